@@ -1,0 +1,201 @@
+"""Pinhole and Brown-Conrady intrinsics, range from a known size, and the zoom lens.
+
+Pixels are (u, v), u right and v down, and (0, 0) is the centre of the top-left pixel.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cotarget.errors import ConfigError
+from cotarget.geometry import Array
+
+# Newton's iteration for the inverse distortion: quadratic, so 20 steps are ample wherever an inverse exists.
+UNDISTORT_STEPS = 20
+# A pixel counts as explained when its ray projects back to within this normalised distance (about 1e-9 px).
+UNDISTORT_TOLERANCE = 1e-12
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A camera's inner geometry: pinhole with Brown-Conrady distortion (OpenCV's first five coefficients).
+
+    Attributes:
+        size: (width, height) [px].
+        focal_px: (fx, fy) [px].
+        center_px: principal point (cx, cy) [px].
+        distortion: (k1, k2, p1, p2, k3), without unit.
+    """
+
+    size: tuple[int, int]
+    focal_px: tuple[float, float]
+    center_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @property
+    def matrix(self) -> Array:
+        """The 3x3 camera matrix K."""
+        (fx, fy), (cx, cy) = self.focal_px, self.center_px
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def image_center_px(self) -> Array:
+        """The middle of the image, (2,), where a target is wanted by default."""
+        return (np.array(self.size, dtype=float) - 1.0) / 2.0
+
+    def project(self, x_camera: Array) -> Array:
+        """Project points into the image.
+
+        Args:
+            x_camera: points in the camera's frame [m], (..., 3).
+
+        Returns:
+            Pixels (..., 2); nan for points that are not in front of the camera, or so far off the axis that
+            the distortion polynomial has folded back.
+        """
+        x_camera = np.asarray(x_camera, dtype=float)
+        depth = x_camera[..., 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = x_camera[..., :2] / depth[..., None]
+        valid = (depth > 0) & (np.linalg.det(self._distort_jacobian(xy)) > 0) & self._before_fold(xy)
+        pixels = self._distort(xy) * np.array(self.focal_px) + np.array(self.center_px)
+        return np.where(valid[..., None], pixels, np.nan)
+
+    def ray(self, pixel: Array) -> Array:
+        """Give the ray through a pixel, scaled so that its z is 1 (depth times ray is the point).
+
+        Args:
+            pixel: (u, v) [px], (..., 2).
+
+        Returns:
+            Rays in the camera's frame, (..., 3); nan where no ray projects to that pixel.
+        """
+        pixel = np.asarray(pixel, dtype=float)
+        distorted = (pixel - np.array(self.center_px)) / np.array(self.focal_px)
+        xy = distorted.copy()
+        with np.errstate(all="ignore"):
+            for _ in range(UNDISTORT_STEPS):
+                error = self._distort(xy) - distorted
+                J = self._distort_jacobian(xy)
+                det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+                step_x = (J[..., 1, 1] * error[..., 0] - J[..., 0, 1] * error[..., 1]) / det
+                step_y = (J[..., 0, 0] * error[..., 1] - J[..., 1, 0] * error[..., 0]) / det
+                xy = xy - np.stack([step_x, step_y], axis=-1)
+            off = np.linalg.norm(self._distort(xy) - distorted, axis=-1)
+            ok = (off <= UNDISTORT_TOLERANCE * (1 + np.linalg.norm(distorted, axis=-1))) & self._before_fold(xy)
+        ray = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+        return np.where(ok[..., None], ray, np.nan)
+
+    def scaled(self, focal_factor: float) -> "Intrinsics":
+        """The same camera with its focal lengths multiplied by ``focal_factor``."""
+        fx, fy = self.focal_px
+        return replace(self, focal_px=(fx * focal_factor, fy * focal_factor))
+
+    def _distort(self, xy: Array) -> Array:
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = xy[..., 0], xy[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        return np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ],
+            axis=-1,
+        )
+
+    def _distort_jacobian(self, xy: Array) -> Array:
+        """Derivative of the distorted by the undistorted coordinates, (..., 2, 2)."""
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = xy[..., 0], xy[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d(radial)/dx = slope * x
+        xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+        xy_ = slope * x * y + 2 * p1 * x + 2 * p2 * y
+        yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+        return np.stack([np.stack([xx, xy_], axis=-1), np.stack([xy_, yy], axis=-1)], axis=-2)
+
+    def _before_fold(self, xy: Array) -> Array:
+        """Whether points lie inside the radius at which the radial polynomial stops growing."""
+        k1, k2, _, _, k3 = self.distortion
+        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])  # d(r radial)/dr = 0, in r^2
+        fold = [r.real for r in roots if abs(r.imag) < 1e-12 and r.real > 0]
+        r2 = np.sum(xy * xy, axis=-1)
+        return r2 < min(fold, default=np.inf)
+
+
+def depth_from_size(intrinsics: Intrinsics, size: float, size_px: float, *, vertical: bool) -> float:
+    """Estimate a target's depth from its known size: z = f x_size / u_measured.
+
+    Args:
+        intrinsics: the fixed camera.
+        size: the target's true size [m].
+        size_px: its measured size in the image [px].
+        vertical: whether the size is measured along v (a height) and not along u.
+
+    Returns:
+        Depth along the camera's axis [m]; nan for a size that is not positive.
+    """
+    focal = intrinsics.focal_px[1 if vertical else 0]
+    return focal * size / size_px if size_px > 0 else float("nan")
+
+
+def focal_for_size(size: float, wanted_px: float, depth: float) -> float:
+    """The focal length [px] at which ``size`` [m] at ``depth`` [m] appears ``wanted_px`` large (Eq. 17)."""
+    return wanted_px * depth / size
+
+
+@dataclass(frozen=True)
+class ZoomLens:
+    """The zoom camera's intrinsics over its whole range.
+
+    The device tells its focal length in nominal pixels; calibration says what that means. Between calibrated
+    stops the intrinsics are interpolated over the logarithm of the focal length; beyond them, the focal length
+    keeps the last stop's ratio to the nominal one.
+
+    Attributes:
+        nominal_px: the device's own focal length at each stop [px], increasing, (n,).
+        stops: the calibrated intrinsics at each stop, n of them.
+    """
+
+    nominal_px: tuple[float, ...]
+    stops: tuple[Intrinsics, ...]
+
+    def __post_init__(self) -> None:
+        if not self.stops or len(self.stops) != len(self.nominal_px):
+            raise ConfigError("a zoom lens needs one nominal focal length for each calibrated stop")
+        if any(b <= a for a, b in zip(self.nominal_px, self.nominal_px[1:], strict=False)):
+            raise ConfigError("the zoom stops' nominal focal lengths must increase")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px]."""
+        return self.stops[0].size
+
+    def at(self, nominal_px: float) -> Intrinsics:
+        """The intrinsics when the device says its focal length is ``nominal_px``."""
+        log_nominal = np.log(self.nominal_px)
+        x = np.log(nominal_px)
+
+        def between(values: list[float]) -> float:
+            return float(np.interp(x, log_nominal, values))
+
+        ratio = [[s.focal_px[i] / n for s, n in zip(self.stops, self.nominal_px, strict=True)] for i in (0, 1)]
+        k1, k2, p1, p2, k3 = (between([s.distortion[i] for s in self.stops]) for i in range(5))
+        return Intrinsics(
+            size=self.size,
+            focal_px=(between(ratio[0]) * nominal_px, between(ratio[1]) * nominal_px),
+            center_px=(
+                between([s.center_px[0] for s in self.stops]),
+                between([s.center_px[1] for s in self.stops]),
+            ),
+            distortion=(k1, k2, p1, p2, k3),
+        )
+
+    def nominal_for(self, focal_px: float) -> float:
+        """What to tell the device so that the true horizontal focal length is ``focal_px`` [px]."""
+        nominal = focal_px
+        for _ in range(UNDISTORT_STEPS):  # the ratio hardly changes, so this fixed point converges at once
+            nominal = focal_px * nominal / self.at(nominal).focal_px[0]
+        return nominal

@@ -1,0 +1,58 @@
+"""Frames, transforms and the rotation conventions everything else relies on.
+
+Frames (names as in code, the paper's in braces): ``fixed`` {L} the stationary wide camera; ``zoom0`` {R0} the
+zoom camera at pan = tilt = 0; ``zoom`` {R} the zoom camera now; ``base`` {O} the pan-tilt unit, not moving;
+``head`` {P} its moving platform; ``world`` in the simulation only.
+
+``T_a_b`` maps coordinates in b to coordinates in a, so that names chain: ``x_a = T_a_b T_b_c x_c``. Cameras look
+along +z with x right and y down. Lengths are metres and angles radians. scipy's ``RigidTransform`` is the only
+type of transform.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform, Rotation
+
+Array = npt.NDArray[np.float64]
+
+__all__ = ["Array", "RigidTransform", "Rotation", "angle_between", "pose", "pose_dict", "rot_x", "rot_y"]
+
+
+def rot_x(angle: float) -> Rotation:
+    """Rotate about x by ``angle`` [rad]: a positive tilt turns +z towards -y, that is up (Eq. 8)."""
+    return Rotation.from_rotvec([angle, 0.0, 0.0])
+
+
+def rot_y(angle: float) -> Rotation:
+    """Rotate about y by ``angle`` [rad]: a positive pan turns +z towards +x, that is right (Eq. 8)."""
+    return Rotation.from_rotvec([0.0, angle, 0.0])
+
+
+def pose(translation: Sequence[float] | Array, rotvec_deg: Sequence[float] | Array) -> RigidTransform:
+    """Make a transform from a translation [m], (3,), and a rotation vector [degrees], (3,)."""
+    return RigidTransform.from_components(
+        np.asarray(translation, dtype=float), Rotation.from_rotvec(rotvec_deg, degrees=True)
+    )
+
+
+def pose_dict(T: RigidTransform) -> Mapping[str, list[float]]:
+    """Write a transform as people edit it: translation [m] and rotation vector [degrees]; inverse of `pose`."""
+    return {
+        "translation": [float(v) for v in T.translation],
+        "rotvec_deg": [float(v) for v in T.rotation.as_rotvec(degrees=True)],
+    }
+
+
+def angle_between(a: Array, b: Array) -> Array:
+    """Angle between directions [rad], exact for tiny and for near-opposite angles.
+
+    Args:
+        a: directions of any length, (..., 3).
+        b: directions of any length, (..., 3).
+
+    Returns:
+        Angles in 0..pi, (...).
+    """
+    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))

@@ -1,0 +1,181 @@
+"""What the pipeline sees of a rig: frames, four small device Protocols, a clock, and `open_rig`.
+
+A rig is the MuJoCo simulation, real devices, or a recording; the pipeline cannot tell which. Every blocking call
+advances the rig's own clock, which is simulated time in the simulation.
+"""
+
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from cotarget.errors import ConfigError
+from cotarget.geometry import RigidTransform
+
+if TYPE_CHECKING:
+    from cotarget.config import RigConfig
+
+Image = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image and when its light fell: ``image`` (H, W, 3) BGR, ``t`` the middle of the exposure [s]."""
+
+    image: Image
+    t: float
+
+
+@dataclass(frozen=True)
+class ZoomState:
+    """The lens as its device tells it: nominal focal length [px], whether it moves, and when that was [s]."""
+
+    focal_px: float
+    moving: bool
+    t: float
+
+
+@dataclass(frozen=True)
+class PanTiltState:
+    """The head as its device tells it: angles [rad], whether it moves, and when that was [s]."""
+
+    pan: float
+    tilt: float
+    moving: bool
+    t: float
+
+
+@dataclass(frozen=True)
+class PanTiltLimits:
+    """What a pan-tilt unit can do.
+
+    Attributes:
+        pan: lowest and highest pan [rad].
+        tilt: lowest and highest tilt [rad].
+        speed: highest speed of either axis [rad/s].
+        acceleration: of either axis [rad/s^2].
+        step: resolution of either axis [rad]; 0 for a continuous head.
+    """
+
+    pan: tuple[float, float]
+    tilt: tuple[float, float]
+    speed: float
+    acceleration: float
+    step: float
+
+
+class Camera(Protocol):
+    """A camera that streams."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px]."""
+
+    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
+        """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
+
+        Raises:
+            StaleFrameError: no such frame arrived within ``timeout`` [s].
+        """
+
+
+class ZoomCamera(Camera, Protocol):
+    """A camera whose focal length can be commanded. Focal lengths are the device's nominal pixels."""
+
+    @property
+    def focal_range(self) -> tuple[float, float]:
+        """Shortest and longest focal length [px]."""
+
+    def zoom(self, focal_px: float) -> float:
+        """Start the lens moving and return at once the focal length [px] that it will really reach."""
+
+    def state(self) -> ZoomState:
+        """Tell the lens's state now."""
+
+    def capture(self) -> Frame:
+        """Take a full still, where the device has one; otherwise the next frame."""
+
+
+class PanTilt(Protocol):
+    """A two-axis head."""
+
+    @property
+    def limits(self) -> PanTiltLimits:
+        """What the unit can do."""
+
+    def state(self) -> PanTiltState:
+        """Tell the head's state now."""
+
+    def move(self, pan: float, tilt: float, speed: float | None = None, wait: bool = False) -> tuple[float, float]:
+        """Command both axes [rad]; return what was commanded after clipping and rounding to steps."""
+
+    def halt(self) -> None:
+        """Stop at once; safe even if the program dies next."""
+
+
+class Clock(Protocol):
+    """The rig's time."""
+
+    def now(self) -> float:
+        """Seconds on the rig's clock."""
+
+    def sleep_until(self, t: float) -> None:
+        """Return when the clock shows ``t`` [s]."""
+
+
+class Board(Protocol):
+    """Somebody, or something, that can hold a calibration board."""
+
+    def present(self, T_fixed_board: RigidTransform | None) -> None:
+        """Wish for the board at a pose (its first corner's frame), or for no board; nobody is told the result."""
+
+
+class Rig(Protocol):
+    """The whole: two cameras, a head, a clock and a board. A context manager that halts, then closes."""
+
+    @property
+    def fixed(self) -> Camera:
+        """The stationary wide camera."""
+
+    @property
+    def zoom(self) -> ZoomCamera:
+        """The zoom camera on the pan-tilt unit."""
+
+    @property
+    def head(self) -> PanTilt:
+        """The pan-tilt unit."""
+
+    @property
+    def clock(self) -> Clock:
+        """The rig's time."""
+
+    @property
+    def board(self) -> Board:
+        """The calibration board's holder."""
+
+    def close(self) -> None:
+        """Halt the head and release the devices."""
+
+    def __enter__(self) -> "Rig":
+        """Give the rig itself."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Halt, then close."""
+
+
+def open_rig(config: "RigConfig") -> Rig:
+    """Open the rig that a configuration describes; the only place that imports a backend.
+
+    Raises:
+        ConfigError: this build has no such backend.
+        DeviceError: the backend could not be opened.
+    """
+    if config.backend == "sim":
+        from cotarget.sim.world import SimWorld
+
+        return SimWorld(config).rig
+    raise ConfigError(f"backend '{config.backend}' has no driver in this version; use 'sim'")

@@ -1,0 +1,1 @@
+"""The simulated rig: a MuJoCo world behind the device Protocols."""
