@@ -1,0 +1,257 @@
+"""calibration.json: readable, replaced atomically, checked when it is read, and with the corners it came from.
+
+Keys: schema; fixed; zoom (stops over the focal length); T_zoom0_fixed; T_head_zoom (or null); head; pitch_mm (or
+null); residuals; covariance (or null); board; provenance; views. Lengths are metres; angles are degrees where people
+read them, and radians in the views, so that a refit starts from the very same numbers.
+"""
+
+import itertools
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cotarget.calibration import parsing
+from cotarget.calibration.atomic import write_atomically
+from cotarget.calibration.model import Calibration, Covariance, Rejected, Residuals, View
+from cotarget.calibration.parsing import Table, get, join
+from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.config import BoardConfig
+from cotarget.errors import CalibrationError
+from cotarget.geometry import pose_dict
+from cotarget.pantilt import HeadGeometry
+
+SCHEMA = 1
+
+
+def save_calibration(path: Path, calibration: Calibration) -> None:
+    """Write calibration.json; the file is replaced in one step.
+
+    Raises:
+        CalibrationError: the file cannot be written, or the calibration holds a number that is not finite.
+    """
+    T_head_zoom = calibration.T_head_zoom
+    covariance = calibration.covariance
+    table = {
+        "schema": SCHEMA,
+        "fixed": {"size": list(calibration.fixed.size), **_write_intrinsics(calibration.fixed)},
+        "zoom": {
+            "size": list(calibration.zoom.size),
+            "stops": [
+                {"nominal_px": float(nominal), **_write_intrinsics(stop)}
+                for nominal, stop in zip(calibration.zoom.nominal_px, calibration.zoom.stops, strict=True)
+            ],
+        },
+        "T_zoom0_fixed": pose_dict(calibration.T_zoom0_fixed),
+        "T_head_zoom": None if T_head_zoom is None else pose_dict(T_head_zoom),
+        "head": {
+            "axis_offset": float(calibration.head.axis_offset),
+            "squareness_deg": math.degrees(calibration.head.squareness),
+        },
+        "pitch_mm": calibration.pitch_mm,
+        "residuals": None if calibration.residuals is None else _write_residuals(calibration.residuals),
+        "covariance": None
+        if covariance is None
+        else {"parameters": list(covariance.parameters), "matrix": covariance.matrix.tolist()},
+        "board": None if calibration.board is None else write_board(calibration.board),
+        "provenance": dict(calibration.provenance),
+        "views": [_write_view(view) for view in calibration.views],
+    }
+    try:
+        text = _readable(table)
+    except ValueError:
+        raise CalibrationError(f"{path}: not written: the calibration holds a number that is not finite") from None
+    write_atomically(path, text.encode())
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Read calibration.json.
+
+    Raises:
+        CalibrationError: the file is missing or malformed; the message names the file and the key.
+    """
+    table = parsing.read_json(path, SCHEMA)
+    try:
+        return _parse(table)
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+
+
+def write_board(board: BoardConfig) -> dict[str, Any]:
+    """Write the board as a JSON object."""
+    return {"kind": board.kind, "corners": list(board.corners), "square": board.square}
+
+
+def parse_board(value: Any, where: str) -> BoardConfig:
+    """Read a board from a JSON object."""
+    table = parsing.as_table(value, where)
+    kind = get(table, "kind", where)
+    if kind != "chessboard":
+        raise CalibrationError(f"{join(where, 'kind')}: {parsing.short(kind)} is not one of: chessboard")
+    return BoardConfig(
+        kind=kind,
+        corners=parsing.as_size(get(table, "corners", where), join(where, "corners")),
+        square=parsing.as_number(get(table, "square", where), join(where, "square"), positive=True),
+    )
+
+
+def _readable(table: dict[str, Any]) -> str:
+    """Write one line a short value and one line a view, not one line a number."""
+    lines = []
+    for key, value in table.items():
+        if isinstance(value, list) and value:
+            items = ",\n    ".join(json.dumps(item, allow_nan=False) for item in value)
+            lines.append(f'  "{key}": [\n    {items}\n  ]')
+        elif isinstance(value, dict) and value:
+            items = ",\n    ".join(f"{json.dumps(k)}: {json.dumps(v, allow_nan=False)}" for k, v in value.items())
+            lines.append(f'  "{key}": {{\n    {items}\n  }}')
+        else:
+            lines.append(f'  "{key}": {json.dumps(value, allow_nan=False)}')
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def _write_intrinsics(camera: Intrinsics) -> dict[str, Any]:
+    (fx, fy), (cx, cy) = camera.focal_px, camera.center_px
+    numbers = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    return {k: float(v) for k, v in numbers.items()} | {"distortion": [float(k) for k in camera.distortion]}
+
+
+def _write_residuals(residuals: Residuals) -> dict[str, Any]:
+    return {
+        **{name: getattr(residuals, name) for name in RESIDUAL_KEYS},
+        "rejected": [{"name": r.name, "reason": r.reason} for r in residuals.rejected],
+    }
+
+
+RESIDUAL_KEYS = (
+    "fixed_rms_px",
+    "zoom_rms_px",
+    "stereo_rms_px",
+    "handeye_rms_px",
+    "fixed_views",
+    "zoom_views",
+    "pairs",
+)
+
+
+def _write_view(view: View) -> dict[str, Any]:
+    return {
+        "camera": view.camera,
+        "board": view.board,
+        "pan": view.pan,
+        "tilt": view.tilt,
+        "focal_px": view.focal_px,
+        "t": view.t,
+        "source": view.source,
+        "corners_px": view.corners_px.tolist(),
+    }
+
+
+def _parse(table: Table) -> Calibration:
+    T_head_zoom = get(table, "T_head_zoom")
+    head = parsing.as_table(get(table, "head"), "head")
+    pitch = get(table, "pitch_mm")
+    board = None if get(table, "board") is None else parse_board(table["board"], "board")
+    views = parsing.as_list(get(table, "views"), "views")
+    if views and board is None:
+        raise CalibrationError("board: is null, but there are views of one")
+    fixed = parsing.as_table(get(table, "fixed"), "fixed")
+    return Calibration(
+        fixed=_parse_intrinsics(fixed, parsing.as_size(get(fixed, "size", "fixed"), "fixed.size"), "fixed"),
+        zoom=_parse_lens(parsing.as_table(get(table, "zoom"), "zoom")),
+        T_zoom0_fixed=parsing.as_pose(get(table, "T_zoom0_fixed"), "T_zoom0_fixed"),
+        T_head_zoom=None if T_head_zoom is None else parsing.as_pose(T_head_zoom, "T_head_zoom"),
+        head=HeadGeometry(
+            axis_offset=parsing.as_number(get(head, "axis_offset", "head"), "head.axis_offset"),
+            squareness=math.radians(parsing.as_number(get(head, "squareness_deg", "head"), "head.squareness_deg")),
+        ),
+        pitch_mm=None if pitch is None else parsing.as_number(pitch, "pitch_mm", positive=True),
+        residuals=_parse_residuals(get(table, "residuals")),
+        covariance=_parse_covariance(get(table, "covariance")),
+        board=board,
+        views=tuple(_parse_view(view, f"views[{i}]", board) for i, view in enumerate(views) if board is not None),
+        provenance=parsing.as_table(get(table, "provenance"), "provenance"),
+    )
+
+
+def _parse_intrinsics(table: Table, size: tuple[int, int], where: str) -> Intrinsics:
+    fx, fy = (parsing.as_number(get(table, k, where), join(where, k), positive=True) for k in ("fx", "fy"))
+    cx, cy = (parsing.as_number(get(table, k, where), join(where, k)) for k in ("cx", "cy"))
+    k1, k2, p1, p2, k3 = parsing.as_numbers(get(table, "distortion", where), join(where, "distortion"), 5)
+    return Intrinsics(size=size, focal_px=(fx, fy), center_px=(cx, cy), distortion=(k1, k2, p1, p2, k3))
+
+
+def _parse_lens(table: Table) -> ZoomLens:
+    size = parsing.as_size(get(table, "size", "zoom"), "zoom.size")
+    stops = parsing.as_list(get(table, "stops", "zoom"), "zoom.stops")
+    if not stops:
+        raise CalibrationError("zoom.stops: is empty; at least one calibrated focal length is needed")
+    nominal, intrinsics = [], []
+    for i, value in enumerate(stops):
+        where = f"zoom.stops[{i}]"
+        stop = parsing.as_table(value, where)
+        nominal.append(parsing.as_number(get(stop, "nominal_px", where), join(where, "nominal_px"), positive=True))
+        intrinsics.append(_parse_intrinsics(stop, size, where))
+    if any(b <= a for a, b in itertools.pairwise(nominal)):
+        raise CalibrationError("zoom.stops: the values of nominal_px do not increase")
+    return ZoomLens(tuple(nominal), tuple(intrinsics))
+
+
+def _parse_residuals(value: Any) -> Residuals | None:
+    if value is None:
+        return None
+    where = "residuals"
+    table = parsing.as_table(value, where)
+    numbers: dict[str, Any] = {}
+    for key in RESIDUAL_KEYS:
+        item = get(table, key, where)
+        if key.endswith("_px"):
+            missing = item is None and key == "handeye_rms_px"
+            numbers[key] = None if missing else parsing.as_number(item, join(where, key))
+        else:
+            numbers[key] = parsing.as_whole(item, join(where, key))
+    rejected = []
+    for i, item in enumerate(parsing.as_list(get(table, "rejected", where), "residuals.rejected")):
+        entry = parsing.as_table(item, f"residuals.rejected[{i}]")
+        name, reason = (
+            parsing.as_text(get(entry, k, f"residuals.rejected[{i}]"), f"residuals.rejected[{i}].{k}")
+            for k in ("name", "reason")
+        )
+        rejected.append(Rejected(name, reason))
+    return Residuals(**numbers, rejected=tuple(rejected))
+
+
+def _parse_covariance(value: Any) -> Covariance | None:
+    if value is None:
+        return None
+    table = parsing.as_table(value, "covariance")
+    names = parsing.as_list(get(table, "parameters", "covariance"), "covariance.parameters")
+    rows = parsing.as_list(get(table, "matrix", "covariance"), "covariance.matrix", len(names))
+    return Covariance(
+        parameters=tuple(parsing.as_text(n, f"covariance.parameters[{i}]") for i, n in enumerate(names)),
+        matrix=np.array([parsing.as_numbers(r, f"covariance.matrix[{i}]", len(names)) for i, r in enumerate(rows)]),
+    )
+
+
+def _parse_view(value: Any, where: str, board: BoardConfig) -> View:
+    table = parsing.as_table(value, where)
+    camera = get(table, "camera", where)
+    if camera not in ("fixed", "zoom"):
+        raise CalibrationError(f"{where}.camera: {parsing.short(camera)} is not one of: fixed, zoom")
+    focal = get(table, "focal_px", where)
+    source = get(table, "source", where)
+    columns, rows = board.corners
+    corners = parsing.as_list(get(table, "corners_px", where), f"{where}.corners_px", columns * rows)
+    pan, tilt, t = (parsing.as_number(get(table, k, where), join(where, k)) for k in ("pan", "tilt", "t"))
+    return View(
+        camera=camera,
+        corners_px=np.array([parsing.as_numbers(c, f"{where}.corners_px[{i}]", 2) for i, c in enumerate(corners)]),
+        board=parsing.as_whole(get(table, "board", where), join(where, "board")),
+        pan=pan,
+        tilt=tilt,
+        focal_px=None if focal is None else parsing.as_number(focal, join(where, "focal_px"), positive=True),
+        t=t,
+        source=None if source is None else parsing.as_text(source, join(where, "source")),
+    )
