@@ -3,6 +3,7 @@
 Pixels are (u, v), u right and v down, and (0, 0) is the centre of the top-left pixel.
 """
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,10 +56,12 @@ class Intrinsics:
         """
         x_camera = np.asarray(x_camera, dtype=float)
         depth = x_camera[..., 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
             xy = x_camera[..., :2] / depth[..., None]
-        valid = (depth > 0) & (np.linalg.det(self._distort_jacobian(xy)) > 0) & self._before_fold(xy)
-        pixels = self._distort(xy) * np.array(self.focal_px) + np.array(self.center_px)
+            J = self._distort_jacobian(xy)
+            unfolded = J[..., 0, 0] * J[..., 1, 1] > J[..., 0, 1] * J[..., 1, 0]
+            valid = (depth > 0) & unfolded & self._before_fold(xy)
+            pixels = self._distort(xy) * np.array(self.focal_px) + np.array(self.center_px)
         return np.where(valid[..., None], pixels, np.nan)
 
     def ray(self, pixel: Array) -> Array:
@@ -165,7 +168,7 @@ class ZoomLens:
     def __post_init__(self) -> None:
         if not self.stops or len(self.stops) != len(self.nominal_px):
             raise ConfigError("a zoom lens needs one nominal focal length for each calibrated stop")
-        if any(b <= a for a, b in zip(self.nominal_px, self.nominal_px[1:], strict=False)):
+        if any(b <= a for a, b in itertools.pairwise(self.nominal_px)):
             raise ConfigError("the zoom stops' nominal focal lengths must increase")
 
     @property

@@ -5,6 +5,7 @@ Defaults are the rig that the project's figures are stated for.
 """
 
 import dataclasses
+import itertools
 import math
 import tomllib
 import types
@@ -430,5 +431,5 @@ def _check(config: RigConfig) -> None:
     for name in sim.targets:
         config.target(name)
     for name, waypoints in sim.paths.items():
-        if len(waypoints) < 2 or any(b[0] <= a[0] for a, b in zip(waypoints, waypoints[1:], strict=False)):
+        if len(waypoints) < 2 or any(b[0] <= a[0] for a, b in itertools.pairwise(waypoints)):
             raise ConfigError(f"sim.paths.{name}: needs two or more waypoints [t, x, y, z] with increasing t")

@@ -1,0 +1,90 @@
+"""Intrinsics against cv2.projectPoints and the numbers of the paper's Section 4.2."""
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.camera import Intrinsics, ZoomLens, depth_from_size, focal_for_size
+from cotarget.errors import ConfigError
+
+# Table 2 as (u, v); the paper lists rows as [v, u].
+FIXED = Intrinsics(size=(640, 480), focal_px=(686.0, 684.0), center_px=(325.0, 239.0))
+ZOOM = Intrinsics(size=(640, 480), focal_px=(692.0, 693.0), center_px=(326.0, 235.0))
+DISTORTED = Intrinsics((640, 480), (690.0, 700.0), (325.0, 231.0), (-0.25, 0.07, 0.002, -0.001, -0.004))
+PROJECTION_PX = 1e-9  # both are double precision
+ROUND_TRIP_PX = 1e-8
+
+
+def test_projection_is_opencvs():
+    rng = np.random.default_rng(0)
+    x = np.column_stack([rng.uniform(-0.45, 0.45, (500, 2)), np.ones(500)]) * rng.uniform(1, 30, (500, 1))
+    expected = cv2.projectPoints(x, np.zeros(3), np.zeros(3), DISTORTED.matrix, np.array(DISTORTED.distortion))[0]
+    np.testing.assert_allclose(DISTORTED.project(x), expected.reshape(-1, 2), atol=PROJECTION_PX)
+
+
+def test_ray_undoes_projection_all_over_the_image():
+    u, v = np.meshgrid(np.linspace(0, 639, 33), np.linspace(0, 479, 25))
+    pixels = np.stack([u, v], axis=-1)
+    rays = DISTORTED.ray(pixels)
+    assert (rays[..., 2] == 1).all()
+    np.testing.assert_allclose(DISTORTED.project(rays * 7.0), pixels, atol=ROUND_TRIP_PX)
+
+
+def test_points_behind_or_beyond_the_fold_are_nan():
+    assert np.isnan(DISTORTED.project(np.array([0.0, 0.0, -1.0]))).all()
+    assert np.isnan(DISTORTED.project(np.array([0.1, 0.0, 0.0]))).all()
+    folded = Intrinsics((640, 480), (690.0, 690.0), (320.0, 240.0), (-0.3, 0, 0, 0, 0))
+    assert np.isnan(folded.project(np.array([1.5, 0.0, 1.0]))).all()  # folds at r = 1 / sqrt(0.9)
+    assert np.isnan(folded.ray(np.array([5000.0, 240.0]))).all()
+
+
+def test_the_papers_worked_example():
+    """Pixel (529, 275) at 10 m; printed (2973, 519, 10000) mm: the first is cut, the second needs a centre of 239.5."""
+    x = FIXED.ray(np.array([529.0, 275.0])) * 10000
+    assert np.floor(x[0]) == 2973
+    assert round(x[0], 1) == 2973.8
+    assert round(x[1], 1) == 526.3
+    with_half = Intrinsics((640, 480), (686.0, 684.0), (325.0, 239.5)).ray(np.array([529.0, 275.0])) * 10000
+    assert round(with_half[1]) == 519
+
+
+def test_the_papers_focal_length():
+    """The book is 234 mm; 160 px wanted at 10464 mm: 7155 px, which is 10.3 of 12 times zoom and 64.4 mm."""
+    focal = focal_for_size(234.0, 160.0, 10464.0)
+    assert round(focal) == 7155
+    assert round(focal * 0.009, 1) == 64.4
+    assert round(focal * 0.009 / 6.237, 1) == 10.3
+    assert round(focal_for_size(234.0, 160.0, 10510.0)) == 7186  # with the exact range after centring
+
+
+def test_table_2_in_millimetres():
+    """Focal lengths in mm are px times pitch: 693, 692 at 0.009 mm and 684, 686 at 0.01 mm."""
+    assert [round(f * 0.009, 3) for f in (693, 692)] == [6.237, 6.228]
+    assert [round(f * 0.01, 3) for f in (684, 686)] == [6.84, 6.86]
+
+
+def test_depth_from_size_is_the_inverse_of_projection():
+    assert depth_from_size(FIXED, 0.234, 686 * 0.234 / 10, vertical=False) == pytest.approx(10)
+    assert depth_from_size(FIXED, 1.75, 684 * 1.75 / 12, vertical=True) == pytest.approx(12)
+    assert np.isnan(depth_from_size(FIXED, 1.0, 0.0, vertical=False))
+
+
+def test_zoom_lens_keeps_its_ratio_beyond_one_stop():
+    lens = ZoomLens((667.0,), (ZOOM,))
+    assert lens.at(667.0).focal_px == pytest.approx(ZOOM.focal_px)
+    assert lens.at(6670.0).focal_px == pytest.approx((6920.0, 6930.0))
+    assert lens.at(lens.nominal_for(5000.0)).focal_px[0] == pytest.approx(5000.0)
+
+
+def test_zoom_lens_interpolates_between_stops():
+    far = Intrinsics((640, 480), (2800.0, 2804.0), (330.0, 239.0), (-0.3, 0, 0, 0, 0))
+    lens = ZoomLens((700.0, 2800.0), (Intrinsics((640, 480), (700.0, 701.0), (326.0, 235.0)), far))
+    middle = lens.at(1400.0)  # half way in the logarithm
+    assert middle.center_px == pytest.approx((328.0, 237.0))
+    assert middle.distortion[0] == pytest.approx(-0.15)
+    assert lens.at(lens.nominal_for(1234.0)).focal_px[0] == pytest.approx(1234.0)
+
+
+def test_zoom_lens_refuses_stops_out_of_order():
+    with pytest.raises(ConfigError, match="increase"):
+        ZoomLens((700.0, 700.0), (ZOOM, ZOOM))

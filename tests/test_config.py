@@ -1,0 +1,110 @@
+"""rig.toml: defaults, every section, and one clear line for each mistake."""
+
+import re
+
+import numpy as np
+import pytest
+
+from cotarget.config import SimEffects, load_config, parse_config
+from cotarget.errors import ConfigError
+
+
+def test_defaults_are_the_published_rig():
+    """Pinned, because every published figure is for this rig and these effects."""
+    config = parse_config({})
+    fixed, zoom, head = config.sim.fixed, config.sim.zoom, config.sim.head
+    assert fixed.size == zoom.size == (640, 480)
+    assert (fixed.distortion[0], zoom.distortion[0]) == (-0.2, -0.1)
+    assert (fixed.noise, fixed.jpeg_quality, fixed.latency_s, fixed.rate_hz) == (2.0, 90, 0.06, 25.0)
+    assert (zoom.noise, zoom.jpeg_quality, zoom.latency_s, zoom.rate_hz) == (2.0, 90, 0.06, 25.0)
+    assert round(head.step_deg, 4) == 0.0514
+    assert (head.axis_offset_mm, head.squareness_deg, head.command_delay_s) == (5.0, 0.1, 0.04)
+    assert [config.targets[n].wanted_px for n in ("book", "person", "bird")] == [160, 300, 160]
+    assert [config.targets[n].size for n in ("book", "person", "bird")] == [0.234, 1.75, 0.8]
+
+
+def test_offsets_and_targets_are_taken(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(
+        """
+        backend = "sim"
+        [sim]
+        scene = "indoor"
+        seed = 7
+        T_zoom0_fixed = { translation = [-1.5, 0, 0.1], rotvec_deg = [0, -12, 5] }
+        [sim.fixed]
+        noise = 1
+        [sim.effects]
+        all = false
+        jpeg = true
+        [sim.paths]
+        bird = [[0, 0, 20, 5], [10, 5, 20, 6]]
+        [targets.bird]
+        size = 0.5
+        [targets.drone]
+        size = 0.3
+        dimension = "width"
+        wanted_px = 100
+        detector = "motion"
+        """
+    )
+    config = load_config(path)
+    assert config.sim.seed == 7
+    np.testing.assert_allclose(config.sim.T_zoom0_fixed.rotation.as_rotvec(degrees=True), [0, -12, 5])
+    assert config.sim.fixed.noise == 1.0
+    assert config.sim.effects.jpeg
+    assert not config.sim.effects.noise
+    assert config.targets["bird"].size == 0.5
+    assert config.targets["bird"].wanted_px == 160
+    assert config.target("drone").wanted_px == 100
+    assert config.sim.paths["bird"][1] == (10.0, 5.0, 20.0, 6.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("backend = 'real'", "backend: 'real' is not one of: sim"),
+        ("[simm]", "unknown key 'simm'; valid here: backend, board, safety, sim, targets"),
+        ("[sim.fixed]\nnoize = 1", "unknown key 'sim.fixed.noize'"),
+        ("[sim.fixed]\nnoise = 'much'", "sim.fixed.noise: 'much' is not a finite number"),
+        ("[sim.fixed]\nnoise = -1", "sim.fixed.noise: -1 is negative"),
+        ("[sim.fixed]\nsize = [640]", "sim.fixed.size: has 1 values where 2 are wanted"),
+        ("[sim.fixed]\nsize = [640, 480.5]", "sim.fixed.size[1]: 480.5 is not a whole number"),
+        ("[sim.fixed]\nfocal_px = [0, 1]", "sim.fixed.focal_px: 0 is not greater than zero"),
+        ("[sim.fixed]\njpeg_quality = 0", "sim.fixed.jpeg_quality: 0 is not within 1 to 100"),
+        ("[sim.head]\npan_deg = [10, -10]", "sim.head.pan_deg: [10.0, -10.0] is not [lowest, highest]"),
+        ("[sim.effects]\nall = 0", "sim.effects.all: 0 is not true or false"),
+        ("sim = 3", "sim: 3 is not a table"),
+        ("[sim]\ntargets = ['cow']", "unknown target 'cow'; the targets are: bird, book, person"),
+        ("[sim]\nT_head_zoom = { translation = [0, 0, 0] }", "sim.T_head_zoom: missing key 'rotvec_deg'"),
+        ("[sim]\nT_head_zoom = 3", "sim.T_head_zoom: 3 is not a table"),
+        ("[sim.paths]\nbird = [[1, 0, 0, 0], [1, 1, 0, 0]]", "sim.paths.bird: needs two or more waypoints"),
+        ("[targets.cow]\nsize = 2.0", "targets.cow: missing key 'detector'"),
+        ("[targets.bird]\nsize = 0", "targets.bird.size: 0 is not greater than zero"),
+        (
+            "[targets.bird]\ndimension = 'depth'",
+            "targets.bird.dimension: 'depth' is not one of: height, width, wingspan",
+        ),
+        ("[board]\ncorners = [2, 6]", "board.corners: [2, 6] has fewer than 3 corners a side"),
+        ("a = ", "is not TOML"),
+    ],
+)
+def test_each_mistake_is_one_line_that_names_it(tmp_path, text, said):
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(said)) as caught:
+        load_config(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"nothing\.toml: no such file"):
+        load_config(tmp_path / "nothing.toml")
+    with pytest.raises(ConfigError, match="is a directory"):
+        load_config(tmp_path)
+
+
+def test_all_false_is_the_textbook():
+    effects = parse_config({"sim": {"effects": {"all": False}}}).sim.effects
+    assert effects == SimEffects(**dict.fromkeys(SimEffects.__dataclass_fields__, False))

@@ -1,0 +1,182 @@
+"""Kinematics against independent truths: MuJoCo-free matrices, hand-worked cases, the paper's numbers."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from cotarget.errors import UnreachableError
+from cotarget.geometry import angle_between, pose
+from cotarget.pantilt import HeadGeometry, base_head, miss, nearest, shortcut, solve, zoom_fixed
+
+RIGS, TARGETS = 500, 200  # 100,000 targets
+MISS_DEG = 1e-9  # the figure to reach
+ROUNDING = 1e-12
+SAME_ANGLES = 1e-7  # [rad]; near the pan axis the angles are ill-conditioned though the aim is not
+MADE_FROM_FOUND = 0.9998  # the rest lie where both branches meet, and either may be given
+
+
+def matrix_head(pan, tilt, dz, eps):
+    """T_base_head, (..., 4, 4), from matrices written out, independent of scipy's rotations."""
+
+    def about(axis, angle):
+        x, y, z = axis
+        K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        angle = np.asarray(angle)[..., None, None]
+        M = np.zeros((*angle.shape[:-2], 4, 4)) + np.eye(4)
+        M[..., :3, :3] += np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+        return M
+
+    def shift(z):
+        M = np.eye(4)
+        M[2, 3] = z
+        return M
+
+    return about((0, 1, 0), pan) @ shift(dz) @ about((np.cos(eps), np.sin(eps), 0), tilt) @ shift(-dz)
+
+
+def test_forward_is_equation_8():
+    pan, tilt = 0.7, -0.4
+    (c1, s1), (c2, s2) = ((np.cos(a), np.sin(a)) for a in (pan, tilt))
+    expected = [[c1, s1 * s2, s1 * c2], [0, c2, -s2], [-s1, c1 * s2, c1 * c2]]
+    np.testing.assert_allclose(base_head(pan, tilt).as_matrix()[:3, :3], expected, atol=ROUNDING)
+
+
+def test_positive_pan_is_right_and_positive_tilt_is_up():
+    ahead = [0.0, 0.0, 1.0]
+    assert base_head(0.1, 0.0).apply(ahead)[0] > 0
+    assert base_head(0.0, 0.1).apply(ahead)[1] < 0
+
+
+def test_forward_of_a_real_head():
+    rng = np.random.default_rng(1)
+    for pan, tilt, dz, eps in rng.uniform(-1, 1, (50, 4)):
+        got = base_head(pan, tilt, HeadGeometry(dz, eps)).as_matrix()
+        np.testing.assert_allclose(got, matrix_head(pan, tilt, dz, eps), atol=ROUNDING)
+
+
+def random_rig(rng):
+    T = RigidTransform.from_components(rng.uniform(-0.3, 0.3, 3), Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3)))
+    head = HeadGeometry(*(rng.uniform(-1, 1, 2) * (0.02, 0.02) * rng.integers(0, 2)))
+    return T, head
+
+
+def test_inverse_hits_random_targets_in_both_branches():
+    """Targets made by the forward matrices from known angles are hit, and the known angles are found."""
+    rng = np.random.default_rng(2)
+    worst, found = 0.0, 0
+    for _ in range(RIGS):
+        T, head = random_rig(rng)
+        pan, tilt, r = (rng.uniform(lo, hi, TARGETS) for lo, hi in ((-np.pi, np.pi), (-1.4, 1.4), (2, 50)))
+        ray = np.append(rng.uniform(-0.4, 0.4, 2), 1.0)
+        ray /= np.linalg.norm(ray)
+        H = matrix_head(pan, tilt, head.axis_offset, head.squareness)
+        x_head = T.apply(r[:, None] * ray)
+        x_base = np.einsum("nij,nj->ni", H[:, :3, :3], x_head) + H[:, :3, 3]
+        solutions = solve(x_base, T, head, ray)
+        assert np.isfinite(solutions.pan).any(axis=1).all()
+        for branch in range(2):
+            ok = np.isfinite(solutions.pan[:, branch])
+            p, q = solutions.pan[ok, branch], solutions.tilt[ok, branch]
+            M = np.linalg.inv(matrix_head(p, q, head.axis_offset, head.squareness))
+            x_zoom = T.inv().apply(np.einsum("nij,nj->ni", M[:, :3, :3], x_base[ok]) + M[:, :3, 3])
+            worst = max(worst, np.degrees(angle_between(x_zoom, ray)).max())
+            worst = max(worst, np.degrees(miss(p, q, x_base[ok], T, head, ray)).max())
+        turned = np.abs(np.exp(1j * solutions.pan) - np.exp(1j * pan[:, None]))
+        turned += np.abs(np.exp(1j * solutions.tilt) - np.exp(1j * tilt[:, None]))
+        found += np.count_nonzero(np.min(np.nan_to_num(turned, nan=9.0), axis=1) < SAME_ANGLES)
+    print(
+        f"worst miss of {RIGS * TARGETS} targets: {worst:.2e} degrees; {found} found at the angles they were made from"
+    )
+    assert worst < MISS_DEG
+    assert found >= MADE_FROM_FOUND * RIGS * TARGETS
+
+
+def test_home_is_its_own_solution():
+    T = pose([0.02, -0.08, 0.05], [1.0, -2.0, 0.5])
+    x_base = T.apply([0.0, 0.0, 10.0])
+    solution = nearest(solve(x_base, T), (-2, 2), (-1, 1))
+    assert solution.pan == pytest.approx(0, abs=ROUNDING)
+    assert solution.tilt == pytest.approx(0, abs=ROUNDING)
+    assert solution.range == pytest.approx(10, abs=1e-12)
+
+
+def test_hand_worked_target():
+    """Camera on the axes, target 45 degrees right and as high as far: pan 45, tilt atan(1 / sqrt 2)."""
+    solution = nearest(solve(np.array([1.0, -1.0, 1.0]), RigidTransform.identity()), (-2, 2), (-1.5, 1.5))
+    assert np.degrees(solution.pan) == pytest.approx(45)
+    assert np.degrees(solution.tilt) == pytest.approx(35.264389682754654)
+    assert solution.range == pytest.approx(np.sqrt(3))
+
+
+def test_nearest_prefers_the_branch_where_the_head_is():
+    solutions = solve(np.array([0.0, 0.0, 5.0]), RigidTransform.identity())
+    wide = (-np.pi, np.pi)
+    over = nearest(solutions, wide, wide, now=(3.1, 3.1))
+    assert (abs(over.pan), abs(over.tilt)) == pytest.approx((np.pi, np.pi))
+    assert nearest(solutions, wide, wide).tilt == pytest.approx(0)
+
+
+def test_nearest_counts_whole_turns():
+    solutions = solve(np.array([-0.1, 0.0, -5.0]), RigidTransform.identity())
+    beyond = nearest(solutions, (-4, 4), (-1, 1), now=(3.0, 0.0))
+    assert beyond.pan == pytest.approx(np.pi + np.arctan(0.1 / 5))
+
+
+def test_beyond_the_limits_is_said_with_the_angles():
+    with pytest.raises(UnreachableError, match=r"needs pan 90\.00, tilt 0\.00.*limits pan -45 to 45, tilt -30 to 30"):
+        nearest(solve(np.array([5.0, 0, 0]), RigidTransform.identity()), np.radians((-45, 45)), np.radians((-30, 30)))
+
+
+def test_a_target_inside_the_lever_arm_has_no_solution():
+    T = RigidTransform.from_translation([0.0, 0.3, 0.0])
+    solutions = solve(np.array([0.05, 0.0, 0.05]), T)
+    assert np.isnan(solutions.pan).all()
+    with pytest.raises(UnreachableError, match="too close"):
+        nearest(solutions, (-2, 2), (-2, 2))
+
+
+def test_shortcut_is_exact_only_where_depth_is_range():
+    """Straight ahead of a camera at the axes both readings agree with the exact solution; off axis they miss."""
+    gamma, T = pose([-0.4, 0.0, 0.0], [0, 0, 0]), pose([0.0, -0.1, 0.05], [0, 0, 0])
+    x_fixed = np.array([0.4, 0.0, 10.0])
+    exact = nearest(solve(T.apply(gamma.apply(x_fixed)), T), (-2, 2), (-1, 1))
+    for reading in ("table", "example"):
+        near = shortcut(x_fixed, gamma, T, reading)
+        assert near.pan == pytest.approx(exact.pan, abs=1e-9)
+        assert near.tilt == pytest.approx(exact.tilt, abs=1e-9)
+    off_axis = np.array([3.6, -2.5, 10.0])
+    x_base = T.apply(gamma.apply(off_axis))
+    near = shortcut(off_axis, gamma, T, "table")
+    assert np.degrees(miss(near.pan, near.tilt, x_base, T)) > 0.01
+
+
+def test_shortcut_without_solution_is_nan():
+    T = pose([0.0, 0.0, 0.0], [0, 0, 0])
+    near = shortcut(np.array([30.0, 0.0, 1.0]), RigidTransform.identity(), T, "table")
+    assert np.isnan(near.pan)
+
+
+def test_zoom_fixed_is_gamma_at_home():
+    gamma, T = pose([-0.4, 0.03, 0.06], [1, -2, 3]), pose([0.02, -0.08, 0.05], [4, 5, 6])
+    np.testing.assert_allclose(zoom_fixed(0, 0, T, gamma).as_matrix(), gamma.as_matrix(), atol=ROUNDING)
+
+
+def test_target_brought_to_the_axis_lies_on_it():
+    gamma, T, head = (
+        pose([-0.4, 0.03, 0.06], [1, -2, 3]),
+        pose([0.02, -0.08, 0.05], [4, 5, 6]),
+        HeadGeometry(0.005, 0.002),
+    )
+    x_fixed = np.array([2.0, -1.0, 9.0])
+    solution = nearest(solve(T.apply(gamma.apply(x_fixed)), T, head), (-2, 2), (-1, 1))
+    x_zoom = zoom_fixed(solution.pan, solution.tilt, T, gamma, head).apply(x_fixed)
+    np.testing.assert_allclose(x_zoom, [0, 0, solution.range], atol=1e-10)
+
+
+def test_the_papers_one_angle():
+    """3.08 degrees is atan(563 / 10464), the tilt if T hardly rotates; Section 4.2 prints it."""
+    x_zoom0 = np.array([811.0, 563.0, 10464.0]) / 1000
+    solution = shortcut(x_zoom0, RigidTransform.identity(), RigidTransform.identity(), "example")
+    assert round(np.degrees(np.arctan(0.563 / 10.464)), 2) == 3.08
+    assert round(abs(np.degrees(solution.tilt)), 2) == 3.08
+    assert np.degrees(solution.pan) == pytest.approx(4.4, abs=0.1)
