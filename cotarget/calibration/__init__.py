@@ -1,6 +1,8 @@
 """Calibration: boards and corners, intrinsics, stereo (Gamma), hand-eye (T), capture sessions and the file."""
 
+from cotarget.calibration.boards import draw_board, find_corners
 from cotarget.calibration.file import load_calibration, save_calibration
+from cotarget.calibration.method import calibrate_captures, calibrate_photos, calibrate_views
 from cotarget.calibration.model import Calibration, Capture, Covariance, Rejected, Residuals, View
 
 __all__ = [
@@ -10,6 +12,11 @@ __all__ = [
     "Rejected",
     "Residuals",
     "View",
+    "calibrate_captures",
+    "calibrate_photos",
+    "calibrate_views",
+    "draw_board",
+    "find_corners",
     "load_calibration",
     "save_calibration",
 ]

@@ -1,0 +1,145 @@
+"""The chessboard: its points, its picture, and its corners in an image, numbered the same way from every side.
+
+The board's frame: origin at the first inner corner, x along the columns, y along the rows, z into the board, away
+from the viewer. The square diagonally outside the first corner is black. With one odd and one even count of corners
+the opposite square is white, so that the colours alone tell a board from the same board upside down.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from cotarget.config import BoardConfig
+from cotarget.errors import ConfigError
+from cotarget.geometry import Array
+from cotarget.rig import Image
+
+# cornerSubPix looks this share of the smallest corner spacing to each side. The customary 11 px reach into the next
+# corners on small boards and more than double the residuals on real photos.
+WINDOW_SHARE = 0.35
+SMALLEST_WINDOW_PX = 2  # below it, cornerSubPix has too few pixels to fit
+# Stop when corners move less than a thousandth of a pixel, ten times below the noise of the best corners.
+SUBPIX_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001)
+# Corners are kept to a ten-thousandth of a pixel: a hundred times below their noise, and short in a file.
+CORNER_DECIMALS = 4
+# Even and odd squares must differ by this many grey levels on average, or what was found is no chessboard.
+SMALLEST_CONTRAST = 8.0
+
+
+def check_board(board: BoardConfig) -> None:
+    """Refuse a board that looks the same upside down.
+
+    Raises:
+        ConfigError: the counts of corners are both even or both odd, or below 3.
+    """
+    columns, rows = board.corners
+    if min(columns, rows) < 3:
+        raise ConfigError(f"board.corners: {columns}x{rows} has fewer than 3 corners a side")
+    if (columns + rows) % 2 == 0:
+        raise ConfigError(
+            f"board.corners: {columns}x{rows} looks the same upside down; "
+            f"one count must be odd and the other even, like {columns}x{rows + 1}"
+        )
+
+
+def board_points(board: BoardConfig) -> Array:
+    """The inner corners in the board's frame [m], row by row, (columns * rows, 3)."""
+    columns, rows = board.corners
+    v, u = np.mgrid[:rows, :columns]
+    return np.stack([u, v, np.zeros_like(u)], axis=-1).reshape(-1, 3) * board.square
+
+
+def board_outline(board: BoardConfig, squares: float = 1.0) -> Array:
+    """The four outer corners of the board [m], (4, 3), ``squares`` squares outside the inner corners."""
+    columns, rows = board.corners
+    low, right, bottom = -squares, columns - 1 + squares, rows - 1 + squares
+    return np.array([[low, low, 0], [right, low, 0], [right, bottom, 0], [low, bottom, 0]]) * board.square
+
+
+def draw_board(board: BoardConfig, square_px: int, margin_px: int | None = None) -> Image:
+    """Draw the board to be printed or to be used as a texture.
+
+    Args:
+        board: (columns + 1) x (rows + 1) squares are drawn.
+        square_px: side of a square [px].
+        margin_px: white margin [px], which finders need; a square's side where it is not given.
+
+    Returns:
+        A BGR image, (H, W, 3), black or white.
+    """
+    check_board(board)
+    columns, rows = board.corners
+    v, u = np.mgrid[: rows + 1, : columns + 1]
+    squares = np.where((u + v) % 2 == 0, 0, 255).astype(np.uint8)
+    margin = square_px if margin_px is None else margin_px
+    picture = np.pad(np.kron(squares, np.ones((square_px, square_px), np.uint8)), margin, constant_values=255)
+    return np.repeat(picture[:, :, None], 3, axis=2)
+
+
+def find_corners(image: Image, board: BoardConfig) -> Array | None:
+    """Find all inner corners of the board.
+
+    Args:
+        image: (H, W, 3) BGR, or grey (H, W).
+        board: which must have one odd and one even count of corners.
+
+    Returns:
+        Corners from the board's first, row by row, (columns * rows, 2) [px]; None where no whole board is seen.
+    """
+    grey = np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    found = _search(grey, board.corners)
+    if found is None:
+        return None
+    numbered = _number(grey, found, board.corners)
+    if numbered is None:
+        return None
+    return np.round(_refine(grey, numbered, board.corners), CORNER_DECIMALS)
+
+
+def smallest_spacing(corners_px: Array, corners: Sequence[int]) -> float:
+    """The smallest distance between neighbouring corners [px]."""
+    grid = corners_px.reshape(corners[1], corners[0], 2)
+    along, down = np.diff(grid, axis=1), np.diff(grid, axis=0)
+    return float(min(np.linalg.norm(along, axis=-1).min(), np.linalg.norm(down, axis=-1).min()))
+
+
+def _search(grey: Image, corners: tuple[int, int]) -> Array | None:
+    """Find corners to about a pixel, in either order; the second finder sees boards that the first does not."""
+    ok, found = cv2.findChessboardCornersSB(grey, corners, flags=cv2.CALIB_CB_ACCURACY)
+    if not ok:
+        # Without CALIB_CB_FAST_CHECK, which finds nothing when squares are small.
+        ok, found = cv2.findChessboardCorners(
+            grey, corners, flags=cv2.CALIB_CB_ADAPTIVE_THRESH + cv2.CALIB_CB_NORMALIZE_IMAGE
+        )
+    if not ok or found is None:
+        return None
+    return np.asarray(found, dtype=float).reshape(-1, 2)  # (N, 1, 2) in OpenCV 4 and (N, 2) in 5
+
+
+def _number(grey: Image, corners_px: Array, corners: tuple[int, int]) -> Array | None:
+    """Turn the order so that the first corner is the board's, by handedness and then by the squares' colours."""
+    columns, rows = corners
+    grid = corners_px.reshape(rows, columns, 2)
+    along, down = grid[:, -1].mean(0) - grid[:, 0].mean(0), grid[-1].mean(0) - grid[0].mean(0)
+    if along[0] * down[1] - along[1] * down[0] < 0:  # seen from its front, x turns clockwise into y
+        grid = grid[:, ::-1]
+    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    map_u, map_v = (centres[..., i].astype(np.float32) for i in (0, 1))
+    colours = cv2.remap(grey, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
+    v, u = np.mgrid[: rows - 1, : columns - 1]
+    even = (u + v) % 2 == 0
+    contrast = colours[~even].mean() - colours[even].mean()  # positive when the first square is dark
+    if abs(contrast) < SMALLEST_CONTRAST:
+        return None
+    if contrast < 0:
+        grid = grid[::-1, ::-1]
+    return grid.reshape(-1, 2)
+
+
+def _refine(grey: Image, corners_px: Array, corners: tuple[int, int]) -> Array:
+    """Move the corners to the saddle points of the image."""
+    half = max(SMALLEST_WINDOW_PX, round(WINDOW_SHARE * smallest_spacing(corners_px, corners)))
+    start = corners_px.astype(np.float32).reshape(-1, 1, 2)
+    refined = cv2.cornerSubPix(grey, start, (half, half), (-1, -1), SUBPIX_CRITERIA)
+    return np.asarray(refined, dtype=float).reshape(-1, 2)

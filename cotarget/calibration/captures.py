@@ -1,0 +1,218 @@
+"""Captures on disk: PNG images and one index.json that says how each was taken; and folders of plain photos.
+
+index.json: schema; board; pitch_mm (or null); captures, one object an image with file, camera, board (the number of
+the placement), pan and tilt [rad], focal_px (null for the fixed camera), t [s]. The index is replaced in one step
+after every placement, so that a session that is cut short can still be used up to there.
+"""
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from cotarget.calibration import parsing
+from cotarget.calibration.atomic import write_atomically
+from cotarget.calibration.file import parse_board, write_board
+from cotarget.calibration.model import CameraName, Capture
+from cotarget.calibration.parsing import Table, get
+from cotarget.config import BoardConfig
+from cotarget.errors import CalibrationError
+from cotarget.rig import Image
+
+SCHEMA = 1
+INDEX = "index.json"
+# zlib's fastest level: noise hardly compresses, and the session's time is better spent on looking for corners.
+PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+
+
+@dataclass(frozen=True)
+class CaptureIndex:
+    """What index.json says, without the images: ``captures`` hold file names as their source and empty images."""
+
+    board: BoardConfig
+    pitch_mm: float | None
+    captures: tuple[Capture, ...]
+
+
+NO_IMAGE: Image = np.zeros((0, 0, 3), np.uint8)
+
+
+def file_name(capture: Capture, number: int) -> str:
+    """Name a capture's image: its number in the session, its camera, its placement."""
+    return f"{number:04d}_{capture.camera}_board{capture.board:02d}.png"
+
+
+def write_image(path: Path, image: Image) -> None:
+    """Write a PNG in one step.
+
+    Raises:
+        CalibrationError: the file cannot be written.
+    """
+    ok, data = cv2.imencode(".png", image, PNG_OPTIONS)
+    if not ok:
+        raise CalibrationError(f"{path}: OpenCV cannot encode the image")
+    write_atomically(path, data.tobytes())
+
+
+def write_index(directory: Path, index: CaptureIndex) -> None:
+    """Write index.json in one step.
+
+    Raises:
+        CalibrationError: the file cannot be written.
+    """
+    rows = ",\n    ".join(
+        json.dumps(
+            {
+                "file": capture.source,
+                "camera": capture.camera,
+                "board": capture.board,
+                "pan": capture.pan,
+                "tilt": capture.tilt,
+                "focal_px": capture.focal_px,
+                "t": capture.t,
+            },
+            allow_nan=False,
+        )
+        for capture in index.captures
+    )
+    text = (
+        f'{{\n  "schema": {SCHEMA},\n  "board": {json.dumps(write_board(index.board))},\n'
+        f'  "pitch_mm": {json.dumps(index.pitch_mm)},\n  "captures": [\n    {rows}\n  ]\n}}\n'
+    )
+    write_atomically(directory / INDEX, text.encode())
+
+
+def read_index(directory: Path) -> CaptureIndex:
+    """Read index.json.
+
+    Raises:
+        CalibrationError: it is missing or malformed; the message names the file and the key.
+    """
+    path = directory / INDEX
+    if not directory.is_dir():
+        raise CalibrationError(f"{directory}: no such folder; give a folder of captures")
+    table = parsing.read_json(path, SCHEMA)
+    try:
+        pitch = get(table, "pitch_mm")
+        rows = parsing.as_list(get(table, "captures"), "captures")
+        if not rows:
+            raise CalibrationError("captures: is empty")
+        return CaptureIndex(
+            board=parse_board(get(table, "board"), "board"),
+            pitch_mm=None if pitch is None else parsing.as_number(pitch, "pitch_mm", positive=True),
+            captures=tuple(_parse_capture(row, f"captures[{i}]") for i, row in enumerate(rows)),
+        )
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+
+
+def read_images(directory: Path, captures: Sequence[Capture]) -> Iterator[Capture]:
+    """Read the images one by one; each camera's must be of one size.
+
+    Raises:
+        CalibrationError: an image is missing, unreadable, or of another size than its camera's others.
+    """
+    sizes: dict[CameraName, tuple[str, tuple[int, int]]] = {}
+    for capture in captures:
+        assert capture.source is not None
+        image = read_image(directory / capture.source)
+        size = (image.shape[1], image.shape[0])
+        first, expected = sizes.setdefault(capture.camera, (capture.source, size))
+        if size != expected:
+            raise CalibrationError(
+                f"{directory / capture.source}: is {size[0]}x{size[1]} px where {first} of the same camera is "
+                f"{expected[0]}x{expected[1]}"
+            )
+        yield replace(capture, image=image)
+
+
+def read_image(path: Path) -> Image:
+    """Read an image as BGR.
+
+    Raises:
+        CalibrationError: the file is missing or is no image.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise CalibrationError(f"{path}: no such file") from None
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if image is None:
+        raise CalibrationError(f"{path}: is not an image that OpenCV reads")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def pair_photos(directory: Path, fixed_glob: str, zoom_glob: str) -> tuple[list[Capture], list[str]]:
+    """Pair plain photos of two cameras by the last number in their names.
+
+    Args:
+        directory: where they lie.
+        fixed_glob: pattern of the fixed camera's files, like 'left*.jpg'.
+        zoom_glob: pattern of the zoom camera's.
+
+    Returns:
+        Captures with empty images, the number as the placement; and the names of files without a partner.
+
+    Raises:
+        CalibrationError: no folder, no files, a file without a number, or two files with one number.
+    """
+    if not directory.is_dir():
+        raise CalibrationError(f"{directory}: no such folder; give a folder of photos")
+    found: dict[CameraName, dict[int, str]] = {
+        "fixed": _numbered(directory, fixed_glob),
+        "zoom": _numbered(directory, zoom_glob),
+    }
+    both = sorted(found["fixed"].keys() & found["zoom"].keys())
+    captures = [
+        Capture(NO_IMAGE, camera, number, source=names[number]) for camera, names in found.items() for number in both
+    ]
+    unpaired = [name for names in found.values() for number, name in sorted(names.items()) if number not in both]
+    return captures, unpaired
+
+
+def _numbered(directory: Path, pattern: str) -> dict[int, str]:
+    """Files by the last number in their names."""
+    try:
+        paths = sorted(path for path in directory.glob(pattern) if path.is_file())
+    except (ValueError, NotImplementedError):
+        raise CalibrationError(f"'{pattern}': is not a pattern of file names; give one like 'left*.jpg'") from None
+    if not paths:
+        raise CalibrationError(f"{directory}: no file matches '{pattern}'")
+    names: dict[int, str] = {}
+    for path in paths:
+        digits = re.findall(r"\d+", path.stem)
+        if not digits:
+            raise CalibrationError(f"{path}: has no number in its name by which to pair it")
+        number = int(digits[-1])
+        if number in names:
+            raise CalibrationError(f"{path}: has the same number as {names[number]}, {number}; pairs need one each")
+        names[number] = path.relative_to(directory).as_posix()
+    return names
+
+
+def _parse_capture(value: object, where: str) -> Capture:
+    row: Table = parsing.as_table(value, where)
+    camera = get(row, "camera", where)
+    if camera not in ("fixed", "zoom"):
+        raise CalibrationError(f"{where}.camera: {parsing.short(camera)} is not one of: fixed, zoom")
+    source = parsing.as_text(get(row, "file", where), f"{where}.file")
+    if Path(source).is_absolute() or ".." in Path(source).parts:
+        raise CalibrationError(f"{where}.file: {parsing.short(source)} is not inside the folder of the index")
+    focal = get(row, "focal_px", where)
+    pan, tilt, t = (parsing.as_number(get(row, key, where), f"{where}.{key}") for key in ("pan", "tilt", "t"))
+    return Capture(
+        image=NO_IMAGE,
+        camera=camera,
+        board=parsing.as_whole(get(row, "board", where), f"{where}.board"),
+        pan=pan,
+        tilt=tilt,
+        focal_px=None if focal is None else parsing.as_number(focal, f"{where}.focal_px", positive=True),
+        t=t,
+        source=source,
+    )

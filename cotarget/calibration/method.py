@@ -1,0 +1,196 @@
+"""From views, saved captures or plain photos to a `Calibration`, by a method that is named."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from cotarget import __version__
+from cotarget.calibration.boards import board_points, check_board, find_corners
+from cotarget.calibration.captures import CaptureIndex, pair_photos, read_images, read_index
+from cotarget.calibration.model import Calibration, CameraName, Capture, Rejected, View
+from cotarget.calibration.sequential import sequential
+from cotarget.camera import ZoomLens
+from cotarget.config import BoardConfig
+from cotarget.errors import CalibrationError, choices
+
+Progress = Callable[[int, int, str], None]  # done, total, text
+
+METHODS = ("sequential",)
+SAME_FOCAL = 1e-3  # relative; a step of a usual lens changes the focal length twenty times more
+
+NO_BOARD = "no whole board of {}x{} corners is seen"
+
+
+def calibrate_views(
+    views: Sequence[View],
+    board: BoardConfig,
+    sizes: Mapping[CameraName, tuple[int, int]],
+    *,
+    pitch_mm: float | None = None,
+    method: str = "sequential",
+    refine: bool = True,
+    rejected: Sequence[Rejected] = (),
+    provenance: Mapping[str, Any] | None = None,
+) -> Calibration:
+    """Calibrate from corners.
+
+    Args:
+        views: of both cameras; those of the zoom camera that are not at the shortest focal length are left out.
+        board: what the corners are of.
+        sizes: (width, height) of the images of "fixed" and "zoom" [px].
+        pitch_mm: size of a pixel of the zoom camera [mm], where it is known.
+        method: "sequential".
+        refine: whether a last fit of everything together ends the method.
+        rejected: images already left out, and why, for the report.
+        provenance: where the views come from; versions and method are added.
+
+    Raises:
+        CalibrationError: the views do not determine the rig.
+        ConfigError: the board looks the same upside down.
+    """
+    if method not in METHODS:
+        raise CalibrationError(f"unknown method '{method}'; the methods are: {choices(METHODS)}")
+    check_board(board)
+    columns, rows = board.corners
+    for view in views:
+        if view.corners_px.shape != (columns * rows, 2) or not np.isfinite(view.corners_px).all():
+            raise CalibrationError(
+                f"{view.name}: has not the {columns * rows} finite corners of a {columns}x{rows} board"
+            )
+    shortest, others, nominal = _at_shortest(views)
+    solution = sequential(shortest, board_points(board), sizes, refine=refine)
+    model = solution.model
+    assert model.fixed is not None
+    assert model.zoom is not None
+    return Calibration(
+        fixed=model.fixed,
+        zoom=ZoomLens((nominal or model.zoom.focal_px[0],), (model.zoom,)),
+        T_zoom0_fixed=model.gamma,
+        T_head_zoom=model.hand if solution.has_head else None,
+        head=model.head,
+        pitch_mm=pitch_mm,
+        residuals=replace(solution.residuals, rejected=(*rejected, *others, *solution.residuals.rejected)),
+        board=board,
+        views=solution.views,
+        provenance={
+            "method": method,
+            "refine": refine,
+            "cotarget": __version__,
+            "opencv": cv2.__version__,
+            "numpy": version("numpy"),
+            "scipy": version("scipy"),
+            **(provenance or {}),
+        },
+    )
+
+
+def _at_shortest(views: Sequence[View]) -> tuple[list[View], list[Rejected], float | None]:
+    """Keep the zoom camera's views at its shortest nominal focal length, which is None where no device told one."""
+    focals = [view.focal_px for view in views if view.camera == "zoom" and view.focal_px is not None]
+    if not focals:
+        return list(views), [], None
+    nominal = min(focals)
+
+    def keep(view: View) -> bool:
+        return view.camera == "fixed" or view.focal_px is None or view.focal_px <= nominal * (1 + SAME_FOCAL)
+
+    left_out = [
+        Rejected(view.name, f"taken at {view.focal_px:.0f} px, not at the shortest focal length, {nominal:.0f} px")
+        for view in views
+        if not keep(view)
+    ]
+    return [view for view in views if keep(view)], left_out, nominal
+
+
+def calibrate_captures(directory: Path, *, refine: bool = True, progress: Progress | None = None) -> Calibration:
+    """Calibrate from captures that `calibrate_rig` or somebody else saved; no rig is needed.
+
+    Args:
+        directory: folder with index.json and its images.
+        refine: whether a last fit of everything together ends the method.
+        progress: called with what is done, of how much, and in words.
+
+    Raises:
+        CalibrationError: a file is missing or malformed, or the views do not determine the rig.
+    """
+    index = read_index(directory)
+    return _calibrate_images(directory, index, refine, progress, rejected=[], what="captures")
+
+
+def calibrate_photos(
+    directory: Path,
+    fixed_glob: str,
+    zoom_glob: str,
+    board: BoardConfig,
+    *,
+    refine: bool = True,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Calibrate both cameras and Gamma from plain photos, paired by the last number in their names.
+
+    Args:
+        directory: folder of the photos.
+        fixed_glob: pattern of the fixed camera's files, like 'left*.jpg'.
+        zoom_glob: pattern of the zoom camera's, taken at pan = tilt = 0 or without any head.
+        board: what the photos show.
+        refine: whether a last fit of everything together ends the method.
+        progress: called with what is done, of how much, and in words.
+
+    Raises:
+        CalibrationError: there are no pairs, or they do not determine the cameras.
+        ConfigError: the board looks the same upside down.
+    """
+    captures, unpaired = pair_photos(directory, fixed_glob, zoom_glob)
+    if not captures:
+        raise CalibrationError(f"{directory}: no two photos of '{fixed_glob}' and '{zoom_glob}' have the same number")
+    rejected = [Rejected(name, "has no partner with the same number") for name in unpaired]
+    index = CaptureIndex(board, None, tuple(captures))
+    return _calibrate_images(directory, index, refine, progress, rejected, what="photos")
+
+
+def find_view(capture: Capture, board: BoardConfig) -> View | None:
+    """Find the board in a capture; None where no whole board is seen."""
+    corners = find_corners(capture.image, board)
+    if corners is None:
+        return None
+    return View(
+        capture.camera, corners, capture.board, capture.pan, capture.tilt, capture.focal_px, capture.t, capture.source
+    )
+
+
+def _calibrate_images(
+    directory: Path,
+    index: CaptureIndex,
+    refine: bool,
+    progress: Progress | None,
+    rejected: list[Rejected],
+    what: str,
+) -> Calibration:
+    check_board(index.board)
+    views: list[View] = []
+    sizes: dict[CameraName, tuple[int, int]] = {}
+    for done, capture in enumerate(read_images(directory, index.captures)):
+        if progress is not None:
+            progress(done, len(index.captures), f"looking for the board in {capture.source}")
+        sizes[capture.camera] = (capture.image.shape[1], capture.image.shape[0])
+        view = find_view(capture, index.board)
+        if view is None:
+            rejected.append(Rejected(str(capture.source), NO_BOARD.format(*index.board.corners)))
+        else:
+            views.append(view)
+    if progress is not None:
+        progress(len(index.captures), len(index.captures), "fitting")
+    return calibrate_views(
+        views,
+        index.board,
+        sizes,
+        pitch_mm=index.pitch_mm,
+        refine=refine,
+        rejected=rejected,
+        provenance={what: str(directory), "images": len(index.captures)},
+    )
