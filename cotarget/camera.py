@@ -60,7 +60,7 @@ class Intrinsics:
             xy = x_camera[..., :2] / depth[..., None]
             J = self._distort_jacobian(xy)
             unfolded = J[..., 0, 0] * J[..., 1, 1] > J[..., 0, 1] * J[..., 1, 0]
-            valid = (depth > 0) & unfolded & self._before_fold(xy)
+            valid = np.greater(depth, 0) & unfolded & self._before_fold(xy)
             pixels = self._distort(xy) * np.array(self.focal_px) + np.array(self.center_px)
         return np.where(valid[..., None], pixels, np.nan)
 

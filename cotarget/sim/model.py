@@ -1,0 +1,166 @@
+"""The compiled MuJoCo model of a configuration: scene, rig, targets and board, edited through MjSpec."""
+
+from pathlib import Path
+
+import numpy as np
+
+import cotarget
+from cotarget.config import BoardConfig, RigConfig, SimConfig
+from cotarget.errors import ConfigError, choices
+from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.sim.opengl import mujoco
+from cotarget.sim.targets import Target, scale_spec
+
+# The only place where MuJoCo's camera axes (x right, y up, z back) become OpenCV's (x right, y down, z forward).
+T_OPENCV_MUJOCO = RigidTransform.from_rotation(Rotation.from_rotvec([np.pi, 0.0, 0.0]))
+MOUNT_SITE = "fixed_mount"
+RIG = "rig/"  # before the names of the rig's parts; a target's stand behind its own name and a slash
+# Geoms by purpose: MuJoCo draws a group when the view's option says so.
+BOARD_GROUP, RIG_GROUP, FRAME_GROUP = 3, 4, 5
+BOARD_THICKNESS = 0.004  # [m]
+BOARD_MARGIN = 0.6  # white border around the squares, in squares
+BLACK, WHITE = (0.05, 0.05, 0.05, 1.0), (0.95, 0.95, 0.95, 1.0)
+ARM_RADIUS = 0.012  # [m], the bracket between the head and the zoom camera
+# Sensor pixels are given this size [m]; only ratios to the focal length matter to the renderer.
+RENDER_PITCH = 1e-5
+
+
+def assets_dir() -> Path:
+    """Where sim_assets lies: inside the installed package, or beside it in a checkout."""
+    package = Path(cotarget.__file__).parent
+    inside = package / "sim_assets"
+    return inside if inside.is_dir() else package.parent / "sim_assets"
+
+
+def scene_path(scene: str) -> Path:
+    """Find a scene by its name, or a user's MJCF file by its path.
+
+    Raises:
+        ConfigError: there is no such scene or file.
+    """
+    if (own := assets_dir() / "scenes" / f"{scene}.xml").is_file():
+        return own
+    if (path := Path(scene)).is_file():
+        return path
+    names = (p.stem for p in (assets_dir() / "scenes").glob("*.xml"))
+    raise ConfigError(f"unknown scene '{scene}'; the scenes are: {choices(names)}, or give the path of an MJCF file")
+
+
+def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tuple[int, int]) -> "mujoco.MjModel":
+    """Compile scene, rig, targets and board.
+
+    Args:
+        config: the rig; its offsets are taken as they are.
+        targets: what else is in the scene, one mocap body each.
+        render_size: (width, height) [px] of the pinhole views.
+
+    Raises:
+        ConfigError: the scene is not MJCF, or has no mount for the rig.
+    """
+    path = scene_path(config.sim.scene)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ConfigError(f"{path}: is not a valid MJCF scene: {' '.join(str(error).split())}") from None
+    mount = next((s for s in spec.sites if s.name == MOUNT_SITE), None)
+    if mount is None:
+        raise ConfigError(
+            f"{path}: has no site '{MOUNT_SITE}', which says where the fixed camera is (looking along -z)"
+        )
+    rig = mujoco.MjSpec.from_file(str(assets_dir() / "rig.xml"))
+    _edit_rig(rig, config.sim, _site_pose(spec), render_size)
+    _attach(spec, rig, RIG)
+    for target in targets:
+        asset = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / target.asset))
+        scale_spec(asset, target.size)
+        _attach(spec, asset, f"{target.name}/")
+    _add_board(spec, config.board)
+    spec.visual.quality.offsamples = 4 if config.sim.effects.multisampling else 0
+    visual = spec.visual.global_
+    visual.offwidth = max(visual.offwidth, render_size[0])
+    visual.offheight = max(visual.offheight, render_size[1])
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise ConfigError(f"{path}: does not compile with the rig: {' '.join(str(error).split())}") from None
+
+
+def mount_pose(model: "mujoco.MjModel") -> RigidTransform:
+    """T_world_fixed of a compiled model, in OpenCV's axes."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    site = data.site(MOUNT_SITE)
+    return RigidTransform.from_components(site.xpos, Rotation.from_matrix(site.xmat.reshape(3, 3))) * T_OPENCV_MUJOCO
+
+
+def base_pose(T_world_fixed: RigidTransform, sim: SimConfig) -> RigidTransform:
+    """T_world_base: at pan = tilt = 0, T_base_zoom0 = T_head_zoom."""
+    return T_world_fixed * (sim.T_head_zoom * sim.T_zoom0_fixed).inv()
+
+
+def quaternion(T: RigidTransform) -> Array:
+    """A transform's rotation as MuJoCo writes it, (w, x, y, z)."""
+    return T.rotation.as_quat(scalar_first=True)
+
+
+def _attach(scene: "mujoco.MjSpec", part: "mujoco.MjSpec", prefix: str) -> None:
+    """Put a part into the scene, its names behind a prefix; of the global settings, the scene's hold."""
+    part.visual.map.znear, part.visual.map.zfar = scene.visual.map.znear, scene.visual.map.zfar
+    scene.attach(part, frame=scene.worldbody.add_frame(), prefix=prefix)
+
+
+def _site_pose(scene: "mujoco.MjSpec") -> RigidTransform:
+    return mount_pose(scene.copy().compile())
+
+
+def _place(body: "mujoco.MjsBody", T: RigidTransform) -> None:
+    body.pos, body.quat = T.translation, quaternion(T)
+
+
+def _edit_rig(
+    rig: "mujoco.MjSpec", sim: SimConfig, T_world_fixed: RigidTransform, render_size: tuple[int, int]
+) -> None:
+    """Put the rig's bodies where the configuration wants them."""
+    _place(rig.body("fixed"), T_world_fixed)
+    _place(rig.body("base"), base_pose(T_world_fixed, sim))
+    _place(rig.body("zoom"), sim.T_head_zoom)
+    if sim.effects.axes:
+        dz, eps = sim.head.axis_offset_mm / 1000, np.radians(sim.head.squareness_deg)
+        rig.body("tilt").pos, rig.body("head").pos = (0.0, 0.0, dz), (0.0, 0.0, -dz)
+        rig.joint("tilt").axis = (np.cos(eps), np.sin(eps), 0.0)
+    arm = rig.geom("arm")
+    arm.fromto = [0.0, 0.0, 0.0, *sim.T_head_zoom.translation]
+    arm.size = [ARM_RADIUS, 0.0, 0.0]
+    for name in ("fixed", "zoom"):
+        camera = rig.camera(name)
+        camera.resolution = render_size
+        camera.sensor_size = np.array(render_size) * RENDER_PITCH
+        camera.focal_length = (render_size[0] * RENDER_PITCH,) * 2  # set before every render
+
+
+def _add_board(spec: "mujoco.MjSpec", board: BoardConfig) -> None:
+    """A chessboard whose tiles are flush: its frame is the first inner corner's, x along the columns, z away."""
+    body = spec.worldbody.add_body(name="board", mocap=True)
+    columns, rows = (n + 1 for n in board.corners)
+
+    def tile(x0: float, y0: float, x1: float, y1: float, colour: tuple[float, ...]) -> None:
+        low, high = np.array([x0, y0]) * board.square, np.array([x1, y1]) * board.square
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[*(low + high) / 2, BOARD_THICKNESS / 2],
+            size=[*(high - low) / 2, BOARD_THICKNESS / 2],
+            rgba=colour,
+            group=BOARD_GROUP,
+            contype=0,
+            conaffinity=0,
+        )
+
+    for column in range(columns):
+        for row in range(rows):
+            colour = BLACK if (column + row) % 2 == 0 else WHITE
+            tile(column - 1, row - 1, column, row, colour)
+    edge = BOARD_MARGIN
+    tile(-1 - edge, -1 - edge, columns - 1 + edge, -1, WHITE)
+    tile(-1 - edge, rows - 1, columns - 1 + edge, rows - 1 + edge, WHITE)
+    tile(-1 - edge, -1, -1, rows - 1, WHITE)
+    tile(columns - 1, -1, columns - 1 + edge, rows - 1, WHITE)

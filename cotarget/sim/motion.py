@@ -1,0 +1,109 @@
+"""Motion of one axis in time: trapezoidal speed profiles that can be replaced on the fly, and backlash."""
+
+import math
+from dataclasses import dataclass, field
+
+# A segment of constant acceleration: it starts at `t` with position `x`, speed `v` and acceleration `a`.
+Segment = tuple[float, float, float, float]
+
+
+def trapezoid(t: float, x: float, v: float, goal: float, speed: float, acceleration: float) -> list[Segment]:
+    """Plan the fastest move from (x, v) at time t to rest at ``goal``.
+
+    Args:
+        t: start [s].
+        x: position then.
+        v: speed then; a motion in the wrong direction, or too fast to stop in time, is braked first.
+        goal: where to rest.
+        speed: highest speed; infinite means a jump.
+        acceleration: of speeding up and of braking.
+
+    Returns:
+        Segments of constant acceleration in order of time; the last one rests at ``goal``.
+    """
+    if math.isinf(speed) or math.isinf(acceleration):
+        return [(t, goal, 0.0, 0.0)]
+    segments: list[Segment] = []
+
+    def run(duration: float, a: float) -> None:
+        nonlocal t, x, v
+        if duration > 0:
+            segments.append((t, x, v, a))
+            t, x, v = t + duration, x + v * duration + a * duration**2 / 2, v + a * duration
+
+    stop = x + v * abs(v) / (2 * acceleration)  # where braking at once would end
+    way = math.copysign(1.0, goal - stop)
+    if v * way < 0:  # wrong way, or past the point of stopping in time: brake, then set out from rest
+        run(abs(v) / acceleration, math.copysign(acceleration, -v))
+        v = 0.0
+        way = math.copysign(1.0, goal - x)
+    if abs(v) > speed:  # a lower limit came with the new command
+        run((abs(v) - speed) / acceleration, -way * acceleration)
+    remaining = way * (goal - x)
+    peak = min(speed, math.sqrt(max(acceleration * remaining + v * v / 2, 0.0)))
+    run((peak - abs(v)) / acceleration, way * acceleration)
+    if peak == speed:
+        run((way * (goal - x) - peak**2 / (2 * acceleration)) / peak, 0.0)
+    run(abs(v) / acceleration, -way * acceleration)
+    segments.append((t, goal, 0.0, 0.0))
+    return segments
+
+
+@dataclass
+class Axis:
+    """One axis with a history, so that its position is known at every time up to the newest command's effect.
+
+    Attributes:
+        speed: highest speed.
+        acceleration: of every move.
+        backlash: play; the driven side follows within half of it.
+    """
+
+    speed: float
+    acceleration: float
+    backlash: float = 0.0
+    position: float = 0.0
+    _segments: list[Segment] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._segments = [(-math.inf, self.position, 0.0, 0.0)]
+
+    def command(self, t: float, goal: float, speed: float | None = None) -> float:
+        """Replace the motion from time t on; return when it will rest [s]."""
+        x, v = self.motor(t)
+        kept = [s for s in self._segments if s[0] < t]
+        highest = self.speed if speed is None else min(speed, self.speed)
+        self._segments = kept + trapezoid(t, x, v, goal, highest, self.acceleration)
+        return self._segments[-1][0]
+
+    def halt(self, t: float) -> float:
+        """Brake from time t on as hard as the acceleration allows; return when it will rest [s]."""
+        x, v = self.motor(t)
+        if math.isinf(self.acceleration):
+            return self.command(t, x)
+        return self.command(t, x + v * abs(v) / (2 * self.acceleration))
+
+    def motor(self, t: float) -> tuple[float, float]:
+        """Position and speed of the driving side at time t."""
+        start, x, v, a = next(s for s in reversed(self._segments) if s[0] <= t)
+        if v == 0.0 and a == 0.0:
+            return x, 0.0
+        dt = t - start
+        return x + v * dt + a * dt * dt / 2, v + a * dt
+
+    def driven(self, t: float) -> float:
+        """Position of the driven side at time t: the motor's, behind the play (a hysteresis)."""
+        if self.backlash == 0.0:
+            return self.motor(t)[0]
+        half = self.backlash / 2
+        y = self._segments[0][1]
+        for i, (start, _, v, a) in enumerate(self._segments):
+            if start > t:
+                break
+            end = min(t, self._segments[i + 1][0] if i + 1 < len(self._segments) else t)
+            turns = start - v / a if a else math.nan  # the motor's turning point within this segment
+            for when in (turns, end):
+                if start < when <= end:
+                    x = self.motor(when)[0]
+                    y = min(max(y, x - half), x + half)
+        return y

@@ -1,0 +1,201 @@
+"""What is really so in a simulated world: for tests and experiments, never for the pipeline.
+
+Poses come from MuJoCo's own kinematics and pixels from the true lenses, so that nothing here can share a mistake
+with the pipeline's geometry.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.sim.lens import TrueLens
+from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, RIG, RIG_GROUP
+from cotarget.sim.opengl import mujoco
+from cotarget.sim.targets import Target
+
+SURFACE_POINTS = 64  # samples on a round geom: its outline is then good to about 1 %
+SILHOUETTE_GRID = 96  # a silhouette is painted this large to compare areas [px]
+BEAT_PHASES = 8  # samples of one wing beat
+
+CameraName = Literal["fixed", "zoom"]
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """A target's true outline in one image, not clipped to it.
+
+    Attributes:
+        low_px: top-left corner of its box, (2,).
+        high_px: bottom-right corner, (2,).
+        visible: fraction of its area that lies inside the image and is not hidden behind something else.
+    """
+
+    low_px: Array
+    high_px: Array
+    visible: float
+
+    @property
+    def size_px(self) -> Array:
+        """(width, height) of the box."""
+        return self.high_px - self.low_px
+
+
+@dataclass(frozen=True)
+class Truth:
+    """True poses, pixels and silhouettes at any time up to now.
+
+    Attributes:
+        model: the compiled world.
+        set_state: brings the world to a time.
+        fixed_lens: the wide camera's optics.
+        zoom_lens: the zoom camera's optics at a time.
+        T_world_fixed: the fixed camera.
+        T_world_base: the pan-tilt unit.
+        head_at: the platform's pan and tilt [rad] at a time.
+        focal_range: what the zoom camera's device calls its shortest and longest focal length [px].
+        targets: by name.
+    """
+
+    model: "mujoco.MjModel"
+    set_state: Callable[[float], "mujoco.MjData"]
+    fixed_lens: TrueLens
+    zoom_lens: Callable[[float], TrueLens]
+    T_world_fixed: RigidTransform
+    T_world_base: RigidTransform
+    head_at: Callable[[float], tuple[float, float]]
+    focal_range: tuple[float, float]
+    targets: Mapping[str, Target]
+    _surfaces: dict[str, list[tuple[int, Array]]] = field(default_factory=dict)
+
+    def lens(self, camera: CameraName, t: float) -> TrueLens:
+        """A camera's optics at time t."""
+        return self.fixed_lens if camera == "fixed" else self.zoom_lens(t)
+
+    def T_world_camera(self, camera: CameraName, t: float) -> RigidTransform:
+        """A camera's pose at time t, in OpenCV's axes."""
+        return self._body_pose(self.set_state(t), camera)
+
+    def center(self, name: str, t: float) -> Array:
+        """A target's body centre in the world [m], (3,)."""
+        return np.asarray(self.targets[name].pose(t).T_world_target.translation)
+
+    def pixel(self, camera: CameraName, x_world: Array, t: float) -> Array:
+        """Where a point of the world appears, (..., 2) [px]; nan behind the camera."""
+        x_world = np.asarray(x_world, dtype=float)
+        x_camera = self.T_world_camera(camera, t).inv().apply(x_world.reshape(-1, 3))
+        return self.lens(camera, t).project(x_camera).reshape(*x_world.shape[:-1], 2)
+
+    def silhouette(self, name: str, camera: CameraName, t: float) -> Silhouette | None:
+        """A target's outline in a camera at time t; None if any of it is behind the camera."""
+        data = self.set_state(t)
+        T_camera_world = self._body_pose(data, camera).inv()
+        lens = self.lens(camera, t)
+        outlines = []
+        for geom, points in self._surface(name):
+            x_world = points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+            x_camera = T_camera_world.apply(x_world)
+            if x_camera[:, 2].min() <= 0:
+                return None
+            outlines.append(lens.project(x_camera))
+        everything = np.concatenate(outlines)
+        low, high = everything.min(axis=0), everything.max(axis=0)
+        inside = _fraction_inside(outlines, low, high, lens.size)
+        return Silhouette(low, high, inside * self._unhidden(name, data, camera))
+
+    def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
+        """The larger side of the box, the maximum over one wing beat at the pose of time t [px]; nan behind."""
+        target = self.targets[name]
+        phases = np.arange(BEAT_PHASES) / BEAT_PHASES * target.beat_s if target.beat_s else [0.0]
+        data = self.set_state(t)
+        T_camera_world, lens = self._body_pose(data, camera).inv(), self.lens(camera, t)
+        sides = []
+        for phase in phases:
+            for joint, angle in target.pose(t + phase).joints.items():
+                data.joint(f"{name}/{joint}").qpos[0] = angle
+            mujoco.mj_kinematics(self.model, data)
+            pixels = np.concatenate(
+                [
+                    lens.project(T_camera_world.apply(points @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]))
+                    for g, points in self._surface(name)
+                ]
+            )
+            sides.append(np.max(pixels.max(axis=0) - pixels.min(axis=0)))
+        return float(np.max(sides))
+
+    def _body_pose(self, data: "mujoco.MjData", body: str) -> RigidTransform:
+        found = data.body(RIG + body)
+        return RigidTransform.from_components(found.xpos, Rotation.from_matrix(found.xmat.reshape(3, 3)))
+
+    def _surface(self, name: str) -> list[tuple[int, Array]]:
+        """The target's geoms, each with points on its surface in its own frame."""
+        if name not in self._surfaces:
+            root = self.model.body(f"{name}/{name}").id
+            self._surfaces[name] = [
+                (geom, _surface_points(self.model, geom))
+                for geom in range(self.model.ngeom)
+                if self.model.body_rootid[self.model.geom_bodyid[geom]] == root
+            ]
+        return self._surfaces[name]
+
+    def _unhidden(self, name: str, data: "mujoco.MjData", camera: CameraName) -> float:
+        """Fraction of the target's parts whose middle a ray from the camera reaches, through nothing but the target."""
+        own = [geom for geom, _ in self._surface(name)]
+        eye = np.array(data.body(RIG + camera).xpos)
+        groups = np.ones(mujoco.mjNGROUP, dtype=np.uint8)
+        groups[[BOARD_GROUP, RIG_GROUP, FRAME_GROUP]] = 0
+        hit = np.zeros(1, dtype=np.int32)
+        reached = 0
+        for geom in own:
+            mujoco.mj_ray(self.model, data, eye, data.geom_xpos[geom] - eye, groups, 1, -1, hit)
+            reached += hit[0] in own
+        return reached / len(own)
+
+
+def _fraction_inside(outlines: list[Array], low: Array, high: Array, size: tuple[int, int]) -> float:
+    """Fraction of the area of a union of convex outlines that lies within the image."""
+    scale = SILHOUETTE_GRID / max(float(np.max(high - low)), 1e-9)
+    width, height = (np.ceil((high - low) * scale).astype(int) + 1).tolist()
+    canvas = np.zeros((height, width), dtype=np.uint8)
+    for outline in outlines:
+        hull = cv2.convexHull(np.rint((outline - low) * scale).astype(np.int32))
+        cv2.fillConvexPoly(canvas, hull, 1)
+    u = low[0] + np.arange(width) / scale
+    v = low[1] + np.arange(height) / scale
+    within = np.outer((v >= -0.5) & (v <= size[1] - 0.5), (u >= -0.5) & (u <= size[0] - 0.5))
+    return float(np.count_nonzero(canvas & within) / np.count_nonzero(canvas))
+
+
+def _surface_points(model: "mujoco.MjModel", geom: int) -> Array:
+    """Points on a geom's surface in its own frame, (n, 3)."""
+    size, kind = model.geom_size[geom], mujoco.mjtGeom(model.geom_type[geom])
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        return np.array(np.meshgrid(*([-s, s] for s in size))).reshape(3, -1).T
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        return np.asarray(model.mesh_vert[start : start + count], dtype=float)
+    ball = _sphere_points(SURFACE_POINTS)
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return ball * size[0]
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+        return ball * size
+    ends = np.where(ball[:, 2:] >= 0, 1.0, -1.0) * [0.0, 0.0, size[1]]
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return ball * size[0] + ends
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        around = np.linspace(0, 2 * np.pi, SURFACE_POINTS // 2, endpoint=False)
+        rim = np.column_stack([np.cos(around), np.sin(around)]) * size[0]
+        return np.concatenate([np.column_stack([rim, np.full(len(rim), z)]) for z in (-size[1], size[1])])
+    raise ValueError(f"a target may not contain a geom of type {kind.name}")
+
+
+def _sphere_points(count: int) -> Array:
+    """Evenly spread points on the unit sphere (Fibonacci's lattice), (count, 3)."""
+    i = np.arange(count) + 0.5
+    z, around = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
+    r = np.sqrt(1 - z * z)
+    return np.column_stack([r * np.cos(around), r * np.sin(around), z])

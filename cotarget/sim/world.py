@@ -1,0 +1,157 @@
+"""The simulated world: time -> poses -> images, with the rig's devices in front and the truth behind."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from cotarget.config import RigConfig, SimCamera
+from cotarget.geometry import RigidTransform
+from cotarget.rig import Image
+from cotarget.sim.devices import SimBoard, SimClock, SimPanTilt, SimRig, SimStream, SimZoomStream
+from cotarget.sim.lens import TrueLens, bend, covering_half_field
+from cotarget.sim.model import (
+    BOARD_GROUP,
+    FRAME_GROUP,
+    RENDER_PITCH,
+    RIG,
+    RIG_GROUP,
+    base_pose,
+    build_model,
+    mount_pose,
+    quaternion,
+)
+from cotarget.sim.opengl import make_renderer, mujoco
+from cotarget.sim.sensor import Sensor
+from cotarget.sim.targets import Target, make_target
+from cotarget.sim.truth import Truth
+
+# Streams of random numbers, so that one effect's draws never shift another's.
+FIXED_NOISE, ZOOM_NOISE, TARGETS = 1, 2, 3
+
+
+class SimWorld:
+    """A world with a rig in it. The pipeline gets `rig`; tests and experiments also get `truth()`."""
+
+    def __init__(self, config: RigConfig) -> None:
+        """Build and compile the world.
+
+        Raises:
+            ConfigError: an unknown scene or target.
+            DeviceError: the machine cannot render.
+        """
+        sim, effects = config.sim, config.sim.effects
+        self.config = config
+        self._clock = SimClock()
+        self.targets = {name: self._make_target(i, name) for i, name in enumerate(sim.targets)}
+        self._fixed_lens = self._lens(sim.fixed)
+        self._zoom_lens = self._lens(sim.zoom)
+        fields = [covering_half_field(lens) for lens in (self._fixed_lens, self._zoom_lens)]
+        self._render_size = self._common_render_size(fields)
+        self._model = build_model(config, tuple(self.targets.values()), self._render_size)
+        self._data = mujoco.MjData(self._model)
+        self._T_world_fixed = mount_pose(self._model)
+        self._boards: list[tuple[float, RigidTransform | None]] = [(-math.inf, None)]
+        self._renderer = make_renderer(self._model, *self._render_size)
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = effects.shadows
+        # The lens obeys as late as the head does.
+        delay = sim.head.command_delay_s if effects.command_delay else 0.0
+        self._sensors = {
+            "fixed": Sensor(sim.fixed, effects, (sim.seed, FIXED_NOISE)),
+            "zoom": Sensor(sim.zoom, effects, (sim.seed, ZOOM_NOISE)),
+        }
+        self._head = SimPanTilt(sim.head, effects, self._clock)
+        self._zoom = SimZoomStream(sim.zoom, effects, self._clock, self._expose_zoom, delay)
+        fixed = SimStream(sim.fixed, effects, self._clock, self._expose_fixed)
+        self.rig = SimRig(fixed, self._zoom, self._head, self._clock, SimBoard(self._place_board), self.close)
+
+    def truth(self) -> Truth:
+        """What is really so; for tests and experiments only."""
+        return Truth(
+            model=self._model,
+            set_state=self._set_state,
+            fixed_lens=self._fixed_lens,
+            zoom_lens=self.zoom_lens_at,
+            T_world_fixed=self._T_world_fixed,
+            T_world_base=base_pose(self._T_world_fixed, self.config.sim),
+            head_at=self._head.angles_at,
+            focal_range=self._zoom.focal_range,
+            targets=self.targets,
+        )
+
+    def zoom_lens_at(self, t: float) -> TrueLens:
+        """The zoom camera's true optics at a time up to now."""
+        factor = self._zoom.focal_at(t) / self._zoom.focal_range[0]
+        fx, fy = self._zoom_lens.focal_px
+        return replace(self._zoom_lens, focal_px=(fx * factor, fy * factor))
+
+    def render(self, camera: str, lens: TrueLens, t: float) -> Image:
+        """The perfect image that a lens sees at time t, without sensor effects, BGR."""
+        data = self._set_state(t)
+        half_width, half_height = covering_half_field(lens)
+        width, height = self._render_size
+        focal = min((width / 2 - 1) / half_width, (height / 2 - 1) / half_height)
+        cam_id = self._model.camera(RIG + camera).id
+        self._model.cam_intrinsic[cam_id] = (focal * RENDER_PITCH, focal * RENDER_PITCH, 0.0, 0.0)
+        option = mujoco.MjvOption()
+        option.geomgroup[RIG_GROUP] = option.geomgroup[FRAME_GROUP] = 0
+        option.geomgroup[BOARD_GROUP] = self._board_at(t) is not None
+        option.sitegroup[:] = 0
+        self._renderer.update_scene(data, cam_id, option)
+        pinhole = self._renderer.render()[..., ::-1]
+        return bend(np.ascontiguousarray(pinhole), focal, lens)
+
+    def close(self) -> None:
+        """Release the renderer; more than once does no harm."""
+        self._renderer.close()
+
+    def _lens(self, camera: SimCamera) -> TrueLens:
+        distortion = camera.distortion if self.config.sim.effects.distortion else (0.0,) * 5
+        return TrueLens(camera.size, camera.focal_px, camera.center_px, distortion)
+
+    def _make_target(self, index: int, name: str) -> Target:
+        sim = self.config.sim
+        rng = np.random.default_rng((sim.seed, TARGETS, index))
+        return make_target(name, sim.scene, rng, sim.effects.scatter, sim.paths.get(name))
+
+    def _common_render_size(self, fields: list[tuple[float, float]]) -> tuple[int, int]:
+        """A size at which the render of either camera is as fine as its image."""
+        sizes = [
+            (2 * field[0] * lens.focal_px[0] + 2, 2 * field[1] * lens.focal_px[1] + 2)
+            for field, lens in zip(fields, (self._fixed_lens, self._zoom_lens), strict=True)
+        ]
+        return math.ceil(max(s[0] for s in sizes)), math.ceil(max(s[1] for s in sizes))
+
+    def _expose_fixed(self, index: int, t: float) -> Image:
+        return self._sensors["fixed"].expose(self.render("fixed", self._fixed_lens, t), index)
+
+    def _expose_zoom(self, index: int, t: float) -> Image:
+        return self._sensors["zoom"].expose(self.render("zoom", self.zoom_lens_at(t), t), index)
+
+    def _place_board(self, T_fixed_board: RigidTransform | None) -> None:
+        self._boards.append((self._clock.now(), T_fixed_board))
+
+    def _board_at(self, t: float) -> RigidTransform | None:
+        return next(T for since, T in reversed(self._boards) if since <= t)
+
+    def _set_state(self, t: float) -> "mujoco.MjData":
+        """Everything's pose at time t."""
+        data = self._data
+        pan, tilt = self._head.angles_at(t)
+        data.joint(RIG + "pan").qpos[0], data.joint(RIG + "tilt").qpos[0] = pan, tilt
+        for name, target in self.targets.items():
+            pose = target.pose(t)
+            self._set_mocap(f"{name}/{name}", pose.T_world_target)
+            for joint, angle in pose.joints.items():
+                data.joint(f"{name}/{joint}").qpos[0] = angle
+        if (T_fixed_board := self._board_at(t)) is not None:
+            self._set_mocap("board", self._T_world_fixed * T_fixed_board)
+        mujoco.mj_kinematics(self._model, data)
+        mujoco.mj_comPos(self._model, data)
+        mujoco.mj_camlight(self._model, data)
+        return data
+
+    def _set_mocap(self, body: str, T_world_body: RigidTransform) -> None:
+        index = self._model.body(body).mocapid[0]
+        self._data.mocap_pos[index] = T_world_body.translation
+        self._data.mocap_quat[index] = quaternion(T_world_body)

@@ -1,0 +1,179 @@
+"""From a pixel and a depth, or a track, to an Aim: pan, tilt and focal length. Pure: no device, no clock."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+
+from cotarget.calibration import Calibration
+from cotarget.camera import depth_from_size, focal_for_size
+from cotarget.config import TargetConfig
+from cotarget.errors import CalibrationError, CotargetError, UnreachableError
+from cotarget.geometry import Array
+from cotarget.pantilt import Pointing, nearest, shortcut, solve
+
+Method = Literal["exact", "paper-table", "paper-example"]
+METHODS: tuple[Method, ...] = get_args(Method)
+
+# The ray of the wanted pixel depends a little on the focal length and the focal length on the range along that ray;
+# each round shrinks what is left by the ratio of the principal point's offset to the range.
+FOCAL_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What head and lens can do, and where the head is.
+
+    Attributes:
+        pan: lowest and highest pan [rad].
+        tilt: lowest and highest tilt [rad].
+        focal_px: shortest and longest nominal focal length [px].
+        now: where the head is, (pan, tilt) [rad].
+        step: the head's resolution [rad].
+    """
+
+    pan: tuple[float, float]
+    tilt: tuple[float, float]
+    focal_px: tuple[float, float]
+    now: tuple[float, float] = (0.0, 0.0)
+    step: float = 0.0
+
+
+@dataclass(frozen=True)
+class Closeup:
+    """How large the target shall be: its size [m] and the size wanted in the image [px]."""
+
+    size: float
+    wanted_px: float
+
+
+@dataclass(frozen=True)
+class Aim:
+    """Where to point and how far to zoom.
+
+    Attributes:
+        pan: [rad].
+        tilt: [rad].
+        focal_px: the true focal length that this means [px].
+        nominal_px: what to tell the lens [px].
+        limited: whether the lens's range cut the focal length.
+        x_fixed: the target in the fixed camera's frame [m], (3,).
+        range: from the zoom camera to the target [m].
+        uncertainty: what each cause alone leaves of error in the line of sight, one standard deviation [rad].
+    """
+
+    pan: float
+    tilt: float
+    focal_px: float
+    nominal_px: float
+    limited: bool
+    x_fixed: Array
+    range: float
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def depth(self) -> float:
+        """Along the fixed camera's axis [m]."""
+        return float(self.x_fixed[2])
+
+    @property
+    def error(self) -> float:
+        """All causes together, one standard deviation [rad]."""
+        return float(np.sqrt(sum(part**2 for part in self.uncertainty.values())))
+
+
+def depth_of(calibration: Calibration, target: TargetConfig, size_px: float) -> float:
+    """Estimate a target's depth from how large it appears: z = f x_size / u_measured.
+
+    Args:
+        calibration: gives the fixed camera's focal length.
+        target: its known size and which dimension that is.
+        size_px: the measured dimension in the fixed view [px].
+    """
+    return depth_from_size(calibration.fixed, target.size, size_px, vertical=target.dimension == "height")
+
+
+def point_at(calibration: Calibration, pixel: Array, depth: float) -> Array:
+    """Where a pixel at a depth is, x_fixed [m], (3,).
+
+    Raises:
+        CotargetError: no ray projects to that pixel, or the depth is not in front of the camera.
+    """
+    if not (np.isfinite(depth) and depth > 0):
+        raise CotargetError(f"a target at a depth of {depth:g} m is not in front of the fixed camera")
+    ray = calibration.fixed.ray(np.asarray(pixel, dtype=float))
+    if not np.isfinite(ray).all():
+        u, v = pixel
+        raise CotargetError(f"pixel ({u:g}, {v:g}) lies outside of what the fixed camera's lens can see")
+    return ray * depth
+
+
+def aim(
+    calibration: Calibration,
+    x_fixed: Array,
+    reach: Reach,
+    *,
+    closeup: Closeup | None = None,
+    nominal_px: float | None = None,
+    method: Method = "exact",
+    pixel: Array | None = None,
+) -> Aim:
+    """Solve pan, tilt and focal length for a target (Eqs. 6, 13, 16 and 17, with the exact range).
+
+    Args:
+        calibration: the rig.
+        x_fixed: the target in the fixed camera's frame [m], (3,).
+        reach: limits, and where the head is now.
+        closeup: how large the target is wanted; decides the focal length.
+        nominal_px: the focal length where no close-up is asked for; the shortest by default.
+        method: the exact inverse, or the paper's shortcut in one of its two readings.
+        pixel: where in the zoom image the target is wanted; its centre by default.
+
+    Raises:
+        CalibrationError: the calibration has no T.
+        UnreachableError: no pan and tilt within the limits do it.
+    """
+    T_head_zoom = calibration.T_head_zoom
+    if T_head_zoom is None:
+        raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
+    x_base = T_head_zoom.apply(calibration.T_zoom0_fixed.apply(x_fixed))  # (6)
+    wanted = calibration.zoom.stops[0].image_center_px if pixel is None else np.asarray(pixel, dtype=float)
+    nominal, limited = reach.focal_px[0] if nominal_px is None else nominal_px, False
+    nominal, limited = _limit(nominal, reach)
+    for _ in range(FOCAL_ROUNDS if closeup else 1):
+        ray = calibration.zoom.at(nominal).ray(wanted)
+        if method == "exact":
+            pointing = nearest(solve(x_base, T_head_zoom, calibration.head, ray), reach.pan, reach.tilt, reach.now)
+        else:
+            pointing = _paper(calibration, x_fixed, method, reach)
+        if closeup:
+            z = float(pointing.range) * ray[2] / float(np.linalg.norm(ray))
+            focal = focal_for_size(closeup.size, closeup.wanted_px, z)  # (17)
+            nominal, limited = _limit(calibration.zoom.nominal_for(focal), reach)
+    return Aim(
+        pan=float(pointing.pan),
+        tilt=float(pointing.tilt),
+        focal_px=calibration.zoom.at(nominal).focal_px[0],
+        nominal_px=nominal,
+        limited=limited,
+        x_fixed=np.asarray(x_fixed, dtype=float),
+        range=float(pointing.range),
+    )
+
+
+def _limit(nominal_px: float, reach: Reach) -> tuple[float, bool]:
+    """Limit a focal length to the lens's range; whether that changed it."""
+    limited = min(max(nominal_px, reach.focal_px[0]), reach.focal_px[1])
+    return limited, limited != nominal_px
+
+
+def _paper(calibration: Calibration, x_fixed: Array, method: Method, reach: Reach) -> Pointing:
+    """The paper's shortcut as one reachable solution."""
+    assert calibration.T_head_zoom is not None
+    reading: Literal["table", "example"] = "table" if method == "paper-table" else "example"
+    found = shortcut(x_fixed, calibration.T_zoom0_fixed, calibration.T_head_zoom, reading)
+    if not np.isfinite(found.pan):
+        raise UnreachableError("the paper's shortcut has no solution for this point; use the exact method")
+    both = Pointing(np.atleast_1d(found.pan), np.atleast_1d(found.tilt), np.atleast_1d(found.range))
+    return nearest(both, reach.pan, reach.tilt, reach.now)
