@@ -2,7 +2,7 @@
 
 from cotarget.calibration.boards import draw_board, find_corners
 from cotarget.calibration.file import load_calibration, save_calibration
-from cotarget.calibration.method import calibrate_captures, calibrate_photos, calibrate_views
+from cotarget.calibration.method import calibrate_captures, calibrate_photos, calibrate_rig, calibrate_views
 from cotarget.calibration.model import Calibration, Capture, Covariance, Rejected, Residuals, View
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "View",
     "calibrate_captures",
     "calibrate_photos",
+    "calibrate_rig",
     "calibrate_views",
     "draw_board",
     "find_corners",

@@ -13,13 +13,18 @@ from cotarget import __version__
 from cotarget.calibration.boards import board_points, check_board, find_corners
 from cotarget.calibration.captures import CaptureIndex, pair_photos, read_images, read_index
 from cotarget.calibration.model import Calibration, CameraName, Capture, Rejected, View
+from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.sequential import sequential
+from cotarget.calibration.session import capture_session
 from cotarget.camera import ZoomLens
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, choices
+from cotarget.rig import Rig
 
 Progress = Callable[[int, int, str], None]  # done, total, text
 
+# Thirty placements point twice as well as fifteen (see the README); beyond, time grows faster than accuracy.
+PLACEMENTS = 30
 METHODS = ("sequential",)
 SAME_FOCAL = 1e-3  # relative; a step of a usual lens changes the focal length twenty times more
 
@@ -193,4 +198,45 @@ def _calibrate_images(
         refine=refine,
         rejected=rejected,
         provenance={what: str(directory), "images": len(index.captures)},
+    )
+
+
+def calibrate_rig(
+    rig: Rig,
+    board: BoardConfig,
+    *,
+    captures_dir: Path | None = None,
+    progress: Progress | None = None,
+    placements: int = PLACEMENTS,
+    seed: int = 0,
+    pitch_mm: float | None = None,
+    refine: bool = True,
+) -> Calibration:
+    """Drive a rig through a capture session, then calibrate it.
+
+    Args:
+        rig: of which nothing needs to be known.
+        board: the board that its holder holds.
+        captures_dir: where to keep the images; None to keep none.
+        progress: called with what is done, of how much, and in words.
+        placements: how many placements of the board.
+        seed: of the choice among possible placements.
+        pitch_mm: size of a pixel of the zoom camera [mm], where it is known.
+        refine: whether a last fit of everything together ends the method.
+
+    Raises:
+        CalibrationError: a camera never sees the board, there is no common view, or the head fails.
+        ConfigError: the board looks the same upside down.
+    """
+    recorder = Recorder(rig, board, captures_dir, pitch_mm)
+    capture_session(recorder, placements, np.random.default_rng(seed), progress)
+    provenance = {"rig": type(rig).__name__, "seed": seed, "placements": placements}
+    return calibrate_views(
+        recorder.views,
+        board,
+        {"fixed": rig.fixed.size, "zoom": rig.zoom.size},
+        pitch_mm=pitch_mm,
+        refine=refine,
+        rejected=recorder.rejected,
+        provenance=provenance | ({} if captures_dir is None else {"captures": str(captures_dir)}),
     )
