@@ -1,0 +1,296 @@
+"""Finding a target in a single frame of the wide view: by its colour (the book) or by its motion (person, bird).
+
+Boxes are (u, v) middle and (width, height), in pixels whose (0, 0) is the centre of the top-left one, so that the
+box of a single lit pixel at column 3 is centred on u = 3 and 1 wide.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from cotarget.config import TargetConfig
+from cotarget.errors import ConfigError, CotargetError
+from cotarget.geometry import Array
+from cotarget.rig import Frame, Image
+
+# What MOG2 writes into its mask: 255 is foreground, 127 a shadow.
+FOREGROUND = 255
+# A target is small: when more of the picture than this changed at once, the light or the camera did.
+MOST_FOREGROUND = 0.3
+
+
+@dataclass(frozen=True)
+class Detection:
+    """One target seen in one frame.
+
+    Attributes:
+        center_px: middle of the box (u, v), (2,).
+        size_px: its width and height, (2,).
+        score: how sure the detector is, 0 to 1.
+        clipped: whether the image's border cuts the box, so that its size is only a lower bound.
+    """
+
+    center_px: Array
+    size_px: Array
+    score: float
+    clipped: bool = False
+
+
+class Detector(Protocol):
+    """Finds targets of one kind in the frames of one camera."""
+
+    @property
+    def mask(self) -> Image | None:
+        """The last frame's foreground, (H, W), 0 to 255; for pictures."""
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """Find the targets, best first; [] where there is none."""
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """What moves like the target.
+
+    Attributes:
+        history_s: how long something must stand still to become background [s].
+        warm_up_s: no detection before the background has been learnt for this long [s].
+        threshold: squared distance to the background, in variances, from which a pixel counts as foreground.
+        shadows: whether to tell shadows apart from the target.
+        opening_px: specks thinner than this are removed; 0 for none.
+        bridge_px: (width, height) of gaps that are closed within one target.
+        smallest_px: smallest width and height of a target.
+        smallest_area_px: fewest foreground pixels of a target.
+        largest: largest side of a target as a fraction of the image's.
+    """
+
+    history_s: float
+    warm_up_s: float
+    threshold: float
+    shadows: bool
+    opening_px: int
+    bridge_px: tuple[int, int]
+    smallest_px: tuple[int, int]
+    smallest_area_px: int
+    largest: float
+
+
+# A bird may be as small as four pixels, so that nothing is opened away; it casts no shadow on the sky.
+BIRD = MotionSettings(
+    history_s=4.0,
+    warm_up_s=0.5,
+    threshold=25.0,
+    shadows=False,
+    opening_px=0,
+    bridge_px=(5, 5),
+    smallest_px=(2, 2),
+    smallest_area_px=5,
+    largest=0.3,
+)
+# A person stops at times, casts a shadow, and falls apart into limbs and trunk one above the other.
+PERSON = MotionSettings(
+    history_s=20.0,
+    warm_up_s=0.5,
+    threshold=16.0,
+    shadows=True,
+    opening_px=3,
+    bridge_px=(5, 15),
+    smallest_px=(8, 24),
+    smallest_area_px=150,
+    largest=0.9,
+)
+
+
+class MotionDetector:
+    """What differs from an adaptive Gaussian mixture of the background (Zivkovic 2004), as connected pieces."""
+
+    def __init__(self, settings: MotionSettings, rate_hz: float) -> None:
+        """Begin without a background.
+
+        Args:
+            settings: what moves like the target.
+            rate_hz: the camera's nominal frames a second, for frames whose times do not tell.
+        """
+        self._settings = settings
+        self._interval = 1.0 / rate_hz
+        self._model = cv2.createBackgroundSubtractorMOG2(
+            history=max(1, round(settings.history_s * rate_hz)),
+            varThreshold=settings.threshold,
+            detectShadows=settings.shadows,
+        )
+        self._t: float | None = None
+        self._learnt = 0.0
+        self._shape: tuple[int, ...] | None = None
+        self.mask: Image | None = None
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """Find what moves, largest first.
+
+        Raises:
+            CotargetError: the image's size changed.
+        """
+        _check_size(self._shape, frame.image)
+        self._shape = frame.image.shape
+        mask = self._model.apply(frame.image, learningRate=self._rate(frame.t))
+        if self._settings.shadows:
+            mask = cv2.compare(mask, FOREGROUND, cv2.CMP_EQ)
+        if self._settings.opening_px:
+            mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((self._settings.opening_px,) * 2, np.uint8))
+        self.mask = mask
+        if self._learnt < self._settings.warm_up_s or cv2.countNonZero(mask) > MOST_FOREGROUND * mask.size:
+            return []
+        return self._boxes(mask)
+
+    def _rate(self, t: float) -> float:
+        """Learning rate for a frame at ``t`` [s]: fast while there is little to remember."""
+        dt = self._interval if self._t is None else t - self._t
+        self._t = t
+        if dt <= 0:
+            dt = self._interval
+        self._learnt += dt
+        return min(1.0, dt / min(self._settings.history_s, 2 * self._learnt))
+
+    def _boxes(self, mask: Image) -> list[Detection]:
+        """Boxes of the connected pieces, largest first."""
+        settings = self._settings
+        height, width = mask.shape
+        bridge_w, bridge_h = settings.bridge_px
+        closed = cv2.dilate(mask, np.ones((bridge_h, bridge_w), np.uint8))
+        contours = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]
+        found = []
+        for contour in contours:
+            x, y, w, h = cv2.boundingRect(contour)
+            # The dilation only joined the pieces: the box is that of the mask's own pixels inside.
+            inside = mask[y : y + h, x : x + w]
+            area = cv2.countNonZero(inside)
+            if area < settings.smallest_area_px:
+                continue
+            dx, dy, w, h = cv2.boundingRect(inside)
+            x, y = x + dx, y + dy
+            if w < settings.smallest_px[0] or h < settings.smallest_px[1]:
+                continue
+            if w > settings.largest * width or h > settings.largest * height:
+                continue
+            found.append((area, _detection(x, y, w, h, area / (area + settings.smallest_area_px), mask.shape)))
+        found.sort(key=lambda pair: -pair[0])
+        return [detection for _, detection in found]
+
+
+def _detection(x: int, y: int, w: int, h: int, score: float, shape: tuple[int, ...]) -> Detection:
+    """Make a detection of a box of whole pixels."""
+    clipped = x <= 0 or y <= 0 or x + w >= shape[1] or y + h >= shape[0]
+    return Detection(np.array([x + (w - 1) / 2, y + (h - 1) / 2]), np.array([w, h], dtype=float), score, clipped)
+
+
+def _check_size(shape: tuple[int, ...] | None, image: Image) -> None:
+    if shape is not None and image.shape != shape:
+        raise CotargetError(
+            f"the image's size changed from {shape[1]}x{shape[0]} to {image.shape[1]}x{image.shape[0]}; "
+            "the detector needs one camera with one size"
+        )
+
+
+# A template whose mean colour is closer to grey than this tells nothing by its colour [grey levels].
+LEAST_CHROMA = 20.0
+# A pixel is taken for the template's colour when it has at least this part of its chroma ...
+LEAST_WEIGHT = 0.35
+# ... and its chroma points at most this far away from the template's (tangent of the angle in the chroma plane).
+HUE_TANGENT = 0.5
+# Fewest pixels of a target that is found by its colour.
+LEAST_PIXELS = 12
+# How far beyond its coarse box a target's pixels are looked at [px]: blur and subsampled chroma reach 3 px.
+MARGIN_PX = 4
+
+
+class ColourDetector:
+    """What has a template's colour, located by the moments of how much of that colour each pixel has.
+
+    The weight of a pixel is its chroma along the template's mean chroma. It is linear in the pixel's colour, so
+    that blur, mixed pixels at the border and subsampled chroma move weight about but make none, and the moments
+    give the box to a fraction of a pixel. What in the template has another colour (a title, a marker) is
+    accounted for by comparing with the template's own moments.
+    """
+
+    def __init__(self, template: Image) -> None:
+        """Learn the colour.
+
+        Args:
+            template: (h, w, 3) BGR picture of the target, cut to its outline; its scale does not matter.
+
+        Raises:
+            ConfigError: the template is grey.
+        """
+        pixels = template.reshape(-1, 3).astype(float)
+        chroma = (pixels - pixels.mean(axis=1, keepdims=True)).mean(axis=0)
+        length = float(np.linalg.norm(chroma))
+        if length < LEAST_CHROMA:
+            raise ConfigError("the colour template is almost grey; give a picture of the target with a strong colour")
+        self._along = chroma / length
+        self._across = np.cross(np.full(3, 1 / np.sqrt(3)), self._along)
+        weight = template.astype(float) @ self._along
+        self._strong = float(np.percentile(weight, 75))
+        mass, center, spread = _moments(weight)
+        shape = np.array([template.shape[1], template.shape[0]], dtype=float)
+        self._fill = mass / weight.size / self._strong
+        self._offset = (center - (shape - 1) / 2) / shape
+        self._spread = spread / shape**2
+        self.mask: Image | None = None
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """Find what has the template's colour, the largest first."""
+        planes = cv2.transform(frame.image, np.vstack([self._along, self._across]) / self._strong * 128.0)
+        along, across = planes[..., 0], planes[..., 1]
+        del across
+        self.mask = cv2.compare(along, LEAST_WEIGHT * 128.0, cv2.CMP_GE)
+        found = []
+        for contour in cv2.findContours(self.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
+            x, y, w, h = cv2.boundingRect(contour)
+            area = cv2.countNonZero(self.mask[y : y + h, x : x + w])
+            if area >= LEAST_PIXELS:
+                found.append((area, self._refine(frame.image, x, y, w, h)))
+        found.sort(key=lambda pair: -pair[0])
+        return [detection for _, detection in found]
+
+    def _refine(self, image: Image, x: int, y: int, w: int, h: int) -> Detection:
+        """Locate the target in its coarse box to a fraction of a pixel."""
+        x0, y0 = max(0, x - MARGIN_PX), max(0, y - MARGIN_PX)
+        part = image[y0 : y + h + MARGIN_PX, x0 : x + w + MARGIN_PX].astype(float) @ self._along
+        border = np.concatenate([part[0], part[-1], part[:, 0], part[:, -1]])
+        part = part - np.median(border)
+        mass, center, spread = _moments(part)
+        size = np.sqrt(np.maximum(1.0, spread / self._spread))
+        center = center - self._offset * size + np.array([x0, y0])
+        coarse = _detection(x, y, w, h, 0.0, image.shape)
+        score = min(1.0, mass / (self._strong * self._fill * float(np.prod(size))))
+        return Detection(center, size, max(0.0, score), coarse.clipped)
+
+
+def _moments(weight: Array) -> tuple[float, Array, Array]:
+    """Sum, mean (u, v) and variance (uu, vv) of an image of weights, in pixels."""
+    mass = float(weight.sum())
+    if mass <= 0:
+        return 0.0, (np.array(weight.shape[::-1]) - 1) / 2.0, np.ones(2)
+    u, v = np.arange(weight.shape[1]), np.arange(weight.shape[0])
+    columns, rows = weight.sum(axis=0), weight.sum(axis=1)
+    center = np.array([columns @ u, rows @ v]) / mass
+    spread = np.array([columns @ (u - center[0]) ** 2, rows @ (v - center[1]) ** 2]) / mass
+    return mass, center, np.maximum(0.0, spread)
+
+
+def make_detector(target: TargetConfig, rate_hz: float, template: Image | None = None) -> Detector:
+    """Make the detector that a target's configuration asks for.
+
+    Args:
+        target: the target.
+        rate_hz: the camera's nominal frames a second.
+        template: (h, w, 3) BGR picture of the target, for a target that is found by its colour.
+
+    Raises:
+        ConfigError: a colour target without a template.
+    """
+    if target.detector == "colour":
+        if template is None:
+            raise ConfigError("a target with detector = \"colour\" needs a template picture of the target")
+        return ColourDetector(template)
+    return MotionDetector(BIRD if target.dimension == "wingspan" else PERSON, rate_hz)

@@ -1,0 +1,144 @@
+"""Head and lens motion against numerical integration and hand-worked moves."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cotarget.config import SimCamera, SimEffects, SimHead, SimZoomCamera
+from cotarget.errors import DeviceError, StaleFrameError
+from cotarget.sim.devices import SimClock, SimPanTilt, SimStream, SimZoomStream
+from cotarget.sim.motion import Axis, trapezoid
+
+ROUNDING = 1e-9
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_replans_keep_position_speed_and_limits(seed):
+    """However often the goal changes: no jump, no overspeed, no more acceleration than allowed, at rest in the end."""
+    rng = np.random.default_rng(seed)
+    axis, speed, acceleration, dt = Axis(2.0, 5.0), 2.0, 5.0, 1e-3
+    t, goal = 0.0, 0.0
+    times, positions = [], []
+    for _ in range(20):
+        goal = rng.uniform(-2, 2)
+        rest = axis.command(t, goal)
+        until = t + rng.uniform(0.01, 1.0)
+        times.extend(np.arange(t, until, dt))
+        t = until
+    times.extend(np.arange(t, rest + 0.1, dt))
+    positions = np.array([axis.motor(s)[0] for s in times])
+    speeds = np.array([axis.motor(s)[1] for s in times])
+    gaps = np.diff(times)
+    assert np.abs(np.diff(positions) / gaps).max() <= speed * (1 + 1e-6)
+    assert np.abs(np.diff(speeds)).max() <= acceleration * gaps.max() + ROUNDING
+    np.testing.assert_allclose(np.cumsum(speeds[:-1] * gaps) + positions[0], positions[1:], atol=0.02)
+    assert positions[-1] == pytest.approx(goal)
+    assert speeds[-1] == 0
+
+
+def test_hand_worked_moves():
+    # 1 rad at 1 rad/s and 2 rad/s^2: 0.5 s up, 0.5 s even, 0.5 s down.
+    assert trapezoid(0, 0, 0, 1, 1, 2)[-1] == pytest.approx((1.5, 1, 0, 0))
+    # 0.5 rad never reaches full speed: 2 sqrt(0.5 / 2) = 1 s.
+    assert trapezoid(0, 0, 0, -0.5, 5, 2)[-1] == pytest.approx((1.0, -0.5, 0, 0))
+    # Already there.
+    assert trapezoid(3, 1, 0, 1, 1, 2)[-1] == pytest.approx((3, 1, 0, 0))
+    # Running away from the goal: 0.5 s to stop 0.25 beyond, then back 0.25 in 2 sqrt(0.125) s.
+    assert trapezoid(0, 0, 1, 0, 5, 2)[-1][0] == pytest.approx(0.5 + 2 * math.sqrt(0.125))
+
+
+def test_backlash_is_a_hysteresis():
+    axis = Axis(1.0, 10.0, backlash=0.1)
+    axis.command(axis.command(0.0, 1.0), 0.98)
+    assert axis.driven(100.0) == pytest.approx(0.95)  # went up to 1 - 0.05; the way back is within the play
+    axis.command(100.0, 0.5)
+    assert axis.driven(200.0) == pytest.approx(0.55)
+
+
+def head(**changes):
+    clock = SimClock()
+    return SimPanTilt(SimHead(**changes), SimEffects(), clock), clock
+
+
+def test_a_command_takes_effect_after_its_delay():
+    unit, clock = head(command_delay_s=0.04)
+    unit.move(0.5, 0.0)
+    assert unit.state().moving
+    clock.sleep_until(0.039)
+    assert unit.angles_at(clock.now()) == (0, 0)
+    clock.sleep_until(0.06)
+    assert unit.angles_at(clock.now())[0] > 0
+
+
+def test_commands_are_rounded_to_steps_inside_the_limits():
+    unit, clock = head(step_deg=0.5, pan_deg=(-10.2, 10.2), tilt_deg=(-5, 5))
+    pan, tilt = unit.move(math.radians(3.3), math.radians(90), wait=True)
+    assert np.degrees((pan, tilt)) == pytest.approx((3.5, 5.0))
+    assert unit.move(math.radians(-90), 0.0)[0] == pytest.approx(math.radians(-10.0))
+    clock.sleep_until(1e3)
+    assert not unit.state().moving
+    assert unit.state().pan == pytest.approx(math.radians(-10.0))
+
+
+def test_halt_brakes_short_of_the_goal():
+    unit, clock = head()
+    unit.move(2.0, 0.0)
+    clock.sleep_until(0.3)
+    unit.halt()
+    clock.sleep_until(10.0)
+    assert 0 < unit.angles_at(clock.now())[0] < 1.0
+    assert not unit.state().moving
+
+
+@pytest.mark.parametrize("angles", [(math.nan, 0.0), (0.0, math.inf)])
+def test_a_head_refuses_what_is_not_a_number(angles):
+    unit, _ = head()
+    with pytest.raises(DeviceError, match="cannot go to"):
+        unit.move(*angles)
+
+
+def stream(**changes):
+    clock = SimClock()
+    image = np.zeros((4, 6, 3), dtype=np.uint8)
+    return SimStream(SimCamera(**changes), SimEffects(), clock, lambda k, t: np.full_like(image, k)), clock
+
+
+def test_frames_are_stamped_at_exposure_and_arrive_late():
+    camera, clock = stream(rate_hz=25.0, latency_s=0.06)
+    first = camera.read()
+    assert (first.t, clock.now()) == (0.0, 0.06)
+    second = camera.read(newer_than=first.t)
+    assert (second.t, clock.now()) == pytest.approx((0.04, 0.10))
+    clock.sleep_until(1.0)
+    assert camera.read().t == pytest.approx(0.92)  # exposed at 0.92, here at 0.98; the next comes at 1.02
+    assert camera.read(newer_than=0.92).t == pytest.approx(0.96)
+
+
+def test_the_same_frame_is_the_same_image():
+    camera, _ = stream()
+    assert camera.read() is camera.read()
+
+
+def test_waiting_too_long_is_an_error_and_takes_the_time():
+    camera, clock = stream()
+    with pytest.raises(StaleFrameError, match=r"within 0\.5 s"):
+        camera.read(newer_than=10.0, timeout=0.5)
+    assert clock.now() == pytest.approx(0.5)
+
+
+def test_the_lens_steps_and_takes_its_time():
+    clock = SimClock()
+    lens = SimZoomStream(SimZoomCamera(), SimEffects(), clock, lambda k, t: np.zeros((2, 2, 3), np.uint8), delay=0.0)
+    shortest, longest = lens.focal_range
+    assert (shortest, longest) == pytest.approx((6 / 0.009, 72 / 0.009))
+    assert lens.zoom(1e9) == pytest.approx(longest)
+    clock.sleep_until(0.5)
+    assert lens.state().moving
+    assert lens.state().focal_px == pytest.approx(math.sqrt(shortest * longest), rel=0.02)  # half way: 0.5 s of 1 s
+    clock.sleep_until(1.1)
+    assert not lens.state().moving
+    step = (longest / shortest) ** (1 / 128)
+    said = lens.zoom(3000.0)
+    assert said == pytest.approx(3000.0, rel=step - 1)
+    assert math.log(said / shortest, step) == pytest.approx(round(math.log(said / shortest, step)))
