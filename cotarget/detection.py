@@ -58,6 +58,8 @@ class MotionSettings:
         warm_up_s: no detection before the background has been learnt for this long [s].
         threshold: squared distance to the background, in variances, from which a pixel counts as foreground.
         shadows: whether to tell shadows apart from the target.
+        sway_px: how far the background itself sways [px]: a pixel is no target where its colour lies between the
+            darkest and the brightest that the background has within this distance; 0 for a rigid background.
         opening_px: specks thinner than this are removed; 0 for none.
         bridge_px: (width, height) of gaps that are closed within one target.
         smallest_px: smallest width and height of a target.
@@ -69,6 +71,7 @@ class MotionSettings:
     warm_up_s: float
     threshold: float
     shadows: bool
+    sway_px: int
     opening_px: int
     bridge_px: tuple[int, int]
     smallest_px: tuple[int, int]
@@ -76,12 +79,18 @@ class MotionSettings:
     largest: float
 
 
+# The background's range of colours is taken anew this often [s]; it costs a third of a frame's work.
+SWAY_UPDATE_S = 0.25
+# Levels by which a pixel must leave that range: five standard deviations of the sensor's noise of 2, and coding.
+SWAY_MARGIN = 15
+
 # A bird may be as small as four pixels, so that nothing is opened away; it casts no shadow on the sky.
 BIRD = MotionSettings(
-    history_s=4.0,
+    history_s=8.0,
     warm_up_s=0.5,
     threshold=25.0,
     shadows=False,
+    sway_px=3,
     opening_px=0,
     bridge_px=(5, 5),
     smallest_px=(2, 2),
@@ -94,6 +103,7 @@ PERSON = MotionSettings(
     warm_up_s=0.5,
     threshold=16.0,
     shadows=True,
+    sway_px=0,
     opening_px=3,
     bridge_px=(5, 15),
     smallest_px=(8, 24),
@@ -121,6 +131,8 @@ class MotionDetector:
         )
         self._t: float | None = None
         self._learnt = 0.0
+        self._range: tuple[Image, Image] | None = None
+        self._range_learnt = 0.0
         self._shape: tuple[int, ...] | None = None
         self.mask: Image | None = None
 
@@ -135,6 +147,8 @@ class MotionDetector:
         mask = self._model.apply(frame.image, learningRate=self._rate(frame.t))
         if self._settings.shadows:
             mask = cv2.compare(mask, FOREGROUND, cv2.CMP_EQ)
+        if self._settings.sway_px:
+            mask = cv2.bitwise_and(mask, self._outside_sway(frame.image))
         if self._settings.opening_px:
             mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((self._settings.opening_px,) * 2, np.uint8))
         self.mask = mask
@@ -150,6 +164,18 @@ class MotionDetector:
             dt = self._interval
         self._learnt += dt
         return min(1.0, dt / min(self._settings.history_s, 2 * self._learnt))
+
+    def _outside_sway(self, image: Image) -> Image:
+        """Where an image leaves the range of colours that the background has nearby: what sways does not."""
+        if self._range is None or self._learnt - self._range_learnt > SWAY_UPDATE_S or self._learnt < SWAY_UPDATE_S:
+            background = self._model.getBackgroundImage()
+            nearby = np.ones((2 * self._settings.sway_px + 1,) * 2, np.uint8)
+            margin = (SWAY_MARGIN,) * 3
+            darkest = cv2.subtract(cv2.erode(background, nearby), (*margin, 0))
+            brightest = cv2.add(cv2.dilate(background, nearby), (*margin, 0))
+            self._range = darkest, brightest
+            self._range_learnt = self._learnt
+        return cv2.bitwise_not(cv2.inRange(image, *self._range))
 
     def _boxes(self, mask: Image) -> list[Detection]:
         """Boxes of the connected pieces, largest first."""
@@ -291,6 +317,6 @@ def make_detector(target: TargetConfig, rate_hz: float, template: Image | None =
     """
     if target.detector == "colour":
         if template is None:
-            raise ConfigError("a target with detector = \"colour\" needs a template picture of the target")
+            raise ConfigError('a target with detector = "colour" needs a template picture of the target')
         return ColourDetector(template)
     return MotionDetector(BIRD if target.dimension == "wingspan" else PERSON, rate_hz)

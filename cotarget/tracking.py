@@ -132,9 +132,7 @@ class Track:
 
     def at(self, t: float) -> "Track":
         """The track as expected at time ``t`` [s], with the covariance grown accordingly."""
-        F, Q = _motion(abs(t - self.t), self.noise)
-        if t < self.t:
-            F = np.linalg.inv(F)
+        F, Q = _motion(t - self.t, self.noise)
         return replace(self, t=t, center_px=self.predict(t), covariance=F @ self.covariance @ F.T + Q)
 
 
@@ -226,7 +224,7 @@ class _State:
         self.number = number
         self.settings = settings
         self.noise = settings.acceleration_px**2 * settings.manoeuvre_s
-        self.x = np.concatenate([detection.center_px, np.zeros(2)]).astype(float)
+        self.x: Array = np.concatenate([detection.center_px, np.zeros(2)])
         self.P = np.diag([*self._variance(detection), settings.speed_px**2, settings.speed_px**2])
         self.t = self.born = self.seen = t
         self.start = self.x[:2].copy()
@@ -329,10 +327,11 @@ class _State:
 
 
 def _motion(dt: float, noise: float) -> tuple[Array, Array]:
-    """Transition and process noise over ``dt`` [s] for white acceleration of density ``noise`` [px^2/s^3]."""
+    """Transition and process noise over ``dt`` [s], forward or back, for white acceleration [px^2/s^3]."""
     eye = np.eye(2)
     F = np.block([[eye, dt * eye], [np.zeros((2, 2)), eye]])
-    Q = noise * np.block([[dt**3 / 3 * eye, dt**2 / 2 * eye], [dt**2 / 2 * eye, dt * eye]])
+    span = abs(dt)
+    Q = noise * np.block([[span**3 / 3 * eye, dt * span / 2 * eye], [dt * span / 2 * eye, span * eye]])
     return F, Q
 
 
@@ -355,9 +354,7 @@ def _assign(states: Sequence[_State], detections: Sequence[Measurement]) -> dict
     return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if cost[i, j] < IMPOSSIBLE}
 
 
-def _crowds(
-    states: Sequence[_State], detections: Sequence[Measurement], matches: dict[int, int]
-) -> dict[int, int]:
+def _crowds(states: Sequence[_State], detections: Sequence[Measurement], matches: dict[int, int]) -> dict[int, int]:
     """Find detections that cover two or more confirmed tracks: {index of such a track: the detection}."""
     crowds: dict[int, int] = {}
     for j, detection in enumerate(detections):
