@@ -294,10 +294,10 @@ def draw_outdoor() -> None:
     dry = 1 / (1 + np.exp(-2.5 * (noise(rng, size, 360, 3) - 1.0)))
     grass += dry[..., None] * 0.5 * (tint((150, 144, 84), 1 + 0.10 * blades) - grass)
     save("outdoor_grass", grass)
-    clumps, fine = noise(rng, size, 190, 3), noise(rng, size, 26, 3)
-    leaf = 1 + 0.16 * clumps + 0.24 * fine
-    leaves = tint((78, 108, 46), leaf)
-    leaves[..., 2] *= 1 + 0.06 * clumps
+    clumps, fine = noise(rng, size, 190, 3), noise(rng, size, 34, 4)
+    leaf = 1 + 0.13 * clumps + 0.27 * fine
+    leaves = tint((86, 112, 54), np.clip(leaf, 0.3, 1.8))
+    leaves[..., 2] *= 1 + 0.07 * clumps
     save("outdoor_leaves", leaves)
     needles = 1 + 0.14 * noise(rng, 512, 90, 3) + 0.26 * noise(rng, 512, 14, 2, stretch=2.0)
     save("outdoor_needles", tint((44, 78, 54), needles))
@@ -680,18 +680,21 @@ def sphere(rings: int, sides: int) -> tuple[Array, Array, list[tuple[int, ...]]]
 def make_trees() -> None:
     """Crowns 1 m across and 1 m high above the origin: three of clumped leaves, one conifer."""
     rng = np.random.default_rng(7)
-    ball, uv, faces = sphere(7, 10)
+    ball, uv, faces = sphere(6, 9)
+    seam = np.unique(np.round(ball, 6), axis=0, return_inverse=True)[1].ravel()  # so that jitter leaves no gap
     for name in "abc":
         mesh = Mesh()
-        for i in range(9):
-            lift = i / 8
-            spread = 0.27 * np.sin(np.pi * (0.25 + 0.65 * lift))
-            turn = i * 2.4 + rng.uniform(-0.4, 0.4)
-            center = np.array([spread * np.cos(turn), spread * np.sin(turn), 0.20 + 0.62 * lift])
-            radius = rng.uniform(0.17, 0.24) * (1.1 - 0.35 * lift)
-            bumps = 1 + 0.13 * np.sin(ball @ rng.normal(0, 4, (3, 3))).sum(axis=1) / 1.5
-            shape = ball * bumps[:, None] * radius * np.array([1.0, 1.0, 0.85])
-            mesh.add(center + shape, uv * np.array([1.0, 0.6]) + rng.uniform(0, 1, 2), faces)
+        for i in range(13):
+            lift = (i + rng.uniform(0, 0.7)) / 13
+            spread = 0.34 * np.sin(np.pi * (0.22 + 0.68 * lift)) * rng.uniform(0.75, 1.05)
+            turn = i * 2.4 + rng.uniform(-0.5, 0.5)
+            center = np.array([spread * np.cos(turn), spread * np.sin(turn), 0.16 + 0.70 * lift])
+            radius = rng.uniform(0.15, 0.22) * (1.15 - 0.45 * lift)
+            ragged = rng.uniform(0.72, 1.22, seam.max() + 1)[seam]
+            shape = ball * ragged[:, None] * radius * np.array([1.0, 1.0, 0.85])
+            mesh.add(center + shape, uv * np.array([0.8, 0.4]) + rng.uniform(0, 1, 2), faces)
+        core = np.array([0.0, 0.0, 0.5]) + ball * np.array([0.30, 0.30, 0.36])
+        mesh.add(core, uv, faces)
         mesh.save(f"tree_crown_{name}")
     mesh = Mesh()
     sides = 14
