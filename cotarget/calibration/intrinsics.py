@@ -93,3 +93,22 @@ def board_pose(lens: Intrinsics, corners_px: Array, points: Array) -> RigidTrans
         points, corners_px, lens.matrix, np.array(lens.distortion), rotvec, translation
     )
     return RigidTransform.from_components(np.ravel(translation), Rotation.from_rotvec(np.ravel(rotvec)))
+
+
+def pose_candidates(lens: Intrinsics, corners_px: Array, points: Array) -> list[RigidTransform]:
+    """The one or two poses of a flat board that explain its corners about equally, the better one first.
+
+    Raises:
+        CalibrationError: no pose explains the corners.
+    """
+    _, rotvecs, translations, _ = cv2.solvePnPGeneric(
+        points, corners_px, lens.matrix, np.array(lens.distortion), flags=cv2.SOLVEPNP_IPPE
+    )
+    found = [
+        RigidTransform.from_components(np.ravel(t), Rotation.from_rotvec(np.ravel(r)))
+        for r, t in zip(rotvecs, translations, strict=True)
+        if np.isfinite(r).all() and np.isfinite(t).all()
+    ]
+    if not found:
+        raise CalibrationError("no pose of the board explains its corners")
+    return found

@@ -6,14 +6,15 @@ Plans need only a rough model of the rig. Whatever is planned is a wish: what co
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from cotarget.calibration.boards import board_outline, board_points
-from cotarget.calibration.reprojection import RigModel
+from cotarget.calibration.reprojection import RigModel, base_heads
 from cotarget.camera import Intrinsics
 from cotarget.config import BoardConfig
 from cotarget.errors import UnreachableError
 from cotarget.geometry import Array, RigidTransform, Rotation
-from cotarget.pantilt import base_head, nearest, solve
+from cotarget.pantilt import nearest, solve
 from cotarget.rig import PanTiltLimits
 
 # Distances for squares of 0.1 m and a focal length of 1.07 image widths: nearer, the board fills the image and moves
@@ -47,27 +48,41 @@ class Coverage:
         np.add.at(new, self._cells(corners_px), 1)
         return float(np.sum(np.log1p(self.counts + new) - np.log1p(self.counts)))
 
-    def _cells(self, corners_px: Array) -> tuple[Array, ...]:
-        cells = (corners_px / np.array(self.size) * np.array(GRID)).astype(int)
+    def _cells(self, corners_px: Array) -> tuple[npt.NDArray[np.intp], ...]:
+        cells = (corners_px / np.array(self.size) * np.array(GRID)).astype(np.intp)
         return tuple(np.clip(cells, 0, np.array(GRID) - 1).T)
 
 
-def visible_corners(lens: Intrinsics, T_camera_board: RigidTransform, board: BoardConfig, margin_px: float) -> Array:
-    """Where the corners appear, (N, 2) [px]; empty unless the whole board with its outer squares is well visible."""
-    nothing = np.empty((0, 2))
-    outline = T_camera_board.apply(board_outline(board))
-    facing = T_camera_board.rotation.as_matrix()[:, 2] @ outline.mean(axis=0)
-    if facing <= 0 or outline[:, 2].min() <= 0:
-        return nothing
-    px = lens.project(np.concatenate([outline, T_camera_board.apply(board_points(board))]))
-    inside = (px >= margin_px) & (px <= np.array(lens.size) - 1 - margin_px)
-    if not inside.all():  # also where a pixel is nan
-        return nothing
+def board_body(board: BoardConfig) -> Array:
+    """The board's outer corners, then its inner ones [m], (4 + N, 3)."""
+    return np.concatenate([board_outline(board), board_points(board)])
+
+
+def visible(
+    lens: Intrinsics, x_camera: Array, board: BoardConfig, margin_px: float
+) -> tuple[npt.NDArray[np.bool_], Array]:
+    """Which of many boards are well visible, with all their outer squares.
+
+    Args:
+        lens: the camera.
+        x_camera: `board_body` in the camera's frame [m], (K, 4 + N, 3).
+        board: the board.
+        margin_px: how far inside the image it must be.
+
+    Returns:
+        Whether each is visible, (K,), and its inner corners (K, N, 2) [px].
+    """
     columns, rows = board.corners
-    grid = px[4:].reshape(rows, columns, 2)
-    across = np.linalg.norm(grid[:, -1] - grid[:, 0], axis=-1).min() / (columns - 1)
-    down = np.linalg.norm(grid[-1] - grid[0], axis=-1).min() / (rows - 1)
-    return px[4:] if min(across, down) >= SMALLEST_SPACING_PX else nothing
+    px = lens.project(x_camera)
+    with np.errstate(invalid="ignore"):
+        inside = (px >= margin_px) & (px <= np.array(lens.size) - 1 - margin_px)  # false where a pixel is nan
+        grid = px[:, 4:].reshape(-1, rows, columns, 2)
+        across = np.linalg.norm(grid[:, :, -1] - grid[:, :, 0], axis=-1).min(axis=1) / (columns - 1)
+        down = np.linalg.norm(grid[:, -1] - grid[:, 0], axis=-1).min(axis=1) / (rows - 1)
+        large = np.minimum(across, down) >= SMALLEST_SPACING_PX
+    right, below = x_camera[:, 1] - x_camera[:, 0], x_camera[:, 3] - x_camera[:, 0]
+    facing = np.sum(np.cross(right, below) * x_camera[:, 0], axis=-1) > 0
+    return inside.all(axis=(1, 2)) & large & facing, px[:, 4:]
 
 
 def facing_board(board: BoardConfig, x_fixed: Array, turn: Rotation) -> RigidTransform:
@@ -107,27 +122,32 @@ def plan_placement(
         T_fixed_board, or None where no candidate is visible.
     """
     assert model.fixed is not None
-    best, best_gain = None, 0.0
-    size = np.array(model.fixed.size)
-    for k in range(CANDIDATES):
-        # The distances of successive placements are spread evenly; late candidates may have any.
-        share = (number * GOLDEN) % 1.0 if k < CANDIDATES // 2 else rng.uniform()
-        ray = model.fixed.ray(rng.uniform(0, 1, 2) * (size - 1))
-        if best is not None and k >= CANDIDATES // 2:
-            break
-        T = facing_board(board, ray * distance(board, model.fixed, share), random_turn(rng))
-        seen = visible_corners(model.fixed, T, board, margin_px)
-        if not len(seen):
-            continue
-        gain = coverage["fixed"].gain(seen)
+    # The distances of successive placements are spread evenly; only where that one does not do, any will.
+    preferred = np.full(CANDIDATES, (number * GOLDEN) % 1.0)
+    for shares in (preferred, rng.uniform(size=CANDIDATES)):
+        pixels = rng.uniform(size=(CANDIDATES, 2)) * (np.array(model.fixed.size) - 1)
+        depths = np.array([distance(board, model.fixed, share) for share in shares])
+        turns = random_turns(CANDIDATES, rng)
+        middle = board_points(board).mean(axis=0)
+        R = turns.as_matrix()
+        t = model.fixed.ray(pixels) * depths[:, None] - R @ middle
+        x_fixed = board_body(board) @ R.swapaxes(1, 2) + t[:, None]
+        good, seen = visible(model.fixed, x_fixed, board, margin_px)
         if model.zoom is not None:
-            seen = visible_corners(model.zoom, model.gamma * T, board, margin_px)
-            if shared and not len(seen):
-                continue
-            gain += coverage["zoom"].gain(seen)
-        if gain > best_gain:
-            best, best_gain = T, gain
-    return best
+            in_zoom, seen_zoom = visible(
+                model.zoom, model.gamma.apply(x_fixed.reshape(-1, 3)).reshape(x_fixed.shape), board, margin_px
+            )
+            good = np.logical_and(good, in_zoom) if shared else good
+        gains: list[tuple[float, int]] = []
+        for k in np.flatnonzero(good):
+            gain = coverage["fixed"].gain(seen[k])
+            if model.zoom is not None and in_zoom[k]:
+                gain += coverage["zoom"].gain(seen_zoom[k])
+            gains.append((gain, int(k)))
+        if gains:
+            best = max(gains)[1]
+            return RigidTransform.from_components(t[best], turns[best])
+    return None
 
 
 def plan_poses(
@@ -154,28 +174,38 @@ def plan_poses(
     except UnreachableError:
         return []
     reach = np.arctan(np.hypot(*lens.size) / 2 / lens.focal_px[0])
-    spread = rng.uniform(-reach, reach, (POSES, 2))
-    candidates = []
-    for pan, tilt in spread + np.array([float(centred.pan), float(centred.tilt)]):
-        if not (limits.pan[0] <= pan <= limits.pan[1] and limits.tilt[0] <= tilt <= limits.tilt[1]):
-            continue
-        P = base_head(pan, tilt, model.head)
-        seen = visible_corners(
-            lens, model.hand.inv() * P.inv() * model.hand * model.gamma * T_fixed_board, board, margin_px
-        )
-        if len(seen):
-            candidates.append((float(pan), float(tilt), seen))
-    chosen = []
+    pan = float(centred.pan) + rng.uniform(-reach, reach, POSES)
+    tilt = float(centred.tilt) + rng.uniform(-reach, reach, POSES)
+    allowed = (pan >= limits.pan[0]) & (pan <= limits.pan[1]) & (tilt >= limits.tilt[0]) & (tilt <= limits.tilt[1])
+    pan, tilt = pan[allowed], tilt[allowed]
+    x_base = (model.hand * model.gamma * T_fixed_board).apply(board_body(board))
+    R, t, _ = base_heads(model.head, pan, tilt)
+    x_head = (x_base - t[:, None]) @ R
+    x_zoom = model.hand.inv().apply(x_head.reshape(-1, 3)).reshape(x_head.shape)
+    good, seen = visible(lens, x_zoom, board, margin_px)
+    candidates = [int(k) for k in np.flatnonzero(good)]
+    chosen: list[tuple[float, float]] = []
     planned = Coverage(coverage.size, coverage.counts.copy())
-    for _ in range(min(count, len(candidates))):
-        pan, tilt, seen = max(candidates, key=lambda candidate: planned.gain(candidate[2]))
-        planned.add(seen)
-        chosen.append((pan, tilt))
+    while candidates and len(chosen) < count:
+        k = max(candidates, key=lambda k: planned.gain(seen[k]))
+        candidates.remove(k)
+        planned.add(seen[k])
+        chosen.append((float(pan[k]), float(tilt[k])))
     return chosen
 
 
-def random_turn(rng: np.random.Generator) -> Rotation:
-    """Turn a board from facing the camera: tilted in any direction, and a little rolled."""
-    direction, tilted = rng.uniform(-np.pi, np.pi), rng.uniform(LEAST_TILTED, MOST_TILTED)
-    tilt = Rotation.from_rotvec([tilted * np.cos(direction), tilted * np.sin(direction), 0.0])
-    return tilt * Rotation.from_rotvec([0.0, 0.0, rng.uniform(-MOST_ROLLED, MOST_ROLLED)])
+def seen_at_home(model: RigModel, T_fixed_board: RigidTransform, board: BoardConfig) -> bool:
+    """Whether the zoom camera should see a board at pan = tilt = 0."""
+    assert model.zoom is not None
+    x_zoom = (model.gamma * T_fixed_board).apply(board_body(board))
+    return bool(visible(model.zoom, x_zoom[None], board, 0.0)[0][0])
+
+
+def random_turns(count: int, rng: np.random.Generator) -> Rotation:
+    """Turn boards from facing the camera: tilted in any direction, and a little rolled."""
+    direction = rng.uniform(-np.pi, np.pi, count)
+    tilted = rng.uniform(LEAST_TILTED, MOST_TILTED, count)
+    rolled = rng.uniform(-MOST_ROLLED, MOST_ROLLED, count)
+    still = np.zeros(count)
+    tilt = Rotation.from_rotvec(np.stack([tilted * np.cos(direction), tilted * np.sin(direction), still], axis=-1))
+    return tilt * Rotation.from_rotvec(np.stack([still, still, rolled], axis=-1))

@@ -128,7 +128,7 @@ class Recorder:
 
     def _keep(self, capture: Capture, expected: bool) -> View | None:
         """Find the board; keep the image where it was found, or should have been."""
-        corners = find_corners(capture.image, self.board)
+        corners = find_corners(capture.image, self.board, thorough=expected)
         if corners is None and not expected:
             return None
         capture = replace(capture, source=file_name(capture, len(self._captures)))

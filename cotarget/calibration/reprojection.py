@@ -9,7 +9,7 @@ Poses are stepped as R <- exp(w) R, t <- t + d. The derivatives are analytic; Op
 the lens.
 """
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,11 +19,10 @@ import numpy as np
 from cotarget.calibration.model import View
 from cotarget.camera import Intrinsics
 from cotarget.errors import CalibrationError
-from cotarget.geometry import Array, RigidTransform, Rotation, rot_y
+from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import IDEAL_HEAD, HeadGeometry
 
 Block = Literal["fixed", "zoom", "gamma", "hand", "head"]
-Derivative = Callable[[Array], Array]  # of x_head (v, N, 3) by one parameter
 
 # fx fy cx cy k1 k2 p1 p2, the order of OpenCV's Jacobian after the pose; k3, the next, stays as it is: it hardly
 # changes the residuals of real photos (0.0002 px) but bends the image where no board was seen.
@@ -37,6 +36,7 @@ BLOCK_WIDTHS: dict[Block, int] = {
     "head": 2,
 }
 STILL = RigidTransform.identity()
+E3 = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +148,8 @@ def _points_in_camera(
         return y, {"board": d_board}
     R_g, R_h = model.gamma.rotation.as_matrix(), model.hand.rotation.as_matrix()
     t_h = model.hand.translation
-    R_p, t_p, d_dz, d_eps = _head(model.head, views)
+    pan, tilt = (np.array([getattr(view, axis) for view in views]) for axis in ("pan", "tilt"))
+    R_p, t_p, A = base_heads(model.head, pan, tilt)
     turned_g = y @ R_g.T
     w = turned_g + model.gamma.translation  # x_zoom0
     turned_h = w @ R_h.T
@@ -159,37 +160,43 @@ def _points_in_camera(
     R_xv = R_xp @ R_p.swapaxes(1, 2)  # dx/dv
     R_xw = R_xv @ R_h  # dx/dw
     d_hand = R_xv[:, None] @ _pose_derivative(turned_h) - R_xp @ _pose_derivative(p - t_h)
-    by_head = np.stack([d_dz(p), d_eps(p)], axis=-1)
     return x, {
         "board": (R_xw @ R_g)[:, None] @ d_board,
         "gamma": R_xw[:, None] @ _pose_derivative(turned_g),
         "hand": d_hand,
-        "head": R_xp @ by_head,
+        "head": R_xp @ _by_head(model.head, A, p),
     }
 
 
-def _head(head: HeadGeometry, views: Sequence[View]) -> tuple[Array, Array, Derivative, Derivative]:
-    """T_base_head of every view as R (v, 3, 3) and t (v, 3), and how x_head changes with dz and with eps.
+def base_heads(head: HeadGeometry, pan: Array, tilt: Array) -> tuple[Array, Array, Array]:
+    """T_base_head of many poses at once (Eq. 8 with dz and eps).
+
+    Args:
+        head: the unit's geometry.
+        pan: [rad], (v,).
+        tilt: [rad], (v,).
+
+    Returns:
+        Rotations (v, 3, 3), translations (v, 3), and the tilts' own rotations (v, 3, 3).
+    """
+    turns = Rotation.from_rotvec(pan[:, None] * np.array([0.0, 1.0, 0.0])).as_matrix()
+    axis = np.array([np.cos(head.squareness), np.sin(head.squareness), 0.0])
+    A = Rotation.from_rotvec(tilt[:, None] * axis).as_matrix()
+    offset = head.axis_offset * (E3 - A @ E3)  # Trans(dz) A Trans(-dz) is A with this translation
+    return turns @ A, np.einsum("vij,vj->vi", turns, offset), A
+
+
+def _by_head(head: HeadGeometry, A: Array, x_head: Array) -> Array:
+    """How x_head changes with dz and with eps, (v, N, 3, 2).
 
     With A the tilt's rotation, x_head = A^T (q - dz e3) + dz e3 where q = Rot(Y, -pan) x_base.
     """
-    tilt = np.array([view.tilt for view in views])
-    pan = np.stack([rot_y(view.pan).as_matrix() for view in views])
-    axis = np.array([np.cos(head.squareness), np.sin(head.squareness), 0.0])
-    A = Rotation.from_rotvec(tilt[:, None] * axis).as_matrix()
-    e3 = np.array([0.0, 0.0, 1.0])
-    offset = head.axis_offset * (e3 - A @ e3)  # Trans(dz) A Trans(-dz) = A with this translation
-
-    def by_dz(x_head: Array) -> Array:
-        return np.broadcast_to((e3 - A[:, 2])[:, None], x_head.shape)  # A^T e3 is A's third row
-
-    def by_eps(x_head: Array) -> Array:
-        # A = Rot(Z, eps) Rot(X, tilt) Rot(Z, -eps), so dA^T/deps = [e3]x A^T - A^T [e3]x
-        a = x_head - head.axis_offset * e3
-        u = a @ A.swapaxes(1, 2)
-        return np.cross(e3, a) - np.cross(e3, u) @ A
-
-    return pan @ A, np.einsum("vij,vj->vi", pan, offset), by_dz, by_eps
+    by_dz = np.broadcast_to((E3 - A[:, 2])[:, None], x_head.shape)  # A^T e3 is A's third row
+    # A = Rot(Z, eps) Rot(X, tilt) Rot(Z, -eps), so dA^T/deps = [e3]x A^T - A^T [e3]x
+    a = x_head - head.axis_offset * E3
+    u = a @ A.swapaxes(1, 2)
+    by_eps = np.cross(E3, a) - np.cross(E3, u) @ A
+    return np.stack([by_dz, by_eps], axis=-1)
 
 
 def _pose_derivative(turned: Array) -> Array:

@@ -7,7 +7,7 @@ from then on a rough model plans every placement and every head pose, and each r
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +15,9 @@ import numpy as np
 from cotarget.calibration.boards import board_points, check_board, smallest_spacing
 from cotarget.calibration.bundle import fit
 from cotarget.calibration.handeye import motions, park_martin
-from cotarget.calibration.intrinsics import board_pose, rough_intrinsics
+from cotarget.calibration.intrinsics import board_pose, pose_candidates, rough_intrinsics
 from cotarget.calibration.model import View
-from cotarget.calibration.plan import Coverage, distance, facing_board, plan_placement, plan_poses
+from cotarget.calibration.plan import Coverage, distance, facing_board, plan_placement, plan_poses, seen_at_home
 from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.reprojection import RigModel
 from cotarget.calibration.sequential import at_home
@@ -130,14 +130,25 @@ def _learn_zoom(recorder: Recorder, model: RigModel) -> RigModel:
     _turn_a_little(recorder, view)
     seen = [v for v in recorder.of_placement(number) if v.camera == "zoom"]
     heads = [base_head(v.pan, v.tilt) for v in seen]
-    hand = park_martin(*motions(heads, [board_pose(zoom, v.corners_px, points) for v in seen]))
+    boards = _consistent_poses(heads, [pose_candidates(zoom, v.corners_px, points) for v in seen])
     # Small turns tell the rotation; the translation is a matter of centimetres and has to wait.
-    hand = RigidTransform.from_rotation(hand.rotation)
+    hand = RigidTransform.from_rotation(park_martin(*motions(heads, boards)).rotation)
     fixed_view = next(v for v in recorder.of_placement(number) if v.camera == "fixed")
-    T_fixed_board = board_pose(model.fixed, fixed_view.corners_px, points)
-    T_zoom_fixed = board_pose(zoom, view.corners_px, points) * T_fixed_board.inv()
-    gamma = hand.inv() * base_head(view.pan, view.tilt) * hand * T_zoom_fixed  # Eq. 2 solved for Gamma
+    T_zoom_fixed = boards[0] * board_pose(model.fixed, fixed_view.corners_px, points).inv()
+    gamma = hand.inv() * heads[0] * hand * T_zoom_fixed  # Eq. 2 solved for Gamma
     return _refitted(replace(model, zoom=zoom, hand=hand, gamma=gamma), recorder)
+
+
+def _consistent_poses(
+    heads: Sequence[RigidTransform], candidates: Sequence[Sequence[RigidTransform]]
+) -> tuple[RigidTransform, ...]:
+    """Of each view's two possible poses, those between which the camera turns by the same angles as the head."""
+
+    def mismatch(boards: tuple[RigidTransform, ...]) -> float:
+        A, B = motions(heads, boards)
+        return sum(abs(a.rotation.magnitude() - b.rotation.magnitude()) for a, b in zip(A, B, strict=True))
+
+    return min(itertools.product(*candidates), key=mismatch)
 
 
 def _find_with_zoom(recorder: Recorder, model: RigModel) -> View:
@@ -236,7 +247,7 @@ def _cover(
             continue
         misses = 0
         T = board_pose(model.fixed, fixed_view.corners_px, points)
-        home = _expected_at_home(model, T, recorder)
+        home = seen_at_home(model, T, board)
         poses = plan_poses(
             model, T, board, coverage["zoom"], rig.head.limits, MOVED_VIEWS + (not home), rng,
             margin * rig.zoom.size[0],
@@ -251,14 +262,6 @@ def _cover(
         done += 1
         if done <= REFIT_ALWAYS or done % REFIT_EVERY == 0:
             model = _refitted(model, recorder)
-
-
-def _expected_at_home(model: RigModel, T_fixed_board: RigidTransform, recorder: Recorder) -> bool:
-    """Whether the zoom camera should see a board at home."""
-    from cotarget.calibration.plan import visible_corners
-
-    assert model.zoom is not None
-    return len(visible_corners(model.zoom, model.gamma * T_fixed_board, recorder.board, 0.0)) > 0
 
 
 def _refitted(model: RigModel, recorder: Recorder) -> RigModel:

@@ -1,0 +1,201 @@
+"""A rig behind the Protocols that draws chessboards with numpy: for sessions without OpenGL, and for breaking.
+
+Every pixel's ray meets the board's plane; the squares' edges are blurred over one pixel, so that corners are where
+they should be to a few hundredths of a pixel.
+"""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from cotarget.config import BoardConfig
+from cotarget.errors import StaleFrameError
+from cotarget.geometry import RigidTransform
+from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
+from tests.synthetic import SIZE, Lens, Truth
+
+PERIOD = 0.04
+LATENCY = 0.05
+BLACK, WHITE, WALL = 30.0, 220.0, 120.0
+
+
+def draw(lens: Lens, T_camera_board: np.ndarray, board: BoardConfig, rays: np.ndarray) -> np.ndarray:
+    """The board before a grey wall, (H, W), float; T_camera_board as a 4x4 matrix."""
+    image = np.full(SIZE[::-1], WALL)
+    columns, rows = board.corners
+    corners = np.array([[-2, -2], [columns + 1, -2], [columns + 1, rows + 1], [-2, rows + 1]], float) * board.square
+    x = np.c_[corners, np.zeros(4)] @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
+    if (x[:, 2] < 0.1).any() or T_camera_board[:3, 2] @ x.mean(axis=0) <= 0:
+        return image
+    # The pixels to look at: those around the outline, clipped to where the distortion is sane.
+    xy = np.clip(x[:, :2] / x[:, 2:], -0.9, 0.9)
+    px = lens.project(np.c_[xy, np.ones(4)])
+    low = np.clip(np.floor(px.min(axis=0)) - 30, 0, SIZE).astype(int)
+    high = np.clip(np.ceil(px.max(axis=0)) + 30, 0, SIZE).astype(int)
+    if (high - low < 2).any():
+        return image
+    H = np.linalg.inv(T_camera_board[:3, [0, 1, 3]])
+    q = rays[low[1] : high[1], low[0] : high[0]] @ H.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = q[..., :2] / q[..., 2:] / board.square
+
+    def soft(coordinate, period_edges):
+        gradient = np.hypot(*np.gradient(coordinate)) + 1e-12
+        return period_edges(coordinate, gradient)
+
+    def stripes(c, g):  # +1 on even squares, -1 on odd ones, linear over one pixel at each edge
+        distance = np.abs(c - np.round(c))
+        sign = np.where(np.floor(c).astype(int) % 2 == 0, 1.0, -1.0)
+        return sign * np.clip(2 * distance / g, 0, 1)
+
+    def inside(first, last):
+        return lambda c, g: np.clip(0.5 + (c - first) / g, 0, 1) * np.clip(0.5 + (last - c) / g, 0, 1)
+
+    pattern = soft(uv[..., 0], stripes) * soft(uv[..., 1], stripes)
+    squares = (BLACK + WHITE) / 2 - (WHITE - BLACK) / 2 * pattern
+    tiled = soft(uv[..., 0], inside(-1, columns)) * soft(uv[..., 1], inside(-1, rows))
+    card = soft(uv[..., 0], inside(-1.5, columns + 0.5)) * soft(uv[..., 1], inside(-1.5, rows + 0.5))
+    front = q[..., 2] > 0
+    picture = WALL * (1 - card) + card * (WHITE * (1 - tiled) + tiled * squares)
+    image[low[1] : high[1], low[0] : high[0]] = np.where(front, picture, WALL)
+    return image
+
+
+def pixel_rays(lens: Lens) -> np.ndarray:
+    """Rays through all pixels, (H, W, 3)."""
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]]
+    px = np.stack([u, v], axis=-1).reshape(-1, 1, 2).astype(float)
+    xy = cv2.undistortPoints(px, lens.K, np.array(lens.distortion)).reshape(*SIZE[::-1], 2)
+    return np.concatenate([xy, np.ones((*SIZE[::-1], 1))], axis=-1)
+
+
+@dataclass
+class SyntheticRig:
+    """The whole rig is one object: its cameras, head, clock and board are views of it."""
+
+    truth: Truth = field(default_factory=Truth)
+    board_config: BoardConfig = field(default_factory=BoardConfig)
+    seed: int = 0
+    noise: float = 2.0
+    stuck: bool = False
+    frozen_camera: bool = False
+    short_of: float = 0.0
+    limits: PanTiltLimits = field(
+        default_factory=lambda: PanTiltLimits(
+            (np.radians(-159), np.radians(159)), (np.radians(-47), np.radians(31)), 2.6, 3.6, np.radians(0.0514286)
+        )
+    )
+
+    def __post_init__(self):
+        self.t = 0.0
+        self.rng = np.random.default_rng(self.seed)
+        self.rays = {"fixed": pixel_rays(self.truth.fixed), "zoom": pixel_rays(self.truth.zoom)}
+        self.pose, self.arrives = (0.0, 0.0), 0.0
+        self.placed = [(-1.0, None)]
+        self.frames = 0
+        self.fixed, self.zoom = _Camera(self, "fixed"), _Zoom(self, "zoom")
+        self.head, self.clock, self.board = _Head(self), _Clock(self), _Board(self)
+
+    def image(self, camera, t):
+        self.frames += 1
+        T = next(T for since, T in reversed(self.placed) if since <= t)
+        grey = np.full(SIZE[::-1], WALL)
+        if T is not None:
+            M = T.as_matrix()
+            if camera == "zoom":
+                assert t >= self.arrives, "a calibration image was taken while the head moved"
+                pan, tilt = (0.0, 0.0) if self.frozen_camera else self.pose
+                M = self.truth.zoom_fixed(pan, tilt) @ M
+            grey = draw(getattr(self.truth, camera), M, self.board_config, self.rays[camera])
+        noisy = grey + self.rng.normal(0, self.noise, grey.shape)
+        return cv2.cvtColor(np.clip(np.round(noisy), 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+
+    def close(self):
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+
+@dataclass
+class _Camera:
+    rig: SyntheticRig
+    name: str
+    size: tuple[int, int] = SIZE
+
+    def read(self, newer_than=None, timeout=1.0):
+        rig = self.rig
+        index = np.floor((rig.t - LATENCY) / PERIOD)
+        if newer_than is not None:
+            index = max(index, np.floor(newer_than / PERIOD + 1e-9) + 1)
+        arrival = index * PERIOD + LATENCY
+        if arrival > rig.t + timeout:
+            raise StaleFrameError("no frame in time")
+        rig.t = max(rig.t, arrival)
+        return Frame(rig.image(self.name, index * PERIOD), index * PERIOD)
+
+
+class _Zoom(_Camera):
+    focal_range = (667.0, 8000.0)
+
+    def zoom(self, focal_px):
+        return focal_px
+
+    def state(self):
+        return ZoomState(667.0, False, self.rig.t)
+
+    def capture(self):
+        return self.read(self.rig.t)
+
+
+@dataclass
+class _Head:
+    rig: SyntheticRig
+
+    @property
+    def limits(self):
+        return self.rig.limits
+
+    def state(self):
+        rig = self.rig
+        return PanTiltState(*rig.pose, moving=rig.t < rig.arrives, t=rig.t)
+
+    def move(self, pan, tilt, speed=None, wait=False):
+        rig = self.rig
+        step = rig.limits.step
+        wanted = tuple(
+            float(np.clip(np.round(q / step) * step, *limit))
+            for q, limit in ((pan, rig.limits.pan), (tilt, rig.limits.tilt))
+        )
+        if not rig.stuck:
+            rig.arrives = rig.t + 0.3
+            rig.pose = (wanted[0] * (1 - rig.short_of), wanted[1])
+        if wait:
+            rig.t = max(rig.t, rig.arrives)
+        return wanted
+
+    def halt(self):
+        pass
+
+
+@dataclass
+class _Clock:
+    rig: SyntheticRig
+
+    def now(self):
+        return self.rig.t
+
+    def sleep_until(self, t):
+        self.rig.t = max(self.rig.t, t)
+
+
+@dataclass
+class _Board:
+    rig: SyntheticRig
+
+    def present(self, T_fixed_board: RigidTransform | None):
+        self.rig.placed.append((self.rig.t, T_fixed_board))
