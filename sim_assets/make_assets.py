@@ -648,7 +648,7 @@ def make_bird() -> None:
     )
     outer = wing_panel(
         [
-            (-0.004, 0.098, -0.088, 0.012),
+            (-0.016, 0.098, -0.088, 0.0105),
             (0.06, 0.082, -0.085, 0.010),
             (0.12, 0.045, -0.090, 0.008),
             (0.165, 0.000, -0.088, 0.006),
@@ -692,9 +692,9 @@ def make_trees() -> None:
             radius = rng.uniform(0.15, 0.22) * (1.15 - 0.45 * lift)
             ragged = rng.uniform(0.72, 1.22, seam.max() + 1)[seam]
             shape = ball * ragged[:, None] * radius * np.array([1.0, 1.0, 0.85])
-            mesh.add(center + shape, uv * np.array([0.8, 0.4]) + rng.uniform(0, 1, 2), faces)
+            mesh.add(center + shape, uv * np.array([2.2, 1.2]) + rng.uniform(0, 1, 2), faces)
         core = np.array([0.0, 0.0, 0.5]) + ball * np.array([0.30, 0.30, 0.36])
-        mesh.add(core, uv, faces)
+        mesh.add(core, 2 * uv, faces)
         mesh.save(f"tree_crown_{name}")
     mesh = Mesh()
     sides = 14

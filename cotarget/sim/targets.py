@@ -255,20 +255,25 @@ def _person_path(scene: str, rng: np.random.Generator) -> Path:
 
 
 def _bird_path(scene: str, rng: np.random.Generator) -> Path:
-    """Fly in from one side at about 5 m/s, then circle; indoors a smaller and slower round."""
+    """Fly in from one side at about 5 m/s, then round after round; indoors a smaller and slower round.
+
+    Rounds are two half circles and two straights across the view, so that the bird shows its side most of the time.
+    """
     a = _angles()
     side = rng.choice([-1.0, 1.0])
     if scene == "indoor":
-        radius, near, height, rise, speed, soften = rng.uniform(2.0, 2.2), 7.4, 2.3, 0.25, rng.uniform(2.7, 3.0), 0.5
+        radius, across, near, height, rise, speed, soften = rng.uniform(2.0, 2.2), 0.8, 7.4, 2.3, 0.25, 2.9, 0.5
     else:
-        radius, near, height, rise, speed, soften = rng.uniform(6.2, 6.5), 18.6, 5.7, 1.6, rng.uniform(4.8, 5.2), 1.2
+        radius, across, near, height, rise, speed, soften = rng.uniform(6.2, 6.5), 2.2, 18.6, 5.7, 1.6, 5.0, 1.2
     height += 0.3 * rise * rng.uniform(-1, 1)
-    rounds, lift = rng.uniform(0, 2 * np.pi), rise * rng.uniform(0.7, 1.0)
-    x = side * radius * np.sin(a)
+    start, lift = rng.uniform(0, 2 * np.pi), rise * rng.uniform(0.7, 1.0)
+    x = side * (radius * np.sin(a) + across * np.where(a < np.pi, 1.0, -1.0))
     y = near + radius * (1 - np.cos(a))
-    z = height + lift * np.sin(a + rounds)
+    flat = _even(np.stack([[*x, x[0]], [*y, y[0]], np.zeros(len(a) + 1)], axis=1), 0.02)[:-1]
+    flat[:, 2] = height + lift * np.sin(start + _angles(len(flat)))
+    speed *= rng.uniform(0.96, 1.04)
     edge = (rng.uniform(2.4, 2.8), -side * VIEW_EDGE * near)
-    return _loop_path(np.stack([x, y, z], axis=1), speed, 0.1 * speed, soften, 8.0 * speed, edge)
+    return _loop_path(flat, speed, 0.1 * speed, soften, 8.0 * speed, edge)
 
 
 # ---------------------------------------------------------------- attitude and gait
