@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from cotarget.assets import assets_dir
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform, pose
 
@@ -185,17 +186,20 @@ class TargetConfig:
         dimension: which of its dimensions that is.
         wanted_px: how large that dimension shall be in the close-up [px].
         detector: how it is found in the wide view.
+        template: picture of the target, cut to its outline, for one that is found by its colour; a relative path is
+            relative to rig.toml.
     """
 
     size: float
     dimension: Literal["width", "height", "wingspan"]
     wanted_px: float
     detector: Literal["colour", "motion"]
+    template: Path | None = None
 
 
 DEFAULT_TARGETS: Mapping[str, TargetConfig] = types.MappingProxyType(
     {
-        "book": TargetConfig(0.234, "width", 160.0, "colour"),
+        "book": TargetConfig(0.234, "width", 160.0, "colour", assets_dir() / "textures" / "book_front.png"),
         "person": TargetConfig(1.75, "height", 300.0, "motion"),
         "bird": TargetConfig(0.8, "wingspan", 160.0, "motion"),
     }
@@ -258,9 +262,14 @@ def load_config(path: Path) -> RigConfig:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: is not TOML: {error}") from None
     try:
-        return parse_config(table)
+        config = parse_config(table)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
+    beside = {  # an absolute template stays what it is
+        name: dataclasses.replace(target, template=target.template and path.parent / target.template)
+        for name, target in config.targets.items()
+    }
+    return dataclasses.replace(config, targets=beside)
 
 
 def parse_config(table: Mapping[str, Any]) -> RigConfig:
@@ -332,6 +341,8 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         if value not in args:
             raise ConfigError(f"{where}: {value!r} is not one of: {choices(args)}")
         return value
+    if hint is Path:
+        return Path(_convert(str, value, where))
     if hint is RigidTransform:
         return _convert_pose(value, where)
     if dataclasses.is_dataclass(hint):

@@ -3,6 +3,7 @@
 Everything that records, draws, scores or prints consumes Steps.
 """
 
+import dataclasses
 import enum
 import math
 from collections.abc import Iterator
@@ -14,10 +15,10 @@ from cotarget.detection import Detection, Detector
 from cotarget.errors import CotargetError
 from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, Rig, ZoomState
 from cotarget.targeting import Aim, Closeup, Reach, aim, depth_of, point_at
-from cotarget.tracking import FirstCome, Track, Tracker, size_for
+from cotarget.tracking import FirstCome, Track, Tracker, settings_for, size_for
 
-# The prediction is refined by the travel that it itself causes; a second round changes less than a step.
-LEAD_ROUNDS = 2
+# Longest interval between frames that is taken for the rhythm of commands [s]; a longer one was a gap.
+LONGEST_INTERVAL_S = 0.2
 
 
 class State(enum.StrEnum):
@@ -38,11 +39,14 @@ class FollowSettings:
         command_delay_s: from a command to the start of motion [s]; the aim leads the target by it.
         zoom_out_after_s: how long a target may be out of sight before the lens zooms out [s].
         focal_deadband: the lens is not moved for a smaller relative change of focal length.
+        margin: the lens zooms in only as far as the way that the head has still to go fits into this part of the
+            image's half height, so that the target is centred first.
     """
 
     command_delay_s: float = 0.0
     zoom_out_after_s: float = 0.4
     focal_deadband: float = 0.04
+    margin: float = 0.8
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,7 @@ def follow(
         CalibrationError: the calibration is of another aspect ratio than the rig's streams.
         StaleFrameError: frames stopped coming, or came too late to act on.
     """
-    tracker, policy = Tracker(), FirstCome()
+    tracker, policy = Tracker(settings_for(target), rig.fixed.size), FirstCome()
     shortest = rig.zoom.focal_range[0]
     state = rig.head.state()
     commanded = (state.pan, state.tilt, rig.zoom.zoom(shortest))
@@ -114,6 +118,7 @@ def follow(
     end, index = rig.clock.now() + seconds, 0
     while rig.clock.now() < end:
         frame = rig.fixed.read(newer_than=frame_t)
+        interval = min(frame.t - frame_t, LONGEST_INTERVAL_S) if frame_t is not None else LONGEST_INTERVAL_S
         frame_t = frame.t
         detections = detector.detect(frame)
         tracks = tracker.update(detections, frame.t)
@@ -128,12 +133,13 @@ def follow(
                 mode, reason = State.LOST, f"out of sight for {frame.t - last_seen:.1f} s"
             else:
                 try:
-                    aimed = lead(rig, calibration, target, chosen, settings.command_delay_s)
+                    aimed = lead(rig, calibration, target, chosen, settings.command_delay_s, interval)
                 except CotargetError as error:
                     mode, reason = State.UNREACHABLE, str(error)
         if aimed is not None:
             pan, tilt = rig.head.move(aimed.pan, aimed.tilt)
-            focal = _command_lens(rig, aimed.nominal_px, commanded[2], settings.focal_deadband)
+            nominal = min(aimed.nominal_px, _focal_while_turning(rig, pan, tilt, settings.margin))
+            focal = _command_lens(rig, nominal, commanded[2], settings.focal_deadband)
             commanded = (pan, tilt, focal)
         elif mode is not State.UNREACHABLE and commanded[2] > shortest:
             commanded = (*commanded[:2], rig.zoom.zoom(shortest))
@@ -156,8 +162,13 @@ def follow(
         index += 1
 
 
-def lead(rig: Rig, calibration: Calibration, target: TargetConfig, track: Track, command_delay_s: float) -> Aim:
-    """Aim at where a track will be when the head has got there.
+def lead(
+    rig: Rig, calibration: Calibration, target: TargetConfig, track: Track, command_delay_s: float, interval_s: float
+) -> Aim:
+    """Aim so that the head keeps up with a track: the unit brakes to rest at every goal, so the goal lies ahead.
+
+    At the next command's effect the head shall be where the target then is, and as fast; from there it needs
+    its stopping distance, rate^2 / (2 acceleration), so that much further lies the goal.
 
     Args:
         rig: gives the time, the limits and where the head is.
@@ -165,28 +176,47 @@ def lead(rig: Rig, calibration: Calibration, target: TargetConfig, track: Track,
         target: the target's known size and the size wanted.
         track: in the fixed view.
         command_delay_s: from command to motion [s].
+        interval_s: from one command to the next [s].
 
     Raises:
         UnreachableError: no pan and tilt within the limits do it.
     """
     limits, head = rig.head.limits, rig.head.state()
     reach = Reach(limits.pan, limits.tilt, rig.zoom.focal_range, (head.pan, head.tilt), limits.step)
+    closeup = Closeup(target.size, target.wanted_px)
     depth = depth_of(calibration, target, size_for(track, target.dimension))
-    start, travel = rig.clock.now() + command_delay_s, 0.0
-    for _ in range(LEAD_ROUNDS):
-        x_fixed = point_at(calibration, track.predict(start + travel), depth)
-        found = aim(calibration, x_fixed, reach, closeup=Closeup(target.size, target.wanted_px))
-        travel = travel_time(max(abs(found.pan - head.pan), abs(found.tilt - head.tilt)), limits)
-    return found
+    effect = rig.clock.now() + command_delay_s
+    at_effect, after = (
+        aim(calibration, point_at(calibration, track.predict(t), depth), reach, closeup=closeup)
+        for t in (effect, effect + interval_s)
+    )
+    pan, tilt = (
+        ahead + stopping_distance((ahead - now) / interval_s, limits)
+        for now, ahead in ((at_effect.pan, after.pan), (at_effect.tilt, after.tilt))
+    )
+    return dataclasses.replace(after, pan=pan, tilt=tilt)
 
 
-def travel_time(angle: float, limits: PanTiltLimits) -> float:
-    """How long a head takes from rest to rest over an angle [rad], by the trapezoidal profile [s]."""
-    if math.isinf(limits.speed) or math.isinf(limits.acceleration):
-        return 0.0
-    if angle * limits.acceleration < limits.speed**2:
-        return 2 * math.sqrt(angle / limits.acceleration)
-    return angle / limits.speed + limits.speed / limits.acceleration
+def stopping_distance(rate: float, limits: PanTiltLimits) -> float:
+    """How far an axis at that rate [rad/s] goes on while it brakes [rad], with the rate's sign."""
+    rate = min(max(rate, -limits.speed), limits.speed)
+    return rate * abs(rate) / (2 * limits.acceleration)
+
+
+def _focal_while_turning(rig: Rig, pan: float, tilt: float, margin: float) -> float:
+    """The longest nominal focal length [px] that keeps the goal inside the image while the head is still on its way.
+
+    Args:
+        rig: gives where the head is.
+        pan: the goal [rad].
+        tilt: likewise.
+        margin: part of the image's half height that the way still to go may take.
+    """
+    head = rig.head.state()
+    way = math.tan(min(math.hypot(pan - head.pan, tilt - head.tilt), 1.5))  # [rad], short of a right angle
+    half = margin * min(rig.zoom.size) / 2
+    longest = rig.zoom.focal_range[1]
+    return longest if way * longest <= half else max(half / way, rig.zoom.focal_range[0])
 
 
 def _command_lens(rig: Rig, nominal_px: float, commanded_px: float, deadband: float) -> float:

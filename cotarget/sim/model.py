@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-import cotarget
+from cotarget.assets import assets_dir
 from cotarget.config import BoardConfig, RigConfig, SimConfig
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import Array, RigidTransform, Rotation
@@ -23,13 +23,6 @@ BLACK, WHITE = (0.05, 0.05, 0.05, 1.0), (0.95, 0.95, 0.95, 1.0)
 ARM_RADIUS = 0.012  # [m], the bracket between the head and the zoom camera
 # Sensor pixels are given this size [m]; only ratios to the focal length matter to the renderer.
 RENDER_PITCH = 1e-5
-
-
-def assets_dir() -> Path:
-    """Where sim_assets lies: inside the installed package, or beside it in a checkout."""
-    package = Path(cotarget.__file__).parent
-    inside = package / "sim_assets"
-    return inside if inside.is_dir() else package.parent / "sim_assets"
 
 
 def scene_path(scene: str) -> Path:

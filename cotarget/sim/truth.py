@@ -53,6 +53,7 @@ class Truth:
         set_state: brings the world to a time.
         fixed_lens: the wide camera's optics.
         zoom_lens: the zoom camera's optics at a time.
+        zoom_lens_for: its optics at what the device calls a focal length [px].
         T_world_fixed: the fixed camera.
         T_world_base: the pan-tilt unit.
         head_at: the platform's pan and tilt [rad] at a time.
@@ -64,6 +65,7 @@ class Truth:
     set_state: Callable[[float], "mujoco.MjData"]
     fixed_lens: TrueLens
     zoom_lens: Callable[[float], TrueLens]
+    zoom_lens_for: Callable[[float], TrueLens]
     T_world_fixed: RigidTransform
     T_world_base: RigidTransform
     head_at: Callable[[float], tuple[float, float]]
@@ -88,6 +90,24 @@ class Truth:
         x_world = np.asarray(x_world, dtype=float)
         x_camera = self.T_world_camera(camera, t).inv().apply(x_world.reshape(-1, 3))
         return self.lens(camera, t).project(x_camera).reshape(*x_world.shape[:-1], 2)
+
+    def line_of_sight_miss(self, pan: float, tilt: float, nominal_px: float, x_world: Array) -> float:
+        """Angle between the ray through the middle of the zoom image and a point, with the head at pan, tilt [rad].
+
+        Args:
+            pan: of the platform, not rounded to steps [rad].
+            tilt: likewise.
+            nominal_px: what the device calls the focal length [px].
+            x_world: the point [m], (3,).
+        """
+        data = self.set_state(0.0)
+        data.joint(RIG + "pan").qpos[0], data.joint(RIG + "tilt").qpos[0] = pan, tilt
+        mujoco.mj_kinematics(self.model, data)
+        x_zoom = self._body_pose(data, "zoom").inv().apply(x_world)
+        lens = self.zoom_lens_for(nominal_px)
+        xy = lens.directions((np.array(lens.size) - 1) / 2)
+        ray = np.append(xy, 1.0)
+        return float(np.arctan2(np.linalg.norm(np.cross(ray, x_zoom)), ray @ x_zoom))
 
     def silhouette(self, name: str, camera: CameraName, t: float) -> Silhouette | None:
         """A target's outline in a camera at time t; None if any of it is behind the camera."""

@@ -72,6 +72,7 @@ class SimWorld:
             set_state=self._set_state,
             fixed_lens=self._fixed_lens,
             zoom_lens=self.zoom_lens_at,
+            zoom_lens_for=self.zoom_lens_for,
             T_world_fixed=self._T_world_fixed,
             T_world_base=base_pose(self._T_world_fixed, self.config.sim),
             head_at=self._head.angles_at,
@@ -81,7 +82,11 @@ class SimWorld:
 
     def zoom_lens_at(self, t: float) -> TrueLens:
         """The zoom camera's true optics at a time up to now."""
-        factor = self._zoom.focal_at(t) / self._zoom.focal_range[0]
+        return self.zoom_lens_for(self._zoom.focal_at(t))
+
+    def zoom_lens_for(self, nominal_px: float) -> TrueLens:
+        """The zoom camera's true optics at what its device calls a focal length [px]."""
+        factor = nominal_px / self._zoom.focal_range[0]
         fx, fy = self._zoom_lens.focal_px
         return replace(self._zoom_lens, focal_px=(fx * factor, fy * factor))
 
