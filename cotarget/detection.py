@@ -14,6 +14,7 @@ from cotarget.config import TargetConfig
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
+from cotarget.templatefit import MARGIN_PX, fit_template
 
 # What MOG2 writes into its mask: 255 is foreground, 127 a shadow.
 FOREGROUND = 255
@@ -222,24 +223,27 @@ LEAST_CHROMA = 20.0
 # A pixel is taken for the template's colour when it has at least this part of its chroma ...
 LEAST_WEIGHT = 0.35
 # ... and its chroma points at most this far away from the template's (tangent of the angle in the chroma plane).
-HUE_TANGENT = 0.5
+HUE_TANGENT = 0.6
+# The template's chroma becomes this value of a byte, so that brighter light does not saturate.
+CHROMA_BYTE = 128.0
 # Fewest pixels of a target that is found by its colour.
 LEAST_PIXELS = 12
-# How far beyond its coarse box a target's pixels are looked at [px]: blur and subsampled chroma reach 3 px.
-MARGIN_PX = 4
+# A target this small beside the image is looked for; a larger patch of its colour is the scene.
+LARGEST_COLOURED = 0.5
+# A detection must explain this part of the variation around it.
+LEAST_FIT = 0.3
 
 
 class ColourDetector:
-    """What has a template's colour, located by the moments of how much of that colour each pixel has.
+    """What has a template's colour, located to a fraction of a pixel by fitting the template to it.
 
-    The weight of a pixel is its chroma along the template's mean chroma. It is linear in the pixel's colour, so
-    that blur, mixed pixels at the border and subsampled chroma move weight about but make none, and the moments
-    give the box to a fraction of a pixel. What in the template has another colour (a title, a marker) is
-    accounted for by comparing with the template's own moments.
+    Everything happens in one plane: a pixel's chroma along the template's mean chroma. It is linear in the colour,
+    so that blur, mixed pixels at the border and subsampled chroma bias nothing, and it is zero for grey, so that
+    shadows and white walls do not matter.
     """
 
     def __init__(self, template: Image) -> None:
-        """Learn the colour.
+        """Learn the colour and what of the template has it.
 
         Args:
             template: (h, w, 3) BGR picture of the target, cut to its outline; its scale does not matter.
@@ -253,55 +257,46 @@ class ColourDetector:
         if length < LEAST_CHROMA:
             raise ConfigError("the colour template is almost grey; give a picture of the target with a strong colour")
         self._along = chroma / length
-        self._across = np.cross(np.full(3, 1 / np.sqrt(3)), self._along)
-        weight = template.astype(float) @ self._along
-        self._strong = float(np.percentile(weight, 75))
-        mass, center, spread = _moments(weight)
-        shape = np.array([template.shape[1], template.shape[0]], dtype=float)
-        self._fill = mass / weight.size / self._strong
-        self._offset = (center - (shape - 1) / 2) / shape
-        self._spread = spread / shape**2
+        across = np.cross(np.full(3, 1 / np.sqrt(3)), self._along)
+        plane = template.astype(float) @ self._along
+        self._plane = (plane / np.percentile(plane, 75)).astype(np.float32)
+        tests = np.vstack([self._along, HUE_TANGENT * self._along - across, HUE_TANGENT * self._along + across])
+        self._tests = tests * CHROMA_BYTE / np.percentile(plane, 75)
+        self._shape: tuple[int, ...] | None = None
         self.mask: Image | None = None
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """Find what has the template's colour, the largest first."""
-        planes = cv2.transform(frame.image, np.vstack([self._along, self._across]) / self._strong * 128.0)
-        along, across = planes[..., 0], planes[..., 1]
-        del across
-        self.mask = cv2.compare(along, LEAST_WEIGHT * 128.0, cv2.CMP_GE)
+        """Find what has the template's colour and shape, the best likeness first.
+
+        Raises:
+            CotargetError: the image's size changed.
+        """
+        _check_size(self._shape, frame.image)
+        self._shape = frame.image.shape
+        tests = cv2.transform(frame.image, self._tests)  # saturates at 0: a wrong hue fails one of the last two
+        self.mask = cv2.inRange(tests, (LEAST_WEIGHT * CHROMA_BYTE, 1, 1), (255, 255, 255))
+        joined = cv2.dilate(self.mask, np.ones((3, 3), np.uint8))
         found = []
-        for contour in cv2.findContours(self.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
+        for contour in cv2.findContours(joined, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
             x, y, w, h = cv2.boundingRect(contour)
-            area = cv2.countNonZero(self.mask[y : y + h, x : x + w])
-            if area >= LEAST_PIXELS:
-                found.append((area, self._refine(frame.image, x, y, w, h)))
-        found.sort(key=lambda pair: -pair[0])
-        return [detection for _, detection in found]
+            inside = self.mask[y : y + h, x : x + w]
+            if cv2.countNonZero(inside) < LEAST_PIXELS:
+                continue
+            dx, dy, w, h = cv2.boundingRect(inside)
+            if max(w / self.mask.shape[1], h / self.mask.shape[0]) <= LARGEST_COLOURED:
+                found.append(self._refine(frame.image, _detection(x + dx, y + dy, w, h, 0.0, self.mask.shape)))
+        return sorted((d for d in found if d.score >= LEAST_FIT), key=lambda d: -d.score)
 
-    def _refine(self, image: Image, x: int, y: int, w: int, h: int) -> Detection:
+    def _refine(self, image: Image, coarse: Detection) -> Detection:
         """Locate the target in its coarse box to a fraction of a pixel."""
-        x0, y0 = max(0, x - MARGIN_PX), max(0, y - MARGIN_PX)
-        part = image[y0 : y + h + MARGIN_PX, x0 : x + w + MARGIN_PX].astype(float) @ self._along
-        border = np.concatenate([part[0], part[-1], part[:, 0], part[:, -1]])
-        part = part - np.median(border)
-        mass, center, spread = _moments(part)
-        size = np.sqrt(np.maximum(1.0, spread / self._spread))
-        center = center - self._offset * size + np.array([x0, y0])
-        coarse = _detection(x, y, w, h, 0.0, image.shape)
-        score = min(1.0, mass / (self._strong * self._fill * float(np.prod(size))))
-        return Detection(center, size, max(0.0, score), coarse.clipped)
-
-
-def _moments(weight: Array) -> tuple[float, Array, Array]:
-    """Sum, mean (u, v) and variance (uu, vv) of an image of weights, in pixels."""
-    mass = float(weight.sum())
-    if mass <= 0:
-        return 0.0, (np.array(weight.shape[::-1]) - 1) / 2.0, np.ones(2)
-    u, v = np.arange(weight.shape[1]), np.arange(weight.shape[0])
-    columns, rows = weight.sum(axis=0), weight.sum(axis=1)
-    center = np.array([columns @ u, rows @ v]) / mass
-    spread = np.array([columns @ (u - center[0]) ** 2, rows @ (v - center[1]) ** 2]) / mass
-    return mass, center, np.maximum(0.0, spread)
+        low = np.maximum(0, np.rint(coarse.center_px - coarse.size_px / 2 - MARGIN_PX)).astype(int)
+        high = np.rint(coarse.center_px + coarse.size_px / 2 + MARGIN_PX).astype(int) + 1
+        part = image[low[1] : high[1], low[0] : high[0]].astype(np.float32) @ self._along.astype(np.float32)
+        fit = fit_template(self._plane, part, coarse.center_px - low, coarse.size_px)
+        if fit is None:
+            return coarse
+        center, size, likeness = fit
+        return Detection(center + low, size, likeness, coarse.clipped)
 
 
 def make_detector(target: TargetConfig, rate_hz: float, template: Image | None = None) -> Detector:
