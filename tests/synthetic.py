@@ -119,9 +119,13 @@ def aim(calibration, x_fixed):
         x = model.in_zoom(x_fixed[None], *q)[0]
         return x[:2] / abs(x[2]) - ray[:2]
 
-    x = model.in_zoom(x_fixed[None], 0.0, 0.0)[0]
+    x = (model.hand * model.gamma).apply(x_fixed)  # from the unit's own middle, the way to look at first
     start = [np.arctan2(x[0], x[2]), np.arctan2(-x[1], np.hypot(x[0], x[2]))]
-    return least_squares(off, start, xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+    for nudge in ([0.0, 0.0], [0.3, 0.0], [-0.3, 0.0], [0.0, 0.3], [0.0, -0.3]):
+        found = least_squares(off, np.add(start, nudge), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        if found.cost < 1e-16 and model.in_zoom(x_fixed[None], *found.x)[0, 2] > 0:
+            return found.x
+    raise AssertionError(f"no pan and tilt found for {x_fixed}")
 
 
 def pointing_errors(calibration: Calibration, truth: Truth, rng, count=200):

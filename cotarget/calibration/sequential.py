@@ -18,7 +18,8 @@ from cotarget.calibration.bundle import Fit, fit, rms
 from cotarget.calibration.handeye import motions, park_martin
 from cotarget.calibration.intrinsics import board_pose, calibrate_camera
 from cotarget.calibration.model import CameraName, Rejected, Residuals, View
-from cotarget.calibration.reprojection import RigModel
+from cotarget.calibration.placing import place_boards
+from cotarget.calibration.reprojection import Block, RigModel
 from cotarget.camera import Intrinsics
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
@@ -60,17 +61,17 @@ def sequential(
     used = (*fixed_views, *zoom_views)
     pairs = _pairs(used)
     model, stereo_fit = _gamma(RigModel(boards={}, fixed=fixed, zoom=zoom), pairs, points)
-    model = _place_boards(model, fixed_views, points)
     has_head = any(not at_home(view) for view in zoom_views)
     handeye_rms = None
     if has_head:
         model = replace(model, hand=_hand(model, zoom_views, points))
-        model = _place_boards(model, zoom_views, points)
+        model = place_boards(model, used, points)
         hand_fit = fit(model, zoom_views, points, {"hand", "head"})
         model, handeye_rms = replace(model, hand=hand_fit.model.hand, head=hand_fit.model.head), hand_fit.rms_px
     if refine:
-        everything = {"fixed", "zoom", "gamma"} | ({"hand", "head"} if has_head else set())
-        final = fit(model, used, points, everything)  # type: ignore[arg-type]
+        model = model if has_head else place_boards(model, used, points)
+        everything: tuple[Block, ...] = ("fixed", "zoom", "gamma", "hand", "head")
+        final = fit(model, used, points, everything if has_head else everything[:3])
         model = final.model
         handeye_rms = rms(final.residuals[len(fixed_views) :]) if has_head else None
     residuals = Residuals(
@@ -145,25 +146,6 @@ def _most_central(candidates: Sequence[RigidTransform], scale: float) -> RigidTr
     far = np.linalg.norm(t[:, None] - t[None], axis=-1) / scale
     turned = np.array([(q * one.inv()).magnitude() for one in q])
     return candidates[int(np.argmin(np.median(far + turned, axis=1)))]
-
-
-def _place_boards(model: RigModel, views: Sequence[View], points: Array) -> RigModel:
-    """Give every placement without a pose yet the one that its first view tells."""
-    boards = dict(model.boards)
-    for view in views:
-        if view.board in boards:
-            continue
-        lens = model.fixed if view.camera == "fixed" else model.zoom
-        assert lens is not None
-        T = board_pose(lens, view.corners_px, points)
-        boards[view.board] = T if view.camera == "fixed" else _zoom_fixed(model, view).inv() * T
-    return replace(model, boards=boards)
-
-
-def _zoom_fixed(model: RigModel, view: View) -> RigidTransform:
-    """Where the fixed camera is seen from the zoom camera of a view (Eq. 2)."""
-    P = base_head(view.pan, view.tilt, model.head)
-    return model.hand.inv() * P.inv() * model.hand * model.gamma
 
 
 def _hand(model: RigModel, views: Sequence[View], points: Array) -> RigidTransform:
