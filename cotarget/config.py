@@ -233,6 +233,11 @@ class RigConfig:
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     targets: Mapping[str, TargetConfig] = field(default_factory=lambda: DEFAULT_TARGETS)
 
+    @property
+    def command_delay_s(self) -> float:
+        """From a command to the start of motion, as far as it is known [s]."""
+        return self.sim.head.command_delay_s if self.sim.effects.command_delay else 0.0
+
     def target(self, name: str) -> TargetConfig:
         """Look a target up by name.
 

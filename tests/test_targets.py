@@ -88,19 +88,19 @@ def test_moves_at_its_own_speed(name, scene, low, high):
         assert speed.max() < high
 
 
-def test_bird_turns_gently_where_it_can_be_seen():
+def test_bird_turns_at_20_to_25_metres_where_it_can_be_seen():
     for seed in SEEDS:
         path = make("bird", "outdoor", seed).path
         v = np.array([path.velocity(t) for t in SECONDS])
         a = np.array([path.acceleration(t) for t in SECONDS])
         turn = np.linalg.norm(np.cross(v, a), axis=1) / np.linalg.norm(v, axis=1) ** 3
-        assert 1 / turn.max() > 5.8  # of circles of 6.2 m and more that rise and fall
+        assert 1 / turn.max() > 2.2  # of circles of 2.5 m and more that rise and fall
         points = positions(make("bird", "outdoor", seed))[SECONDS > 5]
         distance = np.linalg.norm(points - MOUNT, axis=1)
-        assert distance.min() > 18.0
-        assert distance.max() < 33.0
+        assert distance.min() > 19.5
+        assert distance.max() < 27.0
         assert points[:, 2].min() > 3.0
-        assert points[:, 2].max() < 9.0
+        assert points[:, 2].max() < 10.5
 
 
 @pytest.mark.parametrize(("name", "scene"), CASES)
@@ -110,7 +110,7 @@ def test_motion_is_smooth(name, scene):
     times = np.arange(0.0, 12.0, step)
     poses = [target.pose(t) for t in times]
     acceleration = np.diff([p.T_world_target.translation for p in poses], 2, axis=0) / step**2
-    assert np.abs(acceleration).max() < 8.0  # 5 m/s round 6 m takes 4.2 m/s^2
+    assert np.abs(acceleration).max() < 12.0  # 5 m/s round 2.5 m takes 10 m/s^2
     turn = [(a.T_world_target.rotation.inv() * b.T_world_target.rotation).magnitude() for a, b in pairwise(poses)]
     assert np.max(turn) / step < 4.0  # rad/s: no jump of heading or bank
     for joint in poses[0].joints:

@@ -21,6 +21,7 @@ BOARD_THICKNESS = 0.004  # [m]
 BOARD_MARGIN = 0.6  # white border around the squares, in squares
 BLACK, WHITE = (0.05, 0.05, 0.05, 1.0), (0.95, 0.95, 0.95, 1.0)
 ARM_RADIUS = 0.012  # [m], the bracket between the head and the zoom camera
+CAMERA_FOOT = (0.0, 0.038, -0.086)  # where the zoom camera's housing stands on it, in the camera's frame [m]
 # Sensor pixels are given this size [m]; only ratios to the focal length matter to the renderer.
 RENDER_PITCH = 1e-5
 
@@ -122,7 +123,7 @@ def _edit_rig(
         rig.body("tilt").pos, rig.body("head").pos = (0.0, 0.0, dz), (0.0, 0.0, -dz)
         rig.joint("tilt").axis = (np.cos(eps), np.sin(eps), 0.0)
     arm = rig.geom("arm")
-    arm.fromto = [0.0, 0.0, 0.0, *sim.T_head_zoom.translation]
+    arm.fromto = [0.0, 0.0, 0.0, *sim.T_head_zoom.apply(CAMERA_FOOT)]
     arm.size = [ARM_RADIUS, 0.0, 0.0]
     for name in ("fixed", "zoom"):
         camera = rig.camera(name)

@@ -264,7 +264,7 @@ def _bird_path(scene: str, rng: np.random.Generator) -> Path:
     if scene == "indoor":
         radius, across, near, height, rise, speed, soften = rng.uniform(2.0, 2.2), 0.8, 7.4, 2.3, 0.25, 2.9, 0.5
     else:
-        radius, across, near, height, rise, speed, soften = rng.uniform(6.2, 6.5), 2.2, 18.6, 5.7, 1.6, 5.0, 1.2
+        radius, across, near, height, rise, speed, soften = rng.uniform(2.5, 2.8), 4.4, 19.4, 7.8, 1.6, 5.0, 0.6
     height += 0.3 * rise * rng.uniform(-1, 1)
     start, lift = rng.uniform(0, 2 * np.pi), rise * rng.uniform(0.7, 1.0)
     x = side * (radius * np.sin(a) + across * np.where(a < np.pi, 1.0, -1.0))

@@ -22,6 +22,7 @@ from cotarget.sim.model import (
     quaternion,
 )
 from cotarget.sim.opengl import make_renderer, mujoco
+from cotarget.sim.portrait import Portrait, portrait
 from cotarget.sim.sensor import Sensor
 from cotarget.sim.targets import Target, make_target
 from cotarget.sim.truth import Truth
@@ -105,6 +106,10 @@ class SimWorld:
         self._renderer.update_scene(data, cam_id, option)
         pinhole = self._renderer.render()[..., ::-1]
         return bend(np.ascontiguousarray(pinhole), focal, lens)
+
+    def portrait(self, azimuth_deg: float, axes: bool) -> Portrait:
+        """A picture of the rig as it is now, seen in a direction [degrees], with or without its frames' axes."""
+        return portrait(self._model, self._set_state(self._clock.now()), azimuth_deg, axes)
 
     def close(self) -> None:
         """Release the renderer; more than once does no harm."""

@@ -1,0 +1,173 @@
+"""Pictures from Steps: side by side frames, one picture a target, and the aim error over time."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from cotarget.geometry import Array
+from cotarget.loop import State, Step
+from cotarget.metrics import Row
+from cotarget.rig import Image
+
+FOUND, FOLLOWED, CROSS, INK, PAPER, ARROW = (
+    (190, 190, 0),
+    (0, 200, 255),
+    (80, 220, 80),
+    (40, 40, 40),
+    (250, 250, 250),
+    (0, 120, 235),
+)
+STRIP_PX = 36  # height of a caption
+BOX_MARGIN_PX = 4  # a box stands this far outside of what it marks
+
+
+def write_text(image: Image, text: str, at: Sequence[float], scale: float = 0.55, *, halo: bool = True) -> None:
+    """Write text into an image, in dark ink; with a light halo where the background is a picture."""
+    u, v = round(at[0]), round(at[1])
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    for du, dv in ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, 1), (-1, 1), (1, -1)) if halo else ():
+        cv2.putText(image, text, (u + du, v + dv), font, scale, PAPER, 1, cv2.LINE_AA)
+    cv2.putText(image, text, (u, v), font, scale, INK, 1, cv2.LINE_AA)
+
+
+def captioned(image: Image, text: str) -> Image:
+    """An image with a caption below."""
+    strip = np.full((STRIP_PX, image.shape[1], 3), PAPER, np.uint8)
+    write_text(strip, text, (10, STRIP_PX - 12), halo=False)
+    return np.vstack([image, strip])
+
+
+def draw_wide(step: Step) -> Image:
+    """The wide view with every confirmed track's box, the one followed in another colour, (H, W, 3)."""
+    image = step.fixed.image.copy()
+    for track in step.tracks:
+        if not track.confirmed:
+            continue
+        followed = step.target is not None and track.id == step.target.id
+        half = track.size_px / 2 + BOX_MARGIN_PX
+        low, high = np.rint(track.center_px - half).astype(int), np.rint(track.center_px + half).astype(int)
+        colour = FOLLOWED if followed else FOUND
+        cv2.rectangle(image, low.tolist(), high.tolist(), colour, 2 if followed else 1, cv2.LINE_AA)
+        write_text(image, f"{track.id}", (high[0] + 3, low[1] + 10))
+    return image
+
+
+def draw_zoom(step: Step) -> Image:
+    """The zoom view with a small cross at its centre."""
+    image = step.zoom.image.copy()
+    u, v = image.shape[1] // 2, image.shape[0] // 2
+    for a, b in (
+        ((u - 12, v), (u - 4, v)),
+        ((u + 4, v), (u + 12, v)),
+        ((u, v - 12), (u, v - 4)),
+        ((u, v + 4), (u, v + 12)),
+    ):
+        cv2.line(image, a, b, CROSS, 1, cv2.LINE_AA)
+    return image
+
+
+def side_by_side(step: Step, title: str) -> Image:
+    """One frame of the video: the wide view with its detection, the zoom view, and what the loop does."""
+    pan, tilt = np.degrees(step.head.pan), np.degrees(step.head.tilt)
+    depth = f"depth {step.aim.depth:5.1f} m" if step.aim is not None else ""
+    wide = captioned(draw_wide(step), f"{title}   t = {step.fixed.t:5.2f} s   {step.state}   {depth}")
+    close = captioned(
+        draw_zoom(step),
+        f"zoom view   pan {pan:6.2f}   tilt {tilt:6.2f} deg   focal length {step.lens.focal_px:5.0f} px",
+    )
+    height = max(wide.shape[0], close.shape[0])
+    padded = [
+        cv2.copyMakeBorder(i, 0, height - i.shape[0], 0, 0, cv2.BORDER_CONSTANT, value=PAPER) for i in (wide, close)
+    ]
+    return np.hstack(padded)
+
+
+class TargetStages:
+    """Picks from a run of Steps what one picture of a target shows: before, centred, and close up."""
+
+    def __init__(self, shortest_px: float) -> None:
+        """Begin; ``shortest_px`` is the shortest nominal focal length."""
+        self._shortest = shortest_px
+        self._zoomed = False
+        self.before: Step | None = None
+        self.centred: Step | None = None
+        self.close: Step | None = None
+        self._best = np.inf
+
+    def see(self, step: Step) -> None:
+        """Take a Step into account."""
+        if self.before is None or (step.target is None and self.centred is None):
+            self.before = step
+        if step.state is not State.FOLLOWING or step.aim is None or step.target is None:
+            return
+        if not self._zoomed and step.lens.focal_px < 1.02 * self._shortest:
+            self.centred = step
+        else:
+            self._zoomed = True
+        # The best close-up, as far as the loop itself knows: the lens where it should be, the head where it should be.
+        away = abs(np.log(step.lens.focal_px / step.aim.nominal_px))
+        away += (
+            np.hypot(step.head.pan - step.aim.pan, step.head.tilt - step.aim.tilt)
+            * step.aim.focal_px
+            / step.zoom.image.shape[1]
+        )
+        if self._zoomed and away <= self._best:
+            self._best, self.close = away, step
+
+    def picture(self, title: str) -> Image:
+        """The wide view with its detection and the zoom view before, centred and close up, as in Fig. 4 to 6."""
+        missing = next(s for s in (self.close, self.centred, self.before) if s is not None)
+        before, centred, close = self.before or missing, self.centred or missing, self.close or missing
+        wide = close if self.close else missing
+        panels = [
+            captioned(draw_wide(wide), f"(a) {title}: wide view and detection"),
+            captioned(before.zoom.image, "(b) zoom view before"),
+            captioned(draw_zoom(centred), "(c) zoom view, centred"),
+            captioned(draw_zoom(close), f"(d) close-up at {close.lens.focal_px:.0f} px"),
+        ]
+        return np.vstack([np.hstack(panels[:2]), np.hstack(panels[2:])])
+
+
+def draw_frames(image: Image, origins_px: Mapping[str, Array]) -> Image:
+    """The rig's picture with the names of its frames, Gamma and T, as in Fig. 2.
+
+    Args:
+        image: the rig.
+        origins_px: pixels of the origins of the frames fixed, zoom and base, (2,) each.
+    """
+    image = image.copy()
+    fixed, zoom, base = (np.asarray(origins_px[name]) for name in ("fixed", "zoom", "base"))
+    for start, end, text in ((fixed, zoom, "Gamma"), (zoom, base, "T")):
+        a, b = np.rint(start).astype(int).tolist(), np.rint(end).astype(int).tolist()
+        cv2.arrowedLine(image, a, b, PAPER, 4, cv2.LINE_AA, tipLength=0.08)
+        cv2.arrowedLine(image, a, b, ARROW, 2, cv2.LINE_AA, tipLength=0.08)
+        write_text(image, text, (start + end) / 2 + [-14, 24])
+    write_text(image, "{L} fixed", fixed + np.array([-50, -24]))
+    write_text(image, "{R0} zoom at home", zoom + np.array([14, -24]))
+    write_text(image, "{O} base, {P} head", base + np.array([24, 6]))
+    return image
+
+
+def plot_aim_error(path: Path, rows: Mapping[str, Sequence[Row]]) -> None:
+    """Draw the target's offset from the centre of the zoom image over time, one panel a target, into a PNG."""
+    with matplotlib.rc_context({"font.size": 9}):
+        figure = Figure(figsize=(8, 2.4 * len(rows)), layout="constrained")
+        FigureCanvasAgg(figure)
+        for ax, (name, run) in zip(np.atleast_1d(figure.subplots(len(rows), 1)), rows.items(), strict=True):
+            t = np.array([row.t_s for row in run])
+            offset = np.array([100 * row.tpo_px / row.width_px if row.inside else np.nan for row in run])
+            ax.plot(t, offset, lw=1.2, color="#1f6f8b")
+            out = np.array([not row.in_frame and row.in_wide for row in run])
+            ax.fill_between(t, 0, 50, where=out, color="#d9534f", alpha=0.15, lw=0, label="not in the close-up")
+            ax.set(ylim=(0, 50), xlim=(t[0], t[-1]), ylabel="offset [% of width]", title=name)
+            zoom = ax.twinx()
+            zoom.semilogy(t, [row.focal_px for row in run], lw=0.8, color="#999999")
+            zoom.set_ylabel("focal length [px]", color="#777777")
+            ax.legend(loc="upper right", frameon=False)
+        ax.set_xlabel("time [s]")
+        figure.savefig(path, dpi=110)
