@@ -90,7 +90,7 @@ def settings_for(target: TargetConfig) -> TrackerSettings:
     if target.detector == "colour":
         return TrackerSettings(noise_px=0.2, noise_of_size=0.01)
     if target.dimension == "wingspan":
-        return TrackerSettings(confirm_travel=0.5)
+        return TrackerSettings(acceleration_px=250.0, noise_of_size=0.2, confirm_travel=0.5)
     return TrackerSettings(confirm_travel=0.1, noise_of_size=0.04)
 
 
