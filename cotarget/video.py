@@ -1,0 +1,153 @@
+"""Films in and out: any that PyAV can decode, and H.264 yuv420p that any player and browser opens."""
+
+import contextlib
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+
+import av
+import cv2
+import numpy as np
+
+from cotarget.errors import CotargetError
+from cotarget.rig import Frame, Image
+
+# For a film that does not say how fast it is [frames/s].
+FALLBACK_RATE_HZ = 25.0
+# x264's constant quality: 18 is close to invisible loss, 23 its default; boxes and digits stay sharp at 20.
+QUALITY = "20"
+
+
+class Film:
+    """A film, opened; iterate over it for its frames. A context manager.
+
+    Attributes:
+        path: its file.
+        size: (width, height) [px].
+        rate_hz: its mean frames a second.
+        count: how many frames it says it has; None where it does not say.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a film.
+
+        Raises:
+            CotargetError: the file is missing, is no film, or has no video stream.
+        """
+        if path.is_dir():
+            raise CotargetError(f"{path}: is a directory; give the path of a film")
+        if not path.exists():
+            raise CotargetError(f"{path}: no such file; give the path of a film")
+        self.path = path
+        try:
+            self._container = av.open(str(path))
+        except (av.error.FFmpegError, OSError, ValueError) as error:
+            raise CotargetError(
+                f"{path}: cannot be read as a film ({_reason(error)}); give e.g. an mp4 or avi"
+            ) from None
+        if not self._container.streams.video:
+            self._container.close()
+            raise CotargetError(f"{path}: has no video stream; give a film with pictures")
+        stream = self._container.streams.video[0]
+        stream.thread_type = "AUTO"
+        self.size = (int(stream.width), int(stream.height))
+        self.rate_hz = float(stream.average_rate or stream.guessed_rate or FALLBACK_RATE_HZ)
+        self.count: int | None = stream.frames or None
+
+    def __enter__(self) -> "Film":
+        """Give the film itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the file."""
+        self._container.close()
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Decode the frames in order; times are the film's own [s], or by the count where it has none.
+
+        Raises:
+            CotargetError: nothing can be decoded, or the picture's size changes on the way.
+        """
+        index = 0
+        try:
+            for index, picture in enumerate(self._container.decode(video=0), start=1):
+                image = picture.to_ndarray(format="bgr24")
+                if (image.shape[1], image.shape[0]) != self.size:
+                    raise CotargetError(
+                        f"{self.path}: the picture's size changes from {self.size[0]}x{self.size[1]} to "
+                        f"{image.shape[1]}x{image.shape[0]} at frame {index - 1}; cut the film there"
+                    )
+                yield Frame(image, (index - 1) / self.rate_hz if picture.time is None else float(picture.time))
+        except av.error.FFmpegError as error:
+            raise CotargetError(f"{self.path}: cannot be decoded after frame {index - 1} ({_reason(error)})") from None
+        if index == 0:
+            raise CotargetError(f"{self.path}: holds no frame that can be decoded; give a complete film")
+
+
+class VideoWriter:
+    """Writes a film as H.264 yuv420p; it appears under its name only when complete. A context manager."""
+
+    def __init__(self, path: Path, rate_hz: float) -> None:
+        """Prepare to write.
+
+        Args:
+            path: the film, with a suffix that names a container, such as .mp4.
+            rate_hz: frames a second.
+
+        Raises:
+            CotargetError: the folder is missing or the suffix names no container.
+        """
+        self._path = path
+        self._part = path.with_name(f".{path.stem}.part{path.suffix}")
+        self._rate = Fraction(rate_hz).limit_denominator(1001 * 30)
+        try:
+            self._container = av.open(str(self._part), "w")
+        except (av.error.FFmpegError, OSError, ValueError) as error:
+            raise CotargetError(f"{path}: cannot be written ({_reason(error)}); name e.g. an .mp4") from None
+        self._stream: av.VideoStream | None = None
+
+    def write(self, image: Image) -> None:
+        """Append an image, (H, W, 3) BGR; an odd side is made even by repeating its last row or column.
+
+        Raises:
+            CotargetError: the container cannot hold H.264.
+        """
+        height, width = image.shape[:2]
+        if height % 2 or width % 2:
+            image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE).astype(np.uint8)
+        try:
+            if self._stream is None:
+                self._stream = self._container.add_stream("libx264", rate=self._rate, options={"crf": QUALITY})
+                self._stream.width, self._stream.height = image.shape[1], image.shape[0]
+                self._stream.pix_fmt = "yuv420p"
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24")
+            self._container.mux(self._stream.encode(picture))
+        except (av.error.FFmpegError, ValueError) as error:
+            raise CotargetError(f"{self._path}: cannot be written ({_reason(error)}); name e.g. an .mp4") from None
+
+    def __enter__(self) -> "VideoWriter":
+        """Give the writer itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Complete the film and give it its name; after an error, remove what there is."""
+        try:
+            if kind is None and self._stream is not None:
+                self._container.mux(self._stream.encode(None))
+        finally:
+            with contextlib.suppress(av.error.FFmpegError):
+                self._container.close()
+        if kind is None and self._stream is not None:
+            self._part.replace(self._path)
+        else:
+            self._part.unlink(missing_ok=True)
+
+
+def _reason(error: Exception) -> str:
+    """The first line of an error, without the path that FFmpeg appends."""
+    return (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0]
