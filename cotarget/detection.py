@@ -305,13 +305,19 @@ def make_detector(target: TargetConfig, rate_hz: float, template: Image | None =
     Args:
         target: the target.
         rate_hz: the camera's nominal frames a second.
-        template: (h, w, 3) BGR picture of the target, for a target that is found by its colour.
+        template: (h, w, 3) BGR picture of the target, for one that is found by its colour; the configured
+            picture by default.
 
     Raises:
-        ConfigError: a colour target without a template.
+        ConfigError: a colour target without a usable template.
     """
-    if target.detector == "colour":
-        if template is None:
-            raise ConfigError('a target with detector = "colour" needs a template picture of the target')
-        return ColourDetector(template)
-    return MotionDetector(BIRD if target.dimension == "wingspan" else PERSON, rate_hz)
+    if target.detector == "motion":
+        return MotionDetector(BIRD if target.dimension == "wingspan" else PERSON, rate_hz)
+    if template is None:
+        if target.template is None:
+            raise ConfigError('a target with detector = "colour" needs a template, a picture of the target')
+        read = cv2.imread(str(target.template), cv2.IMREAD_COLOR) if target.template.is_file() else None
+        if read is None:
+            raise ConfigError(f"{target.template}: is not a picture; a target's template is a PNG or JPEG of it")
+        template = read.astype(np.uint8)
+    return ColourDetector(template)

@@ -15,7 +15,7 @@ from cotarget.errors import CotargetError
 from cotarget.geometry import Array
 from cotarget.rig import Image
 from cotarget.tracking import Track, Tracker, settings_for
-from cotarget.video import Film, VideoWriter
+from cotarget.video import Film, FilmWriter
 
 COLUMNS = ("frame", "t", "track", "u_px", "v_px", "width_px", "height_px", "score")
 # How long a trail is drawn behind a target [s].
@@ -83,7 +83,7 @@ def run_on_film(
                 if drawn is None:
                     summary = _run(film, target, writer.writerow, None, progress, template)
                 else:
-                    with VideoWriter(drawn, film.rate_hz) as out_film:
+                    with FilmWriter(drawn, film.rate_hz) as out_film:
                         summary = _run(film, target, writer.writerow, out_film.write, progress, template)
             part.replace(csv_path)
         except OSError as error:

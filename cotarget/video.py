@@ -87,7 +87,7 @@ class Film:
             raise CotargetError(f"{self.path}: holds no frame that can be decoded; give a complete film")
 
 
-class VideoWriter:
+class FilmWriter:
     """Writes a film as H.264 yuv420p; it appears under its name only when complete. A context manager."""
 
     def __init__(self, path: Path, rate_hz: float) -> None:
@@ -128,7 +128,7 @@ class VideoWriter:
         except (av.error.FFmpegError, ValueError) as error:
             raise CotargetError(f"{self._path}: cannot be written ({_reason(error)}); name e.g. an .mp4") from None
 
-    def __enter__(self) -> "VideoWriter":
+    def __enter__(self) -> "FilmWriter":
         """Give the writer itself."""
         return self
 
