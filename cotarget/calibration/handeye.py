@@ -21,7 +21,7 @@ SMALLEST_TURN = np.radians(0.5)  # motions below this say more about noise than 
 ANGLE_TOLERANCE = np.radians(2.0)
 ANGLE_SHARE = 0.1
 # The least determined direction may come out mirrored by noise alone while its singular value is below this share.
-WEAK_SHARE = 0.05
+WEAK_SHARE = 0.01
 
 
 def motions(
@@ -46,6 +46,9 @@ def motions(
 def park_martin(head_motions: Sequence[RigidTransform], camera_motions: Sequence[RigidTransform]) -> RigidTransform:
     """Solve A_i T = T B_i in closed form.
 
+    The sign of pan or of tilt cannot be wrong: a head that counts the other way is the same head with its frame
+    turned by half a turn, which T absorbs, so that such a calibration points as well as any.
+
     Args:
         head_motions: A_i.
         camera_motions: B_i.
@@ -67,7 +70,7 @@ def park_martin(head_motions: Sequence[RigidTransform], camera_motions: Sequence
         if s[2] > WEAK_SHARE * s[0]:
             raise CalibrationError(
                 "hand-eye: the answer is a reflection (determinant -1): the head's angles and the camera's motions "
-                "contradict each other; check the sign of pan and tilt"
+                "contradict each other; check that pan and tilt are not exchanged"
             )
         Vt[2] = -Vt[2]  # two axes determine a rotation; the third direction is the one that noise has turned round
         R = Vt.T @ U.T
@@ -117,5 +120,5 @@ def _check_axes_agree(alpha: Array, beta_in_head: Array) -> None:
     if np.median(off - ANGLE_SHARE * np.linalg.norm(alpha, axis=1)) > ANGLE_TOLERANCE:
         raise CalibrationError(
             f"hand-eye: no T explains the motions: {np.degrees(np.median(off)):.1f} degrees remain between the head's "
-            "and the camera's; check the sign of pan and tilt, and that the boards stood still"
+            "and the camera's; check that pan and tilt are not exchanged, and that the boards stood still"
         )

@@ -1,7 +1,7 @@
 """What a calibration takes and gives: captures, views (the corners of one image), and the calibration itself."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from cotarget.camera import Intrinsics, ZoomLens
@@ -131,3 +131,11 @@ class Calibration:
     board: BoardConfig | None = None
     views: tuple[View, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def for_streams(self, fixed_size: tuple[int, int], zoom_size: tuple[int, int]) -> "Calibration":
+        """The same calibration for streams (width, height) [px] that are scaled.
+
+        Raises:
+            ConfigError: a stream has another aspect ratio than was calibrated.
+        """
+        return replace(self, fixed=self.fixed.resized(fixed_size), zoom=self.zoom.resized(zoom_size))

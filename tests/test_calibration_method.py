@@ -1,0 +1,127 @@
+"""The sequential method on corners of a known truth, and on real photos."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cotarget.calibration import calibrate_photos, calibrate_views
+from cotarget.calibration.boards import board_points
+from cotarget.calibration.bundle import fit
+from cotarget.calibration.model import View
+from cotarget.calibration.reprojection import RigModel, predict, stepped
+from cotarget.camera import Intrinsics
+from cotarget.config import DEFAULT_GAMMA, DEFAULT_T, BoardConfig
+from cotarget.errors import CalibrationError, ConfigError
+from cotarget.geometry import pose
+from cotarget.pantilt import HeadGeometry
+from tests.synthetic import SIZE, Truth, other_rig, pointing_errors, synthetic_views
+
+BOARD = BoardConfig()
+POINTS = board_points(BOARD)
+SIZES = {"fixed": SIZE, "zoom": SIZE}
+PHOTOS = Path(__file__).parents[2] / "shared" / "data" / "opencv_stereo"
+PHOTO_BOARD = BoardConfig(corners=(9, 6), square=0.025)
+
+
+def test_exact_corners_give_the_truth_exactly():
+    truth = Truth()
+    views = synthetic_views(truth, POINTS, np.random.default_rng(0), boards=8, noise_px=0.0)
+    calibration = calibrate_views(views, BOARD, SIZES)
+    lens = calibration.zoom.stops[0]
+    # Corners are exact to rounding; the solver stops at a relative fall of the cost of 1e-10.
+    assert np.allclose([*lens.focal_px, *lens.center_px], [692, 693, 326, 235], atol=1e-3)
+    assert np.allclose(calibration.T_zoom0_fixed.as_matrix(), truth.gamma.as_matrix(), atol=1e-6)
+    assert np.allclose(calibration.T_head_zoom.as_matrix(), truth.hand.as_matrix(), atol=1e-6)
+    assert calibration.head.axis_offset == pytest.approx(truth.dz, abs=1e-6)
+    assert calibration.head.squareness == pytest.approx(truth.eps, abs=1e-6)
+
+
+@pytest.mark.parametrize(("truth", "bounds", "refined_bounds"), [
+    # Median and p95 [degrees] at 0.1 px noise from 30 boards; the refined ones are five times what is usual.
+    (Truth(), (0.05, 0.10), (0.010, 0.020)),
+    (other_rig(), (0.08, 0.16), (0.010, 0.020)),
+], ids=["default", "other"])  # fmt: skip
+def test_noisy_corners_point_well_enough(truth, bounds, refined_bounds):
+    views = synthetic_views(truth, POINTS, np.random.default_rng(1))
+    for refine, (median, p95) in ((False, bounds), (True, refined_bounds)):
+        calibration = calibrate_views(views, BOARD, SIZES, refine=refine)
+        errors = pointing_errors(calibration, truth, np.random.default_rng(5), 40)
+        assert np.median(errors) < median
+        assert np.percentile(errors, 95) < p95
+        # Two coordinates of 0.1 px noise each, less what the parameters take up.
+        assert 0.12 < calibration.residuals.handeye_rms_px < 0.16
+
+
+def test_the_derivatives_are_those_of_the_predictions():
+    rng = np.random.default_rng(0)
+    lens = Intrinsics(SIZE, (686.0, 684.0), (325.0, 239.0), (-0.2, 0.03, 0.001, -0.002, 0.01))
+    boards = {i: pose(np.add(rng.normal(0, 0.3, 3), [-0.4, -0.25, 4]), rng.normal(0, 15, 3)) for i in range(2)}
+    model = RigModel(boards, lens, lens, DEFAULT_GAMMA, DEFAULT_T, HeadGeometry(0.05, 0.02))
+    blank = np.zeros((54, 2))
+    views = [View("fixed", blank, 0), View("zoom", blank, 0, 0.1, -0.2), View("zoom", blank, 1, -0.3, 0.1)]
+    free = ("fixed", "zoom", "gamma", "hand", "head")
+    _, by_shared, by_board = predict(model, views, POINTS, free)
+    h = 1e-5  # central differences err by h^2 of the third derivative, relative to the largest of a column
+    for k in range(by_shared.shape[-1]):
+        step = h * np.eye(by_shared.shape[-1])[k]
+        high, low = (predict(stepped(model, s, np.zeros((2, 6)), free), views, POINTS, ())[0] for s in (step, -step))
+        assert np.allclose(
+            (high - low) / (2 * h), by_shared[..., k], atol=1e-6 * max(1, np.abs(by_shared[..., k]).max())
+        )
+    for k in range(6):
+        step = h * np.tile(np.eye(6)[k], (2, 1))
+        still = np.zeros(by_shared.shape[-1])
+        high, low = (predict(stepped(model, still, s, free), views, POINTS, ())[0] for s in (step, -step))
+        assert np.allclose((high - low) / (2 * h), by_board[..., k], atol=1e-6 * np.abs(by_board[..., k]).max())
+
+
+def test_only_pan_is_refused():
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=8, tilt_range=0.0)
+    with pytest.raises(CalibrationError, match="only pan moved"):
+        calibrate_views(views, BOARD, SIZES)
+
+
+def test_without_common_views_at_home_there_is_no_gamma():
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=8)
+    moved = [view for view in views if view.camera == "fixed" or view.pan != 0]
+    with pytest.raises(CalibrationError, match=r"no placement .* seen by both"):
+        calibrate_views(moved, BOARD, SIZES)
+
+
+def test_an_outlying_view_is_left_out_and_named():
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=8)
+    bad = replace(
+        views[5], corners_px=views[5].corners_px + np.random.default_rng(1).normal(0, 5, (54, 2)), source="b.png"
+    )
+    residuals = calibrate_views([*views[:5], bad, *views[6:]], BOARD, SIZES).residuals
+    assert [r.name for r in residuals.rejected] == ["b.png"]
+    assert "px rms" in residuals.rejected[0].reason
+
+
+def test_what_cannot_be_calibrated_is_refused_in_words():
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=3)
+    with pytest.raises(CalibrationError, match=r"fixed camera: 0 usable views.*at least 3"):
+        calibrate_views([], BOARD, SIZES)
+    with pytest.raises(CalibrationError, match="the methods are: sequential"):
+        calibrate_views(views, BOARD, SIZES, method="magic")
+    with pytest.raises(ConfigError, match="upside down"):
+        calibrate_views(views, BoardConfig(corners=(8, 6)), SIZES)
+    with pytest.raises(CalibrationError, match="40 finite corners"):
+        calibrate_views(views, BoardConfig(corners=(8, 5)), SIZES)
+    with pytest.raises(CalibrationError, match="no views"):
+        fit(RigModel({}), [], POINTS, ())
+
+
+@pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"the real stereo photos are not at {PHOTOS}")
+def test_real_photos():
+    calibration = calibrate_photos(PHOTOS, "left*.jpg", "right*.jpg", PHOTO_BOARD)
+    residuals = calibration.residuals
+    assert (residuals.fixed_views, residuals.zoom_views, residuals.pairs) == (13, 13, 13)
+    assert residuals.rejected == ()
+    # Known to be possible with these corners: 0.177, 0.182 and 0.196 px; mrcal's baseline is 83.15 mm.
+    assert max(residuals.fixed_rms_px, residuals.zoom_rms_px, residuals.stereo_rms_px) < 0.20
+    assert np.linalg.norm(calibration.T_zoom0_fixed.translation) == pytest.approx(0.08315, abs=0.0005)
+    assert calibration.T_head_zoom is None
+    assert residuals.handeye_rms_px is None

@@ -1,0 +1,129 @@
+"""Sessions on a rig that draws its own boards: from knowing nothing to a calibration, and everything that can fail."""
+
+import itertools
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.calibration import calibrate_captures, calibrate_photos, calibrate_rig
+from cotarget.calibration.captures import INDEX
+from cotarget.calibration.plan import GRID, Coverage
+from cotarget.config import BoardConfig
+from cotarget.errors import CalibrationError
+from cotarget.geometry import pose
+from tests.synthetic import SIZE, Truth, pointing_errors
+from tests.synthetic_rig import SyntheticRig
+
+BOARD = BoardConfig()
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """One session with a rolled, toed-in zoom camera, its captures and what was told of its progress."""
+    truth = Truth(gamma=pose([-1.2, 0.1, -0.1], [1.0, 10.0, 40.0]), hand=pose([0.1, -0.15, 0.08], [2.0, 1.5, -38.0]))
+    directory = tmp_path_factory.mktemp("captures")
+    told = []
+    calibration = calibrate_rig(
+        SyntheticRig(truth), BOARD, captures_dir=directory, progress=lambda *args: told.append(args), placements=22
+    )
+    return truth, calibration, directory, told
+
+
+def test_a_rig_of_which_nothing_is_known_points_well(session):
+    truth, calibration, _, _ = session
+    errors = pointing_errors(calibration, truth, np.random.default_rng(5), 40)
+    # Usual are 0.002 and 0.005 degrees; a mistake of numbering or of order is off by degrees.
+    assert np.median(errors) < 0.01
+    assert np.percentile(errors, 95) < 0.02
+
+
+def test_the_plan_covers_both_images_near_and_far(session):
+    _, calibration, _, _ = session
+    for camera in ("fixed", "zoom"):
+        coverage = Coverage(SIZE)
+        views = [view for view in calibration.views if view.camera == camera]
+        for view in views:
+            coverage.add(view.corners_px)
+        corners = [coverage.counts[i : i + 2, j : j + 2].sum() for i in (0, GRID[0] - 2) for j in (0, GRID[1] - 2)]
+        assert min(corners) > 0, f"the {camera} camera saw no board in one of its image's corners"
+        assert np.mean(coverage.counts > 0) > 0.8
+        widths = [np.ptp(view.corners_px, axis=0).max() for view in views]
+        assert max(widths) > 1.8 * min(widths)
+    assert calibration.residuals.pairs >= 8
+
+
+def test_progress_ends_where_it_said(session):
+    told = session[3]
+    assert told[-1][0] == told[-1][1] == 22
+    assert all(b[0] >= a[0] for a, b in itertools.pairwise(told))
+
+
+def test_captures_give_the_same_calibration(session):
+    _, calibration, directory, _ = session
+    again = calibrate_captures(directory)
+    error = again.T_zoom0_fixed.inv() * calibration.T_zoom0_fixed
+    # The very same images; only boards that a quick look had missed may be found now.
+    assert error.rotation.magnitude() < 1e-4
+    assert np.linalg.norm(error.translation) < 1e-3
+    assert abs(again.residuals.zoom_views - calibration.residuals.zoom_views) <= 3
+    with pytest.raises(CalibrationError, match="already holds captures"):
+        calibrate_rig(SyntheticRig(), BOARD, captures_dir=directory)
+
+
+@pytest.mark.parametrize(("broken", "message"), [
+    ({"stuck": True, "truth": Truth()}, "the head stands at pan 0.00, tilt 0.00 degrees where pan"),
+    ({"short_of": 0.5}, "the head stands at"),
+    ({"frozen_camera": True}, r"turned by 0\.0"),
+    ({"truth": Truth(gamma=pose([0, 0, 0], [0, 180, 0]))}, "the zoom camera does not see the board"),
+    ({"board_config": BoardConfig(corners=(7, 6))}, "the fixed camera does not see the 9x6 board"),
+])  # fmt: skip
+def test_a_broken_rig_is_refused_in_one_line(broken, message):
+    with pytest.raises(CalibrationError, match=message) as caught:
+        calibrate_rig(SyntheticRig(**broken), BOARD)
+    assert "\n" not in str(caught.value)
+
+
+def captures(tmp_path, rows, **changes):
+    table = {"schema": 1, "board": {"kind": "chessboard", "corners": [9, 6], "square": 0.1}, "pitch_mm": None}
+    (tmp_path / INDEX).write_text(json.dumps(table | {"captures": rows} | changes))
+    return tmp_path
+
+
+ROW = {"file": "a.png", "camera": "fixed", "board": 0, "pan": 0.0, "tilt": 0.0, "focal_px": None, "t": 0.0}
+
+
+@pytest.mark.parametrize(("rows", "changes", "message"), [
+    ([], {}, "captures: is empty"),
+    ([ROW], {"schema": 2}, "schema 2 is not 1"),
+    ([{**ROW, "camera": "left"}], {}, r"captures\[0\].camera: 'left'"),
+    ([{**ROW, "file": "../a.png"}], {}, "not inside the folder"),
+    ([{k: v for k, v in ROW.items() if k != "pan"}], {}, r"missing key 'captures\[0\].pan'"),
+    ([{**ROW, "tilt": "up"}], {}, r"captures\[0\].tilt: 'up' is not a finite number"),
+    ([{**ROW, "file": "missing.png"}], {}, "missing.png: no such file"),
+    ([{**ROW, "file": "text.png"}], {}, "text.png: is not an image"),
+    ([ROW, {**ROW, "file": "small.png"}], {}, "small.png: is 32x24 px where a.png .* is 64x48"),
+    ([ROW], {"board": {"kind": "chessboard", "corners": [9, 6]}}, "missing key 'board.square'"),
+])  # fmt: skip
+def test_malformed_captures_are_refused_by_name(tmp_path, rows, changes, message):
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((48, 64, 3), np.uint8))
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((24, 32, 3), np.uint8))
+    (tmp_path / "text.png").write_text("no image")
+    with pytest.raises(CalibrationError, match=message) as caught:
+        calibrate_captures(captures(tmp_path, rows, **changes))
+    assert str(tmp_path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_photos_are_paired_by_number(tmp_path):
+    with pytest.raises(CalibrationError, match=r"no file matches 'left\*.png'"):
+        calibrate_photos(tmp_path, "left*.png", "right*.png", BOARD)
+    for name in ("left1.png", "left01.png", "left3.png", "right2.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((48, 64, 3), np.uint8))
+    with pytest.raises(CalibrationError, match="the same number as"):
+        calibrate_photos(tmp_path, "left*.png", "right*.png", BOARD)
+    with pytest.raises(CalibrationError, match="no two photos"):
+        calibrate_photos(tmp_path, "left3.png", "right*.png", BOARD)
+    with pytest.raises(CalibrationError, match="no such folder"):
+        calibrate_photos(tmp_path / "none", "left*.png", "right*.png", BOARD)
