@@ -94,6 +94,25 @@ class Intrinsics:
         fx, fy = self.focal_px
         return replace(self, focal_px=(fx * focal_factor, fy * focal_factor))
 
+    def resized(self, size: tuple[int, int]) -> "Intrinsics":
+        """The same camera when its stream is scaled to another size (width, height) [px].
+
+        Raises:
+            ConfigError: the aspect ratio is another one, so that this cannot be the whole image scaled.
+        """
+        if size == self.size:
+            return self
+        (w, h), (old_w, old_h) = size, self.size
+        if w * old_h != h * old_w:
+            raise ConfigError(
+                f"the stream is {w}x{h} but was calibrated at {old_w}x{old_h}, which has another aspect ratio; "
+                "set the stream to a size of the same aspect ratio, or calibrate again"
+            )
+        s = w / old_w
+        (fx, fy), (cx, cy) = self.focal_px, self.center_px
+        center = ((cx + 0.5) * s - 0.5, (cy + 0.5) * s - 0.5)  # pixel centres are whole, edges are half ones
+        return replace(self, size=size, focal_px=(fx * s, fy * s), center_px=center)
+
     def _distort(self, xy: Array) -> Array:
         k1, k2, p1, p2, k3 = self.distortion
         x, y = xy[..., 0], xy[..., 1]
@@ -202,3 +221,12 @@ class ZoomLens:
         for _ in range(UNDISTORT_STEPS):  # the ratio hardly changes, so this fixed point converges at once
             nominal = focal_px * nominal / self.at(nominal).focal_px[0]
         return nominal
+
+    def resized(self, size: tuple[int, int]) -> "ZoomLens":
+        """The same lens when its stream is scaled to another size; its nominal focal lengths are scaled with it.
+
+        Raises:
+            ConfigError: the aspect ratio is another one.
+        """
+        factor = size[0] / self.size[0]
+        return ZoomLens(tuple(n * factor for n in self.nominal_px), tuple(s.resized(size) for s in self.stops))

@@ -234,6 +234,23 @@ class RigConfig:
     targets: Mapping[str, TargetConfig] = field(default_factory=lambda: DEFAULT_TARGETS)
 
     @property
+    def head_limits(self) -> tuple[Pair, Pair]:
+        """Pan and tilt limits [rad], the soft ones where there are any."""
+        pan, tilt = self.safety.pan_deg or self.sim.head.pan_deg, self.safety.tilt_deg or self.sim.head.tilt_deg
+        return (math.radians(pan[0]), math.radians(pan[1])), (math.radians(tilt[0]), math.radians(tilt[1]))
+
+    @property
+    def head_step(self) -> float:
+        """The head's resolution [rad]; 0 for a continuous one."""
+        return math.radians(self.sim.head.step_deg) if self.sim.effects.steps else 0.0
+
+    @property
+    def focal_range_px(self) -> Pair:
+        """The zoom camera's shortest and longest nominal focal length [px]."""
+        shortest, longest = (focal / self.sim.zoom.pitch_mm for focal in self.sim.zoom.focal_mm)
+        return shortest, longest
+
+    @property
     def command_delay_s(self) -> float:
         """From a command to the start of motion, as far as it is known [s]."""
         return self.sim.head.command_delay_s if self.sim.effects.command_delay else 0.0

@@ -18,6 +18,9 @@ from cotarget.templatefit import MARGIN_PX, fit_template
 
 # What MOG2 writes into its mask: 255 is foreground, 127 a shadow.
 FOREGROUND = 255
+# The colours that together make up this part of a pixel's history are its background. A target therefore melts into
+# the background after -log(BACKGROUND_RATIO) = 0.36 of the history, not after a tenth of it as with OpenCV's 0.9.
+BACKGROUND_RATIO = 0.9
 # A target is small: when more of the picture than this changed at once, the light or the camera did.
 MOST_FOREGROUND = 0.3
 
@@ -130,6 +133,7 @@ class MotionDetector:
             varThreshold=settings.threshold,
             detectShadows=settings.shadows,
         )
+        self._model.setBackgroundRatio(BACKGROUND_RATIO)
         self._t: float | None = None
         self._learnt = 0.0
         self._range: tuple[Image, Image] | None = None

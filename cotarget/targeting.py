@@ -1,7 +1,6 @@
 """From a pixel and a depth, or a track, to an Aim: pan, tilt and focal length. Pure: no device, no clock."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -19,6 +18,8 @@ METHODS: tuple[Method, ...] = get_args(Method)
 # The ray of the wanted pixel depends a little on the focal length and the focal length on the range along that ray;
 # each round shrinks what is left by the ratio of the principal point's offset to the range.
 FOCAL_ROUNDS = 3
+# Standard deviation of what is rounded to the nearest whole number.
+ROUNDED = 1 / np.sqrt(12)
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,6 @@ class Aim:
         limited: whether the lens's range cut the focal length.
         x_fixed: the target in the fixed camera's frame [m], (3,).
         range: from the zoom camera to the target [m].
-        uncertainty: what each cause alone leaves of error in the line of sight, one standard deviation [rad].
     """
 
     pan: float
@@ -70,17 +70,11 @@ class Aim:
     limited: bool
     x_fixed: Array
     range: float
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def depth(self) -> float:
         """Along the fixed camera's axis [m]."""
         return float(self.x_fixed[2])
-
-    @property
-    def error(self) -> float:
-        """All causes together, one standard deviation [rad]."""
-        return float(np.sqrt(sum(part**2 for part in self.uncertainty.values())))
 
 
 def depth_of(calibration: Calibration, target: TargetConfig, size_px: float) -> float:
@@ -160,6 +154,39 @@ def aim(
         x_fixed=np.asarray(x_fixed, dtype=float),
         range=float(pointing.range),
     )
+
+
+def error_budget(
+    calibration: Calibration, pixel: Array, found: Aim, reach: Reach, *, size_px: float | None = None
+) -> dict[str, float]:
+    """What each cause alone leaves of error in the line of sight, one standard deviation [rad].
+
+    Args:
+        calibration: the rig.
+        pixel: of the target in the fixed view, (2,).
+        found: the aim at it.
+        reach: gives the head's resolution.
+        size_px: where the depth came from a measured size, that size [px].
+
+    Returns:
+        "steps": rounding to the head's steps; "pixel": a pixel known to the nearest whole one; "size", where a size
+        was given: that likewise, by way of the depth; and "total".
+    """
+
+    def moved(du: float, dv: float, depth: float) -> float:
+        x_fixed = point_at(calibration, np.asarray(pixel) + (du, dv), depth)
+        there = aim(calibration, x_fixed, reach, nominal_px=found.nominal_px)
+        here = aim(calibration, found.x_fixed, reach, nominal_px=found.nominal_px)
+        return float(np.hypot((there.pan - here.pan) * np.cos(here.tilt), there.tilt - here.tilt))
+
+    depth = found.depth
+    parts = {
+        "steps": reach.step * ROUNDED * float(np.hypot(1.0, np.cos(found.tilt))),
+        "pixel": float(np.hypot(moved(ROUNDED, 0.0, depth), moved(0.0, ROUNDED, depth))),
+    }
+    if size_px is not None:
+        parts["size"] = moved(0.0, 0.0, depth * (1 + ROUNDED / size_px))
+    return parts | {"total": float(np.sqrt(sum(part**2 for part in parts.values())))}
 
 
 def _limit(nominal_px: float, reach: Reach) -> tuple[float, bool]:

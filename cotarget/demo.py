@@ -1,0 +1,195 @@
+"""The whole method on a simulated rig that nobody has told the software about: calibrate, then follow three targets."""
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cv2
+import numpy as np
+
+from cotarget.calibration import Calibration, calibrate_rig, save_calibration
+from cotarget.config import RigConfig, TargetConfig
+from cotarget.detection import Detector, make_detector
+from cotarget.drawing import TargetStages, captioned, draw_frames, plot_aim_error, side_by_side
+from cotarget.errors import ConfigError
+from cotarget.loop import FollowSettings, follow
+from cotarget.metrics import Row, Score, observe, pointing_errors, score, write_rows
+from cotarget.safety import SafeRig
+from cotarget.sim.truth import Truth
+from cotarget.sim.world import SimWorld
+from cotarget.targeting import Reach
+from cotarget.video import FilmWriter
+
+SCENES = {"book": "indoor", "person": "indoor", "bird": "outdoor"}
+CALIBRATION_SCENE = "indoor"
+# Two seconds to learn the background, then long enough to acquire and to follow [s].
+RUN_S = {"book": 8.0, "person": 11.0, "bird": 11.0}
+# Targets over which the pointing error of the calibration is stated.
+POINTING_TARGETS = 400
+POINTING_STREAM = 4  # of random numbers, apart from the world's own
+FRONT_DEG, BACK_DEG = -62.0, 118.0  # directions of the two pictures of the rig
+
+Progress = Callable[[str, int, int], None]
+
+
+def run_demo(out: Path, seed: int, progress: Progress) -> dict[str, Any]:
+    """Calibrate a simulated rig from rendered boards, follow a book, a person and a bird, and write what was seen.
+
+    Args:
+        out: folder for pictures, video, tables and metrics.json; its files are replaced only when all is done.
+        seed: of everything random.
+        progress: told (what, done, of how much).
+
+    Returns:
+        What metrics.json holds.
+    """
+    began = time.perf_counter()
+    with finished_together(out) as work:
+        config = sim_config(CALIBRATION_SCENE, (), seed)
+        calibration, pointing = _calibrate(config, work, seed, progress)
+        rows: dict[str, list[Row]] = {}
+        with FilmWriter(work / "demo.mp4", rate_hz=config.sim.fixed.rate_hz) as video:
+            for name in SCENES:
+                rows[name] = _follow_one(name, seed, calibration, work, video, progress)
+        plot_aim_error(work / "aim_error.png", rows)
+        residuals = calibration.residuals
+        assert residuals is not None
+        metrics = {
+            "calibration": {
+                "fixed_rms_px": residuals.fixed_rms_px,
+                "zoom_rms_px": residuals.zoom_rms_px,
+                "stereo_rms_px": residuals.stereo_rms_px,
+                "pointing_error_deg": pointing,
+            },
+            "targets": {name: dataclasses.asdict(score(run)) for name, run in rows.items()},
+            "seed": seed,
+            "wall_s": round(time.perf_counter() - began, 1),
+        }
+        (work / "metrics.json").write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    return metrics
+
+
+def sim_config(scene: str, targets: tuple[str, ...], seed: int) -> RigConfig:
+    """The default rig in a scene with targets."""
+    config = RigConfig()
+    return dataclasses.replace(config, sim=dataclasses.replace(config.sim, scene=scene, targets=targets, seed=seed))
+
+
+def open_detector(target: TargetConfig, rate_hz: float) -> Detector:
+    """Make a target's detector, with its template read.
+
+    Raises:
+        ConfigError: the template is not a picture.
+    """
+    if target.template is None:
+        return make_detector(target, rate_hz)
+    template = cv2.imread(str(target.template), cv2.IMREAD_COLOR) if target.template.is_file() else None
+    if template is None:
+        raise ConfigError(f"{target.template}: is not a picture; the template of a target is a PNG or JPEG of it")
+    return make_detector(target, rate_hz, template)
+
+
+@contextmanager
+def finished_together(out: Path) -> Iterator[Path]:
+    """Give a folder to work in; its files move to ``out`` only when all went well.
+
+    Raises:
+        ConfigError: ``out`` cannot be a folder.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        work = TemporaryDirectory(dir=out, prefix=".unfinished-")
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be written to: {error.strerror}; name a folder that can") from None
+    with work as folder:
+        yield Path(folder)
+        for path in sorted(Path(folder).iterdir()):
+            path.replace(out / path.name)
+
+
+def reach_of(world: SimWorld) -> Reach:
+    """What the head and the lens of a simulated rig can do."""
+    limits = world.rig.head.limits
+    return Reach(limits.pan, limits.tilt, world.rig.zoom.focal_range, step=limits.step)
+
+
+def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> tuple[Calibration, dict[str, float]]:
+    """Calibrate from rendered boards; judge it by the truth, which it cannot see; picture the rig."""
+    world = SimWorld(config)
+    with SafeRig(world.rig, config.safety) as rig:
+        calibration = calibrate_rig(
+            rig,
+            config.board,
+            pitch_mm=config.sim.zoom.pitch_mm,
+            seed=seed,
+            progress=lambda done, total, text: progress(f"calibrating: {text}", done, total),
+        )
+        save_calibration(work / "calibration.json", calibration)
+        errors = np.degrees(
+            pointing_errors(
+                calibration,
+                world.truth(),
+                reach_of(world),
+                np.random.default_rng((seed, POINTING_STREAM)),
+                POINTING_TARGETS,
+            )
+        )
+        front, back = world.portrait(FRONT_DEG, axes=False), world.portrait(BACK_DEG, axes=True)
+        picture = np.hstack(
+            [
+                captioned(front.image, "the rig: a fixed camera, and a zoom camera on a pan-tilt unit"),
+                captioned(draw_frames(back.image, back.origins_px), "its frames: x red, y green, z blue"),
+            ]
+        )
+        cv2.imwrite(str(work / "rig.png"), picture)
+    return calibration, {"median": float(np.median(errors)), "p95": float(np.percentile(errors, 95))}
+
+
+def _follow_one(
+    name: str, seed: int, calibration: Calibration, work: Path, video: FilmWriter, progress: Progress
+) -> list[Row]:
+    """Follow one target; write its picture, its rows and its part of the video."""
+    config = sim_config(SCENES[name], (name,), seed)
+    target = config.target(name)
+    world = SimWorld(config)
+    truth: Truth = world.truth()
+    rows: list[Row] = []
+    with SafeRig(world.rig, config.safety) as rig:
+        stages = TargetStages(rig.zoom.focal_range[0])
+        detector = open_detector(target, config.sim.fixed.rate_hz)
+        settings = FollowSettings(command_delay_s=config.command_delay_s)
+        frames = round(RUN_S[name] * config.sim.fixed.rate_hz)
+        for step in follow(rig, calibration, target, detector, seconds=RUN_S[name], settings=settings):
+            stages.see(step)
+            rows.append(observe(step, truth, name, target))
+            video.write(side_by_side(step, name))
+            progress(f"following: {name}", min(step.index + 1, frames), frames)
+    cv2.imwrite(str(work / f"{name}.png"), stages.picture(name))
+    write_rows(work / f"steps_{name}.csv", rows)
+    return rows
+
+
+def summary(metrics: dict[str, Any]) -> str:
+    """The figures as a short table for people."""
+    pointing = metrics["calibration"]["pointing_error_deg"]
+    lines = [
+        f"pointing error of the calibration: median {pointing['median']:.4f}, p95 {pointing['p95']:.4f} degrees",
+        f"{'target':8} {'acquired':>9} {'in frame':>9} {'yield':>6} {'offset':>8} {'size':>6} {'range':>8}",
+    ]
+    for name, values in metrics["targets"].items():
+        s = Score(**values)
+
+        def cell(value: float | None, form: str) -> str:
+            return "-" if value is None else format(value, form)
+
+        lines.append(
+            f"{name:8} {cell(s.time_to_acquire_s, '.2f'):>7} s {cell(s.in_frame_ratio, '.2f'):>9} "
+            f"{cell(s.closeup_yield, '.2f'):>6} {cell(s.tpo_width_median, '.1%'):>8} "
+            f"{cell(s.size_ratio_median, '.2f'):>6} {cell(s.range_m, '.1f'):>6} m"
+        )
+    return "\n".join(lines)

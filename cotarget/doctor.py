@@ -1,0 +1,105 @@
+"""Looks at this machine: versions, rendering, film codec, and the command that fixes what is missing."""
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import dataclass
+
+from cotarget.assets import assets_dir
+
+PACKAGES = (
+    "cotarget",
+    "mujoco",
+    "numpy",
+    "opencv-python-headless",
+    "scipy",
+    "gymnasium",
+    "pyserial",
+    "av",
+    "matplotlib",
+    "tqdm",
+)
+OLDEST_PYTHON = (3, 11)
+# Rendering is tried in a process of its own, because a broken OpenGL may take its process with it.
+RENDER = (
+    "from cotarget.sim.opengl import BACKEND, make_renderer, mujoco;"
+    "m = mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size=\"1\"/></worldbody></mujoco>');"
+    "r = make_renderer(m, 64, 48); r.update_scene(mujoco.MjData(m)); r.render(); r.close(); print(BACKEND)"
+)
+RENDER_TIMEOUT_S = 60.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at: whether it is well, what was found, and the command that fixes it."""
+
+    name: str
+    ok: bool
+    text: str
+    fix: str = ""
+
+
+def examine() -> list[Finding]:
+    """Look at everything that cotarget needs."""
+    return [_python(), *map(_package, PACKAGES), _assets(), _rendering(), _codec(), *_serial_ports()]
+
+
+def _python() -> Finding:
+    ok = sys.version_info >= OLDEST_PYTHON
+    wanted = ".".join(map(str, OLDEST_PYTHON))
+    return Finding(
+        "python",
+        ok,
+        f"{platform.python_version()} on {platform.platform()}",
+        "" if ok else f"install Python {wanted} or newer",
+    )
+
+
+def _package(name: str) -> Finding:
+    try:
+        return Finding(name, True, importlib.metadata.version(name))
+    except importlib.metadata.PackageNotFoundError:
+        return Finding(name, False, "not installed", f"pip install {name}")
+
+
+def _assets() -> Finding:
+    scenes = sorted(path.stem for path in (assets_dir() / "scenes").glob("*.xml"))
+    fix = "" if scenes else "pip install --force-reinstall cotarget"
+    return Finding("sim_assets", bool(scenes), f"scenes {', '.join(scenes)}" if scenes else "not found", fix)
+
+
+def _rendering() -> Finding:
+    try:
+        tried = subprocess.run(
+            [sys.executable, "-c", RENDER], capture_output=True, text=True, timeout=RENDER_TIMEOUT_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Finding("rendering", False, f"no picture within {RENDER_TIMEOUT_S:.0f} s", "set MUJOCO_GL=osmesa")
+    if tried.returncode == 0:
+        return Finding("rendering", True, f"without a screen by {tried.stdout.split()[-1]}")
+    said = (tried.stderr.strip().splitlines() or [f"the test ended with status {tried.returncode}"])[-1]
+    fix = "apt-get install -y libegl1 libgl1-mesa-dri libopengl0"
+    if os.environ.get("MUJOCO_GL", "egl") not in ("egl", "osmesa", "glfw"):
+        fix = "unset MUJOCO_GL"
+    return Finding("rendering", False, said.split(": ", 1)[-1], fix)
+
+
+def _codec() -> Finding:
+    import av
+
+    ok = "libx264" in av.codecs_available
+    return Finding(
+        "H.264",
+        ok,
+        "PyAV encodes it" if ok else "this PyAV cannot encode it",
+        "" if ok else "pip install --force-reinstall av",
+    )
+
+
+def _serial_ports() -> list[Finding]:
+    from serial.tools import list_ports
+
+    found = [f"{port.device} ({port.description})" for port in list_ports.comports()]
+    return [Finding("serial ports", True, ", ".join(found) or "none (none is needed for the simulation)")]
