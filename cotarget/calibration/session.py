@@ -12,19 +12,23 @@ import numpy as np
 
 from cotarget.calibration.boards import board_points, check_board
 from cotarget.calibration.bootstrap import ROUGH_MARGIN, learn_fixed, learn_zoom, refitted
-from cotarget.calibration.intrinsics import board_pose
+from cotarget.calibration.intrinsics import pose_candidates
+from cotarget.calibration.model import View
 from cotarget.calibration.plan import Coverage, plan_placement, plan_poses, seen_at_home
 from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.reprojection import RigModel
 from cotarget.calibration.sequential import at_home
 from cotarget.errors import CalibrationError
+from cotarget.geometry import RigidTransform
 
 Progress = Callable[[int, int, str], None]  # done, total, text
 
-FINE_MARGIN = 0.008
+FINE_MARGIN = 0.008  # of the image's width, that plans keep clear once the model is fine
+MARGIN_GROWTH, WIDEST_MARGIN = 3.0, 0.15  # at every miss, and at most
 MOVED_VIEWS = 3  # zoom views with the head away from home, a placement
 SHARED_SHARE = 0.75  # of the placements are to be seen by both cameras at home
 REFIT_ALWAYS, REFIT_EVERY = 8, 6  # refit the rough model at each of the first placements, later now and then
+PATIENCE = 4  # placements before the lack of a common view at home is believed
 MOST_MISSES = 4  # placements in a row without a view before giving up
 
 
@@ -72,53 +76,81 @@ def _cover(
     tell: Callable[[str], None],
 ) -> None:
     """Present the board all over both images and turn the head at each placement."""
-    rig, board, points = recorder.rig, recorder.board, board_points(recorder.board)
+    rig = recorder.rig
     coverage = {"fixed": Coverage(rig.fixed.size), "zoom": Coverage(rig.zoom.size)}
     for view in recorder.views:
         coverage[view.camera].add(view.corners_px)
     shared_count = misses = done = 0
     while recorder.number + 1 < placements:
-        assert model.fixed is not None
         # A miss means that the rough model bends the image wrongly where nothing was seen yet: keep farther inside.
-        margin = (ROUGH_MARGIN if done < REFIT_ALWAYS else FINE_MARGIN) * 3**misses
+        margin = min((ROUGH_MARGIN if done < REFIT_ALWAYS else FINE_MARGIN) * MARGIN_GROWTH**misses, WIDEST_MARGIN)
         shared = shared_count <= SHARED_SHARE * done
         recorder.turn(0.0, 0.0)
-        T = None
-        for wish in (shared, False):
-            T = plan_placement(
-                model, board, coverage, recorder.number, rng, shared=wish, margin_px=margin * model.fixed.size[0]
-            )
-            if T is not None:
-                break
-            if not any(at_home(v) for v in recorder.views if v.camera == "zoom") and done >= MOST_MISSES:
-                raise CalibrationError(
-                    "the cameras have no common view at pan = tilt = 0 that would show a whole board to both; "
-                    "turn the zoom camera's mounting towards what the fixed camera sees"
-                )
-        if T is None:
-            raise CalibrationError("no placement of the board is visible to the fixed camera; use a smaller board")
-        number = recorder.present(T)
-        tell(f"board {number + 1} of {placements}")
+        wish = _next_placement(recorder, model, coverage, rng, shared=shared, margin=margin, patient=done < PATIENCE)
+        recorder.present(wish)
+        tell(f"board {recorder.number + 1} of {placements}")
+        missed = misses > 0
         fixed_view = recorder.see_fixed()
+        misses = 0 if fixed_view is not None else misses + 1
+        if misses > MOST_MISSES:
+            raise CalibrationError(f"the fixed camera lost the board: not seen {misses} times in a row")
         if fixed_view is None:
-            misses += 1
-            if misses > MOST_MISSES:
-                raise CalibrationError(f"the fixed camera lost the board: not seen {misses} times in a row")
             continue
-        missed, misses = misses > 0, 0
-        T = board_pose(model.fixed, fixed_view.corners_px, points)
-        home = seen_at_home(model, T, board)
-        poses = plan_poses(
-            model, T, board, coverage["zoom"], rig.head.limits, MOVED_VIEWS + (not home), rng,
-            margin * rig.zoom.size[0],
-        )  # fmt: skip
-        if home:
-            shared_count += recorder.see_zoom() is not None
-        for pan, tilt in poses:
-            recorder.turn(pan, tilt)
-            recorder.see_zoom()
-        for view in recorder.of_placement(number):
-            coverage[view.camera].add(view.corners_px)
+        shared_count += _see_from_everywhere(recorder, model, wish, fixed_view, coverage, margin, rng)
         done += 1
         if done <= REFIT_ALWAYS or done % REFIT_EVERY == 0 or missed:
             model = refitted(model, recorder)
+
+
+def _next_placement(
+    recorder: Recorder,
+    model: RigModel,
+    coverage: dict[str, Coverage],
+    rng: np.random.Generator,
+    *,
+    shared: bool,
+    margin: float,
+    patient: bool,
+) -> RigidTransform:
+    """Where to hold the board next; for the fixed camera alone where no place is visible to both."""
+    assert model.fixed is not None
+    for both in (True, False) if shared else (False,):
+        wish = plan_placement(
+            model, recorder.board, coverage, recorder.number, rng, shared=both, margin_px=margin * model.fixed.size[0]
+        )
+        if wish is not None:
+            return wish
+        if both and not patient and not any(at_home(v) for v in recorder.views if v.camera == "zoom"):
+            raise CalibrationError(
+                "the cameras have no common view at pan = tilt = 0 that would show a whole board to both; "
+                "turn the zoom camera's mounting towards what the fixed camera sees"
+            )
+    raise CalibrationError("no placement of the board is visible to the fixed camera; use a smaller board")
+
+
+def _see_from_everywhere(
+    recorder: Recorder,
+    model: RigModel,
+    wish: RigidTransform,
+    fixed_view: View,
+    coverage: dict[str, Coverage],
+    margin: float,
+    rng: np.random.Generator,
+) -> bool:
+    """Take the zoom views of a placement, home first; whether the zoom camera saw it at home."""
+    assert model.fixed is not None
+    rig, board = recorder.rig, recorder.board
+    # Where the board really is, in that of its two possible poses which is nearer to the wish.
+    poses = pose_candidates(model.fixed, fixed_view.corners_px, board_points(board))
+    T = min(poses, key=lambda pose: float((pose.rotation * wish.rotation.inv()).magnitude()))
+    home = seen_at_home(model, T, board)
+    turns = plan_poses(
+        model, T, board, coverage["zoom"], rig.head.limits, MOVED_VIEWS + (not home), rng, margin * rig.zoom.size[0]
+    )
+    seen_home = home and recorder.see_zoom() is not None
+    for pan, tilt in turns:
+        recorder.turn(pan, tilt)
+        recorder.see_zoom()
+    for view in recorder.of_placement(recorder.number):
+        coverage[view.camera].add(view.corners_px)
+    return seen_home
