@@ -18,9 +18,6 @@ from cotarget.templatefit import MARGIN_PX, fit_template
 
 # What MOG2 writes into its mask: 255 is foreground, 127 a shadow.
 FOREGROUND = 255
-# The colours that together make up this part of a pixel's history are its background. A target therefore melts into
-# the background after -log(BACKGROUND_RATIO) = 0.36 of the history, not after a tenth of it as with OpenCV's 0.9.
-BACKGROUND_RATIO = 0.9
 # A target is small: when more of the picture than this changed at once, the light or the camera did.
 MOST_FOREGROUND = 0.3
 
@@ -58,7 +55,9 @@ class MotionSettings:
     """What moves like the target.
 
     Attributes:
-        history_s: how long something must stand still to become background [s].
+        history_s: how far back the background's colours are remembered [s].
+        background_part: the colours that make up this part of a pixel's history are its background. Many colours
+            (0.9) hide foliage, but then a target that stops melts away after a tenth of the history.
         warm_up_s: no detection before the background has been learnt for this long [s].
         threshold: squared distance to the background, in variances, from which a pixel counts as foreground.
         shadows: whether to tell shadows apart from the target.
@@ -68,10 +67,12 @@ class MotionSettings:
         bridge_px: (width, height) of gaps that are closed within one target.
         smallest_px: smallest width and height of a target.
         smallest_area_px: fewest foreground pixels of a target.
+        widest: largest width as a multiple of the height.
         largest: largest side of a target as a fraction of the image's.
     """
 
     history_s: float
+    background_part: float
     warm_up_s: float
     threshold: float
     shadows: bool
@@ -80,6 +81,7 @@ class MotionSettings:
     bridge_px: tuple[int, int]
     smallest_px: tuple[int, int]
     smallest_area_px: int
+    widest: float
     largest: float
 
 
@@ -91,6 +93,7 @@ SWAY_MARGIN = 15
 # A bird may be as small as four pixels, so that nothing is opened away; it casts no shadow on the sky.
 BIRD = MotionSettings(
     history_s=8.0,
+    background_part=0.9,
     warm_up_s=0.5,
     threshold=25.0,
     shadows=False,
@@ -99,11 +102,14 @@ BIRD = MotionSettings(
     bridge_px=(5, 5),
     smallest_px=(2, 2),
     smallest_area_px=5,
+    widest=np.inf,
     largest=0.3,
 )
-# A person stops at times, casts a shadow, and falls apart into limbs and trunk one above the other.
+# A person stops at times, casts a shadow, falls apart into limbs and trunk one above the other, and stands upright
+# (1.3 still lets two or three side by side pass, but not a patch of light on the ground).
 PERSON = MotionSettings(
     history_s=20.0,
+    background_part=0.7,
     warm_up_s=0.5,
     threshold=16.0,
     shadows=True,
@@ -112,6 +118,7 @@ PERSON = MotionSettings(
     bridge_px=(5, 15),
     smallest_px=(8, 24),
     smallest_area_px=150,
+    widest=1.3,
     largest=0.9,
 )
 
@@ -133,7 +140,7 @@ class MotionDetector:
             varThreshold=settings.threshold,
             detectShadows=settings.shadows,
         )
-        self._model.setBackgroundRatio(BACKGROUND_RATIO)
+        self._model.setBackgroundRatio(settings.background_part)
         self._t: float | None = None
         self._learnt = 0.0
         self._range: tuple[Image, Image] | None = None
@@ -201,7 +208,7 @@ class MotionDetector:
             x, y = x + dx, y + dy
             if w < settings.smallest_px[0] or h < settings.smallest_px[1]:
                 continue
-            if w > settings.largest * width or h > settings.largest * height:
+            if w > settings.largest * width or h > settings.largest * height or w > settings.widest * h:
                 continue
             found.append((area, _detection(x, y, w, h, area / (area + settings.smallest_area_px), mask.shape)))
         found.sort(key=lambda pair: -pair[0])

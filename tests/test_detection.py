@@ -1,0 +1,186 @@
+"""The detectors on drawn pictures: the colour detector's accuracy, and what the motion detector must not see."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.config import DEFAULT_TARGETS, TargetConfig
+from cotarget.detection import ColourDetector, MotionDetector, make_detector
+from cotarget.errors import ConfigError, CotargetError
+from cotarget.rig import Frame
+
+RATE = 25.0
+NOISE = 2.0  # grey levels, as the simulated sensor's
+JPEG = 90
+SUPERSAMPLING = 16
+WIDTH, HEIGHT = 96, 72  # of the small pictures that the colour detector is tried on
+BOOK_PX = (16.0, 12.0)  # as in the wide view at 10 m
+ACCURACY_PX = 0.3  # rms of centre and size: 2 % of the book's width, that is 0.2 m of 10
+
+
+def cover():
+    """A red cover with a white panel off its middle, so that its colour's centroid is not its centre."""
+    image = np.full((120, 160, 3), (35, 25, 190), np.uint8)
+    image[60:110, 90:150] = 235
+    image[70:100, 100:140] = 20
+    return image
+
+
+def photograph(image, rng):
+    """Sensor noise and JPEG."""
+    noisy = np.clip(np.rint(image + rng.normal(0, NOISE, image.shape)), 0, 255).astype(np.uint8)
+    return cv2.imdecode(cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, JPEG])[1], cv2.IMREAD_COLOR)
+
+
+def book_picture(center, size, turn, rng):
+    """The cover at a sub-pixel place on a wall with a gradient: pasted 16 times too large, then averaged."""
+    s = SUPERSAMPLING
+    ramp = np.linspace(100, 170, WIDTH * s)[None, :, None] * np.array([0.8, 0.9, 1.0])
+    wall = np.broadcast_to(ramp, (HEIGHT * s, WIDTH * s, 3)).astype(np.uint8)
+    template = cover()
+    h, w = template.shape[:2]
+    A = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ np.diag(np.array(size) * s / (w, h))
+    shift = (np.array(center) + 0.5) * s - 0.5 - A @ [(w - 1) / 2, (h - 1) / 2]
+    M = np.column_stack([A, shift])
+    big = cv2.warpAffine(template, M, (WIDTH * s, HEIGHT * s), flags=cv2.INTER_NEAREST)
+    there = cv2.warpAffine(np.ones((h, w), np.uint8), M, (WIDTH * s, HEIGHT * s), flags=cv2.INTER_NEAREST)
+    big = np.where(there[..., None] > 0, big, wall)
+    small = cv2.resize(big, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    return photograph(cv2.GaussianBlur(small, (0, 0), 0.5), rng)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 6.0])
+def test_colour_is_located_to_a_fraction_of_a_pixel(turn_deg):
+    rng = np.random.default_rng(0)
+    detector = ColourDetector(cover())
+    errors = []
+    for _ in range(60):
+        center, size = rng.uniform((30, 25), (65, 45)), np.array(BOOK_PX) * rng.uniform(0.9, 1.2)
+        found = detector.detect(Frame(book_picture(center, size, np.radians(turn_deg), rng), 0.0))
+        assert len(found) == 1
+        assert found[0].score > 0.8
+        errors.append([*(found[0].center_px - center), *(found[0].size_px - size)])
+    rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    print(f"turned {turn_deg:g} degrees: rms of u, v, width, height: {np.round(rms, 3)} px")
+    assert rms.max() < ACCURACY_PX
+
+
+def test_another_colour_is_not_taken_for_the_target():
+    rng = np.random.default_rng(1)
+    image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    for k, colour in enumerate([(190, 25, 35), (25, 190, 35), (20, 120, 160), (250, 250, 250), (0, 0, 0)]):
+        image[30:42, 5 + 18 * k : 18 + 18 * k] = colour
+    assert ColourDetector(cover()).detect(Frame(photograph(image, rng), 0.0)) == []
+
+
+def test_a_grey_or_missing_template_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="grey"):
+        ColourDetector(np.full((10, 10, 3), 128, np.uint8))
+    book = dataclasses.replace(DEFAULT_TARGETS["book"], template=None)
+    with pytest.raises(ConfigError, match="template"):
+        make_detector(book, RATE)
+    with pytest.raises(ConfigError, match=r"nothing\.png"):
+        make_detector(dataclasses.replace(book, template=tmp_path / "nothing.png"), RATE)
+
+
+def sky(rng, shape=(240, 320)):
+    """A bright, slightly noisy sky."""
+    return np.clip(rng.normal((210, 180, 150), NOISE, (*shape, 3)), 0, 255).astype(np.uint8)
+
+
+def watch(detector, pictures, rate=RATE):
+    return [detector.detect(Frame(picture, i / rate)) for i, picture in enumerate(pictures)]
+
+
+def motion(name):
+    return make_detector(DEFAULT_TARGETS[name], RATE)
+
+
+def test_a_small_dark_bird_is_boxed():
+    rng = np.random.default_rng(3)
+    pictures, truth = [], []
+    for i in range(50):
+        picture = sky(rng)
+        u, v = 20 + 5 * i, 60 + 2 * i
+        picture[v - 2 : v + 3, u - 6 : u + 7] = 40
+        pictures.append(picture)
+        truth.append((u, v))
+    found = watch(motion("bird"), pictures)
+    for (u, v), boxes in list(zip(truth, found, strict=True))[25:]:
+        assert len(boxes) == 1
+        np.testing.assert_allclose(boxes[0].center_px, (u, v), atol=0.5)
+        np.testing.assert_allclose(boxes[0].size_px, (13, 5), atol=1.0)  # whole pixels; noise may add one
+        assert not boxes[0].clipped
+
+
+def test_a_box_at_the_border_is_marked():
+    rng = np.random.default_rng(4)
+    pictures = [sky(rng) for _ in range(30)]
+    pictures[-1][100:110, :8] = 40
+    (box,) = watch(motion("bird"), pictures)[-1]
+    assert box.clipped
+    np.testing.assert_allclose(box.center_px, (3.5, 104.5), atol=0.5)
+
+
+def test_swaying_twigs_are_background():
+    """Dark twigs on a bright sky swing by 2 px; after they have been seen for a while nothing is detected."""
+    rng = np.random.default_rng(5)
+    twigs = [(x, rng.uniform(0, 6)) for x in range(30, 300, 9)]
+    pictures = []
+    for i in range(100):
+        picture = sky(rng)
+        for x, phase in twigs:
+            u = x + round(2 * np.sin(0.5 * i + phase))
+            picture[160:240, u : u + 2] = 60
+        pictures.append(picture)
+    found = watch(motion("bird"), pictures)
+    assert sum(map(len, found[30:])) == 0
+
+
+def test_a_shadow_is_not_part_of_a_person():
+    rng = np.random.default_rng(6)
+    pictures = []
+    for i in range(60):
+        picture = np.clip(rng.normal((120, 140, 130), NOISE, (240, 320, 3)), 0, 255)
+        u = 30 + 3 * (i - 20)
+        if i < 20:  # the ground alone, to be learnt
+            pictures.append(picture.astype(np.uint8))
+            continue
+        picture[170:182, u + 12 : u + 60] *= 0.7
+        picture[100:180, u - 12 : u + 13] = (150, 60, 30)
+        pictures.append(picture.astype(np.uint8))
+    found = watch(motion("person"), pictures)
+    for i, boxes in list(enumerate(found))[25:]:
+        assert len(boxes) == 1
+        np.testing.assert_allclose(boxes[0].center_px, (30 + 3 * (i - 20), 139.5), atol=2.0)
+        np.testing.assert_allclose(boxes[0].size_px, (25, 80), atol=3.0)
+
+
+def test_light_that_changes_everywhere_is_no_target():
+    rng = np.random.default_rng(7)
+    pictures = [sky(rng) for _ in range(30)] + [np.clip(sky(rng) * 0.6, 0, 255).astype(np.uint8)]
+    assert watch(motion("bird"), pictures)[-1] == []
+
+
+def test_times_that_repeat_or_jump_back_do_no_harm():
+    rng = np.random.default_rng(8)
+    detector = motion("bird")
+    for t in (0.0, 0.0, 5.0, 1.0, 1.0, 1.04):
+        assert detector.detect(Frame(sky(rng), t)) == []
+
+
+@pytest.mark.parametrize("name", ["bird", "person"])
+def test_another_image_size_is_an_error(name):
+    rng = np.random.default_rng(9)
+    detector = motion(name)
+    detector.detect(Frame(sky(rng), 0.0))
+    with pytest.raises(CotargetError, match="320x240 to 200x100"):
+        detector.detect(Frame(sky(rng, (100, 200)), 0.1))
+
+
+def test_the_kind_of_detector_follows_the_target():
+    assert isinstance(motion("bird"), MotionDetector)
+    colour = TargetConfig(0.2, "width", 160.0, "colour")
+    assert isinstance(make_detector(colour, RATE, cover()), ColourDetector)

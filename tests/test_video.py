@@ -1,0 +1,140 @@
+"""Films written and read back, refused, and run through detector and tracker."""
+
+import csv
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.config import DEFAULT_TARGETS
+from cotarget.errors import CotargetError
+from cotarget.film import COLUMNS, run_on_film
+from cotarget.video import Film, FilmWriter
+
+RATE = 25.0
+BIRD = DEFAULT_TARGETS["bird"]
+
+
+def bird_film(path, count=60, size=(161, 121)):
+    """A dark 12 x 6 px bird that crosses a bright sky at 50 px/s; an odd size on purpose."""
+    with FilmWriter(path, RATE) as film:
+        for i in range(count):
+            image = np.full((size[1], size[0], 3), (220, 190, 160), np.uint8)
+            u = 10 + 2 * i
+            image[50:56, u - 6 : u + 6] = 30
+            film.write(image)
+
+
+def test_a_film_is_h264_yuv420p_and_reads_back(tmp_path):
+    path = tmp_path / "a.mp4"
+    bird_film(path, 10)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+    with Film(path) as film:
+        frames = list(film)
+        assert film.size == (162, 122)
+        assert film.rate_hz == pytest.approx(RATE)
+    np.testing.assert_allclose([f.t for f in frames], np.arange(10) / RATE, atol=1e-3)
+    assert frames[0].image[52, 8].max() < 70
+    assert frames[0].image[20, 100].min() > 140
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_a_film_that_failed_leaves_the_old_one(tmp_path):
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"old")
+
+    def fail():
+        with FilmWriter(path, RATE) as film:
+            film.write(np.zeros((20, 20, 3), np.uint8))
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert path.read_bytes() == b"old"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_films_that_cannot_be_read_name_the_file(tmp_path):
+    text, sound, cut = tmp_path / "text.mp4", tmp_path / "sound.wav", tmp_path / "cut.mp4"
+    text.write_text("no film")
+    with av.open(str(sound), "w") as out:
+        stream = out.add_stream("pcm_s16le", rate=8000)
+        block = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        block.sample_rate = 8000
+        out.mux(stream.encode(block))
+    bird_film(tmp_path / "whole.mp4", 10)
+    cut.write_bytes((tmp_path / "whole.mp4").read_bytes()[:300])
+    for path, said in [
+        (tmp_path / "none.mp4", "no such file"),
+        (tmp_path, "directory"),
+        (text, "cannot be read as a film"),
+        (sound, "no video stream"),
+        (cut, "cannot be read as a film"),
+    ]:
+        with pytest.raises(CotargetError, match=said) as caught:
+            run_on_film(path, BIRD, tmp_path / "out.csv")
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_a_size_that_changes_on_the_way_is_named(tmp_path):
+    path = tmp_path / "two.mjpeg"
+    for width in (64, 96):
+        picture = cv2.imencode(".jpg", np.full((48, width, 3), 128, np.uint8))[1].tobytes()
+        with path.open("ab") as file:
+            file.write(picture * 3)
+    with pytest.raises(CotargetError, match=r"64x48 to 96x48 at frame 3"), Film(path) as film:
+        list(film)
+
+
+def test_run_on_film(tmp_path):
+    film, table, drawn = tmp_path / "a.mp4", tmp_path / "a.csv", tmp_path / "drawn.mp4"
+    bird_film(film)
+    told = []
+    summary = run_on_film(film, BIRD, table, drawn, lambda done, total: told.append((done, total)))
+    assert told == [(i, 60) for i in range(1, 61)]
+    with table.open() as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == COLUMNS
+    assert {row["track"] for row in rows} == {"1"}
+    assert summary.tracks == 1
+    assert summary.frames == 60
+    assert summary.frames_with_target == len(rows) > 35  # half a second to learn the sky, some frames to be sure
+    for row in rows:
+        i = int(row["frame"])
+        if i < 40:  # while little of the sky is known, a slow bird's tail melts into it
+            continue
+        assert float(row["t"]) == pytest.approx(i / RATE, abs=1e-3)
+        assert float(row["u_px"]) == pytest.approx(9.5 + 2 * i, abs=1.5)  # columns u-6 to u+5; coding blurs by a pixel
+        assert float(row["v_px"]) == pytest.approx(52.5, abs=1.0)
+        assert float(row["width_px"]) == pytest.approx(12, abs=3)
+        assert 0 <= float(row["score"]) <= 1
+    with Film(drawn) as out:
+        last = list(out)[-1].image.astype(int)
+    with Film(film) as original:
+        before = list(original)[-1].image.astype(int)
+    assert (np.abs(last - before).max(axis=2) > 60).sum() > 40  # a box, a number and a trail are there
+
+
+def test_a_failing_run_keeps_the_old_table(tmp_path):
+    table = tmp_path / "a.csv"
+    table.write_text("old")
+    with pytest.raises(CotargetError):
+        run_on_film(tmp_path / "none.mp4", BIRD, table)
+    bird_film(tmp_path / "a.mp4", 5)
+
+    def fail(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_on_film(tmp_path / "a.mp4", BIRD, table, tmp_path / "b.mp4", fail)
+    assert table.read_text() == "old"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "a.mp4"]
+    with pytest.raises(CotargetError, match="is the film itself"):
+        run_on_film(tmp_path / "a.mp4", BIRD, tmp_path / "a.mp4")
+    with pytest.raises(CotargetError, match="folder"):
+        run_on_film(tmp_path / "a.mp4", BIRD, tmp_path / "nowhere" / "a.csv")
