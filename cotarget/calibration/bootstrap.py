@@ -77,7 +77,6 @@ def learn_fixed(recorder: Recorder, rng: np.random.Generator) -> RigModel:
 def learn_zoom(recorder: Recorder, model: RigModel) -> RigModel:
     """Rough Gamma and T: find the board with the zoom camera, turn the head a little, and see how it moves."""
     assert model.fixed is not None
-    points = board_points(recorder.board)
     focal = recorder.rig.zoom.state().focal_px
     width, height = size = recorder.rig.zoom.size
     zoom = Intrinsics(size, (focal, focal), ((width - 1) / 2, (height - 1) / 2))
@@ -86,27 +85,56 @@ def learn_zoom(recorder: Recorder, model: RigModel) -> RigModel:
     centred = _centred(recorder, view, by_pan, by_tilt)
     if centred is not view:
         by_pan, by_tilt = _turn_a_little(recorder, centred)
-    seen = [centred, by_pan, by_tilt]
-    heads = [base_head(v.pan, v.tilt) for v in seen]
-    boards = _consistent_poses(heads, [pose_candidates(zoom, v.corners_px, points) for v in seen])
-    # Small turns tell the rotation; the translation is a matter of centimetres and has to wait.
-    hand = RigidTransform.from_rotation(park_martin(*motions(heads, boards)).rotation)
+    _present_otherwise_tilted(recorder, model, centred)
+    model = _likeliest(replace(model, zoom=zoom), recorder, [centred, by_pan, by_tilt])
+    return refitted(model, recorder)
+
+
+def _present_otherwise_tilted(recorder: Recorder, model: RigModel, view: View) -> None:
+    """Show both cameras another board in the same place: of Gamma's mirror images only the true one fits both."""
+    assert model.fixed is not None
+    points = board_points(recorder.board)
     fixed_view = next(v for v in recorder.of_placement(view.board) if v.camera == "fixed")
-    T_zoom_fixed = boards[0] * board_pose(model.fixed, fixed_view.corners_px, points).inv()
-    gamma = hand.inv() * heads[0] * hand * T_zoom_fixed  # Eq. 2 solved for Gamma
-    return refitted(replace(model, zoom=zoom, hand=hand, gamma=gamma), recorder)
+    middle = board_pose(model.fixed, fixed_view.corners_px, points).apply(points.mean(axis=0))
+    recorder.turn(view.pan, view.tilt)
+    recorder.present(facing_board(recorder.board, middle, CLEARLY_TILTED.inv()))
+    recorder.see_fixed()
+    recorder.see_zoom(expected=False)
 
 
-def _consistent_poses(
-    heads: Sequence[RigidTransform], candidates: Sequence[Sequence[RigidTransform]]
-) -> tuple[RigidTransform, ...]:
-    """Of each view's two possible poses, those between which the camera turns by the same angles as the head."""
+def _likeliest(model: RigModel, recorder: Recorder, seen: Sequence[View]) -> RigModel:
+    """Rough Gamma and T from one placement seen from three head poses.
 
-    def mismatch(boards: tuple[RigidTransform, ...]) -> float:
-        A, B = motions(heads, boards)
-        return sum(abs(float(a.rotation.magnitude() - b.rotation.magnitude())) for a, b in zip(A, B, strict=True))
-
-    return min(itertools.product(*candidates), key=mismatch)
+    Each view has two possible poses of the board; every combination of them makes a model, and all views so far
+    judge between these.
+    """
+    assert model.fixed is not None
+    assert model.zoom is not None
+    points, zoom = board_points(recorder.board), model.zoom
+    heads = [base_head(view.pan, view.tilt) for view in seen]
+    fixed_view = next(v for v in recorder.of_placement(seen[0].board) if v.camera == "fixed")
+    T_fixed_board = board_pose(model.fixed, fixed_view.corners_px, points)
+    both = {v.board for v in recorder.views if v.camera == "fixed"} & {
+        v.board for v in recorder.views if v.camera == "zoom"
+    }
+    views = [view for view in recorder.views if view.board in both]
+    results: list[tuple[float, RigModel]] = []
+    refused = None
+    for boards in itertools.product(*(pose_candidates(zoom, view.corners_px, points) for view in seen)):
+        try:
+            # Small turns tell the rotation; the translation is a matter of centimetres and has to wait.
+            hand = RigidTransform.from_rotation(park_martin(*motions(heads, boards)).rotation)
+            gamma = hand.inv() * heads[0] * hand * boards[0] * T_fixed_board.inv()  # Eq. 2 solved for Gamma
+            start = place_boards(replace(model, hand=hand, gamma=gamma), views, points)
+            result = fit(start, views, points, {"gamma", "hand"})
+        except CalibrationError as error:
+            refused = refused or error
+            continue
+        # The fit's T is only good for judging: so few views do not yet determine its translation.
+        results.append((result.rms_px, replace(model, hand=hand, gamma=gamma)))
+    if not results:
+        raise refused or CalibrationError("hand-eye: no motion of the head was seen")
+    return min(results, key=lambda one: one[0])[1]
 
 
 def _find_with_zoom(recorder: Recorder, model: RigModel) -> View:
