@@ -15,6 +15,8 @@ from cotarget.geometry import Array
 UNDISTORT_STEPS = 20
 # A pixel counts as explained when its ray projects back to within this normalised distance (about 1e-9 px).
 UNDISTORT_TOLERANCE = 1e-12
+# The ratio of true to nominal focal length hardly changes over the range, so that this fixed point is there at once.
+NOMINAL_ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -59,8 +61,8 @@ class Intrinsics:
         with np.errstate(all="ignore"):
             xy = x_camera[..., :2] / depth[..., None]
             J = self._distort_jacobian(xy)
-            unfolded = J[..., 0, 0] * J[..., 1, 1] > J[..., 0, 1] * J[..., 1, 0]
-            valid = np.greater(depth, 0) & unfolded & self._before_fold(xy)
+            unfolded = np.greater(J[..., 0, 0] * J[..., 1, 1], J[..., 0, 1] * J[..., 1, 0])
+            valid = np.logical_and.reduce([depth > 0, unfolded, self._before_fold(xy)])
             pixels = self._distort(xy) * np.array(self.focal_px) + np.array(self.center_px)
         return np.where(valid[..., None], pixels, np.nan)
 
@@ -84,6 +86,8 @@ class Intrinsics:
                 step_x = (J[..., 1, 1] * error[..., 0] - J[..., 0, 1] * error[..., 1]) / det
                 step_y = (J[..., 0, 0] * error[..., 1] - J[..., 1, 0] * error[..., 0]) / det
                 xy = xy - np.stack([step_x, step_y], axis=-1)
+                if not np.any(np.abs(error) > np.finfo(float).eps):
+                    break
             off = np.linalg.norm(self._distort(xy) - distorted, axis=-1)
             ok = (off <= UNDISTORT_TOLERANCE * (1 + np.linalg.norm(distorted, axis=-1))) & self._before_fold(xy)
         ray = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
@@ -197,6 +201,8 @@ class ZoomLens:
 
     def at(self, nominal_px: float) -> Intrinsics:
         """The intrinsics when the device says its focal length is ``nominal_px``."""
+        if len(self.stops) == 1:
+            return self.stops[0].scaled(nominal_px / self.nominal_px[0])
         log_nominal = np.log(self.nominal_px)
         x = np.log(nominal_px)
 
@@ -218,8 +224,10 @@ class ZoomLens:
     def nominal_for(self, focal_px: float) -> float:
         """What to tell the device so that the true horizontal focal length is ``focal_px`` [px]."""
         nominal = focal_px
-        for _ in range(UNDISTORT_STEPS):  # the ratio hardly changes, so this fixed point converges at once
-            nominal = focal_px * nominal / self.at(nominal).focal_px[0]
+        for _ in range(NOMINAL_ROUNDS):
+            previous, nominal = nominal, focal_px * nominal / self.at(nominal).focal_px[0]
+            if abs(nominal - previous) <= np.finfo(float).eps * nominal:
+                break
         return nominal
 
     def resized(self, size: tuple[int, int]) -> "ZoomLens":

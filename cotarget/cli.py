@@ -215,7 +215,7 @@ def _aim(options: argparse.Namespace) -> None:
 def _follow(options: argparse.Namespace) -> None:
     from cotarget.calibration import load_calibration
     from cotarget.config import load_config
-    from cotarget.demo import open_detector
+    from cotarget.detection import make_detector
     from cotarget.drawing import side_by_side
     from cotarget.loop import FollowSettings, State, follow
     from cotarget.recording import StepTable
@@ -227,7 +227,7 @@ def _follow(options: argparse.Namespace) -> None:
     target = config.target(options.target)
     calibration = load_calibration(options.calibration)
     calibration = calibration.for_streams(config.sim.fixed.size, config.sim.zoom.size)
-    detector = open_detector(target, config.sim.fixed.rate_hz)
+    detector = make_detector(target, config.sim.fixed.rate_hz)
     for path in (options.csv, options.video):
         if path is not None:
             _check_folder(path)

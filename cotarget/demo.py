@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from cotarget.calibration import Calibration, calibrate_rig, save_calibration
-from cotarget.config import RigConfig, TargetConfig
-from cotarget.detection import Detector, make_detector
+from cotarget.config import RigConfig
+from cotarget.detection import make_detector
 from cotarget.drawing import TargetStages, captioned, draw_frames, plot_aim_error, side_by_side
 from cotarget.errors import ConfigError
 from cotarget.loop import FollowSettings, follow
@@ -78,20 +78,6 @@ def sim_config(scene: str, targets: tuple[str, ...], seed: int) -> RigConfig:
     """The default rig in a scene with targets."""
     config = RigConfig()
     return dataclasses.replace(config, sim=dataclasses.replace(config.sim, scene=scene, targets=targets, seed=seed))
-
-
-def open_detector(target: TargetConfig, rate_hz: float) -> Detector:
-    """Make a target's detector, with its template read.
-
-    Raises:
-        ConfigError: the template is not a picture.
-    """
-    if target.template is None:
-        return make_detector(target, rate_hz)
-    template = cv2.imread(str(target.template), cv2.IMREAD_COLOR) if target.template.is_file() else None
-    if template is None:
-        raise ConfigError(f"{target.template}: is not a picture; the template of a target is a PNG or JPEG of it")
-    return make_detector(target, rate_hz, template)
 
 
 @contextmanager
@@ -161,7 +147,7 @@ def _follow_one(
     rows: list[Row] = []
     with SafeRig(world.rig, config.safety) as rig:
         stages = TargetStages(rig.zoom.focal_range[0])
-        detector = open_detector(target, config.sim.fixed.rate_hz)
+        detector = make_detector(target, config.sim.fixed.rate_hz)
         settings = FollowSettings(command_delay_s=config.command_delay_s)
         frames = round(RUN_S[name] * config.sim.fixed.rate_hz)
         for step in follow(rig, calibration, target, detector, seconds=RUN_S[name], settings=settings):

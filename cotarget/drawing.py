@@ -1,5 +1,6 @@
 """Pictures from Steps: side by side frames, one picture a target, and the aim error over time."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -23,10 +24,14 @@ FOUND, FOLLOWED, CROSS, INK, PAPER, ARROW = (
     (0, 120, 235),
 )
 STRIP_PX = 36  # height of a caption
+# For the picture "centred" the lens may have begun to zoom in by this factor.
+ZOOMED_OUT = 1.5
+# For the close-up, lens (relative) and head (over the image's width) are this near to where they are wanted.
+SETTLED = 0.08
 BOX_MARGIN_PX = 4  # a box stands this far outside of what it marks
 
 
-def write_text(image: Image, text: str, at: Sequence[float], scale: float = 0.55, *, halo: bool = True) -> None:
+def write_text(image: Image, text: str, at: Sequence[float] | Array, scale: float = 0.55, *, halo: bool = True) -> None:
     """Write text into an image, in dark ink; with a light halo where the background is a picture."""
     u, v = round(at[0]), round(at[1])
     font = cv2.FONT_HERSHEY_SIMPLEX
@@ -88,16 +93,18 @@ def side_by_side(step: Step, title: str) -> Image:
 
 
 class TargetStages:
-    """Picks from a run of Steps what one picture of a target shows: before, centred, and close up."""
+    """Picks from a run of Steps what one picture of a target shows: before, centred, and close up.
+
+    It judges by what the loop itself knows: how far head and lens are from where the aim wants them.
+    """
 
     def __init__(self, shortest_px: float) -> None:
         """Begin; ``shortest_px`` is the shortest nominal focal length."""
         self._shortest = shortest_px
-        self._zoomed = False
+        self._off_centred, self._largest = math.inf, 0.0
         self.before: Step | None = None
         self.centred: Step | None = None
         self.close: Step | None = None
-        self._best = np.inf
 
     def see(self, step: Step) -> None:
         """Take a Step into account."""
@@ -105,19 +112,13 @@ class TargetStages:
             self.before = step
         if step.state is not State.FOLLOWING or step.aim is None or step.target is None:
             return
-        if not self._zoomed and step.lens.focal_px < 1.02 * self._shortest:
-            self.centred = step
-        else:
-            self._zoomed = True
-        # The best close-up, as far as the loop itself knows: the lens where it should be, the head where it should be.
-        away = abs(np.log(step.lens.focal_px / step.aim.nominal_px))
-        away += (
-            np.hypot(step.head.pan - step.aim.pan, step.head.tilt - step.aim.tilt)
-            * step.aim.focal_px
-            / step.zoom.image.shape[1]
-        )
-        if self._zoomed and away <= self._best:
-            self._best, self.close = away, step
+        off_px = math.hypot(step.head.pan - step.aim.pan, step.head.tilt - step.aim.tilt) * step.lens.focal_px
+        if step.lens.focal_px < ZOOMED_OUT * self._shortest and off_px < self._off_centred:
+            self._off_centred, self.centred = off_px, step
+        size = float(np.max(step.target.box.size_px))
+        settled = abs(math.log(step.lens.focal_px / step.aim.nominal_px)) < SETTLED
+        if settled and off_px < SETTLED * step.zoom.image.shape[1] and size > self._largest:
+            self._largest, self.close = size, step
 
     def picture(self, title: str) -> Image:
         """The wide view with its detection and the zoom view before, centred and close up, as in Fig. 4 to 6."""

@@ -46,7 +46,7 @@ class FollowSettings:
     command_delay_s: float = 0.0
     zoom_out_after_s: float = 0.4
     focal_deadband: float = 0.04
-    margin: float = 0.8
+    margin: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -133,12 +133,12 @@ def follow(
                 mode, reason = State.LOST, f"out of sight for {frame.t - last_seen:.1f} s"
             else:
                 try:
-                    aimed = lead(rig, calibration, target, chosen, settings.command_delay_s, interval)
+                    aimed, way = lead(rig, calibration, target, chosen, settings.command_delay_s, interval)
                 except CotargetError as error:
                     mode, reason = State.UNREACHABLE, str(error)
         if aimed is not None:
             pan, tilt = rig.head.move(aimed.pan, aimed.tilt)
-            nominal = min(aimed.nominal_px, _focal_while_turning(rig, pan, tilt, settings.margin))
+            nominal = min(aimed.nominal_px, _focal_while_turning(rig, way, settings.margin))
             focal = _command_lens(rig, nominal, commanded[2], settings.focal_deadband)
             commanded = (pan, tilt, focal)
         elif mode is not State.UNREACHABLE and commanded[2] > shortest:
@@ -164,7 +164,7 @@ def follow(
 
 def lead(
     rig: Rig, calibration: Calibration, target: TargetConfig, track: Track, command_delay_s: float, interval_s: float
-) -> Aim:
+) -> tuple[Aim, float]:
     """Aim so that the head keeps up with a track: the unit brakes to rest at every goal, so the goal lies ahead.
 
     At the next command's effect the head shall be where the target then is, and as fast; from there it needs
@@ -177,6 +177,9 @@ def lead(
         track: in the fixed view.
         command_delay_s: from command to motion [s].
         interval_s: from one command to the next [s].
+
+    Returns:
+        The aim, and how far the head now is from where the target will be when it moves [rad].
 
     Raises:
         UnreachableError: no pan and tilt within the limits do it.
@@ -194,7 +197,8 @@ def lead(
         ahead + stopping_distance((ahead - now) / interval_s, limits)
         for now, ahead in ((at_effect.pan, after.pan), (at_effect.tilt, after.tilt))
     )
-    return dataclasses.replace(after, pan=pan, tilt=tilt)
+    way = math.hypot(at_effect.pan - head.pan, at_effect.tilt - head.tilt)
+    return dataclasses.replace(after, pan=pan, tilt=tilt), way
 
 
 def stopping_distance(rate: float, limits: PanTiltLimits) -> float:
@@ -203,20 +207,18 @@ def stopping_distance(rate: float, limits: PanTiltLimits) -> float:
     return rate * abs(rate) / (2 * limits.acceleration)
 
 
-def _focal_while_turning(rig: Rig, pan: float, tilt: float, margin: float) -> float:
-    """The longest nominal focal length [px] that keeps the goal inside the image while the head is still on its way.
+def _focal_while_turning(rig: Rig, way: float, margin: float) -> float:
+    """The longest nominal focal length [px] that keeps the target well inside while the head has still to turn.
 
     Args:
-        rig: gives where the head is.
-        pan: the goal [rad].
-        tilt: likewise.
-        margin: part of the image's half height that the way still to go may take.
+        rig: gives the image's size and the lens's range.
+        way: how far the head is from the target [rad].
+        margin: part of the image's half height that the way may take.
     """
-    head = rig.head.state()
-    way = math.tan(min(math.hypot(pan - head.pan, tilt - head.tilt), 1.5))  # [rad], short of a right angle
+    shortest, longest = rig.zoom.focal_range
     half = margin * min(rig.zoom.size) / 2
-    longest = rig.zoom.focal_range[1]
-    return longest if way * longest <= half else max(half / way, rig.zoom.focal_range[0])
+    slope = math.tan(min(way, 1.5))  # [rad], short of a right angle
+    return longest if slope * longest <= half else max(half / slope, shortest)
 
 
 def _command_lens(rig: Rig, nominal_px: float, commanded_px: float, deadband: float) -> float:

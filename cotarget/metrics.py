@@ -7,7 +7,7 @@ truth; the scores only read rows.
 import csv
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -290,15 +290,19 @@ def read_rows(path: Path) -> list[Row]:
         ConfigError: the file is missing, or is not a steps.csv.
     """
     kinds = {f.name: f.type for f in dataclasses.fields(Row)}
-    parse = {int: int, float: float, str: str, bool: lambda text: {"True": True, "False": False}[text]}
+    parse: dict[object, Callable[[str], object]] = {int: int, float: float, str: str, bool: _truth_value}
     try:
         with path.open(newline="", encoding="utf-8") as file:
             return [
-                Row(**{name: parse[kind](line[name]) for name, kind in kinds.items()})  # type: ignore[index]
+                Row(**{name: parse[kind](line[name]) for name, kind in kinds.items()})  # type: ignore[arg-type]
                 for line in csv.DictReader(file)
             ]
     except (OSError, KeyError, ValueError) as error:
         raise ConfigError(f"{path}: is not a steps.csv: {type(error).__name__}: {error}") from None
+
+
+def _truth_value(text: str) -> bool:
+    return {"True": True, "False": False}[text]
 
 
 def _acquired(rows: Sequence[Row]) -> int | None:

@@ -286,13 +286,18 @@ def _residual(unknowns: Array, target: Array, d: Array, t: Array, head: HeadGeom
     q = _turn(axis, tilt, reach[:, None] * d + t - dz)
     reached = _turn(e_y, pan, q + dz)
     J = np.stack(
-        [np.cross(e_y, reached), _turn(e_y, pan, np.cross(axis, q)), _turn(e_y, pan, _turn(axis, tilt, d))], axis=-1
+        [_cross(e_y, reached), _turn(e_y, pan, _cross(axis, q)), _turn(e_y, pan, _turn(axis, tilt, d))], axis=-1
     )
     return reached - target, J
 
 
 def _turn(axis: Array, angle: Array, v: Array) -> Array:
-    """Rodrigues' rotation of vectors (..., 3) about a unit axis by angles (...)."""
+    """Rodrigues' rotation of vectors (..., 3) about a unit axis (3,) by angles (...)."""
     c, s = np.cos(angle)[..., None], np.sin(angle)[..., None]
-    axis = np.broadcast_to(axis, v.shape)
-    return c * v + s * np.cross(axis, v) + (1 - c) * np.sum(axis * v, axis=-1, keepdims=True) * axis
+    return c * v + s * _cross(axis, v) + (1 - c) * (v @ axis)[..., None] * axis
+
+
+def _cross(axis: Array, v: Array) -> Array:
+    """Cross product of one vector (3,) with vectors (..., 3); numpy's own takes ten times as long for a few."""
+    x, y, z = axis
+    return v @ np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])

@@ -16,7 +16,7 @@ Method = Literal["exact", "paper-table", "paper-example"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
 # The ray of the wanted pixel depends a little on the focal length and the focal length on the range along that ray;
-# each round shrinks what is left by the ratio of the principal point's offset to the range.
+# each round shrinks what is left by the lever arm over the range times the principal point's offset, 1e-4 together.
 FOCAL_ROUNDS = 3
 # Standard deviation of what is rounded to the nearest whole number.
 ROUNDED = 1 / np.sqrt(12)
@@ -174,7 +174,7 @@ def error_budget(
     """
 
     def moved(du: float, dv: float, depth: float) -> float:
-        x_fixed = point_at(calibration, np.asarray(pixel) + (du, dv), depth)
+        x_fixed = point_at(calibration, np.add(pixel, (du, dv)), depth)
         there = aim(calibration, x_fixed, reach, nominal_px=found.nominal_px)
         here = aim(calibration, found.x_fixed, reach, nominal_px=found.nominal_px)
         return float(np.hypot((there.pan - here.pan) * np.cos(here.tilt), there.tilt - here.tilt))

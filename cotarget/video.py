@@ -17,6 +17,8 @@ from cotarget.rig import Frame, Image
 FALLBACK_RATE_HZ = 25.0
 # x264's constant quality: 18 is close to invisible loss, 23 its default; boxes and digits stay sharp at 20.
 QUALITY = "20"
+# x264's trade of time against size: this costs a fifth of its default's time and gives files a tenth larger.
+PRESET = "veryfast"
 
 
 class Film:
@@ -120,7 +122,9 @@ class FilmWriter:
             image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE).astype(np.uint8)
         try:
             if self._stream is None:
-                self._stream = self._container.add_stream("libx264", rate=self._rate, options={"crf": QUALITY})
+                self._stream = self._container.add_stream(
+                    "libx264", rate=self._rate, options={"crf": QUALITY, "preset": PRESET}
+                )
                 self._stream.width, self._stream.height = image.shape[1], image.shape[0]
                 self._stream.pix_fmt = "yuv420p"
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24")

@@ -4,6 +4,7 @@ Written apart from `cotarget.camera`, so that a mistake shared between the simul
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -14,8 +15,11 @@ from cotarget.rig import Image
 # The map is computed at every fourth pixel and interpolated: a distortion of k1 = -0.2 curves by less than
 # 6 |k1| r / f a pixel, so this costs at most 0.005 px, in the corners.
 MAP_STRIDE = 4
+# Fields and maps are kept for the lens positions in use: the fixed camera's one and the zoom camera's latest.
+KEPT_MAPS = 8
 # A fixed point: every round shrinks the error by about 3 |k1| r^2, less than 0.3.
-UNDISTORT_ROUNDS = 40
+UNDISTORT_ROUNDS = 60
+UNDISTORTED = 1e-14  # step of the normalised coordinates at which it has converged
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,10 @@ class TrueLens:
         bent = (pixels - self.center_px) / self.focal_px
         xy = bent
         for _ in range(UNDISTORT_ROUNDS):
-            xy = xy + (bent - self._bend(xy))
+            step = bent - self._bend(xy)
+            xy = xy + step
+            if np.abs(step).max() < UNDISTORTED:
+                break
         return xy
 
     def _bend(self, xy: Array) -> Array:
@@ -51,6 +58,7 @@ class TrueLens:
         )
 
 
+@lru_cache(maxsize=KEPT_MAPS)
 def covering_half_field(lens: TrueLens) -> tuple[float, float]:
     """Tangents of the half field (horizontal, vertical) of a centred pinhole view that covers the whole image."""
     w, h = lens.size
@@ -67,13 +75,19 @@ def bend(pinhole: Image, pinhole_focal_px: float, lens: TrueLens) -> Image:
         pinhole_focal_px: its focal length [px].
         lens: the lens wanted.
     """
+    where = _map(lens, pinhole_focal_px, (pinhole.shape[1], pinhole.shape[0]))
+    return cv2.remap(pinhole, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+@lru_cache(maxsize=KEPT_MAPS)
+def _map(lens: TrueLens, pinhole_focal_px: float, pinhole_size: tuple[int, int]) -> Array:
+    """For every pixel of the lens's image where to look in the pinhole render, (H, W, 2) float32."""
     w, h = lens.size
     u, v = np.arange(0, w + MAP_STRIDE, MAP_STRIDE), np.arange(0, h + MAP_STRIDE, MAP_STRIDE)
     coarse = lens.directions(np.stack(np.meshgrid(u, v), axis=-1).astype(float)) * pinhole_focal_px
-    coarse += (np.array(pinhole.shape[1::-1]) - 1) / 2
+    coarse += (np.array(pinhole_size) - 1) / 2
     # Interpolate between the coarse samples exactly at multiples of the stride: an affine warp, not a resize,
     # because a resize would shift by half a sample.
     scale = np.array([[1 / MAP_STRIDE, 0, 0], [0, 1 / MAP_STRIDE, 0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    fine = cv2.warpAffine(coarse.astype(np.float32), scale, (w, h), flags=flags)
-    return cv2.remap(pinhole, fine, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.warpAffine(coarse.astype(np.float32), scale, (w, h), flags=flags)

@@ -6,6 +6,8 @@ import sys
 
 from cotarget.errors import DeviceError
 
+__all__ = ["BACKEND", "make_renderer", "mujoco"]
+
 INSTALL = "install one: apt-get install libegl1 libgl1-mesa-dri libopengl0"
 
 

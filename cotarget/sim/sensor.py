@@ -39,5 +39,5 @@ class Sensor:
             image = cv2.add(image, field[y : y + h, x : x + w], dtype=cv2.CV_8U)
         if self._quality is not None:
             coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self._quality])[1]
-            image = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+            image = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), dtype=np.uint8)
         return image
