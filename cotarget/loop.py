@@ -179,7 +179,7 @@ def lead(
         interval_s: from one command to the next [s].
 
     Returns:
-        The aim, and how far the head now is from where the target will be when it moves [rad].
+        The aim, and how far the head is now from where the target is now [rad].
 
     Raises:
         UnreachableError: no pan and tilt within the limits do it.
@@ -193,11 +193,14 @@ def lead(
         aim(calibration, point_at(calibration, track.predict(t), depth), reach, closeup=closeup)
         for t in (effect, effect + interval_s)
     )
+    rates = [(after.pan - at_effect.pan) / interval_s, (after.tilt - at_effect.tilt) / interval_s]
     pan, tilt = (
-        ahead + stopping_distance((ahead - now) / interval_s, limits)
-        for now, ahead in ((at_effect.pan, after.pan), (at_effect.tilt, after.tilt))
+        goal + stopping_distance(rate, limits) for goal, rate in zip((after.pan, after.tilt), rates, strict=True)
     )
-    way = math.hypot(at_effect.pan - head.pan, at_effect.tilt - head.tilt)
+    # Where the target is now lies one delay back from where it will be when the command takes effect.
+    way = math.hypot(
+        at_effect.pan - rates[0] * command_delay_s - head.pan, at_effect.tilt - rates[1] * command_delay_s - head.tilt
+    )
     return dataclasses.replace(after, pan=pan, tilt=tilt), way
 
 
