@@ -1,7 +1,8 @@
 """The first look through a rig of which nothing is known: from the first board to a rough model.
 
 The board straight ahead tells the fixed camera's focal length, and some tilted ones its rough intrinsics; a scan with
-the head finds it in the zoom camera; two small turns tell how the camera sits on the head, and so Gamma.
+the head finds it in the zoom camera; two small turns tell how the camera sits on the head, and so Gamma, up to the
+mirror image that any single flat board allows; a second board decides.
 """
 
 import itertools
