@@ -5,7 +5,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from cotarget.calibration import Calibration
+from cotarget.calibration import Calibration, predicted_pointing
 from cotarget.camera import depth_from_size, focal_for_size
 from cotarget.config import TargetConfig
 from cotarget.errors import CalibrationError, CotargetError, UnreachableError
@@ -16,8 +16,10 @@ Method = Literal["exact", "paper-table", "paper-example"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
 # The ray of the wanted pixel depends a little on the focal length and the focal length on the range along that ray;
-# each round shrinks what is left by the lever arm over the range times the principal point's offset, 1e-4 together.
-FOCAL_ROUNDS = 3
+# each round shrinks what is left by the lever arm over the range times the wanted pixel's offset from the principal
+# point over the shortest focal length: some 1e-4 in the middle of the image, so that three rounds do; 3e-2 at its rim.
+FOCAL_ROUNDS = 12
+FOCAL_FOUND = 1e-7  # relative change of the focal length, worth less than 1e-4 px at the wanted pixel
 # Standard deviation of what is rounded to the nearest whole number.
 ROUNDED = 1 / np.sqrt(12)
 
@@ -133,8 +135,7 @@ def aim(
         raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
     x_base = T_head_zoom.apply(calibration.T_zoom0_fixed.apply(x_fixed))  # (6)
     wanted = calibration.zoom.stops[0].image_center_px if pixel is None else np.asarray(pixel, dtype=float)
-    nominal, limited = reach.focal_px[0] if nominal_px is None else nominal_px, False
-    nominal, limited = _limit(nominal, reach)
+    nominal, limited = _limit(reach.focal_px[0] if nominal_px is None else nominal_px, reach)
     for _ in range(FOCAL_ROUNDS if closeup else 1):
         ray = calibration.zoom.at(nominal).ray(wanted)
         if method == "exact":
@@ -142,9 +143,12 @@ def aim(
         else:
             pointing = _paper(calibration, x_fixed, method, reach)
         if closeup:
-            z = float(pointing.range) * ray[2] / float(np.linalg.norm(ray))
+            z = float(pointing.range * ray[2] / np.linalg.norm(ray))
             focal = focal_for_size(closeup.size, closeup.wanted_px, z)  # (17)
+            previous = nominal
             nominal, limited = _limit(calibration.zoom.nominal_for(focal), reach)
+            if abs(nominal - previous) <= FOCAL_FOUND * nominal:
+                break
     return Aim(
         pan=float(pointing.pan),
         tilt=float(pointing.tilt),
@@ -170,7 +174,8 @@ def error_budget(
 
     Returns:
         "steps": rounding to the head's steps; "pixel": a pixel known to the nearest whole one; "size", where a size
-        was given: that likewise, by way of the depth; and "total".
+        was given: that likewise, by way of the depth; "calibration", where it has a covariance: what its own noise
+        leaves; and "total".
     """
 
     def moved(du: float, dv: float, depth: float) -> float:
@@ -186,6 +191,10 @@ def error_budget(
     }
     if size_px is not None:
         parts["size"] = moved(0.0, 0.0, depth * (1 + ROUNDED / size_px))
+    if calibration.covariance is not None:
+        there = (found.pan, found.tilt)
+        sigma = predicted_pointing(calibration, pixel, depth, pan_tilt=there, nominal_px=found.nominal_px)
+        parts["calibration"] = float(sigma)
     return parts | {"total": float(np.sqrt(sum(part**2 for part in parts.values())))}
 
 
