@@ -1,0 +1,249 @@
+"""Targeting against cv2.projectPoints through written-out matrices, the paper's worked point, errors worked by hand."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cotarget.calibration import Calibration
+from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.config import DEFAULT_TARGETS
+from cotarget.errors import CalibrationError, CotargetError, UnreachableError
+from cotarget.geometry import RigidTransform, Rotation
+from cotarget.pantilt import HeadGeometry
+from cotarget.targeting import METHODS, Closeup, Reach, aim, depth_of, error_budget, point_at
+from tests.synthetic import SIZE, Lens, Truth
+
+# The solver accepts a miss of 1e-11 rad, which is 1e-7 px at the longest focal length of 8000 px.
+PIXEL = 1e-6
+# Where focal length and ray are found in turn: the wanted pixel, 300 px from the principal point at the most, moves
+# against it by that times the focal length's last relative change, which is said to be 1e-7.
+IN_TURN_PX = 1e-4
+# That relative change, read back as a size of 160 px.
+SIZE_PX = 2e-5
+# The worked point is printed in whole millimetres, one of which is 160 / 234 px of focal length.
+WHOLE_MM_PX = 160 / 234
+RELATIVE = 1e-9  # double precision through a few square roots
+# The error budget differentiates by finite differences of 0.29 px, whose curvature is of the order 0.29 / 686.
+CURVATURE = 1e-3
+ANYWHERE = Reach((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (667.0, 8000.0))
+CENTRED = Intrinsics(SIZE, (686.0, 684.0), (319.5, 239.5))
+HOME = Calibration(CENTRED, ZoomLens((667.0,), (CENTRED,)), RigidTransform.identity(), RigidTransform.identity())
+
+
+def shifted(x, y=0.0, z=0.0):
+    """A rig without any rotation whose zoom camera sees a point shifted by (x, y, z) [m]."""
+    return replace(HOME, T_zoom0_fixed=RigidTransform.from_translation([x, y, z]))
+
+
+def random_truth(rng, real_head):
+    """A rig with everything off: cameras up to 2 m apart and 20 degrees askew, a lever arm, principal points."""
+    gamma = RigidTransform.from_components(
+        rng.uniform(-1.2, 1.2, 3), Rotation.from_rotvec(np.radians(rng.uniform(-12, 12, 3)))
+    )
+    hand = RigidTransform.from_components(
+        rng.uniform(-0.15, 0.15, 3), Rotation.from_rotvec(np.radians(rng.uniform(-5, 5, 3)))
+    )
+    lens = Lens(rng.uniform(680, 700), rng.uniform(680, 700), *rng.uniform([305, 225], [335, 255]), (-0.1, 0.02, 0.001))
+    lens = replace(lens, distortion=(-0.1, 0.02, 0.001, -0.001, 0.0))
+    dz, eps = (rng.uniform(-0.01, 0.01), np.radians(rng.uniform(-0.5, 0.5))) if real_head else (0.0, 0.0)
+    return Truth(zoom=lens, gamma=gamma, hand=hand, dz=dz, eps=eps)
+
+
+def calibration_of(truth):
+    def intrinsics(lens):
+        return Intrinsics(SIZE, (lens.fx, lens.fy), (lens.cx, lens.cy), lens.distortion)
+
+    return Calibration(
+        fixed=intrinsics(truth.fixed),
+        zoom=ZoomLens((667.0,), (intrinsics(truth.zoom),)),
+        T_zoom0_fixed=truth.gamma,
+        T_head_zoom=truth.hand,
+        head=HeadGeometry(truth.dz, truth.eps),
+    )
+
+
+def seen_by_zoom(truth, found, x_fixed):
+    """Pixel of a point by OpenCV, through 4x4 matrices, with the lens at the focal length that the aim tells."""
+    factor = found.nominal_px / 667.0
+    lens = replace(truth.zoom, fx=truth.zoom.fx * factor, fy=truth.zoom.fy * factor)
+    assert found.focal_px == pytest.approx(lens.fx, rel=RELATIVE)
+    x_zoom = truth.in_zoom(np.atleast_2d(x_fixed), found.pan, found.tilt)
+    assert (x_zoom[:, 2] > 0).all()  # looked at, not away from
+    return lens.project(x_zoom)
+
+
+@pytest.mark.parametrize("real_head", [False, True])
+@pytest.mark.parametrize("pixel", [None, (100.0, 420.0)])
+def test_the_exact_aim_brings_the_target_to_the_wanted_pixel(real_head, pixel):
+    rng = np.random.default_rng(3)
+    wanted = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2) if pixel is None else pixel
+    for _ in range(25):
+        truth = random_truth(rng, real_head)
+        assert np.hypot(truth.zoom.cx - 319.5, truth.zoom.cy - 239.5) > 0  # else a mixed-up centre could hide
+        x_fixed = np.array([*rng.uniform(-0.4, 0.4, 2), 1.0]) * rng.uniform(4, 40)
+        closeup = Closeup(0.3, rng.uniform(20, 300))
+        for how in ({}, {"nominal_px": rng.uniform(667, 8000)}, {"closeup": closeup}):
+            found = aim(calibration_of(truth), x_fixed, ANYWHERE, pixel=pixel, **how)
+            tolerance = IN_TURN_PX if "closeup" in how else PIXEL
+            np.testing.assert_allclose(seen_by_zoom(truth, found, x_fixed)[0], wanted, rtol=0, atol=tolerance)
+            x_zoom = truth.in_zoom(x_fixed[None], found.pan, found.tilt)[0]
+            assert found.range == pytest.approx(np.linalg.norm(x_zoom), rel=RELATIVE)
+            assert found.depth == x_fixed[2]
+
+
+def test_the_closeup_is_as_large_as_wanted():
+    """Two points, a target's width apart and square to the zoom camera's axis, appear the wanted size apart."""
+    rng = np.random.default_rng(4)
+    for _ in range(10):
+        truth = replace(random_truth(rng, True), zoom=Lens(692.0, 693.0, 326.0, 235.0))
+        x_fixed = np.array([*rng.uniform(-0.4, 0.4, 2), 1.0]) * rng.uniform(4, 10)
+        found = aim(calibration_of(truth), x_fixed, ANYWHERE, closeup=Closeup(0.234, 160.0))
+        assert not found.limited
+        M = truth.zoom_fixed(found.pan, found.tilt)
+        half = M[:3, :3].T @ [0.117, 0, 0]
+        ends = seen_by_zoom(truth, found, np.stack([x_fixed - half, x_fixed + half]))
+        assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(160.0, abs=SIZE_PX)
+
+
+def test_an_aim_uses_the_lens_as_it_was_calibrated_at_that_focal_length():
+    """Between two stops the principal point drifts: half way in the logarithm it is half way between."""
+    stops = (Intrinsics(SIZE, (700.0, 700.0), (326.0, 235.0)), Intrinsics(SIZE, (2828.0, 2828.0), (336.0, 245.0)))
+    calibration = replace(HOME, zoom=ZoomLens((700.0, 2800.0), stops))
+    found = aim(calibration, np.array([0.0, 0.0, 10.0]), ANYWHERE, nominal_px=1400.0)
+    focal = 1400 * 1.005  # the ratio to the nominal one is half way between 1 and 1.01
+    assert found.focal_px == pytest.approx(focal, rel=RELATIVE)
+    # What lies straight ahead must come to the image's centre, 11.5 px left of and 0.5 px above (331, 240).
+    assert math.tan(found.pan) == pytest.approx(11.5 / focal, rel=CURVATURE)
+    assert math.tan(found.tilt) == pytest.approx(-0.5 / focal, rel=CURVATURE)
+
+
+def test_the_papers_worked_point():
+    """x_zoom0 = (811, 563, 10464) mm: range 10510 and 7186 px; the paper takes the depth for the range: 7155 px."""
+    x_fixed = np.array([2.9738, 0.5263, 10.0])
+    calibration = shifted(*(np.array([0.811, 0.563, 10.464]) - x_fixed))
+    book = Closeup(0.234, 160.0)
+    exact = aim(calibration, x_fixed, ANYWHERE, closeup=book)
+    assert round(1000 * exact.range) == 10510
+    assert exact.focal_px == pytest.approx(7186, abs=WHOLE_MM_PX)
+    example = aim(calibration, x_fixed, ANYWHERE, closeup=book, method="paper-example")
+    assert round(example.focal_px) == 7155
+    assert round(math.degrees(-example.tilt), 2) == 3.08  # the one angle that the paper prints; down is negative
+    table = aim(calibration, x_fixed, ANYWHERE, closeup=book, method="paper-table")
+    assert table.focal_px == pytest.approx(160 * 10 / 0.234, rel=RELATIVE)  # that reading takes the depth in x_fixed
+    assert METHODS == ("exact", "paper-table", "paper-example")
+
+
+def test_the_shortcut_says_where_it_has_no_solution():
+    """The depth in x_fixed is 1 m, but the point is 3 m below the zoom camera: |b| > r1."""
+    with pytest.raises(UnreachableError, match=r"shortcut has no solution.*use the exact method") as caught:
+        aim(shifted(0.0, 3.0, 5.0), np.array([0.0, 0.0, 1.0]), ANYWHERE, method="paper-table")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("wanted_px", "nominal", "limited"), [
+    (10.0, 667.0, True),  # 10 x 10 / 0.234 = 427 px
+    (160.0, 160 * 10 / 0.234 * 667 / 686, False),  # the true focal length is 686 where the device says 667
+    (1000.0, 8000.0, True),
+])  # fmt: skip
+def test_the_focal_length_is_limited_to_the_lens(wanted_px, nominal, limited):
+    found = aim(HOME, np.array([0.0, 0.0, 10.0]), ANYWHERE, closeup=Closeup(0.234, wanted_px))
+    assert found.nominal_px == pytest.approx(nominal, rel=RELATIVE)
+    assert found.limited is limited
+
+
+def test_without_a_closeup_the_lens_is_at_its_shortest_or_where_told():
+    x_fixed = np.array([0.0, 0.0, 10.0])
+    assert aim(HOME, x_fixed, ANYWHERE).nominal_px == 667.0
+    assert aim(HOME, x_fixed, ANYWHERE, nominal_px=1000.0).nominal_px == 1000.0
+    beyond = aim(HOME, x_fixed, ANYWHERE, nominal_px=9000.0)
+    assert (beyond.nominal_px, beyond.limited) == (8000.0, True)
+
+
+def test_positive_pan_is_right_and_positive_tilt_is_up():
+    """Without offsets: atan(1 / 10) to the right, and up, where y is negative."""
+    right, up = (aim(HOME, np.array(x), ANYWHERE) for x in ([1.0, 0.0, 10.0], [0.0, -1.0, 10.0]))
+    assert (right.pan, right.tilt) == pytest.approx((math.atan(0.1), 0.0), abs=1e-12)
+    assert (up.pan, up.tilt) == pytest.approx((0.0, math.atan(0.1)), abs=1e-12)
+
+
+def test_the_nearest_way_round_is_taken():
+    """A target behind can be looked at by pan 180 or -180: the one that is nearer to where the head is."""
+    wide = replace(ANYWHERE, pan=(-3.5, 3.5))
+    for now in (3.0, -3.0):
+        found = aim(HOME, np.array([0.0, 0.0, -10.0]), replace(wide, now=(now, 0.0)))
+        assert found.pan == pytest.approx(math.copysign(math.pi, now))
+
+
+@pytest.mark.parametrize(("name", "size_px", "depth"), [
+    ("book", 686 * 0.234 / 10, 10.0),  # a width: along u
+    ("person", 684 * 1.75 / 12, 12.0),  # a height: along v
+    ("bird", 686 * 0.8 / 25, 25.0),
+])  # fmt: skip
+def test_depth_from_the_known_size(name, size_px, depth):
+    assert depth_of(HOME, DEFAULT_TARGETS[name], size_px) == pytest.approx(depth, rel=RELATIVE)
+
+
+def test_a_pixel_and_a_depth_are_a_point():
+    """Depth is along the axis, not along the ray."""
+    x = point_at(HOME, np.array([319.5 + 68.6, 239.5 - 136.8]), 10.0)
+    np.testing.assert_allclose(x, [1.0, -2.0, 10.0], rtol=RELATIVE)
+
+
+# The zoom camera 0.3 m beside the axes: it cannot look at a point 0.1 m from them.
+LONG_LEVER = replace(HOME, T_head_zoom=RigidTransform.from_translation([0.3, 0.0, 0.0]))
+FOLDING = replace(HOME, fixed=replace(CENTRED, distortion=(-0.3, 0.0, 0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(("act", "kind", "message"), [
+    (lambda: point_at(HOME, (320, 240), -1.0), CotargetError, "a depth of -1 m is not in front of the fixed camera"),
+    (lambda: point_at(HOME, (320, 240), 0.0), CotargetError, "a depth of 0 m is not in front"),
+    (lambda: point_at(HOME, (320, 240), math.nan), CotargetError, "a depth of nan m is not in front"),
+    (lambda: point_at(HOME, (320, 240), math.inf), CotargetError, "a depth of inf m is not in front"),
+    (lambda: point_at(HOME, (320, 240), depth_of(HOME, DEFAULT_TARGETS["book"], 0.0)), CotargetError, "depth of nan"),
+    (lambda: point_at(HOME, (math.nan, 240), 5.0), CotargetError, r"pixel \(nan, 240\) lies outside"),
+    (lambda: point_at(FOLDING, (5000, 240), 5.0), CotargetError, r"pixel \(5000, 240\) lies outside"),
+    (lambda: aim(HOME, np.array([10.0, 0, 1]), replace(ANYWHERE, pan=(-1, 1))), UnreachableError,
+     r"pan 84\.29, tilt 0\.00 .*beyond the limits pan -57\.29.* to 57\.29"),
+    (lambda: aim(HOME, np.array([0, -10.0, 1]), replace(ANYWHERE, pan=(-1, 1), tilt=(-1, 1))), UnreachableError,
+     r"tilt 84\.29"),
+    (lambda: aim(LONG_LEVER, np.array([-0.2, 0.0, 0.0]), ANYWHERE), UnreachableError, "too close to the head"),
+    (lambda: aim(replace(HOME, T_head_zoom=None), np.array([0, 0, 5.0]), ANYWHERE), CalibrationError,
+     "no T_head_zoom; calibrate on a rig"),
+])  # fmt: skip
+def test_what_cannot_be_aimed_at_is_named_in_one_line(act, kind, message):
+    with pytest.raises(kind, match=message) as caught:
+        act()
+    assert "\n" not in str(caught.value)
+
+
+# One rounded whole is uniform over one unit: its standard deviation is 1 / sqrt(12).
+SIGMA = 1 / math.sqrt(12)
+
+
+def test_error_budget_straight_ahead():
+    """No offset: steps of both axes, the pixel as an angle in u and in v, and a depth that does not matter."""
+    reach, pixel = replace(ANYWHERE, step=math.radians(0.05)), np.array([319.5, 239.5])
+    found = aim(HOME, point_at(HOME, pixel, 10.0), reach)
+    budget = error_budget(HOME, pixel, found, reach, size_px=16.0)
+    assert set(budget) == {"steps", "pixel", "size", "total"}
+    assert budget["steps"] == pytest.approx(math.radians(0.05) * SIGMA * math.sqrt(2), rel=RELATIVE)
+    assert budget["pixel"] == pytest.approx(math.hypot(SIGMA / 686, SIGMA / 684), rel=CURVATURE)
+    assert budget["size"] == pytest.approx(0.0, abs=1e-12)
+    assert budget["total"] == pytest.approx(math.hypot(budget["steps"], budget["pixel"]), rel=RELATIVE)
+
+
+def test_error_budget_off_to_the_side():
+    """The zoom camera 1 m beside: a depth error is a parallax. High up, a step of pan is a shorter way."""
+    calibration, pixel, size_px = shifted(1.0), np.array([319.5, 239.5]), 16.0
+    found = aim(calibration, point_at(calibration, pixel, 10.0), ANYWHERE)
+    budget = error_budget(calibration, pixel, found, ANYWHERE, size_px=size_px)
+    assert budget["steps"] == 0.0
+    assert budget["size"] == pytest.approx(
+        math.atan(1 / 10) - math.atan(1 / (10 * (1 + SIGMA / size_px))), rel=RELATIVE
+    )
+    assert "size" not in error_budget(calibration, pixel, found, ANYWHERE)
+    high = replace(aim(HOME, np.array([0.0, 0.0, 10.0]), ANYWHERE), tilt=math.radians(60))
+    steps = error_budget(HOME, pixel, high, replace(ANYWHERE, step=0.001))["steps"]
+    assert steps == pytest.approx(0.001 * SIGMA * math.sqrt(1 + 0.25), rel=RELATIVE)
