@@ -38,6 +38,7 @@ POINTING_DEPTHS = (4.0, 30.0)
 BACKGROUND_S = 2.0
 # In-frame runs broken for longer than this count as fragmentation [s].
 BREAK_S = 0.2
+ROUNDING_S = 1e-6  # frame times are sums and differences of binary fractions
 
 
 @dataclass(frozen=True)
@@ -293,16 +294,21 @@ def read_rows(path: Path) -> list[Row]:
     parse: dict[object, Callable[[str], object]] = {int: int, float: float, str: str, bool: _truth_value}
     try:
         with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file, restval="")
+            if missing := [name for name in kinds if name not in (reader.fieldnames or ())]:
+                raise ValueError(f"it has no column '{missing[0]}'")
             return [
                 Row(**{name: parse[kind](line[name]) for name, kind in kinds.items()})  # type: ignore[arg-type]
-                for line in csv.DictReader(file)
+                for line in reader
             ]
-    except (OSError, KeyError, ValueError) as error:
-        raise ConfigError(f"{path}: is not a steps.csv: {type(error).__name__}: {error}") from None
+    except (OSError, csv.Error, ValueError) as error:
+        raise ConfigError(f"{path}: is not a steps.csv: {error}") from None
 
 
 def _truth_value(text: str) -> bool:
-    return {"True": True, "False": False}[text]
+    if text not in ("True", "False"):
+        raise ValueError(f"'{text}' is not True or False")
+    return text == "True"
 
 
 def _acquired(rows: Sequence[Row]) -> int | None:
@@ -313,7 +319,7 @@ def _acquired(rows: Sequence[Row]) -> int | None:
             begin = None
         else:
             begin = i if begin is None else begin
-            if row.t_s - rows[begin].t_s >= ACQUIRED_S:
+            if row.t_s - rows[begin].t_s >= ACQUIRED_S - ROUNDING_S:
                 return begin
     return None
 
@@ -325,9 +331,9 @@ def _fragmentation(rows: Sequence[Row]) -> float | None:
     breaks, since = 0, None
     for row in rows:
         if row.in_frame:
-            breaks += since is not None and row.t_s - since > BREAK_S
+            breaks += since is not None and row.t_s - since > BREAK_S + ROUNDING_S
             since = None
         elif since is None:
             since = row.t_s
-    breaks += since is not None and rows[-1].t_s - since > BREAK_S
+    breaks += since is not None and rows[-1].t_s - since > BREAK_S + ROUNDING_S
     return breaks / ((rows[-1].t_s - rows[0].t_s) / 60)
