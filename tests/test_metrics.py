@@ -1,0 +1,209 @@
+"""Every field of Score from rows made by hand; the table on disk."""
+
+import dataclasses
+import math
+
+import pytest
+
+from cotarget.errors import ConfigError
+from cotarget.metrics import Row, Score, read_rows, score, write_rows
+
+PERIOD = 0.04
+EXACT = 1e-9
+CENTRE = (319.5, 239.5)  # of a 640x480 image whose pixel centres are whole numbers
+HALF_DIAGONAL = 400.0  # of 640x480
+GOOD = Row(
+    t_s=0.0,
+    state="following",
+    track=1,
+    u_px=CENTRE[0],
+    v_px=CENTRE[1],
+    width_px=640,
+    height_px=480,
+    size_px=160.0,
+    wanted_px=160.0,
+    visible=1.0,
+    in_wide=True,
+    u_wide_px=100.0,
+    v_wide_px=50.0,
+    u_detected_px=100.0,
+    v_detected_px=50.0,
+    range_m=10.0,
+    depth_m=10.0,
+    pan_commanded_deg=1.0,
+    tilt_commanded_deg=2.0,
+    focal_commanded_px=5000.0,
+    pan_deg=1.0,
+    tilt_deg=2.0,
+    focal_px=1000.0,
+)
+AWAY = {"u_px": 700.0, "visible": 0.0}
+
+
+def run(*parts):
+    """Rows at 25 Hz from (how many, what differs) in turn."""
+    differences = [change for count, change in parts for _ in range(count)]
+    return [dataclasses.replace(GOOD, t_s=i * PERIOD, **change) for i, change in enumerate(differences)]
+
+
+def test_a_perfect_run():
+    """Two seconds of learning do not count: 50 of 150 rows lie before t = 2 s."""
+    found = score(run((150, {})))
+    assert found == Score(
+        frames=100,
+        time_to_acquire_s=0.0,
+        closeup_yield=1.0,
+        in_frame_ratio=1.0,
+        tpo_px_median=0.0,
+        tpo_width_median=0.0,
+        tpo_deg_median=0.0,
+        size_ratio_median=1.0,
+        wanted_px=160.0,
+        range_m=10.0,
+        tpe_px_median=0.0,
+        fragmentation_per_min=0.0,
+    )
+
+
+def test_the_clock_starts_when_the_target_is_wholly_in_the_wide_view_and_2_s_have_passed():
+    late = score(run((100, {"in_wide": False, **AWAY}), (25, AWAY), (75, {})))
+    assert late.frames == 100  # it may leave the wide view again; what counts is the first time
+    assert late.time_to_acquire_s == pytest.approx(25 * PERIOD, abs=EXACT)
+    assert late.closeup_yield == pytest.approx(0.75)
+    early = score(run((20, {}), (40, AWAY), (40, {})))  # what happened before 2 s is forgotten
+    assert early.frames == 50
+    assert early.time_to_acquire_s == pytest.approx(10 * PERIOD, abs=EXACT)
+    gone_again = score(run((60, {}), (40, {"in_wide": False, **AWAY})))
+    assert gone_again.frames == 50
+
+
+def test_acquisition_is_dated_to_the_start_of_the_first_half_second_on_end():
+    """12 rows in frame span 0.44 s and do not count; the next ones, from row 90 on, do."""
+    found = score(run((60, AWAY), (12, {}), (18, AWAY), (30, {})))
+    assert found.time_to_acquire_s == pytest.approx((90 - 50) * PERIOD, abs=EXACT)
+    assert found.in_frame_ratio == 1.0  # counted from row 90 on
+    assert found.closeup_yield == pytest.approx((12 + 30) / 70)  # counted from row 50 on
+
+
+def test_lost_frames_count():
+    found = score(run((50, {}), (60, {}), (40, {**AWAY, "track": -1, "state": "lost"})))
+    assert found.in_frame_ratio == pytest.approx(0.6)
+    assert found.closeup_yield == pytest.approx(0.6)
+    assert found.tpo_px_median == 0.0
+    mostly = score(run((50, {}), (40, {}), (60, AWAY)))
+    assert mostly.tpo_px_median == pytest.approx(HALF_DIAGONAL)
+    assert mostly.tpo_width_median == pytest.approx(HALF_DIAGONAL / 640)
+
+
+def test_never_acquired_and_never_there():
+    never = score(run((100, AWAY)))
+    assert (never.frames, never.closeup_yield) == (50, 0.0)
+    for field in ("time_to_acquire_s", "in_frame_ratio", "tpo_px_median", "tpo_width_median", "tpo_deg_median",
+                  "size_ratio_median", "fragmentation_per_min"):  # fmt: skip
+        assert getattr(never, field) is None, field
+    assert never.range_m == 10.0
+    for rows in ([], run((100, {"in_wide": False})), run((40, {}))):
+        assert score(rows) == Score(0, *[None] * 11)
+
+
+@pytest.mark.parametrize(("change", "in_frame", "good"), [
+    ({}, True, True),
+    ({"size_px": 0.79 * 160}, True, False),
+    ({"size_px": 0.81 * 160}, True, True),
+    ({"size_px": 1.24 * 160}, True, True),
+    ({"size_px": 1.26 * 160}, True, False),
+    ({"size_px": 0.51 * 160}, True, False),
+    ({"size_px": 0.49 * 160}, False, False),
+    ({"size_px": math.nan}, False, False),
+    ({"visible": 0.51}, True, False),
+    ({"visible": 0.49}, False, False),
+    ({"u_px": -0.4}, True, True),  # pixels reach half a pixel beyond their centres
+    ({"u_px": -0.6}, False, False),
+    ({"u_px": 639.4, "v_px": 479.4}, True, True),
+    ({"v_px": 479.6}, False, False),
+    ({"u_px": math.nan, "v_px": math.nan}, False, False),  # behind the camera
+])  # fmt: skip
+def test_in_frame_and_good_closeup(change, in_frame, good):
+    row = dataclasses.replace(GOOD, **change)
+    assert (row.in_frame, row.good_closeup) == (in_frame, good)
+
+
+def test_target_point_offset():
+    off = dataclasses.replace(GOOD, u_px=CENTRE[0] + 30, v_px=CENTRE[1] - 40)
+    assert off.tpo_px == pytest.approx(50.0)
+    assert off.tpo_deg == pytest.approx(math.degrees(math.atan(0.05)))
+    for lost in (AWAY, {"u_px": math.nan, "v_px": math.nan}):
+        assert dataclasses.replace(GOOD, **lost).tpo_px == pytest.approx(HALF_DIAGONAL)
+
+
+def test_medians():
+    """Three thirds after acquisition: the middle one is the median. TPE counts frames with a track only."""
+    thirds = [
+        (20, {"u_px": CENTRE[0] + 16, "size_px": 144.0, "u_detected_px": 103.0, "v_detected_px": 54.0}),
+        (20, {"u_px": CENTRE[0] + 32, "size_px": 160.0, "u_detected_px": 103.0, "v_detected_px": 54.0}),
+        (20, {"u_px": CENTRE[0] + 64, "size_px": 176.0, "track": -1, "u_detected_px": math.nan}),
+    ]
+    found = score(run((50, {}), *thirds))
+    assert found.tpo_px_median == pytest.approx(32.0)
+    assert found.tpo_width_median == pytest.approx(0.05)
+    assert found.tpo_deg_median == pytest.approx(math.degrees(math.atan(0.032)))
+    assert found.size_ratio_median == pytest.approx(1.0)
+    assert found.tpe_px_median == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize(("parts", "breaks"), [
+    ([(100, {})], 0),
+    ([(40, {}), (5, AWAY), (55, {})], 0),  # out at k, back at k + 5: 0.2 s, no longer than that
+    ([(40, {}), (6, AWAY), (54, {})], 1),
+    ([(40, {}), (6, AWAY), (24, {}), (10, AWAY), (20, {})], 2),
+    ([(40, {}), (60, AWAY)], 1),  # a break that the run's end cuts off
+    ([(40, {}), (60, {"size_px": 60.0})], 1),  # too small is out of frame
+])  # fmt: skip
+def test_fragmentation_per_minute(parts, breaks):
+    """100 rows after acquisition are 99 periods, 3.96 s."""
+    found = score(run((50, {}), *parts))
+    assert found.fragmentation_per_min == pytest.approx(breaks * 60 / (99 * PERIOD))
+
+
+def test_the_table_comes_back_exactly(tmp_path):
+    path = tmp_path / "steps.csv"
+    rows = run((3, {"u_px": 1 / 3}), (2, {"in_wide": False, "state": "lost", "track": -1}))
+    write_rows(path, rows)
+    assert read_rows(path) == rows
+    assert path.read_text().splitlines()[0].split(",") == [field.name for field in dataclasses.fields(Row)]
+    write_rows(path, [dataclasses.replace(GOOD, u_px=math.nan, depth_m=math.nan)])
+    back = read_rows(path)[0]
+    assert math.isnan(back.u_px)
+    assert math.isnan(back.depth_m)
+    write_rows(path, [])
+    assert read_rows(path) == []
+
+
+def table(edit):
+    names = [field.name for field in dataclasses.fields(Row)]
+    values = [str(getattr(GOOD, name)) for name in names]
+    names, values = edit(names, values)
+    return (",".join(names) + "\n" + ",".join(values) + "\n").encode()
+
+
+@pytest.mark.parametrize("content", [
+    table(lambda n, v: (n[1:], v[1:])),  # a column is missing
+    table(lambda n, v: (n, v[:-1])),  # the last line was cut off
+    table(lambda n, v: (n, ["soon", *v[1:]])),
+    table(lambda n, v: (n, [t.replace("True", "yes") for t in v])),
+    table(lambda n, v: (n, [*v[:2], "1.5", *v[3:]])),  # the track's number
+    b"",
+    b"\x00\xff\xfe\x89PNG\r\n",
+    b'{"json": 1}\n',
+])  # fmt: skip
+def test_what_is_no_table_is_refused_in_one_line(tmp_path, content):
+    path = tmp_path / "steps.csv"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"steps\.csv: is not a steps\.csv") as caught:
+        read_rows(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_table_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"none\.csv"):
+        read_rows(tmp_path / "none.csv")
