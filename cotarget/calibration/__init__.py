@@ -4,6 +4,7 @@ from cotarget.calibration.boards import draw_board, find_corners
 from cotarget.calibration.file import load_calibration, save_calibration
 from cotarget.calibration.method import calibrate_captures, calibrate_photos, calibrate_rig, calibrate_views
 from cotarget.calibration.model import Calibration, Capture, Covariance, Rejected, Residuals, View
+from cotarget.calibration.uncertainty import line_of_sight_covariance, predicted_pointing
 
 __all__ = [
     "Calibration",
@@ -18,6 +19,8 @@ __all__ = [
     "calibrate_views",
     "draw_board",
     "find_corners",
+    "line_of_sight_covariance",
     "load_calibration",
+    "predicted_pointing",
     "save_calibration",
 ]

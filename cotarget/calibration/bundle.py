@@ -100,6 +100,29 @@ def fit(model: RigModel, views: Sequence[View], points: Array, free: Collection[
     return Fit(model, residuals, _reduced(equations, 0.0)[0])
 
 
+def coordinate_variance(residuals: Array, parameters: int) -> float | None:
+    """Estimate what variance of one coordinate, times the inverse normal matrix, gives the parameters' covariance.
+
+    It is that of Huber's estimate (Huber 1981, Eq. 7.6.10): mean |psi|^2 / 2 over the squared mean slope of psi, where
+    psi is a residual cut to the robust scale; for Gaussian noise 1 % more than the noise's own variance.
+
+    Args:
+        residuals: of the optimum (V, N, 2) [px].
+        parameters: how many were fitted, the boards' poses included; they take up as many coordinates.
+
+    Returns:
+        [px^2]; None where there are not more coordinates than parameters.
+    """
+    freedom = residuals.size - parameters
+    if freedom <= 0:
+        return None
+    scale = _robust_scale(residuals)
+    weights = _weights(residuals, scale)
+    psi2 = np.sum((weights[..., None] * residuals) ** 2, axis=-1)
+    slope = np.where(weights < 1, weights / 2, 1.0)  # beyond the scale psi only turns: one direction of the two
+    return float(np.mean(psi2) / 2 / np.mean(slope) ** 2 * residuals.size / freedom)
+
+
 @dataclass(frozen=True, eq=False)
 class _Equations:
     """Normal equations in blocks: shared (n, n), shared by board (B, n, 6), board (B, 6, 6), and gradients."""

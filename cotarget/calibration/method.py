@@ -82,6 +82,7 @@ def calibrate_views(
         head=model.head,
         pitch_mm=pitch_mm,
         residuals=replace(solution.residuals, rejected=(*rejected, *others, *solution.residuals.rejected)),
+        covariance=solution.covariance,
         board=board,
         views=solution.views,
         provenance={

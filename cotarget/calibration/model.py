@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import numpy as np
+
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
 from cotarget.geometry import Array, RigidTransform
@@ -96,10 +98,30 @@ class Residuals:
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """What the corners' noise leaves uncertain: names of the parameters, n of them, and their covariance (n, n)."""
+    """What the corners' noise leaves uncertain.
+
+    The truth differs from what was found by an error of this covariance. Parameters that were held (k3) are left out.
+
+        fixed.fx .fy .cx .cy                 [px], of the image size calibrated; zoom.* likewise, at the shortest
+        fixed.k1 .k2 .p1 .p2                 without unit                        focal length calibrated
+        T_zoom0_fixed.rx .ry .rz .tx .ty .tz     [rad] and [m]; T_head_zoom.* likewise
+        head.axis_offset head.squareness     [m] and [rad]
+
+    An error (w, d) of a transform (R, t) means exp(w) R and t + d: w turns about the axes of the frame that the
+    transform leads to, and leaves t as it is.
+
+    Attributes:
+        parameters: names, n of them.
+        matrix: (n, n), in products of the units above.
+    """
 
     parameters: tuple[str, ...]
     matrix: Array
+
+    def scaled(self, factors: Mapping[str, float]) -> "Covariance":
+        """The same where the parameters named are multiplied by factors."""
+        by = np.array([factors.get(name, 1.0) for name in self.parameters])
+        return Covariance(self.parameters, self.matrix * np.outer(by, by))
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,4 +160,13 @@ class Calibration:
         Raises:
             ConfigError: a stream has another aspect ratio than was calibrated.
         """
-        return replace(self, fixed=self.fixed.resized(fixed_size), zoom=self.zoom.resized(zoom_size))
+        covariance = self.covariance
+        if covariance is not None:
+            s_fixed, s_zoom = fixed_size[0] / self.fixed.size[0], zoom_size[0] / self.zoom.size[0]
+            in_pixels = ("fx", "fy", "cx", "cy")
+            covariance = covariance.scaled(
+                {f"fixed.{k}": s_fixed for k in in_pixels} | {f"zoom.{k}": s_zoom for k in in_pixels}
+            )
+        return replace(
+            self, fixed=self.fixed.resized(fixed_size), zoom=self.zoom.resized(zoom_size), covariance=covariance
+        )

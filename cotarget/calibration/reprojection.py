@@ -35,6 +35,15 @@ BLOCK_WIDTHS: dict[Block, int] = {
     "hand": POSE_PARAMETERS,
     "head": 2,
 }
+LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
+BLOCK_NAMES: dict[Block, tuple[str, ...]] = {
+    "fixed": tuple(f"fixed.{name}" for name in LENS_NAMES),
+    "zoom": tuple(f"zoom.{name}" for name in LENS_NAMES),
+    "gamma": tuple(f"T_zoom0_fixed.{name}" for name in POSE_NAMES),
+    "hand": tuple(f"T_head_zoom.{name}" for name in POSE_NAMES),
+    "head": ("head.axis_offset", "head.squareness"),
+}
 STILL = RigidTransform.identity()
 E3 = np.array([0.0, 0.0, 1.0])
 
@@ -101,6 +110,11 @@ def columns_of(free: Collection[Block]) -> dict[Block, slice]:
             columns[name] = slice(width, width + size)
             width += size
     return columns
+
+
+def parameter_names(free: Collection[Block]) -> tuple[str, ...]:
+    """Name the free blocks' parameters, in their order among the shared ones; see `Covariance` for their units."""
+    return tuple(name for block in columns_of(free) for name in BLOCK_NAMES[block])
 
 
 def stepped(model: RigModel, shared: Array, boards: Array, free: Collection[Block]) -> RigModel:

@@ -17,9 +17,10 @@ import numpy as np
 from cotarget.calibration.bundle import Fit, fit, rms
 from cotarget.calibration.handeye import motions, park_martin
 from cotarget.calibration.intrinsics import board_pose, calibrate_camera
-from cotarget.calibration.model import CameraName, Rejected, Residuals, View
+from cotarget.calibration.model import CameraName, Covariance, Rejected, Residuals, View
 from cotarget.calibration.placing import place_boards
 from cotarget.calibration.reprojection import Block, RigModel
+from cotarget.calibration.uncertainty import covariance_of
 from cotarget.camera import Intrinsics
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
@@ -33,12 +34,17 @@ HOME_TOLERANCE = np.radians(0.01)  # the head is at home within a fifth of the s
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What the method found: the model (every placement's board in it), residuals, and the views it used."""
+    """What the method found: the model (every placement's board in it), residuals, and the views it used.
+
+    The covariance is the last refinement's. Without that there is none: the steps before it hold fixed what earlier
+    ones found, so that their own normal matrices know nothing of most of what is uncertain.
+    """
 
     model: RigModel
     residuals: Residuals
     views: tuple[View, ...]
     has_head: bool
+    covariance: Covariance | None
 
 
 def sequential(
@@ -68,11 +74,13 @@ def sequential(
         model = place_boards(model, used, points)
         hand_fit = fit(model, zoom_views, points, {"hand", "head"})
         model, handeye_rms = replace(model, hand=hand_fit.model.hand, head=hand_fit.model.head), hand_fit.rms_px
+    covariance = None
     if refine:
         model = model if has_head else place_boards(model, used, points)
         everything: tuple[Block, ...] = ("fixed", "zoom", "gamma", "hand", "head")
-        final = fit(model, used, points, everything if has_head else everything[:3])
-        model = final.model
+        free = everything if has_head else everything[:3]
+        final = fit(model, used, points, free)
+        model, covariance = final.model, covariance_of(final, free)
         handeye_rms = rms(final.residuals[len(fixed_views) :]) if has_head else None
     residuals = Residuals(
         fixed_rms_px=fixed_fit.rms_px,
@@ -84,7 +92,7 @@ def sequential(
         pairs=len({view.board for view in pairs}),
         rejected=tuple(rejected),
     )
-    return Solution(model, residuals, used, has_head)
+    return Solution(model, residuals, used, has_head, covariance)
 
 
 def at_home(view: View) -> bool:

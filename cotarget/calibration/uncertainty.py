@@ -1,0 +1,157 @@
+"""How uncertain a calibration is: the covariance of its parameters, and what that leaves of error in pointing.
+
+Both speak of the corners' noise alone. What the model leaves out (a head that does not stand where it says, a
+principal point that moves with the zoom, a board that is not flat) is seen only as far as it enlarges the residuals.
+"""
+
+from collections.abc import Collection
+
+import numpy as np
+
+from cotarget.calibration.bundle import Fit, coordinate_variance
+from cotarget.calibration.model import Calibration, Covariance
+from cotarget.calibration.reprojection import (
+    BLOCK_WIDTHS,
+    POSE_PARAMETERS,
+    Block,
+    RigModel,
+    base_heads,
+    parameter_names,
+    stepped,
+)
+from cotarget.camera import ZoomLens
+from cotarget.errors import CalibrationError
+from cotarget.geometry import Array
+from cotarget.pantilt import solve
+
+# Central differences err by the square of this times the third derivative, which is of the order of the first [px, m,
+# rad]; rounding stays at 1e-11.
+STEP = 1e-5
+# Smallest eigenvalue of the normal matrix, scaled to a unit diagonal, that rounding cannot have made.
+SMALLEST_EIGENVALUE = 1e-13
+ALL_BLOCKS: tuple[Block, ...] = tuple(BLOCK_WIDTHS)
+
+
+def covariance_of(result: Fit, free: Collection[Block]) -> Covariance | None:
+    """Give the covariance of a fit's free parameters, the boards' poses left out by marginalising them.
+
+    Args:
+        result: of `fit`, at its optimum.
+        free: the blocks that were free.
+
+    Returns:
+        The inverse of the normal matrix times the variance of a coordinate; None where the views leave a direction of
+        the parameters open, or are no more than the parameters.
+    """
+    variance = coordinate_variance(result.residuals, len(result.normal) + POSE_PARAMETERS * len(result.model.boards))
+    scale = np.sqrt(np.diagonal(result.normal))
+    if variance is None or not (scale > 0).all():
+        return None
+    values, vectors = np.linalg.eigh(result.normal / np.outer(scale, scale))
+    if values[0] < SMALLEST_EIGENVALUE:
+        return None
+    inverse = (vectors / values) @ vectors.T
+    return Covariance(parameter_names(free), (inverse + inverse.T) / 2 / np.outer(scale, scale) * variance)
+
+
+def predicted_pointing(
+    calibration: Calibration,
+    pixel: Array,
+    depth: Array | float,
+    *,
+    pan_tilt: tuple[Array | float, Array | float] | None = None,
+    nominal_px: float | None = None,
+) -> Array:
+    """Predict the rms angle by which the line of sight misses a target, see `line_of_sight_covariance` [rad], (...)."""
+    covariance = line_of_sight_covariance(calibration, pixel, depth, pan_tilt=pan_tilt, nominal_px=nominal_px)
+    return np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
+
+
+def line_of_sight_covariance(
+    calibration: Calibration,
+    pixel: Array,
+    depth: Array | float,
+    *,
+    pan_tilt: tuple[Array | float, Array | float] | None = None,
+    nominal_px: float | None = None,
+) -> Array:
+    """Predict the covariance of the miss between the zoom camera's line of sight and a target.
+
+    With parameters p, the target is at x(p) = depth ray_fixed(pixel; p), the head at q = (pan, tilt) shows it in the
+    direction a(p, q) of T_zoom_fixed(q; p) x(p) (Eq. 2), and the line of sight, through the middle of the zoom image,
+    is d(p). The head is sent to the q that makes a = d by the parameters found, p0. There it stays, while the true
+    parameters p0 + e put the target at m = E^T (a(p0 + e, q) - d(p0 + e)), E being the two directions across d. To
+    first order m = J e with J = dm/dp at fixed q, so that cov(m) = J cov(e) J^T; how q was solved does not matter.
+
+    Args:
+        calibration: with a covariance and a T.
+        pixel: of the target in the fixed view, known exactly, (..., 2) [px].
+        depth: along the fixed camera's axis, known exactly [m], (...).
+        pan_tilt: where the head is sent [rad], (...) each; by default the exact solution that faces forward.
+        nominal_px: the zoom camera's nominal focal length [px]; the shortest calibrated one by default.
+
+    Returns:
+        Covariance along right and down in the zoom image [rad^2], (..., 2, 2); nan where the target cannot be reached.
+
+    Raises:
+        CalibrationError: the calibration has no covariance, or an unusable one, or no T.
+    """
+    covariance, hand = calibration.covariance, calibration.T_head_zoom
+    if covariance is None:
+        raise CalibrationError("this calibration has no covariance; calibrate again, with the last refinement")
+    if hand is None:
+        raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
+    known = parameter_names(ALL_BLOCKS)
+    if unknown := [name for name in covariance.parameters if name not in known]:
+        raise CalibrationError(f"covariance.parameters: '{unknown[0]}' is no parameter; they are: {', '.join(known)}")
+    nominal = calibration.zoom.nominal_px[0] if nominal_px is None else nominal_px
+    depth = np.asarray(depth, dtype=float)
+    shape = np.broadcast_shapes(np.shape(pixel)[:-1], depth.shape)
+    pixels = np.array(np.broadcast_to(pixel, (*shape, 2)), dtype=float).reshape(-1, 2)
+    depths = np.array(np.broadcast_to(depth, shape)).ravel()
+    if pan_tilt is None:
+        lens = calibration.zoom.at(nominal)
+        x_base = (hand * calibration.T_zoom0_fixed).apply(calibration.fixed.ray(pixels) * depths[:, None])
+        found = solve(x_base, hand, calibration.head, lens.ray(lens.image_center_px))
+        pan, tilt = found.pan[:, 0], found.tilt[:, 0]
+    else:
+        pan, tilt = (np.array(np.broadcast_to(angle, shape), dtype=float).ravel() for angle in pan_tilt)
+
+    model = RigModel(
+        {}, calibration.fixed, calibration.zoom.stops[0], calibration.T_zoom0_fixed, hand, calibration.head
+    )
+    across = _across(_line_of_sight(calibration, model, nominal))
+
+    def miss(step: Array) -> Array:
+        at = stepped(model, step, np.empty((0, POSE_PARAMETERS)), ALL_BLOCKS)
+        return (_directions(at, pixels, depths, pan, tilt) - _line_of_sight(calibration, at, nominal)) @ across
+
+    steps = STEP * np.eye(len(known))[[known.index(name) for name in covariance.parameters]]
+    J = np.stack([(miss(step) - miss(-step)) / (2 * STEP) for step in steps], axis=-1)  # (n, 2, parameters)
+    return (J @ covariance.matrix @ J.swapaxes(-1, -2)).reshape(*shape, 2, 2)
+
+
+def _directions(model: RigModel, pixels: Array, depths: Array, pan: Array, tilt: Array) -> Array:
+    """Unit vectors from the moved zoom camera to the targets, (n, 3) (Eq. 2)."""
+    assert model.fixed is not None
+    x_base = (model.hand * model.gamma).apply(model.fixed.ray(pixels) * depths[:, None])
+    R, t, _ = base_heads(model.head, pan, tilt)
+    x_head = np.einsum("vji,vj->vi", R, x_base - t)
+    return _unit(model.hand.inv().apply(x_head))
+
+
+def _line_of_sight(calibration: Calibration, model: RigModel, nominal_px: float) -> Array:
+    """Unit vector through the middle of the zoom image at a nominal focal length, (3,)."""
+    assert model.zoom is not None
+    lens = ZoomLens(calibration.zoom.nominal_px, (model.zoom, *calibration.zoom.stops[1:])).at(nominal_px)
+    return _unit(lens.ray(lens.image_center_px))
+
+
+def _unit(v: Array) -> Array:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def _across(d: Array) -> Array:
+    """Right and down across a direction near +z, as columns (3, 2)."""
+    right = _unit(np.cross([0.0, 1.0, 0.0], d))
+    return np.stack([right, np.cross(d, right)], axis=-1)
