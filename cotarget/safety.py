@@ -21,8 +21,8 @@ class SafeHead:
         speed = device.speed if config.speed_deg_s is None else min(device.speed, math.radians(config.speed_deg_s))
         self._limits = dataclasses.replace(
             device,
-            pan=_within(config.pan_deg, device.pan, "safety.pan_deg"),
-            tilt=_within(config.tilt_deg, device.tilt, "safety.tilt_deg"),
+            pan=_within(config.pan_deg, device.pan, device.step, "safety.pan_deg"),
+            tilt=_within(config.tilt_deg, device.tilt, device.step, "safety.tilt_deg"),
             speed=speed,
         )
 
@@ -102,12 +102,15 @@ class SafeRig:
         self.close()
 
 
-def _within(soft_deg: tuple[float, float] | None, device: tuple[float, float], name: str) -> tuple[float, float]:
+def _within(
+    soft_deg: tuple[float, float] | None, device: tuple[float, float], step: float, name: str
+) -> tuple[float, float]:
     """The tighter of both limits [rad]; soft ones that leave nothing of the device's are a mistake."""
     if soft_deg is None:
         return device
     low, high = max(math.radians(soft_deg[0]), device[0]), min(math.radians(soft_deg[1]), device[1])
-    if low >= high:
+    first, last = _outermost((low, high), step)
+    if low >= high or first > last:
         own = [round(math.degrees(v), 1) for v in device]
         raise ConfigError(f"{name}: {list(soft_deg)} leaves nothing of the device's own range {own}")
     return low, high
@@ -115,6 +118,12 @@ def _within(soft_deg: tuple[float, float] | None, device: tuple[float, float], n
 
 def _clip(angle: float, limits: tuple[float, float], step: float) -> float:
     """Clip to the limits; with steps to the outermost step inside them, so that rounding cannot lead outside."""
+    low, high = _outermost(limits, step)
+    return min(max(angle, low), high)
+
+
+def _outermost(limits: tuple[float, float], step: float) -> tuple[float, float]:
+    """The outermost steps inside the limits; the limits themselves for a head without steps."""
     if step > 0:
-        limits = math.ceil(limits[0] / step - 1e-9) * step, math.floor(limits[1] / step + 1e-9) * step
-    return min(max(angle, limits[0]), limits[1])
+        return math.ceil(limits[0] / step - 1e-9) * step, math.floor(limits[1] / step + 1e-9) * step
+    return limits
