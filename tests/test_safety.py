@@ -1,0 +1,162 @@
+"""The safety layer in front of a head that notes what it is told, and of a camera that may be late."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cotarget.config import SafetyConfig
+from cotarget.errors import ConfigError, StaleFrameError
+from cotarget.rig import Frame, PanTiltLimits, PanTiltState
+from cotarget.safety import SafeRig
+
+STEP = math.radians(0.0514286)
+SPEED = math.radians(149.0)
+ROUNDING = 1e-12  # degrees to radians and back, and a multiple of a step
+LIMITS = PanTiltLimits(
+    (math.radians(-158.9), math.radians(158.9)), (math.radians(-46.6), math.radians(31.1)), SPEED, 3.6, STEP
+)
+
+
+class Head:
+    """Does what it is told, rounded to steps and without any limit, so that only the layer keeps it inside."""
+
+    def __init__(self, limits=LIMITS):
+        self.limits, self.log, self.pose = limits, [], (0.0, 0.0)
+
+    def state(self):
+        return PanTiltState(*self.pose, moving=False, t=0.0)
+
+    def move(self, pan, tilt, speed=None, wait=False):
+        step = self.limits.step
+        self.pose = tuple(round(q / step) * step if step else q for q in (pan, tilt))
+        self.log.append((*self.pose, speed, wait))
+        return self.pose
+
+    def halt(self):
+        self.log.append("halt")
+
+
+class Rig:
+    """The rest: a camera whose newest frame is as old as wanted."""
+
+    def __init__(self, head=None, age=0.06):
+        self.head = head or Head()
+        self.closed = False
+        self.clock = SimpleNamespace(now=lambda: 5.0, sleep_until=lambda t: None)
+        self.zoom = self.board = object()
+        frame = Frame(np.zeros((2, 2, 3), np.uint8), 5.0 - age)
+        self.asked = []
+        self.fixed = SimpleNamespace(size=(2, 2), read=lambda *a: self.asked.append(a) or frame)
+
+    def close(self):
+        self.head.log.append("close")
+        self.closed = True
+
+
+def inside(angle, limits):
+    return limits[0] - ROUNDING <= angle <= limits[1] + ROUNDING
+
+
+@pytest.mark.parametrize("step", [STEP, 0.0, math.radians(2.0)])
+@pytest.mark.parametrize("soft", [
+    SafetyConfig(),
+    SafetyConfig(pan_deg=(-20.03, 33.37), tilt_deg=(-5.01, 4.99), speed_deg_s=40.0),
+    SafetyConfig(pan_deg=(-500.0, 500.0), tilt_deg=(-40.0, 500.0), speed_deg_s=1000.0),
+    SafetyConfig(pan_deg=(10.0, 12.1), tilt_deg=(-30.0, -25.0)),  # home is not among them
+])  # fmt: skip
+def test_no_command_leaves_the_limits_or_exceeds_the_cap(step, soft):
+    rng = np.random.default_rng(1)
+    head = Head(PanTiltLimits(LIMITS.pan, LIMITS.tilt, SPEED, 3.6, step))
+    allowed = []
+    for wanted, device in ((soft.pan_deg, (-158.9, 158.9)), (soft.tilt_deg, (-46.6, 31.1))):
+        low, high = wanted or device
+        allowed.append((math.radians(max(low, device[0])), math.radians(min(high, device[1]))))
+    cap = math.radians(min(soft.speed_deg_s or 149.0, 149.0))
+    safe = SafeRig(Rig(head), soft).head
+    edges = [e + d for limits in allowed for e in limits for d in (-1e-3, -1e-12, 0.0, 1e-12, 1e-3)]
+    commands = [*rng.uniform(-7, 7, (3000, 2)), *((p, t) for p in edges for t in edges), (math.inf, -math.inf)]
+    for pan, tilt in commands:
+        speed = None if rng.random() < 0.3 else rng.uniform(0.01, 10)
+        said = safe.move(pan, tilt, speed)
+        done = head.log[-1]
+        assert inside(done[0], allowed[0]), (pan, done)
+        assert inside(done[1], allowed[1]), (tilt, done)
+        assert said == done[:2]
+        assert done[2] == pytest.approx(cap if speed is None else min(speed, cap), abs=ROUNDING)
+    pan, tilt = (np.mean(limits) for limits in allowed)  # what is allowed is done, to a step
+    said = safe.move(pan, tilt)
+    assert np.allclose(said, (pan, tilt), rtol=0, atol=step / 2 + ROUNDING)
+    for told, limits in zip((safe.limits.pan, safe.limits.tilt), allowed, strict=True):
+        assert np.allclose(told, limits, rtol=0, atol=ROUNDING)
+    assert safe.limits.speed == pytest.approx(cap)
+
+
+def test_a_head_of_unlimited_speed_is_not_told_infinity():
+    head = Head(PanTiltLimits((-1.0, 1.0), (-1.0, 1.0), math.inf, math.inf, 0.0))
+    SafeRig(Rig(head), SafetyConfig()).head.move(0.1, 0.1)
+    assert head.log == [(0.1, 0.1, None, False)]
+
+
+def test_waiting_is_passed_on():
+    rig = Rig()
+    SafeRig(rig, SafetyConfig()).head.move(0.0, 0.0, wait=True)
+    assert rig.head.log[-1][3] is True
+
+
+def test_a_stale_frame_is_refused():
+    config = SafetyConfig(max_frame_age_s=0.5)
+    fresh = SafeRig(Rig(age=0.49), config).fixed
+    assert fresh.read().t == pytest.approx(4.51)
+    assert fresh.size == (2, 2)
+    with pytest.raises(StaleFrameError, match=r"the newest frame is 0\.51 s old; at most 0\.5 s") as caught:
+        SafeRig(Rig(age=0.51), config).fixed.read()
+    assert "\n" not in str(caught.value)
+
+
+def test_what_a_frame_is_asked_for_is_passed_on():
+    rig = Rig()
+    SafeRig(rig, SafetyConfig()).fixed.read(3.0, 0.2)
+    assert rig.asked == [(3.0, 0.2)]
+
+
+@pytest.mark.parametrize("error", [None, ValueError, KeyboardInterrupt, SystemExit])
+def test_the_head_halts_before_the_rig_closes_on_every_way_out(error):
+    rig = Rig()
+
+    def work():
+        with SafeRig(rig, SafetyConfig()) as safe:
+            safe.head.move(0.5, 0.1)
+            if error is not None:
+                raise error
+
+    if error is None:
+        work()
+    else:
+        with pytest.raises(error):
+            work()
+    assert rig.head.log[1:] == ["halt", "close"]
+
+
+def test_a_head_that_cannot_halt_does_not_keep_the_rig_open():
+    rig = Rig()
+
+    def broken():
+        raise OSError("the cable is out")
+
+    rig.head.halt = broken
+    with pytest.raises(OSError, match="cable"), SafeRig(rig, SafetyConfig()):
+        pass
+    assert rig.closed
+
+
+@pytest.mark.parametrize(("soft", "message"), [
+    ({"pan_deg": (160.0, 170.0)}, r"safety\.pan_deg: \[160\.0, 170\.0\] leaves nothing .*\[-158\.9, 158\.9\]"),
+    ({"tilt_deg": (-90.0, -46.6)}, r"safety\.tilt_deg: \[-90\.0, -46\.6\] leaves nothing .*\[-46\.6, 31\.1\]"),
+    ({"pan_deg": (0.01, 0.04)}, r"safety\.pan_deg: \[0\.01, 0\.04\] leaves nothing"),  # between two steps of the head
+])  # fmt: skip
+def test_soft_limits_that_leave_nothing_are_refused(soft, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        SafeRig(Rig(), SafetyConfig(**soft))
+    assert "\n" not in str(caught.value)
