@@ -106,9 +106,10 @@ def follow(
         settings: delays and habits.
 
     Raises:
-        CalibrationError: the calibration is of another aspect ratio than the rig's streams.
+        ConfigError: the calibration is of another aspect ratio than the rig's streams.
         StaleFrameError: frames stopped coming, or came too late to act on.
     """
+    calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
     tracker, policy = Tracker(settings_for(target), rig.fixed.size), FirstCome()
     shortest = rig.zoom.focal_range[0]
     state = rig.head.state()
