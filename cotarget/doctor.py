@@ -76,7 +76,7 @@ def _rendering() -> Finding:
             [sys.executable, "-c", RENDER], capture_output=True, text=True, timeout=RENDER_TIMEOUT_S, check=False
         )
     except subprocess.TimeoutExpired:
-        return Finding("rendering", False, f"no picture within {RENDER_TIMEOUT_S:.0f} s", "set MUJOCO_GL=osmesa")
+        return Finding("rendering", False, f"no picture within {RENDER_TIMEOUT_S:.0f} s", "export MUJOCO_GL=osmesa")
     if tried.returncode == 0:
         return Finding("rendering", True, f"without a screen by {tried.stdout.split()[-1]}")
     said = (tried.stderr.strip().splitlines() or [f"the test ended with status {tried.returncode}"])[-1]
@@ -87,8 +87,10 @@ def _rendering() -> Finding:
 
 
 def _codec() -> Finding:
-    import av
-
+    try:
+        import av
+    except ImportError as error:
+        return Finding("H.264", False, f"PyAV cannot be imported: {error}", "pip install --force-reinstall av")
     ok = "libx264" in av.codecs_available
     return Finding(
         "H.264",
@@ -99,7 +101,10 @@ def _codec() -> Finding:
 
 
 def _serial_ports() -> list[Finding]:
-    from serial.tools import list_ports
-
+    try:
+        from serial.tools import list_ports
+    except ImportError as error:
+        fix = "pip install --force-reinstall pyserial"
+        return [Finding("serial ports", False, f"pyserial cannot be imported: {error}", fix)]
     found = [f"{port.device} ({port.description})" for port in list_ports.comports()]
     return [Finding("serial ports", True, ", ".join(found) or "none (none is needed for the simulation)")]
