@@ -1,0 +1,90 @@
+"""The doctor: what is missing is said with the command that mends it, whatever else is broken."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from cotarget import cli, doctor
+from cotarget.doctor import PACKAGES, Finding
+
+
+@pytest.fixture
+def tried(monkeypatch):
+    """The rendering process, replaced: set its outcome."""
+    outcome = SimpleNamespace(returncode=0, stdout="egl\n", stderr="", error=None)
+    real = subprocess.run
+
+    def run(command, **options):
+        if command[0] != sys.executable:  # the standard library asks the system for its name
+            return real(command, **options)
+        if outcome.error is not None:
+            raise outcome.error
+        return outcome
+
+    monkeypatch.setattr(doctor.subprocess, "run", run)
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    return outcome
+
+
+def finding(name):
+    return next(f for f in doctor.examine() if f.name == name)
+
+
+def test_a_machine_that_has_everything(tried, capsys):
+    findings = doctor.examine()
+    assert all(f.ok and not f.fix for f in findings if f.name != "cotarget"), findings
+    names = [f.name for f in findings]
+    assert {"python", "rendering", "H.264", "sim_assets", "serial ports", *PACKAGES} == set(names)
+    assert finding("rendering").text == "without a screen by egl"
+    assert finding("sim_assets").text == "scenes indoor, outdoor"
+    assert cli.main(["doctor"]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert len(out) == len(findings)
+    assert all(line.startswith("ok ") for line in out)
+
+
+def test_a_missing_package_is_named_with_its_command(tried, monkeypatch, capsys):
+    def version(name):
+        if name == "pyserial":
+            raise doctor.importlib.metadata.PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(doctor.importlib.metadata, "version", version)
+    assert finding("pyserial") == Finding("pyserial", False, "not installed", "pip install pyserial")
+    assert cli.main(["doctor"]) == 1
+    out = capsys.readouterr().out
+    assert "MISSING  pyserial: not installed\n         fix: pip install pyserial\n" in out
+
+
+@pytest.mark.parametrize("module", ["av", "serial.tools"])
+def test_a_package_that_cannot_be_imported_does_not_stop_the_doctor(tried, monkeypatch, module):
+    monkeypatch.setitem(sys.modules, module, None)
+    if module != "av":
+        monkeypatch.delitem(sys.modules, "serial.tools.list_ports", raising=False)
+    broken = [f for f in doctor.examine() if not f.ok]
+    assert [f.name for f in broken] == ["H.264" if module == "av" else "serial ports"]
+    assert broken[0].fix.startswith("pip install")
+
+
+@pytest.mark.parametrize(("change", "backend", "text", "fix"), [
+    ({"returncode": 1, "stderr": "Traceback (most recent call last):\n  x\ncotarget.errors.DeviceError: no OpenGL\n"},
+     None, "no OpenGL", "apt-get install -y libegl1"),
+    ({"returncode": -11}, None, "the test ended with status -11", "apt-get install -y libegl1"),
+    ({"returncode": 1, "stderr": "RuntimeError: invalid value\n"}, "vulkan", "invalid value", "unset MUJOCO_GL"),
+    ({"error": subprocess.TimeoutExpired("python", 60)}, None, "no picture within 60 s", "MUJOCO_GL=osmesa"),
+])  # fmt: skip
+def test_rendering_that_fails(tried, monkeypatch, change, backend, text, fix):
+    vars(tried).update(change)
+    if backend:
+        monkeypatch.setenv("MUJOCO_GL", backend)
+    found = finding("rendering")
+    assert not found.ok
+    assert found.text == text
+    assert fix in found.fix
+
+
+@pytest.mark.render
+def test_rendering_is_really_tried():
+    assert doctor._rendering().ok
