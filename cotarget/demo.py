@@ -1,4 +1,8 @@
-"""The whole method on a simulated rig that nobody has told the software about: calibrate, then follow three targets."""
+"""The whole method on a simulated rig that nobody has told the software about: calibrate, then follow three targets.
+
+The three runs share nothing but the calibration, so they run side by side. A script that calls `run_demo` needs the
+usual ``if __name__ == "__main__"``, because each run is a new process.
+"""
 
 import dataclasses
 import json
@@ -19,11 +23,11 @@ from cotarget.drawing import TargetStages, captioned, draw_frames, plot_aim_erro
 from cotarget.errors import ConfigError
 from cotarget.loop import FollowSettings, follow
 from cotarget.metrics import Row, Score, observe, pointing_errors, score, write_rows
+from cotarget.parallel import Report, run_side_by_side
 from cotarget.safety import SafeRig
-from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
-from cotarget.video import FilmWriter
+from cotarget.video import FilmWriter, join_films
 
 SCENES = {"book": "indoor", "person": "indoor", "bird": "outdoor"}
 CALIBRATION_SCENE = "indoor"
@@ -52,10 +56,14 @@ def run_demo(out: Path, seed: int, progress: Progress) -> dict[str, Any]:
     with finished_together(out) as work:
         config = sim_config(CALIBRATION_SCENE, (), seed)
         calibration, pointing = _calibrate(config, work, seed, progress)
-        rows: dict[str, list[Row]] = {}
-        with FilmWriter(work / "demo.mp4", rate_hz=config.sim.fixed.rate_hz) as video:
-            for name in SCENES:
-                rows[name] = _follow_one(name, seed, calibration, work, video, progress)
+        jobs = [(name, seed, calibration, work) for name in SCENES]
+        runs = run_side_by_side(_follow_one, jobs, lambda done, total: progress("following", done, total))
+        rows = dict(zip(SCENES, runs, strict=True))
+        write_rows(work / "steps.csv", [row for run in runs for row in run])
+        parts = [work / f"{name}.mp4" for name in SCENES]
+        join_films(parts, work / "demo.mp4")
+        for part in parts:
+            part.unlink()
         plot_aim_error(work / "aim_error.png", rows)
         residuals = calibration.residuals
         assert residuals is not None
@@ -136,27 +144,24 @@ def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> 
     return calibration, {"median": float(np.median(errors)), "p95": float(np.percentile(errors, 95))}
 
 
-def _follow_one(
-    name: str, seed: int, calibration: Calibration, work: Path, video: FilmWriter, progress: Progress
-) -> list[Row]:
+def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, report: Report) -> list[Row]:
     """Follow one target; write its picture, its rows and its part of the video."""
     config = sim_config(SCENES[name], (name,), seed)
-    target = config.target(name)
+    target, rate_hz = config.target(name), config.sim.fixed.rate_hz
     world = SimWorld(config)
-    truth: Truth = world.truth()
+    truth = world.truth()
     rows: list[Row] = []
-    with SafeRig(world.rig, config.safety) as rig:
+    with SafeRig(world.rig, config.safety) as rig, FilmWriter(work / f"{name}.mp4", rate_hz) as film:
         stages = TargetStages(rig.zoom.focal_range[0])
-        detector = make_detector(target, config.sim.fixed.rate_hz)
+        detector = make_detector(target, rate_hz)
         settings = FollowSettings(command_delay_s=config.command_delay_s)
-        frames = round(RUN_S[name] * config.sim.fixed.rate_hz)
+        frames = round(RUN_S[name] * rate_hz)
         for step in follow(rig, calibration, target, detector, seconds=RUN_S[name], settings=settings):
             stages.see(step)
             rows.append(observe(step, truth, name, target))
-            video.write(side_by_side(step, name))
-            progress(f"following: {name}", min(step.index + 1, frames), frames)
+            film.write(side_by_side(step, name))
+            report(min(step.index + 1, frames), frames)
     cv2.imwrite(str(work / f"{name}.png"), stages.picture(name))
-    write_rows(work / f"steps_{name}.csv", rows)
     return rows
 
 

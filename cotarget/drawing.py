@@ -1,6 +1,7 @@
 """Pictures from Steps: side by side frames, one picture a target, and the aim error over time."""
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -25,7 +26,8 @@ FOUND, FOLLOWED, CROSS, INK, PAPER, ARROW = (
 )
 STRIP_PX = 36  # height of a caption
 # For the picture "centred" the lens may have begun to zoom in by this factor.
-ZOOMED_OUT = 1.5
+ZOOMED_OUT = 1.6
+RECENT_STEPS = 16  # states kept to tell what the lens was when a frame was exposed; more than any latency needs
 # For the close-up, lens (relative) and head (over the image's width) are this near to where they are wanted.
 SETTLED = 0.08
 BOX_MARGIN_PX = 4  # a box stands this far outside of what it marks
@@ -95,30 +97,39 @@ def side_by_side(step: Step, title: str) -> Image:
 class TargetStages:
     """Picks from a run of Steps what one picture of a target shows: before, centred, and close up.
 
-    It judges by what the loop itself knows: how far head and lens are from where the aim wants them.
+    It judges by what the loop itself knows: where the devices said that head and lens were, and where the aim wanted
+    them.
     """
 
     def __init__(self, shortest_px: float) -> None:
         """Begin; ``shortest_px`` is the shortest nominal focal length."""
         self._shortest = shortest_px
-        self._off_centred, self._largest = math.inf, 0.0
+        self._largest = 0.0
+        self._recent: deque[Step] = deque(maxlen=RECENT_STEPS)
         self.before: Step | None = None
         self.centred: Step | None = None
         self.close: Step | None = None
 
     def see(self, step: Step) -> None:
         """Take a Step into account."""
+        self._recent.append(step)
         if self.before is None or (step.target is None and self.centred is None):
             self.before = step
         if step.state is not State.FOLLOWING or step.aim is None or step.target is None:
             return
+        # The head turns before the lens zooms in, so the last view before the close-up is the best centred one.
+        if self.close is None and self._focal_of_view() < ZOOMED_OUT * self._shortest:
+            self.centred = step
         off_px = math.hypot(step.head.pan - step.aim.pan, step.head.tilt - step.aim.tilt) * step.lens.focal_px
-        if step.lens.focal_px < ZOOMED_OUT * self._shortest and off_px < self._off_centred:
-            self._off_centred, self.centred = off_px, step
         size = float(np.max(step.target.box.size_px))
         settled = abs(math.log(step.lens.focal_px / step.aim.nominal_px)) < SETTLED
         if settled and off_px < SETTLED * step.zoom.image.shape[1] and size > self._largest:
             self._largest, self.close = size, step
+
+    def _focal_of_view(self) -> float:
+        """Focal length of the latest zoom frame, which is older than the lens's latest state [px]."""
+        t, focal = [s.lens.t for s in self._recent], [s.lens.focal_px for s in self._recent]
+        return float(np.interp(self._recent[-1].zoom.t, t, focal))
 
     def picture(self, title: str) -> Image:
         """The wide view with its detection and the zoom view before, centred and close up, as in Fig. 4 to 6."""

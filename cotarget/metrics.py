@@ -69,6 +69,7 @@ class Row:
         pan_deg: true pan at the zoom frame's time [degrees].
         tilt_deg: likewise.
         focal_px: true focal length at the zoom frame's time [px].
+        target: name of the target that is followed.
     """
 
     t_s: float
@@ -94,6 +95,7 @@ class Row:
     pan_deg: float
     tilt_deg: float
     focal_px: float
+    target: str = ""
 
     @property
     def inside(self) -> bool:
@@ -207,6 +209,7 @@ def observe(step: Step, truth: "Truth", name: str, target: TargetConfig) -> Row:
         pan_deg=math.degrees(pan),
         tilt_deg=math.degrees(tilt),
         focal_px=focal,
+        target=name,
     )
 
 

@@ -1,7 +1,7 @@
 """Films in and out: any that PyAV can decode, and H.264 yuv420p that any player and browser opens."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -150,6 +150,27 @@ class FilmWriter:
             self._part.replace(self._path)
         else:
             self._part.unlink(missing_ok=True)
+
+
+def join_films(parts: Sequence[Path], path: Path) -> None:
+    """Put films of one size and rate, as `FilmWriter` writes them, one after the other without encoding them again."""
+    with av.open(str(path), "w") as joined:
+        stream, shift = None, 0
+        for part in parts:
+            with av.open(str(part)) as film:
+                source = film.streams.video[0]
+                if stream is None:
+                    stream = joined.add_stream_from_template(source)
+                    stream.time_base = source.time_base
+                end = 0
+                for packet in film.demux(source):
+                    if packet.dts is None:  # the demuxer's mark of the end
+                        continue
+                    end = max(end, packet.pts + packet.duration)
+                    packet.pts, packet.dts = packet.pts + shift, packet.dts + shift
+                    packet.stream = stream
+                    joined.mux(packet)
+                shift += end
 
 
 def _reason(error: Exception) -> str:
