@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from cotarget.errors import ConfigError, CotargetError
 # Heavy modules (MuJoCo, OpenCV, matplotlib) are imported by the command that needs them, so that --help and
 # mistakes in the arguments answer at once, and `doctor` runs where one of them is broken.
 
+USAGE = 2  # argparse's own exit status
 INTERRUPTED = 130  # a shell's exit status for Ctrl-C
 
 
@@ -39,8 +40,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose mistakes, too, end in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, without the usage in front of it."""
+        self.exit(USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="cotarget", description=cotarget.__doc__)
+    parser = _Parser(prog="cotarget", description=cotarget.__doc__)
     parser.add_argument("--version", action="version", version=f"cotarget {cotarget.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -322,14 +331,14 @@ def _positive(text: str) -> float:
 
 
 def _not_negative(text: str) -> int:
-    if not text.isdigit():
+    if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0")
     return int(text)
 
 
 def _corners(text: str) -> tuple[int, int]:
     columns, _, rows = text.partition("x")
-    if not (columns.isdigit() and rows.isdigit() and int(columns) >= 3 and int(rows) >= 3):
+    if not (columns.isdecimal() and rows.isdecimal() and int(columns) >= 3 and int(rows) >= 3):
         raise argparse.ArgumentTypeError(f"'{text}' is not like 9x6 (inner corners: columns x rows, 3 at least)")
     return int(columns), int(rows)
 
