@@ -39,13 +39,15 @@ class FollowSettings:
         command_delay_s: from a command to the start of motion [s]; the aim leads the target by it.
         zoom_out_after_s: how long a target may be out of sight before the lens zooms out [s].
         focal_deadband: the lens is not moved for a smaller relative change of focal length.
-        margin: the lens zooms in only as far as the way that the head has still to go fits into this part of the
+        centred_deg: the lens begins to zoom in when the head is this near to the target [degrees] ...
+        margin: ... and goes on only as far as the way that the head has still to go fits into this part of the
             image's half height, so that the target is centred first.
     """
 
     command_delay_s: float = 0.0
     zoom_out_after_s: float = 0.4
     focal_deadband: float = 0.04
+    centred_deg: float = 1.5
     margin: float = 0.3
 
 
@@ -139,7 +141,11 @@ def follow(
                     mode, reason = State.UNREACHABLE, str(error)
         if aimed is not None:
             pan, tilt = rig.head.move(aimed.pan, aimed.tilt)
-            nominal = min(aimed.nominal_px, _focal_while_turning(rig, way, settings.margin))
+            zoomed_out = commanded[2] <= shortest * (1 + settings.focal_deadband)
+            if zoomed_out and way > math.radians(settings.centred_deg):
+                nominal = shortest
+            else:
+                nominal = min(aimed.nominal_px, _focal_while_turning(rig, way, settings.margin))
             focal = _command_lens(rig, nominal, commanded[2], settings.focal_deadband)
             commanded = (pan, tilt, focal)
         elif mode is not State.UNREACHABLE and commanded[2] > shortest:
