@@ -256,6 +256,8 @@ def test_the_target_is_centred_before_the_lens_zooms_in():
     run(rig, Seer(still), 4.0)
     assert max(focal for focal, _ in told) > 6000
     assert len(told) > 2  # in steps, while the head turns
+    first_way = next(way for focal, way in told if focal > 667.0)
+    assert first_way < math.radians(FollowSettings().centred_deg) + 7.9 / 692  # from the wide end only when there
     # 0.3 of half the height in the device's own pixels; and the way is that to the close-up, in whose middle another
     # ray lies than in the wide end's, because the principal point is 7.9 px off.
     ratio = 692 / 667
