@@ -9,7 +9,6 @@ import itertools
 import math
 import tomllib
 import types
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any, Literal
 from cotarget.assets import assets_dir
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform, pose
+from cotarget.tables import build, expect_table
 
 Pair = tuple[float, float]
 Size = tuple[int, int]
@@ -303,13 +303,13 @@ def parse_config(table: Mapping[str, Any]) -> RigConfig:
     table = dict(table)
     targets = dict(DEFAULT_TARGETS)
     given = table.pop("targets", {})
-    _expect_table(given, "targets")
+    expect_table(given, "targets")
     for name, values in given.items():
-        targets[name] = _build(TargetConfig, values, f"targets.{name}", base=targets.get(name))
+        targets[name] = build(TargetConfig, values, f"targets.{name}", base=targets.get(name))
     sim_table = table.get("sim")
     if isinstance(sim_table, Mapping) and isinstance(sim_table.get("effects"), Mapping):
         table["sim"] = {**sim_table, "effects": _expand_all(dict(sim_table["effects"]))}
-    config = dataclasses.replace(_build(RigConfig, table, ""), targets=targets)
+    config = dataclasses.replace(build(RigConfig, table, ""), targets=targets)
     _check(config)
     return config
 
@@ -322,91 +322,6 @@ def _expand_all(effects: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(every, bool):
         raise ConfigError(f"sim.effects.all: {every!r} is not true or false")
     return {f.name: every for f in dataclasses.fields(SimEffects)} | effects
-
-
-def _expect_table(value: Any, where: str) -> None:
-    if not isinstance(value, Mapping):
-        raise ConfigError(f"{where}: {value!r} is not a table")
-
-
-def _build(cls: type[Any], table: Any, where: str, base: Any = None) -> Any:
-    """Make a dataclass from a table, on top of ``base`` where that is given."""
-    _expect_table(table, where or "the file")
-    hints = typing.get_type_hints(cls)
-    unknown = sorted(set(table) - set(hints))
-    if unknown:
-        raise ConfigError(f"unknown key '{_join(where, unknown[0])}'; valid here: {choices(hints)}")
-    values = {name: _convert(hints[name], value, _join(where, name)) for name, value in table.items()}
-    if base is not None:
-        return dataclasses.replace(base, **values)
-    required = {
-        f.name
-        for f in dataclasses.fields(cls)
-        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-    }
-    missing = sorted(required - set(values))
-    if missing:
-        raise ConfigError(f"{where}: missing key '{missing[0]}'; needed here: {choices(required)}")
-    return cls(**values)
-
-
-def _join(where: str, name: str) -> str:
-    return f"{where}.{name}" if where else name
-
-
-def _convert(hint: Any, value: Any, where: str) -> Any:
-    """Check one value against its field's type and convert it."""
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin is types.UnionType:  # the only unions are "or None", which TOML cannot say
-        return _convert(args[0], value, where)
-    if origin is Literal:
-        if value not in args:
-            raise ConfigError(f"{where}: {value!r} is not one of: {choices(args)}")
-        return value
-    if hint is Path:
-        return Path(_convert(str, value, where))
-    if hint is RigidTransform:
-        return _convert_pose(value, where)
-    if dataclasses.is_dataclass(hint):
-        return _build(typing.cast(type[Any], hint), value, where)
-    if origin is tuple:
-        return _convert_tuple(args, value, where)
-    if origin is Mapping or (isinstance(origin, type) and issubclass(origin, Mapping)):
-        _expect_table(value, where)
-        return {key: _convert(args[1], item, _join(where, key)) for key, item in value.items()}
-    if hint is float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ConfigError(f"{where}: {value!r} is not a finite number")
-        return float(value)
-    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
-        kinds = {int: "a whole number", str: "a text", bool: "true or false"}
-        raise ConfigError(f"{where}: {value!r} is not {kinds[hint]}")
-    return value
-
-
-def _convert_tuple(args: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
-    if not isinstance(value, list):
-        raise ConfigError(f"{where}: {value!r} is not a list")
-    if args[-1] is Ellipsis:
-        return tuple(_convert(args[0], item, f"{where}[{i}]") for i, item in enumerate(value))
-    if len(value) != len(args):
-        raise ConfigError(f"{where}: has {len(value)} values where {len(args)} are wanted")
-    return tuple(_convert(a, item, f"{where}[{i}]") for i, (a, item) in enumerate(zip(args, value, strict=True)))
-
-
-def _convert_pose(value: Any, where: str) -> RigidTransform:
-    _expect_table(value, where)
-    keys = {"translation", "rotvec_deg"}
-    if set(value) != keys:
-        wrong = sorted(set(value) ^ keys)[0]
-        raise ConfigError(
-            f"{where}: {'unknown' if wrong in value else 'missing'} key '{wrong}'; needed: {choices(keys)}"
-        )
-    triple = (float, float, float)
-    return pose(
-        _convert_tuple(triple, value["translation"], f"{where}.translation"),
-        _convert_tuple(triple, value["rotvec_deg"], f"{where}.rotvec_deg"),
-    )
 
 
 def _check(config: RigConfig) -> None:

@@ -21,8 +21,9 @@ from cotarget.config import RigConfig
 from cotarget.detection import make_detector
 from cotarget.drawing import TargetStages, captioned, draw_frames, plot_aim_error, side_by_side
 from cotarget.errors import ConfigError
+from cotarget.judging import observe, pointing_errors
 from cotarget.loop import FollowSettings, follow
-from cotarget.metrics import Row, Score, observe, pointing_errors, score, write_rows
+from cotarget.metrics import Row, Score, score, write_rows
 from cotarget.parallel import Report, run_side_by_side
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld

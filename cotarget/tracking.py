@@ -1,139 +1,29 @@
 """From detections in single frames to tracks with a number, a velocity, a size and an honest uncertainty.
 
-Every track is a constant-velocity Kalman filter over (u, v, du, dv), driven by white acceleration, so that frames
-may come at any times. Detections are assigned by the Hungarian method inside a Mahalanobis gate. A track is told
-to the outside as a frozen ``Track``; the filter's own state stays here.
+Every track has its own motion filter; detections are assigned to tracks by the Hungarian method inside a
+Mahalanobis gate.
 """
 
-from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from cotarget.config import TargetConfig
-from cotarget.geometry import Array
+from cotarget.motionfilter import Box, Measurement, TargetFilter, Track, TrackerSettings, settings_for
+
+__all__ = ["FirstCome", "Measurement", "Track", "Tracker", "TrackerSettings", "settings_for", "size_for"]
 
 # A cost that no assignment inside the gate reaches, so that it marks pairs that must not be matched.
 IMPOSSIBLE = 1e6
 # 99.9 % of a chi-square with two degrees of freedom: one true detection in a thousand is turned away.
 GATE_CHI2 = 13.8
+# A box that overlaps a track's by this much may be its target even outside the gate: it grew into something else.
+OVERLAP_ENOUGH = 0.3
 # What perfect overlap of the boxes is worth against the Mahalanobis distance squared.
 OVERLAP_BONUS = 4.0
 # A detection that covers this much of a track's predicted box explains that track, even where another has won it.
 COVERED = 0.6
-# The larger side over a wing beat is this percentile: the maximum, but deaf to one frame in ten that is wrong.
-BEAT_PERCENTILE = 90.0
-
-
-class Measurement(Protocol):
-    """What the tracker needs of a detection."""
-
-    @property
-    def center_px(self) -> Array:
-        """Middle of the box (u, v) [px], (2,)."""
-
-    @property
-    def size_px(self) -> Array:
-        """Width and height of the box [px], (2,)."""
-
-    @property
-    def score(self) -> float:
-        """How sure the detector is, 0 to 1."""
-
-    @property
-    def clipped(self) -> bool:
-        """Whether the image's border cuts the box."""
-
-
-@dataclass(frozen=True)
-class TrackerSettings:
-    """How tracks are born, moved and dropped.
-
-    Attributes:
-        acceleration_px: typical acceleration in the image [px/s^2].
-        manoeuvre_s: how long such an acceleration lasts [s]; acceleration_px^2 manoeuvre_s is the filter's noise.
-        noise_px: standard deviation of a detection's centre that does not depend on its size [px].
-        noise_of_size: the part that does, as a fraction of the box's side (limbs and wings that move).
-        speed_px: standard deviation of the speed that a new target may have [px/s].
-        confirm_hits: detections before a track is believed ...
-        confirm_s: ... and how long it must have been followed [s] ...
-        confirm_travel: ... and how far it must have come, in larger sides of its box (0: it may stand still).
-        lose_s: a confirmed track dies after this long without a detection [s].
-        drop_s: one that was never confirmed, after this long [s].
-        size_s: window of the size's median [s].
-        beat_s: window of the largest size; some two wing beats [s].
-    """
-
-    acceleration_px: float = 150.0
-    manoeuvre_s: float = 0.3
-    noise_px: float = 0.4
-    noise_of_size: float = 0.06
-    speed_px: float = 120.0
-    confirm_hits: int = 4
-    confirm_s: float = 0.15
-    confirm_travel: float = 0.0
-    lose_s: float = 0.8
-    drop_s: float = 0.13
-    size_s: float = 0.6
-    beat_s: float = 0.5
-
-
-def settings_for(target: TargetConfig) -> TrackerSettings:
-    """Choose the tracker's settings for a target.
-
-    A colour is found to a fraction of a pixel. What is found by its motion jitters with limbs and wings, and
-    must have moved before it is believed.
-    """
-    if target.detector == "colour":
-        return TrackerSettings(noise_px=0.2, noise_of_size=0.01)
-    if target.dimension == "wingspan":
-        return TrackerSettings(acceleration_px=250.0, noise_of_size=0.2, confirm_travel=0.5)
-    return TrackerSettings(confirm_travel=0.1, noise_of_size=0.04)
-
-
-@dataclass(frozen=True)
-class Track:
-    """One target as far as it is known at time ``t``.
-
-    Attributes:
-        id: its number, from 1, never used again.
-        t: the time that this state is for [s].
-        confirmed: whether it has been consistent for long enough to be believed.
-        missed: frames since its last detection; 0 when the last frame had it.
-        center_px: filtered middle (u, v), (2,).
-        velocity_px: (du, dv) [px/s], (2,).
-        size_px: filtered width and height, (2,).
-        larger_side_px: the larger side over the last wing beats [px].
-        covariance: of (u, v, du, dv), (4, 4).
-        score: of the last detection, 0 to 1.
-        box: the last detection.
-        noise: spectral density of the acceleration that ``at`` grows the covariance with [px^2/s^3].
-    """
-
-    id: int
-    t: float
-    confirmed: bool
-    missed: int
-    center_px: Array
-    velocity_px: Array
-    size_px: Array
-    larger_side_px: float
-    covariance: Array
-    score: float
-    box: Measurement
-    noise: float
-
-    def predict(self, t: float) -> Array:
-        """Where its middle will be at time ``t`` [s] if it keeps its velocity, (2,)."""
-        return self.center_px + (t - self.t) * self.velocity_px
-
-    def at(self, t: float) -> "Track":
-        """The track as expected at time ``t`` [s], with the covariance grown accordingly."""
-        F, Q = _motion(t - self.t, self.noise)
-        return replace(self, t=t, center_px=self.predict(t), covariance=F @ self.covariance @ F.T + Q)
 
 
 def size_for(track: Track, dimension: Literal["width", "height", "wingspan"]) -> float:
@@ -169,7 +59,7 @@ class Tracker:
         """
         self._settings = settings or TrackerSettings()
         self._image_size = image_size
-        self._tracks: list[_State] = []
+        self._tracks: list[TargetFilter] = []
         self._next_id = 1
         self._t: float | None = None
 
@@ -209,152 +99,33 @@ class Tracker:
         self._tracks = [s for s in self._tracks if not s.is_over(self._image_size)]
         for j, detection in enumerate(detections):
             if j not in taken and not any(_covered(s.box, detection) > COVERED for s in self._tracks):
-                self._tracks.append(_State(self._next_id, detection, t, self._settings))
+                self._tracks.append(TargetFilter(self._next_id, detection, t, self._settings))
                 self._next_id += 1
         return self.tracks
 
 
-Box = tuple[Array, Array]
-
-
-class _State:
-    """The Kalman filter and the size history of one track."""
-
-    def __init__(self, number: int, detection: Measurement, t: float, settings: TrackerSettings) -> None:
-        self.number = number
-        self.settings = settings
-        self.noise = settings.acceleration_px**2 * settings.manoeuvre_s
-        self.x: Array = np.concatenate([detection.center_px, np.zeros(2)])
-        self.P = np.diag([*self._variance(detection), settings.speed_px**2, settings.speed_px**2])
-        self.t = self.born = self.seen = t
-        self.start = self.x[:2].copy()
-        self.detection = detection
-        self.hits = 1
-        self.missed = 0
-        self.confirmed = False
-        self.sizes: deque[tuple[float, Array, bool]] = deque([(t, detection.size_px, detection.clipped)])
-
-    @property
-    def box(self) -> Box:
-        """Predicted centre and filtered size [px]."""
-        return self.x[:2], self.size()
-
-    def predict(self, t: float) -> None:
-        """Move the filter to time ``t`` [s]."""
-        F, Q = _motion(t - self.t, self.noise)
-        self.x = F @ self.x
-        self.P = F @ self.P @ F.T + Q
-        self.t = t
-
-    def correct(self, detection: Measurement) -> None:
-        """Take a detection of this target alone into account."""
-        self._measure(detection.center_px, self._variance(detection))
-        self.sizes.append((self.t, detection.size_px, detection.clipped))
-        self.detection = detection
-        self.hits += 1
-        window = max(self.settings.size_s, self.settings.beat_s)
-        while self.sizes[0][0] < self.t - window:
-            self.sizes.popleft()
-        if not self.confirmed:
-            travel = np.linalg.norm(self.x[:2] - self.start) / max(1.0, float(np.max(self.size())))
-            self.confirmed = bool(
-                self.hits >= self.settings.confirm_hits
-                and self.t - self.born >= self.settings.confirm_s
-                and travel >= self.settings.confirm_travel
-            )
-
-    def share(self, detection: Measurement) -> None:
-        """Take a detection into account that covers other targets too: all it tells is that this one is inside."""
-        center, size = self.box
-        room = np.maximum(0.0, (detection.size_px - size) / 2)
-        inside = np.clip(center, detection.center_px - room, detection.center_px + room)
-        self._measure(inside, (size / 4) ** 2 + room**2)
-
-    def is_over(self, image_size: tuple[int, int] | None) -> bool:
-        """Whether the track has been without a detection for too long, or has left the image."""
-        if self.missed and image_size is not None and not (-0.5 <= self.x[0] <= image_size[0] - 0.5):
-            return True
-        if self.missed and image_size is not None and not (-0.5 <= self.x[1] <= image_size[1] - 0.5):
-            return True
-        return self.t - self.seen > (self.settings.lose_s if self.confirmed else self.settings.drop_s)
-
-    def size(self) -> Array:
-        """Median width and height of the boxes that the border did not cut, or the largest of those it did."""
-        recent = [(s, clipped) for t, s, clipped in self.sizes if t >= self.sizes[-1][0] - self.settings.size_s]
-        whole = [s for s, clipped in recent if not clipped]
-        if whole:
-            return np.median(whole, axis=0)
-        return np.max([s for s, _ in recent], axis=0)
-
-    def larger_side(self) -> float:
-        """The larger side over the last wing beats [px]."""
-        recent = [(s.max(), clipped) for t, s, clipped in self.sizes if t >= self.sizes[-1][0] - self.settings.beat_s]
-        whole = [s for s, clipped in recent if not clipped] or [s for s, _ in recent]
-        return float(np.percentile(whole, BEAT_PERCENTILE))
-
-    def track(self) -> Track:
-        """What the outside sees."""
-        return Track(
-            id=self.number,
-            t=self.t,
-            confirmed=self.confirmed,
-            missed=self.missed,
-            center_px=self.x[:2].copy(),
-            velocity_px=self.x[2:].copy(),
-            size_px=self.size(),
-            larger_side_px=self.larger_side(),
-            covariance=self.P.copy(),
-            score=self.detection.score,
-            box=self.detection,
-            noise=self.noise,
-        )
-
-    def _variance(self, detection: Measurement) -> Array:
-        """Variance of a detection's centre [px^2], (2,)."""
-        if detection.clipped:  # the hidden part may be as large again
-            return self.settings.noise_px**2 + (detection.size_px / 2) ** 2
-        return self.settings.noise_px**2 + (self.settings.noise_of_size * detection.size_px) ** 2
-
-    def _measure(self, center: Array, variance: Array) -> None:
-        """Kalman's correction by a measured centre [px] with its variance [px^2], both (2,)."""
-        S = self.P[:2, :2] + np.diag(variance)
-        K = np.linalg.solve(S, self.P[:2]).T
-        self.x = self.x + K @ (center - self.x[:2])
-        self.P = self.P - K @ S @ K.T
-        self.P = (self.P + self.P.T) / 2
-        self.seen = self.t
-        self.missed = 0
-
-
-def _motion(dt: float, noise: float) -> tuple[Array, Array]:
-    """Transition and process noise over ``dt`` [s], forward or back, for white acceleration [px^2/s^3]."""
-    eye = np.eye(2)
-    F = np.block([[eye, dt * eye], [np.zeros((2, 2)), eye]])
-    span = abs(dt)
-    Q = noise * np.block([[span**3 / 3 * eye, dt * span / 2 * eye], [dt * span / 2 * eye, span * eye]])
-    return F, Q
-
-
-def _assign(states: Sequence[_State], detections: Sequence[Measurement]) -> dict[int, int]:
+def _assign(states: Sequence[TargetFilter], detections: Sequence[Measurement]) -> dict[int, int]:
     """Match tracks to detections one to one: {index of the track: index of the detection}."""
     if not states or not detections:
         return {}
     cost = np.full((len(states), len(detections)), IMPOSSIBLE)
     for i, state in enumerate(states):
         for j, detection in enumerate(detections):
-            S = state.P[:2, :2] + np.diag(state._variance(detection))
+            S = state.P[:2, :2] + np.diag(state.variance(detection))
             error = detection.center_px - state.x[:2]
             distance = float(error @ np.linalg.solve(S, error))
             overlap = _overlap(state.box, detection)
             # A track that was confirmed goes first, and a box that grew into another still overlaps its track.
-            if distance <= GATE_CHI2 or (overlap > 0.3):
+            if distance <= GATE_CHI2 or overlap > OVERLAP_ENOUGH:
                 cost[i, j] = distance + np.log(np.linalg.det(S)) - OVERLAP_BONUS * overlap
                 cost[i, j] += 0.0 if state.confirmed else OVERLAP_BONUS
     rows, columns = linear_sum_assignment(cost)
     return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if cost[i, j] < IMPOSSIBLE}
 
 
-def _crowds(states: Sequence[_State], detections: Sequence[Measurement], matches: dict[int, int]) -> dict[int, int]:
+def _crowds(
+    states: Sequence[TargetFilter], detections: Sequence[Measurement], matches: dict[int, int]
+) -> dict[int, int]:
     """Find detections that cover two or more confirmed tracks: {index of such a track: the detection}."""
     crowds: dict[int, int] = {}
     for j, detection in enumerate(detections):

@@ -26,7 +26,7 @@ import cotarget
 from cotarget.calibration import Calibration, calibrate_rig
 from cotarget.config import RigConfig, SimConfig
 from cotarget.geometry import RigidTransform, pose
-from cotarget.metrics import pointing_errors
+from cotarget.judging import pointing_errors
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Method, Reach

@@ -1,0 +1,89 @@
+"""What has a template's colour, located to a fraction of a pixel (the book)."""
+
+import cv2
+import numpy as np
+
+from cotarget.detection.base import Detection, box_detection, check_size
+from cotarget.detection.templatefit import MARGIN_PX, fit_template
+from cotarget.errors import ConfigError
+from cotarget.rig import Frame, Image
+
+# A template whose mean colour is closer to grey than this tells nothing by its colour [grey levels].
+LEAST_CHROMA = 20.0
+# A pixel is taken for the template's colour when it has at least this part of its chroma ...
+LEAST_WEIGHT = 0.35
+# ... and its chroma points at most this far away from the template's (tangent of the angle in the chroma plane).
+HUE_TANGENT = 0.6
+# The template's chroma becomes this value of a byte, so that brighter light does not saturate.
+CHROMA_BYTE = 128.0
+# Fewest pixels of a target that is found by its colour.
+LEAST_PIXELS = 12
+# A target this small beside the image is looked for; a larger patch of its colour is the scene.
+LARGEST_COLOURED = 0.5
+# A detection must explain this part of the variation around it.
+LEAST_FIT = 0.3
+
+
+class ColourDetector:
+    """What has a template's colour, located to a fraction of a pixel by fitting the template to it.
+
+    Everything happens in one plane: a pixel's chroma along the template's mean chroma. It is linear in the colour,
+    so that blur, mixed pixels at the border and subsampled chroma bias nothing, and it is zero for grey, so that
+    shadows and white walls do not matter.
+    """
+
+    def __init__(self, template: Image) -> None:
+        """Learn the colour and what of the template has it.
+
+        Args:
+            template: (h, w, 3) BGR picture of the target, cut to its outline; its scale does not matter.
+
+        Raises:
+            ConfigError: the template is grey.
+        """
+        pixels = template.reshape(-1, 3).astype(float)
+        chroma = (pixels - pixels.mean(axis=1, keepdims=True)).mean(axis=0)
+        length = float(np.linalg.norm(chroma))
+        if length < LEAST_CHROMA:
+            raise ConfigError("the colour template is almost grey; give a picture of the target with a strong colour")
+        self._along = chroma / length
+        across = np.cross(np.full(3, 1 / np.sqrt(3)), self._along)
+        plane = template.astype(float) @ self._along
+        self._plane = (plane / np.percentile(plane, 75)).astype(np.float32)
+        tests = np.vstack([self._along, HUE_TANGENT * self._along - across, HUE_TANGENT * self._along + across])
+        self._tests = tests * CHROMA_BYTE / np.percentile(plane, 75)
+        self._shape: tuple[int, ...] | None = None
+        self.mask: Image | None = None
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """Find what has the template's colour and shape, the best likeness first.
+
+        Raises:
+            CotargetError: the image's size changed.
+        """
+        check_size(self._shape, frame.image)
+        self._shape = frame.image.shape
+        tests = cv2.transform(frame.image, self._tests)  # saturates at 0: a wrong hue fails one of the last two
+        self.mask = cv2.inRange(tests, (LEAST_WEIGHT * CHROMA_BYTE, 1, 1), (255, 255, 255))
+        joined = cv2.dilate(self.mask, np.ones((3, 3), np.uint8))
+        found = []
+        for contour in cv2.findContours(joined, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
+            x, y, w, h = cv2.boundingRect(contour)
+            inside = self.mask[y : y + h, x : x + w]
+            if cv2.countNonZero(inside) < LEAST_PIXELS:
+                continue
+            dx, dy, w, h = cv2.boundingRect(inside)
+            if max(w / self.mask.shape[1], h / self.mask.shape[0]) <= LARGEST_COLOURED:
+                found.append(self._refine(frame.image, box_detection(x + dx, y + dy, w, h, 0.0, self.mask.shape)))
+        return sorted((d for d in found if d.score >= LEAST_FIT), key=lambda d: -d.score)
+
+    def _refine(self, image: Image, coarse: Detection) -> Detection:
+        """Locate the target in its coarse box to a fraction of a pixel."""
+        low = np.maximum(0, np.rint(coarse.center_px - coarse.size_px / 2 - MARGIN_PX)).astype(int)
+        high = np.rint(coarse.center_px + coarse.size_px / 2 + MARGIN_PX).astype(int) + 1
+        part = image[low[1] : high[1], low[0] : high[0]].astype(np.float32) @ self._along.astype(np.float32)
+        fit = fit_template(self._plane, part, coarse.center_px - low, coarse.size_px)
+        if fit is None:
+            return coarse
+        center, size, likeness = fit
+        return Detection(center + low, size, likeness, coarse.clipped)

@@ -1,0 +1,179 @@
+"""What moves: an adaptive Gaussian mixture of the background, morphology and connected pieces (person, bird)."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from cotarget.detection.base import Detection, box_detection, check_size
+from cotarget.rig import Frame, Image
+
+# What MOG2 writes into its mask: 255 is foreground, 127 a shadow.
+FOREGROUND = 255
+# A target is small: when more of the picture than this changed at once, the light or the camera did.
+MOST_FOREGROUND = 0.3
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """What moves like the target.
+
+    Attributes:
+        history_s: how far back the background's colours are remembered [s].
+        background_part: the colours that make up this part of a pixel's history are its background. Many colours
+            (0.9) hide foliage, but then a target that stops melts away after a tenth of the history.
+        warm_up_s: no detection before the background has been learnt for this long [s].
+        threshold: squared distance to the background, in variances, from which a pixel counts as foreground.
+        shadows: whether to tell shadows apart from the target.
+        sway_px: how far the background itself sways [px]: a pixel is no target where its colour lies between the
+            darkest and the brightest that the background has within this distance; 0 for a rigid background.
+        opening_px: specks thinner than this are removed; 0 for none.
+        bridge_px: (width, height) of gaps that are closed within one target.
+        smallest_px: smallest width and height of a target.
+        smallest_area_px: fewest foreground pixels of a target.
+        widest: largest width as a multiple of the height.
+        largest: largest side of a target as a fraction of the image's.
+    """
+
+    history_s: float
+    background_part: float
+    warm_up_s: float
+    threshold: float
+    shadows: bool
+    sway_px: int
+    opening_px: int
+    bridge_px: tuple[int, int]
+    smallest_px: tuple[int, int]
+    smallest_area_px: int
+    widest: float
+    largest: float
+
+
+# The background's range of colours is taken anew this often [s]; it costs a third of a frame's work.
+SWAY_UPDATE_S = 0.25
+# Levels by which a pixel must leave that range: five standard deviations of the sensor's noise of 2, and coding.
+SWAY_MARGIN = 15
+
+# A bird may be as small as four pixels, so that nothing is opened away; it casts no shadow on the sky.
+BIRD = MotionSettings(
+    history_s=8.0,
+    background_part=0.9,
+    warm_up_s=0.5,
+    threshold=25.0,
+    shadows=False,
+    sway_px=3,
+    opening_px=0,
+    bridge_px=(5, 5),
+    smallest_px=(2, 2),
+    smallest_area_px=5,
+    widest=np.inf,
+    largest=0.3,
+)
+# A person stops at times, casts a shadow, falls apart into limbs and trunk one above the other, and stands upright
+# (1.3 still lets two or three side by side pass, but not a patch of light on the ground).
+PERSON = MotionSettings(
+    history_s=20.0,
+    background_part=0.7,
+    warm_up_s=0.5,
+    threshold=16.0,
+    shadows=True,
+    sway_px=0,
+    opening_px=3,
+    bridge_px=(5, 15),
+    smallest_px=(8, 24),
+    smallest_area_px=150,
+    widest=1.3,
+    largest=0.9,
+)
+
+
+class MotionDetector:
+    """What differs from an adaptive Gaussian mixture of the background (Zivkovic 2004), as connected pieces."""
+
+    def __init__(self, settings: MotionSettings, rate_hz: float) -> None:
+        """Begin without a background.
+
+        Args:
+            settings: what moves like the target.
+            rate_hz: the camera's nominal frames a second, for frames whose times do not tell.
+        """
+        self._settings = settings
+        self._interval = 1.0 / rate_hz
+        self._model = cv2.createBackgroundSubtractorMOG2(
+            history=max(1, round(settings.history_s * rate_hz)),
+            varThreshold=settings.threshold,
+            detectShadows=settings.shadows,
+        )
+        self._model.setBackgroundRatio(settings.background_part)
+        self._t: float | None = None
+        self._learnt = 0.0
+        self._range: tuple[Image, Image] | None = None
+        self._range_learnt = 0.0
+        self._shape: tuple[int, ...] | None = None
+        self.mask: Image | None = None
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """Find what moves, largest first.
+
+        Raises:
+            CotargetError: the image's size changed.
+        """
+        check_size(self._shape, frame.image)
+        self._shape = frame.image.shape
+        mask = self._model.apply(frame.image, learningRate=self._rate(frame.t))
+        if self._settings.shadows:
+            mask = cv2.compare(mask, FOREGROUND, cv2.CMP_EQ)
+        if self._settings.sway_px:
+            mask = cv2.bitwise_and(mask, self._outside_sway(frame.image))
+        if self._settings.opening_px:
+            mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((self._settings.opening_px,) * 2, np.uint8))
+        self.mask = mask
+        if self._learnt < self._settings.warm_up_s or cv2.countNonZero(mask) > MOST_FOREGROUND * mask.size:
+            return []
+        return self._boxes(mask)
+
+    def _rate(self, t: float) -> float:
+        """Learning rate for a frame at ``t`` [s]: fast while there is little to remember."""
+        dt = self._interval if self._t is None else t - self._t
+        self._t = t
+        if dt <= 0:
+            dt = self._interval
+        self._learnt += dt
+        return min(1.0, dt / min(self._settings.history_s, 2 * self._learnt))
+
+    def _outside_sway(self, image: Image) -> Image:
+        """Where an image leaves the range of colours that the background has nearby: what sways does not."""
+        if self._range is None or self._learnt - self._range_learnt > SWAY_UPDATE_S or self._learnt < SWAY_UPDATE_S:
+            background = self._model.getBackgroundImage()
+            nearby = np.ones((2 * self._settings.sway_px + 1,) * 2, np.uint8)
+            margin = (SWAY_MARGIN,) * 3
+            darkest = cv2.subtract(cv2.erode(background, nearby), (*margin, 0))
+            brightest = cv2.add(cv2.dilate(background, nearby), (*margin, 0))
+            self._range = darkest, brightest
+            self._range_learnt = self._learnt
+        return cv2.bitwise_not(cv2.inRange(image, *self._range))
+
+    def _boxes(self, mask: Image) -> list[Detection]:
+        """Boxes of the connected pieces, largest first."""
+        settings = self._settings
+        height, width = mask.shape
+        bridge_w, bridge_h = settings.bridge_px
+        closed = cv2.dilate(mask, np.ones((bridge_h, bridge_w), np.uint8))
+        contours = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]
+        found = []
+        for contour in contours:
+            x, y, w, h = cv2.boundingRect(contour)
+            # The dilation only joined the pieces: the box is that of the mask's own pixels inside.
+            inside = mask[y : y + h, x : x + w]
+            area = cv2.countNonZero(inside)
+            if area < settings.smallest_area_px:
+                continue
+            dx, dy, w, h = cv2.boundingRect(inside)
+            x, y = x + dx, y + dy
+            if w < settings.smallest_px[0] or h < settings.smallest_px[1]:
+                continue
+            if w > settings.largest * width or h > settings.largest * height or w > settings.widest * h:
+                continue
+            found.append((area, box_detection(x, y, w, h, area / (area + settings.smallest_area_px), mask.shape)))
+        found.sort(key=lambda pair: -pair[0])
+        return [detection for _, detection in found]

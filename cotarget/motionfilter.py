@@ -1,0 +1,245 @@
+"""One target's motion filter: a constant-velocity Kalman filter over (u, v, du, dv) with a history of sizes.
+
+It is driven by white acceleration, so that frames may come at any times. To the outside it is told as a frozen
+``Track``; the filter's own state stays here.
+"""
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from cotarget.config import TargetConfig
+from cotarget.geometry import Array
+
+# The larger side over a wing beat is this percentile: the maximum, but deaf to one frame in ten that is wrong.
+BEAT_PERCENTILE = 90.0
+
+Box = tuple[Array, Array]  # centre and size [px], (2,) each
+
+
+class Measurement(Protocol):
+    """What the tracker needs of a detection."""
+
+    @property
+    def center_px(self) -> Array:
+        """Middle of the box (u, v) [px], (2,)."""
+
+    @property
+    def size_px(self) -> Array:
+        """Width and height of the box [px], (2,)."""
+
+    @property
+    def score(self) -> float:
+        """How sure the detector is, 0 to 1."""
+
+    @property
+    def clipped(self) -> bool:
+        """Whether the image's border cuts the box."""
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """How tracks are born, moved and dropped.
+
+    Attributes:
+        acceleration_px: typical acceleration in the image [px/s^2].
+        manoeuvre_s: how long such an acceleration lasts [s]; acceleration_px^2 manoeuvre_s is the filter's noise.
+        noise_px: standard deviation of a detection's centre that does not depend on its size [px].
+        noise_of_size: the part that does, as a fraction of the box's side (limbs and wings that move).
+        speed_px: standard deviation of the speed that a new target may have [px/s].
+        confirm_hits: detections before a track is believed ...
+        confirm_s: ... and how long it must have been followed [s] ...
+        confirm_travel: ... and how far it must have come, in larger sides of its box (0: it may stand still).
+        lose_s: a confirmed track dies after this long without a detection [s].
+        drop_s: one that was never confirmed, after this long [s].
+        size_s: window of the size's median [s].
+        beat_s: window of the largest size; some two wing beats [s].
+    """
+
+    acceleration_px: float = 150.0
+    manoeuvre_s: float = 0.3
+    noise_px: float = 0.4
+    noise_of_size: float = 0.06
+    speed_px: float = 120.0
+    confirm_hits: int = 4
+    confirm_s: float = 0.15
+    confirm_travel: float = 0.0
+    lose_s: float = 0.8
+    drop_s: float = 0.13
+    size_s: float = 0.6
+    beat_s: float = 0.5
+
+
+def settings_for(target: TargetConfig) -> TrackerSettings:
+    """Choose the tracker's settings for a target.
+
+    A colour is found to a fraction of a pixel. What is found by its motion jitters with limbs and wings, and
+    must have moved before it is believed.
+    """
+    if target.detector == "colour":
+        return TrackerSettings(noise_px=0.2, noise_of_size=0.01)
+    if target.dimension == "wingspan":
+        return TrackerSettings(acceleration_px=250.0, noise_of_size=0.2, confirm_travel=0.5)
+    return TrackerSettings(confirm_travel=0.1, noise_of_size=0.04)
+
+
+@dataclass(frozen=True)
+class Track:
+    """One target as far as it is known at time ``t``.
+
+    Attributes:
+        id: its number, from 1, never used again.
+        t: the time that this state is for [s].
+        confirmed: whether it has been consistent for long enough to be believed.
+        missed: frames since its last detection; 0 when the last frame had it.
+        center_px: filtered middle (u, v), (2,).
+        velocity_px: (du, dv) [px/s], (2,).
+        size_px: filtered width and height, (2,).
+        larger_side_px: the larger side over the last wing beats [px].
+        covariance: of (u, v, du, dv), (4, 4).
+        score: of the last detection, 0 to 1.
+        box: the last detection.
+        noise: spectral density of the acceleration that ``at`` grows the covariance with [px^2/s^3].
+    """
+
+    id: int
+    t: float
+    confirmed: bool
+    missed: int
+    center_px: Array
+    velocity_px: Array
+    size_px: Array
+    larger_side_px: float
+    covariance: Array
+    score: float
+    box: Measurement
+    noise: float
+
+    def predict(self, t: float) -> Array:
+        """Where its middle will be at time ``t`` [s] if it keeps its velocity, (2,)."""
+        return self.center_px + (t - self.t) * self.velocity_px
+
+    def at(self, t: float) -> "Track":
+        """The track as expected at time ``t`` [s], with the covariance grown accordingly."""
+        F, Q = _motion(t - self.t, self.noise)
+        return replace(self, t=t, center_px=self.predict(t), covariance=F @ self.covariance @ F.T + Q)
+
+
+class TargetFilter:
+    """The Kalman filter and the size history of one track."""
+
+    def __init__(self, number: int, detection: Measurement, t: float, settings: TrackerSettings) -> None:
+        self.number = number
+        self.settings = settings
+        self.noise = settings.acceleration_px**2 * settings.manoeuvre_s
+        self.x: Array = np.concatenate([detection.center_px, np.zeros(2)])
+        self.P = np.diag([*self.variance(detection), settings.speed_px**2, settings.speed_px**2])
+        self.t = self.born = self.seen = t
+        self.start = self.x[:2].copy()
+        self.detection = detection
+        self.hits = 1
+        self.missed = 0
+        self.confirmed = False
+        self.sizes: deque[tuple[float, Array, bool]] = deque([(t, detection.size_px, detection.clipped)])
+
+    @property
+    def box(self) -> Box:
+        """Predicted centre and filtered size [px]."""
+        return self.x[:2], self.size()
+
+    def predict(self, t: float) -> None:
+        """Move the filter to time ``t`` [s]."""
+        F, Q = _motion(t - self.t, self.noise)
+        self.x = F @ self.x
+        self.P = F @ self.P @ F.T + Q
+        self.t = t
+
+    def correct(self, detection: Measurement) -> None:
+        """Take a detection of this target alone into account."""
+        self._measure(detection.center_px, self.variance(detection))
+        self.sizes.append((self.t, detection.size_px, detection.clipped))
+        self.detection = detection
+        self.hits += 1
+        window = max(self.settings.size_s, self.settings.beat_s)
+        while self.sizes[0][0] < self.t - window:
+            self.sizes.popleft()
+        if not self.confirmed:
+            travel = np.linalg.norm(self.x[:2] - self.start) / max(1.0, float(np.max(self.size())))
+            self.confirmed = bool(
+                self.hits >= self.settings.confirm_hits
+                and self.t - self.born >= self.settings.confirm_s
+                and travel >= self.settings.confirm_travel
+            )
+
+    def share(self, detection: Measurement) -> None:
+        """Take a detection into account that covers other targets too: all it tells is that this one is inside."""
+        center, size = self.box
+        room = np.maximum(0.0, (detection.size_px - size) / 2)
+        inside = np.clip(center, detection.center_px - room, detection.center_px + room)
+        self._measure(inside, (size / 4) ** 2 + room**2)
+
+    def is_over(self, image_size: tuple[int, int] | None) -> bool:
+        """Whether the track has been without a detection for too long, or has left the image."""
+        if self.missed and image_size is not None and not (-0.5 <= self.x[0] <= image_size[0] - 0.5):
+            return True
+        if self.missed and image_size is not None and not (-0.5 <= self.x[1] <= image_size[1] - 0.5):
+            return True
+        return self.t - self.seen > (self.settings.lose_s if self.confirmed else self.settings.drop_s)
+
+    def size(self) -> Array:
+        """Median width and height of the boxes that the border did not cut, or the largest of those it did."""
+        recent = [(s, clipped) for t, s, clipped in self.sizes if t >= self.sizes[-1][0] - self.settings.size_s]
+        whole = [s for s, clipped in recent if not clipped]
+        if whole:
+            return np.median(whole, axis=0)
+        return np.max([s for s, _ in recent], axis=0)
+
+    def larger_side(self) -> float:
+        """The larger side over the last wing beats [px]."""
+        recent = [(s.max(), clipped) for t, s, clipped in self.sizes if t >= self.sizes[-1][0] - self.settings.beat_s]
+        whole = [s for s, clipped in recent if not clipped] or [s for s, _ in recent]
+        return float(np.percentile(whole, BEAT_PERCENTILE))
+
+    def track(self) -> Track:
+        """What the outside sees."""
+        return Track(
+            id=self.number,
+            t=self.t,
+            confirmed=self.confirmed,
+            missed=self.missed,
+            center_px=self.x[:2].copy(),
+            velocity_px=self.x[2:].copy(),
+            size_px=self.size(),
+            larger_side_px=self.larger_side(),
+            covariance=self.P.copy(),
+            score=self.detection.score,
+            box=self.detection,
+            noise=self.noise,
+        )
+
+    def variance(self, detection: Measurement) -> Array:
+        """Variance of a detection's centre [px^2], (2,)."""
+        if detection.clipped:  # the hidden part may be as large again
+            return self.settings.noise_px**2 + (detection.size_px / 2) ** 2
+        return self.settings.noise_px**2 + (self.settings.noise_of_size * detection.size_px) ** 2
+
+    def _measure(self, center: Array, variance: Array) -> None:
+        """Kalman's correction by a measured centre [px] with its variance [px^2], both (2,)."""
+        S = self.P[:2, :2] + np.diag(variance)
+        K = np.linalg.solve(S, self.P[:2]).T
+        self.x = self.x + K @ (center - self.x[:2])
+        self.P = self.P - K @ S @ K.T
+        self.P = (self.P + self.P.T) / 2
+        self.seen = self.t
+        self.missed = 0
+
+
+def _motion(dt: float, noise: float) -> tuple[Array, Array]:
+    """Transition and process noise over ``dt`` [s], forward or back, for white acceleration [px^2/s^3]."""
+    eye = np.eye(2)
+    F = np.block([[eye, dt * eye], [np.zeros((2, 2)), eye]])
+    span = abs(dt)
+    Q = noise * np.block([[span**3 / 3 * eye, dt * span / 2 * eye], [dt * span / 2 * eye, span * eye]])
+    return F, Q
