@@ -235,8 +235,9 @@ class RigConfig:
 
     @property
     def head_limits(self) -> tuple[Pair, Pair]:
-        """Pan and tilt limits [rad], the soft ones where there are any."""
-        pan, tilt = self.safety.pan_deg or self.sim.head.pan_deg, self.safety.tilt_deg or self.sim.head.tilt_deg
+        """Pan and tilt limits [rad]: the device's, and the soft ones where they are tighter."""
+        head, soft = self.sim.head, self.safety
+        pan, tilt = _overlap(head.pan_deg, soft.pan_deg), _overlap(head.tilt_deg, soft.tilt_deg)
         return (math.radians(pan[0]), math.radians(pan[1])), (math.radians(tilt[0]), math.radians(tilt[1]))
 
     @property
@@ -322,6 +323,10 @@ def _expand_all(effects: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(every, bool):
         raise ConfigError(f"sim.effects.all: {every!r} is not true or false")
     return {f.name: every for f in dataclasses.fields(SimEffects)} | effects
+
+
+def _overlap(own: Pair, soft: Pair | None) -> Pair:
+    return own if soft is None else (max(own[0], soft[0]), min(own[1], soft[1]))
 
 
 def _check(config: RigConfig) -> None:

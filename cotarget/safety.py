@@ -76,7 +76,11 @@ class SafeRig:
 
     def __init__(self, rig: Rig, config: SafetyConfig) -> None:
         self._rig = rig
-        self.head: PanTilt = SafeHead(rig.head, config)
+        try:
+            self.head: PanTilt = SafeHead(rig.head, config)
+        except ConfigError:
+            rig.close()
+            raise
         self.fixed: Camera = SafeCamera(rig.fixed, rig.clock, config.max_frame_age_s)
         self.zoom: ZoomCamera = rig.zoom
         self.clock: Clock = rig.clock

@@ -192,6 +192,12 @@ def _calibrate_images(
             rejected.append(Rejected(str(capture.source), NO_BOARD.format(*index.board.corners)))
         else:
             views.append(view)
+    if not views:
+        columns, rows = index.board.corners
+        raise CalibrationError(
+            f"{directory}: no picture shows a whole chessboard of {columns}x{rows} inner corners; "
+            "check the board's corners, and that every picture shows all of it"
+        )
     if progress is not None:
         progress(len(index.captures), len(index.captures), "fitting")
     return calibrate_views(

@@ -8,7 +8,7 @@ from cotarget.errors import DeviceError
 
 __all__ = ["BACKEND", "make_renderer", "mujoco"]
 
-INSTALL = "install one: apt-get install libegl1 libgl1-mesa-dri libopengl0"
+INSTALL = "install one: apt-get install -y libegl1 libgl1-mesa-dri libgl1"
 
 
 def choose_backend() -> str:
@@ -27,6 +27,8 @@ BACKEND = choose_backend()
 
 try:
     import mujoco
+except RuntimeError as error:
+    raise DeviceError(f"MUJOCO_GL={BACKEND}: {error}; unset MUJOCO_GL, or set it to egl, osmesa or glfw") from None
 except (ImportError, AttributeError, OSError) as error:
     raise DeviceError(f"no OpenGL library for rendering without a screen ({BACKEND}): {error}; {INSTALL}") from None
 

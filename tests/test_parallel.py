@@ -1,0 +1,55 @@
+"""Jobs side by side: results in order, progress over all, and mistakes that end the others."""
+
+import os
+
+import pytest
+
+from cotarget.errors import ConfigError, CotargetError
+from cotarget.parallel import run_side_by_side
+
+
+def square(x, report):
+    report(1, 1)
+    return x * x
+
+
+def refuse(x, report):
+    raise ConfigError(f"{x} is wrong")
+
+
+def die(x, report):
+    os._exit(3)
+
+
+def wait_for_ever(pipe_end, report):
+    report(0, 1)
+    os.read(pipe_end, 1)
+
+
+def test_results_come_in_the_order_of_the_arguments():
+    told = []
+    assert run_side_by_side(square, [(3,), (1,), (2,)], lambda *given: told.append(given)) == [9, 1, 4]
+    assert told[-1] == (3, 3)
+
+
+def test_a_jobs_own_error_is_raised():
+    with pytest.raises(ConfigError, match="7 is wrong"):
+        run_side_by_side(refuse, [(7,), (7,)], lambda *_: None)
+
+
+def test_a_job_that_dies_is_an_error():
+    with pytest.raises(CotargetError, match=r"ended before it was done \(exit status 3\)"):
+        run_side_by_side(die, [(1,)], lambda *_: None)
+
+
+def test_an_interrupt_ends_the_jobs():
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    reading, writing = os.pipe()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_side_by_side(wait_for_ever, [(0,)], interrupt)
+    finally:
+        os.close(reading)
+        os.close(writing)
