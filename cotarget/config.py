@@ -37,6 +37,8 @@ class SimCamera:
         noise: standard deviation of the sensor's noise [grey levels].
         rate_hz: frames a second.
         latency_s: from light to frame [s].
+        exposure_s: how long light is gathered [s]; what moves meanwhile is blurred, and rendering takes four times
+            as long. 0 for an instant.
         jpeg_quality: 1 to 100.
     """
 
@@ -47,6 +49,7 @@ class SimCamera:
     noise: float = 2.0
     rate_hz: float = 25.0
     latency_s: float = 0.06
+    exposure_s: float = 0.0
     jpeg_quality: int = 90
 
 
@@ -106,6 +109,7 @@ class SimEffects:
         jpeg: compression.
         distortion: lens distortion of both cameras.
         latency: light to frame.
+        blur: motion during the exposure.
         command_delay: command to motion.
         profile: finite speed and acceleration of the head.
         steps: the head's resolution.
@@ -121,6 +125,7 @@ class SimEffects:
     jpeg: bool = True
     distortion: bool = True
     latency: bool = True
+    blur: bool = True
     command_delay: bool = True
     profile: bool = True
     steps: bool = True
@@ -352,6 +357,7 @@ def _check(config: RigConfig) -> None:
         positive[f"sim.{name}.rate_hz"] = (camera.rate_hz,)
         not_negative[f"sim.{name}.noise"] = (camera.noise,)
         not_negative[f"sim.{name}.latency_s"] = (camera.latency_s,)
+        not_negative[f"sim.{name}.exposure_s"] = (camera.exposure_s,)
         if not 1 <= camera.jpeg_quality <= 100:
             raise ConfigError(f"sim.{name}.jpeg_quality: {camera.jpeg_quality} is not within 1 to 100")
     for name, target in config.targets.items():

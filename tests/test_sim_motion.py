@@ -7,7 +7,7 @@ import pytest
 
 from cotarget.config import SimCamera, SimEffects, SimHead, SimZoomCamera
 from cotarget.errors import DeviceError, StaleFrameError
-from cotarget.sim.devices import SimClock, SimPanTilt, SimStream, SimZoomStream
+from cotarget.sim.devices import SimClock, SimPanTilt, SimStream, SimZoomStream, head_drive, lens_drive
 from cotarget.sim.motion import Axis, trapezoid
 
 ROUNDING = 1e-9
@@ -57,22 +57,23 @@ def test_backlash_is_a_hysteresis():
 
 
 def head(**changes):
-    clock = SimClock()
-    return SimPanTilt(SimHead(**changes), SimEffects(), clock), clock
+    clock, config = SimClock(), SimHead(**changes)
+    drive = head_drive(config, SimEffects())
+    return SimPanTilt(config, SimEffects(), clock, drive), clock, drive
 
 
 def test_a_command_takes_effect_after_its_delay():
-    unit, clock = head(command_delay_s=0.04)
+    unit, clock, drive = head(command_delay_s=0.04)
     unit.move(0.5, 0.0)
     assert unit.state().moving
     clock.sleep_until(0.039)
-    assert unit.angles_at(clock.now()) == (0, 0)
+    assert drive.angles_at(clock.now()) == (0, 0)
     clock.sleep_until(0.06)
-    assert unit.angles_at(clock.now())[0] > 0
+    assert drive.angles_at(clock.now())[0] > 0
 
 
 def test_commands_are_rounded_to_steps_inside_the_limits():
-    unit, clock = head(step_deg=0.5, pan_deg=(-10.2, 10.2), tilt_deg=(-5, 5))
+    unit, clock, _ = head(step_deg=0.5, pan_deg=(-10.2, 10.2), tilt_deg=(-5, 5))
     pan, tilt = unit.move(math.radians(3.3), math.radians(90), wait=True)
     assert np.degrees((pan, tilt)) == pytest.approx((3.5, 5.0))
     assert unit.move(math.radians(-90), 0.0)[0] == pytest.approx(math.radians(-10.0))
@@ -82,18 +83,18 @@ def test_commands_are_rounded_to_steps_inside_the_limits():
 
 
 def test_halt_brakes_short_of_the_goal():
-    unit, clock = head()
+    unit, clock, drive = head()
     unit.move(2.0, 0.0)
     clock.sleep_until(0.3)
     unit.halt()
     clock.sleep_until(10.0)
-    assert 0 < unit.angles_at(clock.now())[0] < 1.0
+    assert 0 < drive.angles_at(clock.now())[0] < 1.0
     assert not unit.state().moving
 
 
 @pytest.mark.parametrize("angles", [(math.nan, 0.0), (0.0, math.inf)])
 def test_a_head_refuses_what_is_not_a_number(angles):
-    unit, _ = head()
+    unit, *_ = head()
     with pytest.raises(DeviceError, match="cannot go to"):
         unit.move(*angles)
 
@@ -115,6 +116,12 @@ def test_frames_are_stamped_at_exposure_and_arrive_late():
     assert camera.read(newer_than=0.92).t == pytest.approx(0.96)
 
 
+def test_a_frame_cannot_arrive_before_its_exposure_ends():
+    camera, clock = stream(latency_s=0.001, exposure_s=0.03)
+    assert camera.read().t == 0.0
+    assert clock.now() == 0.015
+
+
 def test_the_same_frame_is_the_same_image():
     camera, _ = stream()
     assert camera.read() is camera.read()
@@ -129,7 +136,9 @@ def test_waiting_too_long_is_an_error_and_takes_the_time():
 
 def test_the_lens_steps_and_takes_its_time():
     clock = SimClock()
-    lens = SimZoomStream(SimZoomCamera(), SimEffects(), clock, lambda k, t: np.zeros((2, 2, 3), np.uint8), delay=0.0)
+    camera, effects = SimZoomCamera(), SimEffects()
+    drive = lens_drive(camera, effects)
+    lens = SimZoomStream(camera, effects, clock, lambda k, t: np.zeros((2, 2, 3), np.uint8), drive, delay=0.0)
     shortest, longest = lens.focal_range
     assert (shortest, longest) == pytest.approx((6 / 0.009, 72 / 0.009))
     assert lens.zoom(1e9) == pytest.approx(longest)

@@ -160,6 +160,23 @@ def test_an_unknown_scene_is_told_the_scenes():
         world(scene="moon")
 
 
+def test_exposure_blurs_what_moves_and_nothing_else():
+    """The head turns at 20 degrees/s: 1/50 s smears the picture over 0.4 degrees, 5 px."""
+
+    def gradient(exposure):
+        effects = {"all": False, "profile": True, "multisampling": True, "blur": True}
+        head, zoom = {"speed_deg_s": 20.0, "accel_deg_s2": 1e4}, {"exposure_s": exposure}
+        with world(effects=effects, head=head, zoom=zoom).rig as rig:
+            still = rig.zoom.read().image.astype(float)
+            rig.head.move(0.5, 0.0)
+            moving = rig.zoom.read(newer_than=0.5).image.astype(float)
+            return np.abs(np.diff(still, axis=1)).mean(), np.abs(np.diff(moving, axis=1)).mean()
+
+    sharp, blurred = gradient(0.0), gradient(0.02)
+    assert blurred[0] == pytest.approx(sharp[0])
+    assert blurred[1] < 0.8 * sharp[1]
+
+
 def test_truth_sees_the_target_where_it_is_drawn():
     """The book is the only saturated red thing; its blob's middle is where the truth projects the body's centre."""
     with (w := world(targets=["book"], effects={"all": False, "multisampling": True})).rig as rig:

@@ -8,7 +8,7 @@ from cotarget.config import SimCamera, SimEffects, SimHead, SimZoomCamera
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, ZoomState
-from cotarget.sim.motion import Axis
+from cotarget.sim.motion import Axis, HeadDrive, LensDrive
 
 # Frame times are multiples of the frame period; this much of a period [1] absorbs their rounding.
 ROUNDING = 1e-6
@@ -45,7 +45,9 @@ class SimStream:
         self, camera: SimCamera, effects: SimEffects, clock: SimClock, expose: Callable[[int, float], Image]
     ) -> None:
         self._camera, self._clock, self._expose = camera, clock, expose
-        self._latency = camera.latency_s if effects.latency else 0.0
+        # Light falls until half an exposure after a frame's time; no link is faster than that.
+        half = camera.exposure_s / 2 if effects.blur else 0.0
+        self._latency = max(camera.latency_s if effects.latency else 0.0, half)
         self._kept: dict[int, Frame] = {}
 
     @property
@@ -76,7 +78,16 @@ class SimStream:
 
 
 class SimZoomStream(SimStream):
-    """A camera with a stepping zoom lens."""
+    """A camera with a stepping zoom lens.
+
+    Args:
+        camera: its configuration.
+        effects: switches.
+        clock: the rig's clock.
+        expose: gives the image of frame number k, exposed at time t.
+        drive: the lens's drive.
+        delay: from a command to the start of motion [s].
+    """
 
     def __init__(
         self,
@@ -84,69 +95,63 @@ class SimZoomStream(SimStream):
         effects: SimEffects,
         clock: SimClock,
         expose: Callable[[int, float], Image],
+        drive: LensDrive,
         delay: float,
     ) -> None:
         super().__init__(camera, effects, clock, expose)
-        self._shortest, self._longest = (f / camera.pitch_mm for f in camera.focal_mm)
-        self._last = camera.lens_steps - 1
-        self._stepping = effects.lens
-        self._delay = delay
-        # The lens has no run-up: an acceleration that reaches full speed within a step is fast enough to be none.
-        speed = camera.lens_speed if effects.lens else math.inf
-        self._axis = Axis(speed, speed * speed)
+        self._drive, self._delay = drive, delay
         self._rests = 0.0
 
     @property
     def focal_range(self) -> tuple[float, float]:
         """Shortest and longest focal length [px], as the maker states them."""
-        return self._shortest, self._longest
+        return self._drive.shortest_px, self._drive.longest_px
 
     def zoom(self, focal_px: float) -> float:
         """Start the lens moving; return the focal length [px] of the position that it will stop at."""
         if not focal_px > 0 or math.isinf(focal_px):
             raise DeviceError(f"the lens cannot go to a focal length of {focal_px} px")
-        position = min(max(math.log(focal_px / self._shortest) / self._log_step, 0.0), self._last)
-        if self._stepping:
-            position = round(position)
-        self._rests = self._axis.command(self._clock.now() + self._delay, position)
-        return self._focal(position)
+        position = self._drive.position_for(focal_px)
+        self._rests = self._drive.axis.command(self._clock.now() + self._delay, position)
+        return self._drive.focal_of(position)
 
     def state(self) -> ZoomState:
         """The lens's state now."""
         now = self._clock.now()
-        return ZoomState(self.focal_at(now), now < self._rests, now)
+        return ZoomState(self._drive.focal_at(now), now < self._rests, now)
 
     def capture(self) -> Frame:
         """This camera has no separate stills: the next frame exposed from now on."""
         return self.read(newer_than=self._clock.now())
 
-    def focal_at(self, t: float) -> float:
-        """Nominal focal length [px] at a time up to now."""
-        return self._focal(self._axis.motor(t)[0])
 
-    @property
-    def _log_step(self) -> float:
-        return math.log(self._longest / self._shortest) / self._last
+def lens_drive(camera: SimZoomCamera, effects: SimEffects) -> LensDrive:
+    """The drive of the lens that a configuration describes."""
+    shortest, longest = (focal / camera.pitch_mm for focal in camera.focal_mm)
+    # The lens has no run-up: an acceleration that reaches full speed within a step is fast enough to be none.
+    speed = camera.lens_speed if effects.lens else math.inf
+    return LensDrive(shortest, longest, camera.lens_steps - 1, effects.lens, Axis(speed, speed * speed))
 
-    def _focal(self, position: float) -> float:
-        return self._shortest * math.exp(position * self._log_step)
+
+def head_drive(head: SimHead, effects: SimEffects) -> HeadDrive:
+    """The axes of the pan-tilt unit that a configuration describes."""
+    speed = math.radians(head.speed_deg_s) if effects.profile else math.inf
+    acceleration = math.radians(head.accel_deg_s2) if effects.profile else math.inf
+    play = math.radians(head.backlash_deg) if effects.backlash else 0.0
+    return HeadDrive(Axis(speed, acceleration, play), Axis(speed, acceleration, play))
 
 
 class SimPanTilt:
     """A pan-tilt unit: delayed commands, trapezoidal profiles, steps, limits and play."""
 
-    def __init__(self, head: SimHead, effects: SimEffects, clock: SimClock) -> None:
-        self._clock = clock
+    def __init__(self, head: SimHead, effects: SimEffects, clock: SimClock, drive: HeadDrive) -> None:
+        self._clock, self._drive = clock, drive
         self._delay = head.command_delay_s if effects.command_delay else 0.0
-        speed = math.radians(head.speed_deg_s) if effects.profile else math.inf
-        acceleration = math.radians(head.accel_deg_s2) if effects.profile else math.inf
-        play = math.radians(head.backlash_deg) if effects.backlash else 0.0
-        self._pan, self._tilt = Axis(speed, acceleration, play), Axis(speed, acceleration, play)
         self._limits = PanTiltLimits(
             pan=(math.radians(head.pan_deg[0]), math.radians(head.pan_deg[1])),
             tilt=(math.radians(head.tilt_deg[0]), math.radians(head.tilt_deg[1])),
-            speed=speed,
-            acceleration=acceleration,
+            speed=drive.pan.speed,
+            acceleration=drive.pan.acceleration,
             step=math.radians(head.step_deg) if effects.steps else 0.0,
         )
         self._rests = 0.0
@@ -159,7 +164,7 @@ class SimPanTilt:
     def state(self) -> PanTiltState:
         """What the unit's own step counters say now."""
         now = self._clock.now()
-        pan, tilt = (self._to_step(axis.motor(now)[0]) for axis in (self._pan, self._tilt))
+        pan, tilt = (self._to_step(axis.motor(now)[0]) for axis in (self._drive.pan, self._drive.tilt))
         return PanTiltState(pan, tilt, now < self._rests, now)
 
     def move(self, pan: float, tilt: float, speed: float | None = None, wait: bool = False) -> tuple[float, float]:
@@ -170,7 +175,7 @@ class SimPanTilt:
             raise DeviceError(f"the head cannot move at a speed of {speed} rad/s")
         pan, tilt = self._clip(pan, self._limits.pan), self._clip(tilt, self._limits.tilt)
         t = self._clock.now() + self._delay
-        self._rests = max(self._pan.command(t, pan, speed), self._tilt.command(t, tilt, speed))
+        self._rests = max(self._drive.pan.command(t, pan, speed), self._drive.tilt.command(t, tilt, speed))
         if wait:
             self._clock.sleep_until(self._rests)
         return pan, tilt
@@ -178,11 +183,7 @@ class SimPanTilt:
     def halt(self) -> None:
         """Brake both axes."""
         t = self._clock.now() + self._delay
-        self._rests = max(self._pan.halt(t), self._tilt.halt(t))
-
-    def angles_at(self, t: float) -> tuple[float, float]:
-        """Pan and tilt of the platform itself [rad] at a time up to now, behind any play."""
-        return self._pan.driven(t), self._tilt.driven(t)
+        self._rests = max(self._drive.pan.halt(t), self._drive.tilt.halt(t))
 
     def _to_step(self, angle: float) -> float:
         step = self._limits.step

@@ -1,4 +1,4 @@
-"""Motion of one axis in time: trapezoidal speed profiles that can be replaced on the fly, and backlash."""
+"""Motion in time: trapezoidal speed profiles that can be replaced on the fly, backlash, and the lens's positions."""
 
 import math
 from dataclasses import dataclass, field
@@ -107,3 +107,51 @@ class Axis:
                     x = self.motor(when)[0]
                     y = min(max(y, x - half), x + half)
         return y
+
+
+@dataclass(frozen=True)
+class HeadDrive:
+    """The two axes of a pan-tilt unit; the device commands them, the world looks where they really are."""
+
+    pan: Axis
+    tilt: Axis
+
+    def angles_at(self, t: float) -> tuple[float, float]:
+        """Pan and tilt of the platform itself [rad] at a time up to now, behind any play."""
+        return self.pan.driven(t), self.tilt.driven(t)
+
+
+@dataclass(frozen=True)
+class LensDrive:
+    """A zoom lens whose positions are evenly spaced in the logarithm of the focal length.
+
+    Attributes:
+        shortest_px: nominal focal length at the first position [px].
+        longest_px: at the last position [px].
+        last: number of the last position, counted from 0.
+        stepping: whether it only stops at whole positions.
+        axis: its motion, in positions.
+    """
+
+    shortest_px: float
+    longest_px: float
+    last: int
+    stepping: bool
+    axis: Axis
+
+    def position_for(self, focal_px: float) -> float:
+        """The position that it can stop at whose focal length is nearest."""
+        position = min(max(math.log(focal_px / self.shortest_px) / self._log_step, 0.0), float(self.last))
+        return float(round(position)) if self.stepping else position
+
+    def focal_of(self, position: float) -> float:
+        """Nominal focal length at a position [px]."""
+        return self.shortest_px * math.exp(position * self._log_step)
+
+    def focal_at(self, t: float) -> float:
+        """Nominal focal length at a time up to now [px]."""
+        return self.focal_of(self.axis.motor(t)[0])
+
+    @property
+    def _log_step(self) -> float:
+        return math.log(self.longest_px / self.shortest_px) / self.last

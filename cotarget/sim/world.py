@@ -8,7 +8,16 @@ import numpy as np
 from cotarget.config import RigConfig, SimCamera
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Image
-from cotarget.sim.devices import SimBoard, SimClock, SimPanTilt, SimRig, SimStream, SimZoomStream
+from cotarget.sim.devices import (
+    SimBoard,
+    SimClock,
+    SimPanTilt,
+    SimRig,
+    SimStream,
+    SimZoomStream,
+    head_drive,
+    lens_drive,
+)
 from cotarget.sim.lens import TrueLens, bend, covering_half_field
 from cotarget.sim.model import (
     BOARD_GROUP,
@@ -25,10 +34,12 @@ from cotarget.sim.opengl import make_renderer, mujoco
 from cotarget.sim.portrait import Portrait, portrait
 from cotarget.sim.sensor import Sensor
 from cotarget.sim.targets import Target, make_target
-from cotarget.sim.truth import Truth
+from cotarget.sim.truth import CameraName, Truth
 
 # Streams of random numbers, so that one effect's draws never shift another's.
 FIXED_NOISE, ZOOM_NOISE, TARGETS = 1, 2, 3
+# A blurred image is the mean of this many renders spread over the exposure.
+BLUR_RENDERS = 4
 
 
 class SimWorld:
@@ -61,10 +72,15 @@ class SimWorld:
             "fixed": Sensor(sim.fixed, effects, (sim.seed, FIXED_NOISE)),
             "zoom": Sensor(sim.zoom, effects, (sim.seed, ZOOM_NOISE)),
         }
-        self._head = SimPanTilt(sim.head, effects, self._clock)
-        self._zoom = SimZoomStream(sim.zoom, effects, self._clock, self._expose_zoom, delay)
-        fixed = SimStream(sim.fixed, effects, self._clock, self._expose_fixed)
-        self.rig = SimRig(fixed, self._zoom, self._head, self._clock, SimBoard(self._place_board), self.close)
+        self._head_drive, self._lens_drive = head_drive(sim.head, effects), lens_drive(sim.zoom, effects)
+        self.rig = SimRig(
+            SimStream(sim.fixed, effects, self._clock, self._expose_fixed),
+            SimZoomStream(sim.zoom, effects, self._clock, self._expose_zoom, self._lens_drive, delay),
+            SimPanTilt(sim.head, effects, self._clock, self._head_drive),
+            self._clock,
+            SimBoard(self._place_board),
+            self.close,
+        )
 
     def truth(self) -> Truth:
         """What is really so; for tests and experiments only."""
@@ -76,18 +92,18 @@ class SimWorld:
             zoom_lens_for=self.zoom_lens_for,
             T_world_fixed=self._T_world_fixed,
             T_world_base=base_pose(self._T_world_fixed, self.config.sim),
-            head_at=self._head.angles_at,
-            focal_range=self._zoom.focal_range,
+            head_at=self._head_drive.angles_at,
+            focal_range=self.rig.zoom.focal_range,
             targets=self.targets,
         )
 
     def zoom_lens_at(self, t: float) -> TrueLens:
         """The zoom camera's true optics at a time up to now."""
-        return self.zoom_lens_for(self._zoom.focal_at(t))
+        return self.zoom_lens_for(self._lens_drive.focal_at(t))
 
     def zoom_lens_for(self, nominal_px: float) -> TrueLens:
         """The zoom camera's true optics at what its device calls a focal length [px]."""
-        factor = nominal_px / self._zoom.focal_range[0]
+        factor = nominal_px / self._lens_drive.shortest_px
         fx, fy = self._zoom_lens.focal_px
         return replace(self._zoom_lens, focal_px=(fx * factor, fy * factor))
 
@@ -133,10 +149,21 @@ class SimWorld:
         return math.ceil(max(s[0] for s in sizes)), math.ceil(max(s[1] for s in sizes))
 
     def _expose_fixed(self, index: int, t: float) -> Image:
-        return self._sensors["fixed"].expose(self.render("fixed", self._fixed_lens, t), index)
+        return self._expose("fixed", self.config.sim.fixed, index, t)
 
     def _expose_zoom(self, index: int, t: float) -> Image:
-        return self._sensors["zoom"].expose(self.render("zoom", self.zoom_lens_at(t), t), index)
+        return self._expose("zoom", self.config.sim.zoom, index, t)
+
+    def _expose(self, name: CameraName, camera: SimCamera, index: int, t: float) -> Image:
+        """Gather light around time t, then add the sensor's effects."""
+        exposure = camera.exposure_s if self.config.sim.effects.blur else 0.0
+        moments = t + exposure * ((np.arange(BLUR_RENDERS) + 0.5) / BLUR_RENDERS - 0.5) if exposure else [t]
+        images = [
+            self.render(name, self._fixed_lens if name == "fixed" else self.zoom_lens_at(moment), moment)
+            for moment in moments
+        ]
+        light = images[0] if len(images) == 1 else np.rint(np.mean(images, axis=0)).astype(np.uint8)
+        return self._sensors[name].expose(light, index)
 
     def _place_board(self, T_fixed_board: RigidTransform | None) -> None:
         self._boards.append((self._clock.now(), T_fixed_board))
@@ -147,7 +174,7 @@ class SimWorld:
     def _set_state(self, t: float) -> "mujoco.MjData":
         """Everything's pose at time t."""
         data = self._data
-        pan, tilt = self._head.angles_at(t)
+        pan, tilt = self._head_drive.angles_at(t)
         data.joint(RIG + "pan").qpos[0], data.joint(RIG + "tilt").qpos[0] = pan, tilt
         for name, target in self.targets.items():
             pose = target.pose(t)
