@@ -151,20 +151,28 @@ class Intrinsics:
         return r2 < min(fold, default=np.inf)
 
 
-def depth_from_size(intrinsics: Intrinsics, size: float, size_px: float, *, vertical: bool) -> float:
+def depth_from_size(intrinsics: Intrinsics, size: float, size_px: float, center_px: Array, *, vertical: bool) -> float:
     """Estimate a target's depth from its known size: z = f x_size / u_measured.
+
+    The measured size is taken between the rays through its two ends, because distortion makes a pixel worth more
+    away from the middle of the image.
 
     Args:
         intrinsics: the fixed camera.
         size: the target's true size [m].
         size_px: its measured size in the image [px].
+        center_px: where its middle is in the image (u, v) [px], (2,).
         vertical: whether the size is measured along v (a height) and not along u.
 
     Returns:
-        Depth along the camera's axis [m]; nan for a size that is not positive.
+        Depth along the camera's axis [m]; nan for a size that is not positive or reaches beyond the lens's view.
     """
-    focal = intrinsics.focal_px[1 if vertical else 0]
-    return focal * size / size_px if size_px > 0 else float("nan")
+    axis = 1 if vertical else 0
+    half = np.zeros(2)
+    half[axis] = size_px / 2
+    ends = intrinsics.ray(np.stack([center_px - half, center_px + half]))
+    across = ends[1, axis] - ends[0, axis]  # u_measured / f for a lens without distortion
+    return float(size / across) if across > 0 else float("nan")
 
 
 def focal_for_size(size: float, wanted_px: float, depth: float) -> float:

@@ -5,13 +5,12 @@ import dataclasses
 import json
 import logging
 import math
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
-
-import numpy as np
 
 import cotarget
 from cotarget.errors import ConfigError, CotargetError
@@ -21,12 +20,15 @@ from cotarget.errors import ConfigError, CotargetError
 
 USAGE = 2  # argparse's own exit status
 INTERRUPTED = 130  # a shell's exit status for Ctrl-C
+TERMINATED = 143  # and for SIGTERM
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit status."""
     parser = _parser()
     options = parser.parse_args(arguments)
+    # A polite end is an end: the rig halts and half-written files go, as on Ctrl-C.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     logging.basicConfig(level=logging.INFO if options.verbose else logging.WARNING, format="%(message)s")
     try:
         return int(options.run(options) or 0)
@@ -120,6 +122,8 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _calibrate(options: argparse.Namespace) -> None:
+    import numpy as np
+
     from cotarget import calibration as cal
     from cotarget.config import BoardConfig, load_config
     from cotarget.rig import open_rig
@@ -170,6 +174,8 @@ def _calibrate(options: argparse.Namespace) -> None:
 
 
 def _aim(options: argparse.Namespace) -> None:
+    import numpy as np
+
     from cotarget.calibration import load_calibration
     from cotarget.config import RigConfig, load_config
     from cotarget.targeting import Closeup, Reach, aim, depth_of, error_budget, point_at
@@ -184,11 +190,20 @@ def _aim(options: argparse.Namespace) -> None:
     if options.wanted_px is not None and target is None:
         raise ConfigError("--wanted-px needs --target NAME, whose true size gives the focal length")
     depth = (
-        options.depth if target is None or options.size_px is None else depth_of(calibration, target, options.size_px)
+        options.depth
+        if target is None or options.size_px is None
+        else depth_of(calibration, target, options.size_px, np.array(options.pixel))
     )
     pitch_mm = calibration.pitch_mm or config.sim.zoom.pitch_mm
-    reach = Reach(*config.head_limits, config.focal_range_px, step=config.head_step)
-    closeup = Closeup(target.size, options.wanted_px) if target and options.wanted_px is not None else None
+    shortest, longest = config.focal_range_px
+    if options.rig is None:  # the calibration knows its own lens's shortest focal length
+        shortest = calibration.zoom.nominal_px[0]
+    reach = Reach(*config.head_limits, (shortest, max(shortest, longest)), step=config.head_step)
+    closeup = (
+        Closeup(target.size, options.wanted_px, target.dimension == "height")
+        if target and options.wanted_px is not None
+        else None
+    )
     nominal = None if options.focal_mm is None else options.focal_mm / pitch_mm
     if nominal is not None and not reach.focal_px[0] <= nominal <= reach.focal_px[1]:
         shortest, longest = (f * pitch_mm for f in reach.focal_px)
@@ -236,6 +251,11 @@ def _follow(options: argparse.Namespace) -> None:
     target = config.target(options.target)
     calibration = load_calibration(options.calibration)
     calibration = calibration.for_streams(config.sim.fixed.size, config.sim.zoom.size)
+    if config.backend == "sim" and options.target not in config.sim.targets:
+        raise ConfigError(
+            f"{options.rig}: the simulated scene has no {options.target}; add it: [sim] targets = "
+            f"{json.dumps([*config.sim.targets, options.target])}"
+        )
     detector = make_detector(target, config.sim.fixed.rate_hz)
     for path in (options.csv, options.video):
         if path is not None:

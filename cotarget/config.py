@@ -14,7 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from cotarget.assets import assets_dir
+from cotarget.camera import Intrinsics
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform, pose
 from cotarget.tables import build, expect_table
@@ -242,7 +245,8 @@ class RigConfig:
     def head_limits(self) -> tuple[Pair, Pair]:
         """Pan and tilt limits [rad]: the device's, and the soft ones where they are tighter."""
         head, soft = self.sim.head, self.safety
-        pan, tilt = _overlap(head.pan_deg, soft.pan_deg), _overlap(head.tilt_deg, soft.tilt_deg)
+        pan = _overlap(head.pan_deg, soft.pan_deg, "safety.pan_deg")
+        tilt = _overlap(head.tilt_deg, soft.tilt_deg, "safety.tilt_deg")
         return (math.radians(pan[0]), math.radians(pan[1])), (math.radians(tilt[0]), math.radians(tilt[1]))
 
     @property
@@ -330,8 +334,25 @@ def _expand_all(effects: dict[str, Any]) -> dict[str, Any]:
     return {f.name: every for f in dataclasses.fields(SimEffects)} | effects
 
 
-def _overlap(own: Pair, soft: Pair | None) -> Pair:
-    return own if soft is None else (max(own[0], soft[0]), min(own[1], soft[1]))
+def _check_lens(where: str, camera: SimCamera) -> None:
+    """Refuse a lens through which part of the image sees nothing."""
+    (w, h), focal = camera.size, camera.focal_px
+    if min(*camera.size, *focal) <= 0:
+        return  # said elsewhere
+    rim = np.array([(u, v) for u in np.linspace(-1, w, 9) for v in np.linspace(-1, h, 9)])
+    lens = Intrinsics(camera.size, focal, camera.center_px, camera.distortion)
+    if not np.isfinite(lens.ray(rim)).all():
+        raise ConfigError(
+            f"{where}.distortion: {list(camera.distortion)} folds back inside the image, so that parts of it see "
+            "nothing; give a weaker distortion, a longer focal_px or a smaller size"
+        )
+
+
+def _overlap(own: Pair, soft: Pair | None, where: str) -> Pair:
+    both = own if soft is None else (max(own[0], soft[0]), min(own[1], soft[1]))
+    if both[0] >= both[1]:
+        raise ConfigError(f"{where}: {list(soft or own)} leaves nothing of the device's own range {list(own)}")
+    return both
 
 
 def _check(config: RigConfig) -> None:
@@ -360,6 +381,7 @@ def _check(config: RigConfig) -> None:
         not_negative[f"sim.{name}.exposure_s"] = (camera.exposure_s,)
         if not 1 <= camera.jpeg_quality <= 100:
             raise ConfigError(f"sim.{name}.jpeg_quality: {camera.jpeg_quality} is not within 1 to 100")
+        _check_lens(f"sim.{name}", camera)
     for name, target in config.targets.items():
         positive[f"targets.{name}.size"] = (target.size,)
         positive[f"targets.{name}.wanted_px"] = (target.wanted_px,)
@@ -390,5 +412,7 @@ def _check(config: RigConfig) -> None:
     for name in sim.targets:
         config.target(name)
     for name, waypoints in sim.paths.items():
+        if name not in config.targets:
+            raise ConfigError(f"sim.paths.{name}: is no target; the targets are: {choices(config.targets)}")
         if len(waypoints) < 2 or any(b[0] <= a[0] for a, b in itertools.pairwise(waypoints)):
             raise ConfigError(f"sim.paths.{name}: needs two or more waypoints [t, x, y, z] with increasing t")

@@ -27,6 +27,7 @@ FOUND, FOLLOWED, CROSS, INK, PAPER, ARROW = (
 STRIP_PX = 36  # height of a caption
 # For the picture "centred" the lens may have begun to zoom in by this factor.
 ZOOMED_OUT = 1.6
+AIM_AHEAD_S = 0.08  # an aim is for about this long after its step: the command's delay and a frame
 RECENT_STEPS = 16  # states kept to tell what the lens was when a frame was exposed; more than any latency needs
 # For the close-up, lens (relative) and head (over the image's width) are this near to where they are wanted.
 SETTLED = 0.08
@@ -104,7 +105,7 @@ class TargetStages:
     def __init__(self, shortest_px: float) -> None:
         """Begin; ``shortest_px`` is the shortest nominal focal length."""
         self._shortest = shortest_px
-        self._largest = 0.0
+        self._largest, self._nearest = 0.0, math.inf
         self._recent: deque[Step] = deque(maxlen=RECENT_STEPS)
         self.before: Step | None = None
         self.centred: Step | None = None
@@ -117,9 +118,10 @@ class TargetStages:
             self.before = step
         if step.state is not State.FOLLOWING or step.aim is None or step.target is None:
             return
-        # The head turns before the lens zooms in, so the last view before the close-up is the best centred one.
         if self.close is None and self._focal_of_view() < ZOOMED_OUT * self._shortest:
-            self.centred = step
+            away = self._away_in_view()
+            if away < self._nearest:
+                self._nearest, self.centred = away, step
         off_px = math.hypot(step.head.pan - step.aim.pan, step.head.tilt - step.aim.tilt) * step.lens.focal_px
         size = float(np.max(step.target.box.size_px))
         settled = abs(math.log(step.lens.focal_px / step.aim.nominal_px)) < SETTLED
@@ -131,6 +133,16 @@ class TargetStages:
         t, focal = [s.lens.t for s in self._recent], [s.lens.focal_px for s in self._recent]
         return float(np.interp(self._recent[-1].zoom.t, t, focal))
 
+    def _away_in_view(self) -> float:
+        """How far the head was from the target when the latest zoom frame was exposed [rad]."""
+        t = self._recent[-1].zoom.t
+        heads = [(s.head.t, s.head.pan, s.head.tilt) for s in self._recent]
+        aims = [(s.t + AIM_AHEAD_S, s.aim.pan, s.aim.tilt) for s in self._recent if s.aim is not None]
+        (pan, tilt), (wanted_pan, wanted_tilt) = (
+            [np.interp(t, *np.array(told).T[[0, i]]) for i in (1, 2)] for told in (heads, aims)
+        )
+        return float(np.hypot(pan - wanted_pan, tilt - wanted_tilt))
+
     def picture(self, title: str) -> Image:
         """The wide view with its detection and the zoom view before, centred and close up, as in Fig. 4 to 6."""
         missing = next(s for s in (self.close, self.centred, self.before) if s is not None)
@@ -139,10 +151,15 @@ class TargetStages:
         panels = [
             captioned(draw_wide(wide), f"(a) {title}: wide view and detection"),
             captioned(before.zoom.image, "(b) zoom view before"),
-            captioned(draw_zoom(centred), "(c) zoom view, centred"),
+            captioned(draw_zoom(centred), "(c) zoom view, turned to the target"),
             captioned(draw_zoom(close), f"(d) close-up at {close.lens.focal_px:.0f} px"),
         ]
-        return np.vstack([np.hstack(panels[:2]), np.hstack(panels[2:])])
+        if wide.mask is not None:
+            mask = captioned(cv2.cvtColor(wide.mask, cv2.COLOR_GRAY2BGR), "(a') what the detector found in it")
+            panels[1:1] = [mask]
+        blank = np.full_like(panels[0], PAPER)
+        panels += [blank] * (len(panels) % 2)
+        return np.vstack([np.hstack(panels[i : i + 2]) for i in range(0, len(panels), 2)])
 
 
 def draw_frames(image: Image, origins_px: Mapping[str, Array]) -> Image:

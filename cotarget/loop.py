@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from cotarget.calibration import Calibration
 from cotarget.config import TargetConfig
 from cotarget.detection import Detection, Detector
-from cotarget.errors import CotargetError
+from cotarget.errors import CalibrationError, UnreachableError
 from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, Rig, ZoomState
 from cotarget.targeting import Aim, Closeup, Reach, aim, depth_of, point_at
 from cotarget.tracking import FirstCome, Track, Tracker, settings_for, size_for
@@ -108,14 +108,16 @@ def follow(
         settings: delays and habits.
 
     Raises:
+        CalibrationError: the calibration has no T.
         ConfigError: the calibration is of another aspect ratio than the rig's streams.
         StaleFrameError: frames stopped coming, or came too late to act on.
     """
+    if calibration.T_head_zoom is None:
+        raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
     calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
     tracker, policy = Tracker(settings_for(target), rig.fixed.size), FirstCome()
-    shortest = rig.zoom.focal_range[0]
     state = rig.head.state()
-    commanded = (state.pan, state.tilt, rig.zoom.zoom(shortest))
+    commanded = (state.pan, state.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
     frame_t: float | None = None
     last_seen = -math.inf
     end, index = rig.clock.now() + seconds, 0
@@ -126,30 +128,20 @@ def follow(
         detections = detector.detect(frame)
         tracks = tracker.update(detections, frame.t)
         chosen = policy.select(tracks)
-        aimed: Aim | None = None
+        led: Lead | None = None
         mode, reason = State.SEARCHING, ""
         if chosen is not None:
-            if chosen.missed == 0:
-                last_seen = frame.t
+            last_seen = frame.t if chosen.missed == 0 else last_seen
             mode = State.FOLLOWING if chosen.missed == 0 else State.COASTING
             if frame.t - last_seen > settings.zoom_out_after_s:
                 mode, reason = State.LOST, f"out of sight for {frame.t - last_seen:.1f} s"
             else:
                 try:
-                    aimed, way = lead(rig, calibration, target, chosen, settings.command_delay_s, interval)
-                except CotargetError as error:
+                    led = lead(rig, calibration, target, chosen, settings.command_delay_s, interval)
+                except UnreachableError as error:
                     mode, reason = State.UNREACHABLE, str(error)
-        if aimed is not None:
-            pan, tilt = rig.head.move(aimed.pan, aimed.tilt)
-            zoomed_out = commanded[2] <= shortest * (1 + settings.focal_deadband)
-            if zoomed_out and way > math.radians(settings.centred_deg):
-                nominal = shortest
-            else:
-                nominal = min(aimed.nominal_px, _focal_while_turning(rig, way, settings.margin))
-            focal = _command_lens(rig, nominal, commanded[2], settings.focal_deadband)
-            commanded = (pan, tilt, focal)
-        elif mode is not State.UNREACHABLE and commanded[2] > shortest:
-            commanded = (*commanded[:2], rig.zoom.zoom(shortest))
+        if mode is not State.UNREACHABLE:
+            commanded = _command(rig, led, commanded, settings)
         yield Step(
             index=index,
             t=rig.clock.now(),
@@ -161,7 +153,7 @@ def follow(
             detections=tuple(detections),
             tracks=tuple(tracks),
             target=chosen,
-            aim=aimed,
+            aim=None if led is None else led.aim,
             commanded=commanded,
             head=rig.head.state(),
             lens=rig.zoom.state(),
@@ -169,9 +161,34 @@ def follow(
         index += 1
 
 
+@dataclass(frozen=True)
+class Lead:
+    """Where to send the head, and how far it is now from where the target is now [rad]."""
+
+    aim: Aim
+    way: float
+
+
+def _command(
+    rig: Rig, led: Lead | None, commanded: tuple[float, float, float], settings: FollowSettings
+) -> tuple[float, float, float]:
+    """Send head and lens after the target, or zoom out where there is none; return what is commanded now."""
+    shortest = rig.zoom.focal_range[0]
+    pan, tilt, focal = commanded
+    if led is None:
+        return pan, tilt, rig.zoom.zoom(shortest) if focal > shortest else focal
+    pan, tilt = rig.head.move(led.aim.pan, led.aim.tilt)
+    zoomed_out = focal <= shortest * (1 + settings.focal_deadband)
+    if zoomed_out and led.way > math.radians(settings.centred_deg):
+        nominal = shortest
+    else:
+        nominal = min(led.aim.nominal_px, _focal_while_turning(rig, led.way, settings.margin))
+    return pan, tilt, _command_lens(rig, nominal, focal, settings.focal_deadband)
+
+
 def lead(
     rig: Rig, calibration: Calibration, target: TargetConfig, track: Track, command_delay_s: float, interval_s: float
-) -> tuple[Aim, float]:
+) -> Lead:
     """Aim so that the head keeps up with a track: the unit brakes to rest at every goal, so the goal lies ahead.
 
     At the next command's effect the head shall be where the target then is, and as fast; from there it needs
@@ -185,16 +202,14 @@ def lead(
         command_delay_s: from command to motion [s].
         interval_s: from one command to the next [s].
 
-    Returns:
-        The aim, and how far the head is now from where the target is now [rad].
-
     Raises:
         UnreachableError: no pan and tilt within the limits do it.
     """
     limits, head = rig.head.limits, rig.head.state()
     reach = Reach(limits.pan, limits.tilt, rig.zoom.focal_range, (head.pan, head.tilt), limits.step)
-    closeup = Closeup(target.size, target.wanted_px)
-    depth = depth_of(calibration, target, size_for(track, target.dimension))
+    closeup = Closeup(target.size, target.wanted_px, target.dimension == "height")
+    upright = bool(track.size_px[1] > track.size_px[0])
+    depth = depth_of(calibration, target, size_for(track, target.dimension), track.center_px, upright=upright)
     effect = rig.clock.now() + command_delay_s
     at_effect, after = (
         aim(calibration, point_at(calibration, track.predict(t), depth), reach, closeup=closeup)
@@ -208,7 +223,7 @@ def lead(
     way = math.hypot(
         at_effect.pan - rates[0] * command_delay_s - head.pan, at_effect.tilt - rates[1] * command_delay_s - head.tilt
     )
-    return dataclasses.replace(after, pan=pan, tilt=tilt), way
+    return Lead(dataclasses.replace(after, pan=pan, tilt=tilt), way)
 
 
 def stopping_distance(rate: float, limits: PanTiltLimits) -> float:

@@ -6,7 +6,7 @@ import math
 from types import TracebackType
 
 from cotarget.config import SafetyConfig
-from cotarget.errors import ConfigError, StaleFrameError
+from cotarget.errors import ConfigError, DeviceError, StaleFrameError
 from cotarget.rig import Board, Camera, Clock, Frame, PanTilt, PanTiltLimits, PanTiltState, Rig, ZoomCamera
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,13 @@ class SafeHead:
         return self._head.state()
 
     def move(self, pan: float, tilt: float, speed: float | None = None, wait: bool = False) -> tuple[float, float]:
-        """Command both axes [rad], clipped to the soft limits; return what was really commanded."""
+        """Command both axes [rad], clipped to the soft limits; return what was really commanded.
+
+        Raises:
+            DeviceError: an angle is not a number.
+        """
+        if math.isnan(pan) or math.isnan(tilt):
+            raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
         step = self._limits.step
         pan, tilt = _clip(pan, self._limits.pan, step), _clip(tilt, self._limits.tilt, step)
         capped = self._limits.speed if speed is None else min(speed, self._limits.speed)
@@ -78,7 +84,7 @@ class SafeRig:
         self._rig = rig
         try:
             self.head: PanTilt = SafeHead(rig.head, config)
-        except ConfigError:
+        except BaseException:
             rig.close()
             raise
         self.fixed: Camera = SafeCamera(rig.fixed, rig.clock, config.max_frame_age_s)

@@ -1,6 +1,6 @@
 """From a pixel and a depth, or a track, to an Aim: pan, tilt and focal length. Pure: no device, no clock."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from cotarget.calibration import Calibration, predicted_pointing
 from cotarget.camera import depth_from_size, focal_for_size
 from cotarget.config import TargetConfig
-from cotarget.errors import CalibrationError, CotargetError, UnreachableError
+from cotarget.errors import CalibrationError, UnreachableError
 from cotarget.geometry import Array
 from cotarget.pantilt import Pointing, nearest, shortcut, solve
 
@@ -45,10 +45,11 @@ class Reach:
 
 @dataclass(frozen=True)
 class Closeup:
-    """How large the target shall be: its size [m] and the size wanted in the image [px]."""
+    """How large the target shall be: its size [m], the size wanted in the image [px], and whether that is a height."""
 
     size: float
     wanted_px: float
+    vertical: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,29 +80,34 @@ class Aim:
         return float(self.x_fixed[2])
 
 
-def depth_of(calibration: Calibration, target: TargetConfig, size_px: float) -> float:
+def depth_of(
+    calibration: Calibration, target: TargetConfig, size_px: float, center_px: Array, *, upright: bool = False
+) -> float:
     """Estimate a target's depth from how large it appears: z = f x_size / u_measured.
 
     Args:
-        calibration: gives the fixed camera's focal length.
+        calibration: gives the fixed camera.
         target: its known size and which dimension that is.
         size_px: the measured dimension in the fixed view [px].
+        center_px: where its middle is in the fixed view, (2,) [px].
+        upright: for a wingspan, whether the larger side of the box was its height.
     """
-    return depth_from_size(calibration.fixed, target.size, size_px, vertical=target.dimension == "height")
+    vertical = target.dimension == "height" or (target.dimension == "wingspan" and upright)
+    return depth_from_size(calibration.fixed, target.size, size_px, np.asarray(center_px, float), vertical=vertical)
 
 
 def point_at(calibration: Calibration, pixel: Array, depth: float) -> Array:
     """Where a pixel at a depth is, x_fixed [m], (3,).
 
     Raises:
-        CotargetError: no ray projects to that pixel, or the depth is not in front of the camera.
+        UnreachableError: no ray projects to that pixel, or the depth is not in front of the camera.
     """
     if not (np.isfinite(depth) and depth > 0):
-        raise CotargetError(f"a target at a depth of {depth:g} m is not in front of the fixed camera")
+        raise UnreachableError(f"a target at a depth of {depth:g} m is not in front of the fixed camera")
     ray = calibration.fixed.ray(np.asarray(pixel, dtype=float))
     if not np.isfinite(ray).all():
         u, v = pixel
-        raise CotargetError(f"pixel ({u:g}, {v:g}) lies outside of what the fixed camera's lens can see")
+        raise UnreachableError(f"pixel ({u:g}, {v:g}) lies outside of what the fixed camera's lens can see")
     return ray * depth
 
 
@@ -145,6 +151,9 @@ def aim(
         if closeup:
             z = float(pointing.range * ray[2] / np.linalg.norm(ray))
             focal = focal_for_size(closeup.size, closeup.wanted_px, z)  # (17)
+            if closeup.vertical:  # that is fy; the lens is told by fx
+                fx, fy = calibration.zoom.at(nominal).focal_px
+                focal *= fx / fy
             previous = nominal
             nominal, limited = _limit(calibration.zoom.nominal_for(focal), reach)
             if abs(nominal - previous) <= FOCAL_FOUND * nominal:
@@ -177,11 +186,13 @@ def error_budget(
         was given: that likewise, by way of the depth; "calibration", where it has a covariance: what its own noise
         leaves; and "total".
     """
+    # A target just inside a limit may lie beyond it when it is moved a little: here only angles count.
+    free = replace(reach, pan=(-np.inf, np.inf), tilt=(-np.inf, np.inf), now=(found.pan, found.tilt))
 
     def moved(du: float, dv: float, depth: float) -> float:
         x_fixed = point_at(calibration, np.add(pixel, (du, dv)), depth)
-        there = aim(calibration, x_fixed, reach, nominal_px=found.nominal_px)
-        here = aim(calibration, found.x_fixed, reach, nominal_px=found.nominal_px)
+        there = aim(calibration, x_fixed, free, nominal_px=found.nominal_px)
+        here = aim(calibration, found.x_fixed, free, nominal_px=found.nominal_px)
         return float(np.hypot((there.pan - here.pan) * np.cos(here.tilt), there.tilt - here.tilt))
 
     depth = found.depth

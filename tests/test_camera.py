@@ -13,6 +13,8 @@ ZOOM = Intrinsics(size=(640, 480), focal_px=(692.0, 693.0), center_px=(326.0, 23
 DISTORTED = Intrinsics((640, 480), (690.0, 700.0), (325.0, 231.0), (-0.25, 0.07, 0.002, -0.001, -0.004))
 PROJECTION_PX = 1e-9  # both are double precision
 ROUND_TRIP_PX = 1e-8
+MIDDLE = np.array(FIXED.center_px)
+BOX_TILT = 5e-3  # distortion bends the stick a little out of the box's middle line
 
 
 def test_projection_is_opencvs():
@@ -64,9 +66,22 @@ def test_table_2_in_millimetres():
 
 
 def test_depth_from_size_is_the_inverse_of_projection():
-    assert depth_from_size(FIXED, 0.234, 686 * 0.234 / 10, vertical=False) == pytest.approx(10)
-    assert depth_from_size(FIXED, 1.75, 684 * 1.75 / 12, vertical=True) == pytest.approx(12)
-    assert np.isnan(depth_from_size(FIXED, 1.0, 0.0, vertical=False))
+    assert depth_from_size(FIXED, 0.234, 686 * 0.234 / 10, MIDDLE, vertical=False) == pytest.approx(10)
+    assert depth_from_size(FIXED, 1.75, 684 * 1.75 / 12, MIDDLE, vertical=True) == pytest.approx(12)
+    assert np.isnan(depth_from_size(FIXED, 1.0, 0.0, MIDDLE, vertical=False))
+
+
+@pytest.mark.parametrize("vertical", [False, True])
+@pytest.mark.parametrize("middle", [(0.0, 0.0), (3.0, -1.5), (-4.2, 2.0), (3.9, 2.9)])
+def test_depth_from_size_knows_distortion(middle, vertical):
+    """A stick of 0.5 m at 10 m, its ends projected by OpenCV: f size / u alone would be off by up to 14 percent."""
+    lens = Intrinsics((640, 480), (690.0, 700.0), (325.0, 231.0), (-0.2, 0, 0, 0, 0))
+    stick = np.array([[0.0, 0.25, 0.0] if vertical else [0.25, 0.0, 0.0]])
+    ends = np.array([*middle, 10.0]) + np.vstack([-stick, stick])
+    px = cv2.projectPoints(ends, np.zeros(3), np.zeros(3), lens.matrix, np.array(lens.distortion))[0].reshape(2, 2)
+    size_px = np.ptp(px[:, 1 if vertical else 0])
+    depth = depth_from_size(lens, 0.5, size_px, px.mean(axis=0), vertical=vertical)
+    assert depth == pytest.approx(10.0, rel=BOX_TILT)
 
 
 def test_zoom_lens_keeps_its_ratio_beyond_one_stop():

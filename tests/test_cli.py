@@ -283,7 +283,7 @@ def test_aim_tells_json_with_the_documented_keys(folder, capsys):
 def test_aim_takes_depth_from_a_size_and_focal_length_from_a_close_up(folder, capsys):
     size = str(686 * 0.234 / 12)
     told = aim_json(capsys, *AIM, "--size-px", size, "--target", "book", "--wanted-px", "100", "--rig", "rig.toml")
-    assert told["depth_m"] == pytest.approx(12.0)
+    assert told["depth_m"] == pytest.approx(12.0, rel=1e-3)  # the pixel is not quite in the middle of the distortion
     assert told["focal_limited"] is False
     assert told["focal_px"] == pytest.approx(100 * told["range_m"] / 0.234, rel=1e-4)  # the principal point is 7 px off
     assert told["focal_mm"] == pytest.approx(6.0 * told["focal_px"] / 692)

@@ -68,6 +68,8 @@ def test_offsets_and_targets_are_taken(tmp_path):
         ("[sim.fixed]\nnoize = 1", "unknown key 'sim.fixed.noize'"),
         ("[sim.fixed]\nnoise = 'much'", "sim.fixed.noise: 'much' is not a finite number"),
         ("[sim.fixed]\nnoise = -1", "sim.fixed.noise: -1 is negative"),
+        ("[sim.fixed]\ndistortion = [-0.5, 0, 0, 0, 0]", "sim.fixed.distortion: [-0.5, 0.0, 0.0, 0.0, 0.0] folds back"),
+        ("[sim.paths]\nboook = [[0, 0, 0, 0], [1, 0, 0, 0]]", "sim.paths.boook: is no target; the targets are: bird"),
         ("[sim.fixed]\nsize = [640]", "sim.fixed.size: has 1 values where 2 are wanted"),
         ("[sim.fixed]\nsize = [640, 480.5]", "sim.fixed.size[1]: 480.5 is not a whole number"),
         ("[sim.fixed]\nfocal_px = [0, 1]", "sim.fixed.focal_px: 0 is not greater than zero"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import SafetyConfig
-from cotarget.errors import ConfigError, StaleFrameError
+from cotarget.errors import ConfigError, DeviceError, StaleFrameError
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState
 from cotarget.safety import SafeRig
 
@@ -91,6 +91,14 @@ def test_no_command_leaves_the_limits_or_exceeds_the_cap(step, soft):
     for told, limits in zip((safe.limits.pan, safe.limits.tilt), allowed, strict=True):
         assert np.allclose(told, limits, rtol=0, atol=ROUNDING)
     assert safe.limits.speed == pytest.approx(cap)
+
+
+@pytest.mark.parametrize("angles", [(math.nan, 0.0), (0.0, math.nan)])
+def test_what_is_not_a_number_never_reaches_the_head(angles):
+    head = Head(PanTiltLimits((-1.0, 1.0), (-1.0, 1.0), 1.0, 1.0, 0.0))
+    with pytest.raises(DeviceError, match="cannot go to"):
+        SafeRig(Rig(head), SafetyConfig()).head.move(*angles)
+    assert not head.log
 
 
 def test_a_head_of_unlimited_speed_is_not_told_infinity():

@@ -132,6 +132,9 @@ def test_waiting_too_long_is_an_error_and_takes_the_time():
     with pytest.raises(StaleFrameError, match=r"within 0\.5 s"):
         camera.read(newer_than=10.0, timeout=0.5)
     assert clock.now() == pytest.approx(0.5)
+    late, _ = stream(latency_s=1.5)
+    with pytest.raises(StaleFrameError, match=r"no frame within 1 s; the camera is 1\.5 s late"):
+        late.read()
 
 
 def test_the_lens_steps_and_takes_its_time():

@@ -182,7 +182,7 @@ def test_the_nearest_way_round_is_taken():
     ("bird", 686 * 0.8 / 25, 25.0),
 ])  # fmt: skip
 def test_depth_from_the_known_size(name, size_px, depth):
-    assert depth_of(HOME, DEFAULT_TARGETS[name], size_px) == pytest.approx(depth, rel=RELATIVE)
+    assert depth_of(HOME, DEFAULT_TARGETS[name], size_px, HOME.fixed.center_px) == pytest.approx(depth, rel=RELATIVE)
 
 
 def test_a_pixel_and_a_depth_are_a_point():
@@ -201,7 +201,8 @@ FOLDING = replace(HOME, fixed=replace(CENTRED, distortion=(-0.3, 0.0, 0.0, 0.0, 
     (lambda: point_at(HOME, (320, 240), 0.0), CotargetError, "a depth of 0 m is not in front"),
     (lambda: point_at(HOME, (320, 240), math.nan), CotargetError, "a depth of nan m is not in front"),
     (lambda: point_at(HOME, (320, 240), math.inf), CotargetError, "a depth of inf m is not in front"),
-    (lambda: point_at(HOME, (320, 240), depth_of(HOME, DEFAULT_TARGETS["book"], 0.0)), CotargetError, "depth of nan"),
+    (lambda: point_at(HOME, (320, 240), depth_of(HOME, DEFAULT_TARGETS["book"], 0.0, (320, 240))),
+     CotargetError, "depth of nan"),
     (lambda: point_at(HOME, (math.nan, 240), 5.0), CotargetError, r"pixel \(nan, 240\) lies outside"),
     (lambda: point_at(FOLDING, (5000, 240), 5.0), CotargetError, r"pixel \(5000, 240\) lies outside"),
     (lambda: aim(HOME, np.array([10.0, 0, 1]), replace(ANYWHERE, pan=(-1, 1))), UnreachableError,

@@ -167,6 +167,11 @@ class Calibration:
             covariance = covariance.scaled(
                 {f"fixed.{k}": s_fixed for k in in_pixels} | {f"zoom.{k}": s_zoom for k in in_pixels}
             )
+        pitch_mm = self.pitch_mm and self.pitch_mm * self.zoom.size[0] / zoom_size[0]  # a larger pixel, where binned
         return replace(
-            self, fixed=self.fixed.resized(fixed_size), zoom=self.zoom.resized(zoom_size), covariance=covariance
+            self,
+            fixed=self.fixed.resized(fixed_size),
+            zoom=self.zoom.resized(zoom_size),
+            covariance=covariance,
+            pitch_mm=pitch_mm,
         )

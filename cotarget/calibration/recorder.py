@@ -73,7 +73,7 @@ class Recorder:
         """Ask for the board at a pose, as a new placement; its number."""
         self.save_index()
         self.rig.board.present(T_fixed_board)
-        self._still_since = max(self._still_since, self.rig.clock.now())
+        self._still_since = max(self._still_since, self.rig.clock.now() + SETTLE)
         self.number += 1
         return self.number
 

@@ -68,7 +68,8 @@ class SimStream:
         arrival = index / rate + self._latency
         if arrival - now > timeout:
             self._clock.sleep_until(now + timeout)
-            raise StaleFrameError(f"no frame newer than {newer_than:.3f} s within {timeout:g} s")
+            which = "frame" if newer_than is None else f"frame newer than {newer_than:.3f} s"
+            raise StaleFrameError(f"no {which} within {timeout:g} s; the camera is {self._latency:g} s late")
         self._clock.sleep_until(arrival)
         if index not in self._kept:
             frame = Frame(self._expose(index, index / rate), index / rate)

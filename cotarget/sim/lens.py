@@ -15,6 +15,8 @@ from cotarget.rig import Image
 # The map is computed at every fourth pixel and interpolated: a distortion of k1 = -0.2 curves by less than
 # 6 |k1| r / f a pixel, so this costs at most 0.005 px, in the corners.
 MAP_STRIDE = 4
+# The fold is looked for up to this tangent (87 degrees off the axis), in steps far finer than it matters.
+FOLD_SEARCHED, FOLD_SAMPLES = 20.0, 20001
 # Fields and maps are kept for the lens positions in use: the fixed camera's one and the zoom camera's latest.
 KEPT_MAPS = 8
 # A fixed point: every round shrinks the error by about 3 |k1| r^2, less than 0.3.
@@ -32,9 +34,14 @@ class TrueLens:
     distortion: tuple[float, float, float, float, float]
 
     def project(self, x_camera: Array) -> Array:
-        """Project points (..., 3) in the camera's frame to pixels (..., 2), nan behind; not clipped to the image."""
+        """Project points (..., 3) in the camera's frame to pixels (..., 2); not clipped to the image.
+
+        Pixels are nan behind the camera, and as far off its axis as the distortion has folded back.
+        """
         depth = np.where(x_camera[..., 2:] > 0, x_camera[..., 2:], np.nan)
-        return self._bend(x_camera[..., :2] / depth) * self.focal_px + self.center_px
+        xy = x_camera[..., :2] / depth
+        seen = np.hypot(xy[..., 0], xy[..., 1]) < _fold(self.distortion)
+        return np.where(seen[..., None], self._bend(xy) * self.focal_px + self.center_px, np.nan)
 
     def directions(self, pixels: Array) -> Array:
         """Undistorted image-plane coordinates (x / z, y / z) of pixels, (..., 2)."""
@@ -56,6 +63,15 @@ class TrueLens:
             [x * gain + 2 * p1 * x * y + p2 * (3 * x**2 + y**2), y * gain + p1 * (x**2 + 3 * y**2) + 2 * p2 * x * y],
             axis=-1,
         )
+
+
+@lru_cache(maxsize=KEPT_MAPS)
+def _fold(distortion: tuple[float, float, float, float, float]) -> float:
+    """Tangent of the angle off the axis where the radial distortion begins to shrink; infinite if it never does."""
+    k1, k2, _, _, k3 = distortion
+    r = np.linspace(0.0, FOLD_SEARCHED, FOLD_SAMPLES)
+    shrinking = np.flatnonzero(np.diff(r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)) <= 0)
+    return float(r[shrinking[0]]) if len(shrinking) else np.inf
 
 
 @lru_cache(maxsize=KEPT_MAPS)

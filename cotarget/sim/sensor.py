@@ -22,7 +22,8 @@ class Sensor:
             rng = np.random.default_rng(seed)
             w, h = camera.size
             shape = (h + NOISE_MARGIN, w + NOISE_MARGIN, 3)
-            self._fields = [np.rint(rng.normal(0.0, camera.noise, shape)).astype(np.int8) for _ in range(NOISE_FIELDS)]
+            fields = (rng.normal(0.0, camera.noise, shape) for _ in range(NOISE_FIELDS))
+            self._fields = [np.clip(np.rint(field), -127, 127).astype(np.int8) for field in fields]
 
     def expose(self, image: Image, index: int) -> Image:
         """The image as it arrives.

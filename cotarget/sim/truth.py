@@ -110,7 +110,7 @@ class Truth:
         return float(np.arctan2(np.linalg.norm(np.cross(ray, x_zoom)), ray @ x_zoom))
 
     def silhouette(self, name: str, camera: CameraName, t: float) -> Silhouette | None:
-        """A target's outline in a camera at time t; None if any of it is behind the camera."""
+        """A target's outline in a camera at time t; None if any of it is behind the camera, or beyond its lens."""
         data = self.set_state(t)
         T_camera_world = self._body_pose(data, camera).inv()
         lens = self.lens(camera, t)
@@ -122,6 +122,8 @@ class Truth:
                 return None
             outlines.append(lens.project(x_camera))
         everything = np.concatenate(outlines)
+        if not np.isfinite(everything).all():  # further off the axis than the lens can see
+            return None
         low, high = everything.min(axis=0), everything.max(axis=0)
         inside = _fraction_inside(outlines, low, high, lens.size)
         return Silhouette(low, high, inside * self._unhidden(name, data, camera))

@@ -1,6 +1,7 @@
 """The simulated world: time -> poses -> images, with the rig's devices in front and the truth behind."""
 
 import math
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -55,7 +56,7 @@ class SimWorld:
         sim, effects = config.sim, config.sim.effects
         self.config = config
         self._clock = SimClock()
-        self.targets = {name: self._make_target(i, name) for i, name in enumerate(sim.targets)}
+        self.targets = {name: self._make_target(name) for name in sim.targets}
         self._fixed_lens = self._lens(sim.fixed)
         self._zoom_lens = self._lens(sim.zoom)
         fields = [covering_half_field(lens) for lens in (self._fixed_lens, self._zoom_lens)]
@@ -135,9 +136,9 @@ class SimWorld:
         distortion = camera.distortion if self.config.sim.effects.distortion else (0.0,) * 5
         return TrueLens(camera.size, camera.focal_px, camera.center_px, distortion)
 
-    def _make_target(self, index: int, name: str) -> Target:
+    def _make_target(self, name: str) -> Target:
         sim = self.config.sim
-        rng = np.random.default_rng((sim.seed, TARGETS, index))
+        rng = np.random.default_rng((sim.seed, TARGETS, zlib.crc32(name.encode())))  # whatever else is in the scene
         return make_target(name, sim.scene, rng, sim.effects.scatter, sim.paths.get(name))
 
     def _common_render_size(self, fields: list[tuple[float, float]]) -> tuple[int, int]:
