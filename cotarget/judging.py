@@ -1,7 +1,9 @@
 """Puts Steps and calibrations beside a simulated world's truth, which the pipeline cannot see."""
 
 import math
+from collections.abc import Iterable
 
+import cv2
 import numpy as np
 
 from cotarget.calibration import Calibration
@@ -10,15 +12,39 @@ from cotarget.errors import UnreachableError
 from cotarget.geometry import Array
 from cotarget.loop import Step
 from cotarget.metrics import WHOLLY_VISIBLE, Row
-from cotarget.sim.truth import Truth
+from cotarget.rig import Frame
+from cotarget.sim.truth import Silhouette, Truth
 from cotarget.targeting import Method, Reach, aim
+from cotarget.tracking import Track
 
 # Pointing error is stated for targets at these depths, all over the wide view [m].
 POINTING_DEPTHS = (4.0, 30.0)
+# The markers that the simulated targets carry, of MARKERS; sim_assets/make_assets.py draws them.
+MARKER_IDS = {"book": 1, "person": 2, "bird": 3}
+MARKERS = cv2.aruco.DICT_4X4_50
+# A marker is sought in its target's true box, widened on each side by this part of the larger side ...
+SEARCH_MARGIN = 0.25
+SEARCH_PX = 8.0  # ... and by this, for what a moving target smears and the finder's windows need [px]
+
+
+def add_row(rows: list[Row], step: Step, truth: Truth, name: str, target: TargetConfig) -> None:
+    """Append a Step's row, unless its zoom frame is the one that the last row is of.
+
+    A zoom camera slower than the fixed one has no new frame in some Steps; those frames would count twice.
+
+    Args:
+        rows: of the Steps before, oldest first; grows by one where the zoom frame is new.
+        step: of the loop.
+        truth: of the simulated world.
+        name: of the target that is followed.
+        target: gives its dimension and the size wanted.
+    """
+    if not rows or step.zoom.t > rows[-1].t_s:
+        rows.append(observe(step, truth, name, target))
 
 
 def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
-    """Put a Step beside the truth at its zoom frame's own time.
+    """Put a Step beside the truth: its zoom frame, and its fixed frame, each at its own time.
 
     Args:
         step: of the loop.
@@ -26,9 +52,13 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
         name: of the target that is followed.
         target: gives its dimension and the size wanted.
     """
-    t, center = step.zoom.t, truth.center(name, step.zoom.t)
-    zoom_px, wide_px = truth.pixel("zoom", center, t), truth.pixel("fixed", center, t)
-    outline, wide_outline = truth.silhouette(name, "zoom", t), truth.silhouette(name, "fixed", t)
+    t, t_fixed = step.zoom.t, step.fixed.t
+    center = truth.center(name, t)
+    zoom_px = truth.pixel("zoom", center, t)
+    wide_px = truth.pixel("fixed", truth.center(name, t_fixed), t_fixed)
+    outline = truth.silhouette(name, "zoom", t)
+    wide_outlines = {each: truth.silhouette(each, "fixed", t_fixed) for each in truth.targets}
+    wide_outline = wide_outlines[name]
     size = math.nan
     if outline is not None:
         width, height = outline.size_px
@@ -37,10 +67,12 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
     focal = truth.lens("zoom", t).focal_px[0]
     longest = truth.zoom_lens_for(truth.focal_range[1]).focal_px[0]
     pan, tilt = truth.head_at(t)
-    detected = (math.nan, math.nan) if step.target is None else tuple(step.target.predict(t))
+    followed = step.target
+    detected = (math.nan, math.nan) if followed is None or followed.missed else followed.box.center_px
     height_px, width_px = step.zoom.image.shape[:2]
     return Row(
         t_s=t,
+        t_fixed_s=t_fixed,
         state=str(step.state),
         track=-1 if step.target is None else step.target.id,
         u_px=float(zoom_px[0]),
@@ -55,6 +87,9 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
         v_wide_px=float(wide_px[1]),
         u_detected_px=float(detected[0]),
         v_detected_px=float(detected[1]),
+        decoded=decodes(step.zoom, outline, MARKER_IDS[name]),
+        decoded_wide=decodes(step.fixed, wide_outline, MARKER_IDS[name]),
+        off_target=" ".join(str(i) for i in off_target(step.tracks, wide_outlines.values())),
         range_m=float(np.linalg.norm(center - truth.T_world_camera("zoom", t).translation)),
         depth_m=math.nan if step.aim is None else step.aim.depth,
         pan_commanded_deg=math.degrees(step.commanded[0]),
@@ -65,6 +100,44 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
         focal_px=focal,
         target=name,
     )
+
+
+def decodes(frame: Frame, outline: Silhouette | None, marker: int) -> bool:
+    """Whether a target's marker can be read in a frame.
+
+    It is sought about the target's true box only: that is quick, and a marker elsewhere is not this target's.
+
+    Args:
+        frame: of either camera.
+        outline: the target's true one in it.
+        marker: its number in MARKERS.
+    """
+    if outline is None or outline.visible <= 0:
+        return False
+    margin = SEARCH_PX + SEARCH_MARGIN * float(outline.size_px.max())
+    size = np.array(frame.image.shape[1::-1])
+    left, top = np.clip(np.floor(outline.low_px - margin), 0, size).astype(int)
+    right, bottom = np.clip(np.ceil(outline.high_px + margin) + 1, 0, size).astype(int)
+    grey = cv2.cvtColor(frame.image[top:bottom, left:right], cv2.COLOR_BGR2GRAY)
+    finder = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(MARKERS))
+    _, found, _ = finder.detectMarkers(grey)
+    return found is not None and marker in found
+
+
+def off_target(tracks: Iterable[Track], outlines: Iterable[Silhouette | None]) -> list[int]:
+    """Numbers of the confirmed tracks that are on no target.
+
+    Args:
+        tracks: at a fixed frame's time.
+        outlines: the targets' true ones in it; a track is off a target when it is farther from the middle of its box
+            than the box's larger side.
+    """
+    boxes = [((o.low_px + o.high_px) / 2, float(o.size_px.max())) for o in outlines if o is not None]
+    return [
+        track.id
+        for track in tracks
+        if track.confirmed and not any(np.linalg.norm(track.center_px - middle) <= side for middle, side in boxes)
+    ]
 
 
 def pointing_errors(

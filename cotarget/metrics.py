@@ -27,15 +27,20 @@ WHOLLY_VISIBLE = 0.999  # the silhouette's area is counted on a grid; a rim of l
 BACKGROUND_S = 2.0
 # In-frame runs broken for longer than this count as fragmentation [s].
 BREAK_S = 0.2
+# A track counts as false when it was confirmed and off every target for this long on end [s].
+FALSE_S = 0.5
 ROUNDING_S = 1e-6  # frame times are sums and differences of binary fractions
 
 
 @dataclass(frozen=True)
 class Row:
-    """One zoom frame.
+    """One new zoom frame, and the fixed frame that the loop had acted on when it came.
+
+    What is said of the wide view is at that fixed frame's own time; all else is at the zoom frame's.
 
     Attributes:
         t_s: middle of the zoom frame's exposure [s].
+        t_fixed_s: middle of the fixed frame's exposure [s].
         state: what the loop was doing.
         track: number of the track followed; -1 for none.
         u_px: true position of the target's body centre in the zoom image [px]; nan behind the camera.
@@ -48,8 +53,11 @@ class Row:
         in_wide: whether the target is wholly in the wide view.
         u_wide_px: true position in the wide image [px].
         v_wide_px: likewise.
-        u_detected_px: where the followed track is in the wide image [px]; nan for none.
+        u_detected_px: middle of the followed track's detection in the wide image [px]; nan where that image had none.
         v_detected_px: likewise.
+        decoded: whether the target's marker decodes in the zoom image.
+        decoded_wide: whether it decodes in the wide image.
+        off_target: numbers of the confirmed tracks that are off every target, as "3 7".
         range_m: true distance from the zoom camera [m].
         depth_m: estimated depth [m]; nan where nothing was aimed at.
         pan_commanded_deg: last command [degrees].
@@ -62,6 +70,7 @@ class Row:
     """
 
     t_s: float
+    t_fixed_s: float
     state: str
     track: int
     u_px: float
@@ -76,6 +85,9 @@ class Row:
     v_wide_px: float
     u_detected_px: float
     v_detected_px: float
+    decoded: bool
+    decoded_wide: bool
+    off_target: str
     range_m: float
     depth_m: float
     pan_commanded_deg: float
@@ -118,10 +130,17 @@ class Row:
         """The same as an angle [degrees]."""
         return math.degrees(math.atan(self.tpo_px / self.focal_px))
 
+    @property
+    def tpe_px(self) -> float:
+        """Target point error: distance from the detection to the truth in the wide view [px]; nan without one."""
+        return math.hypot(self.u_wide_px - self.u_detected_px, self.v_wide_px - self.v_detected_px)
+
 
 @dataclass(frozen=True)
 class Score:
     """How well a target was held; None where it was never acquired, or never there.
+
+    Wear and false tracks are counted, like the yield, from when the target was wholly in the wide view.
 
     Attributes:
         frames: zoom frames since the target was wholly in the wide view.
@@ -134,8 +153,13 @@ class Score:
         size_ratio_median: of the frames after acquisition.
         wanted_px: size wanted [px], median.
         range_m: true range [m], median.
-        tpe_px_median: the followed track's error in the wide view [px].
-        fragmentation_per_min: in-frame runs broken for more than 0.2 s, a minute.
+        tpe_px_median: the detection's error in the wide view, of the frames that have one [px].
+        fragmentation_per_min: in-frame runs broken for more than 0.2 s [1/min].
+        identification: frames in which the marker decodes in the close-up, over all those that the yield counts.
+        identification_wide: the same in the wide view, for comparison.
+        commands_per_min: changes of the commanded pan or tilt from one row to the next [1/min].
+        reversals_per_min: changes of direction of the commands, both axes together [1/min].
+        false_tracks_per_min: tracks that were confirmed and off every target for 0.5 s on end [1/min].
     """
 
     frames: int
@@ -150,6 +174,11 @@ class Score:
     range_m: float | None
     tpe_px_median: float | None
     fragmentation_per_min: float | None
+    identification: float | None = None
+    identification_wide: float | None = None
+    commands_per_min: float | None = None
+    reversals_per_min: float | None = None
+    false_tracks_per_min: float | None = None
 
 
 def score(rows: Sequence[Row]) -> Score:
@@ -160,7 +189,7 @@ def score(rows: Sequence[Row]) -> Score:
     counted = rows[start:]
     acquired = _acquired(counted)
     after = counted[acquired:] if acquired is not None else []
-    off = [math.hypot(r.u_wide_px - r.u_detected_px, r.v_wide_px - r.v_detected_px) for r in counted if r.track >= 0]
+    commands, reversals = _wear(counted)
 
     def median(values: Iterable[float]) -> float | None:
         finite = [v for v in values if math.isfinite(v)]
@@ -177,8 +206,13 @@ def score(rows: Sequence[Row]) -> Score:
         size_ratio_median=median(r.size_ratio for r in after),
         wanted_px=median(r.wanted_px for r in counted),
         range_m=median(r.range_m for r in counted),
-        tpe_px_median=median(off),
-        fragmentation_per_min=_fragmentation(after),
+        tpe_px_median=median(r.tpe_px for r in counted),
+        fragmentation_per_min=_per_minute(_breaks(after), after),
+        identification=float(np.mean([r.decoded for r in counted])),
+        identification_wide=float(np.mean([r.decoded_wide for r in counted])),
+        commands_per_min=_per_minute(commands, counted),
+        reversals_per_min=_per_minute(reversals, counted),
+        false_tracks_per_min=_per_minute(_false_tracks(counted), counted),
     )
 
 
@@ -234,10 +268,13 @@ def _acquired(rows: Sequence[Row]) -> int | None:
     return None
 
 
-def _fragmentation(rows: Sequence[Row]) -> float | None:
-    """How often the target was out of frame for longer than 0.2 s, a minute."""
-    if len(rows) < 2:
-        return None
+def _per_minute(count: int, rows: Sequence[Row]) -> float | None:
+    """Events over the time from the first row to the last [1/min]; None for no time."""
+    return count / ((rows[-1].t_s - rows[0].t_s) / 60) if len(rows) > 1 else None
+
+
+def _breaks(rows: Sequence[Row]) -> int:
+    """How often the target was out of frame for longer than 0.2 s."""
     breaks, since = 0, None
     for row in rows:
         if row.in_frame:
@@ -245,5 +282,21 @@ def _fragmentation(rows: Sequence[Row]) -> float | None:
             since = None
         elif since is None:
             since = row.t_s
-    breaks += since is not None and rows[-1].t_s - since > BREAK_S + ROUNDING_S
-    return breaks / ((rows[-1].t_s - rows[0].t_s) / 60)
+    return breaks + (since is not None and rows[-1].t_s - since > BREAK_S + ROUNDING_S)
+
+
+def _wear(rows: Sequence[Row]) -> tuple[int, int]:
+    """How often the commanded pan or tilt changed, and how often an axis's changes turned round, pauses aside."""
+    changes = np.diff([[row.pan_commanded_deg, row.tilt_commanded_deg] for row in rows], axis=0)
+    reversals = sum(np.count_nonzero(np.diff(np.sign(axis[axis != 0]))) for axis in changes.T)
+    return int(np.count_nonzero(changes.any(axis=1))), int(reversals)
+
+
+def _false_tracks(rows: Sequence[Row]) -> int:
+    """How many tracks were confirmed and off every target for half a second on end."""
+    false: set[str] = set()
+    since: dict[str, float] = {}
+    for row in rows:
+        since = {track: since.get(track, row.t_s) for track in row.off_target.split()}
+        false |= {track for track, begin in since.items() if row.t_s - begin >= FALSE_S - ROUNDING_S}
+    return len(false)

@@ -14,6 +14,7 @@ CENTRE = (319.5, 239.5)  # of a 640x480 image whose pixel centres are whole numb
 HALF_DIAGONAL = 400.0  # of 640x480
 GOOD = Row(
     t_s=0.0,
+    t_fixed_s=0.0,
     state="following",
     track=1,
     u_px=CENTRE[0],
@@ -28,6 +29,9 @@ GOOD = Row(
     v_wide_px=50.0,
     u_detected_px=100.0,
     v_detected_px=50.0,
+    decoded=True,
+    decoded_wide=False,
+    off_target="",
     range_m=10.0,
     depth_m=10.0,
     pan_commanded_deg=1.0,
@@ -62,6 +66,11 @@ def test_a_perfect_run():
         range_m=10.0,
         tpe_px_median=0.0,
         fragmentation_per_min=0.0,
+        identification=1.0,
+        identification_wide=0.0,
+        commands_per_min=0.0,
+        reversals_per_min=0.0,
+        false_tracks_per_min=0.0,
     )
 
 
@@ -137,11 +146,11 @@ def test_target_point_offset():
 
 
 def test_medians():
-    """Three thirds after acquisition: the middle one is the median. TPE counts frames with a track only."""
+    """Three thirds after acquisition: the middle one is the median. TPE counts frames with a detection only."""
     thirds = [
         (20, {"u_px": CENTRE[0] + 16, "size_px": 144.0, "u_detected_px": 103.0, "v_detected_px": 54.0}),
         (20, {"u_px": CENTRE[0] + 32, "size_px": 160.0, "u_detected_px": 103.0, "v_detected_px": 54.0}),
-        (20, {"u_px": CENTRE[0] + 64, "size_px": 176.0, "track": -1, "u_detected_px": math.nan}),
+        (20, {"u_px": CENTRE[0] + 64, "size_px": 176.0, "u_detected_px": math.nan}),
     ]
     found = score(run((50, {}), *thirds))
     assert found.tpo_px_median == pytest.approx(32.0)
@@ -165,9 +174,65 @@ def test_fragmentation_per_minute(parts, breaks):
     assert found.fragmentation_per_min == pytest.approx(breaks * 60 / (99 * PERIOD))
 
 
+COUNTED_MIN = 99 * PERIOD / 60  # from the first to the last of 100 rows after the start
+
+
+def test_identification_counts_all_frames_since_the_start():
+    """25 and 5 of 100 rows; those before the start are forgotten, those before acquisition count."""
+    parts = (50, {"decoded_wide": True}), (70, {**AWAY, "decoded": False}), (5, {"decoded_wide": True}), (25, {})
+    found = score(run(*parts))
+    assert found.identification == pytest.approx(0.30)
+    assert found.identification_wide == pytest.approx(0.05)
+
+
+def commanded(*pairs):
+    """Rows of the start, then the commanded (pan, tilt) given, then the last of them up to 100 rows."""
+    rows = run((150, {}))
+    pairs = [pairs[0]] * 50 + list(pairs) + [pairs[-1]] * (100 - len(pairs))
+    return [
+        dataclasses.replace(row, pan_commanded_deg=pan, tilt_commanded_deg=tilt)
+        for row, (pan, tilt) in zip(rows, pairs, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(("pairs", "commands", "reversals"), [
+    ([(0, 0)], 0, 0),
+    ([(0, 0), (1, 0), (2, 0), (2, 0), (3, 0)], 3, 0),  # on in one direction, with a pause
+    ([(0, 0), (1, 1), (2, 2)], 2, 0),  # both axes are one command
+    ([(0, 0), (1, 0), (1, 1), (2, 1)], 3, 0),
+    ([(0, 0), (1, 0), (0, 0), (1, 0)], 3, 2),
+    ([(0, 0), (1, 0), (1, 0), (0, 0)], 2, 1),  # a pause does not hide a reversal
+    ([(0, 0), (1, 1), (0, 0)], 2, 2),  # of each axis
+])  # fmt: skip
+def test_wear(pairs, commands, reversals):
+    found = score(commanded(*pairs))
+    assert found.commands_per_min == pytest.approx(commands / COUNTED_MIN)
+    assert found.reversals_per_min == pytest.approx(reversals / COUNTED_MIN)
+
+
+@pytest.mark.parametrize(("parts", "count"), [
+    ([(100, {})], 0),
+    ([(13, {"off_target": "3"}), (87, {})], 0),  # 12 periods, 0.48 s
+    ([(14, {"off_target": "3"}), (86, {})], 1),
+    ([(7, {"off_target": "3"}), (1, {}), (7, {"off_target": "3"}), (85, {})], 0),  # not on end
+    ([(7, {"off_target": "3"}), (7, {"off_target": "7"}), (86, {})], 0),  # two tracks, each too short
+    ([(7, {"off_target": "3"}), (7, {"off_target": "3 7"}), (7, {"off_target": "7"}), (79, {})], 2),
+    ([(20, {"off_target": "3"}), (20, {}), (20, {"off_target": "3"}), (40, {})], 1),  # a track is false once
+    ([(86, {}), (14, {"off_target": "13"})], 1),
+])  # fmt: skip
+def test_false_tracks(parts, count):
+    assert score(run((50, {}), *parts)).false_tracks_per_min == pytest.approx(count / COUNTED_MIN)
+
+
+def test_a_single_row_has_no_rates():
+    found = score(run((51, {})))
+    assert found.frames == 1
+    assert (found.commands_per_min, found.reversals_per_min, found.false_tracks_per_min) == (None, None, None)
+
+
 def test_the_table_comes_back_exactly(tmp_path):
     path = tmp_path / "steps.csv"
-    rows = run((3, {"u_px": 1 / 3}), (2, {"in_wide": False, "state": "lost", "track": -1}))
+    rows = run((3, {"u_px": 1 / 3, "off_target": "3 7"}), (2, {"in_wide": False, "state": "lost", "track": -1}))
     write_rows(path, rows)
     assert read_rows(path) == rows
     assert path.read_text().splitlines()[0].split(",") == [field.name for field in dataclasses.fields(Row)]
@@ -191,7 +256,7 @@ def table(edit):
     table(lambda n, v: (n, v[:-1])),  # the last line was cut off
     table(lambda n, v: (n, ["soon", *v[1:]])),
     table(lambda n, v: (n, [t.replace("True", "yes") for t in v])),
-    table(lambda n, v: (n, [*v[:2], "1.5", *v[3:]])),  # the track's number
+    table(lambda n, v: (n, [*v[:3], "1.5", *v[4:]])),  # the track's number
     b"",
     b"\x00\xff\xfe\x89PNG\r\n",
     b'{"json": 1}\n',
