@@ -31,7 +31,11 @@ class Silhouette:
     Attributes:
         low_px: top-left corner of its box, (2,).
         high_px: bottom-right corner, (2,).
-        visible: fraction of its area that lies inside the image and is not hidden behind something else.
+        visible: fraction of the target that shows: of its outline's area, the fraction inside the image, times, of
+            its parts (geoms, each counting the same whatever its size), the fraction whose middle a ray from the
+            camera reaches with nothing but the target itself in the way. Hence exact for a target that is cut by the
+            image's border only; for one behind something it goes in steps of a part, and the two fractions are
+            taken to be independent. A board shown to the cameras and the rig itself hide nothing.
     """
 
     low_px: Array
@@ -164,7 +168,10 @@ class Truth:
         return self._surfaces[name]
 
     def _unhidden(self, name: str, data: "mujoco.MjData", camera: CameraName) -> float:
-        """Fraction of the target's parts whose middle a ray from the camera reaches, through nothing but the target."""
+        """Fraction of the target's parts whose middle a ray from the camera reaches, through nothing but the target.
+
+        Parts inside or outside the image count alike. A mesh's middle is its centre of mass.
+        """
         own = [geom for geom, _ in self._surface(name)]
         eye = np.array(data.body(RIG + camera).xpos)
         groups = np.ones(mujoco.mjNGROUP, dtype=np.uint8)
