@@ -37,6 +37,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except BrokenPipeError:
         return 1
+    except OSError as error:  # a full disk, a folder without permission: whatever the commands' own checks missed
+        where = "" if error.filename is None else f"{error.filename}: "
+        print(f"cotarget {options.command}: {where}{error.strerror or error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print(f"cotarget {options.command}: interrupted", file=sys.stderr)
         return INTERRUPTED

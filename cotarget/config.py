@@ -19,161 +19,23 @@ import numpy as np
 from cotarget.assets import assets_dir
 from cotarget.camera import Intrinsics
 from cotarget.errors import ConfigError, choices
-from cotarget.geometry import RigidTransform, pose
+from cotarget.simconfig import Pair, SimCamera, SimConfig, SimEffects, SimHead, SimZoomCamera, Size
 from cotarget.tables import build, expect_table
 
-Pair = tuple[float, float]
-Size = tuple[int, int]
-Distortion = tuple[float, float, float, float, float]
-Waypoint = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class SimCamera:
-    """The simulated fixed camera: true intrinsics, sensor and link.
-
-    Attributes:
-        size: (width, height) [px].
-        focal_px: true (fx, fy) [px].
-        center_px: true principal point [px].
-        distortion: true (k1, k2, p1, p2, k3).
-        noise: standard deviation of the sensor's noise [grey levels].
-        rate_hz: frames a second.
-        latency_s: from light to frame [s].
-        exposure_s: how long light is gathered [s]; what moves meanwhile is blurred, and rendering takes four times
-            as long. 0 for an instant.
-        jpeg_quality: 1 to 100.
-    """
-
-    size: Size = (640, 480)
-    focal_px: Pair = (686.0, 684.0)
-    center_px: Pair = (325.0, 239.0)
-    distortion: Distortion = (-0.2, 0.0, 0.0, 0.0, 0.0)
-    noise: float = 2.0
-    rate_hz: float = 25.0
-    latency_s: float = 0.06
-    exposure_s: float = 0.0
-    jpeg_quality: int = 90
-
-
-@dataclass(frozen=True)
-class SimZoomCamera(SimCamera):
-    """The simulated zoom camera; ``focal_px`` is the truth at the shortest focal length.
-
-    Attributes:
-        focal_mm: shortest and longest focal length as the maker states them [mm].
-        pitch_mm: size of a pixel as the maker states it [mm]; focal_mm / pitch_mm is what the device tells.
-        lens_steps: number of positions from shortest to longest, evenly spaced in the logarithm.
-        lens_speed: positions a second.
-    """
-
-    focal_px: Pair = (692.0, 693.0)
-    center_px: Pair = (326.0, 235.0)
-    distortion: Distortion = (-0.1, 0.0, 0.0, 0.0, 0.0)
-    focal_mm: Pair = (6.0, 72.0)
-    pitch_mm: float = 0.009
-    lens_steps: int = 129
-    lens_speed: float = 129.0
-
-
-@dataclass(frozen=True)
-class SimHead:
-    """The simulated pan-tilt unit; defaults are a stock PTU-D46-17.5 with the geometry of a real, imperfect one.
-
-    Attributes:
-        step_deg: resolution [degrees].
-        pan_deg: lowest and highest pan [degrees].
-        tilt_deg: lowest and highest tilt [degrees].
-        speed_deg_s: highest speed [degrees/s].
-        accel_deg_s2: acceleration [degrees/s^2].
-        command_delay_s: from command to motion [s].
-        axis_offset_mm: distance between the axes along the pan frame's z, dz [mm].
-        squareness_deg: departure of the axes from a right angle, eps [degrees].
-        backlash_deg: play of each axis [degrees].
-    """
-
-    step_deg: float = 0.0514286
-    pan_deg: Pair = (-158.9, 158.9)
-    tilt_deg: Pair = (-46.6, 31.1)
-    speed_deg_s: float = 149.0
-    accel_deg_s2: float = 206.0
-    command_delay_s: float = 0.04
-    axis_offset_mm: float = 5.0
-    squareness_deg: float = 0.1
-    backlash_deg: float = 0.0
-
-
-@dataclass(frozen=True)
-class SimEffects:
-    """One switch for each way in which the simulation departs from the textbook; ``all = false`` clears them.
-
-    Attributes:
-        noise: sensor noise.
-        jpeg: compression.
-        distortion: lens distortion of both cameras.
-        latency: light to frame.
-        blur: motion during the exposure.
-        command_delay: command to motion.
-        profile: finite speed and acceleration of the head.
-        steps: the head's resolution.
-        axes: axis offset and non-squareness.
-        backlash: play.
-        lens: positions and travel time of the zoom lens.
-        scatter: true sizes differ from what the pipeline is told.
-        shadows: cast shadows (costs two to four times the rendering).
-        multisampling: antialiasing with 4 samples.
-    """
-
-    noise: bool = True
-    jpeg: bool = True
-    distortion: bool = True
-    latency: bool = True
-    blur: bool = True
-    command_delay: bool = True
-    profile: bool = True
-    steps: bool = True
-    axes: bool = True
-    backlash: bool = True
-    lens: bool = True
-    scatter: bool = True
-    shadows: bool = False
-    multisampling: bool = True
-
-
-# Offsets of the kind the paper's rig had: 0.4 m beside each other, a few degrees apart, the camera bolted to the
-# unit with a lever of some ten centimetres.
-DEFAULT_GAMMA = pose([-0.40, 0.03, 0.06], [0.8, -1.9, 0.6])
-DEFAULT_T = pose([0.02, -0.08, 0.05], [0.7, -1.4, 0.5])
-
-
-@dataclass(frozen=True)
-class SimConfig:
-    """The simulated world.
-
-    Attributes:
-        scene: a scene of sim_assets, or a path to an MJCF file.
-        seed: of everything random.
-        targets: which targets are in the scene.
-        T_zoom0_fixed: the true Gamma.
-        T_head_zoom: the true T.
-        fixed: the wide camera.
-        zoom: the zoom camera.
-        head: the pan-tilt unit.
-        effects: switches.
-        paths: for a target of that name, waypoints [t, x, y, z] (seconds, metres in the world) of a smooth path
-            that replaces the built-in one.
-    """
-
-    scene: str = "outdoor"
-    seed: int = 0
-    targets: tuple[str, ...] = ()
-    T_zoom0_fixed: RigidTransform = DEFAULT_GAMMA
-    T_head_zoom: RigidTransform = DEFAULT_T
-    fixed: SimCamera = SimCamera()
-    zoom: SimZoomCamera = SimZoomCamera()
-    head: SimHead = SimHead()
-    effects: SimEffects = SimEffects()
-    paths: Mapping[str, tuple[Waypoint, ...]] = field(default_factory=dict)
+__all__ = [
+    "DEFAULT_TARGETS",
+    "BoardConfig",
+    "RigConfig",
+    "SafetyConfig",
+    "SimCamera",
+    "SimConfig",
+    "SimEffects",
+    "SimHead",
+    "SimZoomCamera",
+    "TargetConfig",
+    "load_config",
+    "parse_config",
+]
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ usual ``if __name__ == "__main__"``, because each run is a new process.
 
 import dataclasses
 import json
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,13 +14,19 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cv2
 import numpy as np
 
 from cotarget.calibration import Calibration, calibrate_rig, save_calibration
 from cotarget.config import RigConfig
 from cotarget.detection import make_detector
-from cotarget.drawing import TargetStages, captioned, draw_frames, plot_aim_error, side_by_side
+from cotarget.drawing import (
+    TargetStages,
+    captioned,
+    draw_frames,
+    plot_aim_error,
+    side_by_side,
+    write_picture,
+)
 from cotarget.errors import ConfigError
 from cotarget.judging import observe, pointing_errors
 from cotarget.loop import FollowSettings, follow
@@ -38,6 +45,8 @@ RUN_S = {"book": 8.0, "person": 11.0, "bird": 11.0}
 POINTING_TARGETS = 400
 POINTING_STREAM = 4  # of random numbers, apart from the world's own
 FRONT_DEG, BACK_DEG = -62.0, 118.0  # directions of the two pictures of the rig
+
+UNFINISHED = ".unfinished-"  # begins the name of the folder that a run works in
 
 Progress = Callable[[str, int, int], None]
 
@@ -98,7 +107,9 @@ def finished_together(out: Path) -> Iterator[Path]:
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        work = TemporaryDirectory(dir=out, prefix=".unfinished-")
+        for left in out.glob(f"{UNFINISHED}*"):  # of a run that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        work = TemporaryDirectory(dir=out, prefix=UNFINISHED)
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written to: {error.strerror}; name a folder that can") from None
     with work as folder:
@@ -141,7 +152,7 @@ def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> 
                 captioned(draw_frames(back.image, back.origins_px), "its frames: x red, y green, z blue"),
             ]
         )
-        cv2.imwrite(str(work / "rig.png"), picture)
+        write_picture(work / "rig.png", picture)
     return calibration, {"median": float(np.median(errors)), "p95": float(np.percentile(errors, 95))}
 
 
@@ -162,7 +173,7 @@ def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, repo
             rows.append(observe(step, truth, name, target))
             film.write(side_by_side(step, name))
             report(min(step.index + 1, frames), frames)
-    cv2.imwrite(str(work / f"{name}.png"), stages.picture(name))
+    write_picture(work / f"{name}.png", stages.picture(name))
     return rows
 
 

@@ -43,6 +43,15 @@ def write_text(image: Image, text: str, at: Sequence[float] | Array, scale: floa
     cv2.putText(image, text, (u, v), font, scale, INK, 1, cv2.LINE_AA)
 
 
+def write_picture(path: Path, image: Image) -> None:
+    """Write an image as PNG.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
 def captioned(image: Image, text: str) -> Image:
     """An image with a caption below."""
     strip = np.full((STRIP_PX, image.shape[1], 3), PAPER, np.uint8)

@@ -139,17 +139,26 @@ class FilmWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Complete the film and give it its name; after an error, remove what there is."""
+        """Complete the film and give it its name; after an error, remove what there is.
+
+        Raises:
+            CotargetError: the film could not be completed, as on a full disk.
+        """
+        complete = False
         try:
             if kind is None and self._stream is not None:
                 self._container.mux(self._stream.encode(None))
-        finally:
-            with contextlib.suppress(av.error.FFmpegError):
                 self._container.close()
-        if kind is None and self._stream is not None:
-            self._part.replace(self._path)
-        else:
-            self._part.unlink(missing_ok=True)
+                complete = True
+        except (av.error.FFmpegError, OSError) as failed:
+            raise CotargetError(f"{self._path}: cannot be completed ({_reason(failed)})") from None
+        finally:
+            if complete:
+                self._part.replace(self._path)
+            else:
+                with contextlib.suppress(av.error.FFmpegError, OSError):
+                    self._container.close()
+                self._part.unlink(missing_ok=True)
 
 
 def join_films(parts: Sequence[Path], path: Path) -> None:

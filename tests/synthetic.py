@@ -10,8 +10,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from cotarget.calibration import Calibration, View
-from cotarget.config import DEFAULT_GAMMA, DEFAULT_T
 from cotarget.geometry import RigidTransform, Rotation, pose
+from cotarget.simconfig import DEFAULT_GAMMA, DEFAULT_T
 
 SIZE = (640, 480)
 

@@ -16,9 +16,10 @@ from cotarget.calibration import (
     save_calibration,
 )  # fmt: skip
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.config import DEFAULT_GAMMA, DEFAULT_T, BoardConfig
+from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.pantilt import HeadGeometry
+from cotarget.simconfig import DEFAULT_GAMMA, DEFAULT_T
 
 ROUNDING = 1e-15  # between radians and degrees, matrix and rotation vector
 

@@ -12,10 +12,11 @@ from cotarget.calibration.bundle import fit
 from cotarget.calibration.model import View
 from cotarget.calibration.reprojection import RigModel, predict, stepped
 from cotarget.camera import Intrinsics
-from cotarget.config import DEFAULT_GAMMA, DEFAULT_T, BoardConfig
+from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, ConfigError
 from cotarget.geometry import pose
 from cotarget.pantilt import HeadGeometry
+from cotarget.simconfig import DEFAULT_GAMMA, DEFAULT_T
 from tests.synthetic import SIZE, Truth, other_rig, pointing_errors, synthetic_views
 
 BOARD = BoardConfig()

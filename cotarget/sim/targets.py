@@ -12,9 +12,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from cotarget.config import Waypoint
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.simconfig import Waypoint
 
 if TYPE_CHECKING:
     import mujoco
