@@ -31,7 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     logging.basicConfig(level=logging.INFO if options.verbose else logging.WARNING, format="%(message)s")
     try:
-        return int(options.run(options) or 0)
+        status = int(options.run(options) or 0)
+        sys.stdout.flush()
+        return status
     except CotargetError as error:
         print(f"cotarget {options.command}: {error}", file=sys.stderr)
         return 1
@@ -73,7 +75,9 @@ def _parser() -> argparse.ArgumentParser:
     source = calibrate.add_mutually_exclusive_group(required=True)
     source.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml: drive that rig through a capture plan")
     source.add_argument("--from", type=Path, metavar="DIR", dest="source", help="captures taken earlier, or photos")
-    calibrate.add_argument("--out", type=Path, default=Path("calibration.json"), metavar="FILE")
+    calibrate.add_argument(
+        "--out", type=Path, default=Path("calibration.json"), metavar="FILE", help="what to write (calibration.json)"
+    )
     calibrate.add_argument("--captures", type=Path, metavar="DIR", help="with --rig: keep the images there")
     calibrate.add_argument("--fixed", metavar="GLOB", help="photos of the fixed camera, such as 'left*.jpg'")
     calibrate.add_argument(
@@ -83,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument("--square", type=_positive, metavar="M", help="side of a square [m]")
 
     aim = command("aim", _aim, "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout")
-    aim.add_argument("--calibration", type=Path, required=True, metavar="FILE")
+    aim.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
     aim.add_argument("--pixel", type=float, nargs=2, required=True, metavar=("U", "V"), help="in the fixed view [px]")
     how_far = aim.add_mutually_exclusive_group(required=True)
     how_far.add_argument("--depth", type=_positive, metavar="M", help="along the fixed camera's axis [m]")
@@ -97,7 +101,7 @@ def _parser() -> argparse.ArgumentParser:
 
     follow = command("follow", _follow, "follow a target with a calibrated rig")
     follow.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
-    follow.add_argument("--calibration", type=Path, required=True, metavar="FILE")
+    follow.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
     follow.add_argument("--target", required=True, metavar="NAME", help="a target of rig.toml")
     follow.add_argument("--seconds", type=_positive, default=20.0, metavar="S", help="for how long (20)")
     follow.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
@@ -133,9 +137,9 @@ def _calibrate(options: argparse.Namespace) -> None:
     from cotarget.rig import open_rig
     from cotarget.safety import SafeRig
 
+    _check_outputs([options.out], [options.rig, options.source and options.source / "index.json"])
     photos = {name: getattr(options, name) for name in ("fixed", "zoom", "board", "square")}
     given = [name for name, value in photos.items() if value is not None]
-    _check_folder(options.out)
     with _progress() as progress:
 
         def tell(done: int, total: int, text: str) -> None:
@@ -162,6 +166,11 @@ def _calibrate(options: argparse.Namespace) -> None:
             board = BoardConfig(corners=options.board, square=options.square)
             found = cal.calibrate_photos(options.source, options.fixed, options.zoom, board, progress=tell)
         else:
+            if not (options.source / "index.json").exists():
+                raise ConfigError(
+                    f"{options.source}: holds no index.json of captures; plain photos need --fixed, --zoom, --board "
+                    "and --square"
+                )
             found = cal.calibrate_captures(options.source, progress=tell)
         cal.save_calibration(options.out, found)
     residuals = found.residuals
@@ -261,9 +270,7 @@ def _follow(options: argparse.Namespace) -> None:
             f"{json.dumps([*config.sim.targets, options.target])}"
         )
     detector = make_detector(target, config.sim.fixed.rate_hz)
-    for path in (options.csv, options.video):
-        if path is not None:
-            _check_folder(path)
+    _check_outputs([options.csv, options.video], [options.rig, options.calibration, target.template])
     settings = FollowSettings(command_delay_s=config.command_delay_s)
     states: dict[str, int] = dict.fromkeys(State, 0)
     frames = math.ceil(options.seconds * config.sim.fixed.rate_hz)
@@ -288,9 +295,7 @@ def _detect(options: argparse.Namespace) -> None:
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
     target = config.target(options.target)
-    for path in (options.csv, options.video):
-        if path is not None:
-            _check_folder(path)
+    _check_outputs([options.csv, options.video], [options.film, options.rig, target.template])
     with _progress() as progress:
         found = run_on_film(
             options.film,
@@ -336,12 +341,19 @@ def _nothing() -> Any:
     yield None
 
 
-def _check_folder(path: Path) -> None:
-    """Refuse a result file that cannot be written, before the long work and not after it."""
-    if path.is_dir():
-        raise ConfigError(f"{path}: is a folder; name the file to write")
-    if not path.absolute().parent.is_dir():
-        raise ConfigError(f"{path}: its folder does not exist; create it first")
+def _check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None]) -> None:
+    """Refuse a result file that cannot be written, or that is an input too, before the long work and not after it."""
+    taken = {path.resolve() for path in inputs if path is not None}
+    for path in outputs:
+        if path is None:
+            continue
+        if path.is_dir():
+            raise ConfigError(f"{path}: is a folder; name the file to write")
+        if not path.absolute().parent.is_dir():
+            raise ConfigError(f"{path}: its folder does not exist; create it first")
+        if path.resolve() in taken:
+            raise ConfigError(f"{path}: is read or written for something else too; give another name for the result")
+        taken.add(path.resolve())
 
 
 def _positive(text: str) -> float:

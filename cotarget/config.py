@@ -163,7 +163,9 @@ def load_config(path: Path) -> RigConfig:
         name: dataclasses.replace(target, template=target.template and path.parent / target.template)
         for name, target in config.targets.items()
     }
-    return dataclasses.replace(config, targets=beside)
+    scene = path.parent / config.sim.scene
+    sim = dataclasses.replace(config.sim, scene=str(scene)) if scene.is_file() else config.sim
+    return dataclasses.replace(config, targets=beside, sim=sim)
 
 
 def parse_config(table: Mapping[str, Any]) -> RigConfig:
@@ -186,6 +188,10 @@ def parse_config(table: Mapping[str, Any]) -> RigConfig:
     return config
 
 
+# No effect of a real rig but the quality of the rendering, which `all` leaves alone.
+QUALITY = ("multisampling", "shadows")
+
+
 def _expand_all(effects: dict[str, Any]) -> dict[str, Any]:
     """Let ``all`` set every switch that is not named."""
     every = effects.pop("all", None)
@@ -193,7 +199,7 @@ def _expand_all(effects: dict[str, Any]) -> dict[str, Any]:
         return effects
     if not isinstance(every, bool):
         raise ConfigError(f"sim.effects.all: {every!r} is not true or false")
-    return {f.name: every for f in dataclasses.fields(SimEffects)} | effects
+    return {f.name: every for f in dataclasses.fields(SimEffects) if f.name not in QUALITY} | effects
 
 
 def _check_lens(where: str, camera: SimCamera) -> None:

@@ -23,15 +23,15 @@ from cotarget.drawing import (
     TargetStages,
     captioned,
     draw_frames,
-    plot_aim_error,
     side_by_side,
     write_picture,
 )
 from cotarget.errors import ConfigError
-from cotarget.judging import observe, pointing_errors
+from cotarget.judging import add_row, pointing_errors
 from cotarget.loop import FollowSettings, follow
 from cotarget.metrics import Row, Score, score, write_rows
 from cotarget.parallel import Report, run_side_by_side
+from cotarget.plots import plot_aim_error
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
@@ -170,7 +170,7 @@ def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, repo
         frames = round(RUN_S[name] * rate_hz)
         for step in follow(rig, calibration, target, detector, seconds=RUN_S[name], settings=settings):
             stages.see(step)
-            rows.append(observe(step, truth, name, target))
+            add_row(rows, step, truth, name, target)
             film.write(side_by_side(step, name))
             report(min(step.index + 1, frames), frames)
     write_picture(work / f"{name}.png", stages.picture(name))

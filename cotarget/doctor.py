@@ -80,9 +80,8 @@ def _rendering() -> Finding:
     if tried.returncode == 0:
         return Finding("rendering", True, f"without a screen by {tried.stdout.split()[-1]}")
     said = (tried.stderr.strip().splitlines() or [f"the test ended with status {tried.returncode}"])[-1]
-    fix = "apt-get install -y libegl1 libgl1-mesa-dri libgl1"
-    if os.environ.get("MUJOCO_GL", "egl") not in ("egl", "osmesa", "glfw"):
-        fix = "unset MUJOCO_GL"
+    chosen = os.environ.get("MUJOCO_GL", "egl")
+    fix = "apt-get install -y libegl1 libgl1-mesa-dri libgl1" if chosen == "egl" else "unset MUJOCO_GL"
     return Finding("rendering", False, said.split(": ", 1)[-1], fix)
 
 

@@ -6,14 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
-import matplotlib
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from cotarget.geometry import Array
 from cotarget.loop import State, Step
-from cotarget.metrics import Row
 from cotarget.rig import Image
 
 FOUND, FOLLOWED, CROSS, INK, PAPER, ARROW = (
@@ -28,6 +24,7 @@ STRIP_PX = 36  # height of a caption
 # For the picture "centred" the lens may have begun to zoom in by this factor.
 ZOOMED_OUT = 1.6
 AIM_AHEAD_S = 0.08  # an aim is for about this long after its step: the command's delay and a frame
+SIZE_KNOWN_S = 1.5  # a target that has just come in is still cut by the border, or not yet seen with wings spread
 RECENT_STEPS = 16  # states kept to tell what the lens was when a frame was exposed; more than any latency needs
 # For the close-up, lens (relative) and head (over the image's width) are this near to where they are wanted.
 SETTLED = 0.08
@@ -114,7 +111,7 @@ class TargetStages:
     def __init__(self, shortest_px: float) -> None:
         """Begin; ``shortest_px`` is the shortest nominal focal length."""
         self._shortest = shortest_px
-        self._largest, self._nearest = 0.0, math.inf
+        self._largest, self._nearest, self._since = 0.0, math.inf, math.inf
         self._recent: deque[Step] = deque(maxlen=RECENT_STEPS)
         self.before: Step | None = None
         self.centred: Step | None = None
@@ -131,6 +128,9 @@ class TargetStages:
             away = self._away_in_view()
             if away < self._nearest:
                 self._nearest, self.centred = away, step
+        self._since = min(self._since, step.t)
+        if step.t - self._since < SIZE_KNOWN_S:
+            return
         off_px = math.hypot(step.head.pan - step.aim.pan, step.head.tilt - step.aim.tilt) * step.lens.focal_px
         size = float(np.max(step.target.box.size_px))
         settled = abs(math.log(step.lens.focal_px / step.aim.nominal_px)) < SETTLED
@@ -189,23 +189,3 @@ def draw_frames(image: Image, origins_px: Mapping[str, Array]) -> Image:
     write_text(image, "{R0} zoom at home", zoom + np.array([14, -24]))
     write_text(image, "{O} base, {P} head", base + np.array([24, 6]))
     return image
-
-
-def plot_aim_error(path: Path, rows: Mapping[str, Sequence[Row]]) -> None:
-    """Draw the target's offset from the centre of the zoom image over time, one panel a target, into a PNG."""
-    with matplotlib.rc_context({"font.size": 9}):
-        figure = Figure(figsize=(8, 2.4 * len(rows)), layout="constrained")
-        FigureCanvasAgg(figure)
-        for ax, (name, run) in zip(np.atleast_1d(figure.subplots(len(rows), 1)), rows.items(), strict=True):
-            t = np.array([row.t_s for row in run])
-            offset = np.array([100 * row.tpo_px / row.width_px if row.inside else np.nan for row in run])
-            ax.plot(t, offset, lw=1.2, color="#1f6f8b")
-            out = np.array([not row.in_frame and row.in_wide for row in run])
-            ax.fill_between(t, 0, 50, where=out, color="#d9534f", alpha=0.15, lw=0, label="not in the close-up")
-            ax.set(ylim=(0, 50), xlim=(t[0], t[-1]), ylabel="offset [% of width]", title=name)
-            zoom = ax.twinx()
-            zoom.semilogy(t, [row.focal_px for row in run], lw=0.8, color="#999999")
-            zoom.set_ylabel("focal length [px]", color="#777777")
-            ax.legend(loc="upper right", frameon=False)
-        ax.set_xlabel("time [s]")
-        figure.savefig(path, dpi=110)

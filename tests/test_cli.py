@@ -110,6 +110,10 @@ def changed(command, *changes):
 
 
 MISTAKES = {
+    # results that would overwrite what they come from
+    "a rig as result": (changed([*FROM_RIG, "rig.toml"], "--out", "rig.toml"), ["rig.toml: is read or written"]),
+    "a calibration as table": ([*FOLLOW, "--csv", "good.json"], ["good.json: is read or written"]),
+    "one file for two results": ([*FOLLOW, "--csv", "out.csv", "--video", "out.csv"], ["out.csv: is read or written"]),
     # rig.toml
     "no rig": ([*FROM_RIG, "none.toml"], ["none.toml: no such file", "rig.toml"]),
     "a folder as rig": ([*FROM_RIG, "nothing"], ["nothing: is a directory"]),
@@ -135,7 +139,7 @@ MISTAKES = {
     "a single photo of each": ([*FROM, "single", *PHOTOS], ["1 usable views of the board; at least 3"]),
     "no photos": ([*FROM, "nothing", *PHOTOS], ["nothing: no file matches 'left*.png'"]),
     "no folder": ([*FROM, "none", *PHOTOS], ["none: no such folder"]),
-    "no captures": ([*FROM, "nothing"], ["index.json: no such file"]),
+    "no captures": ([*FROM, "nothing"], ["holds no index.json of captures"]),
     "a malformed index": ([*FROM, "index"], ["index.json: ", "board"]),
     "half an index": ([*FROM, "cut"], ["index.json: is not JSON"]),
     "a board that is no board": (changed([*FROM, "single", *PHOTOS], "--board", "9by6"), ["--board", "9by6", "9x6"]),

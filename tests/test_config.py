@@ -107,6 +107,13 @@ def test_a_missing_file_is_named(tmp_path):
         load_config(tmp_path)
 
 
+def test_a_scene_lies_beside_its_rig(tmp_path, monkeypatch):
+    (tmp_path / "own.xml").write_text("<mujoco/>")
+    (tmp_path / "rig.toml").write_text('[sim]\nscene = "own.xml"\n')
+    monkeypatch.chdir("/")
+    assert load_config(tmp_path / "rig.toml").sim.scene == str(tmp_path / "own.xml")
+
+
 def test_all_false_is_the_textbook():
     effects = parse_config({"sim": {"effects": {"all": False}}}).sim.effects
-    assert effects == SimEffects(**dict.fromkeys(SimEffects.__dataclass_fields__, False))
+    assert effects == SimEffects(**dict.fromkeys(SimEffects.__dataclass_fields__, False) | {"multisampling": True})

@@ -168,6 +168,10 @@ def pair_photos(directory: Path, fixed_glob: str, zoom_glob: str) -> tuple[list[
         "fixed": _numbered(directory, fixed_glob),
         "zoom": _numbered(directory, zoom_glob),
     }
+    if twice := sorted(set(found["fixed"].values()) & set(found["zoom"].values())):
+        raise CalibrationError(
+            f"{directory}: {twice[0]} matches both '{fixed_glob}' and '{zoom_glob}'; tell them apart"
+        )
     both = sorted(found["fixed"].keys() & found["zoom"].keys())
     captures = [
         Capture(NO_IMAGE, camera, number, source=names[number]) for camera, names in found.items() for number in both

@@ -37,7 +37,10 @@ def scene_path(scene: str) -> Path:
     if (path := Path(scene)).is_file():
         return path
     names = (p.stem for p in (assets_dir() / "scenes").glob("*.xml"))
-    raise ConfigError(f"unknown scene '{scene}'; the scenes are: {choices(names)}, or give the path of an MJCF file")
+    raise ConfigError(
+        f"unknown scene '{scene}'; the scenes are: {choices(names)}, or give the path of an MJCF file"
+        " beside the rig.toml"
+    )
 
 
 def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tuple[int, int]) -> "mujoco.MjModel":

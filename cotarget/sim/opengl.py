@@ -8,7 +8,11 @@ from cotarget.errors import DeviceError
 
 __all__ = ["BACKEND", "make_renderer", "mujoco"]
 
-INSTALL = "install one: apt-get install -y libegl1 libgl1-mesa-dri libgl1"
+INSTALL = {
+    "egl": "install it: apt-get install -y libegl1 libgl1-mesa-dri libgl1",
+    "osmesa": "install it: apt-get install -y libosmesa6, or unset MUJOCO_GL",
+}
+OTHERWISE = "unset MUJOCO_GL to render without a screen"
 
 
 def choose_backend() -> str:
@@ -30,7 +34,9 @@ try:
 except RuntimeError as error:
     raise DeviceError(f"MUJOCO_GL={BACKEND}: {error}; unset MUJOCO_GL, or set it to egl, osmesa or glfw") from None
 except (ImportError, AttributeError, OSError) as error:
-    raise DeviceError(f"no OpenGL library for rendering without a screen ({BACKEND}): {error}; {INSTALL}") from None
+    raise DeviceError(
+        f"no OpenGL library for rendering without a screen ({BACKEND}): {error}; {INSTALL.get(BACKEND, OTHERWISE)}"
+    ) from None
 
 
 def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.Renderer":
@@ -44,5 +50,5 @@ def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.R
     except Exception as error:  # PyOpenGL and the backends raise whatever they meet
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise DeviceError(
-            f"OpenGL ({BACKEND or 'default'}) cannot render without a screen: {reason}; {INSTALL}"
+            f"OpenGL ({BACKEND}) cannot render without a screen: {reason}; {INSTALL.get(BACKEND, OTHERWISE)}"
         ) from None
