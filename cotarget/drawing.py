@@ -153,22 +153,34 @@ class TargetStages:
         return float(np.hypot(pan - wanted_pan, tilt - wanted_tilt))
 
     def picture(self, title: str) -> Image:
-        """The wide view with its detection and the zoom view before, centred and close up, as in Fig. 4 to 6."""
+        """Both views of a target in six panels, as in Fig. 4 to 6: found, before, centred, close up."""
         missing = next(s for s in (self.close, self.centred, self.before) if s is not None)
         before, centred, close = self.before or missing, self.centred or missing, self.close or missing
-        wide = close if self.close else missing
-        panels = [
-            captioned(draw_wide(wide), f"(a) {title}: wide view and detection"),
-            captioned(before.zoom.image, "(b) zoom view before"),
-            captioned(draw_zoom(centred), "(c) zoom view, turned to the target"),
-            captioned(draw_zoom(close), f"(d) close-up at {close.lens.focal_px:.0f} px"),
+        mask = np.zeros(close.fixed.image.shape[:2], np.uint8) if close.mask is None else close.mask
+        rows = [
+            (draw_wide(close), f"(a) {title}: wide view and detection"),
+            (cv2.cvtColor(mask, cv2.COLOR_GRAY2BGR), "(b) what the detector marked in it"),
+            (before.zoom.image, "(c) zoom view before"),
+            (draw_zoom(centred), "(d) zoom view, turned to the target"),
+            (self._enlarged(close), "(e) the wide view enlarged as much as the close-up"),
+            (draw_zoom(close), f"(f) close-up at {close.lens.focal_px:.0f} px"),
         ]
-        if wide.mask is not None:
-            mask = captioned(cv2.cvtColor(wide.mask, cv2.COLOR_GRAY2BGR), "(a') what the detector found in it")
-            panels[1:1] = [mask]
-        blank = np.full_like(panels[0], PAPER)
-        panels += [blank] * (len(panels) % 2)
+        panels = [captioned(np.asarray(image, np.uint8), text) for image, text in rows]
         return np.vstack([np.hstack(panels[i : i + 2]) for i in range(0, len(panels), 2)])
+
+    def _enlarged(self, step: Step) -> Image:
+        """What the wide view alone has of the target, at the close-up's scale (both lenses being alike when short)."""
+        image = step.fixed.image
+        if step.target is None:
+            return image
+        h, w = image.shape[:2]
+        part = (
+            max(2, round(w * self._shortest / step.lens.focal_px)),
+            max(2, round(h * self._shortest / step.lens.focal_px)),
+        )
+        u, v = step.target.center_px
+        cut = cv2.getRectSubPix(image, part, (float(u), float(v)))
+        return np.asarray(cv2.resize(cut, (w, h), interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
 def draw_frames(image: Image, origins_px: Mapping[str, Array]) -> Image:
