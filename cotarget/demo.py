@@ -47,6 +47,7 @@ POINTING_STREAM = 4  # of random numbers, apart from the world's own
 FRONT_DEG, BACK_DEG = -62.0, 118.0  # directions of the two pictures of the rig
 
 UNFINISHED = ".unfinished-"  # begins the name of the folder that a run works in
+ABANDONED_S = 3600.0  # such a folder that has not changed for so long is of a run that was killed
 
 Progress = Callable[[str, int, int], None]
 
@@ -107,8 +108,9 @@ def finished_together(out: Path) -> Iterator[Path]:
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for left in out.glob(f"{UNFINISHED}*"):  # of a run that was killed
-            shutil.rmtree(left, ignore_errors=True)
+        for left in out.glob(f"{UNFINISHED}*"):
+            if time.time() - left.stat().st_mtime > ABANDONED_S:
+                shutil.rmtree(left, ignore_errors=True)
         work = TemporaryDirectory(dir=out, prefix=UNFINISHED)
     except OSError as error:
         raise ConfigError(f"{out}: cannot be written to: {error.strerror}; name a folder that can") from None
