@@ -128,6 +128,15 @@ def aim(calibration, x_fixed):
     raise AssertionError(f"no pan and tilt found for {x_fixed}")
 
 
+def undistorted(pixel, lens):
+    """OpenCV's undistorted image-plane coordinates of one pixel, iterated to rounding, (2,)."""
+    ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
+    given = np.reshape(pixel, (1, 1, 2)).astype(float), lens.K, np.array(lens.distortion), None, None
+    if hasattr(cv2, "undistortPointsIter"):  # OpenCV 4 has the criteria in a function of their own
+        return np.ravel(cv2.undistortPointsIter(*given, ends))
+    return np.ravel(cv2.undistortPoints(*given, None, ends))
+
+
 def pointing_errors(calibration: Calibration, truth: Truth, rng, count=200):
     """Angles between where the true zoom camera looks and the true target [degrees], (count,).
 
@@ -142,21 +151,8 @@ def pointing_errors(calibration: Calibration, truth: Truth, rng, count=200):
     for _ in range(count):
         pixel = rng.uniform([0, 0], np.array(SIZE) - 1.0)
         depth = np.exp(rng.uniform(np.log(4), np.log(30)))
-        xy = (
-            cv2.undistortPointsIter(
-                pixel.reshape(1, 1, 2),
-                truth.fixed.K,
-                np.array(truth.fixed.distortion),
-                None,
-                None,
-                (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12),
-            )
-            if hasattr(cv2, "undistortPointsIter")
-            else cv2.undistortPoints(
-                pixel.reshape(1, 1, 2), truth.fixed.K, np.array(truth.fixed.distortion), None, None
-            )
-        )
-        x_true = np.array([*np.ravel(xy), 1.0]) * depth
+        xy = undistorted(pixel, truth.fixed)
+        x_true = np.array([*xy, 1.0]) * depth
         x_believed = calibration.fixed.ray(pixel) * depth
         q = aim(calibration, x_believed)
         x = truth.in_zoom(x_true[None], *q)[0]

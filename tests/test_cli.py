@@ -17,7 +17,7 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig, RigConfig
 from cotarget.geometry import pose
 from cotarget.pantilt import HeadGeometry
-from tests.synthetic import Truth
+from tests.synthetic import Truth, undistorted
 from tests.synthetic_rig import draw, pixel_rays
 
 OLD = "what was there before\n"
@@ -275,9 +275,7 @@ def test_aim_tells_json_with_the_documented_keys(folder, capsys):
     assert told["predicted_error_px"] == pytest.approx(math.tan(math.radians(budget["total"])) * 692)
     # By written-out matrices and OpenCV: the point is then in the middle of the zoom image.
     truth = Truth()
-    ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-14)
-    distortion = np.array(truth.fixed.distortion)
-    xy = cv2.undistortPoints(np.array([[[500.0, 240.0]]]), truth.fixed.K, distortion, None, None, None, ends)[0, 0]
+    xy = undistorted((500.0, 240.0), truth.fixed)
     pan, tilt = math.radians(told["pan_deg"]), math.radians(told["tilt_deg"])
     x_zoom = truth.in_zoom(10 * np.array([[*xy, 1.0]]), pan, tilt)
     np.testing.assert_allclose(truth.zoom.project(x_zoom)[0], [319.5, 239.5], rtol=0, atol=PIXEL)
