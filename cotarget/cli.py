@@ -116,6 +116,11 @@ def _parser() -> argparse.ArgumentParser:
     detect.add_argument("--video", type=Path, metavar="OUT", help="write the film with the tracks drawn (.mp4)")
     detect.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml, for targets of your own")
 
+    board = command("board", _board, "write a calibration board to print, to scale")
+    board.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .pdf, .svg or .png")
+    board.add_argument("--board", type=_corners, default=(9, 6), metavar="CxR", help="inner corners (9x6)")
+    board.add_argument("--square", type=_positive, default=0.025, metavar="M", help="side of a square [m] (0.025)")
+
     command("doctor", _doctor, "versions, rendering, and for each thing that is missing the command that fixes it")
     return parser
 
@@ -305,6 +310,18 @@ def _detect(options: argparse.Namespace) -> None:
             lambda done, total: progress(f"detecting: {options.target}", done, total or done),
         )
     print(json.dumps(dataclasses.asdict(found), indent=2))
+
+
+def _board(options: argparse.Namespace) -> None:
+    from cotarget.calibration.printing import print_board
+    from cotarget.config import BoardConfig
+
+    _check_outputs([options.out], [])
+    width, height = print_board(options.out, BoardConfig(corners=options.board, square=options.square))
+    print(
+        f"{options.out}: {1000 * width:.1f} x {1000 * height:.1f} mm with its white border; print it at 100 %, stick it"
+    )
+    print("on something flat, and measure ten squares before you trust it")
 
 
 def _doctor(options: argparse.Namespace) -> int:

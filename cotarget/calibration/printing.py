@@ -1,0 +1,65 @@
+"""A board to print, to scale."""
+
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from cotarget.calibration.atomic import write_atomically
+from cotarget.calibration.boards import check_board
+from cotarget.config import BoardConfig
+from cotarget.errors import ConfigError, choices
+
+METRES_PER_INCH = 0.0254
+MARGIN = 1.0  # white border, in squares; the corner finder needs about half of one
+DOTS_PER_INCH = 300
+SUFFIXES = (".pdf", ".png", ".svg")
+# A page beyond this is a mistake of units, and a PNG of it would not fit into memory [m].
+LARGEST = 5.0
+
+
+def print_board(path: Path, board: BoardConfig) -> tuple[float, float]:
+    """Write a board to scale, as PDF, SVG, or a PNG of 300 dots an inch that carries its size.
+
+    Args:
+        path: where to; the suffix chooses the format.
+        board: its inner corners and the side of a square.
+
+    Returns:
+        Width and height of the page, white border included [m].
+
+    Raises:
+        ConfigError: an unknown suffix, a board that looks the same upside down, or one larger than 5 m.
+        CalibrationError: the file cannot be written.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"{path}: cannot be drawn as '{path.suffix}'; the formats are: {choices(SUFFIXES)}")
+    check_board(board)
+    columns, rows = (n + 1 for n in board.corners)
+    width, height = ((n + 2 * MARGIN) * board.square for n in (columns, rows))
+    if max(width, height) > LARGEST:
+        raise ConfigError(
+            f"a board of {width:g} x {height:g} m is larger than {LARGEST:g} m; squares are given in metres"
+        )
+    figure = Figure(figsize=(width / METRES_PER_INCH, height / METRES_PER_INCH), dpi=DOTS_PER_INCH)
+    FigureCanvasAgg(figure)
+    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    ax.set(xlim=(-MARGIN, columns + MARGIN), ylim=(rows + MARGIN, -MARGIN))
+    ax.axis("off")
+    for column in range(columns):
+        for row in range(column % 2, rows, 2):  # the square outside the first corner is black
+            ax.add_patch(Rectangle((column, row), 1, 1, color="black", linewidth=0, snap=False))
+    told = (
+        f"{board.corners[0]} x {board.corners[1]} inner corners, squares of {1000 * board.square:g} mm: print at 100 %"
+    )
+    ax.text(columns / 2, rows + MARGIN / 2, told, ha="center", va="center", fontsize=board.square * 300)
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        figure.savefig(part, dpi=DOTS_PER_INCH)
+        write_atomically(path, part.read_bytes())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
+    finally:
+        part.unlink(missing_ok=True)
+    return width, height

@@ -1,0 +1,51 @@
+"""A printed board: its size on paper, and that the finder reads it as the board it is."""
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.calibration.boards import find_corners
+from cotarget.calibration.printing import print_board
+from cotarget.config import BoardConfig
+from cotarget.errors import ConfigError
+
+BOARD = BoardConfig(corners=(7, 4), square=0.02)
+PIXELS_PER_SQUARE = 0.02 / 0.0254 * 300
+CORNER_PX = 0.2  # 0.02 mm on paper: edges within a pixel are drawn in few levels, and the finder errs too
+
+
+def test_a_pdf_has_the_size_it_says(tmp_path):
+    """8 x 5 squares of 20 mm with a square of border: 200 x 140 mm, in points of 1/72 inch."""
+    assert print_board(tmp_path / "board.pdf", BOARD) == pytest.approx((0.2, 0.14))
+    box = re.search(rb"/MediaBox \[ *([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+)", (tmp_path / "board.pdf").read_bytes())
+    points = [float(v) for v in box.groups()]
+    assert points == pytest.approx([0, 0, 200 / 25.4 * 72, 140 / 25.4 * 72], abs=0.01)
+
+
+def test_a_png_is_read_as_the_board_it_is(tmp_path):
+    print_board(tmp_path / "board.png", BOARD)
+    image = cv2.imread(str(tmp_path / "board.png"))
+    corners = find_corners(image, BOARD)
+    assert corners is not None
+    u, v = np.meshgrid(np.arange(7), np.arange(4))
+    expected = np.stack([u, v], axis=-1).reshape(-1, 2) * PIXELS_PER_SQUARE
+    # Where the page begins is cut to whole pixels; how far the corners are apart is not.
+    np.testing.assert_allclose(corners - corners[0], expected, atol=CORNER_PX)
+    np.testing.assert_allclose(corners[0], 2 * PIXELS_PER_SQUARE - 0.5, atol=1.0)
+    assert [p.name for p in tmp_path.iterdir()] == ["board.png"]
+
+
+@pytest.mark.parametrize(
+    ("name", "board", "said"),
+    [
+        ("board.doc", BOARD, "cannot be drawn as '.doc'; the formats are: .pdf, .png, .svg"),
+        ("board.pdf", BoardConfig(corners=(6, 6)), "looks the same upside down"),
+        ("board.pdf", BoardConfig(corners=(9, 6), square=25.0), "larger than 5 m; squares are given in metres"),
+    ],
+)
+def test_what_cannot_be_printed_is_said(tmp_path, name, board, said):
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        print_board(tmp_path / name, board)
+    assert not list(tmp_path.iterdir())
