@@ -268,7 +268,6 @@ def _follow(options: argparse.Namespace) -> None:
     config = load_config(options.rig)
     target = config.target(options.target)
     calibration = load_calibration(options.calibration)
-    calibration = calibration.for_streams(config.sim.fixed.size, config.sim.zoom.size)
     if config.backend == "sim" and options.target not in config.sim.targets:
         raise ConfigError(
             f"{options.rig}: the simulated scene has no {options.target}; add it: [sim] targets = "

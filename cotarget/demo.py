@@ -28,13 +28,12 @@ from cotarget.drawing import (
 )
 from cotarget.errors import ConfigError
 from cotarget.judging import add_row, pointing_errors
-from cotarget.loop import FollowSettings, follow
+from cotarget.loop import FollowSettings, follow, reach_of
 from cotarget.metrics import Row, Score, score, write_rows
 from cotarget.parallel import Report, run_side_by_side
 from cotarget.plots import plot_aim_error
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
-from cotarget.targeting import Reach
 from cotarget.video import FilmWriter, join_films
 
 SCENES = {"book": "indoor", "person": "indoor", "bird": "outdoor"}
@@ -120,12 +119,6 @@ def finished_together(out: Path) -> Iterator[Path]:
             path.replace(out / path.name)
 
 
-def reach_of(world: SimWorld) -> Reach:
-    """What the head and the lens of a simulated rig can do."""
-    limits = world.rig.head.limits
-    return Reach(limits.pan, limits.tilt, world.rig.zoom.focal_range, step=limits.step)
-
-
 def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> tuple[Calibration, dict[str, float]]:
     """Calibrate from rendered boards; judge it by the truth, which it cannot see; picture the rig."""
     world = SimWorld(config)
@@ -142,7 +135,7 @@ def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> 
             pointing_errors(
                 calibration,
                 world.truth(),
-                reach_of(world),
+                reach_of(rig),
                 np.random.default_rng((seed, POINTING_STREAM)),
                 POINTING_TARGETS,
             )

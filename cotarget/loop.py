@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from cotarget.calibration import Calibration
 from cotarget.config import TargetConfig
 from cotarget.detection import Detection, Detector
-from cotarget.errors import CalibrationError, UnreachableError
+from cotarget.errors import UnreachableError
 from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, Rig, ZoomState
 from cotarget.targeting import Aim, Closeup, Reach, aim, depth_of, point_at
 from cotarget.tracking import FirstCome, Track, Tracker, settings_for, size_for
@@ -112,8 +112,7 @@ def follow(
         ConfigError: the calibration is of another aspect ratio than the rig's streams.
         StaleFrameError: frames stopped coming, or came too late to act on.
     """
-    if calibration.T_head_zoom is None:
-        raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
+    calibration.hand_eye()  # refused now, and not when the first target is seen
     calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
     tracker, policy = Tracker(settings_for(target), rig.fixed.size), FirstCome()
     state = rig.head.state()
@@ -205,8 +204,7 @@ def lead(
     Raises:
         UnreachableError: no pan and tilt within the limits do it.
     """
-    limits, head = rig.head.limits, rig.head.state()
-    reach = Reach(limits.pan, limits.tilt, rig.zoom.focal_range, (head.pan, head.tilt), limits.step)
+    limits, reach = rig.head.limits, reach_of(rig)
     closeup = Closeup(target.size, target.wanted_px, target.dimension == "height")
     upright = bool(track.size_px[1] > track.size_px[0])
     depth = depth_of(calibration, target, size_for(track, target.dimension), track.center_px, upright=upright)
@@ -220,10 +218,17 @@ def lead(
         goal + stopping_distance(rate, limits) for goal, rate in zip((after.pan, after.tilt), rates, strict=True)
     )
     # Where the target is now lies one delay back from where it will be when the command takes effect.
+    pan_now, tilt_now = reach.now
     way = math.hypot(
-        at_effect.pan - rates[0] * command_delay_s - head.pan, at_effect.tilt - rates[1] * command_delay_s - head.tilt
+        at_effect.pan - rates[0] * command_delay_s - pan_now, at_effect.tilt - rates[1] * command_delay_s - tilt_now
     )
     return Lead(dataclasses.replace(after, pan=pan, tilt=tilt), way)
+
+
+def reach_of(rig: Rig) -> Reach:
+    """What a rig's head and lens can do, and where the head is."""
+    limits, head = rig.head.limits, rig.head.state()
+    return Reach(limits.pan, limits.tilt, rig.zoom.focal_range, (head.pan, head.tilt), limits.step)
 
 
 def stopping_distance(rate: float, limits: PanTiltLimits) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from cotarget.calibration import Calibration, predicted_pointing
 from cotarget.camera import depth_from_size, focal_for_size
 from cotarget.config import TargetConfig
-from cotarget.errors import CalibrationError, UnreachableError
+from cotarget.errors import UnreachableError
 from cotarget.geometry import Array
 from cotarget.pantilt import Pointing, nearest, shortcut, solve
 
@@ -136,9 +136,7 @@ def aim(
         CalibrationError: the calibration has no T.
         UnreachableError: no pan and tilt within the limits do it.
     """
-    T_head_zoom = calibration.T_head_zoom
-    if T_head_zoom is None:
-        raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
+    T_head_zoom = calibration.hand_eye()
     x_base = T_head_zoom.apply(calibration.T_zoom0_fixed.apply(x_fixed))  # (6)
     wanted = calibration.zoom.stops[0].image_center_px if pixel is None else np.asarray(pixel, dtype=float)
     nominal, limited = _limit(reach.focal_px[0] if nominal_px is None else nominal_px, reach)
@@ -217,9 +215,8 @@ def _limit(nominal_px: float, reach: Reach) -> tuple[float, bool]:
 
 def _paper(calibration: Calibration, x_fixed: Array, method: Method, reach: Reach) -> Pointing:
     """The paper's shortcut as one reachable solution."""
-    assert calibration.T_head_zoom is not None
     reading: Literal["table", "example"] = "table" if method == "paper-table" else "example"
-    found = shortcut(x_fixed, calibration.T_zoom0_fixed, calibration.T_head_zoom, reading)
+    found = shortcut(x_fixed, calibration.T_zoom0_fixed, calibration.hand_eye(), reading)
     if not np.isfinite(found.pan):
         raise UnreachableError("the paper's shortcut has no solution for this point; use the exact method")
     both = Pointing(np.atleast_1d(found.pan), np.atleast_1d(found.tilt), np.atleast_1d(found.range))

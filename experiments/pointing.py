@@ -27,9 +27,10 @@ from cotarget.calibration import Calibration, calibrate_rig
 from cotarget.config import RigConfig, SimConfig
 from cotarget.geometry import RigidTransform, pose
 from cotarget.judging import pointing_errors
+from cotarget.loop import reach_of
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
-from cotarget.targeting import Method, Reach
+from cotarget.targeting import Method
 
 RIGS = {
     "default": SimConfig(scene="indoor"),
@@ -68,8 +69,7 @@ def run(settings: Settings) -> list[dict[str, Any]]:
         world = SimWorld(config)
         with SafeRig(world.rig, config.safety) as opened:
             calibration = calibrate_rig(opened, config.board, seed=seed)
-            limits = opened.head.limits
-            reach = Reach(limits.pan, limits.tilt, opened.zoom.focal_range)
+            reach = reach_of(opened)
             for model, (method, ignoring) in MODELS.items():
                 judged = without_offsets(calibration) if ignoring else calibration
                 rng = np.random.default_rng((seed, STREAM))
@@ -89,12 +89,10 @@ def run(settings: Settings) -> list[dict[str, Any]]:
 
 def without_offsets(calibration: Calibration) -> Calibration:
     """The model of those who ignore where the cameras are: the same rotations, everything in one place."""
-    T = calibration.T_head_zoom
-    assert T is not None
     return dataclasses.replace(
         calibration,
         T_zoom0_fixed=RigidTransform.from_rotation(calibration.T_zoom0_fixed.rotation),
-        T_head_zoom=RigidTransform.from_rotation(T.rotation),
+        T_head_zoom=RigidTransform.from_rotation(calibration.hand_eye().rotation),
     )
 
 

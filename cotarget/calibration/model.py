@@ -8,6 +8,7 @@ import numpy as np
 
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
+from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
 from cotarget.pantilt import IDEAL_HEAD, HeadGeometry
 from cotarget.rig import Image
@@ -153,6 +154,16 @@ class Calibration:
     board: BoardConfig | None = None
     views: tuple[View, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def hand_eye(self) -> RigidTransform:
+        """T_head_zoom, for those who cannot do without.
+
+        Raises:
+            CalibrationError: there was no head to calibrate.
+        """
+        if self.T_head_zoom is None:
+            raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
+        return self.T_head_zoom
 
     def for_streams(self, fixed_size: tuple[int, int], zoom_size: tuple[int, int]) -> "Calibration":
         """The same calibration for streams (width, height) [px] that are scaled.

@@ -96,11 +96,10 @@ def line_of_sight_covariance(
     Raises:
         CalibrationError: the calibration has no covariance, or an unusable one, or no T.
     """
-    covariance, hand = calibration.covariance, calibration.T_head_zoom
+    covariance = calibration.covariance
     if covariance is None:
         raise CalibrationError("this calibration has no covariance; calibrate again, with the last refinement")
-    if hand is None:
-        raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
+    hand = calibration.hand_eye()
     known = parameter_names(ALL_BLOCKS)
     if unknown := [name for name in covariance.parameters if name not in known]:
         raise CalibrationError(f"covariance.parameters: '{unknown[0]}' is no parameter; they are: {', '.join(known)}")

@@ -115,18 +115,10 @@ class Truth:
 
     def silhouette(self, name: str, camera: CameraName, t: float) -> Silhouette | None:
         """A target's outline in a camera at time t; None if any of it is behind the camera, or beyond its lens."""
-        data = self.set_state(t)
-        T_camera_world = self._body_pose(data, camera).inv()
-        lens = self.lens(camera, t)
-        outlines = []
-        for geom, points in self._surface(name):
-            x_world = points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
-            x_camera = T_camera_world.apply(x_world)
-            if x_camera[:, 2].min() <= 0:
-                return None
-            outlines.append(lens.project(x_camera))
+        data, lens = self.set_state(t), self.lens(camera, t)
+        outlines = self._outlines(name, data, self._body_pose(data, camera).inv(), lens)
         everything = np.concatenate(outlines)
-        if not np.isfinite(everything).all():  # further off the axis than the lens can see
+        if not np.isfinite(everything).all():
             return None
         low, high = everything.min(axis=0), everything.max(axis=0)
         inside = _fraction_inside(outlines, low, high, lens.size)
@@ -143,14 +135,18 @@ class Truth:
             for joint, angle in target.pose(t + phase).joints.items():
                 data.joint(f"{name}/{joint}").qpos[0] = angle
             mujoco.mj_kinematics(self.model, data)
-            pixels = np.concatenate(
-                [
-                    lens.project(T_camera_world.apply(points @ data.geom_xmat[g].reshape(3, 3).T + data.geom_xpos[g]))
-                    for g, points in self._surface(name)
-                ]
-            )
+            pixels = np.concatenate(self._outlines(name, data, T_camera_world, lens))
             sides.append(np.max(pixels.max(axis=0) - pixels.min(axis=0)))
         return float(np.max(sides))
+
+    def _outlines(
+        self, name: str, data: "mujoco.MjData", T_camera_world: RigidTransform, lens: TrueLens
+    ) -> list[Array]:
+        """Pixels of the points on each of a target's geoms, (n, 2) each; nan behind the camera or beyond its lens."""
+        return [
+            lens.project(T_camera_world.apply(points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]))
+            for geom, points in self._surface(name)
+        ]
 
     def _body_pose(self, data: "mujoco.MjData", body: str) -> RigidTransform:
         found = data.body(RIG + body)
