@@ -11,9 +11,12 @@ from cotarget.calibration.captures import INDEX, NO_IMAGE, CaptureIndex, file_na
 from cotarget.calibration.model import Capture, Rejected, View
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, DeviceError
-from cotarget.geometry import RigidTransform
+from cotarget.geometry import RigidTransform, Rotation
 from cotarget.rig import Rig
 
+# Wishes are rounded to 0.1 mm and 0.1 mrad. Nobody holds a board better; and the fits behind a plan sum in an order
+# that varies with the threads: their last digits would otherwise make two runs with the same seed drift apart.
+WISH_DECIMALS = 4
 SETTLE = 0.05  # after a stop, for vibrations and for an exposure that had begun before [s]
 POLL = 0.02  # between looks at a state [s]
 FRAME_TIMEOUT = 5.0  # a slow network camera's latency, several times [s]
@@ -72,7 +75,11 @@ class Recorder:
     def present(self, T_fixed_board: RigidTransform) -> int:
         """Ask for the board at a pose, as a new placement; its number."""
         self.save_index()
-        self.rig.board.present(T_fixed_board)
+        wish = RigidTransform.from_components(
+            np.round(T_fixed_board.translation, WISH_DECIMALS),
+            Rotation.from_rotvec(np.round(T_fixed_board.rotation.as_rotvec(), WISH_DECIMALS)),
+        )
+        self.rig.board.present(wish)
         self._still_since = max(self._still_since, self.rig.clock.now() + SETTLE)
         self.number += 1
         return self.number
@@ -85,7 +92,7 @@ class Recorder:
         """
         head, clock = self.rig.head, self.rig.clock
         before = head.state()
-        wanted = head.move(pan, tilt, wait=True)
+        wanted = head.move(round(pan, WISH_DECIMALS), round(tilt, WISH_DECIMALS), wait=True)
         way = max(abs(wanted[0] - before.pan), abs(wanted[1] - before.tilt))
         limits = head.limits
         deadline = clock.now() + way / limits.speed + limits.speed / limits.acceleration + HEAD_PATIENCE
