@@ -42,7 +42,7 @@ __all__ = [
 class BoardConfig:
     """The calibration board: inner corners (columns, rows) and the side of a square [m]."""
 
-    kind: Literal["chessboard"] = "chessboard"
+    kind: Literal["chessboard", "charuco"] = "chessboard"
     corners: Size = (9, 6)
     square: float = 0.1
 
@@ -188,6 +188,10 @@ def parse_config(table: Mapping[str, Any]) -> RigConfig:
     return config
 
 
+# The curves of the zoom lens are checked at this many focal lengths.
+CHECKED_FOCALS = 33
+# Farther than any lens is long: an entrance pupil that moves so far was given in millimetres [m].
+FARTHEST_PUPIL = 1.0
 # No effect of a real rig but the quality of the rendering, which `all` leaves alone.
 QUALITY = ("multisampling", "shadows")
 
@@ -202,18 +206,45 @@ def _expand_all(effects: dict[str, Any]) -> dict[str, Any]:
     return {f.name: every for f in dataclasses.fields(SimEffects) if f.name not in QUALITY} | effects
 
 
+def _sees_nothing(lens: Intrinsics) -> bool:
+    """Whether part of the image has no ray."""
+    w, h = lens.size
+    rim = np.array([(u, v) for u in np.linspace(-1, w, 9) for v in np.linspace(-1, h, 9)])
+    return not np.isfinite(lens.ray(rim)).all()
+
+
 def _check_lens(where: str, camera: SimCamera) -> None:
     """Refuse a lens through which part of the image sees nothing."""
-    (w, h), focal = camera.size, camera.focal_px
-    if min(*camera.size, *focal) <= 0:
+    if min(*camera.size, *camera.focal_px) <= 0:
         return  # said elsewhere
-    rim = np.array([(u, v) for u in np.linspace(-1, w, 9) for v in np.linspace(-1, h, 9)])
-    lens = Intrinsics(camera.size, focal, camera.center_px, camera.distortion)
-    if not np.isfinite(lens.ray(rim)).all():
+    if _sees_nothing(Intrinsics(camera.size, camera.focal_px, camera.center_px, camera.distortion)):
         raise ConfigError(
             f"{where}.distortion: {list(camera.distortion)} folds back inside the image, so that parts of it see "
             "nothing; give a weaker distortion, a longer focal_px or a smaller size"
         )
+
+
+def _check_optics(zoom: SimZoomCamera) -> None:
+    """Refuse a zoom lens whose curves no real lens follows."""
+    shortest_mm, longest_mm = zoom.focal_mm
+    before = 0.0
+    for magnification in np.geomspace(1.0, longest_mm / shortest_mm, CHECKED_FOCALS).tolist():
+        optics, at = zoom.optics_at(magnification), f"at {magnification:.3g} times the shortest focal length"
+        focal = optics.focal_px[0]
+        if not before < focal < math.inf:
+            raise ConfigError(f"sim.zoom.focal_curve: the true focal length does not grow with the nominal one {at}")
+        before = focal
+        drift = np.abs(np.subtract(optics.center_px, zoom.center_px))
+        if not (drift < zoom.size).all():
+            raise ConfigError(f"sim.zoom.center_drift_px: moves the centre by the whole image or more {at}")
+        if not abs(optics.pupil) < FARTHEST_PUPIL:
+            raise ConfigError(f"sim.zoom.pupil: {optics.pupil:g} m {at} is {FARTHEST_PUPIL:g} m or more; give metres")
+        lens = Intrinsics(zoom.size, optics.focal_px, optics.center_px, optics.distortion)
+        if not np.isfinite(optics.distortion).all() or _sees_nothing(lens):
+            raise ConfigError(
+                f"sim.zoom.distortion_drift: the distortion folds back inside the image {at}, so that parts of it see "
+                "nothing; give smaller coefficients"
+            )
 
 
 def _overlap(own: Pair, soft: Pair | None, where: str) -> Pair:
@@ -271,6 +302,8 @@ def _check(config: RigConfig) -> None:
             raise ConfigError(f"{where}: {list(limits)} is not [lowest, highest]")
     if sim.zoom.focal_mm[0] <= 0:
         raise ConfigError(f"sim.zoom.focal_mm: {sim.zoom.focal_mm[0]:g} is not greater than zero")
+    if sim.effects.optics:
+        _check_optics(sim.zoom)
     if sim.zoom.lens_steps < 2:
         raise ConfigError(f"sim.zoom.lens_steps: {sim.zoom.lens_steps} is fewer than 2")
     if config.safety.speed_deg_s is not None and config.safety.speed_deg_s <= 0:

@@ -147,16 +147,18 @@ def pointing_errors(
     rng: np.random.Generator,
     count: int,
     method: Method = "exact",
+    nominal_px: float | None = None,
 ) -> Array:
     """Pointing error of a calibration: pixel and depth given exactly, before rounding to steps.
 
     Args:
         calibration: to be judged.
         truth: of the simulated world that it is of.
-        reach: limits of head and lens; the shortest focal length is used.
+        reach: limits of head and lens.
         rng: draws the targets, evenly over the wide image and over depth.
         count: how many targets.
         method: the exact inverse, or the paper's shortcut.
+        nominal_px: what the zoom camera's device calls the focal length [px]; the shortest by default.
 
     Returns:
         Angle between the line of sight and the true target for each that can be reached [rad], (n,), n <= count.
@@ -168,7 +170,7 @@ def pointing_errors(
         depth = rng.uniform(*POINTING_DEPTHS)
         x_world = truth.T_world_fixed.apply(np.append(lens.directions(pixel), 1.0) * depth)
         try:
-            found = aim(calibration, calibration.fixed.ray(pixel) * depth, reach, method=method)
+            found = aim(calibration, calibration.fixed.ray(pixel) * depth, reach, nominal_px=nominal_px, method=method)
         except UnreachableError:
             continue
         errors.append(truth.line_of_sight_miss(found.pan, found.tilt, found.nominal_px, x_world))

@@ -4,6 +4,7 @@ Values keep the units of the file: metres and degrees, millimetres where a name 
 project's figures are stated for.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -13,6 +14,8 @@ Pair = tuple[float, float]
 Size = tuple[int, int]
 Distortion = tuple[float, float, float, float, float]
 Waypoint = tuple[float, float, float, float]
+# Coefficients of s, s^2, s^3 ...: a curve that is 0 at the shortest focal length.
+Curve = tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -44,14 +47,31 @@ class SimCamera:
 
 
 @dataclass(frozen=True)
+class ZoomOptics:
+    """What a zoom lens does at one focal length; ``pupil`` is how far forward its entrance pupil has moved [m]."""
+
+    focal_px: Pair
+    center_px: Pair
+    distortion: Distortion
+    pupil: float
+
+
+@dataclass(frozen=True)
 class SimZoomCamera(SimCamera):
-    """The simulated zoom camera; ``focal_px`` is the truth at the shortest focal length.
+    """The simulated zoom camera; ``focal_px``, ``center_px`` and ``distortion`` hold at the shortest focal length.
+
+    The curves are what the effect "optics" adds, over s = ln(nominal / shortest) / ln(longest / shortest) in 0..1.
+    Their defaults are of the size of a 12x consumer zoom's, and bent as no cubic is.
 
     Attributes:
         focal_mm: shortest and longest focal length as the maker states them [mm].
         pitch_mm: size of a pixel as the maker states it [mm]; focal_mm / pitch_mm is what the device tells.
         lens_steps: number of positions from shortest to longest, evenly spaced in the logarithm.
         lens_speed: positions a second.
+        focal_curve: true over nominal focal length is 1 + this times what it is at the shortest.
+        center_drift_px: what the principal point's u and v have moved by [px].
+        distortion_drift: what is added to k1 as it is measured in the image, in tangents at the shortest focal length.
+        pupil: how far the entrance pupil has moved along the axis [m]; forward is positive.
     """
 
     focal_px: Pair = (692.0, 693.0)
@@ -61,6 +81,35 @@ class SimZoomCamera(SimCamera):
     pitch_mm: float = 0.009
     lens_steps: int = 129
     lens_speed: float = 129.0
+    focal_curve: Curve = (0.13, 0.14, -1.76, 2.39, -0.91)
+    center_drift_px: tuple[Curve, Curve] = ((27.0, 85.0, -322.0, 268.0, -62.0), (-7.0, -4.0, -92.0, 195.0, -102.0))
+    distortion_drift: Curve = (0.4, 0.04, -0.88, 0.62, -0.05)
+    pupil: Curve = (0.03, 0.06, -0.9, 1.17, -0.44)
+
+    def optics_at(self, magnification: float) -> ZoomOptics:
+        """What the lens does at a nominal focal length, given as a multiple of the shortest."""
+        s = math.log(magnification) / math.log(self.focal_mm[1] / self.focal_mm[0])
+        gain = magnification * (1 + _along(self.focal_curve, s))
+        (fx, fy), (cx, cy), (k1, k2, p1, p2, k3) = self.focal_px, self.center_px, self.distortion
+        du, dv = (_along(curve, s) for curve in self.center_drift_px)
+        # A pixel's tangent shrinks as the focal length grows; coefficients that grow with its powers keep the image's
+        # distortion.
+        squared = gain * gain
+        k1 = (k1 + _along(self.distortion_drift, s)) * squared
+        return ZoomOptics(
+            focal_px=(fx * gain, fy * gain),
+            center_px=(cx + du, cy + dv),
+            distortion=(k1, k2 * squared * squared, p1 * gain, p2 * gain, k3 * squared * squared * squared),
+            pupil=_along(self.pupil, s),
+        )
+
+
+def _along(curve: Curve, s: float) -> float:
+    """A curve's value, by Horner's rule."""
+    value = 0.0
+    for coefficient in reversed(curve):
+        value = (value + coefficient) * s
+    return value
 
 
 @dataclass(frozen=True)
@@ -106,6 +155,9 @@ class SimEffects:
         axes: axis offset and non-squareness.
         backlash: play.
         lens: positions and travel time of the zoom lens.
+        optics: what the zoom lens's optics do besides magnifying: focal curve, centre, distortion and pupil that move
+            with focal length. Without it the coefficients of the distortion stay what they are, so that the image's
+            distortion vanishes as the field narrows.
         scatter: true sizes differ from what the pipeline is told.
         shadows: cast shadows (costs two to four times the rendering).
         multisampling: antialiasing with 4 samples.
@@ -122,6 +174,7 @@ class SimEffects:
     axes: bool = True
     backlash: bool = True
     lens: bool = True
+    optics: bool = False
     scatter: bool = True
     shadows: bool = False
     multisampling: bool = True
@@ -142,7 +195,7 @@ class SimConfig:
         seed: of everything random.
         targets: which targets are in the scene.
         T_zoom0_fixed: the true Gamma.
-        T_head_zoom: the true T.
+        T_head_zoom: the true T, at the zoom lens's shortest focal length like Gamma.
         fixed: the wide camera.
         zoom: the zoom camera.
         head: the pan-tilt unit.

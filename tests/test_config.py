@@ -8,6 +8,8 @@ import pytest
 from cotarget.config import SimEffects, load_config, parse_config
 from cotarget.errors import ConfigError
 
+OPTICS = "[sim.effects]\noptics = true\n[sim.zoom]\n"
+
 
 def test_defaults_are_the_published_rig():
     """Pinned, because every published figure is for this rig and these effects."""
@@ -88,6 +90,21 @@ def test_offsets_and_targets_are_taken(tmp_path):
             "targets.bird.dimension: 'depth' is not one of: height, width, wingspan",
         ),
         ("[board]\ncorners = [2, 6]", "board.corners: [2, 6] has fewer than 3 corners a side"),
+        ("[sim.zoom]\npupil = -0.08", "sim.zoom.pupil: -0.08 is not a list"),
+        ("[sim.zoom]\nfocal_curve = [0.1, nan]", "sim.zoom.focal_curve[1]: nan is not a finite number"),
+        ("[sim.zoom]\ncenter_drift_px = [[1, 2]]", "sim.zoom.center_drift_px: has 1 values where 2 are wanted"),
+        ("[sim.zoom]\ncenter_drift_px = [1, 2]", "sim.zoom.center_drift_px[0]: 1 is not a list"),
+        (
+            OPTICS + "focal_curve = [-0.95]",
+            "sim.zoom.focal_curve: the true focal length does not grow with the nominal",
+        ),
+        (OPTICS + "focal_curve = [1e308, 1e308]", "sim.zoom.focal_curve: the true focal length does not grow"),
+        (OPTICS + "center_drift_px = [[0], [480]]", "sim.zoom.center_drift_px: moves the centre by the whole image"),
+        (
+            OPTICS + "distortion_drift = [-0.5]",
+            "sim.zoom.distortion_drift: the distortion folds back inside the image at",
+        ),
+        (OPTICS + "pupil = [-80]", "m or more; give metres"),
         ("a = ", "is not TOML"),
     ],
 )
@@ -112,6 +129,15 @@ def test_a_scene_lies_beside_its_rig(tmp_path, monkeypatch):
     (tmp_path / "rig.toml").write_text('[sim]\nscene = "own.xml"\n')
     monkeypatch.chdir("/")
     assert load_config(tmp_path / "rig.toml").sim.scene == str(tmp_path / "own.xml")
+
+
+def test_the_curves_of_the_zoom_lens_are_taken_and_checked_only_where_they_are_used():
+    curves = {"focal_curve": [-0.95], "center_drift_px": [[], [1, 2.5]], "pupil": []}
+    zoom = parse_config({"sim": {"zoom": curves}}).sim.zoom
+    assert (zoom.focal_curve, zoom.center_drift_px, zoom.pupil) == ((-0.95,), ((), (1.0, 2.5)), ())
+    config = parse_config({"sim": {"effects": {"all": True}}})
+    assert config.sim.effects.optics
+    assert not SimEffects().optics
 
 
 def test_all_false_is_the_textbook():

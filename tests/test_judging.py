@@ -23,6 +23,7 @@ from cotarget.tracking import Track
 pytestmark = pytest.mark.render
 
 EXACT_DEG = 1e-6  # the inverse is exact to 1e-9; the rays of both lens models agree to 1e-12
+ASIDE = 1e-3  # the rays are also 4.5 px below the middle
 SIZE_PX = 1.0  # the book swings by some ten degrees and shows 0.03 m of its spine: 0.4 px, and it stands 0.015 m nearer
 DENSE_PX = 0.01  # 200 phases of a beat miss its maximum by 1 - cos 1.8 degrees of an amplitude of 7 px at most
 
@@ -80,6 +81,42 @@ def test_a_boresight_that_is_off_by_a_tenth_of_a_degree_points_off_by_as_much(bo
     errors = np.degrees(pointing_errors(off, book.truth(), reach_of(book), np.random.default_rng(0), 50))
     assert errors.max() < 0.1 + EXACT_DEG
     assert np.median(errors) > 0.09
+
+
+def test_a_principal_point_that_is_off_matters_less_at_a_longer_focal_length(book):
+    """The middle of the image is taken for a ray 20 px aside of the true one, at five times the shortest 692 px."""
+    true = true_calibration(book)
+    stop = dataclasses.replace(true.zoom.stops[0], center_px=(346.0, 235.0))
+    off = dataclasses.replace(true, zoom=dataclasses.replace(true.zoom, stops=(stop,)))
+    reach = reach_of(book)
+    for nominal, focal in ((None, 692), (5 * reach.focal_px[0], 3460)):
+        errors = pointing_errors(off, book.truth(), reach, np.random.default_rng(0), 5, nominal_px=nominal)
+        between = math.atan((346 - 319.5) / focal) - math.atan((326 - 319.5) / focal)
+        assert errors == pytest.approx(between, rel=ASIDE)
+
+
+def test_the_true_calibration_at_a_focal_length_points_exactly_with_it():
+    """Of a lens whose optics move: the pupil moves both T and Gamma."""
+    world = SimWorld(parse_config({"sim": {"scene": "indoor", "effects": {"optics": True}}}))
+    nominal = 4000.0
+    lens = world.truth().zoom_lens_for(nominal)
+    assert abs(lens.pupil) > 0.05
+    to_pupil = pose([0, 0, lens.pupil], [0, 0, 0])
+    true, sim = true_calibration(world), world.config.sim
+    at_nominal = dataclasses.replace(
+        true,
+        fixed=dataclasses.replace(true.fixed, distortion=sim.fixed.distortion),
+        zoom=ZoomLens((nominal,), (Intrinsics(lens.size, lens.focal_px, lens.center_px, lens.distortion),)),
+        T_zoom0_fixed=to_pupil.inv() * sim.T_zoom0_fixed,
+        T_head_zoom=sim.T_head_zoom * to_pupil,
+    )
+    judged = (world.truth(), reach_of(world))
+    at, elsewhere = (
+        pointing_errors(at_nominal, *judged, np.random.default_rng(0), 30, nominal_px=px) for px in (nominal, None)
+    )
+    world.close()
+    assert np.degrees(at).max() < EXACT_DEG
+    assert np.degrees(np.median(elsewhere)) > 0.1  # the same calibration is wrong at the shortest
 
 
 def step_of(world, **changes):

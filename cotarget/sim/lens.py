@@ -26,12 +26,21 @@ UNDISTORTED = 1e-14  # step of the normalised coordinates at which it has conver
 
 @dataclass(frozen=True)
 class TrueLens:
-    """What a simulated camera's optics really do: focal lengths and centre [px], distortion (k1, k2, p1, p2, k3)."""
+    """What a simulated camera's optics really do.
+
+    Attributes:
+        size: (width, height) [px].
+        focal_px: (fx, fy) [px].
+        center_px: principal point [px].
+        distortion: (k1, k2, p1, p2, k3).
+        pupil: where the optical centre, the lens's entrance pupil, is along z of the camera's body [m].
+    """
 
     size: tuple[int, int]
     focal_px: tuple[float, float]
     center_px: tuple[float, float]
     distortion: tuple[float, float, float, float, float]
+    pupil: float = 0.0
 
     def project(self, x_camera: Array) -> Array:
         """Project points (..., 3) in the camera's frame to pixels (..., 2); not clipped to the image.

@@ -56,8 +56,8 @@ class Truth:
         model: the compiled world.
         set_state: brings the world to a time.
         fixed_lens: the wide camera's optics.
-        zoom_lens: the zoom camera's optics at a time.
-        zoom_lens_for: its optics at what the device calls a focal length [px].
+        nominal_at: what the zoom camera's device calls its focal length at a time [px].
+        zoom_lens_for: the zoom camera's optics at what its device calls a focal length [px].
         T_world_fixed: the fixed camera.
         T_world_base: the pan-tilt unit.
         head_at: the platform's pan and tilt [rad] at a time.
@@ -68,7 +68,7 @@ class Truth:
     model: "mujoco.MjModel"
     set_state: Callable[[float], "mujoco.MjData"]
     fixed_lens: TrueLens
-    zoom_lens: Callable[[float], TrueLens]
+    nominal_at: Callable[[float], float]
     zoom_lens_for: Callable[[float], TrueLens]
     T_world_fixed: RigidTransform
     T_world_base: RigidTransform
@@ -79,11 +79,11 @@ class Truth:
 
     def lens(self, camera: CameraName, t: float) -> TrueLens:
         """A camera's optics at time t."""
-        return self.fixed_lens if camera == "fixed" else self.zoom_lens(t)
+        return self.fixed_lens if camera == "fixed" else self.zoom_lens_for(self.nominal_at(t))
 
     def T_world_camera(self, camera: CameraName, t: float) -> RigidTransform:
-        """A camera's pose at time t, in OpenCV's axes."""
-        return self._body_pose(self.set_state(t), camera)
+        """Pose of a camera's optical centre at time t, in OpenCV's axes."""
+        return self._camera_pose(self.set_state(t), camera, self.lens(camera, t))
 
     def center(self, name: str, t: float) -> Array:
         """A target's body centre in the world [m], (3,)."""
@@ -107,8 +107,8 @@ class Truth:
         data = self.set_state(0.0)
         data.joint(RIG + "pan").qpos[0], data.joint(RIG + "tilt").qpos[0] = pan, tilt
         mujoco.mj_kinematics(self.model, data)
-        x_zoom = self._body_pose(data, "zoom").inv().apply(x_world)
         lens = self.zoom_lens_for(nominal_px)
+        x_zoom = self._camera_pose(data, "zoom", lens).inv().apply(x_world)
         xy = lens.directions((np.array(lens.size) - 1) / 2)
         ray = np.append(xy, 1.0)
         return float(np.arctan2(np.linalg.norm(np.cross(ray, x_zoom)), ray @ x_zoom))
@@ -116,20 +116,22 @@ class Truth:
     def silhouette(self, name: str, camera: CameraName, t: float) -> Silhouette | None:
         """A target's outline in a camera at time t; None if any of it is behind the camera, or beyond its lens."""
         data, lens = self.set_state(t), self.lens(camera, t)
-        outlines = self._outlines(name, data, self._body_pose(data, camera).inv(), lens)
+        T_world_camera = self._camera_pose(data, camera, lens)
+        outlines = self._outlines(name, data, T_world_camera.inv(), lens)
         everything = np.concatenate(outlines)
         if not np.isfinite(everything).all():
             return None
         low, high = everything.min(axis=0), everything.max(axis=0)
         inside = _fraction_inside(outlines, low, high, lens.size)
-        return Silhouette(low, high, inside * self._unhidden(name, data, camera))
+        return Silhouette(low, high, inside * self._unhidden(name, data, T_world_camera.translation))
 
     def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
         """The larger side of the box, the maximum over one wing beat at the pose of time t [px]; nan behind."""
         target = self.targets[name]
         phases = np.arange(BEAT_PHASES) / BEAT_PHASES * target.beat_s if target.beat_s else [0.0]
         data = self.set_state(t)
-        T_camera_world, lens = self._body_pose(data, camera).inv(), self.lens(camera, t)
+        lens = self.lens(camera, t)
+        T_camera_world = self._camera_pose(data, camera, lens).inv()
         sides = []
         for phase in phases:
             for joint, angle in target.pose(t + phase).joints.items():
@@ -148,9 +150,11 @@ class Truth:
             for geom, points in self._surface(name)
         ]
 
-    def _body_pose(self, data: "mujoco.MjData", body: str) -> RigidTransform:
-        found = data.body(RIG + body)
-        return RigidTransform.from_components(found.xpos, Rotation.from_matrix(found.xmat.reshape(3, 3)))
+    def _camera_pose(self, data: "mujoco.MjData", camera: CameraName, lens: TrueLens) -> RigidTransform:
+        """The pose of a camera's body, moved along its axis to the lens's pupil."""
+        body = data.body(RIG + camera)
+        axes = body.xmat.reshape(3, 3)
+        return RigidTransform.from_components(body.xpos + axes[:, 2] * lens.pupil, Rotation.from_matrix(axes))
 
     def _surface(self, name: str) -> list[tuple[int, Array]]:
         """The target's geoms, each with points on its surface in its own frame."""
@@ -163,13 +167,12 @@ class Truth:
             ]
         return self._surfaces[name]
 
-    def _unhidden(self, name: str, data: "mujoco.MjData", camera: CameraName) -> float:
-        """Fraction of the target's parts whose middle a ray from the camera reaches, through nothing but the target.
+    def _unhidden(self, name: str, data: "mujoco.MjData", eye: Array) -> float:
+        """Fraction of the target's parts whose middle a ray from the eye reaches, through nothing but the target.
 
         Parts inside or outside the image count alike. A mesh's middle is its centre of mass.
         """
         own = [geom for geom, _ in self._surface(name)]
-        eye = np.array(data.body(RIG + camera).xpos)
         groups = np.ones(mujoco.mjNGROUP, dtype=np.uint8)
         groups[[BOARD_GROUP, RIG_GROUP, FRAME_GROUP]] = 0
         hit = np.zeros(1, dtype=np.int32)

@@ -37,8 +37,11 @@ from cotarget.sim.sensor import Sensor
 from cotarget.sim.targets import Target, make_target
 from cotarget.sim.truth import CameraName, Truth
 
+NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 # Streams of random numbers, so that one effect's draws never shift another's.
 FIXED_NOISE, ZOOM_NOISE, TARGETS = 1, 2, 3
+# The render's size is worked out for this many focal lengths of the zoom lens; between them its optics are smooth.
+SIZED_FOCALS = 17
 # A blurred image is the mean of this many renders spread over the exposure.
 BLUR_RENDERS = 4
 
@@ -59,8 +62,8 @@ class SimWorld:
         self.targets = {name: self._make_target(name) for name in sim.targets}
         self._fixed_lens = self._lens(sim.fixed)
         self._zoom_lens = self._lens(sim.zoom)
-        fields = [covering_half_field(lens) for lens in (self._fixed_lens, self._zoom_lens)]
-        self._render_size = self._common_render_size(fields)
+        self._head_drive, self._lens_drive = head_drive(sim.head, effects), lens_drive(sim.zoom, effects)
+        self._render_size = self._common_render_size()
         self._model = build_model(config, tuple(self.targets.values()), self._render_size)
         self._data = mujoco.MjData(self._model)
         self._T_world_fixed = mount_pose(self._model)
@@ -73,7 +76,6 @@ class SimWorld:
             "fixed": Sensor(sim.fixed, effects, (sim.seed, FIXED_NOISE)),
             "zoom": Sensor(sim.zoom, effects, (sim.seed, ZOOM_NOISE)),
         }
-        self._head_drive, self._lens_drive = head_drive(sim.head, effects), lens_drive(sim.zoom, effects)
         self.rig = SimRig(
             SimStream(sim.fixed, effects, self._clock, self._expose_fixed),
             SimZoomStream(sim.zoom, effects, self._clock, self._expose_zoom, self._lens_drive, delay),
@@ -89,7 +91,7 @@ class SimWorld:
             model=self._model,
             set_state=self._set_state,
             fixed_lens=self._fixed_lens,
-            zoom_lens=self.zoom_lens_at,
+            nominal_at=self._lens_drive.focal_at,
             zoom_lens_for=self.zoom_lens_for,
             T_world_fixed=self._T_world_fixed,
             T_world_base=base_pose(self._T_world_fixed, self.config.sim),
@@ -105,16 +107,21 @@ class SimWorld:
     def zoom_lens_for(self, nominal_px: float) -> TrueLens:
         """The zoom camera's true optics at what its device calls a focal length [px]."""
         factor = nominal_px / self._lens_drive.shortest_px
+        if self.config.sim.effects.optics:
+            optics = self.config.sim.zoom.optics_at(factor)
+            distortion = optics.distortion if self.config.sim.effects.distortion else NO_DISTORTION
+            return TrueLens(self._zoom_lens.size, optics.focal_px, optics.center_px, distortion, optics.pupil)
         fx, fy = self._zoom_lens.focal_px
         return replace(self._zoom_lens, focal_px=(fx * factor, fy * factor))
 
     def render(self, camera: str, lens: TrueLens, t: float) -> Image:
         """The perfect image that a lens sees at time t, without sensor effects, BGR."""
+        cam_id = self._model.camera(RIG + camera).id
+        self._model.cam_pos[cam_id] = (0.0, 0.0, lens.pupil)  # in the body's frame, whose z is the optical axis
         data = self._set_state(t)
         half_width, half_height = covering_half_field(lens)
         width, height = self._render_size
         focal = min((width / 2 - 1) / half_width, (height / 2 - 1) / half_height)
-        cam_id = self._model.camera(RIG + camera).id
         self._model.cam_intrinsic[cam_id] = (focal * RENDER_PITCH, focal * RENDER_PITCH, 0.0, 0.0)
         option = mujoco.MjvOption()
         option.geomgroup[RIG_GROUP] = option.geomgroup[FRAME_GROUP] = 0
@@ -133,7 +140,7 @@ class SimWorld:
         self._renderer.close()
 
     def _lens(self, camera: SimCamera) -> TrueLens:
-        distortion = camera.distortion if self.config.sim.effects.distortion else (0.0,) * 5
+        distortion = camera.distortion if self.config.sim.effects.distortion else NO_DISTORTION
         return TrueLens(camera.size, camera.focal_px, camera.center_px, distortion)
 
     def _make_target(self, name: str) -> Target:
@@ -141,11 +148,13 @@ class SimWorld:
         rng = np.random.default_rng((sim.seed, TARGETS, zlib.crc32(name.encode())))  # whatever else is in the scene
         return make_target(name, sim.scene, rng, sim.effects.scatter, sim.paths.get(name))
 
-    def _common_render_size(self, fields: list[tuple[float, float]]) -> tuple[int, int]:
-        """A size at which the render of either camera is as fine as its image."""
+    def _common_render_size(self) -> tuple[int, int]:
+        """A size at which the render of either camera is as fine as its image, over all of its focal lengths."""
+        drive, count = self._lens_drive, SIZED_FOCALS if self.config.sim.effects.optics else 1
+        zooms = [self.zoom_lens_for(float(f)) for f in np.geomspace(drive.shortest_px, drive.longest_px, count)]
         sizes = [
-            (2 * field[0] * lens.focal_px[0] + 2, 2 * field[1] * lens.focal_px[1] + 2)
-            for field, lens in zip(fields, (self._fixed_lens, self._zoom_lens), strict=True)
+            tuple(2 * half * focal + 2 for half, focal in zip(covering_half_field(lens), lens.focal_px, strict=True))
+            for lens in (self._fixed_lens, *zooms)
         ]
         return math.ceil(max(s[0] for s in sizes)), math.ceil(max(s[1] for s in sizes))
 
