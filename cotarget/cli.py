@@ -118,6 +118,8 @@ def _parser() -> argparse.ArgumentParser:
 
     board = command("board", _board, "write a calibration board to print, to scale")
     board.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .pdf, .svg or .png")
+    kinds = ("chessboard", "charuco")
+    board.add_argument("--kind", choices=kinds, default=kinds[0], help="charuco has markers in it (chessboard)")
     board.add_argument("--board", type=_corners, default=(9, 6), metavar="CxR", help="inner corners (9x6)")
     board.add_argument("--square", type=_positive, default=0.025, metavar="M", help="side of a square [m] (0.025)")
 
@@ -316,7 +318,7 @@ def _board(options: argparse.Namespace) -> None:
     from cotarget.config import BoardConfig
 
     _check_outputs([options.out], [])
-    width, height = print_board(options.out, BoardConfig(corners=options.board, square=options.square))
+    width, height = print_board(options.out, BoardConfig(options.kind, options.board, options.square))
     print(
         f"{options.out}: {1000 * width:.1f} x {1000 * height:.1f} mm with its white border; print it at 100 %, stick it"
     )

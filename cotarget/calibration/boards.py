@@ -1,8 +1,9 @@
-"""The chessboard: its points, its picture, and its corners in an image, numbered the same way from every side.
+"""The board: its points, its picture, and its corners in an image, numbered the same way from every side.
 
 The board's frame: origin at the first inner corner, x along the columns, y along the rows, z into the board, away
 from the viewer. The square diagonally outside the first corner is black. With one odd and one even count of corners
-the opposite square is white, so that the colours alone tell a board from the same board upside down.
+the opposite square is white, so that the colours alone tell a board from the same board upside down; a ChArUco board is
+told by its markers, whatever the counts.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,33 +11,36 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
+from cotarget.calibration.charuco import find_charuco
+from cotarget.calibration.gridsearch import (
+    CORNER_DECIMALS,
+    SMALLEST_CONTRAST,
+    SMALLEST_WINDOW_PX,
+    SUBPIX_CRITERIA,
+    WINDOW_SHARE,
+)
 from cotarget.config import BoardConfig
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array
+from cotarget.pattern import cells, marker_dictionary
 from cotarget.rig import Image
-
-# cornerSubPix looks this share of the smallest corner spacing to each side. The customary 11 px reach into the next
-# corners on small boards and more than double the residuals on real photos.
-WINDOW_SHARE = 0.35
-SMALLEST_WINDOW_PX = 2  # below it, cornerSubPix has too few pixels to fit
-# Stop when corners move less than a thousandth of a pixel, ten times below the noise of the best corners.
-SUBPIX_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001)
-# Corners are kept to a ten-thousandth of a pixel: a hundred times below their noise, and short in a file.
-CORNER_DECIMALS = 4
-# Even and odd squares must differ by this many grey levels on average, or what was found is no chessboard.
-SMALLEST_CONTRAST = 8.0
 
 
 def check_board(board: BoardConfig) -> None:
-    """Refuse a board that looks the same upside down.
+    """Refuse a board that looks the same upside down, or has more squares than there are markers.
 
     Raises:
-        ConfigError: the counts of corners are both even or both odd, or below 3.
+        ConfigError: the counts of corners are below 3; of a chessboard, both even or both odd; of a ChArUco board, too
+            many.
     """
     columns, rows = board.corners
     if min(columns, rows) < 3:
         raise ConfigError(f"board.corners: {columns}x{rows} has fewer than 3 corners a side")
-    if (columns + rows) % 2 == 0:
+    if board.kind == "charuco":
+        most = len(marker_dictionary().bytesList)
+        if (columns + 1) * (rows + 1) // 2 > most:
+            raise ConfigError(f"board.corners: {columns}x{rows} needs more than the {most} markers that there are")
+    elif (columns + rows) % 2 == 0:
         raise ConfigError(
             f"board.corners: {columns}x{rows} looks the same upside down; "
             f"one count must be odd and the other even, like {columns}x{rows + 1}"
@@ -69,27 +73,34 @@ def draw_board(board: BoardConfig, square_px: int, margin_px: int | None = None)
         A BGR image, (H, W, 3), black or white.
     """
     check_board(board)
-    columns, rows = board.corners
-    v, u = np.mgrid[: rows + 1, : columns + 1]
-    squares = np.where((u + v) % 2 == 0, 0, 255).astype(np.uint8)
+    dark = cells(board)
+    width, height = (square_px * (n + 1) for n in board.corners)
+    # From the middle of each pixel, so that an edge is off by half a pixel at most where cells are not whole pixels.
+    rows, columns = (
+        ((np.arange(size) + 0.5) * count / size).astype(int)
+        for size, count in ((height, dark.shape[0]), (width, dark.shape[1]))
+    )
     margin = square_px if margin_px is None else margin_px
-    picture = np.pad(np.kron(squares, np.ones((square_px, square_px), np.uint8)), margin, constant_values=255)
+    picture = np.pad(np.where(dark[np.ix_(rows, columns)], 0, 255).astype(np.uint8), margin, constant_values=255)
     return np.repeat(picture[:, :, None], 3, axis=2)
 
 
 def find_corners(image: Image, board: BoardConfig, *, thorough: bool = True) -> Array | None:
-    """Find all inner corners of the board.
+    """Find the inner corners of the board: all of a chessboard, or those that are seen of a ChArUco board.
 
     Args:
         image: (H, W, 3) BGR, or grey (H, W).
-        board: which must have one odd and one even count of corners.
+        board: a chessboard must have one odd and one even count of corners.
         thorough: whether to try every finder; the first alone finds nearly all boards, in a tenth of the time that
             it takes to be sure that there is none.
 
     Returns:
-        Corners from the board's first, row by row, (columns * rows, 2) [px]; None where no whole board is seen.
+        Corners from the board's first, row by row, (columns * rows, 2) [px]; None where no whole chessboard is seen.
+        Corners of a ChArUco board that are not seen are nan; None where fewer than six are, or all in one line.
     """
     grey = np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    if board.kind == "charuco":
+        return find_charuco(grey, board, thorough=thorough)
     for search in SEARCHES if thorough else SEARCHES[:1]:
         found = search(grey, board.corners)
         if found is None:
@@ -101,10 +112,10 @@ def find_corners(image: Image, board: BoardConfig, *, thorough: bool = True) -> 
 
 
 def smallest_spacing(corners_px: Array, corners: Sequence[int]) -> float:
-    """The smallest distance between neighbouring corners [px]."""
+    """The smallest distance between neighbouring corners that are seen [px]; nan where no neighbours are."""
     grid = corners_px.reshape(corners[1], corners[0], 2)
-    along, down = np.diff(grid, axis=1), np.diff(grid, axis=0)
-    return float(min(np.linalg.norm(along, axis=-1).min(), np.linalg.norm(down, axis=-1).min()))
+    distances = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1) for axis in (0, 1)]
+    return float(np.fmin.reduce(np.concatenate(distances, axis=None)))
 
 
 def _number(grey: Image, corners_px: Array, corners: tuple[int, int]) -> Array | None:

@@ -88,8 +88,8 @@ def parse_board(value: Any, where: str) -> BoardConfig:
     """Read a board from a JSON object."""
     table = parsing.as_table(value, where)
     kind = get(table, "kind", where)
-    if kind != "chessboard":
-        raise CalibrationError(f"{join(where, 'kind')}: {parsing.short(kind)} is not one of: chessboard")
+    if kind not in ("chessboard", "charuco"):
+        raise CalibrationError(f"{join(where, 'kind')}: {parsing.short(kind)} is not one of: chessboard, charuco")
     return BoardConfig(
         kind=kind,
         corners=parsing.as_size(get(table, "corners", where), join(where, "corners")),

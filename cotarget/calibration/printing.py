@@ -10,6 +10,7 @@ from cotarget.calibration.atomic import write_atomically
 from cotarget.calibration.boards import check_board
 from cotarget.config import BoardConfig
 from cotarget.errors import ConfigError, choices
+from cotarget.pattern import tiles
 
 METRES_PER_INCH = 0.0254
 MARGIN = 1.0  # white border, in squares; the corner finder needs about half of one
@@ -30,7 +31,7 @@ def print_board(path: Path, board: BoardConfig) -> tuple[float, float]:
         Width and height of the page, white border included [m].
 
     Raises:
-        ConfigError: an unknown suffix, a board that looks the same upside down, or one larger than 5 m.
+        ConfigError: an unknown suffix, a board that `check_board` refuses, or one larger than 5 m.
         CalibrationError: the file cannot be written.
     """
     if path.suffix.lower() not in SUFFIXES:
@@ -47,11 +48,13 @@ def print_board(path: Path, board: BoardConfig) -> tuple[float, float]:
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     ax.set(xlim=(-MARGIN, columns + MARGIN), ylim=(rows + MARGIN, -MARGIN))
     ax.axis("off")
-    for column in range(columns):
-        for row in range(column % 2, rows, 2):  # the square outside the first corner is black
-            ax.add_patch(Rectangle((column, row), 1, 1, color="black", linewidth=0, snap=False))
+    for tile in tiles(board):
+        if tile.dark:
+            size = tile.x1 - tile.x0, tile.y1 - tile.y0
+            ax.add_patch(Rectangle((tile.x0, tile.y0), *size, color="black", linewidth=0, snap=False))
     told = (
-        f"{board.corners[0]} x {board.corners[1]} inner corners, squares of {1000 * board.square:g} mm: print at 100 %"
+        f"{board.kind}, {board.corners[0]} x {board.corners[1]} inner corners, squares of {1000 * board.square:g} mm: "
+        "print at 100 %"
     )
     ax.text(columns / 2, rows + MARGIN / 2, told, ha="center", va="center", fontsize=board.square * 300)
     part = path.with_name(f".{path.stem}.part{path.suffix}")

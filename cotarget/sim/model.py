@@ -8,6 +8,7 @@ from cotarget.assets import assets_dir
 from cotarget.config import BoardConfig, RigConfig, SimConfig
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.pattern import tiles
 from cotarget.sim.opengl import mujoco
 from cotarget.sim.targets import Target, scale_spec
 
@@ -136,7 +137,7 @@ def _edit_rig(
 
 
 def _add_board(spec: "mujoco.MjSpec", board: BoardConfig) -> None:
-    """A chessboard whose tiles are flush: its frame is the first inner corner's, x along the columns, z away."""
+    """A board whose tiles are flush: its frame is the first inner corner's, x along the columns, z away."""
     body = spec.worldbody.add_body(name="board", mocap=True)
     columns, rows = (n + 1 for n in board.corners)
 
@@ -152,10 +153,8 @@ def _add_board(spec: "mujoco.MjSpec", board: BoardConfig) -> None:
             conaffinity=0,
         )
 
-    for column in range(columns):
-        for row in range(rows):
-            colour = BLACK if (column + row) % 2 == 0 else WHITE
-            tile(column - 1, row - 1, column, row, colour)
+    for part in tiles(board):
+        tile(part.x0 - 1, part.y0 - 1, part.x1 - 1, part.y1 - 1, BLACK if part.dark else WHITE)
     edge = BOARD_MARGIN
     tile(-1 - edge, -1 - edge, columns - 1 + edge, -1, WHITE)
     tile(-1 - edge, rows - 1, columns - 1 + edge, rows - 1 + edge, WHITE)
