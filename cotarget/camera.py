@@ -4,9 +4,12 @@ Pixels are (u, v), u right and v down, and (0, 0) is the centre of the top-left 
 """
 
 import itertools
+import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array
@@ -182,23 +185,31 @@ def focal_for_size(size: float, wanted_px: float, depth: float) -> float:
 
 @dataclass(frozen=True)
 class ZoomLens:
-    """The zoom camera's intrinsics over its whole range.
+    """The zoom camera's optics over its whole range.
 
-    The device tells its focal length in nominal pixels; calibration says what that means. Between calibrated
-    stops the intrinsics are interpolated over the logarithm of the focal length; beyond them, the focal length
-    keeps the last stop's ratio to the nominal one.
+    The device tells its focal length in nominal pixels; calibration says what that means at some stops. Between them
+    a cubic spline over the logarithm of the nominal focal length passes through what was calibrated: ratios of true to
+    nominal focal length, principal point, distortion as it appears in the image, and entrance pupil. Beyond them the
+    last stop's values hold. A lens with one stop is magnified without any other change.
 
     Attributes:
         nominal_px: the device's own focal length at each stop [px], increasing, (n,).
         stops: the calibrated intrinsics at each stop, n of them.
+        pupil: how far the entrance pupil has moved forward along the optical axis since the first stop [m], n of
+            them, the first one 0; where it is left out, it does not move.
     """
 
     nominal_px: tuple[float, ...]
     stops: tuple[Intrinsics, ...]
+    pupil: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.stops or len(self.stops) != len(self.nominal_px):
-            raise ConfigError("a zoom lens needs one nominal focal length for each calibrated stop")
+        if not self.pupil:
+            object.__setattr__(self, "pupil", (0.0,) * len(self.stops))
+        if not self.stops or not len(self.stops) == len(self.nominal_px) == len(self.pupil):
+            raise ConfigError("a zoom lens needs one nominal focal length and one pupil for each calibrated stop")
+        if self.pupil[0] != 0:
+            raise ConfigError("a zoom lens's pupil is counted from the first stop, where it must be 0")
         if any(b <= a for a, b in itertools.pairwise(self.nominal_px)):
             raise ConfigError("the zoom stops' nominal focal lengths must increase")
 
@@ -211,23 +222,18 @@ class ZoomLens:
         """The intrinsics when the device says its focal length is ``nominal_px``."""
         if len(self.stops) == 1:
             return self.stops[0].scaled(nominal_px / self.nominal_px[0])
-        log_nominal = np.log(self.nominal_px)
-        x = np.log(nominal_px)
-
-        def between(values: list[float]) -> float:
-            return float(np.interp(x, log_nominal, values))
-
-        ratio = [[s.focal_px[i] / n for s, n in zip(self.stops, self.nominal_px, strict=True)] for i in (0, 1)]
-        k1, k2, p1, p2, k3 = (between([s.distortion[i] for s in self.stops]) for i in range(5))
+        log_x, log_y, cx, cy, k1, k2, p1, p2, k3, _ = (float(value) for value in self._values(nominal_px))
+        m = nominal_px / self.nominal_px[0]
         return Intrinsics(
             size=self.size,
-            focal_px=(between(ratio[0]) * nominal_px, between(ratio[1]) * nominal_px),
-            center_px=(
-                between([s.center_px[0] for s in self.stops]),
-                between([s.center_px[1] for s in self.stops]),
-            ),
-            distortion=(k1, k2, p1, p2, k3),
+            focal_px=(math.exp(log_x) * nominal_px, math.exp(log_y) * nominal_px),
+            center_px=(cx, cy),
+            distortion=(k1 * m**2, k2 * m**4, p1 * m, p2 * m, k3 * m**6),
         )
+
+    def pupil_at(self, nominal_px: float) -> float:
+        """How far the entrance pupil has moved forward since the first stop [m]."""
+        return 0.0 if len(self.stops) == 1 else float(self._values(nominal_px)[-1])
 
     def nominal_for(self, focal_px: float) -> float:
         """What to tell the device so that the true horizontal focal length is ``focal_px`` [px]."""
@@ -245,4 +251,25 @@ class ZoomLens:
             ConfigError: the aspect ratio is another one.
         """
         factor = size[0] / self.size[0]
-        return ZoomLens(tuple(n * factor for n in self.nominal_px), tuple(s.resized(size) for s in self.stops))
+        nominal, stops = tuple(n * factor for n in self.nominal_px), tuple(s.resized(size) for s in self.stops)
+        return ZoomLens(nominal, stops, self.pupil)
+
+    def _values(self, nominal_px: float) -> Array:
+        """Log ratios (2), centre (2), the image's distortion (5) and pupil (1) at a nominal focal length."""
+        inside = np.clip(nominal_px, self.nominal_px[0], self.nominal_px[-1])
+        return np.asarray(self._curve(np.log(inside)))
+
+    @cached_property
+    def _curve(self) -> CubicSpline:
+        nominal = np.array(self.nominal_px)
+        m = nominal / nominal[0]
+        rows = [
+            [*np.log(np.array(stop.focal_px) / n), *stop.center_px, *(np.array(stop.distortion) / _growth(g)), pupil]
+            for stop, n, g, pupil in zip(self.stops, nominal, m, self.pupil, strict=True)
+        ]
+        return CubicSpline(np.log(nominal), np.array(rows))
+
+
+def _growth(magnified: float) -> Array:
+    """By what the distortion coefficients grow with the focal length for the image to be bent the same."""
+    return np.array([magnified**2, magnified**4, magnified, magnified, magnified**6])

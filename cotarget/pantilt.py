@@ -27,15 +27,34 @@ TURN = 2.0 * np.pi
 
 @dataclass(frozen=True)
 class HeadGeometry:
-    """How a real head departs from two axes that cross at a right angle.
+    """How a real head departs from two axes that cross at a right angle and encoders that count truly.
 
     Attributes:
         axis_offset: dz, from the pan axis to the tilt axis along the base's z at pan = 0 [m].
         squareness: eps, how far the tilt axis leans from X towards Y [rad].
+        pan_scale: true turn over the turn that the head reports.
+        tilt_scale: likewise.
+        pan_zero: true pan where the head reports 0 [rad].
+        tilt_zero: likewise.
     """
 
     axis_offset: float = 0.0
     squareness: float = 0.0
+    pan_scale: float = 1.0
+    tilt_scale: float = 1.0
+    pan_zero: float = 0.0
+    tilt_zero: float = 0.0
+
+    def true_angles(self, pan: Array | float, tilt: Array | float) -> tuple[Array, Array]:
+        """The axes' true angles [rad] where the head reports these."""
+        return (
+            self.pan_scale * np.asarray(pan, float) + self.pan_zero,
+            self.tilt_scale * np.asarray(tilt, float) + self.tilt_zero,
+        )
+
+    def reported_angles(self, pan: Array, tilt: Array) -> tuple[Array, Array]:
+        """What the head reports at true angles [rad]."""
+        return (pan - self.pan_zero) / self.pan_scale, (tilt - self.tilt_zero) / self.tilt_scale
 
 
 IDEAL_HEAD = HeadGeometry()
@@ -57,16 +76,17 @@ class Pointing:
 
 
 def base_head(pan: float, tilt: float, head: HeadGeometry = IDEAL_HEAD) -> RigidTransform:
-    """Forward kinematics T_base_head, the paper's P (Eq. 8); the identity at pan = tilt = 0.
+    """Forward kinematics T_base_head, the paper's P (Eq. 8); the identity at true pan = tilt = 0.
 
     Args:
-        pan: positive turns the camera right [rad].
-        tilt: positive turns the camera up [rad].
+        pan: as the head reports it, positive turns the camera right [rad].
+        tilt: likewise, positive turns the camera up [rad].
         head: the unit's own geometry.
     """
+    true_pan, true_tilt = (float(angle) for angle in head.true_angles(pan, tilt))
     offset = RigidTransform.from_translation([0.0, 0.0, head.axis_offset])
-    tilting = RigidTransform.from_rotation(Rotation.from_rotvec(_tilt_axis(head) * tilt))
-    return RigidTransform.from_rotation(rot_y(pan)) * offset * tilting * offset.inv()
+    tilting = RigidTransform.from_rotation(Rotation.from_rotvec(_tilt_axis(head) * true_tilt))
+    return RigidTransform.from_rotation(rot_y(true_pan)) * offset * tilting * offset.inv()
 
 
 def zoom_fixed(
@@ -98,9 +118,10 @@ def solve(
         ray: the zoom camera's ray that shall meet the target, of any length, (3,) or (..., 3).
 
     Returns:
-        Pan within -pi..pi, tilt within -pi..pi and range, each (..., 2); the first branch is the one that faces
-        forward. All three are nan in a branch that does not exist, as for a target nearer than the lever arm.
-        Within half a degree of the pan axis, where the branches meet, both may be the same solution.
+        Pan and tilt as the head reports them, their true angles within -pi..pi, and range, each (..., 2); the first
+        branch is the one that faces forward. All three are nan in a branch that does not exist, as for a target
+        nearer than the lever arm. Within half a degree of the pan axis, where the branches meet, both may be the same
+        solution.
     """
     x_base, ray = np.broadcast_arrays(np.asarray(x_base, float), np.asarray(ray, float))
     d = T_head_zoom.rotation.as_matrix() @ (ray / np.linalg.norm(ray, axis=-1, keepdims=True))[..., None]
@@ -109,7 +130,7 @@ def solve(
         start = _closed_form(x_base, d, t, head)
         pan, tilt, reach = _newton(*start, x_base, d, t, head)
     found = reach > 0
-    wrapped = [(angle + np.pi) % TURN - np.pi for angle in (pan, tilt)]
+    wrapped = head.reported_angles(*((angle + np.pi) % TURN - np.pi for angle in (pan, tilt)))
     return Pointing(*(np.where(found, value, np.nan) for value in (*wrapped, reach)))
 
 
@@ -118,6 +139,7 @@ def nearest(
     pan_limits: tuple[float, float],
     tilt_limits: tuple[float, float],
     now: tuple[float, float] = (0.0, 0.0),
+    head: HeadGeometry = IDEAL_HEAD,
 ) -> Pointing:
     """Choose from both branches, whole turns included, the solution within the limits that is nearest to now.
 
@@ -126,6 +148,7 @@ def nearest(
         pan_limits: lowest and highest pan [rad].
         tilt_limits: lowest and highest tilt [rad].
         now: where the head is, (pan, tilt) [rad]. Near is what the slower axis has to travel.
+        head: the unit's own geometry, for what it reports after a whole turn.
 
     Raises:
         UnreachableError: there is no solution, or none within the limits.
@@ -134,8 +157,8 @@ def nearest(
     for pan, tilt, reach in zip(pointing.pan, pointing.tilt, pointing.range, strict=True):
         if not np.isfinite(pan + tilt + reach):
             continue
-        for p in pan + TURN * np.arange(-2, 3):
-            for q in tilt + TURN * np.arange(-1, 2):
+        for p in pan + TURN / head.pan_scale * np.arange(-2, 3):
+            for q in tilt + TURN / head.tilt_scale * np.arange(-1, 2):
                 if pan_limits[0] <= p <= pan_limits[1] and tilt_limits[0] <= q <= tilt_limits[1]:
                     travel = max(abs(p - now[0]), abs(q - now[1]))
                     candidates.append((travel, p, q, reach))
@@ -210,6 +233,7 @@ def miss(
         head: the unit's own geometry.
         ray: the ray, (3,) or (..., 3).
     """
+    pan, tilt = head.true_angles(pan, tilt)
     shape = np.broadcast_shapes(np.shape(pan), np.shape(tilt), np.shape(x_base)[:-1])
     dz = np.array([0.0, 0.0, head.axis_offset])
     pans = Rotation.from_rotvec(np.multiply.outer(np.broadcast_to(pan, shape).ravel(), [0.0, 1.0, 0.0]))

@@ -136,14 +136,14 @@ def aim(
         CalibrationError: the calibration has no T.
         UnreachableError: no pan and tilt within the limits do it.
     """
-    T_head_zoom = calibration.hand_eye()
-    x_base = T_head_zoom.apply(calibration.T_zoom0_fixed.apply(x_fixed))  # (6)
+    x_base = (calibration.hand_eye() * calibration.T_zoom0_fixed).apply(x_fixed)  # (6)
     wanted = calibration.zoom.stops[0].image_center_px if pixel is None else np.asarray(pixel, dtype=float)
     nominal, limited = _limit(reach.focal_px[0] if nominal_px is None else nominal_px, reach)
     for _ in range(FOCAL_ROUNDS if closeup else 1):
         ray = calibration.zoom.at(nominal).ray(wanted)
         if method == "exact":
-            pointing = nearest(solve(x_base, T_head_zoom, calibration.head, ray), reach.pan, reach.tilt, reach.now)
+            ways = solve(x_base, calibration.hand_eye(nominal), calibration.head, ray)
+            pointing = nearest(ways, reach.pan, reach.tilt, reach.now, calibration.head)
         else:
             pointing = _paper(calibration, x_fixed, method, reach)
         if closeup:

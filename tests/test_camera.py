@@ -96,10 +96,39 @@ def test_zoom_lens_interpolates_between_stops():
     lens = ZoomLens((700.0, 2800.0), (Intrinsics((640, 480), (700.0, 701.0), (326.0, 235.0)), far))
     middle = lens.at(1400.0)  # half way in the logarithm
     assert middle.center_px == pytest.approx((328.0, 237.0))
-    assert middle.distortion[0] == pytest.approx(-0.15)
+    # In the image the far stop's distortion is that of k1 = -0.3 / 4^2 at the near one; half of it, twice magnified.
+    assert middle.distortion[0] == pytest.approx(-0.3 / 4**2 / 2 * 2**2)
+    assert lens.at(350.0).center_px == (326.0, 235.0)  # beyond the stops, the last one holds
+    assert lens.at(350.0).focal_px == pytest.approx((350.0, 350.5))
     assert lens.at(lens.nominal_for(1234.0)).focal_px[0] == pytest.approx(1234.0)
 
 
+def test_a_spline_through_eight_stops_follows_a_smooth_lens():
+    """Twelvefold zoom: a sine's period of 3 % in focal length, 10 px in the centre, 5 cm in the pupil."""
+    nominal = 667 * 12 ** (np.arange(8) / 7)
+
+    def true(n):
+        s = np.log(n / 667) / np.log(12)
+        wave = np.sin(2 * np.pi * s)
+        f, k = n * (1 + 0.03 * wave), -0.1 * (1 - wave) * (n / 667) ** 2
+        return Intrinsics((640, 480), (f, f), (320 + 10 * wave, 240.0), (k, 0, 0, 0, 0)), 0.05 * (np.cos(3 * s) - 1)
+
+    lenses, pupils = zip(*(true(n) for n in nominal), strict=True)
+    zoom = ZoomLens(tuple(nominal), lenses, pupils)
+    for n in np.geomspace(667, 8004, 50):
+        lens, pupil = true(n)
+        found = zoom.at(n)
+        # A cubic through points h = 1/7 apart misses sin(2 pi s) by up to (2 pi h)^4 / 384 inside, ten times that at
+        # the ends, where it has no slope to go by.
+        assert found.focal_px[0] == pytest.approx(lens.focal_px[0], rel=0.03 * 0.02)
+        assert found.center_px[0] == pytest.approx(lens.center_px[0], abs=10 * 0.02)
+        assert zoom.pupil_at(n) == pytest.approx(pupil, abs=0.05 * 0.02)
+        corner = np.array([600.0, 400.0])
+        assert found.project(lens.ray(corner)) == pytest.approx(corner, abs=1.0)
+
+
 def test_zoom_lens_refuses_stops_out_of_order():
+    with pytest.raises(ConfigError, match="pupil"):
+        ZoomLens((700.0, 1400.0), (ZOOM, ZOOM), (0.1, 0.2))
     with pytest.raises(ConfigError, match="increase"):
         ZoomLens((700.0, 700.0), (ZOOM, ZOOM))

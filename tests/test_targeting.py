@@ -112,7 +112,7 @@ def test_an_aim_uses_the_lens_as_it_was_calibrated_at_that_focal_length():
     stops = (Intrinsics(SIZE, (700.0, 700.0), (326.0, 235.0)), Intrinsics(SIZE, (2828.0, 2828.0), (336.0, 245.0)))
     calibration = replace(HOME, zoom=ZoomLens((700.0, 2800.0), stops))
     found = aim(calibration, np.array([0.0, 0.0, 10.0]), ANYWHERE, nominal_px=1400.0)
-    focal = 1400 * 1.005  # the ratio to the nominal one is half way between 1 and 1.01
+    focal = 1400 * 1.01**0.5  # the ratio to the nominal one is half way between 1 and 1.01 in the logarithm
     assert found.focal_px == pytest.approx(focal, rel=RELATIVE)
     # What lies straight ahead must come to the image's centre, 11.5 px left of and 0.5 px above (331, 240).
     assert math.tan(found.pan) == pytest.approx(11.5 / focal, rel=CURVATURE)

@@ -3,13 +3,15 @@
 from cotarget.calibration.boards import draw_board, find_corners
 from cotarget.calibration.file import load_calibration, save_calibration
 from cotarget.calibration.method import calibrate_captures, calibrate_photos, calibrate_rig, calibrate_views
-from cotarget.calibration.model import Calibration, Capture, Covariance, Rejected, Residuals, View
+from cotarget.calibration.model import Calibration, Capture, Covariance, HeldOut, Options, Rejected, Residuals, View
 from cotarget.calibration.uncertainty import line_of_sight_covariance, predicted_pointing
 
 __all__ = [
     "Calibration",
     "Capture",
     "Covariance",
+    "HeldOut",
+    "Options",
     "Rejected",
     "Residuals",
     "View",

@@ -20,7 +20,7 @@ from cotarget.calibration.placing import place_boards
 from cotarget.calibration.plan import Coverage, distance, facing_board, plan_placement
 from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.reprojection import Block, RigModel
-from cotarget.camera import Intrinsics
+from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import base_head
@@ -87,7 +87,7 @@ def learn_zoom(recorder: Recorder, model: RigModel) -> RigModel:
     if centred is not view:
         by_pan, by_tilt = _turn_a_little(recorder, centred)
     _present_otherwise_tilted(recorder, model, centred)
-    model = _likeliest(replace(model, zoom=zoom), recorder, [centred, by_pan, by_tilt])
+    model = _likeliest(replace(model, zoom=ZoomLens((focal,), (zoom,))), recorder, [centred, by_pan, by_tilt])
     return refitted(model, recorder)
 
 
@@ -111,7 +111,7 @@ def _likeliest(model: RigModel, recorder: Recorder, seen: Sequence[View]) -> Rig
     """
     assert model.fixed is not None
     assert model.zoom is not None
-    points, zoom = board_points(recorder.board), model.zoom
+    points, zoom = board_points(recorder.board), model.zoom.stops[0]
     heads = [base_head(view.pan, view.tilt) for view in seen]
     fixed_view = next(v for v in recorder.of_placement(seen[0].board) if v.camera == "fixed")
     T_fixed_board = board_pose(model.fixed, fixed_view.corners_px, points)
@@ -227,6 +227,8 @@ def refitted(model: RigModel, recorder: Recorder) -> RigModel:
     by_camera = {name: [view for view in views if view.camera == name] for name in ("fixed", "zoom")}
     fixed = rough_intrinsics("fixed", by_camera["fixed"], points, recorder.rig.fixed.size)
     zoom = rough_intrinsics("zoom", by_camera["zoom"], points, recorder.rig.zoom.size)
-    afresh = place_boards(replace(model, fixed=fixed, zoom=zoom), views, points)
+    assert model.zoom is not None
+    lens = ZoomLens(model.zoom.nominal_px, (zoom,))
+    afresh = place_boards(replace(model, fixed=fixed, zoom=lens), views, points)
     again = fit(fit(afresh, views, points, {"gamma"}).model, views, points, blocks)
     return min((result, again), key=lambda one: one.rms_px).model

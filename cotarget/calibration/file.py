@@ -1,10 +1,12 @@
 """calibration.json: readable, replaced atomically, checked when it is read, and with the corners it came from.
 
 Keys: schema; fixed; zoom (stops over the focal length); T_zoom0_fixed; T_head_zoom (or null); head; pitch_mm (or
-null); residuals; covariance (or null); board; provenance; views. Lengths are metres; angles are degrees where people
-read them, and radians in the views, so that a refit starts from the very same numbers.
+null); residuals; covariance (or null); held_out (or null); board; provenance; views, with null for a corner that is
+not seen. Lengths are metres; angles are degrees where people read them, and radians in the views, so that a refit
+starts from the very same numbers.
 """
 
+import dataclasses
 import itertools
 import json
 import math
@@ -15,7 +17,7 @@ import numpy as np
 
 from cotarget.calibration import parsing
 from cotarget.calibration.atomic import write_atomically
-from cotarget.calibration.model import Calibration, Covariance, Rejected, Residuals, View
+from cotarget.calibration.model import Calibration, Covariance, HeldOut, Rejected, Residuals, View
 from cotarget.calibration.parsing import Table, get, join
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
@@ -23,7 +25,7 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import pose_dict
 from cotarget.pantilt import HeadGeometry
 
-SCHEMA = 1
+SCHEMA = 2
 
 
 def save_calibration(path: Path, calibration: Calibration) -> None:
@@ -40,8 +42,8 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
         "zoom": {
             "size": list(calibration.zoom.size),
             "stops": [
-                {"nominal_px": float(nominal), **_write_intrinsics(stop)}
-                for nominal, stop in zip(calibration.zoom.nominal_px, calibration.zoom.stops, strict=True)
+                {"nominal_px": float(nominal), **_write_intrinsics(stop), "pupil": float(pupil)}
+                for nominal, stop, pupil in zip(*_columns(calibration.zoom), strict=True)
             ],
         },
         "T_zoom0_fixed": pose_dict(calibration.T_zoom0_fixed),
@@ -49,12 +51,18 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
         "head": {
             "axis_offset": float(calibration.head.axis_offset),
             "squareness_deg": math.degrees(calibration.head.squareness),
+            "pan_scale": float(calibration.head.pan_scale),
+            "tilt_scale": float(calibration.head.tilt_scale),
+            "pan_zero_deg": math.degrees(calibration.head.pan_zero),
+            "tilt_zero_deg": math.degrees(calibration.head.tilt_zero),
+            "jitter_deg": math.degrees(calibration.jitter),
         },
         "pitch_mm": calibration.pitch_mm,
         "residuals": None if calibration.residuals is None else _write_residuals(calibration.residuals),
         "covariance": None
         if covariance is None
         else {"parameters": list(covariance.parameters), "matrix": covariance.matrix.tolist()},
+        "held_out": None if calibration.held_out is None else dataclasses.asdict(calibration.held_out),
         "board": None if calibration.board is None else write_board(calibration.board),
         "provenance": dict(calibration.provenance),
         "views": [_write_view(view) for view in calibration.views],
@@ -112,6 +120,10 @@ def _readable(table: dict[str, Any]) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
+def _columns(lens: ZoomLens) -> tuple[tuple[float, ...], tuple[Intrinsics, ...], tuple[float, ...]]:
+    return lens.nominal_px, lens.stops, lens.pupil
+
+
 def _write_intrinsics(camera: Intrinsics) -> dict[str, Any]:
     (fx, fy), (cx, cy) = camera.focal_px, camera.center_px
     numbers = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
@@ -133,6 +145,7 @@ RESIDUAL_KEYS = (
     "fixed_views",
     "zoom_views",
     "pairs",
+    "outliers",
 )
 
 
@@ -145,7 +158,9 @@ def _write_view(view: View) -> dict[str, Any]:
         "focal_px": view.focal_px,
         "t": view.t,
         "source": view.source,
-        "corners_px": view.corners_px.tolist(),
+        "corners_px": [
+            corner if seen else None for corner, seen in zip(view.corners_px.tolist(), view.seen, strict=True)
+        ],
     }
 
 
@@ -158,6 +173,10 @@ def _parse(table: Table) -> Calibration:
     if views and board is None:
         raise CalibrationError("board: is null, but there are views of one")
     fixed = parsing.as_table(get(table, "fixed"), "fixed")
+
+    def angle(name: str) -> float:
+        return math.radians(parsing.as_number(get(head, f"{name}_deg", "head"), f"head.{name}_deg"))
+
     return Calibration(
         fixed=_parse_intrinsics(fixed, parsing.as_size(get(fixed, "size", "fixed"), "fixed.size"), "fixed"),
         zoom=_parse_lens(parsing.as_table(get(table, "zoom"), "zoom")),
@@ -165,11 +184,17 @@ def _parse(table: Table) -> Calibration:
         T_head_zoom=None if T_head_zoom is None else parsing.as_pose(T_head_zoom, "T_head_zoom"),
         head=HeadGeometry(
             axis_offset=parsing.as_number(get(head, "axis_offset", "head"), "head.axis_offset"),
-            squareness=math.radians(parsing.as_number(get(head, "squareness_deg", "head"), "head.squareness_deg")),
+            squareness=angle("squareness"),
+            pan_scale=parsing.as_number(get(head, "pan_scale", "head"), "head.pan_scale", positive=True),
+            tilt_scale=parsing.as_number(get(head, "tilt_scale", "head"), "head.tilt_scale", positive=True),
+            pan_zero=angle("pan_zero"),
+            tilt_zero=angle("tilt_zero"),
         ),
+        jitter=angle("jitter"),
         pitch_mm=None if pitch is None else parsing.as_number(pitch, "pitch_mm", positive=True),
         residuals=_parse_residuals(get(table, "residuals")),
         covariance=_parse_covariance(get(table, "covariance")),
+        held_out=_parse_held_out(get(table, "held_out")),
         board=board,
         views=tuple(_parse_view(view, f"views[{i}]", board) for i, view in enumerate(views) if board is not None),
         provenance=parsing.as_table(get(table, "provenance"), "provenance"),
@@ -188,15 +213,18 @@ def _parse_lens(table: Table) -> ZoomLens:
     stops = parsing.as_list(get(table, "stops", "zoom"), "zoom.stops")
     if not stops:
         raise CalibrationError("zoom.stops: is empty; at least one calibrated focal length is needed")
-    nominal, intrinsics = [], []
+    nominal, intrinsics, pupil = [], [], []
     for i, value in enumerate(stops):
         where = f"zoom.stops[{i}]"
         stop = parsing.as_table(value, where)
         nominal.append(parsing.as_number(get(stop, "nominal_px", where), join(where, "nominal_px"), positive=True))
         intrinsics.append(_parse_intrinsics(stop, size, where))
+        pupil.append(parsing.as_number(get(stop, "pupil", where), join(where, "pupil")))
     if any(b <= a for a, b in itertools.pairwise(nominal)):
         raise CalibrationError("zoom.stops: the values of nominal_px do not increase")
-    return ZoomLens(tuple(nominal), tuple(intrinsics))
+    if pupil[0] != 0:
+        raise CalibrationError("zoom.stops[0].pupil: is not 0, from which the others are counted")
+    return ZoomLens(tuple(nominal), tuple(intrinsics), tuple(pupil))
 
 
 def _parse_residuals(value: Any) -> Residuals | None:
@@ -208,7 +236,7 @@ def _parse_residuals(value: Any) -> Residuals | None:
     for key in RESIDUAL_KEYS:
         item = get(table, key, where)
         if key.endswith("_px"):
-            missing = item is None and key == "handeye_rms_px"
+            missing = item is None and key in ("handeye_rms_px", "stereo_rms_px")
             numbers[key] = None if missing else parsing.as_number(item, join(where, key))
         else:
             numbers[key] = parsing.as_whole(item, join(where, key))
@@ -221,6 +249,17 @@ def _parse_residuals(value: Any) -> Residuals | None:
         )
         rejected.append(Rejected(name, reason))
     return Residuals(**numbers, rejected=tuple(rejected))
+
+
+def _parse_held_out(value: Any) -> HeldOut | None:
+    if value is None:
+        return None
+    table = parsing.as_table(value, "held_out")
+    numbers = {
+        name: parsing.as_number(get(table, name, "held_out"), f"held_out.{name}")
+        for name in ("measured_px", "predicted_px", "corners_rms_px", "widened")
+    }
+    return HeldOut(views=parsing.as_whole(get(table, "views", "held_out"), "held_out.views"), **numbers)
 
 
 def _parse_covariance(value: Any) -> Covariance | None:
@@ -247,7 +286,12 @@ def _parse_view(value: Any, where: str, board: BoardConfig) -> View:
     pan, tilt, t = (parsing.as_number(get(table, k, where), join(where, k)) for k in ("pan", "tilt", "t"))
     return View(
         camera=camera,
-        corners_px=np.array([parsing.as_numbers(c, f"{where}.corners_px[{i}]", 2) for i, c in enumerate(corners)]),
+        corners_px=np.array(
+            [
+                (np.nan, np.nan) if c is None else parsing.as_numbers(c, f"{where}.corners_px[{i}]", 2)
+                for i, c in enumerate(corners)
+            ]
+        ),
         board=parsing.as_whole(get(table, "board", where), join(where, "board")),
         pan=pan,
         tilt=tilt,

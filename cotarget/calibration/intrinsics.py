@@ -14,6 +14,7 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
 
 FEWEST_VIEWS = 3  # Zhang's method: two views determine a pinhole, a third the distortion
+FEWEST_CORNERS = 4  # of a plane, for its pose
 # OpenCV starts the fit from this many views, evenly picked: its time grows with their square.
 STARTING_VIEWS = 20
 # A start only: no tangential distortion nor k2, k3, which a few views near the middle do not determine.
@@ -56,8 +57,8 @@ def rough_intrinsics(camera: CameraName, views: Sequence[View], points: Array, s
     picked = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, STARTING_VIEWS).round().astype(int))]
     try:
         _, K, distortion, _, _ = cv2.calibrateCamera(
-            [points.astype(np.float32)] * len(picked),
-            [view.corners_px.astype(np.float32) for view in picked],
+            [points[view.seen].astype(np.float32) for view in picked],
+            [view.corners_px[view.seen].astype(np.float32) for view in picked],
             size,
             np.array([[1.0, 0, (size[0] - 1) / 2], [0, 1.0, (size[1] - 1) / 2], [0, 0, 1.0]]),
             np.zeros(5),
@@ -84,6 +85,7 @@ def board_pose(lens: Intrinsics, corners_px: Array, points: Array) -> RigidTrans
     Raises:
         CalibrationError: no pose explains the corners.
     """
+    points, corners_px = _seen(points, corners_px)
     ok, rotvec, translation = cv2.solvePnP(
         points, corners_px, lens.matrix, np.array(lens.distortion), flags=cv2.SOLVEPNP_IPPE
     )
@@ -101,6 +103,7 @@ def pose_candidates(lens: Intrinsics, corners_px: Array, points: Array) -> list[
     Raises:
         CalibrationError: no pose explains the corners.
     """
+    points, corners_px = _seen(points, corners_px)
     _, rotvecs, translations, _ = cv2.solvePnPGeneric(
         points, corners_px, lens.matrix, np.array(lens.distortion), flags=cv2.SOLVEPNP_IPPE
     )
@@ -112,3 +115,15 @@ def pose_candidates(lens: Intrinsics, corners_px: Array, points: Array) -> list[
     if not found:
         raise CalibrationError("no pose of the board explains its corners")
     return found
+
+
+def _seen(points: Array, corners_px: Array) -> tuple[Array, Array]:
+    """The points that are seen, and where.
+
+    Raises:
+        CalibrationError: they are too few for a pose.
+    """
+    seen = np.isfinite(corners_px[:, 0])
+    if np.count_nonzero(seen) < FEWEST_CORNERS:
+        raise CalibrationError(f"{np.count_nonzero(seen)} corners of the board do not determine its pose")
+    return points[seen], corners_px[seen]

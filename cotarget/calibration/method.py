@@ -1,5 +1,6 @@
 """From views, saved captures or plain photos to a `Calibration`, by a method that is named."""
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -13,11 +14,12 @@ import numpy as np
 from cotarget import __version__
 from cotarget.calibration.boards import board_points, check_board, find_corners
 from cotarget.calibration.captures import CaptureIndex, pair_photos, read_images, read_index
-from cotarget.calibration.model import Calibration, CameraName, Capture, Rejected, View
+from cotarget.calibration.intrinsics import FEWEST_CORNERS
+from cotarget.calibration.joint import joint
+from cotarget.calibration.model import DEFAULT_OPTIONS, Calibration, CameraName, Capture, Options, Rejected, View
 from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.sequential import sequential
 from cotarget.calibration.session import capture_session
-from cotarget.camera import ZoomLens
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.rig import Rig
@@ -27,7 +29,7 @@ Progress = Callable[[int, int, str], None]  # done, total, text
 # Without the last refinement, thirty placements point twice as well as fifteen; a session of them takes about 15 s
 # of computing on two cores.
 PLACEMENTS = 30
-METHODS = ("sequential",)
+METHODS = ("joint", "sequential")
 SAME_FOCAL = 1e-3  # relative; a step of a usual lens changes the focal length twenty times more
 
 NO_BOARD = "no whole board of {}x{} corners is seen"
@@ -39,20 +41,19 @@ def calibrate_views(
     sizes: Mapping[CameraName, tuple[int, int]],
     *,
     pitch_mm: float | None = None,
-    method: str = "sequential",
-    refine: bool = True,
+    options: Options = DEFAULT_OPTIONS,
     rejected: Sequence[Rejected] = (),
     provenance: Mapping[str, Any] | None = None,
 ) -> Calibration:
-    """Calibrate from corners.
+    """Calibrate from corners. The order of the views does not matter.
 
     Args:
-        views: of both cameras; those of the zoom camera that are not at the shortest focal length are left out.
+        views: of both cameras. The sequential method leaves out those of the zoom camera that are not at its shortest
+            focal length.
         board: what the corners are of.
         sizes: (width, height) of the images of "fixed" and "zoom" [px].
         pitch_mm: size of a pixel of the zoom camera [mm], where it is known.
-        method: "sequential".
-        refine: whether a last fit of everything together ends the method.
+        options: how to calibrate.
         rejected: images already left out, and why, for the report.
         provenance: where the views come from; versions and method are added.
 
@@ -60,34 +61,37 @@ def calibrate_views(
         CalibrationError: the views do not determine the rig.
         ConfigError: the board looks the same upside down.
     """
-    if method not in METHODS:
-        raise CalibrationError(f"unknown method '{method}'; the methods are: {choices(METHODS)}")
+    if options.method not in METHODS:
+        raise CalibrationError(f"unknown method '{options.method}'; the methods are: {choices(METHODS)}")
     check_board(board)
-    columns, rows = board.corners
-    for view in views:
-        if view.corners_px.shape != (columns * rows, 2) or not np.isfinite(view.corners_px).all():
-            raise CalibrationError(
-                f"{view.name}: has not the {columns * rows} finite corners of a {columns}x{rows} board"
-            )
-    shortest, others, nominal = _at_shortest(views)
-    solution = sequential(shortest, board_points(board), sizes, refine=refine)
+    _check_views(views, board)
+    views = _in_canonical_order(views)
+    nominal = _stops(views)
+    points = board_points(board)
+    others: list[Rejected] = []
+    if options.method == "joint":
+        solution = joint(views, points, sizes, nominal, options)
+    else:
+        shortest, others = _at_shortest(views, nominal)
+        solution = sequential(shortest, points, sizes, nominal[0] if nominal else None)
     model = solution.model
     assert model.fixed is not None
     assert model.zoom is not None
     return Calibration(
         fixed=model.fixed,
-        zoom=ZoomLens((nominal or model.zoom.focal_px[0],), (model.zoom,)),
+        zoom=model.zoom,
         T_zoom0_fixed=model.gamma,
         T_head_zoom=model.hand if solution.has_head else None,
         head=model.head,
         pitch_mm=pitch_mm,
         residuals=replace(solution.residuals, rejected=(*rejected, *others, *solution.residuals.rejected)),
         covariance=solution.covariance,
+        jitter=solution.jitter,
+        held_out=solution.held_out,
         board=board,
         views=solution.views,
         provenance={
-            "method": method,
-            "refine": refine,
+            **dataclasses.asdict(options),
             "when": datetime.now(UTC).isoformat(timespec="seconds"),
             "cotarget": __version__,
             "opencv": cv2.__version__,
@@ -98,37 +102,65 @@ def calibrate_views(
     )
 
 
-def _at_shortest(views: Sequence[View]) -> tuple[list[View], list[Rejected], float | None]:
-    """Keep the zoom camera's views at its shortest nominal focal length, which is None where no device told one."""
-    focals = [view.focal_px for view in views if view.camera == "zoom" and view.focal_px is not None]
-    if not focals:
-        return list(views), [], None
-    nominal = min(focals)
+def _check_views(views: Sequence[View], board: BoardConfig) -> None:
+    """Refuse corners that are not of this board."""
+    columns, rows = board.corners
+    for view in views:
+        corners = view.corners_px
+        if corners.shape != (columns * rows, 2) or np.isinf(corners).any() or view.seen.sum() < FEWEST_CORNERS:
+            raise CalibrationError(
+                f"{view.name}: has not the {columns * rows} finite corners of a {columns}x{rows} board, or the "
+                f"{FEWEST_CORNERS} of them that tell its pose"
+            )
+
+
+def _in_canonical_order(views: Sequence[View]) -> list[View]:
+    """The same views in an order that does not depend on the one given, so that sums round alike."""
+
+    def key(view: View) -> tuple[Any, ...]:
+        return view.camera, view.board, view.focal_px or 0.0, view.pan, view.tilt, view.corners_px.tobytes()
+
+    return sorted(views, key=key)
+
+
+def _stops(views: Sequence[View]) -> list[float]:
+    """The nominal focal lengths at which the zoom camera was, increasing; empty where no device told one."""
+    stops: list[float] = []
+    for focal in sorted({view.focal_px for view in views if view.camera == "zoom" and view.focal_px is not None}):
+        if not stops or focal > stops[-1] * (1 + SAME_FOCAL):
+            stops.append(focal)
+    return stops
+
+
+def _at_shortest(views: Sequence[View], nominal: Sequence[float]) -> tuple[list[View], list[Rejected]]:
+    """Keep the zoom camera's views at its shortest nominal focal length."""
 
     def keep(view: View) -> bool:
-        return view.camera == "fixed" or view.focal_px is None or view.focal_px <= nominal * (1 + SAME_FOCAL)
+        return view.camera == "fixed" or view.focal_px is None or view.focal_px <= nominal[0] * (1 + SAME_FOCAL)
 
     left_out = [
-        Rejected(view.name, f"taken at {view.focal_px:.0f} px, not at the shortest focal length, {nominal:.0f} px")
+        Rejected(view.name, f"taken at {view.focal_px:.0f} px, not at the shortest focal length, {nominal[0]:.0f} px")
         for view in views
         if not keep(view)
     ]
-    return [view for view in views if keep(view)], left_out, nominal
+    return [view for view in views if keep(view)], left_out
 
 
-def calibrate_captures(directory: Path, *, refine: bool = True, progress: Progress | None = None) -> Calibration:
+def calibrate_captures(
+    directory: Path, *, options: Options = DEFAULT_OPTIONS, progress: Progress | None = None
+) -> Calibration:
     """Calibrate from captures that `calibrate_rig` or somebody else saved; no rig is needed.
 
     Args:
         directory: folder with index.json and its images.
-        refine: whether a last fit of everything together ends the method.
+        options: how to calibrate.
         progress: called with what is done, of how much, and in words.
 
     Raises:
         CalibrationError: a file is missing or malformed, or the views do not determine the rig.
     """
     index = read_index(directory)
-    return _calibrate_images(directory, index, refine, progress, rejected=[], what="captures")
+    return _calibrate_images(directory, index, options, progress, rejected=[], what="captures")
 
 
 def calibrate_photos(
@@ -137,7 +169,7 @@ def calibrate_photos(
     zoom_glob: str,
     board: BoardConfig,
     *,
-    refine: bool = True,
+    options: Options = DEFAULT_OPTIONS,
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrate both cameras and Gamma from plain photos, paired by the last number in their names.
@@ -147,7 +179,7 @@ def calibrate_photos(
         fixed_glob: pattern of the fixed camera's files, like 'left*.jpg'.
         zoom_glob: pattern of the zoom camera's, taken at pan = tilt = 0 or without any head.
         board: what the photos show.
-        refine: whether a last fit of everything together ends the method.
+        options: how to calibrate.
         progress: called with what is done, of how much, and in words.
 
     Raises:
@@ -159,7 +191,7 @@ def calibrate_photos(
         raise CalibrationError(f"{directory}: no two photos of '{fixed_glob}' and '{zoom_glob}' have the same number")
     rejected = [Rejected(name, "has no partner with the same number") for name in unpaired]
     index = CaptureIndex(board, None, tuple(captures))
-    return _calibrate_images(directory, index, refine, progress, rejected, what="photos")
+    return _calibrate_images(directory, index, options, progress, rejected, what="photos")
 
 
 def find_view(capture: Capture, board: BoardConfig) -> View | None:
@@ -175,7 +207,7 @@ def find_view(capture: Capture, board: BoardConfig) -> View | None:
 def _calibrate_images(
     directory: Path,
     index: CaptureIndex,
-    refine: bool,
+    options: Options,
     progress: Progress | None,
     rejected: list[Rejected],
     what: str,
@@ -205,7 +237,7 @@ def _calibrate_images(
         index.board,
         sizes,
         pitch_mm=index.pitch_mm,
-        refine=refine,
+        options=options,
         rejected=rejected,
         provenance={what: str(directory), "images": len(index.captures)},
     )
@@ -220,7 +252,7 @@ def calibrate_rig(
     placements: int = PLACEMENTS,
     seed: int = 0,
     pitch_mm: float | None = None,
-    refine: bool = True,
+    options: Options = DEFAULT_OPTIONS,
 ) -> Calibration:
     """Drive a rig through a capture session, then calibrate it.
 
@@ -232,7 +264,7 @@ def calibrate_rig(
         placements: how many placements of the board.
         seed: of the choice among possible placements.
         pitch_mm: size of a pixel of the zoom camera [mm], where it is known.
-        refine: whether a last fit of everything together ends the method.
+        options: how to calibrate.
 
     Raises:
         CalibrationError: a camera never sees the board, there is no common view, or the head fails.
@@ -246,7 +278,7 @@ def calibrate_rig(
         board,
         {"fixed": rig.fixed.size, "zoom": rig.zoom.size},
         pitch_mm=pitch_mm,
-        refine=refine,
+        options=options,
         rejected=recorder.rejected,
         provenance=provenance | ({} if captures_dir is None else {"captures": str(captures_dir)}),
     )

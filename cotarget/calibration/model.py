@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
@@ -46,7 +47,7 @@ class View:
     """The board's corners in one image; see `Capture` for the other attributes.
 
     Attributes:
-        corners_px: all inner corners, row by row from the board's first, (N, 2) [px].
+        corners_px: all inner corners, row by row from the board's first, (N, 2) [px]; nan for those not seen.
     """
 
     camera: CameraName
@@ -57,6 +58,11 @@ class View:
     focal_px: float | None = None
     t: float = 0.0
     source: str | None = None
+
+    @property
+    def seen(self) -> npt.NDArray[np.bool_]:
+        """Which corners are seen, (N,)."""
+        return np.isfinite(self.corners_px[:, 0])
 
     @property
     def name(self) -> str:
@@ -73,14 +79,35 @@ class Rejected:
 
 
 @dataclass(frozen=True)
+class Options:
+    """How to calibrate.
+
+    Attributes:
+        method: "joint", one fit of everything; or "sequential", the paper's, to be compared with.
+        encoders: joint only: whether to find the encoders' scales and zeros too, near 1 and 0 by prior knowledge.
+        insist: joint only: whether to go on where the motions leave something open, with an uncertainty that says so.
+        folds: joint only: into how many parts the placements are split, each kept out once and predicted; 0 for none.
+    """
+
+    method: str = "joint"
+    encoders: bool = False
+    insist: bool = False
+    folds: int = 5
+
+
+DEFAULT_OPTIONS = Options()
+
+
+@dataclass(frozen=True)
 class Residuals:
     """How well the corners are explained: root mean square distance per point, all corners of all views used [px].
 
     Attributes:
         fixed_rms_px: the fixed camera's views, each board pose free.
         zoom_rms_px: the zoom camera's views, each board pose free.
-        stereo_rms_px: pairs at home, one board pose a pair, over both cameras' points.
+        stereo_rms_px: pairs at home, one board pose a pair, over both cameras' points; None without pairs.
         handeye_rms_px: every view of the zoom camera through the head; None without a head.
+        outliers: how many single corners were left out of the last fit.
         fixed_views: how many views of the fixed camera were used.
         zoom_views: how many views of the zoom camera were used.
         pairs: how many placements were seen by both cameras at home.
@@ -89,24 +116,29 @@ class Residuals:
 
     fixed_rms_px: float
     zoom_rms_px: float
-    stereo_rms_px: float
+    stereo_rms_px: float | None
     handeye_rms_px: float | None
     fixed_views: int
     zoom_views: int
     pairs: int
+    outliers: int = 0
     rejected: tuple[Rejected, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """What the corners' noise leaves uncertain.
+    """What is left uncertain.
 
     The truth differs from what was found by an error of this covariance. Parameters that were held (k3) are left out.
 
-        fixed.fx .fy .cx .cy                 [px], of the image size calibrated; zoom.* likewise, at the shortest
-        fixed.k1 .k2 .p1 .p2                 without unit                        focal length calibrated
+        fixed.fx .fy .cx .cy                 [px], of the image size calibrated
+        fixed.k1 .k2 .p1 .p2                 without unit
+        zoom[i].fx ... zoom[i].p2            the same of the zoom lens's stop i, counted from 0
+        zoom[i].pupil                        [m], of all stops but the first
         T_zoom0_fixed.rx .ry .rz .tx .ty .tz     [rad] and [m]; T_head_zoom.* likewise
-        head.axis_offset head.squareness     [m] and [rad]
+        head.axis_offset .squareness         [m] and [rad]
+        head.pan_scale .tilt_scale           without unit, where they were asked for
+        head.pan_zero .tilt_zero             [rad], where they were asked for
 
     An error (w, d) of a transform (R, t) means exp(w) R and t + d: w turns about the axes of the frame that the
     transform leads to, and leaves t as it is.
@@ -124,6 +156,34 @@ class Covariance:
         by = np.array([factors.get(name, 1.0) for name in self.parameters])
         return Covariance(self.parameters, self.matrix * np.outer(by, by))
 
+    def sigma(self, name: str) -> float:
+        """Standard deviation of one parameter."""
+        i = self.parameters.index(name)
+        return float(np.sqrt(self.matrix[i, i]))
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How well placements that were kept out of the fit are predicted, each of some folds in its turn.
+
+    The board's place comes from the fixed camera's view alone; where it then appears to the zoom camera, on average
+    over its corners, is what pointing at a target means.
+
+    Attributes:
+        views: how many views of the zoom camera were predicted.
+        measured_px: rms distance between predicted and seen, at each view's own focal length brought to the shortest.
+        predicted_px: what the covariance, the jitter and the corners' noise let expect of that.
+        corners_rms_px: rms of single corners of all views kept out, with only their board's pose fitted.
+        widened: factor by which the standard deviations were widened, because the measured distance was larger than
+            predicted beyond chance; 1 where they agree.
+    """
+
+    views: int
+    measured_px: float
+    predicted_px: float
+    corners_rms_px: float
+    widened: float = 1.0
+
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
@@ -138,6 +198,9 @@ class Calibration:
         pitch_mm: size of a pixel of the zoom camera [mm], where it is known; only for focal lengths in millimetres.
         residuals: how well the corners are explained, and what was rejected.
         covariance: None where the method gives none.
+        jitter: standard deviation by which each axis of the head misses what it reports, at every pose anew [rad];
+            beyond the head itself it stands for whatever of the rig the model leaves out.
+        held_out: what captures kept out of the fit say; None where there were too few, or the method tells none.
         board: the board, None for a calibration that comes from no board.
         views: the corners themselves, so that the calibration can be checked and refitted.
         provenance: versions, method, when, from which captures; JSON values only.
@@ -151,19 +214,27 @@ class Calibration:
     pitch_mm: float | None = None
     residuals: Residuals | None = None
     covariance: Covariance | None = None
+    jitter: float = 0.0
+    held_out: HeldOut | None = None
     board: BoardConfig | None = None
     views: tuple[View, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    def hand_eye(self) -> RigidTransform:
+    def hand_eye(self, nominal_px: float | None = None) -> RigidTransform:
         """T_head_zoom, for those who cannot do without.
+
+        Args:
+            nominal_px: focal length by the device's own account [px], whose entrance pupil is meant; the shortest
+                calibrated one by default.
 
         Raises:
             CalibrationError: there was no head to calibrate.
         """
         if self.T_head_zoom is None:
             raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
-        return self.T_head_zoom
+        if nominal_px is None:
+            return self.T_head_zoom
+        return self.T_head_zoom * RigidTransform.from_translation([0.0, 0.0, self.zoom.pupil_at(nominal_px)])
 
     def for_streams(self, fixed_size: tuple[int, int], zoom_size: tuple[int, int]) -> "Calibration":
         """The same calibration for streams (width, height) [px] that are scaled.
@@ -176,7 +247,8 @@ class Calibration:
             s_fixed, s_zoom = fixed_size[0] / self.fixed.size[0], zoom_size[0] / self.zoom.size[0]
             in_pixels = ("fx", "fy", "cx", "cy")
             covariance = covariance.scaled(
-                {f"fixed.{k}": s_fixed for k in in_pixels} | {f"zoom.{k}": s_zoom for k in in_pixels}
+                {f"fixed.{k}": s_fixed for k in in_pixels}
+                | {f"zoom[{i}].{k}": s_zoom for i in range(len(self.zoom.stops)) for k in in_pixels}
             )
         pitch_mm = self.pitch_mm and self.pitch_mm * self.zoom.size[0] / zoom_size[0]  # a larger pixel, where binned
         return replace(

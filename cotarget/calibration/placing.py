@@ -12,7 +12,7 @@ import numpy as np
 
 from cotarget.calibration.intrinsics import pose_candidates
 from cotarget.calibration.model import View
-from cotarget.calibration.reprojection import RigModel, predict
+from cotarget.calibration.reprojection import RigModel, predict_pixels, stop_of
 from cotarget.geometry import Array, RigidTransform
 from cotarget.pantilt import zoom_fixed
 
@@ -35,8 +35,8 @@ def place_boards(model: RigModel, views: Sequence[View], points: Array) -> RigMo
         placements[view.board].append(view)
     boards = {}
     for number, same in placements.items():
-        # One view of each camera, where there are two cameras: their candidates differ.
-        by_camera = {view.camera: view for view in reversed(same)}
+        # One view of each camera, where there are two cameras: their candidates differ. The one that shows most.
+        by_camera = {view.camera: view for view in sorted(same, key=lambda view: int(view.seen.sum()))}
         candidates = [T for view in list(by_camera.values())[:ASKED_VIEWS] for T in _suggested(model, view, points)]
         errors = [_misfit(model, number, T, same, points) for T in candidates]
         boards[number] = candidates[int(np.argmin(errors))]
@@ -45,17 +45,20 @@ def place_boards(model: RigModel, views: Sequence[View], points: Array) -> RigMo
 
 def _suggested(model: RigModel, view: View, points: Array) -> list[RigidTransform]:
     """T_fixed_board as one view may mean it."""
-    lens = model.fixed if view.camera == "fixed" else model.zoom
-    assert lens is not None
-    poses = pose_candidates(lens, view.corners_px, points)
+    poses = pose_candidates(model.lens_of(view), view.corners_px, points)
     if view.camera == "fixed":
         return poses
-    T_fixed_zoom = zoom_fixed(view.pan, view.tilt, model.hand, model.gamma, model.head).inv()
+    assert model.zoom is not None
+    pupil = RigidTransform.from_translation([0.0, 0.0, model.zoom.pupil[stop_of(model.zoom, view)]])
+    T_fixed_zoom = zoom_fixed(view.pan, view.tilt, model.hand, model.gamma, model.head).inv() * pupil
     return [T_fixed_zoom * T for T in poses]
 
 
 def _misfit(model: RigModel, number: int, T: RigidTransform, views: Sequence[View], points: Array) -> float:
     """Mean distance between predicted and seen corners [px]; infinite behind a camera."""
-    pixels = predict(replace(model, boards={number: T}), views, points, ())[0]
-    off = np.linalg.norm(pixels - np.stack([view.corners_px for view in views]), axis=-1)
+    pixels = predict_pixels(replace(model, boards={number: T}), views, points)
+    off = np.concatenate([
+        np.linalg.norm(predicted[view.seen] - view.corners_px[view.seen], axis=-1)
+        for predicted, view in zip(pixels, views, strict=True)
+    ])  # fmt: skip
     return float(np.mean(off)) if np.isfinite(off).all() else np.inf

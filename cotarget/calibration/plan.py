@@ -135,7 +135,7 @@ def plan_placement(
         good, seen = visible(model.fixed, x_fixed, board, margin_px)
         if model.zoom is not None:
             in_zoom, seen_zoom = visible(
-                model.zoom, model.gamma.apply(x_fixed.reshape(-1, 3)).reshape(x_fixed.shape), board, margin_px
+                model.zoom.stops[0], model.gamma.apply(x_fixed.reshape(-1, 3)).reshape(x_fixed.shape), board, margin_px
             )
             good = np.logical_and(good, in_zoom) if shared else good
         gains: list[tuple[float, int]] = []
@@ -166,7 +166,7 @@ def plan_poses(
         Up to ``count`` pairs (pan, tilt) [rad], within the limits.
     """
     assert model.zoom is not None
-    lens = model.zoom
+    lens = model.zoom.stops[0]
     middle = (model.hand * model.gamma * T_fixed_board).apply(board_points(board).mean(axis=0))
     ray = lens.ray(lens.image_center_px)
     try:
@@ -198,7 +198,7 @@ def seen_at_home(model: RigModel, T_fixed_board: RigidTransform, board: BoardCon
     """Whether the zoom camera should see a board at pan = tilt = 0."""
     assert model.zoom is not None
     x_zoom = (model.gamma * T_fixed_board).apply(board_body(board))
-    return bool(visible(model.zoom, x_zoom[None], board, 0.0)[0][0])
+    return bool(visible(model.zoom.stops[0], x_zoom[None], board, 0.0)[0][0])
 
 
 def random_turns(count: int, rng: np.random.Generator) -> Rotation:

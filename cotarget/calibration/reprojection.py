@@ -5,44 +5,39 @@ Boards are placed in the fixed camera's frame, so that a corner X of placement b
     by the fixed camera at      x_fixed = T_fixed_board X
     by the zoom camera at       x_zoom = T_head_zoom^-1 T_base_head^-1 T_head_zoom T_zoom0_fixed x_fixed       (Eq. 2)
 
-Poses are stepped as R <- exp(w) R, t <- t + d. The derivatives are analytic; OpenCV's cv2.projectPoints gives those of
-the lens.
+less the way that its entrance pupil has moved forward at the focal length in use. Poses are stepped as R <- exp(w) R,
+t <- t + d. The derivatives are analytic; OpenCV's cv2.projectPoints gives those of the lens.
 """
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from cotarget.calibration.model import View
-from cotarget.camera import Intrinsics
+from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import IDEAL_HEAD, HeadGeometry
 
-Block = Literal["fixed", "zoom", "gamma", "hand", "head"]
+Block = Literal["fixed", "zoom", "pupil", "gamma", "hand", "head", "scale", "zero"]
+# What a calibration finds by default, in the order of the parameters; "scale" and "zero" are the encoders'.
+ALL_BLOCKS: tuple[Block, ...] = ("fixed", "zoom", "pupil", "gamma", "hand", "head")
+EVERY_BLOCK: tuple[Block, ...] = (*ALL_BLOCKS, "scale", "zero")
 
 # fx fy cx cy k1 k2 p1 p2, the order of OpenCV's Jacobian after the pose; k3, the next, stays as it is: it hardly
 # changes the residuals of real photos (0.0002 px) but bends the image where no board was seen.
-FREE_LENS_PARAMETERS = 8
-POSE_PARAMETERS = 6
-BLOCK_WIDTHS: dict[Block, int] = {
-    "fixed": FREE_LENS_PARAMETERS,
-    "zoom": FREE_LENS_PARAMETERS,
-    "gamma": POSE_PARAMETERS,
-    "hand": POSE_PARAMETERS,
-    "head": 2,
-}
 LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+LENS_PARAMETERS = len(LENS_NAMES)
 POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
-BLOCK_NAMES: dict[Block, tuple[str, ...]] = {
-    "fixed": tuple(f"fixed.{name}" for name in LENS_NAMES),
-    "zoom": tuple(f"zoom.{name}" for name in LENS_NAMES),
-    "gamma": tuple(f"T_zoom0_fixed.{name}" for name in POSE_NAMES),
-    "hand": tuple(f"T_head_zoom.{name}" for name in POSE_NAMES),
-    "head": ("head.axis_offset", "head.squareness"),
+POSE_PARAMETERS = len(POSE_NAMES)
+HEAD_NAMES = {
+    "head": ("axis_offset", "squareness"),
+    "scale": ("pan_scale", "tilt_scale"),
+    "zero": ("pan_zero", "tilt_zero"),
 }
 STILL = RigidTransform.identity()
 E3 = np.array([0.0, 0.0, 1.0])
@@ -54,84 +49,242 @@ class RigModel:
 
     Attributes:
         fixed: the fixed camera, None while only the zoom camera is looked at.
-        zoom: the zoom camera at the focal length of the views, None while only the fixed camera is looked at.
-        gamma: T_zoom0_fixed.
-        hand: T_head_zoom.
+        zoom: the zoom camera, None while only the fixed camera is looked at.
+        gamma: T_zoom0_fixed, at the first stop.
+        hand: T_head_zoom, at the first stop.
         head: the pan-tilt unit's geometry.
-        boards: T_fixed_board of each placement.
+        boards: T_fixed_board by the number of the placement.
     """
 
-    boards: dict[int, RigidTransform]
+    boards: Mapping[int, RigidTransform]
     fixed: Intrinsics | None = None
-    zoom: Intrinsics | None = None
+    zoom: ZoomLens | None = None
     gamma: RigidTransform = STILL
     hand: RigidTransform = STILL
     head: HeadGeometry = IDEAL_HEAD
 
+    @property
+    def stops(self) -> int:
+        """How many stops the zoom lens has here."""
+        return 0 if self.zoom is None else len(self.zoom.stops)
 
-def predict(
-    model: RigModel, views: Sequence[View], points: Array, free: Collection[Block]
-) -> tuple[Array, Array, Array]:
-    """Predict every corner, and its derivatives.
+    def lens_of(self, view: View) -> Intrinsics:
+        """The intrinsics with which a view was taken.
 
-    Returns:
-        Pixels (V, N, 2); derivatives by the free blocks, in the order of `BLOCK_WIDTHS`, (V, N, 2, n); and by the pose
-        of the view's own board, (V, N, 2, 6).
+        Raises:
+            CalibrationError: there is no model of its camera.
+        """
+        if view.camera == "fixed" and self.fixed is not None:
+            return self.fixed
+        if view.camera == "zoom" and self.zoom is not None:
+            return self.zoom.stops[stop_of(self.zoom, view)]
+        raise CalibrationError(f"there are views of the {view.camera} camera, but no model of it")
+
+
+def stop_of(lens: ZoomLens, view: View) -> int:
+    """The stop that is nearest to a view's nominal focal length; the first where none was told."""
+    if view.focal_px is None:
+        return 0
+    return int(np.argmin(np.abs(np.log(np.array(lens.nominal_px) / view.focal_px))))
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Views through one lens, as arrays.
+
+    Attributes:
+        rows: which of all views these v are, (v,).
+        stop: of the zoom lens; None for the fixed camera.
+        pan: as the head reported it [rad], (v,).
+        tilt: likewise.
+        owners: index of each view's board among the model's, (v,).
+        observed: corners [px], (v, N, 2); 0 where they are not seen.
+        seen: which are, (v, N).
     """
-    columns = columns_of(free)
-    shape = (len(views), len(points), 2)
-    pixels = np.empty(shape)
-    by_shared = np.zeros((*shape, sum(BLOCK_WIDTHS[name] for name in columns)))
-    by_board = np.empty((*shape, POSE_PARAMETERS))
-    for camera in ("fixed", "zoom"):
-        rows = np.array([i for i, view in enumerate(views) if view.camera == camera], dtype=int)
-        if not len(rows):
-            continue
-        lens = model.fixed if camera == "fixed" else model.zoom
-        if lens is None:
-            raise CalibrationError(f"there are views of the {camera} camera, but no model of it")
-        x, moved = _points_in_camera(model, [views[i] for i in rows], points, zoom=camera == "zoom")
-        pixels[rows], by_x, by_lens = _project(lens, x)
-        by_board[rows] = by_x @ moved.pop("board")
-        for name, dx in moved.items():  # (v, N, 3, parameters)
-            if name in columns:
-                by_shared[rows, :, :, columns[name]] = by_x @ dx
-        if camera in columns:
-            by_shared[rows, :, :, columns[camera]] = by_lens
-    return pixels, by_shared, by_board
+
+    rows: npt.NDArray[np.intp]
+    stop: int | None
+    pan: Array
+    tilt: Array
+    owners: npt.NDArray[np.intp]
+    observed: Array
+    seen: npt.NDArray[np.bool_]
 
 
-def columns_of(free: Collection[Block]) -> dict[Block, slice]:
-    """Where each free block stands among the shared parameters."""
-    columns: dict[Block, slice] = {}
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a model says of a batch.
+
+    Attributes:
+        pixels: of all corners, (v, N, 2) [px].
+        by_shared: derivatives by the free parameters that matter to it, (v, N, 2, k).
+        columns: where these stand among all free parameters, (k,).
+        by_board: derivatives by the pose of each view's own board, (v, N, 2, 6).
+        by_turn: derivatives by the true pan and tilt of each view, (v, N, 2, 2); None for the fixed camera.
+    """
+
+    pixels: Array
+    by_shared: Array
+    columns: npt.NDArray[np.intp]
+    by_board: Array
+    by_turn: Array | None
+
+
+def batches_of(model: RigModel, views: Sequence[View]) -> list[Batch]:
+    """Sort views by lens; their placements must be among the model's boards.
+
+    Raises:
+        CalibrationError: there are views of a camera without a model.
+    """
+    order = {number: i for i, number in enumerate(model.boards)}
+    lenses: dict[int | None, list[int]] = {}
+    for row, view in enumerate(views):
+        model.lens_of(view)
+        stop = None if view.camera == "fixed" or model.zoom is None else stop_of(model.zoom, view)
+        lenses.setdefault(stop, []).append(row)
+    found = []
+    for stop, rows in lenses.items():
+        same = [views[row] for row in rows]
+        corners = np.stack([view.corners_px for view in same])
+        seen = np.isfinite(corners[..., 0])
+        found.append(
+            Batch(
+                rows=np.array(rows, dtype=np.intp),
+                stop=stop,
+                pan=np.array([view.pan for view in same], dtype=float),
+                tilt=np.array([view.tilt for view in same], dtype=float),
+                owners=np.array([order[view.board] for view in same], dtype=np.intp),
+                observed=np.where(seen[..., None], corners, 0.0),
+                seen=seen,
+            )
+        )
+    return found
+
+
+def predict(model: RigModel, batch: Batch, points: Array, free: Collection[Block]) -> Prediction:
+    """Predict every corner of a batch, and its derivatives; nan behind a camera."""
+    if batch.stop is None:
+        assert model.fixed is not None
+        lens, own = model.fixed, "fixed"
+    else:
+        assert model.zoom is not None
+        lens, own = model.zoom.stops[batch.stop], "zoom"
+    x, moved = _points_in_camera(model, batch, points)
+    pixels, by_x, by_lens = _project(lens, x)
+    columns = columns_of(free, model.stops)
+    parts, where = [], []
+    if own in columns:
+        first = columns[own].start + LENS_PARAMETERS * (batch.stop or 0)
+        parts.append(by_lens)
+        where.append(np.arange(first, first + LENS_PARAMETERS))
+    if batch.stop and "pupil" in columns:
+        parts.append(-by_x[..., 2:])  # the camera moves forward along its own z
+        where.append(np.array([columns["pupil"].start + batch.stop - 1]))
+    for name, dx in moved.items():  # (v, N, 3, parameters)
+        if name in columns:
+            parts.append(by_x @ dx)
+            where.append(np.arange(columns[name].start, columns[name].stop))
+    return Prediction(
+        pixels=pixels,
+        by_shared=np.concatenate(parts, axis=-1) if parts else np.zeros((*pixels.shape, 0)),
+        columns=np.concatenate(where) if where else np.zeros(0, dtype=np.intp),
+        by_board=by_x @ moved["board"],
+        by_turn=by_x @ moved["turn"] if "turn" in moved else None,
+    )
+
+
+def predict_pixels(model: RigModel, views: Sequence[View], points: Array) -> Array:
+    """Predict every corner of all views, (V, N, 2) [px]; nan behind a camera."""
+    pixels = np.empty((len(views), len(points), 2))
+    for batch in batches_of(model, views):
+        pixels[batch.rows] = predict(model, batch, points, ()).pixels
+    return pixels
+
+
+def columns_of(free: Collection[Block], stops: int) -> dict[str, slice]:
+    """Where each free block stands among the shared parameters, for a zoom lens of so many stops."""
+    columns: dict[str, slice] = {}
     width = 0
-    for name, size in BLOCK_WIDTHS.items():
+    for name in EVERY_BLOCK:
         if name in free:
+            size = len(_names(name, stops))
             columns[name] = slice(width, width + size)
             width += size
     return columns
 
 
-def parameter_names(free: Collection[Block]) -> tuple[str, ...]:
+def parameter_names(free: Collection[Block], stops: int = 1) -> tuple[str, ...]:
     """Name the free blocks' parameters, in their order among the shared ones; see `Covariance` for their units."""
-    return tuple(name for block in columns_of(free) for name in BLOCK_NAMES[block])
+    return tuple(name for block in columns_of(free, stops) for name in _names(block, stops))
+
+
+def _names(block: str, stops: int) -> list[str]:
+    match block:
+        case "fixed":
+            return [f"fixed.{name}" for name in LENS_NAMES]
+        case "zoom":
+            return [f"zoom[{i}].{name}" for i in range(stops) for name in LENS_NAMES]
+        case "pupil":
+            return [f"zoom[{i}].pupil" for i in range(1, stops)]
+        case "gamma":
+            return [f"T_zoom0_fixed.{name}" for name in POSE_NAMES]
+        case "hand":
+            return [f"T_head_zoom.{name}" for name in POSE_NAMES]
+        case _:
+            return [f"head.{name}" for name in HEAD_NAMES[block]]
 
 
 def stepped(model: RigModel, shared: Array, boards: Array, free: Collection[Block]) -> RigModel:
     """Add a step to the shared parameters (n,) and to the boards' poses (B, 6)."""
-    steps = {name: shared[columns] for name, columns in columns_of(free).items()}
+    steps = {name: shared[columns] for name, columns in columns_of(free, model.stops).items()}
     head = model.head
-    if "head" in steps:
-        d_dz, d_eps = (float(d) for d in steps["head"])
-        head = HeadGeometry(head.axis_offset + d_dz, head.squareness + d_eps)
+    for block, names in HEAD_NAMES.items():
+        if block in steps:
+            changed = {name: getattr(head, name) + float(d) for name, d in zip(names, steps[block], strict=True)}
+            head = replace(head, **changed)
+    zoom = model.zoom
+    if zoom is not None and ("zoom" in steps or "pupil" in steps):
+        lenses = steps.get("zoom", np.zeros(LENS_PARAMETERS * model.stops)).reshape(model.stops, LENS_PARAMETERS)
+        pupils = np.append(0.0, steps.get("pupil", np.zeros(model.stops - 1)))
+        zoom = ZoomLens(
+            zoom.nominal_px,
+            tuple(_bent(stop, step) for stop, step in zip(zoom.stops, lenses, strict=True)),
+            tuple(float(old + step) for old, step in zip(zoom.pupil, pupils, strict=True)),
+        )
     return RigModel(
         boards={number: _moved(T, d) for (number, T), d in zip(model.boards.items(), boards, strict=True)},
-        fixed=_bent(model.fixed, steps.get("fixed")),
-        zoom=_bent(model.zoom, steps.get("zoom")),
+        fixed=_bent(model.fixed, steps["fixed"]) if model.fixed is not None and "fixed" in steps else model.fixed,
+        zoom=zoom,
         gamma=_moved(model.gamma, steps.get("gamma")),
         hand=_moved(model.hand, steps.get("hand")),
         head=head,
     )
+
+
+def difference(model: RigModel, reference: RigModel, free: Collection[Block]) -> Array:
+    """The step of the shared parameters that leads from the reference to the model, (n,): the inverse of `stepped`."""
+    parts: list[Array] = []
+    for block in columns_of(free, model.stops):
+        match block:
+            case "fixed":
+                assert model.fixed is not None
+                assert reference.fixed is not None
+                parts.append(_numbers(model.fixed) - _numbers(reference.fixed))
+            case "zoom" | "pupil":
+                assert model.zoom is not None
+                assert reference.zoom is not None
+                if block == "pupil":
+                    parts.append(np.subtract(model.zoom.pupil, reference.zoom.pupil)[1:])
+                else:
+                    pairs = zip(model.zoom.stops, reference.zoom.stops, strict=True)
+                    parts.extend(_numbers(a) - _numbers(b) for a, b in pairs)
+            case "gamma" | "hand":
+                T, T_ref = getattr(model, block), getattr(reference, block)
+                parts.append((T.rotation * T_ref.rotation.inv()).as_rotvec())
+                parts.append(T.translation - T_ref.translation)
+            case _:
+                parts.append(np.array([getattr(model.head, k) - getattr(reference.head, k) for k in HEAD_NAMES[block]]))
+    return np.concatenate(parts) if parts else np.zeros(0)
 
 
 def _moved(T: RigidTransform, step: Array | None) -> RigidTransform:
@@ -140,45 +293,48 @@ def _moved(T: RigidTransform, step: Array | None) -> RigidTransform:
     return RigidTransform.from_components(T.translation + step[3:], Rotation.from_rotvec(step[:3]) * T.rotation)
 
 
-def _bent(lens: Intrinsics | None, step: Array | None) -> Intrinsics | None:
-    if step is None or lens is None:
-        return lens
-    values = np.array([*lens.focal_px, *lens.center_px, *lens.distortion])
-    values[:FREE_LENS_PARAMETERS] += step
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(value) for value in values)
-    return Intrinsics(lens.size, (fx, fy), (cx, cy), (k1, k2, p1, p2, k3))
+def _numbers(lens: Intrinsics) -> Array:
+    return np.array([*lens.focal_px, *lens.center_px, *lens.distortion])[:LENS_PARAMETERS]
 
 
-def _points_in_camera(
-    model: RigModel, views: Sequence[View], points: Array, *, zoom: bool
-) -> tuple[Array, dict[str, Array]]:
+def _bent(lens: Intrinsics, step: Array) -> Intrinsics:
+    fx, fy, cx, cy, k1, k2, p1, p2 = (float(value) for value in _numbers(lens) + step)
+    return Intrinsics(lens.size, (fx, fy), (cx, cy), (k1, k2, p1, p2, lens.distortion[4]))
+
+
+def _points_in_camera(model: RigModel, batch: Batch, points: Array) -> tuple[Array, dict[str, Array]]:
     """Map the board's points into the camera of each view, (v, N, 3), with derivatives (v, N, 3, parameters)."""
-    R_b = np.stack([model.boards[view.board].rotation.as_matrix() for view in views])
-    t_b = np.stack([model.boards[view.board].translation for view in views])
-    turned = points @ R_b.swapaxes(1, 2)
-    y = turned + t_b[:, None]  # x_fixed
+    boards = list(model.boards.values())
+    R_all = np.stack([T.rotation.as_matrix() for T in boards])
+    t_all = np.stack([T.translation for T in boards])
+    turned = points @ R_all[batch.owners].swapaxes(1, 2)
+    y = turned + t_all[batch.owners][:, None]  # x_fixed
     d_board = _pose_derivative(turned)
-    if not zoom:
+    if batch.stop is None:
         return y, {"board": d_board}
+    assert model.zoom is not None
     R_g, R_h = model.gamma.rotation.as_matrix(), model.hand.rotation.as_matrix()
     t_h = model.hand.translation
-    pan, tilt = (np.array([getattr(view, axis) for view in views]) for axis in ("pan", "tilt"))
-    R_p, t_p, A = base_heads(model.head, pan, tilt)
+    R_p, t_p, A = base_heads(model.head, batch.pan, batch.tilt)
     turned_g = y @ R_g.T
     w = turned_g + model.gamma.translation  # x_zoom0
     turned_h = w @ R_h.T
     v = turned_h + t_h  # x_base
     p = (v - t_p[:, None]) @ R_p  # x_head = R_p^T (x_base - t_p)
-    x = (p - t_h) @ R_h  # x_zoom
+    x = (p - t_h) @ R_h - model.zoom.pupil[batch.stop] * E3  # x_zoom, from the pupil
     R_xp = R_h.T  # dx/dp
     R_xv = R_xp @ R_p.swapaxes(1, 2)  # dx/dv
     R_xw = R_xv @ R_h  # dx/dw
     d_hand = R_xv[:, None] @ _pose_derivative(turned_h) - R_xp @ _pose_derivative(p - t_h)
+    d_turn = R_xp @ _by_turn(model.head, A, p)
     return x, {
         "board": (R_xw @ R_g)[:, None] @ d_board,
         "gamma": R_xw[:, None] @ _pose_derivative(turned_g),
         "hand": d_hand,
         "head": R_xp @ _by_head(model.head, A, p),
+        "scale": d_turn * np.stack([batch.pan, batch.tilt], axis=-1)[:, None, None],
+        "zero": d_turn,
+        "turn": d_turn,
     }
 
 
@@ -187,17 +343,21 @@ def base_heads(head: HeadGeometry, pan: Array, tilt: Array) -> tuple[Array, Arra
 
     Args:
         head: the unit's geometry.
-        pan: [rad], (v,).
-        tilt: [rad], (v,).
+        pan: as the head reports it [rad], (v,).
+        tilt: likewise.
 
     Returns:
         Rotations (v, 3, 3), translations (v, 3), and the tilts' own rotations (v, 3, 3).
     """
+    pan, tilt = head.true_angles(pan, tilt)
     turns = Rotation.from_rotvec(pan[:, None] * np.array([0.0, 1.0, 0.0])).as_matrix()
-    axis = np.array([np.cos(head.squareness), np.sin(head.squareness), 0.0])
-    A = Rotation.from_rotvec(tilt[:, None] * axis).as_matrix()
+    A = Rotation.from_rotvec(tilt[:, None] * _tilt_axis(head)).as_matrix()
     offset = head.axis_offset * (E3 - A @ E3)  # Trans(dz) A Trans(-dz) is A with this translation
     return turns @ A, np.einsum("vij,vj->vi", turns, offset), A
+
+
+def _tilt_axis(head: HeadGeometry) -> Array:
+    return np.array([np.cos(head.squareness), np.sin(head.squareness), 0.0])
 
 
 def _by_head(head: HeadGeometry, A: Array, x_head: Array) -> Array:
@@ -211,6 +371,15 @@ def _by_head(head: HeadGeometry, A: Array, x_head: Array) -> Array:
     u = a @ A.swapaxes(1, 2)
     by_eps = np.cross(E3, a) - np.cross(E3, u) @ A
     return np.stack([by_dz, by_eps], axis=-1)
+
+
+def _by_turn(head: HeadGeometry, A: Array, x_head: Array) -> Array:
+    """How x_head changes with true pan and tilt, (v, N, 3, 2), in the terms of `_by_head`."""
+    a = x_head - head.axis_offset * E3
+    q = a @ A.swapaxes(1, 2) + head.axis_offset * E3
+    by_pan = -np.cross(np.array([0.0, 1.0, 0.0]), q) @ A  # dq/dpan = -e2 x q, then A^T
+    by_tilt = -np.cross(_tilt_axis(head), a)
+    return np.stack([by_pan, by_tilt], axis=-1)
 
 
 def _pose_derivative(turned: Array) -> Array:
@@ -228,5 +397,5 @@ def _project(lens: Intrinsics, x_camera: Array) -> tuple[Array, Array, Array]:
     x = np.where(x[..., 2:] > 0, x, np.nan)
     px, J = cv2.projectPoints(x, np.zeros(3), np.zeros(3), lens.matrix, np.array(lens.distortion))
     J = np.asarray(J).reshape(v, n, 2, -1)
-    by_lens = J[..., POSE_PARAMETERS : POSE_PARAMETERS + FREE_LENS_PARAMETERS]
+    by_lens = J[..., POSE_PARAMETERS : POSE_PARAMETERS + LENS_PARAMETERS]
     return np.asarray(px).reshape(v, n, 2), J[..., 3:POSE_PARAMETERS], by_lens  # by t, which equals by the point

@@ -17,7 +17,7 @@ from cotarget.calibration.model import View
 from cotarget.calibration.plan import Coverage, plan_placement, plan_poses, seen_at_home
 from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.reprojection import RigModel
-from cotarget.calibration.sequential import at_home
+from cotarget.calibration.start import at_home
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform
 

@@ -1,27 +1,23 @@
 """How uncertain a calibration is: the covariance of its parameters, and what that leaves of error in pointing.
 
-Both speak of the corners' noise alone. What the model leaves out (a head that does not stand where it says, a
-principal point that moves with the zoom, a board that is not flat) is seen only as far as it enlarges the residuals.
+The covariance speaks of the corners' noise, and of a head that does not stand quite where it says. What else a model
+leaves out is noticed by captures kept out of the fit (`cotarget.calibration.heldout`), which widen it.
 """
-
-from collections.abc import Collection
 
 import numpy as np
 
-from cotarget.calibration.bundle import Fit, coordinate_variance
+from cotarget.calibration.bundle import Fit
 from cotarget.calibration.model import Calibration, Covariance
 from cotarget.calibration.reprojection import (
-    BLOCK_WIDTHS,
+    EVERY_BLOCK,
     POSE_PARAMETERS,
-    Block,
     RigModel,
     base_heads,
     parameter_names,
     stepped,
 )
-from cotarget.camera import ZoomLens
 from cotarget.errors import CalibrationError
-from cotarget.geometry import Array
+from cotarget.geometry import Array, RigidTransform
 from cotarget.pantilt import solve
 
 # Central differences err by the square of this times the third derivative, which is of the order of the first [px, m,
@@ -29,29 +25,27 @@ from cotarget.pantilt import solve
 STEP = 1e-5
 # Smallest eigenvalue of the normal matrix, scaled to a unit diagonal, that rounding cannot have made.
 SMALLEST_EIGENVALUE = 1e-13
-ALL_BLOCKS: tuple[Block, ...] = tuple(BLOCK_WIDTHS)
 
 
-def covariance_of(result: Fit, free: Collection[Block]) -> Covariance | None:
+def covariance_of(result: Fit) -> Covariance | None:
     """Give the covariance of a fit's free parameters, the boards' poses left out by marginalising them.
 
     Args:
         result: of `fit`, at its optimum.
-        free: the blocks that were free.
 
     Returns:
         The inverse of the normal matrix times the variance of a coordinate; None where the views leave a direction of
         the parameters open, or are no more than the parameters.
     """
-    variance = coordinate_variance(result.residuals, len(result.normal) + POSE_PARAMETERS * len(result.model.boards))
     scale = np.sqrt(np.diagonal(result.normal))
-    if variance is None or not (scale > 0).all():
+    if result.variance is None or not (scale > 0).all():
         return None
     values, vectors = np.linalg.eigh(result.normal / np.outer(scale, scale))
     if values[0] < SMALLEST_EIGENVALUE:
         return None
     inverse = (vectors / values) @ vectors.T
-    return Covariance(parameter_names(free), (inverse + inverse.T) / 2 / np.outer(scale, scale) * variance)
+    names = parameter_names(result.free, result.model.stops)
+    return Covariance(names, (inverse + inverse.T) / 2 / np.outer(scale, scale) * result.variance)
 
 
 def predicted_pointing(
@@ -82,6 +76,7 @@ def line_of_sight_covariance(
     is d(p). The head is sent to the q that makes a = d by the parameters found, p0. There it stays, while the true
     parameters p0 + e put the target at m = E^T (a(p0 + e, q) - d(p0 + e)), E being the two directions across d. To
     first order m = J e with J = dm/dp at fixed q, so that cov(m) = J cov(e) J^T; how q was solved does not matter.
+    The head's jitter, where there is any, adds what a turn of that size moves.
 
     Args:
         calibration: with a covariance and a T.
@@ -96,11 +91,12 @@ def line_of_sight_covariance(
     Raises:
         CalibrationError: the calibration has no covariance, or an unusable one, or no T.
     """
+    calibration.hand_eye()
     covariance = calibration.covariance
     if covariance is None:
-        raise CalibrationError("this calibration has no covariance; calibrate again, with the last refinement")
-    hand = calibration.hand_eye()
-    known = parameter_names(ALL_BLOCKS)
+        raise CalibrationError("this calibration has no covariance; calibrate again, by the joint method")
+    model = model_of(calibration)
+    known = parameter_names(EVERY_BLOCK, model.stops)
     if unknown := [name for name in covariance.parameters if name not in known]:
         raise CalibrationError(f"covariance.parameters: '{unknown[0]}' is no parameter; they are: {', '.join(known)}")
     nominal = calibration.zoom.nominal_px[0] if nominal_px is None else nominal_px
@@ -110,39 +106,64 @@ def line_of_sight_covariance(
     depths = np.array(np.broadcast_to(depth, shape)).ravel()
     if pan_tilt is None:
         lens = calibration.zoom.at(nominal)
-        x_base = (hand * calibration.T_zoom0_fixed).apply(calibration.fixed.ray(pixels) * depths[:, None])
+        x_base = (model.hand * model.gamma).apply(calibration.fixed.ray(pixels) * depths[:, None])
+        hand = calibration.hand_eye(nominal)
         found = solve(x_base, hand, calibration.head, lens.ray(lens.image_center_px))
         pan, tilt = found.pan[:, 0], found.tilt[:, 0]
     else:
         pan, tilt = (np.array(np.broadcast_to(angle, shape), dtype=float).ravel() for angle in pan_tilt)
 
-    model = RigModel(
-        {}, calibration.fixed, calibration.zoom.stops[0], calibration.T_zoom0_fixed, hand, calibration.head
-    )
-    across = _across(_line_of_sight(calibration, model, nominal))
+    across = _across(_line_of_sight(model, nominal))
 
     def miss(step: Array) -> Array:
-        at = stepped(model, step, np.empty((0, POSE_PARAMETERS)), ALL_BLOCKS)
-        return (_directions(at, pixels, depths, pan, tilt) - _line_of_sight(calibration, at, nominal)) @ across
+        at = stepped(model, step, np.empty((0, POSE_PARAMETERS)), EVERY_BLOCK)
+        return (_directions(at, pixels, depths, pan, tilt, nominal) - _line_of_sight(at, nominal)) @ across
 
     steps = STEP * np.eye(len(known))[[known.index(name) for name in covariance.parameters]]
     J = np.stack([(miss(step) - miss(-step)) / (2 * STEP) for step in steps], axis=-1)  # (n, 2, parameters)
-    return (J @ covariance.matrix @ J.swapaxes(-1, -2)).reshape(*shape, 2, 2)
+    found_covariance = J @ covariance.matrix @ J.swapaxes(-1, -2)
+    if calibration.jitter:
+        turned = [
+            (
+                _directions(model, pixels, depths, pan + STEP * d_pan, tilt + STEP * d_tilt, nominal)
+                - _directions(model, pixels, depths, pan - STEP * d_pan, tilt - STEP * d_tilt, nominal)
+            )
+            @ across
+            / (2 * STEP)
+            for d_pan, d_tilt in np.eye(2)
+        ]
+        J_turn = np.stack(turned, axis=-1)
+        found_covariance = found_covariance + calibration.jitter**2 * J_turn @ J_turn.swapaxes(-1, -2)
+    return found_covariance.reshape(*shape, 2, 2)
 
 
-def _directions(model: RigModel, pixels: Array, depths: Array, pan: Array, tilt: Array) -> Array:
+def model_of(calibration: Calibration) -> RigModel:
+    """A calibration as the fit sees it, without boards; T is the identity where there was no head."""
+    hand = calibration.T_head_zoom
+    return RigModel(
+        boards={},
+        fixed=calibration.fixed,
+        zoom=calibration.zoom,
+        gamma=calibration.T_zoom0_fixed,
+        hand=RigidTransform.identity() if hand is None else hand,
+        head=calibration.head,
+    )
+
+
+def _directions(model: RigModel, pixels: Array, depths: Array, pan: Array, tilt: Array, nominal_px: float) -> Array:
     """Unit vectors from the moved zoom camera to the targets, (n, 3) (Eq. 2)."""
     assert model.fixed is not None
+    assert model.zoom is not None
     x_base = (model.hand * model.gamma).apply(model.fixed.ray(pixels) * depths[:, None])
     R, t, _ = base_heads(model.head, pan, tilt)
     x_head = np.einsum("vji,vj->vi", R, x_base - t)
-    return _unit(model.hand.inv().apply(x_head))
+    return _unit(model.hand.inv().apply(x_head) - np.array([0.0, 0.0, model.zoom.pupil_at(nominal_px)]))
 
 
-def _line_of_sight(calibration: Calibration, model: RigModel, nominal_px: float) -> Array:
+def _line_of_sight(model: RigModel, nominal_px: float) -> Array:
     """Unit vector through the middle of the zoom image at a nominal focal length, (3,)."""
     assert model.zoom is not None
-    lens = ZoomLens(calibration.zoom.nominal_px, (model.zoom, *calibration.zoom.stops[1:])).at(nominal_px)
+    lens = model.zoom.at(nominal_px)
     return _unit(lens.ray(lens.image_center_px))
 
 
