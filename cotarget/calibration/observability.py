@@ -1,37 +1,52 @@
 """What motions or views leave undetermined, and what to add, in words.
 
-A normal matrix N (the inverse of a covariance) tells how well every direction of the parameters is known. A direction v
-counts as undetermined where its standard deviation is beyond use, more than `LIMITS` say; scaled by these limits, all
-parameters have the same unit, and that is an eigenvalue of N below 1.
+`judge_motions` speaks of hand-eye motions, `weak_directions` and `name_directions` of a rig's joint fit. A normal
+matrix N (the inverse of a covariance) tells how well every direction of the parameters is known. A direction counts as
+undetermined where its standard deviation is beyond use; divided by these limits of use, all parameters have the same
+unit, and that is an eigenvalue of N below 1.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from scipy.linalg import eigh
 
+from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
 
 # A start that is wrong by so much still leads every later fit to the optimum, and nobody would call it measured.
 USELESS_ROTATION = np.radians(5.0)
 USELESS_POSITION = 0.5  # [m]
-# A lens parameter wrong by so much moves corners at the edge of a usual image (0.6 focal lengths off its middle) by
-# some 50 px, as much as 5 degrees do at a focal length of 600 px.
-LIMITS = {
-    **dict.fromkeys(("rx", "ry", "rz", "squareness"), USELESS_ROTATION),
-    **dict.fromkeys(("tx", "ty", "tz", "axis_offset"), USELESS_POSITION),
-    **dict.fromkeys(("fx", "fy", "cx", "cy"), 50.0),  # [px]
-    "k1": 0.4,
-    "k2": 1.0,
-    "p1": 0.1,
-    "p2": 0.1,
+# A lens parameter is of no use when it is wrong by so much that corners at the image's edge move by 50 px, about as
+# much as 5 degrees do at a focal length of 600 px.
+USELESS_PX = 50.0
+EDGE_PX = 360.0  # from the middle of a usual image to its edge
+USUAL_FOCAL_PX = 600.0
+USELESS_SCALE = 0.1  # of an encoder: of 50 degrees, 5 degrees
+NO_FOCAL_PX: Mapping[str, float] = MappingProxyType({})
+TILT_BOARDS = "tilt the boards against the camera by 20 to 40 degrees, in several directions"
+OUTWARD = "show boards out to the image's corners"
+BOTH = "show both cameras the same placements, near and far"
+NEARER = "move both pan and tilt further, with boards nearer"
+# How people call a parameter, and what determines it.
+WORDS = {
+    **dict.fromkeys(("fx", "fy"), ("focal length", TILT_BOARDS)),
+    **dict.fromkeys(("cx", "cy"), ("principal point", TILT_BOARDS)),
+    **dict.fromkeys(("k1", "k2", "p1", "p2"), ("distortion", OUTWARD)),
+    "pupil": ("pupil's shift", "show boards near and far at that focal length"),
+    "axis_offset": ("axis offset", NEARER),
+    "squareness": ("squareness", NEARER),
+    "tilt_scale": ("scale of tilt", "add tilt"),
+    "pan_scale": ("scale of pan", "add pan"),
+    **dict.fromkeys(("pan_zero", "tilt_zero"), ("zero angles", "hold these or T_zoom0_fixed: they say the same")),
 }
 # Noise of the hand's own pose turns axes about and makes a direction look measured that is not. It has to be seen by
 # this many times as much as by noise alone; below, the estimate would be drawn towards noise by more than a tenth.
 ABOVE_NOISE = 3.0
-# Eigenvalues below this share of the largest are rounding.
-ROUNDING = 1e-14
+# Eigenvalues below this share of the largest are rounding, where boards' poses were eliminated by subtraction.
+ROUNDING = 1e-12
 # Axes of rotation are one when the second singular value of all rotation vectors is below this share of the first: a
 # head that only pans or only tilts leaves two of T's six numbers free.
 PARALLEL_SHARE = 0.05
@@ -107,6 +122,137 @@ def judge_motions(normal: Array, noise: Array, motions: HandMotions) -> Observab
     free = (*_along("position", "along", shifts, axis, axis_name), *_along("rotation", "about", turns, axis, axis_name))
     text = f"{moved}: the camera's {_listed(free)} {'is' if len(free) == 1 else 'are'} free; {advice}"
     return Observability(False, text, free, (basis / np.linalg.norm(basis, axis=0)).T)
+
+
+def weak_directions(
+    normal: Array, parameters: Sequence[str], variance: float, focal_px: Mapping[str, float] = NO_FOCAL_PX
+) -> Array:
+    """Find what a normal matrix leaves undetermined, judged in units that matter.
+
+    Args:
+        normal: (n, n), its inverse times the variance being the covariance.
+        parameters: names, n of them, as in `Covariance`.
+        variance: of one coordinate [px^2]; 0 for what is undetermined however exact the corners are.
+        focal_px: of lenses whose focal length is far from 600 px, by the part of the name in front of the point.
+
+    Returns:
+        Directions (k, n) in the parameters' units, the least known first. Divided by the parameters' limits of use they
+        are orthonormal; the standard deviation of each is larger than it is long.
+
+    Raises:
+        CalibrationError: a name is none that is known.
+    """
+    limits = _limits(parameters, focal_px)
+    values, vectors = np.linalg.eigh(normal * np.outer(limits, limits))
+    weak = values < max(variance, ROUNDING * values[-1])
+    return (vectors[:, weak] * limits[:, None]).T
+
+
+def name_directions(parameters: Sequence[str], directions: Array, focal_px: Mapping[str, float] = NO_FOCAL_PX) -> str:
+    """Say in words what is undetermined, and what to add.
+
+    Args:
+        parameters: names, n of them, as in `Covariance`.
+        directions: in their units, independent of each other, (k, n); as `weak_directions` gives them.
+        focal_px: as there.
+
+    Returns:
+        One sentence without a full stop; empty where there are no directions.
+
+    Raises:
+        CalibrationError: a name is none that is known.
+    """
+    if not len(directions):
+        return ""
+    # The projection on the directions does not depend on which of them span the same space.
+    basis = np.linalg.qr((directions / _limits(parameters, focal_px)).T)[0]
+    part = np.sum(basis**2, axis=1)
+    reason = ""
+    what: list[str] = []
+    add: list[str] = []
+    hand = [i for i, name in enumerate(parameters) if name.startswith("T_head_zoom.")]
+    if hand and (part[hand] > TAKES_PART).any():
+        head = [i for i, name in enumerate(parameters) if name.startswith("head.")]
+        reason, what, add = _name_hand([parameters[i] for i in hand], _still(basis, head)[hand])
+    for name, share in zip(parameters, part, strict=True):
+        owner, kind = name.rsplit(".", 1)
+        if share <= TAKES_PART or owner == "T_head_zoom":
+            continue
+        if owner == "T_zoom0_fixed":
+            word, advice = "rotation" if kind.startswith("r") else "position", BOTH
+        else:
+            word, advice = WORDS[kind]
+        what.append(f"{_owner(owner)}'s {word}")
+        if not (reason and owner == "head"):  # then the missing axis is all it takes
+            add.append(advice)
+    what, add = list(dict.fromkeys(what)), list(dict.fromkeys(add))
+    return f"{reason}{_listed(what)} {'is' if len(what) == 1 else 'are'} free; {_listed(add)}"
+
+
+def _limits(parameters: Sequence[str], focal_px: Mapping[str, float]) -> Array:
+    """By how much each parameter must be wrong to be of no use, in its unit, (n,)."""
+    limits = []
+    for name in parameters:
+        owner, _, kind = name.rpartition(".")
+        f = focal_px.get(owner, USUAL_FOCAL_PX)
+        r = EDGE_PX / f
+        match kind:
+            case "rx" | "ry" | "rz" | "squareness" | "pan_zero" | "tilt_zero":
+                limits.append(USELESS_ROTATION)
+            case "tx" | "ty" | "tz" | "axis_offset" | "pupil":
+                limits.append(USELESS_POSITION)
+            case "fx" | "fy":
+                limits.append(USELESS_PX / r)
+            case "cx" | "cy":
+                limits.append(USELESS_PX)
+            case "k1":
+                limits.append(USELESS_PX / (f * r**3))
+            case "k2":
+                limits.append(USELESS_PX / (f * r**5))
+            case "p1" | "p2":
+                limits.append(USELESS_PX / (3 * f * r**2))
+            case "pan_scale" | "tilt_scale":
+                limits.append(USELESS_SCALE)
+            case _:
+                raise CalibrationError(f"'{name}' is no parameter whose observability can be judged")
+    return np.array(limits)
+
+
+def _owner(owner: str) -> str:
+    """How people call a block of parameters."""
+    if owner.startswith("zoom["):
+        return f"the zoom camera's stop {owner[5:-1]}"
+    return {"fixed": "the fixed camera", "zoom": "the zoom camera", "head": "the head"}.get(owner, owner)
+
+
+def _still(basis: Array, rows: Sequence[int]) -> Array:
+    """Those of the directions that leave some parameters as they are; all where each of them changes these.
+
+    With tilt alone, an axis offset is nothing but a shift of T_head_zoom: that is not to hide why both are free.
+    """
+    _, s, Vt = np.linalg.svd(basis[list(rows)])
+    rank = int(np.sum(s**2 > TAKES_PART))
+    return basis @ Vt[rank:].T if rank < len(Vt) else basis
+
+
+def _name_hand(names: Sequence[str], basis: Array) -> tuple[str, list[str], list[str]]:
+    """Why T_head_zoom is free, what of it, and what to add; basis: its rows of all free directions, (m, k)."""
+    spans = []
+    for kind in ("r", "t"):
+        rows = np.zeros((3, basis.shape[1]))
+        for name, row in zip(names, basis, strict=True):
+            if name.startswith(f"T_head_zoom.{kind}"):
+                rows["xyz".index(name[-1])] = row
+        U, s, _ = np.linalg.svd(rows)
+        spans.append(U.T[: int(np.sum(s**2 > TAKES_PART))])
+    turns, shifts = spans
+    for axis, moved, other in ((1, "pan", "tilt"), (0, "tilt", "pan")):
+        if all(len(span) <= 1 and (np.abs(span[:, axis]) > ALIGNED).all() for span in spans):
+            words = [f"T_head_zoom's position along the {moved} axis"] * len(shifts)
+            words += [f"T_head_zoom's rotation about the {moved} axis"] * len(turns)
+            return f"only {moved} moved: ", words, [f"add {other}"]
+    words = ["T_head_zoom's position"] * bool(len(shifts)) + ["T_head_zoom's rotation"] * bool(len(turns))
+    return "", words, [NEARER]
 
 
 def _how_it_moved(motions: HandMotions) -> tuple[str, Array | None, str, str]:
