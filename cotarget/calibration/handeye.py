@@ -33,6 +33,8 @@ ANGLE_SHARE = 0.1
 WEAK_SHARE = 0.01
 # While the search only needs a start, a second axis counts that is seen at a hundredth of the first (squared).
 START_SHARE = 1e-4
+START_ROUNDS = 4
+START_MEDIANS = 3.0  # one Gaussian motion in eighty is further off
 UNTURNED = 1e-6  # [rad]; less than this is no rotation but rounding
 # Cosine and sine of a turn that the translations tell come out of linear equations with length 1; with length 0 where
 # they do not tell it.
@@ -102,6 +104,7 @@ def park_martin(head_motions: Sequence[RigidTransform], camera_motions: Sequence
     _check_axes(alpha)
     _check_angles(alpha, beta)
     R = _park_martin_rotation(alpha, beta)
+    _check_axes_agree(alpha, beta @ R.T)
     A, B = RigidTransform.concatenate(list(head_motions)), RigidTransform.concatenate(list(camera_motions))
     return RigidTransform.from_components(_translation(R, A, B), Rotation.from_matrix(R))
 
@@ -220,8 +223,12 @@ def _start(A: RigidTransform, B: RigidTransform) -> RigidTransform:
         R = _rotation_between(A.translation, B.translation)
     else:
         R = _rotation_between(alpha, beta)
+        for _ in range(START_ROUNDS):  # a few gross errors shall not draw it away
+            off = np.linalg.norm(alpha - beta @ R.T, axis=1)
+            near = off <= START_MEDIANS * np.median(off) + UNTURNED
+            R = _rotation_between(alpha[near], beta[near])
         _check_axes_agree(alpha, beta @ R.T)
-        _, s, Vt = np.linalg.svd(alpha)
+        _, s, Vt = np.linalg.svd(alpha, full_matrices=False)
         if len(s) < 2 or s[1] ** 2 <= START_SHARE * s[0] ** 2:
             R = _turned_by_shifts(Vt[0], R, A, B)
     return RigidTransform.from_components(_translation(R, A, B), Rotation.from_matrix(R))
@@ -277,7 +284,6 @@ def _park_martin_rotation(alpha: Array, beta: Array) -> Array:
             )
         Vt[2] = -Vt[2]  # two axes determine a rotation; the third direction is the one that noise has turned round
         R = Vt.T @ U.T
-    _check_axes_agree(alpha, beta @ R.T)
     return R
 
 
@@ -285,7 +291,7 @@ def _check_axes(alpha: Array) -> None:
     """Refuse motions that leave T undetermined, and say which axis is missing."""
     if not len(alpha) or np.linalg.norm(alpha, axis=1).max() < SMALLEST_TURN:
         raise CalibrationError("hand-eye: the head did not move between the views; both pan and tilt must")
-    _, s, Vt = np.linalg.svd(alpha)
+    _, s, Vt = np.linalg.svd(alpha, full_matrices=False)
     if len(s) > 1 and s[1] > PARALLEL_SHARE * s[0]:
         return
     moved, missing = ("pan", "tilt") if abs(Vt[0][1]) > abs(Vt[0][0]) else ("tilt", "pan")

@@ -33,7 +33,7 @@ CONVERGED = 1e-5  # length of the last step, in standard deviations
 ROUGHLY = 0.03  # likewise, while looking for gross errors
 LONGEST_TURN = 0.5  # of one step [rad]: linearising holds no further
 # Directions so much worse known than is of use (see `spectrum`) are left alone while looking for the optimum.
-HOPELESS = 0.01
+HOPELESS = 0.03
 ROTATION_AND_TRANSLATION = (0, 0, 0, 1, 1, 1)
 E3 = np.array([0.0, 0.0, 1.0])
 # With k degrees of freedom left, a variance that was itself estimated widens the parameters' distribution to Student's,
@@ -53,15 +53,15 @@ class Problem:
         residuals: gives residuals (n, 6), rotation [rad] before translation [m], and derivatives by a step (w, d) of
             every transform, (n, 6, 6 * transforms).
         groups: for each of the six residuals the number of its group, from 0.
-        noise: from the standard deviations of the six residuals and how many motions or poses are used, what N of X
-            noise alone would show; see `spectrum`.
+        noise: from the transforms, the six residuals' standard deviations and how many motions or poses are used,
+            what N of X noise alone would show; see `spectrum`.
         independent: how many independent motions there are.
         share: of the motions (poses) that are, where they are not independent; information counts that much.
     """
 
     residuals: Callable[[RigidTransform], tuple[Array, Array]]
     groups: tuple[int, ...]
-    noise: Callable[[Array, int], Array]
+    noise: Callable[[RigidTransform, Array, int], Array]
     independent: int
     share: float = 1.0
 
@@ -115,7 +115,7 @@ def motion_problem(A: RigidTransform, B: RigidTransform, independent: int) -> Pr
         J[:, 3:, 3:] = R_A - one
         return r, J
 
-    def noise(sigma: Array, count: int) -> Array:
+    def noise(transforms: RigidTransform, sigma: Array, count: int) -> Array:
         # An error e of R_A adds [e]x to all blocks, one of t_B adds [R e]x below; both are weighted with their inverse
         # variances, so that each gives 2.
         return count * np.repeat([4.0, 2.0 * (sigma[0] / sigma[3]) ** 2], 3)
@@ -156,13 +156,16 @@ def pose_problem(T_base_hand: RigidTransform, T_camera_board: RigidTransform, ow
         J[rows, 3:, 1 + owners, 3:] = by_z
         return r, J.reshape(n, 6, -1)
 
-    def noise(sigma: Array, count: int) -> Array:
-        # The hand's rotation, off by e, counts as in `motion_problem`. It is no worse than the residuals show it, of
-        # which those across the line of sight see it with the distance as a lever.
-        lever = float(np.sqrt(np.mean(T_camera_board.translation**2) * 3))
-        across = min(sigma[3], sigma[5])
-        hand = min(*sigma[:3], across / lever)
-        return count * np.repeat([4.0, 2.0 * (hand / across) ** 2], 3)
+    def noise(transforms: RigidTransform, sigma: Array, count: int) -> Array:
+        # An error e of the hand's rotation adds [e]x to the blocks of rotation by w and of translation by d, and
+        # [e x q]x to that of translation by w, q being the board in the hand's axes. It is no larger than residuals
+        # across the line of sight show it, with |q| as a lever.
+        q = transforms[1 + owners].translation - T_base_hand.translation
+        lever = float(np.sqrt(np.mean(np.sum(q**2, axis=1))))
+        rotation, translation = min(sigma[:3]), min(sigma[3:])
+        e = min(rotation, sigma[3] / max(lever, SMALLEST_SIGMA))
+        by_w = (e / rotation) ** 2 + (e * lever / translation) ** 2
+        return 2.0 * count * np.repeat([by_w, (e / translation) ** 2], 3)
 
     return Problem(residuals, (0, 0, 1, 2, 2, 3), noise, n - boards)
 
@@ -248,7 +251,7 @@ def _inverse(
     problem: Problem, state: RigidTransform, Nx: Array, sigma: Array, count: int, free: int
 ) -> tuple[Array, Array]:
     """The covariance of X, and the step towards the smallest X that the prior asks for."""
-    values, V = spectrum(Nx, problem.share * problem.noise(sigma, count))
+    values, V = spectrum(Nx, problem.share * problem.noise(state, sigma, count))
     known = np.arange(6) >= free if free else values > HOPELESS
     inverse = (V[:, known] / np.maximum(values[known], HOPELESS)) @ V[:, known].T
     # Only along the free directions is X drawn, so that the others keep what the motions say.
@@ -298,7 +301,7 @@ def _result(
     sigma = _sigmas(problem, r[used], taken, robust=False, lost=STUDENT)
     J = J[used] / sigma[:, None]
     Nx, _, _ = _eliminated(problem.share * np.einsum("nij,nik->jk", J, J), np.zeros(J.shape[2]))
-    noise = problem.share * problem.noise(sigma, int(used.sum()))
+    noise = problem.share * problem.noise(state, sigma, int(used.sum()))
     return MotionFit(state, r, Nx, noise, used, _covariance(Nx, noise, free))
 
 

@@ -264,18 +264,17 @@ def _how_it_moved(motions: HandMotions) -> tuple[str, Array | None, str, str]:
         return "the hand did not move between the views", None, "", "turn it about two axes (pan and tilt)"
     if largest < SMALLEST_TURN:
         return "the hand shifted but did not turn", None, "", "turn it about two axes"
-    _, s, Vt = np.linalg.svd(turns)
+    _, s, Vt = np.linalg.svd(turns, full_matrices=False)
     if len(s) > 1 and s[1] > PARALLEL_SHARE * s[0]:
-        advice = "turn the hand further, and about two axes, or measure more often"
-        return (
-            f"the motions, of {np.degrees(largest):.2g} degrees at most, are too small for their noise",
-            None,
-            "",
-            advice,
+        others = float(np.linalg.norm(turns - np.outer(turns @ Vt[0], Vt[0]), axis=1).max())
+        moved = (
+            f"motions of {np.degrees(largest):.2g} degrees at most, {np.degrees(others):.2g} about other axes than "
+            f"{_vector(Vt[0])} of the hand, are too small for their noise"
         )
+        return moved, None, "", "turn the hand further, about two axes, or measure more often"
     axis = Vt[0]
     if moves <= max(LONGEST_OFFSET * largest, SMALLEST_SHIFT):
-        base = axis if motions.turns_base is None else np.linalg.svd(motions.turns_base)[2][0]
+        base = axis if motions.turns_base is None else np.linalg.svd(motions.turns_base, full_matrices=False)[2][0]
         if abs(base[1]) > ALIGNED:
             return "only pan moved", axis, "the pan axis", "add tilt"
         if abs(axis[0]) > ALIGNED:
