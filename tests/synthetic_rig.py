@@ -13,7 +13,7 @@ from cotarget.config import BoardConfig
 from cotarget.errors import StaleFrameError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
-from tests.synthetic import SIZE, Lens, Truth
+from experiments.synthetic import SIZE, Lens, Truth
 
 PERIOD = 0.04
 LATENCY = 0.05

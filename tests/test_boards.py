@@ -8,7 +8,7 @@ from cotarget.calibration.boards import board_points, check_board, draw_board, f
 from cotarget.config import BoardConfig
 from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, Rotation
-from tests.synthetic import Truth
+from experiments.synthetic import Truth
 from tests.synthetic_rig import draw, pixel_rays
 
 BOARD = BoardConfig()

@@ -25,7 +25,7 @@ from cotarget.errors import CalibrationError, ConfigError
 from cotarget.geometry import pose
 from cotarget.pantilt import HeadGeometry
 from cotarget.simconfig import DEFAULT_GAMMA, DEFAULT_T
-from tests.synthetic import SIZE, Truth, other_rig, pointing_errors, synthetic_views
+from experiments.synthetic import SIZE, Truth, other_rig, pointing_errors, synthetic_views
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)

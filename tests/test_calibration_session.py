@@ -13,7 +13,7 @@ from cotarget.calibration.plan import GRID, Coverage
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import pose
-from tests.synthetic import SIZE, Truth, pointing_errors
+from experiments.synthetic import SIZE, Truth, pointing_errors
 from tests.synthetic_rig import SyntheticRig
 
 BOARD = BoardConfig()

@@ -27,7 +27,7 @@ from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform
 from cotarget.targeting import Reach, aim, error_budget, point_at
-from tests.synthetic import SIZE, Truth, other_rig, pointing_errors, synthetic_views
+from experiments.synthetic import SIZE, Truth, other_rig, pointing_errors, synthetic_views
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)
@@ -86,7 +86,7 @@ def inside(calibration, truth, names, level):
 
 
 def same_targets(seed):
-    """The targets that tests.synthetic.pointing_errors draws: pixels and depths."""
+    """The targets that experiments.synthetic.draw_targets draws: pixels and depths."""
     rng = np.random.default_rng(seed)
     drawn = [
         (rng.uniform([0, 0], np.array(SIZE) - 1.0), np.exp(rng.uniform(np.log(4), np.log(30)))) for _ in range(TARGETS)

@@ -17,7 +17,7 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig, RigConfig
 from cotarget.geometry import pose
 from cotarget.pantilt import HeadGeometry
-from tests.synthetic import Truth, undistorted
+from experiments.synthetic import Truth, undistorted
 from tests.synthetic_rig import draw, pixel_rays
 
 OLD = "what was there before\n"

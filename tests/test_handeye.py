@@ -6,7 +6,7 @@ import pytest
 from cotarget.calibration.handeye import motions, park_martin
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform, pose
-from tests.synthetic import Truth
+from experiments.synthetic import Truth
 
 EXACT = 1e-10  # m and rad: noise-free motions leave only rounding
 

@@ -15,7 +15,7 @@ from cotarget.errors import ConfigError, StaleFrameError
 from cotarget.loop import FollowSettings, State, follow, stopping_distance
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
 from cotarget.sim.motion import Axis
-from tests.synthetic import SIZE, Lens, Truth
+from experiments.synthetic import SIZE, Lens, Truth
 
 RATE_HZ = 24.0  # neither 0.4 s nor 0.8 s is a whole number of frames
 LATENCY = 0.06
