@@ -2,15 +2,19 @@
 
 from cotarget.calibration.boards import draw_board, find_corners
 from cotarget.calibration.file import load_calibration, save_calibration
+from cotarget.calibration.handeye import HandEye, solve_hand_eye, solve_hand_eye_from_poses
 from cotarget.calibration.method import calibrate_captures, calibrate_photos, calibrate_rig, calibrate_views
 from cotarget.calibration.model import Calibration, Capture, Covariance, HeldOut, Options, Rejected, Residuals, View
+from cotarget.calibration.observability import Observability, name_directions, weak_directions
 from cotarget.calibration.uncertainty import line_of_sight_covariance, predicted_pointing
 
 __all__ = [
     "Calibration",
     "Capture",
     "Covariance",
+    "HandEye",
     "HeldOut",
+    "Observability",
     "Options",
     "Rejected",
     "Residuals",
@@ -23,6 +27,10 @@ __all__ = [
     "find_corners",
     "line_of_sight_covariance",
     "load_calibration",
+    "name_directions",
     "predicted_pointing",
     "save_calibration",
+    "solve_hand_eye",
+    "solve_hand_eye_from_poses",
+    "weak_directions",
 ]
