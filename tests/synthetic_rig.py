@@ -140,7 +140,7 @@ class _Camera:
 
 
 class _Zoom(_Camera):
-    focal_range = (667.0, 8000.0)
+    focal_range = (667.0, 667.0)  # it does not zoom
 
     def zoom(self, focal_px):
         return focal_px

@@ -20,12 +20,11 @@ from cotarget.calibration.placing import place_boards
 from cotarget.calibration.reprojection import (
     ALL_BLOCKS,
     Block,
-    RigModel,
 )
 from cotarget.calibration.sequential import Solution, Steps, both_cameras, stereo
 from cotarget.calibration.start import of_both, pairs_at_home, rough_gamma, rough_hand
+from cotarget.calibration.stops import check_stops, fit_last_stop, lens_prior, with_stop
 from cotarget.calibration.uncertainty import covariance_of
-from cotarget.camera import ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
 
@@ -33,11 +32,7 @@ from cotarget.geometry import Array
 # 65 million is.
 WRONG_SIGMAS, WRONG_FLOOR_PX = 6.0, 0.5
 WRONG_SHARE = 0.3  # a view with more wrong corners than this is left out as a whole
-FEWEST_STOP_VIEWS = 3  # of a stop, in two or more placements
-# What is known of a lens before it is seen: its pupil moves by some decimetres over the range; and distortion, measured
-# in the image, stays within several times of what lenses have. Boards all over the image know either far better.
-PUPIL_SIGMA = 0.2  # [m]
-BENT_SIGMAS = {"k1": (0.5, 2), "k2": (1.0, 4), "p1": (0.05, 1), "p2": (0.05, 1)}  # and the power of the focal length
+FEWEST_STOP_VIEWS, FEWEST_STOP_PLACEMENTS = 3, 2  # of a stop of the zoom lens
 # Encoders, where they are asked for: gears are cut to a thousandth or two, zeros are found to half a degree.
 ENCODER_SIGMAS = {
     "head.pan_scale": 0.002,
@@ -113,28 +108,25 @@ def _all_stops(
 ) -> tuple[Fit, list[Rejected], Prior]:
     """Add the stops in their order, then fit everything together."""
     model, used, rejected = found.model, list(found.views), []
-    assert model.zoom is not None
-    for nominal in nominal_px[1:]:
+    for number, nominal in enumerate(nominal_px[1:], start=1):
         assert model.zoom is not None
-        wider = model.zoom
-        guess = wider.at(nominal) if len(wider.stops) > 1 else wider.stops[-1].scaled(nominal / wider.nominal_px[-1])
-        # The spline does not reach beyond the last stop: there its ratios hold, as they are taken to here.
-        lens = ZoomLens((*wider.nominal_px, nominal), (*wider.stops, guess), (*wider.pupil, wider.pupil[-1]))
-        here = [v for v in views if v.camera == "zoom" and _stop_of(nominal_px, v) == len(wider.stops)]
-        if len(here) < FEWEST_STOP_VIEWS or len({view.board for view in here}) < 2:
+        here = [
+            v for v in views if v.camera == "zoom" and _stop_of(nominal_px, v) == number and v.board in model.boards
+        ]
+        if len(here) < FEWEST_STOP_VIEWS or len({view.board for view in here}) < FEWEST_STOP_PLACEMENTS:
             rejected += [
                 Rejected(v.name, f"{len(here)} views at {nominal:.0f} px are too few for a zoom stop") for v in here
             ]
             continue
         seen_too = {view.board for view in here}
         with_fixed = [view for view in used if view.camera == "fixed" and view.board in seen_too]
-        here = [view for view in here if view.board in model.boards]
-        start = replace(model, zoom=lens)
-        added = fit(start, [*with_fixed, *here], points, ("zoom", "pupil"), prior=lens_prior(start))
-        model = replace(added.model, boards=model.boards)
+        start = replace(model, zoom=with_stop(model.zoom, nominal))
+        model = fit_last_stop(start, [*with_fixed, *here], points)
         used += here
     prior = lens_prior(model)
-    return fit(model, used, points, blocks, prior=prior), rejected, prior
+    result = fit(model, used, points, blocks, prior=prior)
+    check_stops(result.model)
+    return result, rejected, prior
 
 
 def _stop_of(nominal_px: Sequence[float], view: View) -> int:
@@ -142,21 +134,6 @@ def _stop_of(nominal_px: Sequence[float], view: View) -> int:
     if not nominal_px:
         return 0
     return int(np.argmin(np.abs(np.log(np.array(nominal_px) / (view.focal_px or nominal_px[0])))))
-
-
-def lens_prior(model: RigModel) -> Prior:
-    """What is known of a zoom lens beyond its first stop before it is seen; see `PUPIL_SIGMA` and `BENT_SIGMAS`."""
-    assert model.zoom is not None
-    sigmas: dict[str, float] = {}
-    stops = []
-    for i, (stop, nominal) in enumerate(zip(model.zoom.stops, model.zoom.nominal_px, strict=True)):
-        m = nominal / model.zoom.nominal_px[0]
-        stops.append(replace(stop, distortion=(0.0,) * 5) if i else stop)
-        if i:
-            sigmas[f"zoom[{i}].pupil"] = PUPIL_SIGMA
-            sigmas |= {f"zoom[{i}].{name}": sigma * m**power for name, (sigma, power) in BENT_SIGMAS.items()}
-    still = ZoomLens(model.zoom.nominal_px, tuple(stops))
-    return Prior(replace(model, zoom=still), sigmas)
 
 
 def _without_wrong_corners(found: Fit, points: Array, prior: Prior | None) -> tuple[Fit, int, list[Rejected]]:

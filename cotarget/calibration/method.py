@@ -12,27 +12,27 @@ import cv2
 import numpy as np
 
 from cotarget import __version__
-from cotarget.calibration.boards import board_points, check_board, find_corners
-from cotarget.calibration.captures import CaptureIndex, pair_photos, read_images, read_index
+from cotarget.calibration.boards import board_points, check_board
+from cotarget.calibration.captures import CaptureIndex, pair_photos, read_index
+from cotarget.calibration.finding import find_views
 from cotarget.calibration.intrinsics import FEWEST_CORNERS
 from cotarget.calibration.joint import joint
-from cotarget.calibration.model import DEFAULT_OPTIONS, Calibration, CameraName, Capture, Options, Rejected, View
+from cotarget.calibration.model import DEFAULT_OPTIONS, Calibration, CameraName, Options, Rejected, View
 from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.sequential import sequential
 from cotarget.calibration.session import capture_session
+from cotarget.calibration.stops import SAME_FOCAL, stops_of
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.rig import Rig
 
 Progress = Callable[[int, int, str], None]  # done, total, text
 
-# Without the last refinement, thirty placements point twice as well as fifteen; a session of them takes about 15 s
-# of computing on two cores.
+# Thirty placements point to a few thousandths of a degree; a session of them takes about 15 s on two cores.
 PLACEMENTS = 30
+# Eight stops follow a twelvefold zoom to some hundredths of a percent; six placements see each twelve times.
+STOPS, FAR_PLACEMENTS = 8, 6
 METHODS = ("joint", "sequential")
-SAME_FOCAL = 1e-3  # relative; a step of a usual lens changes the focal length twenty times more
-
-NO_BOARD = "no whole board of {}x{} corners is seen"
 
 
 def calibrate_views(
@@ -66,7 +66,7 @@ def calibrate_views(
     check_board(board)
     _check_views(views, board)
     views = _in_canonical_order(views)
-    nominal = _stops(views)
+    nominal = stops_of(views)
     points = board_points(board)
     others: list[Rejected] = []
     if options.method == "joint":
@@ -121,15 +121,6 @@ def _in_canonical_order(views: Sequence[View]) -> list[View]:
         return view.camera, view.board, view.focal_px or 0.0, view.pan, view.tilt, view.corners_px.tobytes()
 
     return sorted(views, key=key)
-
-
-def _stops(views: Sequence[View]) -> list[float]:
-    """The nominal focal lengths at which the zoom camera was, increasing; empty where no device told one."""
-    stops: list[float] = []
-    for focal in sorted({view.focal_px for view in views if view.camera == "zoom" and view.focal_px is not None}):
-        if not stops or focal > stops[-1] * (1 + SAME_FOCAL):
-            stops.append(focal)
-    return stops
 
 
 def _at_shortest(views: Sequence[View], nominal: Sequence[float]) -> tuple[list[View], list[Rejected]]:
@@ -194,16 +185,6 @@ def calibrate_photos(
     return _calibrate_images(directory, index, options, progress, rejected, what="photos")
 
 
-def find_view(capture: Capture, board: BoardConfig) -> View | None:
-    """Find the board in a capture; None where no whole board is seen."""
-    corners = find_corners(capture.image, board)
-    if corners is None:
-        return None
-    return View(
-        capture.camera, corners, capture.board, capture.pan, capture.tilt, capture.focal_px, capture.t, capture.source
-    )
-
-
 def _calibrate_images(
     directory: Path,
     index: CaptureIndex,
@@ -213,32 +194,16 @@ def _calibrate_images(
     what: str,
 ) -> Calibration:
     check_board(index.board)
-    views: list[View] = []
-    sizes: dict[CameraName, tuple[int, int]] = {}
-    for done, capture in enumerate(read_images(directory, index.captures)):
-        if progress is not None:
-            progress(done, len(index.captures), f"looking for the board in {capture.source}")
-        sizes[capture.camera] = (capture.image.shape[1], capture.image.shape[0])
-        view = find_view(capture, index.board)
-        if view is None:
-            rejected.append(Rejected(str(capture.source), NO_BOARD.format(*index.board.corners)))
-        else:
-            views.append(view)
-    if not views:
-        columns, rows = index.board.corners
-        raise CalibrationError(
-            f"{directory}: no picture shows a whole chessboard of {columns}x{rows} inner corners; "
-            "check the board's corners, and that every picture shows all of it"
-        )
+    found = find_views(directory, index, progress)
     if progress is not None:
         progress(len(index.captures), len(index.captures), "fitting")
     return calibrate_views(
-        views,
+        found.views,
         index.board,
-        sizes,
+        found.sizes,
         pitch_mm=index.pitch_mm,
         options=options,
-        rejected=rejected,
+        rejected=(*rejected, *found.rejected),
         provenance={what: str(directory), "images": len(index.captures)},
     )
 
@@ -250,6 +215,8 @@ def calibrate_rig(
     captures_dir: Path | None = None,
     progress: Progress | None = None,
     placements: int = PLACEMENTS,
+    stops: int = STOPS,
+    far_placements: int = FAR_PLACEMENTS,
     seed: int = 0,
     pitch_mm: float | None = None,
     options: Options = DEFAULT_OPTIONS,
@@ -261,7 +228,9 @@ def calibrate_rig(
         board: the board that its holder holds.
         captures_dir: where to keep the images; None to keep none.
         progress: called with what is done, of how much, and in words.
-        placements: how many placements of the board.
+        placements: how many placements of the board, at the shortest focal length.
+        stops: how many stops of the zoom lens, evenly spread over its range; 1 for the shortest alone.
+        far_placements: how many more placements, far away, for the stops beyond the first.
         seed: of the choice among possible placements.
         pitch_mm: size of a pixel of the zoom camera [mm], where it is known.
         options: how to calibrate.
@@ -271,8 +240,15 @@ def calibrate_rig(
         ConfigError: the board looks the same upside down.
     """
     recorder = Recorder(rig, board, captures_dir, pitch_mm)
-    capture_session(recorder, placements, np.random.default_rng(seed), progress)
-    provenance = {"rig": type(rig).__name__, "seed": seed, "placements": placements}
+    rng = np.random.default_rng(seed)
+    capture_session(recorder, placements, rng, progress, stops=stops, far_placements=far_placements)
+    provenance = {
+        "rig": type(rig).__name__,
+        "seed": seed,
+        "placements": placements,
+        "stops": stops,
+        "far_placements": far_placements,
+    }
     return calibrate_views(
         recorder.views,
         board,

@@ -70,6 +70,11 @@ class View:
         return self.source or f"{self.camera} view of placement {self.board} at t = {self.t:.2f} s"
 
 
+def unseen(count: int) -> Array:
+    """The corners of a view in which none is seen, (count, 2)."""
+    return np.full((count, 2), np.nan)
+
+
 @dataclass(frozen=True)
 class Rejected:
     """An image, or a view, that was not used, by name, and why."""

@@ -106,6 +106,7 @@ def plan_placement(
     *,
     shared: bool,
     margin_px: float,
+    share: float | None = None,
 ) -> RigidTransform | None:
     """Choose where to hold the board.
 
@@ -117,13 +118,14 @@ def plan_placement(
         rng: random numbers.
         shared: whether the zoom camera must see it too, at pan = tilt = 0.
         margin_px: how far inside the images the board must stay.
+        share: of the way from near to far; by default it follows from the number.
 
     Returns:
         T_fixed_board, or None where no candidate is visible.
     """
     assert model.fixed is not None
     # The distances of successive placements are spread evenly; only where that one does not do, any will.
-    preferred = np.full(CANDIDATES, (number * GOLDEN) % 1.0)
+    preferred = np.full(CANDIDATES, (number * GOLDEN) % 1.0 if share is None else share)
     for shares in (preferred, rng.uniform(size=CANDIDATES)):
         pixels = rng.uniform(size=(CANDIDATES, 2)) * (np.array(model.fixed.size) - 1)
         depths = np.array([distance(board, model.fixed, share) for share in shares])

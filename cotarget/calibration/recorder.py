@@ -1,6 +1,6 @@
 """Taking captures from a rig: everything stands still first, and every image goes to disk with how it was taken."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from cotarget.calibration.boards import find_corners
 from cotarget.calibration.captures import INDEX, NO_IMAGE, CaptureIndex, file_name, write_image, write_index
-from cotarget.calibration.model import Capture, Rejected, View
+from cotarget.calibration.model import Capture, Rejected, View, unseen
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, DeviceError
-from cotarget.geometry import RigidTransform, Rotation
-from cotarget.rig import Rig
+from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.rig import Image, Rig
 
 # Wishes are rounded to 0.1 mm and 0.1 mrad. Nobody holds a board better; and the fits behind a plan sum in an order
 # that varies with the threads: their last digits would otherwise make two runs with the same seed drift apart.
@@ -22,7 +22,26 @@ POLL = 0.02  # between looks at a state [s]
 FRAME_TIMEOUT = 5.0  # a slow network camera's latency, several times [s]
 HEAD_PATIENCE = 2.0  # beyond what the way takes at the head's own speed and acceleration [s]
 LENS_TIMEOUT = 15.0  # the slowest zoom lenses take some ten seconds from end to end [s]
+LENS_TOLERANCE = 0.03  # of the focal length; a step of a usual lens is 0.02
 POSE_TOLERANCE = np.radians(0.2)  # between commanded and reached, above the head's own step [rad]
+
+
+# Finds a board's corners in an image, given the view that it will be but for its corners.
+Finder = Callable[[Image, View], Array | None]
+
+
+def view_of(capture: Capture, corners_px: Array) -> View:
+    """The view that a capture becomes."""
+    return View(
+        capture.camera,
+        corners_px,
+        capture.board,
+        capture.pan,
+        capture.tilt,
+        capture.focal_px,
+        capture.t,
+        capture.source,
+    )
 
 
 @dataclass(eq=False)
@@ -62,15 +81,29 @@ class Recorder:
                 raise CalibrationError(f"{self.directory}: cannot be made: {error.strerror}") from None
             if (self.directory / INDEX).exists():
                 raise CalibrationError(f"{self.directory}: already holds captures; give another folder")
-        rig = self.rig
-        rig.zoom.zoom(rig.zoom.focal_range[0])
-        deadline = rig.clock.now() + LENS_TIMEOUT
-        rig.clock.sleep_until(rig.clock.now() + POLL)
-        while rig.zoom.state().moving:
-            if rig.clock.now() > deadline:
-                raise CalibrationError(f"the zoom lens still moves after {LENS_TIMEOUT:g} s")
-            rig.clock.sleep_until(rig.clock.now() + POLL)
+        self.zoom(self.rig.zoom.focal_range[0])
         self.turn(0.0, 0.0)
+
+    def zoom(self, nominal_px: float) -> float:
+        """Send the lens to a focal length and wait until it stands; the one that it reached, by its own account [px].
+
+        Raises:
+            CalibrationError: the lens goes on moving, or does not reach what it said it would.
+        """
+        lens, clock = self.rig.zoom, self.rig.clock
+        wanted = lens.zoom(nominal_px)
+        deadline = clock.now() + LENS_TIMEOUT
+        clock.sleep_until(clock.now() + POLL)
+        while (state := lens.state()).moving:
+            if clock.now() > deadline:
+                raise CalibrationError(f"the zoom lens still moves after {LENS_TIMEOUT:g} s")
+            clock.sleep_until(clock.now() + POLL)
+        if abs(np.log(state.focal_px / wanted)) > LENS_TOLERANCE:
+            raise CalibrationError(
+                f"the zoom lens stands at {state.focal_px:.0f} px where {wanted:.0f} px was commanded"
+            )
+        self._still_since = max(self._still_since, state.t + SETTLE)
+        return state.focal_px
 
     def present(self, T_fixed_board: RigidTransform) -> int:
         """Ask for the board at a pose, as a new placement; its number."""
@@ -115,14 +148,19 @@ class Recorder:
         frame = self.rig.fixed.read(newer_than=self._still_since, timeout=FRAME_TIMEOUT)
         return self._keep(Capture(frame.image, "fixed", self.number, t=frame.t), expected)
 
-    def see_zoom(self, *, expected: bool = True) -> View | None:
-        """Take an image with the zoom camera where the head now stands and find the board in it."""
+    def see_zoom(self, *, expected: bool = True, find: Finder | None = None) -> View | None:
+        """Take an image with the zoom camera where the head now stands and find the board in it.
+
+        Args:
+            expected: whether the board should be there, so that it is worth looking thoroughly.
+            find: how to look for it: given the image, and the view that it will be but for its corners.
+        """
         frame = self.rig.zoom.read(newer_than=self._still_since, timeout=FRAME_TIMEOUT)
         pose, lens = self.rig.head.state(), self.rig.zoom.state()
         if pose.moving or lens.moving:
             raise DeviceError("head or lens moved while the zoom camera took a calibration image")
         capture = Capture(frame.image, "zoom", self.number, pose.pan, pose.tilt, lens.focal_px, frame.t)
-        return self._keep(capture, expected)
+        return self._keep(capture, expected, find)
 
     def of_placement(self, number: int) -> Sequence[View]:
         """The views of one placement."""
@@ -133,9 +171,12 @@ class Recorder:
         if self.directory is not None and self._captures:
             write_index(self.directory, CaptureIndex(self.board, self.pitch_mm, tuple(self._captures)))
 
-    def _keep(self, capture: Capture, expected: bool) -> View | None:
+    def _keep(self, capture: Capture, expected: bool, find: Finder | None = None) -> View | None:
         """Find the board; keep the image where it was found, or should have been."""
-        corners = find_corners(capture.image, self.board, thorough=expected)
+        if find is None:
+            corners = find_corners(capture.image, self.board, thorough=expected)
+        else:
+            corners = find(capture.image, view_of(capture, unseen(self.board.corners[0] * self.board.corners[1])))
         if corners is None and not expected:
             return None
         capture = replace(capture, source=file_name(capture, len(self._captures)))
@@ -147,9 +188,8 @@ class Recorder:
         if corners is None:
             self.rejected.append(Rejected(str(capture.source), "the board was expected but not found"))
             return None
-        view = View(
-            capture.camera, corners, capture.board, capture.pan, capture.tilt, capture.focal_px, capture.t,
-            capture.source if self.directory is not None else None,
-        )  # fmt: skip
+        view = view_of(capture, corners)
+        if self.directory is None:
+            view = replace(view, source=None)
         self.views.append(view)
         return view

@@ -18,6 +18,8 @@ from cotarget.calibration.plan import Coverage, plan_placement, plan_poses, seen
 from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.reprojection import RigModel
 from cotarget.calibration.start import at_home
+from cotarget.calibration.stops import spread_stops
+from cotarget.calibration.zooming import see_stops
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform
 
@@ -33,13 +35,21 @@ MOST_MISSES = 4  # placements in a row without a view before giving up
 
 
 def capture_session(
-    recorder: Recorder, placements: int, rng: np.random.Generator, progress: Progress | None = None
+    recorder: Recorder,
+    placements: int,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+    *,
+    stops: int = 1,
+    far_placements: int = 0,
 ) -> None:
     """Fill a recorder with views.
 
     Args:
         recorder: of a rig that stands still.
         placements: how many placements of the board.
+        stops: how many stops of the zoom lens.
+        far_placements: how many more placements of the board, for the stops beyond the first.
         rng: chooses among possible placements.
         progress: called with what is done, of how much, and in words.
 
@@ -47,10 +57,12 @@ def capture_session(
         CalibrationError: a camera never sees the board, the cameras have no common view at home, or the head fails.
     """
     check_board(recorder.board)
+    nominal = spread_stops(*recorder.rig.zoom.focal_range, stops)
+    total = placements + (far_placements if len(nominal) > 1 else 0)
 
     def tell(text: str) -> None:
         if progress is not None:
-            progress(min(recorder.number + 1, placements), placements, text)
+            progress(min(recorder.number + 1, total), total, text)
 
     try:
         recorder.start()
@@ -59,13 +71,15 @@ def capture_session(
         tell("looking for the board with the zoom camera")
         model = learn_zoom(recorder, model)
         tell("planning")
-        _cover(recorder, model, placements, rng, tell)
+        model = _cover(recorder, model, placements, rng, tell)
+        if len(nominal) > 1:
+            see_stops(recorder, model, nominal, far_placements, rng, tell)
         recorder.turn(0.0, 0.0)
     finally:
         recorder.save_index()
         recorder.rig.board.present(None)
     if progress is not None:
-        progress(placements, placements, "fitting")
+        progress(total, total, "fitting")
 
 
 def _cover(
@@ -74,7 +88,7 @@ def _cover(
     placements: int,
     rng: np.random.Generator,
     tell: Callable[[str], None],
-) -> None:
+) -> RigModel:
     """Present the board all over both images and turn the head at each placement."""
     rig = recorder.rig
     coverage = {"fixed": Coverage(rig.fixed.size), "zoom": Coverage(rig.zoom.size)}
@@ -100,6 +114,7 @@ def _cover(
         done += 1
         if done <= REFIT_ALWAYS or done % REFIT_EVERY == 0 or missed:
             model = refitted(model, recorder)
+    return refitted(model, recorder)
 
 
 def _next_placement(

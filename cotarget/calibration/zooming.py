@@ -1,0 +1,169 @@
+"""The part of a capture session that sees boards at the zoom lens's other stops.
+
+Boards are held far away, where the fixed camera still sees them whole; at each the lens goes through all stops, and the
+head brings parts of the board all over the zoom image. The first board teaches each stop before the next one is tried.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cotarget.calibration.boards import board_points
+from cotarget.calibration.model import View
+from cotarget.calibration.placing import place_boards
+from cotarget.calibration.plan import Coverage, plan_placement
+from cotarget.calibration.recorder import Recorder
+from cotarget.calibration.reprojection import RigModel, base_heads
+from cotarget.calibration.stops import (
+    FEWEST_CORNERS,
+    expected_corners,
+    expected_inside,
+    find_expected,
+    fit_last_stop,
+    with_stop,
+)
+from cotarget.camera import Intrinsics
+from cotarget.geometry import Array, RigidTransform
+from cotarget.pantilt import solve
+from cotarget.rig import PanTiltLimits
+
+# Shares of the way from near to far at which boards are held: far, because the fixed camera must see a board whole that
+# fills the zoom image many times over; not all as far, or the entrance pupil could not be told from the focal length.
+NEAREST_SHARE, FARTHEST_SHARE = 0.6, 1.0
+VIEWS_A_STOP = 2  # of each placement
+FIRST_VIEWS = 3  # of the first placement, from which a stop is learnt
+CANDIDATES = 60  # ways to bring a part of the board into the image that are tried for each view
+BORDER_PX = 12.0  # a point of the board is brought anywhere but this near to the image's border
+
+
+def see_stops(
+    recorder: Recorder,
+    model: RigModel,
+    stops: Sequence[float],
+    placements: int,
+    rng: np.random.Generator,
+    tell: Callable[[str], None],
+) -> RigModel:
+    """Take views at all stops but the first, and learn them; the model with these stops.
+
+    Args:
+        recorder: with the views at the shortest focal length.
+        model: fitted to these.
+        stops: nominal focal lengths [px], increasing, the shortest first.
+        placements: how many placements of the board.
+        rng: random numbers.
+        tell: told what is done.
+    """
+    assert model.fixed is not None
+    assert model.zoom is not None
+    points = board_points(recorder.board)
+    size = recorder.rig.zoom.size
+    coverage = {"fixed": Coverage(recorder.rig.fixed.size), "zoom": Coverage(size)}
+    for view in recorder.views:
+        if view.camera == "fixed":
+            coverage["fixed"].add(view.corners_px)
+    at_stop = [Coverage(size) for _ in stops]
+    only_fixed = replace(model, zoom=None)
+    reached = list(model.zoom.nominal_px)
+    for k in range(placements):
+        share = FARTHEST_SHARE - (FARTHEST_SHARE - NEAREST_SHARE) * k / max(placements - 1, 1)
+        wish = plan_placement(
+            only_fixed,
+            recorder.board,
+            coverage,
+            recorder.number + 1,
+            rng,
+            shared=False,
+            margin_px=BORDER_PX,
+            share=share,
+        )
+        if wish is None:
+            continue
+        recorder.present(wish)
+        fixed_view = recorder.see_fixed()
+        if fixed_view is None:
+            continue
+        coverage["fixed"].add(fixed_view.corners_px)
+        for i, stop in enumerate(stops[1:], start=1):
+            tell(f"zoom stop {i + 1} of {len(stops)}, board {k + 1} of {placements}")
+            nominal = recorder.zoom(stop)
+            new = i >= len(reached)
+            if new:
+                reached.append(nominal)
+                assert model.zoom is not None
+                model = replace(model, zoom=with_stop(model.zoom, nominal))
+            placed = place_boards(model, [fixed_view], points)
+            for _ in range(FIRST_VIEWS if new else VIEWS_A_STOP):
+                seen = _see_part(recorder, placed, nominal, at_stop[i], rng, points)
+                if seen is not None and new:
+                    placed = fit_last_stop(placed, [fixed_view, *_at(recorder, nominal)], points)
+                    model = replace(model, zoom=placed.zoom)
+        recorder.zoom(stops[0])
+    return model
+
+
+def _at(recorder: Recorder, nominal: float) -> list[View]:
+    """The views of the present placement at a focal length."""
+    return [view for view in recorder.of_placement(recorder.number) if view.focal_px == nominal]
+
+
+def _see_part(
+    recorder: Recorder,
+    model: RigModel,
+    nominal: float,
+    coverage: Coverage,
+    rng: np.random.Generator,
+    points: Array,
+) -> View | None:
+    """Turn the head so that the board, or a part of it, fills what was not yet covered, and look."""
+    turn = plan_part(model, recorder.number, nominal, coverage, recorder.rig.head.limits, rng, points)
+    if turn is None:
+        return None
+    recorder.turn(*turn)
+    view = recorder.see_zoom(
+        find=lambda image, view: find_expected(image, recorder.board, expected_corners(model, view, points))
+    )
+    if view is not None:
+        coverage.add(view.corners_px[view.seen])
+    return view
+
+
+def plan_part(
+    model: RigModel,
+    board: int,
+    nominal: float,
+    coverage: Coverage,
+    limits: PanTiltLimits,
+    rng: np.random.Generator,
+    points: Array,
+) -> tuple[float, float] | None:
+    """Choose a head pose that brings some point of a board to some pixel, so that its corners gain most.
+
+    Returns:
+        Pan and tilt [rad]; None where none within the limits shows enough of the board.
+    """
+    assert model.zoom is not None
+    lens = model.zoom.at(nominal)
+    hand = model.hand * RigidTransform.from_translation([0.0, 0.0, model.zoom.pupil_at(nominal)])
+    T_base_board = model.hand * model.gamma * model.boards[board]
+    chosen = points[rng.integers(len(points), size=CANDIDATES)]
+    pixels = rng.uniform(BORDER_PX, np.array(lens.size) - 1 - BORDER_PX, size=(CANDIDATES, 2))
+    found = solve(T_base_board.apply(chosen), hand, model.head, lens.ray(pixels))
+    pan, tilt = found.pan[:, 0], found.tilt[:, 0]
+    with np.errstate(invalid="ignore"):
+        allowed = (pan >= limits.pan[0]) & (pan <= limits.pan[1]) & (tilt >= limits.tilt[0]) & (tilt <= limits.tilt[1])
+    best, most = None, 0.0
+    R, t, _ = base_heads(model.head, np.nan_to_num(pan), np.nan_to_num(tilt))
+    x_zoom = hand.inv().apply(((T_base_board.apply(points) - t[:, None]) @ R).reshape(-1, 3)).reshape(CANDIDATES, -1, 3)
+    for k in np.flatnonzero(allowed):
+        seen = _seen(lens, x_zoom[k])
+        if len(seen) >= FEWEST_CORNERS and (gain := coverage.gain(seen)) > most:
+            best, most = k, gain
+    return None if best is None else (float(pan[best]), float(tilt[best]))
+
+
+def _seen(lens: Intrinsics, x_zoom: Array) -> Array:
+    """The pixels of those points (N, 3) that are in the image, (n, 2)."""
+    pixels = lens.project(x_zoom)
+    return pixels[expected_inside(pixels, lens.size)]
