@@ -152,7 +152,8 @@ def solve_hand_eye_from_poses(
     What remains is looked at in the camera's frame, along the line of sight and across it apart: a camera sees across
     ten times better than along. From eight poses on, the standard deviations of all four (rotation about the line of
     sight and about axes across it, shift along and across) are estimated. The poses' errors are independent, so that
-    the covariance is honest.
+    the covariance is honest, as long as noise is the camera's. Noise of the hand's rotation moves board and view
+    together, which these four know nothing of: where it dominates, 90 % ellipsoids hold X in some 70 % of cases.
 
     For a camera that stands still and a board in the hand, give the inverse of T_base_hand: X is T_base_camera then.
 
