@@ -60,9 +60,9 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "text.mp4").write_text("no film")
     (tmp_path / "nothing").mkdir()
     (tmp_path / "index").mkdir()
-    (tmp_path / "index" / "index.json").write_text('{"schema": 2, "board": 5, "pitch_mm": null, "captures": [1]}')
+    (tmp_path / "index" / "index.json").write_text('{"schema": 1, "board": 5, "pitch_mm": null, "captures": [1]}')
     (tmp_path / "cut").mkdir()
-    (tmp_path / "cut" / "index.json").write_text('{"schema": 2, "boa')
+    (tmp_path / "cut" / "index.json").write_text('{"schema": 1, "boa')
     grey = np.full((120, 160, 3), 128, np.uint8)
     for number in range(4):
         (tmp_path / "grey").mkdir(exist_ok=True)
