@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.config import BoardConfig
+from cotarget.errors import ConfigError
 
 # Another dictionary than that of the targets' markers (4x4, 50), so that neither is ever taken for the other.
 DICTIONARY = cv2.aruco.DICT_5X5_250
@@ -37,13 +38,29 @@ def marker_dictionary() -> "cv2.aruco.Dictionary":
     return cv2.aruco.getPredefinedDictionary(DICTIONARY)
 
 
+def check_markers(board: BoardConfig) -> None:
+    """Refuse a ChArUco board of more squares than there are markers.
+
+    Raises:
+        ConfigError: it has too many.
+    """
+    (columns, rows), most = board.corners, len(marker_dictionary().bytesList)
+    if (columns + 1) * (rows + 1) // 2 > most:
+        raise ConfigError(f"board.corners: {columns}x{rows} needs more than the {most} markers that there are")
+
+
 def cells(board: BoardConfig) -> Cells:
-    """Which cells are dark, row by row: a chessboard's squares, or 20 x 20 in each square of a ChArUco board."""
+    """Which cells are dark, row by row: a chessboard's squares, or 20 x 20 in each square of a ChArUco board.
+
+    Raises:
+        ConfigError: a ChArUco board has more squares than there are markers.
+    """
     columns, rows = (n + 1 for n in board.corners)
     v, u = np.mgrid[:rows, :columns]
     dark = (u + v) % 2 == 0
     if board.kind == "chessboard":
         return dark
+    check_markers(board)
     n, side = CELLS_PER_SQUARE, round(MARKER_SHARE * CELLS_PER_SQUARE)
     first = (n - side) // 2
     fine = np.kron(dark, np.ones((n, n), bool))

@@ -1,10 +1,20 @@
 """Corners: found to a fraction of a pixel, and numbered by the board and not by the image."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
-from cotarget.calibration.boards import board_points, check_board, draw_board, find_corners
+from cotarget.calibration.boards import (
+    another_board,
+    board_points,
+    check_board,
+    draw_board,
+    find_corners,
+    guess_corners,
+    smallest_spacing,
+)
 from cotarget.config import BoardConfig
 from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, Rotation
@@ -12,6 +22,7 @@ from experiments.synthetic import Truth
 from tests.synthetic_rig import draw, pixel_rays
 
 BOARD = BoardConfig()
+PHOTOS = Path(__file__).parents[2] / "shared" / "data" / "opencv_stereo"
 CORNER_TOLERANCE_PX = 0.15  # the drawing blurs edges only roughly; a mistake of numbering is ten pixels and more
 LENS = Truth().fixed
 RAYS = pixel_rays(LENS)
@@ -60,3 +71,60 @@ def test_no_board_is_none():
 def test_a_board_that_looks_the_same_upside_down_is_refused(corners):
     with pytest.raises(ConfigError, match="upside down"):
         check_board(BoardConfig(corners=corners))
+
+
+@pytest.mark.parametrize("corners", [(6, 5), (7, 4), (8, 5), (9, 4), (10, 7), (9, 8)])
+def test_part_of_a_larger_board_is_no_board(corners):
+    """OpenCV's finders do report the inner part of one, which would be numbered differently in every picture."""
+    board = BoardConfig(corners=corners)
+    pictures = [
+        seen_from(Rotation.from_euler("xyz", angles, degrees=True))[0] for angles in ([20, 10, 5], [0, -25, 80])
+    ]
+    for picture in (*pictures, draw_board(BOARD, 30)):
+        assert find_corners(picture, board) is None
+        assert guess_corners(picture) == (9, 6)
+
+
+def test_nothing_is_guessed_of_nothing():
+    assert guess_corners(np.full((480, 640, 3), 128, np.uint8)) is None
+    assert guess_corners(np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)) is None
+
+
+@pytest.mark.parametrize("kind", ["chessboard", "charuco"])
+def test_a_second_board_in_the_picture_is_seen(kind):
+    board = BoardConfig(kind)
+    one = draw_board(board, 30)
+    two = np.concatenate([one, cv2.rotate(one, cv2.ROTATE_180)], axis=1)
+    corners = find_corners(one, board)
+    assert not another_board(one, board, corners)
+    assert another_board(two, board, corners)
+    assert another_board(two, board, corners + np.array([one.shape[1], 0]))
+
+
+def test_a_picture_of_two_boards_gives_one_and_tells_of_the_other():
+    one = draw_board(BOARD, 30)
+    two = np.concatenate([one, one], axis=0)
+    corners = find_corners(two, BOARD)
+    assert corners is None or another_board(two, BOARD, corners)
+
+
+def test_spacing_is_of_the_corners_that_are_seen():
+    corners = board_points(BoardConfig(corners=(3, 4)))[:, :2] * 100
+    corners[0] = np.nan
+    assert smallest_spacing(corners, (3, 4)) == pytest.approx(10.0)
+    assert np.isnan(smallest_spacing(np.full((12, 2), np.nan), (3, 4)))
+
+
+@pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"the real stereo photos are not at {PHOTOS}")
+def test_real_photos_show_the_board_they_show():
+    """Its outer squares are cut short, and a screen behind it shows two small boards in some."""
+    guesses = []
+    for path in sorted(PHOTOS.glob("left*.jpg")):
+        image = cv2.imread(str(path))
+        corners = find_corners(image, BOARD)
+        assert corners is not None
+        assert not another_board(image, BOARD, corners)
+        assert find_corners(image, BoardConfig(corners=(6, 5))) is None
+        guesses.append(guess_corners(image))
+    assert set(guesses) <= {(9, 6), None}
+    assert guesses.count((9, 6)) >= 8

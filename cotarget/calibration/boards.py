@@ -14,16 +14,25 @@ import numpy as np
 from cotarget.calibration.charuco import find_charuco
 from cotarget.calibration.gridsearch import (
     CORNER_DECIMALS,
+    SMALL,
     SMALLEST_CONTRAST,
     SMALLEST_WINDOW_PX,
     SUBPIX_CRITERIA,
     WINDOW_SHARE,
+    are_corners,
+    goes_on,
+    grid_of,
+    homography,
+    through,
 )
 from cotarget.config import BoardConfig
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array
-from cotarget.pattern import cells, marker_dictionary
+from cotarget.pattern import cells, check_markers
 from cotarget.rig import Image
+
+FILLABLE_PX = (-10000.0, 10000.0)  # OpenCV paints no polygons whose corners are much farther out
+SMALLEST_RIGHT = 0.7  # of the corners of any row or column, whose squares have the colours that they should
 
 
 def check_board(board: BoardConfig) -> None:
@@ -37,9 +46,7 @@ def check_board(board: BoardConfig) -> None:
     if min(columns, rows) < 3:
         raise ConfigError(f"board.corners: {columns}x{rows} has fewer than 3 corners a side")
     if board.kind == "charuco":
-        most = len(marker_dictionary().bytesList)
-        if (columns + 1) * (rows + 1) // 2 > most:
-            raise ConfigError(f"board.corners: {columns}x{rows} needs more than the {most} markers that there are")
+        check_markers(board)
     elif (columns + rows) % 2 == 0:
         raise ConfigError(
             f"board.corners: {columns}x{rows} looks the same upside down; "
@@ -106,9 +113,48 @@ def find_corners(image: Image, board: BoardConfig, *, thorough: bool = True) -> 
         if found is None:
             continue
         numbered = _number(grey, found, board.corners)
-        if numbered is not None:
+        if numbered is not None and _is_whole(grey, numbered, board):
             return np.round(_refine(grey, numbered, board.corners), CORNER_DECIMALS)
     return None
+
+
+def another_board(image: Image, board: BoardConfig, corners_px: Array) -> bool:
+    """Whether a picture shows a second board of the same kind and size, by the fastest finder alone.
+
+    Args:
+        image: (H, W, 3) BGR, or grey (H, W).
+        board: the board.
+        corners_px: where one was found, (columns * rows, 2) [px], nan for corners that are not seen.
+    """
+    grey = np.array(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    H = homography(grid_of(board), corners_px)
+    if H is None:
+        return False
+    outline = through(H, board_outline(board)[:, :2] / board.square)
+    if not np.isfinite(outline).all():
+        return False
+    cv2.fillConvexPoly(grey, np.round(np.clip(outline, *FILLABLE_PX)).astype(np.int32), float(np.median(grey)))
+    return find_corners(grey, board, thorough=False) is not None
+
+
+def guess_corners(image: Image) -> tuple[int, int] | None:
+    """Guess the inner corners, columns and rows, of whatever chessboard a picture shows, for an error's message.
+
+    Args:
+        image: (H, W, 3) BGR, or grey (H, W).
+
+    Returns:
+        The larger count first; None where no chessboard is surely seen.
+    """
+    grey = np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    ok, _, layout = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), cv2.CALIB_CB_LARGER)
+    if not ok:
+        return None
+    rows, columns = sorted(layout.shape)
+    found = SEARCHES[0](grey, (columns, rows))
+    numbered = None if found is None else _number(grey, found, (columns, rows))
+    board = BoardConfig(corners=(columns, rows))
+    return (columns, rows) if numbered is not None and _is_whole(grey, numbered, board) else None
 
 
 def smallest_spacing(corners_px: Array, corners: Sequence[int]) -> float:
@@ -136,6 +182,18 @@ def _number(grey: Image, corners_px: Array, corners: tuple[int, int]) -> Array |
     if contrast < 0:
         grid = grid[::-1, ::-1]
     return grid.reshape(-1, 2)
+
+
+def _is_whole(grey: Image, corners_px: Array, board: BoardConfig) -> bool:
+    """Whether corners are those of the whole board: finders also report part of a larger one, or a row too many."""
+    grid = grid_of(board)
+    H = homography(grid, corners_px)
+    if H is None:
+        return False
+    columns, rows = board.corners
+    right = are_corners(grey, corners_px, grid, H, SMALL).reshape(rows, columns)
+    lines = (*right.mean(axis=0), *right.mean(axis=1))
+    return min(lines) > SMALLEST_RIGHT and not goes_on(grey, grid, right.ravel(), H)
 
 
 def _refine(grey: Image, corners_px: Array, corners: tuple[int, int]) -> Array:

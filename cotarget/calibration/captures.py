@@ -6,6 +6,7 @@ after every placement, so that a session that is cut short can still be used up 
 """
 
 import json
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -27,6 +28,7 @@ SCHEMA = 1
 INDEX = "index.json"
 # zlib's fastest level: noise hardly compresses, and the session's time is better spent on looking for corners.
 PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+LARGEST_ANGLE = 2 * math.pi  # of a head that stays within one turn to each side [rad]
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,8 @@ def read_index(directory: Path) -> CaptureIndex:
     """Read index.json.
 
     Raises:
-        CalibrationError: it is missing or malformed; the message names the file and the key.
+        CalibrationError: it is missing or malformed, or lists an image twice or one that is not there; the message
+            names the file and the key.
     """
     path = directory / INDEX
     if not directory.is_dir():
@@ -101,10 +104,12 @@ def read_index(directory: Path) -> CaptureIndex:
         rows = parsing.as_list(get(table, "captures"), "captures")
         if not rows:
             raise CalibrationError("captures: is empty")
+        captures = tuple(_parse_capture(row, f"captures[{i}]") for i, row in enumerate(rows))
+        _check_files(directory, captures)
         return CaptureIndex(
             board=parse_board(get(table, "board"), "board"),
             pitch_mm=None if pitch is None else parsing.as_number(pitch, "pitch_mm", positive=True),
-            captures=tuple(_parse_capture(row, f"captures[{i}]") for i, row in enumerate(rows)),
+            captures=captures,
         )
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
@@ -209,14 +214,43 @@ def _parse_capture(value: object, where: str) -> Capture:
     if Path(source).is_absolute() or ".." in Path(source).parts:
         raise CalibrationError(f"{where}.file: {parsing.short(source)} is not inside the folder of the index")
     focal = get(row, "focal_px", where)
-    pan, tilt, t = (parsing.as_number(get(row, key, where), f"{where}.{key}") for key in ("pan", "tilt", "t"))
+    board = parsing.as_whole(get(row, "board", where), f"{where}.board")
+    if board < 0:
+        raise CalibrationError(f"{where}.board: {board} is negative; placements are numbered from 0")
+    pan, tilt = (_parse_angle(row, key, where, camera) for key in ("pan", "tilt"))
     return Capture(
         image=NO_IMAGE,
         camera=camera,
-        board=parsing.as_whole(get(row, "board", where), f"{where}.board"),
+        board=board,
         pan=pan,
         tilt=tilt,
         focal_px=None if focal is None else parsing.as_number(focal, f"{where}.focal_px", positive=True),
-        t=t,
+        t=parsing.as_number(get(row, "t", where), f"{where}.t"),
         source=source,
     )
+
+
+def _parse_angle(row: Table, key: str, where: str, camera: CameraName) -> float:
+    """The head's angle [rad]; null is none, which does for the fixed camera."""
+    value = get(row, key, where) if camera == "fixed" else row.get(key)
+    if value is None:
+        if camera == "fixed":
+            return 0.0
+        raise CalibrationError(f"{where}.{key}: is missing; an image of the zoom camera needs the head's pan and tilt")
+    angle = parsing.as_number(value, f"{where}.{key}")
+    if abs(angle) > LARGEST_ANGLE:
+        raise CalibrationError(f"{where}.{key}: {angle:g} is more than a whole turn in radians; it looks like degrees")
+    return angle
+
+
+def _check_files(directory: Path, captures: Sequence[Capture]) -> None:
+    """Refuse an index that does not agree with the folder."""
+    first: dict[str, int] = {}
+    for i, capture in enumerate(captures):
+        assert capture.source is not None
+        name = Path(capture.source).as_posix()
+        if name in first:
+            raise CalibrationError(f"captures[{i}].file: {name} is captures[{first[name]}] already")
+        first[name] = i
+        if not (directory / name).is_file():
+            raise CalibrationError(f"captures[{i}].file: {name}: no such file in the folder")

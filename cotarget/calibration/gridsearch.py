@@ -22,6 +22,7 @@ SUBPIX_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001
 CORNER_DECIMALS = 4
 # Even and odd squares must differ by this many grey levels, or what was found is no chessboard.
 SMALLEST_CONTRAST = 8.0
+BEYOND_SHARE = 0.4  # of the board's usual contrast, which a corner beyond its edge has too, and a background has not
 FEWEST_CORNERS = 6
 FEWEST_AFFINE = 4  # at the first look, whose larger window leaves out those near the image's edge
 SMALLEST_SPACING_PX = 10.0  # below, the four squares around a corner blur into each other
@@ -56,6 +57,8 @@ class Look:
 
 # Blurred by 7 px (one standard deviation) where squares are 70 px large is too much.
 PLAIN = Look(window=WINDOW_SHARE, inside=0.3, near=0.1, sharpness=0.4)
+# Squares of a whole board may be as small as 7 px, and then little is left of the contrast near the corners.
+SMALL = Look(window=WINDOW_SHARE, inside=0.3, near=0.3, sharpness=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,29 +168,57 @@ def refined(grey: Image, start: Array, which: Mask, half: int) -> Array:
 
 
 def are_corners(grey: Image, pixels: Array, grid: Array, H: Array, look: Look) -> Mask:
-    """Whether the image shows a corner of the board's there: two dark squares across, as its place wants, two bright.
+    """Whether the image shows corners of the board's there, and sharp ones; see `contrast`."""
+    well_inside, near = (contrast(grey, pixels, grid, H, share) for share in (look.inside, look.near))
+    with np.errstate(invalid="ignore"):
+        return np.asarray((well_inside > SMALLEST_CONTRAST) & (near > look.sharpness * well_inside))
+
+
+def contrast(grey: Image, pixels: Array, grid: Array, H: Array, share: float) -> Array:
+    """By how much the two squares across that should be bright are brighter than the two that should be dark.
 
     Args:
         grey: the image.
-        pixels: where it is looked, (N, 2); nan ones are none.
+        pixels: where corners may be, (N, 2).
         grid: column and row of the corners that should be there, (N, 2).
         H: from squares to pixels, roughly, for the size and the slant of the squares.
-        look: how closely to look.
+        share: how far from the corner it is looked, along both axes, in squares.
+
+    Returns:
+        (N,) [grey levels], from the darker bright square to the brighter dark one; nan where the pixel is.
     """
     diagonals = np.array([[-1, -1], [1, 1], [1, -1], [-1, 1]])  # dark, dark, bright, bright around the first corner
-    place = through(H, grid)[:, None]
-
-    def contrast(share: float) -> Array:
-        arms = through(H, grid[:, None] + share * diagonals) - place
-        at = (np.nan_to_num(pixels)[:, None] + arms).astype(np.float32)
-        levels = cv2.remap(smooth, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        levels = np.where((grid.sum(axis=1) % 2 == 0)[:, None], levels, 255.0 - levels)
-        return levels[:, 2:].min(axis=1) - levels[:, :2].max(axis=1)
-
+    arms = through(H, grid[:, None] + share * diagonals) - through(H, grid)[:, None]
+    at = (np.nan_to_num(pixels)[:, None] + np.nan_to_num(arms)).astype(np.float32)
     smooth = cv2.boxFilter(grey, cv2.CV_32F, (3, 3))
-    well_inside, near = contrast(look.inside), contrast(look.near)
-    ok = (well_inside > SMALLEST_CONTRAST) & (near > look.sharpness * well_inside)
-    return np.asarray(np.isfinite(pixels).all(axis=1) & ok)
+    levels = cv2.remap(smooth, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    levels = np.where((grid.sum(axis=1) % 2 == 0)[:, None], levels, -levels)
+    return np.where(np.isfinite(pixels).all(axis=1), levels[:, 2:].min(axis=1) - levels[:, :2].max(axis=1), np.nan)
+
+
+def goes_on(grey: Image, grid: Array, seen: Mask, H: Array) -> bool:
+    """Whether there are corners beyond an edge of the board: then this is another part of it, or of a larger one.
+
+    Args:
+        grey: the image.
+        grid: column and row of the board's corners, (N, 2).
+        seen: those whose contrast is taken for the board's.
+        H: from squares to pixels.
+    """
+    usual = np.median(contrast(grey, through(H, grid[seen]), grid[seen], H, PLAIN.inside))
+    last_column, last_row = grid.max(axis=0)
+    u, v = np.arange(last_column + 1), np.arange(last_row + 1)
+    sides = [
+        np.stack(np.broadcast_arrays(across, along), axis=-1)
+        for across, along in ((-1.0, v), (last_column + 1, v), (u, -1.0), (u, last_row + 1))
+    ]
+    for side in sides:
+        places = through(H, side)
+        visible = inside(grey, places, 1)
+        beyond = contrast(grey, places, side, H, PLAIN.inside)[visible] > BEYOND_SHARE * usual
+        if np.count_nonzero(beyond) > max(1, len(beyond) / 2):
+            return True
+    return False
 
 
 def _agreeing(predicted: Array, found: Array, corners: Mask, spacing: float, *, rough: bool) -> Mask:

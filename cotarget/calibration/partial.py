@@ -12,13 +12,11 @@ from cotarget.calibration.gridsearch import (
     PIXEL_SCALE,
     PLAIN,
     Found,
-    are_corners,
     design,
+    goes_on,
     grid_of,
     homography,
-    inside,
     search,
-    through,
 )
 from cotarget.config import BoardConfig
 from cotarget.geometry import Array
@@ -74,21 +72,4 @@ def _as_predicted(grey: Image, grid: Array, predicted: Array, found: Found) -> b
     if np.hypot(*offset.mean(axis=0)) > FARTHEST_SHARE * found.spacing or np.abs(slopes).max() > LARGEST_STRETCH:
         return False
     H = homography(grid[seen], found.corners_px[seen])
-    return H is not None and not _goes_on(grey, grid, H)
-
-
-def _goes_on(grey: Image, grid: Array, H: Array) -> bool:
-    """Whether there are corners beyond an edge of the board: then this is another part of it than was predicted."""
-    last_column, last_row = grid.max(axis=0)
-    u, v = np.arange(last_column + 1), np.arange(last_row + 1)
-    sides = [
-        np.stack(np.broadcast_arrays(across, along), axis=-1)
-        for across, along in ((-1.0, v), (last_column + 1, v), (u, -1.0), (u, last_row + 1))
-    ]
-    for side in sides:
-        places = through(H, side)
-        visible = inside(grey, places, 1)
-        beyond = are_corners(grey, np.where(visible[:, None], places, np.nan), side, H, PLAIN)
-        if np.count_nonzero(beyond) > max(1, np.count_nonzero(visible) / 2):
-            return True
-    return False
+    return H is not None and not goes_on(grey, grid, seen, H)
