@@ -104,10 +104,11 @@ def read_index(directory: Path) -> CaptureIndex:
         rows = parsing.as_list(get(table, "captures"), "captures")
         if not rows:
             raise CalibrationError("captures: is empty")
+        board = parse_board(get(table, "board"), "board")
         captures = tuple(_parse_capture(row, f"captures[{i}]") for i, row in enumerate(rows))
         _check_files(directory, captures)
         return CaptureIndex(
-            board=parse_board(get(table, "board"), "board"),
+            board=board,
             pitch_mm=None if pitch is None else parsing.as_number(pitch, "pitch_mm", positive=True),
             captures=captures,
         )
