@@ -5,7 +5,7 @@ The truth can have what a model lacks: lenses of other kinds, a head that sags, 
 lever that gives way.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,10 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.calibration import Calibration, View
+from cotarget.calibration.model import CameraName
 from cotarget.geometry import Array, RigidTransform, Rotation, pose
 from cotarget.simconfig import DEFAULT_GAMMA, DEFAULT_T
 
 SIZE = (640, 480)
+SIZES: Mapping[CameraName, tuple[int, int]] = {"fixed": SIZE, "zoom": SIZE}
 NOMINAL_PX = 667.0  # what the zoom camera's device calls its shortest focal length
 LONGEST_PX = 7155.0  # the focal length at which errors are stated in pixels
 TARGET_DEPTHS = (4.0, 30.0)  # [m]
@@ -24,6 +26,13 @@ BOARD_DEPTHS = (2.5, 8.0)  # [m]
 MARGIN_PX = 40.0  # the middle of a board stays so far inside the wide view
 NEAREST = 0.2  # [m]; no camera sees anything nearer
 WIDEST = 1.2  # tangent of the angle off the axis beyond which distortion may have folded back
+# Of the head in use: pan and tilt [rad].
+HEAD_LIMITS = ((np.radians(-158.9), np.radians(158.9)), (np.radians(-46.6), np.radians(31.1)))
+CELLS = (5, 3)  # of the wide view, in columns and rows, over which boards are spread
+FLATTEST = np.cos(np.radians(65.0))  # a board is not found that is seen at a flatter angle
+FARTHER = 0.03  # by which a board moves away that is not wholly seen, relative to its depth
+GOLDEN = (np.sqrt(5) - 1) / 2  # multiples of it, modulo 1, are evenly spread from the first on
+LOOKS_DRAWN = 80  # head poses among which those far apart are chosen
 FEWEST_CORNERS = 12  # of a board seen in part, through a longer focal length
 TRIES = 200  # head poses drawn for a placement
 PLACEMENT_TRIES = 100_000
@@ -234,6 +243,120 @@ def synthetic_views(
     return views
 
 
+@dataclass(frozen=True)
+class Placing:
+    """Where boards are put, and from where they are looked at.
+
+    Attributes:
+        boards: how many placements, one in each cell of the wide view in turn.
+        looks: head poses for each placement, as far apart as the zoom camera's view and the head's limits allow; the
+            one at home is among them where it sees the board.
+        depths: of the boards, even in their logarithm [m].
+        turned: how far a board is turned out of the direction halfway between both cameras [rad].
+        limits: of pan and of tilt [rad].
+    """
+
+    boards: int = 15
+    looks: int = 4
+    depths: tuple[float, float] = BOARD_DEPTHS
+    turned: float = np.radians(45.0)
+    limits: tuple[tuple[float, float], tuple[float, float]] = HEAD_LIMITS
+
+
+DEFAULT_PLACING = Placing()
+
+
+def spread_views(
+    truth: Truth,
+    points: Array,
+    rng: np.random.Generator,
+    noise_px: float,
+    placing: Placing = DEFAULT_PLACING,
+    shape: Array | None = None,
+) -> list[View]:
+    """Views of boards all over the wide view, each looked at from head poses that bring it all over the zoom view.
+
+    Args:
+        truth: the rig.
+        points: the board's corners as everybody believes them to be [m], (N, 3).
+        rng: draws everything.
+        noise_px: standard deviation of a corner's coordinate.
+        placing: where boards are put.
+        shape: where the corners really are on the board [m], (N, 3); by default the same.
+
+    Raises:
+        AssertionError: there is no room for a board.
+    """
+    views: list[View] = []
+    stood = np.zeros(2)
+    for number in range(placing.boards):
+        x_fixed, poses = placed(truth, points if shape is None else shape, rng, placing, number)
+        views.append(View("fixed", noisy(truth.fixed.project(x_fixed), noise_px, rng), number))
+        for reported in poses:
+            views.append(zoom_view(truth, x_fixed, number, reported, stood, noise_px, rng))
+            stood = reported
+    return views
+
+
+def placed(truth: Truth, points: Array, rng: np.random.Generator, placing: Placing, number: int) -> tuple[Array, Array]:
+    """Find a place for a board: its corners in the fixed camera's frame [m], (N, 3), and head poses (n, 2) [rad].
+
+    A board too near for its cell moves away from the camera; a cell that the zoom camera cannot see gives way to any.
+
+    Raises:
+        AssertionError: there is none.
+    """
+    centered = points - points.mean(axis=0)
+    column, row = number % CELLS[0], number // CELLS[0] % CELLS[1]
+    near, far = np.log(np.array(placing.depths))
+    depth = near + (far - near) * (GOLDEN * number % 1)
+    zoom_at = truth.gamma.inv().translation
+    for i in range(PLACEMENT_TRIES // TRIES):
+        cell = np.array([column, row]) + rng.uniform(0, 1, 2) if i < TRIES else rng.uniform([0, 0], CELLS)
+        x = np.append(undistorted(cell / CELLS * (np.array(SIZE) - 1.0), truth.fixed), 1.0) * np.exp(depth)
+        facing = _unit(_unit(x) + _unit(x - zoom_at))
+        turn = Rotation.from_rotvec(rng.uniform(-1, 1, 3) * placing.turned)
+        x_fixed = (turn * _towards(facing)).apply(centered) + x
+        normal = turn.apply(facing)
+        sideways = min(normal @ _unit(x), normal @ _unit(x - zoom_at)) < FLATTEST
+        if sideways or not truth.fixed.sees(x_fixed):
+            depth = min(depth + FARTHER, far) if depth < far else rng.uniform(near, far)
+            continue
+        looking = np.concatenate([np.zeros((1, 2)), _looks(truth, x, rng)])
+        inside = ((looking >= np.array(placing.limits)[:, 0]) & (looking <= np.array(placing.limits)[:, 1])).all(axis=1)
+        seen = looking[inside]
+        seen = seen[seen_from(truth, x_fixed, seen)]
+        if len(seen) >= placing.looks:
+            return x_fixed, _apart(seen, placing.looks)
+        depth = rng.uniform(near, far)
+    raise AssertionError("no room for a board that both cameras see")
+
+
+def _looks(truth: Truth, x_fixed: Array, rng: np.random.Generator) -> Array:
+    """Head poses that bring a point (3,) to pixels all over the zoom view, (n, 2)."""
+    pixels = rng.uniform([0, 0], np.array(SIZE) - 1.0, (LOOKS_DRAWN, 2))
+    rays = np.c_[(pixels - [truth.zoom.cx, truth.zoom.cy]) / [truth.zoom.fx, truth.zoom.fy], np.ones(LOOKS_DRAWN)]
+    return aimed(truth, np.tile(x_fixed, (LOOKS_DRAWN, 1)), rays)
+
+
+def _apart(poses: Array, count: int) -> Array:
+    """So many of the poses (n, 2), the first one and each time the one farthest from all taken."""
+    taken = [0]
+    while len(taken) < count:
+        away = np.linalg.norm(poses[:, None] - poses[taken][None], axis=-1).min(axis=1)
+        taken.append(int(np.argmax(away)))
+    return poses[taken]
+
+
+def _towards(direction: Array) -> Rotation:
+    """The smallest rotation that turns +z into a direction (3,)."""
+    return Rotation.align_vectors(direction[None], np.array([[0.0, 0.0, 1.0]]))[0]
+
+
+def _unit(v: Array) -> Array:
+    return np.asarray(v / np.linalg.norm(v))
+
+
 def seen_from(truth: Truth, x_fixed: Array, poses: Array) -> npt.NDArray[np.bool_]:
     """From which head poses (n, 2) the zoom camera sees all points (N, 3)."""
     x_zoom = truth.in_zoom(x_fixed, poses[:, :1], poses[:, 1:])
@@ -322,19 +445,19 @@ def aim(calibration: Calibration, x_fixed: Array) -> Array:
 
 
 def aimed(model: Truth, x_fixed: Array, ray: Array) -> Array:
-    """True pan and tilt at which a ray (3,) of the zoom camera meets points (n, 3); nan where none does [rad], (n, 2).
+    """True pan and tilt at which a ray (3,) or (n, 3) of the zoom camera meets points (n, 3) [rad], (n, 2).
 
-    Newton's method, from where a head without levers would look.
+    Newton's method, from where a head without levers would look; nan where there is no such pose.
     """
     x_base = (model.hand * model.gamma).apply(x_fixed)
     look = model.hand.rotation.apply(ray)
 
     def off(q: Array) -> Array:
         x = model.in_zoom(x_fixed, q[:, 0], q[:, 1])
-        return x[:, :2] / np.abs(x[:, 2:]) - ray[:2] / ray[2]
+        return x[:, :2] / np.abs(x[:, 2:]) - ray[..., :2] / ray[..., 2:]
 
-    pan = np.arctan2(x_base[:, 0], x_base[:, 2]) - np.arctan2(look[0], look[2])
-    tilt = np.arctan2(-x_base[:, 1], np.hypot(x_base[:, 0], x_base[:, 2])) + np.arctan2(look[1], look[2])
+    pan = np.arctan2(x_base[:, 0], x_base[:, 2]) - np.arctan2(look[..., 0], look[..., 2])
+    tilt = np.arctan2(-x_base[:, 1], np.hypot(x_base[:, 0], x_base[:, 2])) + np.arctan2(look[..., 1], look[..., 2])
     found = np.full((len(x_fixed), 2), np.nan)
     for nudge in ([0.0, 0.0], [0.3, 0.0], [-0.3, 0.0], [0.0, 0.3], [0.0, -0.3]):
         q = np.stack([pan, tilt], axis=-1) + nudge

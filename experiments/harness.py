@@ -1,0 +1,198 @@
+"""What all experiments share: seeds spread over processes, a table, and the files of a run.
+
+An experiment is a module with a dataclass of settings, `run(settings) -> rows`, `summarise(rows)` and, where there is
+something to see, `plot(rows, figure)`. Rows are flat dictionaries; everything reported is made from them alone.
+
+    python -m experiments.NAME [--seeds N] [--seed-base B] [--processes P] [--quick] [--out DIR]
+"""
+
+import argparse
+import csv
+import dataclasses
+import functools
+import json
+import math
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import cv2
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+import cotarget
+from cotarget.geometry import Array
+
+Row = dict[str, Any]
+Job = TypeVar("Job")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # a process each is faster than threads
+EXPECTED = Path(__file__).parent / "expected"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How many seeds, from which on, and over how many processes."""
+
+    seeds: int = 100
+    seed_base: int = 0
+    processes: int = 1
+
+
+S = TypeVar("S", bound=Settings)
+
+
+@dataclass(frozen=True)
+class Experiment(Generic[S]):
+    """What an experiment consists of.
+
+    Attributes:
+        name: of its module.
+        purpose: one line, for --help.
+        settings: as it is reported.
+        quick: the same in a few seconds.
+        run: gives the rows.
+        summarise: gives the figures, from the rows alone; nan where nothing was measured.
+        describe: gives the figures as a text to print.
+        plot: draws the rows.
+    """
+
+    name: str
+    purpose: str
+    settings: S
+    quick: S
+    run: Callable[[S], list[Row]]
+    summarise: Callable[[Sequence[Row]], Mapping[str, Any]]
+    describe: Callable[[Mapping[str, Any]], str]
+    plot: Callable[[Sequence[Row], Figure], None] | None = None
+
+    def main(self, arguments: Sequence[str] | None = None) -> int:
+        """The command: run, print the figures, and write the files where asked to."""
+        parser = argparse.ArgumentParser(prog=f"python -m experiments.{self.name}", description=self.purpose)
+        parser.add_argument("--seeds", type=int, metavar="N", help=f"how many ({self.settings.seeds})")
+        parser.add_argument("--seed-base", type=int, default=0, metavar="B", help="the first seed (0)")
+        parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, metavar="P")
+        parser.add_argument("--quick", action="store_true", help="a few seeds only")
+        parser.add_argument("--out", type=Path, metavar="DIR", help="write result.json, rows.csv and figure.png there")
+        given = parser.parse_args(arguments)
+        settings = self.quick if given.quick else self.settings
+        settings = dataclasses.replace(settings, seed_base=given.seed_base, processes=given.processes)
+        if given.seeds is not None:
+            settings = dataclasses.replace(settings, seeds=given.seeds)
+        return self.report(settings, given.out)
+
+    def report(self, settings: S, out: Path | None) -> int:
+        """Run with these settings, print the figures, and write the files where there is a folder for them."""
+        rows = self.run(settings)
+        summary = self.summarise(rows)
+        print(f"{self.name}: seeds {settings.seed_base} to {settings.seed_base + settings.seeds - 1}")
+        print(self.describe(summary))
+        if out is not None:
+            self.write(out, settings, rows, summary)
+        return 0
+
+    def write(self, out: Path, settings: S, rows: Sequence[Row], summary: Mapping[str, Any]) -> None:
+        """Write result.json, rows.csv and, where there is a plot, figure.png."""
+        out.mkdir(parents=True, exist_ok=True)
+        result = {
+            "experiment": self.name,
+            "settings": dataclasses.asdict(settings),
+            "versions": {
+                "cotarget": cotarget.__version__,
+                "opencv": cv2.__version__,
+                **{name: version(name) for name in ("numpy", "scipy")},
+            },
+            "summary": summary,
+        }
+        (out / "result.json").write_text(json.dumps(_plain(result), indent=2) + "\n", encoding="utf-8")
+        with (out / "rows.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, fieldnames=list(dict.fromkeys(key for row in rows for key in row)))
+            writer.writeheader()
+            writer.writerows(rows)
+        if self.plot is not None:
+            figure = Figure(figsize=(8, 4.5), layout="constrained")
+            FigureCanvasAgg(figure)
+            self.plot(rows, figure)
+            figure.savefig(out / "figure.png", dpi=110)
+
+
+def over_seeds(one: Callable[[S, int], list[Row]], settings: S) -> list[Row]:
+    """All rows of ``one(settings, seed)``, in the order of the seeds; see `spread`."""
+    seeds = range(settings.seed_base, settings.seed_base + settings.seeds)
+    return [row for rows in spread(functools.partial(one, settings), seeds, settings.processes) for row in rows]
+
+
+def spread(work: Callable[[Job], list[Row]], jobs: Iterable[Job], processes: int) -> Iterator[list[Row]]:
+    """Do each job, in as many processes; what comes out has the jobs' order.
+
+    Args:
+        work: a function at the top of a module, or a partial one of it.
+        jobs: its arguments, one each.
+        processes: 1 for this one.
+    """
+    jobs = list(jobs)
+    progress = functools.partial(tqdm, total=len(jobs), disable=None, leave=False)
+    if processes == 1 or len(jobs) == 1:
+        yield from progress(map(work, jobs))
+        return
+    context = multiprocessing.get_context("spawn")
+    with (
+        _one_thread_each(),
+        ProcessPoolExecutor(min(processes, len(jobs)), context, initializer=cv2.setNumThreads, initargs=(1,)) as pool,
+    ):
+        yield from progress(pool.map(work, jobs))
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Processes started meanwhile have linear algebra on one thread: it reads the environment when it is loaded."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def rms(values: Iterable[float] | Array) -> float:
+    """Root mean square; nan values do not count."""
+    squared = np.square(np.array(list(values), dtype=float))
+    return float(np.sqrt(np.nanmean(squared))) if np.isfinite(squared).any() else math.nan
+
+
+def table(head: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
+    """A table as text: the first column to the left, numbers to the right with three significant digits or more."""
+    cells = [list(head), *([_text(cell) for cell in line] for line in lines)]
+    widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
+    return "\n".join(
+        "  ".join(cell.rjust(w) if i else cell.ljust(w) for i, (cell, w) in enumerate(zip(line, widths, strict=True)))
+        for line in cells
+    )
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return "-" if math.isnan(value) else f"{value:#.3g}" if abs(value) < 100 else f"{value:.0f}"
+    return str(value)
+
+
+def _plain(value: Any) -> Any:
+    """As JSON has it: null where nothing was measured."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value
