@@ -32,6 +32,7 @@ from cotarget.pattern import cells, check_markers
 from cotarget.rig import Image
 
 FILLABLE_PX = (-10000.0, 10000.0)  # OpenCV paints no polygons whose corners are much farther out
+LARGEST_BEND = 0.4  # of a square, of the corners from a plane's picture; a lens bends real ones by 0.3
 SMALLEST_RIGHT = 0.7  # of the corners of any row or column, whose squares have the colours that they should
 
 
@@ -189,6 +190,9 @@ def _is_whole(grey: Image, corners_px: Array, board: BoardConfig) -> bool:
     grid = grid_of(board)
     H = homography(grid, corners_px)
     if H is None:
+        return False
+    off = np.linalg.norm(through(H, grid) - corners_px, axis=1)
+    if not off.max() < LARGEST_BEND * smallest_spacing(corners_px, board.corners):
         return False
     columns, rows = board.corners
     right = are_corners(grey, corners_px, grid, H, SMALL).reshape(rows, columns)
