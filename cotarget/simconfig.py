@@ -174,7 +174,7 @@ class SimEffects:
     axes: bool = True
     backlash: bool = True
     lens: bool = True
-    optics: bool = False
+    optics: bool = True
     scatter: bool = True
     shadows: bool = False
     multisampling: bool = True

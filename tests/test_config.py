@@ -133,11 +133,12 @@ def test_a_scene_lies_beside_its_rig(tmp_path, monkeypatch):
 
 def test_the_curves_of_the_zoom_lens_are_taken_and_checked_only_where_they_are_used():
     curves = {"focal_curve": [-0.95], "center_drift_px": [[], [1, 2.5]], "pupil": []}
-    zoom = parse_config({"sim": {"zoom": curves}}).sim.zoom
+    zoom = parse_config({"sim": {"zoom": curves, "effects": {"optics": False}}}).sim.zoom
     assert (zoom.focal_curve, zoom.center_drift_px, zoom.pupil) == ((-0.95,), ((), (1.0, 2.5)), ())
-    config = parse_config({"sim": {"effects": {"all": True}}})
-    assert config.sim.effects.optics
-    assert not SimEffects().optics
+    assert not parse_config({"sim": {"effects": {"all": False}}}).sim.effects.optics
+    assert SimEffects().optics
+    with pytest.raises(ConfigError, match="does not grow"):
+        parse_config({"sim": {"zoom": curves}})
 
 
 def test_all_false_is_the_textbook():

@@ -36,8 +36,8 @@ def test_exact_motions_give_t_exactly(angles):
 
 
 @pytest.mark.parametrize(("angles", "message"), [
-    ([(0.0, 0.1), (0.2, 0.1), (-0.3, 0.1)], "only pan moved.*add views with other tilt"),
-    ([(0.1, 0.0), (0.1, 0.2), (0.1, -0.3)], "only tilt moved.*add views with other pan"),
+    ([(0.0, 0.1), (0.2, 0.1), (-0.3, 0.1)], "only pan moved.*along the pan axis.*add tilt"),
+    ([(0.1, 0.0), (0.1, 0.2), (0.1, -0.3)], "only tilt moved.*along the tilt axis.*add pan"),
     ([(0.1, 0.1), (0.1, 0.1)], "did not move"),
 ])  # fmt: skip
 def test_motions_about_one_axis_are_refused_in_words(angles, message):

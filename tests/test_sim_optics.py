@@ -210,7 +210,7 @@ def test_switched_off_the_lens_only_magnifies_whatever_the_curves():
     wild = {"focal_curve": [0.5], "center_drift_px": [[30], [-30]], "distortion_drift": [0.3], "pupil": [0.5]}
     images = []
     for zoom in ({}, wild):
-        with (w := world(zoom=zoom)).rig as rig:
+        with (w := world(zoom=zoom, effects={"optics": False})).rig as rig:
             rig.zoom.zoom(3000.0)
             rig.clock.sleep_until(2.0)
             frame = rig.zoom.read()

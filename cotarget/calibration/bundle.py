@@ -43,6 +43,7 @@ CONVERGED = 1e-10  # relative fall of the cost at which the solver stops
 DAMPING = 1e-4  # first, relative to the diagonal of the normal equations
 DAMPING_LIMIT = 1e10
 SMALLEST_DAMPING = 1e-12
+RELATIVE_ROUNDING = 1e-10  # of a normal matrix whose boards were eliminated by subtraction
 # Jitter is looked for between these [rad], and believed when its likelihood is this many times that of none:
 # exp(2.71 / 2), which chance exceeds once in twenty times (a half chi-square at its border).
 JITTER_RANGE = (1e-7, 0.1)
@@ -176,7 +177,7 @@ def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> fl
         """Squares left, and the reduced matrix and the boards' inverses, at jitter^2 = ratio * variance."""
         equations = problem.assembled(here, grams, 1 / ratio if ratio else np.inf)
         matrix, gradient, inverse = _reduced(equations, 0.0)
-        matrix = matrix + _damped(matrix, 0.0)
+        matrix = matrix + _damped(matrix, RELATIVE_ROUNDING)  # where a direction is open, it stands still
         left = equations.squares - gradient @ np.linalg.solve(matrix, gradient)
         left -= np.einsum("bi,bij,bj->", equations.board_gradient, inverse, equations.board_gradient)
         return max(float(left), SMALLEST_SIGMA_PX**2), matrix, inverse

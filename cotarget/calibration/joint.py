@@ -16,10 +16,13 @@ import numpy as np
 from cotarget.calibration.bundle import Fit, Prior, estimate_jitter, fit, rms, robust_sigma
 from cotarget.calibration.heldout import cross_validate
 from cotarget.calibration.model import DEFAULT_OPTIONS, CameraName, Options, Rejected, Residuals, View
+from cotarget.calibration.observability import limits_of_use, name_directions, weak_directions
 from cotarget.calibration.placing import place_boards
 from cotarget.calibration.reprojection import (
     ALL_BLOCKS,
     Block,
+    RigModel,
+    parameter_names,
 )
 from cotarget.calibration.sequential import Solution, Steps, both_cameras, stereo
 from cotarget.calibration.start import of_both, pairs_at_home, rough_gamma, rough_hand
@@ -67,24 +70,27 @@ def joint(
         raise CalibrationError("no placement of the board is seen by both cameras; turn the head so that both see it")
     model = steps.model
     if steps.has_head:
-        model = replace(model, hand=rough_hand(model, steps.views, points))
+        model = replace(model, hand=rough_hand(model, steps.views, points, insist=options.insist))
     model = replace(model, gamma=rough_gamma(model, of_both(steps.views), points))
-    used = steps.views
+    used, rejected = list(steps.views), list(steps.rejected)
     blocks = tuple(block for block in ALL_BLOCKS if steps.has_head or block not in ("hand", "head"))
     ties: tuple[Block, ...] = ("gamma", "hand") if steps.has_head else ("gamma",)
-    model = fit(place_boards(model, used, points), used, points, ties).model
-    result = fit(model, used, points, blocks)
-    prior, rejected = None, list(steps.rejected)
-    if len(nominal_px) > 1:
-        result, more, prior = _all_stops(result, views, points, nominal_px, blocks)
-        rejected += more
     if options.encoders and steps.has_head:
         blocks = (*blocks, "scale", "zero")
-        sigmas = {**(prior.sigmas if prior else {}), **ENCODER_SIGMAS}
-        prior = Prior(prior.reference if prior else result.model, sigmas)
-        result = fit(result.model, result.views, points, blocks, prior=prior)
+    start = model
+    prior = _known(model, start, blocks, options)
+    model = fit(place_boards(model, used, points), used, points, ties, prior=prior).model
+    result = fit(model, used, points, blocks, prior=prior)
+    if len(nominal_px) > 1:
+        model, used, more = _all_stops(result, views, points, nominal_px)
+        rejected += more
+        prior = _known(model, start, blocks, options)
+        result = fit(model, used, points, blocks, prior=prior)
+        check_stops(result.model)
     result, wrong, more = _without_wrong_corners(result, points, prior)
     rejected += more
+    if not options.insist and (text := undetermined(result)):
+        raise CalibrationError(text)
     covariance = covariance_of(result)
     held_out = None
     if covariance is not None and options.folds:
@@ -103,10 +109,39 @@ def joint(
     )
 
 
+def undetermined(found: Fit) -> str:
+    """What a fit leaves undetermined, in words with what to add; empty where nothing is."""
+    names = parameter_names(found.free, found.model.stops)
+    focal = (
+        {f"zoom[{i}]": stop.focal_px[0] for i, stop in enumerate(found.model.zoom.stops)} if found.model.zoom else {}
+    )
+    if found.model.fixed is not None:
+        focal["fixed"] = found.model.fixed.focal_px[0]
+    return name_directions(names, weak_directions(found.normal, names, found.variance or 0.0, focal), focal)
+
+
+def _known(model: RigModel, start: RigModel, blocks: Sequence[Block], options: Options) -> Prior | None:
+    """What is known before the corners speak, beyond nothing: of the zoom lens, of encoders, and what is insisted on.
+
+    Who insists holds T, Gamma and the head's geometry near the start, as loosely as they are of any use: directions
+    that the corners determine do not notice, and the others get an uncertainty that says so.
+    """
+    reference, sigmas = replace(start, zoom=model.zoom), {}
+    if model.stops > 1:
+        lens = lens_prior(model)
+        reference, sigmas = replace(reference, zoom=lens.reference.zoom), dict(lens.sigmas)
+    if options.insist:
+        names = [name for name in parameter_names(blocks, model.stops) if not name.startswith(("fixed.", "zoom["))]
+        sigmas |= dict(zip(names, limits_of_use(names).tolist(), strict=True))
+    if "scale" in blocks:
+        sigmas |= ENCODER_SIGMAS
+    return Prior(reference, sigmas) if sigmas else None
+
+
 def _all_stops(
-    found: Fit, views: Sequence[View], points: Array, nominal_px: Sequence[float], blocks: Sequence[Block]
-) -> tuple[Fit, list[Rejected], Prior]:
-    """Add the stops in their order, then fit everything together."""
+    found: Fit, views: Sequence[View], points: Array, nominal_px: Sequence[float]
+) -> tuple[RigModel, list[View], list[Rejected]]:
+    """Add the stops in their order, each fitted by itself; the model then, all views of it, and what is left out."""
     model, used, rejected = found.model, list(found.views), []
     for number, nominal in enumerate(nominal_px[1:], start=1):
         assert model.zoom is not None
@@ -123,10 +158,7 @@ def _all_stops(
         start = replace(model, zoom=with_stop(model.zoom, nominal))
         model = fit_last_stop(start, [*with_fixed, *here], points)
         used += here
-    prior = lens_prior(model)
-    result = fit(model, used, points, blocks, prior=prior)
-    check_stops(result.model)
-    return result, rejected, prior
+    return model, used, rejected
 
 
 def _stop_of(nominal_px: Sequence[float], view: View) -> int:

@@ -142,7 +142,7 @@ def weak_directions(
     Raises:
         CalibrationError: a name is none that is known.
     """
-    limits = _limits(parameters, focal_px)
+    limits = limits_of_use(parameters, focal_px)
     values, vectors = np.linalg.eigh(normal * np.outer(limits, limits))
     weak = values < max(variance, ROUNDING * values[-1])
     return (vectors[:, weak] * limits[:, None]).T
@@ -165,7 +165,7 @@ def name_directions(parameters: Sequence[str], directions: Array, focal_px: Mapp
     if not len(directions):
         return ""
     # The projection on the directions does not depend on which of them span the same space.
-    basis = np.linalg.qr((directions / _limits(parameters, focal_px)).T)[0]
+    basis = np.linalg.qr((directions / limits_of_use(parameters, focal_px)).T)[0]
     part = np.sum(basis**2, axis=1)
     reason = ""
     what: list[str] = []
@@ -189,8 +189,8 @@ def name_directions(parameters: Sequence[str], directions: Array, focal_px: Mapp
     return f"{reason}{_listed(what)} {'is' if len(what) == 1 else 'are'} free; {_listed(add)}"
 
 
-def _limits(parameters: Sequence[str], focal_px: Mapping[str, float]) -> Array:
-    """By how much each parameter must be wrong to be of no use, in its unit, (n,)."""
+def limits_of_use(parameters: Sequence[str], focal_px: Mapping[str, float] = NO_FOCAL_PX) -> Array:
+    """By how much each parameter must be wrong to be of no use, in its unit, (n,); see `weak_directions`."""
     limits = []
     for name in parameters:
         owner, _, kind = name.rpartition(".")

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cotarget.calibration.bundle import Fit, robust_sigma
-from cotarget.calibration.handeye import motions, park_martin
+from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye
 from cotarget.calibration.intrinsics import board_pose, calibrate_camera
 from cotarget.calibration.model import CameraName, Rejected, View
 from cotarget.calibration.reprojection import RigModel
@@ -100,13 +100,20 @@ def _most_central(candidates: Sequence[RigidTransform], scale: float) -> RigidTr
     return candidates[int(np.argmin(np.median(far + turned, axis=1)))]
 
 
-def rough_hand(model: RigModel, views: Sequence[View], points: Array) -> RigidTransform:
+def rough_hand(model: RigModel, views: Sequence[View], points: Array, *, insist: bool = False) -> RigidTransform:
     """T by Park and Martin's method from all motions within each placement.
 
+    Args:
+        model: with the zoom camera.
+        views: of any placements.
+        points: the board's corners in its frame [m], (N, 3).
+        insist: whether to take the smallest turn and shift of what the motions leave free.
+
     Raises:
-        CalibrationError: the motions do not determine it.
+        CalibrationError: the motions do not determine it, or contradict each other.
     """
-    return park_martin(*head_motions(model, views, points))
+    A, B = head_motions(model, views, points)
+    return solve_hand_eye(A, B, insist=True).X if insist else park_martin(A, B)
 
 
 def head_motions(
