@@ -86,6 +86,12 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument("--board", type=_corners, metavar="CxR", help="inner corners of the board, such as 9x6")
     calibrate.add_argument("--square", type=_positive, metavar="M", help="side of a square [m]")
 
+    report = command("report", _report, "tell whether to trust a calibration, on one page with pictures")
+    report.add_argument("calibration", type=Path, metavar="FILE", help="calibration.json")
+    report.add_argument(
+        "--out", type=Path, default=Path("report.html"), metavar="PAGE", help="what to write (report.html)"
+    )
+
     aim = command("aim", _aim, "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout")
     aim.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
     aim.add_argument("--pixel", type=float, nargs=2, required=True, metavar=("U", "V"), help="in the fixed view [px]")
@@ -191,6 +197,16 @@ def _calibrate(options: argparse.Namespace) -> None:
         "calibration": str(options.out),
     }
     print(json.dumps(report, indent=2))
+
+
+def _report(options: argparse.Namespace) -> None:
+    from cotarget.calibration import load_calibration
+    from cotarget.report.page import write_report
+
+    _check_outputs([options.out], [options.calibration])
+    calibration = load_calibration(options.calibration)
+    print(write_report(options.out, calibration, options.calibration.name).text)
+    print(f"the page is {options.out}, and its pictures are in {options.out.stem}_pictures beside it")
 
 
 def _aim(options: argparse.Namespace) -> None:

@@ -1,0 +1,169 @@
+"""What a calibration predicts of its own pointing, all over the wide view, and which parameters that comes from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from cotarget.calibration.model import Calibration, Covariance
+from cotarget.calibration.observability import name_directions, weak_directions
+from cotarget.calibration.uncertainty import predicted_pointing
+from cotarget.geometry import Array
+
+DEPTHS = (4.0, 30.0)  # where targets are [m]
+CELLS = (9, 7)  # across and down the wide view, at whose middles pointing is predicted
+DEPTH_STEPS = 5
+# Groups of parameters in the order of the page: how people call them, and how their names begin.
+GROUPS = (
+    ("the fixed camera's lens", ("fixed.",)),
+    ("the zoom lens's pupil", ("zoom.pupil",)),
+    ("the zoom camera's lens", ("zoom.",)),
+    ("the offset between the cameras", ("T_zoom0_fixed.",)),
+    ("the zoom camera's place on the head", ("T_head_zoom.",)),
+    ("the encoders", ("head.pan_", "head.tilt_")),
+    ("the head's axes", ("head.",)),
+)
+JITTER_GROUP = "the head's jitter"
+
+
+@dataclass(frozen=True)
+class AtFocal:
+    """Pointing at one stop of the zoom lens, rms over the wide view and the depths.
+
+    Attributes:
+        nominal_px: the stop's nominal focal length [px].
+        focal_px: its true one, the mean of both directions [px].
+        rms: predicted angle [rad].
+        worst: the largest anywhere [rad].
+    """
+
+    nominal_px: float
+    focal_px: float
+    rms: float
+    worst: float
+
+    @property
+    def rms_px(self) -> float:
+        """The same in the zoom image, near its middle [px]."""
+        return float(np.tan(self.rms)) * self.focal_px
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """What one group of parameters adds to the error: the rms that would be left if it were known exactly [rad]."""
+
+    group: str
+    left: float
+
+
+def sample_pixels(calibration: Calibration, cells: tuple[int, int] = CELLS) -> Array:
+    """Middles of cells all over the wide view, (n, 2) [px]."""
+    across, down = (
+        (np.arange(n) + 0.5) / n * side - 0.5 for n, side in zip(cells, calibration.fixed.size, strict=True)
+    )
+    return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+
+
+def sample_depths(count: int = DEPTH_STEPS) -> Array:
+    """Depths from the nearest to the farthest target, evenly over their logarithm [m]."""
+    return np.geomspace(*DEPTHS, count)
+
+
+def sigma_of(calibration: Calibration, name: str) -> float | None:
+    """Standard deviation of a parameter; None where the calibration tells none."""
+    covariance = calibration.covariance
+    return covariance.sigma(name) if covariance is not None and name in covariance.parameters else None
+
+
+def can_point(calibration: Calibration) -> bool:
+    """Whether pointing can be predicted at all."""
+    return calibration.T_head_zoom is not None and calibration.covariance is not None
+
+
+def pointing(calibration: Calibration, nominal_px: Sequence[float] | None = None) -> tuple[AtFocal, ...]:
+    """Predict the pointing at focal lengths, by default at every stop of the zoom lens.
+
+    Returns:
+        One each; nan where the head reaches nothing; empty where nothing can be predicted.
+    """
+    if not can_point(calibration):
+        return ()
+    found = []
+    for nominal in calibration.zoom.nominal_px if nominal_px is None else nominal_px:
+        rms, worst = _over_the_view(calibration, nominal)
+        found.append(AtFocal(nominal, float(np.mean(calibration.zoom.at(nominal).focal_px)), rms, worst))
+    return tuple(found)
+
+
+def _over_the_view(calibration: Calibration, nominal_px: float) -> tuple[float, float]:
+    """Rms and largest predicted angle over all pixels and depths that can be reached [rad]."""
+    pixels, depths = sample_pixels(calibration), sample_depths()
+    errors = predicted_pointing(calibration, pixels[None], depths[:, None], nominal_px=nominal_px)
+    reached = errors[np.isfinite(errors)]
+    return (float(np.sqrt(np.mean(reached**2))), float(reached.max())) if len(reached) else (np.nan, np.nan)
+
+
+def corner_errors(calibration: Calibration, nominal_px: float) -> tuple[float, dict[str, float]]:
+    """Predicted angle in the middle of the wide view, and by name in its corners that can be reached [rad].
+
+    Depths are those of `sample_depths`, rms over them.
+    """
+    right, bottom = np.array(calibration.fixed.size) - 1.0
+    places = {"upper left": (0.0, 0.0), "upper right": (right, 0.0), "lower left": (0.0, bottom)}
+    places |= {"lower right": (right, bottom)}
+    pixels = np.array([calibration.fixed.image_center_px, *places.values()])
+    errors = predicted_pointing(calibration, pixels[None], sample_depths()[:, None], nominal_px=nominal_px)
+    middle, *rms = np.sqrt(np.mean(errors**2, axis=0)).tolist()
+    return middle, {name: error for name, error in zip(places, rms, strict=True) if np.isfinite(error)}
+
+
+def group_of(parameter: str) -> str:
+    """The group that a parameter belongs to."""
+    owner, _, kind = parameter.rpartition(".")
+    plain = f"{owner.partition('[')[0]}.{kind}"
+    return next((name for name, begins in GROUPS if plain.startswith(begins)), parameter)
+
+
+def contributions(calibration: Calibration) -> tuple[Contribution, ...]:
+    """What each group adds to the error at the longest focal length, the largest first.
+
+    A group is taken as known exactly: what the others then leave, given it, is the conditional covariance. To clear
+    its rows instead would count what it shares with the others twice.
+    """
+    covariance = calibration.covariance
+    if not can_point(calibration) or covariance is None:
+        return ()
+    nominal = calibration.zoom.nominal_px[-1]
+    found = []
+    for group in dict.fromkeys(group_of(name) for name in covariance.parameters):
+        known = np.array([group_of(name) == group for name in covariance.parameters])
+        found.append(
+            Contribution(group, _over_the_view(replace(calibration, covariance=given(covariance, known)), nominal)[0])
+        )
+    if calibration.jitter:
+        found.append(Contribution(JITTER_GROUP, _over_the_view(replace(calibration, jitter=0.0), nominal)[0]))
+    return tuple(sorted(found, key=lambda c: c.left))
+
+
+def given(covariance: Covariance, known: npt.NDArray[np.bool_]) -> Covariance:
+    """The covariance left when some parameters, (n,) booleans, are known exactly."""
+    C = covariance.matrix
+    scale = np.sqrt(np.maximum(np.diagonal(C), np.finfo(float).tiny))
+    R = C / np.outer(scale, scale)
+    rest = ~known
+    left = np.zeros_like(R)
+    through = R[np.ix_(rest, known)]
+    left[np.ix_(rest, rest)] = R[np.ix_(rest, rest)] - through @ np.linalg.pinv(R[np.ix_(known, known)]) @ through.T
+    return Covariance(covariance.parameters, left * np.outer(scale, scale))
+
+
+def undetermined(calibration: Calibration) -> str:
+    """Say what the covariance leaves undetermined, and what to add; empty where all is determined."""
+    covariance = calibration.covariance
+    if covariance is None:
+        return ""
+    stops = calibration.zoom.stops
+    focal = {"fixed": calibration.fixed.focal_px[0]} | {f"zoom[{i}]": s.focal_px[0] for i, s in enumerate(stops)}
+    normal = np.asarray(np.linalg.pinv(covariance.matrix, hermitian=True, rcond=np.finfo(float).tiny), dtype=float)
+    return name_directions(covariance.parameters, weak_directions(normal, covariance.parameters, 1.0, focal), focal)

@@ -1,0 +1,131 @@
+"""Whether to trust a calibration, in one sentence."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from cotarget.calibration.model import Calibration
+from cotarget.report.pointing import DEPTHS, AtFocal, pointing, sigma_of, undetermined
+from cotarget.report.wording import digits, percent
+
+Level = Literal["good", "care", "bad", "unknown"]
+LABELS: dict[Level, str] = {
+    "good": "It points, and says how well",
+    "care": "It points, but read on",
+    "bad": "Do not rely on it",
+    "unknown": "It does not say how well it points",
+}
+# Stops whose errors differ by less than this factor are spoken of together.
+ALIKE = 1.25
+# Shares of the close-up's width by which a target may be off the middle: beyond the first it is worth a word, beyond
+# the second it is not in the picture.
+FAR_OFF, OUT_OF_SIGHT = 0.05, 0.5
+MOSTLY = 0.5  # share of the squared error
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The sentence, and how it is meant."""
+
+    text: str
+    level: Level
+
+
+def verdict(calibration: Calibration) -> str:
+    """Say in one sentence how well a calibration points, and whether captures kept out of its fit agree."""
+    return judge(calibration).text
+
+
+def judge(calibration: Calibration, at: tuple[AtFocal, ...] | None = None) -> Verdict:
+    """Give the verdict on a calibration; `pointing` of it, where that is known already."""
+    if calibration.T_head_zoom is None:
+        return Verdict(_without_head(calibration), "unknown")
+    if calibration.covariance is None:
+        return _without_covariance(calibration)
+    if open_ := undetermined(calibration):
+        return Verdict(f"Does not determine the rig: {open_}.", "bad")
+    at = pointing(calibration) if at is None else at
+    if not np.isfinite(at[-1].rms):
+        return Verdict("Reaches no point of the wide view with the head: its geometry cannot be right.", "bad")
+    width = calibration.zoom.size[0]
+    level: Level = "good"
+    parts = [_how_well(at)]
+    if at[-1].rms_px > FAR_OFF * width:
+        level = "bad" if at[-1].rms_px > OUT_OF_SIGHT * width else "care"
+        parts.append(f"that is {percent(at[-1].rms_px / width)} of the close-up's width")
+    if calibration.jitter:
+        level = "care" if level == "good" else level
+        parts.append(_jitter(calibration, at[-1]))
+    text, agrees = _held_out(calibration)
+    return Verdict("; ".join([*parts, text]) + ".", level if agrees or level == "bad" else "care")
+
+
+def _how_well(at: tuple[AtFocal, ...]) -> str:
+    last = at[-1]
+    which = "the longest focal length calibrated" if len(at) > 1 else "the one focal length calibrated"
+    in_px = f"{digits(last.rms_px)} px at {last.focal_px:.0f} px, {which}"
+    text = f"Points to {digits(np.degrees(last.rms))} degrees ({in_px})"
+    worst = max(at, key=lambda stop: stop.rms)
+    if worst.rms > ALIKE * last.rms:
+        text += f" and to {digits(np.degrees(worst.rms))} degrees at {worst.focal_px:.0f} px"
+    near, far = DEPTHS
+    return f"{text}, one standard deviation, all over the wide view from {near:g} to {far:g} m"
+
+
+def _jitter(calibration: Calibration, last: AtFocal) -> str:
+    share = min(2 * calibration.jitter**2 / last.rms**2, 1.0)
+    angle = digits(np.degrees(calibration.jitter))
+    if share > MOSTLY:
+        return f"most of it because the head misses what it reports by {angle} degrees an axis, at every pose anew"
+    return f"in it the {angle} degrees by which each axis of the head misses what it reports"
+
+
+def _held_out(calibration: Calibration) -> tuple[str, bool]:
+    """What captures kept out of the fit say, and whether they agree."""
+    held_out = calibration.held_out
+    if held_out is None:
+        return "no captures were kept out of the fit to confirm it", False
+    if held_out.widened > 1:
+        factor = digits(held_out.widened)
+        return (
+            f"captures kept out of the fit miss {factor} times as far as was predicted, and this is widened so",
+            False,
+        )
+    return "captures kept out of the fit agree", True
+
+
+def _without_head(calibration: Calibration) -> str:
+    parts = ["Cannot point, because it was made without a head"]
+    residuals, covariance = calibration.residuals, calibration.covariance
+    if residuals is not None and residuals.stereo_rms_px is not None:
+        parts.append(f"the two cameras agree on the corners to {digits(residuals.stereo_rms_px)} px")
+    if covariance is not None:
+        if open_ := undetermined(calibration):
+            parts.append(f"it does not determine the cameras either: {open_}")
+        else:
+            turn, shift = (
+                np.sqrt(sum((sigma_of(calibration, f"T_zoom0_fixed.{kind}{axis}") or 0.0) ** 2 for axis in "xyz"))
+                for kind in "rt"
+            )
+            parts.append(
+                f"the offset between them is known to {digits(1000 * shift)} mm and {digits(np.degrees(turn))} degrees"
+            )
+    return "; ".join(parts) + "."
+
+
+def _without_covariance(calibration: Calibration) -> Verdict:
+    method = calibration.provenance.get("method")
+    residuals = calibration.residuals
+    fits = ""
+    if residuals is not None and residuals.handeye_rms_px is not None:
+        fits = f"; its corners are explained to {digits(residuals.handeye_rms_px)} px, which tells little of pointing"
+    if method == "sequential":
+        return Verdict(
+            f"Does not say how well it points, because the sequential method gives no uncertainty{fits}.", "unknown"
+        )
+    if method == "joint":
+        return Verdict(
+            f"Leaves some of its parameters undetermined, so that it cannot say how well it points{fits}.", "bad"
+        )
+    return Verdict(f"Does not say how well it points, because it carries no uncertainty{fits}.", "unknown")
