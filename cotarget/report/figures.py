@@ -60,6 +60,7 @@ def as_bytes(figure: Figure, kind: str, dpi: int = PNG_DPI) -> bytes:
     metadata = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
     with matplotlib.rc_context(STYLE):
         figure.savefig(buffer, format=kind, dpi=dpi, metadata=metadata)
+        figure.set_layout_engine("none")  # it is laid out now, also for the next time
     return buffer.getvalue()
 
 

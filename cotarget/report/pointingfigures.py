@@ -21,7 +21,7 @@ TICKS = 5
 LOG_RATIO = 8.0  # from where on colours go by the logarithm
 CURVE_REACH = 3.0  # the curve goes so many times nearer and farther than targets are
 CURVE_POINTS = 60
-BETWEEN_STOPS = 12  # focal lengths evaluated between the stops, shared out, but never fewer than two each
+BETWEEN_STOPS = 6  # focal lengths evaluated between the stops, shared out, but never fewer than two each
 
 
 def map_figure(calibration: Calibration, at: AtFocal) -> Figure:
@@ -45,8 +45,10 @@ def map_figure(calibration: Calibration, at: AtFocal) -> Figure:
                 interpolation="bilinear",
                 extent=(-0.5, width - 0.5, height - 0.5, -0.5),
             )
-            lines = ax.contour(u, v, error, levels, colors="white", linewidths=0.8)
-            ax.clabel(lines, fontsize=7.5, fmt=digits)
+            inside = levels[(levels > np.nanmin(error)) & (levels < np.nanmax(error))]
+            if len(inside):
+                lines = ax.contour(u, v, error, inside, colors="white", linewidths=0.8)
+                ax.clabel(lines, fontsize=7.5, fmt=digits)
             ax.set_title(f"{depth:.0f} m")
         bar = figure.colorbar(drawn, ax=axes, orientation="horizontal", shrink=0.75, aspect=45, pad=0.06)
         ticks = _steps(*limits, TICKS)

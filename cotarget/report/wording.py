@@ -14,16 +14,21 @@ def digits(value: float, count: int = 2) -> str:
         return "unknown"
     if value == 0:
         return "0"
-    decimals = count - 1 - math.floor(math.log10(abs(value)))
+    decimals = _decimals(value, count)
     return f"{round(value, decimals):.{min(max(decimals, 0), MOST_DECIMALS)}f}"
+
+
+def _decimals(value: float, count: int) -> int:
+    """How many decimals show so many significant digits, once the value is rounded to them: 0.0996 becomes 0.10."""
+    decimals = count - 1 - math.floor(math.log10(abs(value)))
+    return count - 1 - math.floor(math.log10(abs(round(value, decimals))))
 
 
 def value_and_sigma(value: float, sigma: float | None) -> str:
     """Write a value to the decimals that its standard deviation leaves: 692.31 ± 0.24."""
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
         return digits(value, VALUE_DIGITS)
-    decimals = UNCERTAINTY_DIGITS - 1 - math.floor(math.log10(sigma))
-    shown = min(max(decimals, 0), MOST_DECIMALS)
+    shown = min(max(_decimals(sigma, UNCERTAINTY_DIGITS), 0), MOST_DECIMALS)
     return f"{value:.{shown}f} ± {digits(sigma, UNCERTAINTY_DIGITS)}"
 
 
