@@ -27,7 +27,7 @@ from cotarget.calibration.reprojection import ALL_BLOCKS, Block, parameter_names
 from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from cotarget.geometry import Array
-from experiments.harness import Experiment, Row, Settings, over_seeds, rms, table
+from experiments.harness import Experiment, Row, Settings, over_seeds, rms, seeds_of, table
 from experiments.synthetic import (
     LONGEST_PX,
     SIZES,
@@ -122,9 +122,9 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     }
 
 
-def describe(summary: Mapping[str, Any]) -> str:
+def describe(settings: ChainSettings, summary: Mapping[str, Any]) -> str:
     """The table."""
-    return "rms pointing error [px at f = 7155 px]\n" + table(
+    return f"rms pointing error [px at f = 7155 px], {seeds_of(settings)}\n" + table(
         ("case", "joint", "predicted", "Cramer-Rao", "intrinsics known", "sequential", "widened"),
         ([case, *(found[f"{name}_px"] for name in FIGURES), found["widened"]] for case, found in summary.items()),
     )

@@ -25,7 +25,7 @@ from cotarget.calibration.reprojection import RigModel
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import base_head
-from experiments.harness import Experiment, Row, Settings, over_seeds, rms, table
+from experiments.harness import Experiment, Row, Settings, over_seeds, rms, seeds_of, table
 from experiments.synthetic import NOMINAL_PX, SIZE, Lens, Truth, noisy, seen_from
 
 LENS = Lens(693.0, 693.0, 319.5, 239.5)
@@ -124,10 +124,10 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     return found
 
 
-def describe(summary: Mapping[str, Any]) -> str:
+def describe(settings: HandEyeSettings, summary: Mapping[str, Any]) -> str:
     """The table."""
     keys = ("rotation_deg", "translation_mm", "rotation_ratio", "translation_ratio", "inside")
-    return table(
+    return f"T from {settings.poses} poses, rms over {seeds_of(settings)}\n" + table(
         ("method", "rotation [deg]", "translation [mm]", "x bound", "x bound", "in 90 % ellipsoid"),
         ([method, *(found.get(key, float("nan")) for key in keys)] for method, found in summary.items()),
     )

@@ -46,6 +46,11 @@ class Settings:
     processes: int = 1
 
 
+def seeds_of(settings: Settings) -> str:
+    """Which seeds, in words."""
+    return f"seeds {settings.seed_base} to {settings.seed_base + settings.seeds - 1}"
+
+
 S = TypeVar("S", bound=Settings)
 
 
@@ -60,7 +65,7 @@ class Experiment(Generic[S]):
         quick: the same in a few seconds.
         run: gives the rows.
         summarise: gives the figures, from the rows alone; nan where nothing was measured.
-        describe: gives the figures as a text to print.
+        describe: gives settings and figures as a text to print.
         plot: draws the rows.
     """
 
@@ -70,7 +75,7 @@ class Experiment(Generic[S]):
     quick: S
     run: Callable[[S], list[Row]]
     summarise: Callable[[Sequence[Row]], Mapping[str, Any]]
-    describe: Callable[[Mapping[str, Any]], str]
+    describe: Callable[[S, Mapping[str, Any]], str]
     plot: Callable[[Sequence[Row], Figure], None] | None = None
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
@@ -92,8 +97,7 @@ class Experiment(Generic[S]):
         """Run with these settings, print the figures, and write the files where there is a folder for them."""
         rows = self.run(settings)
         summary = self.summarise(rows)
-        print(f"{self.name}: seeds {settings.seed_base} to {settings.seed_base + settings.seeds - 1}")
-        print(self.describe(summary))
+        print(self.describe(settings, summary))
         if out is not None:
             self.write(out, settings, rows, summary)
         return 0

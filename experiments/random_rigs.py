@@ -4,10 +4,11 @@ The baseline is 0.1 to 10 m (even in its logarithm) in a random direction, no mo
 camera's image plane; the zoom camera is turned against the fixed one by up to 60 degrees about any axis, and by any
 roll; it sits on the head with a lever of up to 0.3 m, turned by up to 10 degrees about any axis, and by any roll.
 Lenses vary by a few per cent, corners have 0.1 to 0.2 px of noise. The head's limits are pan -158.9 to 158.9 and tilt
--46.6 to 31.1 degrees. Boards hang where the fixed camera sees them and some head poses within the limits let the zoom camera see
-them, turned to face halfway between both, at 2.5 to 8 m, with squares of 0.1 m; from a baseline of 3 m on, depths and
-squares grow with it. A mounting from which the zoom camera cannot look at a third of the fixed camera's view is none,
-and is drawn again. Targets lie all over the wide view at 4 to 30 m (grown likewise), wherever the head reaches.
+-46.6 to 31.1 degrees. Boards hang where the fixed camera sees them and some head poses within the limits let the zoom
+camera see them, turned to face halfway between both, at 2.5 to 8 m, with squares of 0.1 m; from a baseline of 3 m on,
+depths and squares grow with it. A mounting from which the zoom camera cannot look at a third of the fixed camera's view
+is none, and is drawn again. Targets lie all over the wide view at 4 to 30 m (grown likewise), wherever the head
+reaches.
 
     python -m experiments.random_rigs [--seeds 200] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -25,7 +26,7 @@ from cotarget.calibration.boards import board_points
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
-from experiments.harness import Experiment, Row, Settings, over_seeds, rms, table
+from experiments.harness import Experiment, Row, Settings, over_seeds, rms, seeds_of, table
 from experiments.synthetic import (
     BOARD_DEPTHS,
     HEAD_LIMITS,
@@ -204,12 +205,12 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def describe(summary: Mapping[str, Any]) -> str:
+def describe(settings: RigsSettings, summary: Mapping[str, Any]) -> str:
     """The table, then a line for each rig that was refused or is too far off."""
     lines = [[name.replace("_", " "), value] for name, value in summary.items() if not isinstance(value, Mapping)]
     refused = [f"rig {seed} refused: {reason}" for seed, reason in summary["why_refused"].items()]
     beyond = [f"rig {seed}: {ratio:.2f} times its predicted error" for seed, ratio in summary["beyond"].items()]
-    return "\n".join([table(("what", "value"), lines), *refused, *beyond])
+    return "\n".join([f"random rigs, {seeds_of(settings)}", table(("what", "value"), lines), *refused, *beyond])
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:

@@ -68,7 +68,7 @@ class Lens:
         """Pixels (n, 2) of points (n, 3)."""
         project = cv2.fisheye.projectPoints if self.fisheye else cv2.projectPoints
         x = np.ascontiguousarray(np.asarray(x_camera, float).reshape(-1, 1, 3))
-        px, _ = project(x, np.zeros((3, 1)), np.zeros((3, 1)), self.K, np.array(self.distortion))
+        px, _ = project(x, np.zeros((3, 1)), np.zeros((3, 1)), self.K, np.array(self.distortion, float))
         return np.asarray(px).reshape(-1, 2)
 
     def inside(self, x_camera: Array, margin: float = 0.0) -> npt.NDArray[np.bool_]:
@@ -526,6 +526,8 @@ def misses(
     pixels: Array,
     depths: Array,
     rng: np.random.Generator | None = None,
+    *,
+    by_distance: bool = False,
 ) -> Array:
     """Angles between where the true zoom camera looks and true targets, one after the other [rad], (n,).
 
@@ -538,12 +540,17 @@ def misses(
         pixels: of the targets in the wide view, (n, 2).
         depths: of the targets [m], (n,).
         rng: for the head's jitter.
+        by_distance: whether the calibration is told the targets' distance in place of their depth. That serves where
+            the true lens follows another model, whose axis the calibration cannot know.
 
     Returns:
         nan where the calibration finds no pose.
     """
     x_true = np.c_[undistorted(pixels, truth.fixed), np.ones(len(pixels))] * depths[:, None]
-    q = aim(calibration, calibration.fixed.ray(pixels) * depths[:, None])
+    x_believed = calibration.fixed.ray(pixels) * depths[:, None]
+    if by_distance:
+        x_believed *= np.linalg.norm(x_true, axis=1, keepdims=True) / np.linalg.norm(x_believed, axis=1, keepdims=True)
+    q = aim(calibration, x_believed)
     before = np.concatenate([np.zeros((1, 2)), q[:-1]])
     stood = np.array([truth.stands(*pair, rng) for pair in zip(q, before, strict=True)])
     x = truth.in_zoom(x_true, stood[:, 0], stood[:, 1])
