@@ -132,9 +132,7 @@ def describe(settings: HonestySettings, summary: Mapping[str, Any]) -> str:
     """The table, a column a rig."""
     names = list(dict.fromkeys(name for found in summary.values() for name in found))
     lines = ([name.replace("_", " "), *(float(found[name]) for found in summary.values())] for name in names)
-    head = (
-        f"fraction of {100 * LEVEL:.0f} % ellipses that hold the truth; pointing at f = 7155 px, {seeds_of(settings)}"
-    )
+    head = f"{100 * LEVEL:.0f} % ellipses that hold the truth; pointing at f = 7155 px, {seeds_of(settings)}"
     return head + "\n" + table(("of", *summary), lines)
 
 
@@ -143,7 +141,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
     ax = figure.subplots()
     for rig in RIGS:
         ratios = [row["measured_px"] / row["predicted_px"] for row in rows if row["rig"] == rig]
-        ax.hist(ratios, bins=np.linspace(0, 3, 31), histtype="step", label=rig)
+        ax.hist(ratios, bins=np.linspace(0, 3, 31).tolist(), histtype="step", label=rig)
     ax.set(xlabel="measured / predicted pointing error", ylabel="seeds")
     ax.legend(frameon=False)
 

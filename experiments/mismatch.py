@@ -2,7 +2,9 @@
 
 The default rig, 20 boards of 9 x 6 corners at 2.5 to 8 m, four head poses each, corners of 0.1 px; each case adds one
 thing that the model has no parameter for. The pointing error is measured with the same imperfect head, on targets all
-over the wide view at 4 to 30 m one after the other, their pixel and distance given exactly. Wanted is an error within twice the predicted one, or a refusal.
+over the wide view at 4 to 30 m one after the other, their pixel and distance given exactly (not their depth: the axis
+of a lens that follows another model is nobody's to say). Wanted is an error within twice the predicted one, or a
+refusal.
 
     python -m experiments.mismatch [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -102,8 +104,8 @@ def _zoom(*distortion: float, fisheye: bool = False) -> Case:
     return Case(replace(RIG, zoom=Lens(692.0, 693.0, 326.0, 235.0, distortion, fisheye)))
 
 
-# How far these lenses are from the model's nearest over the image, rms and at most: rational 0.04 and 0.3 px, strong 0.2
-# and 1.5; thin prism 0.03 and 0.2; equidistant fisheye 0.03 and 0.2, the other one 0.09 and 0.6.
+# How far these lenses are from the model's nearest over the image, rms and at most: rational 0.04 and 0.3 px, strong
+# 0.2 and 1.5; thin prism 0.03 and 0.2; equidistant fisheye 0.03 and 0.2, the other one 0.09 and 0.6.
 CASES: Mapping[str, Case] = {
     "as modelled": Case(),
     "fixed lens rational, mild": _fixed(0.5, 0, 0, 0, 0, 1.0, 0.3, 0),

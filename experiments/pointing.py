@@ -6,23 +6,18 @@ the angle between the zoom camera's line of sight and the true target, for targe
 pixel and depth given exactly, at the shortest focal length. Beside the full model stand the paper's shortcut in its
 two readings and a model that ignores the offsets between fixed camera, head and zoom camera.
 
-    python -m experiments.pointing [--seeds 5] [--seed-base 0] [--out DIR]
+    python -m experiments.pointing [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
-import argparse
-import csv
 import dataclasses
-import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
+from matplotlib.figure import Figure
 
-import cotarget
 from cotarget.calibration import Calibration, calibrate_rig
 from cotarget.config import RigConfig, SimConfig
 from cotarget.geometry import RigidTransform, pose
@@ -31,6 +26,8 @@ from cotarget.loop import reach_of
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Method
+from experiments import harness
+from experiments.harness import Experiment, Row, over_seeds, seeds_of
 
 RIGS = {
     "default": SimConfig(scene="indoor"),
@@ -51,21 +48,23 @@ STREAM = 5  # of random numbers, apart from the world's own
 
 
 @dataclass(frozen=True)
-class Settings:
-    """How many seeds, from which on, and how many targets for each."""
+class Settings(harness.Settings):
+    """How many seeds, and how many targets for each."""
 
     seeds: int = 5
-    seed_base: int = 0
     targets: int = 400
 
 
-def run(settings: Settings) -> list[dict[str, Any]]:
+def run(settings: Settings) -> list[Row]:
     """Calibrate every rig once a seed; one row for each model's error then [degrees]."""
-    rows = []
-    jobs = [(rig, settings.seed_base + i) for rig in RIGS for i in range(settings.seeds)]
-    for rig, seed in tqdm(jobs, disable=None, desc="calibrating"):
-        sim = dataclasses.replace(RIGS[rig], seed=seed)
-        config = RigConfig(sim=sim)
+    return over_seeds(one, settings)
+
+
+def one(settings: Settings, seed: int) -> list[Row]:
+    """Calibrate every rig once."""
+    rows: list[Row] = []
+    for rig, sim in RIGS.items():
+        config = RigConfig(sim=dataclasses.replace(sim, seed=seed))
         world = SimWorld(config)
         with SafeRig(world.rig, config.safety) as opened:
             calibration = calibrate_rig(opened, config.board, seed=seed)
@@ -96,7 +95,7 @@ def without_offsets(calibration: Calibration) -> Calibration:
     )
 
 
-def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
     """Median over the seeds of each rig's and model's median and 95th percentile [degrees]."""
     return {
         rig: {
@@ -110,32 +109,37 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, dict[str, f
     }
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, print the table, and write result.json and rows.csv where asked to."""
-    parser = argparse.ArgumentParser(prog="python -m experiments.pointing", description=__doc__.splitlines()[0])
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--seed-base", type=int, default=0)
-    parser.add_argument("--out", type=Path, metavar="DIR")
-    options = parser.parse_args(arguments)
-    settings = Settings(options.seeds, options.seed_base)
-    rows = run(settings)
-    summary = summarise(rows)
-    print(
-        f"pointing error, median over seeds {settings.seed_base} to {settings.seed_base + settings.seeds - 1} [degrees]"
-    )
-    for rig, models in summary.items():
-        for model, found in models.items():
-            print(f"{rig:8} {model:40} median {found['median_deg']:.4f}   p95 {found['p95_deg']:.4f}")
-    if options.out is not None:
-        options.out.mkdir(parents=True, exist_ok=True)
-        result = {"settings": dataclasses.asdict(settings), "version": cotarget.__version__, "summary": summary}
-        (options.out / "result.json").write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-        with (options.out / "rows.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
-    return 0
+def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
+    """A line for each rig and model."""
+    lines = [
+        f"{rig:8} {model:40} median {found['median_deg']:.4f}   p95 {found['p95_deg']:.4f}"
+        for rig, models in summary.items()
+        for model, found in models.items()
+    ]
+    return "\n".join([f"pointing error, median over {seeds_of(settings)} [degrees]", *lines])
 
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Median errors of each seed, by model."""
+    for ax, rig in zip(figure.subplots(1, len(RIGS), sharey=True), RIGS, strict=True):
+        for i, model in enumerate(MODELS):
+            errors = [row["median_deg"] for row in rows if row["rig"] == rig and row["model"] == model]
+            ax.semilogy([i] * len(errors), errors, "o", label=model)
+        ax.set(title=rig, ylabel="median pointing error [degrees]", xticks=[])
+    ax.legend(frameon=False)
+
+
+SETTINGS = Settings()
+EXPERIMENT = Experiment(
+    "pointing",
+    "How well a rig points after it was calibrated from rendered boards, and what simpler models lose.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, targets=50),
+    run,
+    summarise,
+    describe,
+    plot,
+)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(EXPERIMENT.main())

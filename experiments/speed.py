@@ -78,15 +78,18 @@ def _joint(views: Sequence[View]) -> float:
 
 def _opencv(views: Sequence[View], flags: int) -> float:
     """The baseline [m] by OpenCV."""
-    corners = [[v.corners_px.astype(np.float32) for v in views if v.camera == camera] for camera in ("fixed", "zoom")]
-    objects = [POINTS.astype(np.float32)] * len(corners[0])
+    left, right = (
+        [v.corners_px.astype(np.float32) for v in views if v.camera == camera] for camera in ("fixed", "zoom")
+    )
+    objects = [POINTS.astype(np.float32)] * len(left)
     cameras = []
-    for mine in corners:
+    for mine in (left, right):
         _, K, distortion, _, _ = cv2.calibrateCamera(
             objects, mine, SIZE, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
         )
-        cameras += [K, distortion]
-    t = cv2.stereoCalibrate(objects, *corners, *cameras, SIZE, flags=flags)[6]
+        cameras.append((K, distortion))
+    (K_l, d_l), (K_r, d_r) = cameras
+    t = cv2.stereoCalibrate(objects, left, right, K_l, d_l, K_r, d_r, SIZE, flags=flags)[6]
     return float(np.linalg.norm(t))
 
 
