@@ -18,6 +18,10 @@ from cotarget.geometry import Array
 UNDISTORT_STEPS = 20
 # A pixel counts as explained when its ray projects back to within this normalised distance (about 1e-9 px).
 UNDISTORT_TOLERANCE = 1e-12
+# By how much a zoom lens's optical axis wanders for every doubling of its focal length [px]: that of consumer cameras
+# comes to some 10 to 30 px of 640 over a tenfold range.
+WANDER_PX = 5.0
+CENTER = slice(2, 4)  # of what a lens interpolates
 # The ratio of true to nominal focal length hardly changes over the range, so that this fixed point is there at once.
 NOMINAL_ROUNDS = 20
 
@@ -234,6 +238,20 @@ class ZoomLens:
     def pupil_at(self, nominal_px: float) -> float:
         """How far the entrance pupil has moved forward since the first stop [m]."""
         return 0.0 if len(self.stops) == 1 else float(self._values(nominal_px)[-1])
+
+    def center_doubt_px(self, nominal_px: float) -> Array:
+        """How far off the principal point may be for want of stops, one standard deviation, (2,) [px].
+
+        Between stops, what two interpolants differ by: the spline used, and the one with straight ends. Beyond them, as
+        much as a usual zoom lens's axis wanders.
+        """
+        beyond = abs(math.log2(nominal_px / min(max(nominal_px, self.nominal_px[0]), self.nominal_px[-1])))
+        doubt = np.full(2, WANDER_PX * beyond)
+        if len(self.stops) < 3 or beyond:
+            return doubt
+        x = math.log(nominal_px)
+        straight = CubicSpline(self._curve.x, self._curve(self._curve.x), bc_type="natural")
+        return np.abs(straight(x) - self._curve(x))[CENTER]
 
     def nominal_for(self, focal_px: float) -> float:
         """What to tell the device so that the true horizontal focal length is ``focal_px`` [px]."""

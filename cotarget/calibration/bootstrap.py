@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from cotarget.calibration.boards import board_points, smallest_spacing
-from cotarget.calibration.bundle import fit
+from cotarget.calibration.bundle import Fit, fit
 from cotarget.calibration.handeye import motions, park_martin
 from cotarget.calibration.intrinsics import board_pose, pose_candidates, rough_intrinsics
 from cotarget.calibration.model import View
 from cotarget.calibration.placing import place_boards
-from cotarget.calibration.plan import Coverage, distance, facing_board, plan_placement
+from cotarget.calibration.plan import Coverage, distance, facing_board, plan_placements, preferred_share
 from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.reprojection import Block, RigModel
 from cotarget.camera import Intrinsics, ZoomLens
@@ -29,9 +29,19 @@ FIRST_FIELD = np.radians(50.0)  # the field of view supposed before anything was
 FIRST_SHARES = (0.16, 0.5, -0.2, 0.8)  # of the way from near to far: 3, 4.5, 2, 6.3 m for a usual board
 LEARNING = 4  # tilted placements from which the fixed camera's rough intrinsics come
 SCAN_STEP = np.radians(20.0)  # less than half the smaller field of view of a usual camera
-SCAN_PAN, SCAN_TILT = np.radians(80.0), np.radians(40.0)  # how far the scan looks to each side
+SCAN_PAN, SCAN_TILT = np.radians(160.0), np.radians(60.0)  # how far the scan looks to each side, limits allowing
 # A board seen face-on has two poses that its corners hardly tell apart.
 CLEARLY_TILTED = Rotation.from_rotvec(np.radians([20.0, 20.0, 0.0]))
+# How the board is shown while the zoom camera looks for it: as far away as this share, turned so [degrees]. A camera
+# far to one side sees it only where it is turned towards that side, and farther away.
+SHOWN = (
+    (0.6, (20.0, 20.0)),
+    (0.2, (20.0, 20.0)),
+    (1.0, (10.0, 35.0)),
+    (1.0, (10.0, -35.0)),
+    (1.0, (35.0, 10.0)),
+    (1.0, (-35.0, 10.0)),
+)
 SMALL_TURN = np.radians(7.0)  # tells the camera's mounting without losing a central board
 ROUGH_MARGIN = 0.04  # of the image's width, that plans keep clear while the model is rough
 ENOUGH_VIEWS = 12  # of the zoom camera, before its intrinsics and T's translation join the rough fit
@@ -64,12 +74,13 @@ def learn_fixed(recorder: Recorder, rng: np.random.Generator) -> RigModel:
     coverage = {"fixed": Coverage(size)}
     for k in range(LEARNING):
         model = RigModel(boards={}, fixed=lens)
-        T = plan_placement(model, board, coverage, k, rng, shared=False, margin_px=ROUGH_MARGIN * width)
-        if T is None:
+        shares = [preferred_share(k)]
+        wishes = plan_placements(model, board, coverage, shares, rng, shared=False, margin_px=ROUGH_MARGIN * width)
+        if not wishes:
             continue
-        recorder.present(T)
+        recorder.present(wishes[0])
         if (view := recorder.see_fixed()) is not None:
-            coverage["fixed"].add(view.corners_px)
+            coverage["fixed"].add(view.corners_px[view.seen])
         recorder.see_zoom(expected=False)
     views = [view for view in recorder.views if view.camera == "fixed"]
     return RigModel(boards={}, fixed=rough_intrinsics("fixed", views, points, size))
@@ -88,7 +99,7 @@ def learn_zoom(recorder: Recorder, model: RigModel) -> RigModel:
         by_pan, by_tilt = _turn_a_little(recorder, centred)
     _present_otherwise_tilted(recorder, model, centred)
     model = _likeliest(replace(model, zoom=ZoomLens((focal,), (zoom,))), recorder, [centred, by_pan, by_tilt])
-    return refitted(model, recorder)
+    return refitted(model, recorder).model
 
 
 def _present_otherwise_tilted(recorder: Recorder, model: RigModel, view: View) -> None:
@@ -141,7 +152,6 @@ def _likeliest(model: RigModel, recorder: Recorder, seen: Sequence[View]) -> Rig
 def _find_with_zoom(recorder: Recorder, model: RigModel) -> View:
     """A zoom view of a placement that the fixed camera sees too, near the middle of the zoom image."""
     assert model.fixed is not None
-    distances = [distance(recorder.board, model.fixed, share) for share in (0.6, 0.2)]
     limits = recorder.rig.head.limits
     steps = [
         np.arange(-round(reach / SCAN_STEP), round(reach / SCAN_STEP) + 1) * SCAN_STEP
@@ -153,22 +163,24 @@ def _find_with_zoom(recorder: Recorder, model: RigModel) -> View:
         for pan, tilt in grid
         if limits.pan[0] <= pan <= limits.pan[1] and limits.tilt[0] <= tilt <= limits.tilt[1]
     ]
-    for depth in distances:
-        recorder.present(facing_board(recorder.board, np.array([0.0, 0.0, depth]), CLEARLY_TILTED))
+    tried = []
+    for share, turned in SHOWN:
+        depth = distance(recorder.board, model.fixed, share)
+        turn = Rotation.from_rotvec(np.radians([*turned, 0.0]))
+        recorder.present(facing_board(recorder.board, np.array([0.0, 0.0, depth]), turn))
         if recorder.see_fixed() is None:
             continue
+        tried.append(f"{depth:.1f}")
         for pan, tilt in grid:
             recorder.turn(pan, tilt)
             view = recorder.see_zoom(expected=False)
             if view is not None:
                 return view
-    reach = " and ".join(
-        f"{np.degrees(np.max(s)):.0f} degrees of {n}" for s, n in zip(steps, ("pan", "tilt"), strict=True)
-    )
+    reach = " and ".join(f"{np.degrees(max(abs(q) for q in axis)):.0f} degrees" for axis in zip(*grid, strict=True))
     raise CalibrationError(
         f"the zoom camera does not see the board that the fixed camera sees straight ahead, at "
-        f"{' and '.join(f'{d:.1f}' for d in distances)} m, with the head turned up to {reach}; "
-        "check where the zoom camera looks at pan = tilt = 0"
+        f"{', '.join(dict.fromkeys(tried))} m, turned either way, with pan and tilt up to {reach}; "
+        "check where the zoom camera looks at pan = tilt = 0, or use a larger board farther away"
     )
 
 
@@ -213,16 +225,17 @@ def _centred(recorder: Recorder, view: View, by_pan: View, by_tilt: View) -> Vie
     return recorder.see_zoom(expected=False) or view
 
 
-def refitted(model: RigModel, recorder: Recorder) -> RigModel:
+def refitted(model: RigModel, recorder: Recorder) -> Fit:
     """Fit the rough model to all views so far: at first Gamma alone, with more views everything."""
     points: Array = board_points(recorder.board)
     views = recorder.views
     if sum(view.camera == "zoom" for view in views) < ENOUGH_VIEWS:
-        return fit(place_boards(model, views, points), views, points, {"gamma"}).model
+        only_gamma: tuple[Block, ...] = ("gamma",)
+        return fit(place_boards(model, views, points), views, points, only_gamma)
     blocks: tuple[Block, ...] = ("fixed", "zoom", "gamma", "hand", "head")
     result = fit(place_boards(model, views, points), views, points, blocks)
     if result.rms_px <= ROUGH_RMS_PX:
-        return result.model
+        return result
     # The first views misled the intrinsics too far: start those afresh from all views.
     by_camera = {name: [view for view in views if view.camera == name] for name in ("fixed", "zoom")}
     fixed = rough_intrinsics("fixed", by_camera["fixed"], points, recorder.rig.fixed.size)
@@ -231,4 +244,4 @@ def refitted(model: RigModel, recorder: Recorder) -> RigModel:
     lens = ZoomLens(model.zoom.nominal_px, (zoom,))
     afresh = place_boards(replace(model, fixed=fixed, zoom=lens), views, points)
     again = fit(fit(afresh, views, points, {"gamma"}).model, views, points, blocks)
-    return min((result, again), key=lambda one: one.rms_px).model
+    return min((result, again), key=lambda one: one.rms_px)

@@ -151,6 +151,23 @@ def fit(
     return Fit(here.model, problem.free, residuals, left, normal, variance, jitter, tuple(views))
 
 
+def information(model: RigModel, views: Sequence[View], points: Array, free: Collection[Block]) -> Array:
+    """What views would tell of the free parameters, whatever their corners: the normal matrix without the boards.
+
+    Args:
+        model: with the boards of the views.
+        views: planned or taken; only which corners are seen matters.
+        points: the board's corners in its frame [m], (N, 3).
+        free: the blocks.
+
+    Returns:
+        (n, n), in the order of `parameter_names` [1/px^2]; views of the same placement must come together.
+    """
+    model = replace(model, boards={number: model.boards[number] for number in sorted({v.board for v in views})})
+    problem = _Problem(batches_of(model, views), points, tuple(free), None, 0.0)
+    return _reduced(problem.equations(problem.at(model), None), 0.0)[0]
+
+
 def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> float:
     """Estimate how far the head's angles scatter about the reported ones, by restricted maximum likelihood.
 

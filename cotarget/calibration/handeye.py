@@ -297,8 +297,8 @@ def _check_axes(alpha: Array) -> None:
         return
     moved, missing = ("pan", "tilt") if abs(Vt[0][1]) > abs(Vt[0][0]) else ("tilt", "pan")
     raise CalibrationError(
-        f"hand-eye: only {moved} moved: the position of the camera along the {moved} axis and its rotation about it are "
-        f"free; add {missing}"
+        f"hand-eye: only {moved} moved: the position of the camera along the {moved} axis and its rotation about it "
+        f"are free; add {missing}"
     )
 
 

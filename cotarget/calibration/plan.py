@@ -3,6 +3,7 @@
 Plans need only a rough model of the rig. Whatever is planned is a wish: what counts is what is then seen.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,6 +27,8 @@ MOST_TILTED, LEAST_TILTED = np.radians(40.0), np.radians(8.0)  # from facing the
 MOST_ROLLED = np.radians(25.0)
 GOLDEN = 0.6180339887  # its multiples spread evenly over 0..1 however many there are
 GRID = (10, 8)  # cells across and down an image in which corners are counted
+HIDDEN_REACH = 0.12  # of the image's width: so near to a board that was not seen, others are not expected either
+SAME_DEPTH = 0.9  # boards this much nearer are
 CANDIDATES = 150  # placements tried before one is chosen; the choice hardly improves with more
 POSES = 120  # head poses tried for a placement
 SMALLEST_SPACING_PX = 7.0  # on average over the board, of the thinner direction
@@ -33,10 +36,18 @@ SMALLEST_SPACING_PX = 7.0  # on average over the board, of the thinner direction
 
 @dataclass(eq=False)
 class Coverage:
-    """How many corners each cell of one camera's image has seen."""
+    """How many corners each cell of one camera's image has seen, and where boards were held that it did not see.
+
+    Attributes:
+        size: of the image [px].
+        counts: of every cell.
+        misses: middle in the image [px], (2,), and depth [m] of boards that were not seen: behind a wall or below a
+            floor, where others at that depth or farther will not be seen either.
+    """
 
     size: tuple[int, int]
     counts: Array = field(default_factory=lambda: np.zeros(GRID))
+    misses: list[tuple[Array, float]] = field(default_factory=list)
 
     def add(self, corners_px: Array) -> None:
         """Count corners (N, 2) [px]."""
@@ -47,6 +58,14 @@ class Coverage:
         new = np.zeros(GRID)
         np.add.at(new, self._cells(corners_px), 1)
         return float(np.sum(np.log1p(self.counts + new) - np.log1p(self.counts)))
+
+    def hidden(self, middles_px: Array, depth: float) -> npt.NDArray[np.bool_]:
+        """Which boards with their middles there (K, 2) [px], at a depth [m], are likely not to be seen, (K,)."""
+        near = np.zeros(len(middles_px), dtype=bool)
+        for middle, missed in self.misses:
+            if depth >= SAME_DEPTH * missed:
+                near |= np.linalg.norm(middles_px - middle, axis=-1) < HIDDEN_REACH * self.size[0]
+        return near
 
     def _cells(self, corners_px: Array) -> tuple[npt.NDArray[np.intp], ...]:
         cells = (corners_px / np.array(self.size) * np.array(GRID)).astype(np.intp)
@@ -97,48 +116,47 @@ def distance(board: BoardConfig, lens: Intrinsics, share: float) -> float:
     return float(scale * NEAR * (FAR / NEAR) ** share)
 
 
-def plan_placement(
+def plan_placements(
     model: RigModel,
     board: BoardConfig,
     coverage: dict[str, Coverage],
-    number: int,
+    shares: Sequence[float],
     rng: np.random.Generator,
     *,
     shared: bool,
     margin_px: float,
-    share: float | None = None,
-) -> RigidTransform | None:
-    """Choose where to hold the board.
+) -> list[RigidTransform]:
+    """Choose where the board may be held: for each distance, the place that covers most of what was not yet covered.
 
     Args:
         model: rough model of the rig; while its ``zoom`` is None, only the fixed camera is looked at.
         board: the board.
         coverage: of "fixed" and "zoom".
-        number: of the placement, from which its distance follows.
+        shares: distances, as shares of the way from near to far.
         rng: random numbers.
         shared: whether the zoom camera must see it too, at pan = tilt = 0.
         margin_px: how far inside the images the board must stay.
-        share: of the way from near to far; by default it follows from the number.
 
     Returns:
-        T_fixed_board, or None where no candidate is visible.
+        T_fixed_board, one for each distance at which a candidate is visible.
     """
     assert model.fixed is not None
-    # The distances of successive placements are spread evenly; only where that one does not do, any will.
-    preferred = np.full(CANDIDATES, (number * GOLDEN) % 1.0 if share is None else share)
-    for shares in (preferred, rng.uniform(size=CANDIDATES)):
+    chosen = []
+    for share in shares:
         pixels = rng.uniform(size=(CANDIDATES, 2)) * (np.array(model.fixed.size) - 1)
-        depths = np.array([distance(board, model.fixed, share) for share in shares])
         turns = random_turns(CANDIDATES, rng)
         middle = board_points(board).mean(axis=0)
+        x = model.fixed.ray(pixels) * distance(board, model.fixed, share)
+        if model.zoom is not None:
+            turns = _between(x, model.gamma.inv().translation) * turns
         R = turns.as_matrix()
-        t = model.fixed.ray(pixels) * depths[:, None] - R @ middle
+        t = x - R @ middle
         x_fixed = board_body(board) @ R.swapaxes(1, 2) + t[:, None]
         good, seen = visible(model.fixed, x_fixed, board, margin_px)
+        good &= ~coverage["fixed"].hidden(pixels, distance(board, model.fixed, share))
         if model.zoom is not None:
-            in_zoom, seen_zoom = visible(
-                model.zoom.stops[0], model.gamma.apply(x_fixed.reshape(-1, 3)).reshape(x_fixed.shape), board, margin_px
-            )
+            x_zoom0 = model.gamma.apply(x_fixed.reshape(-1, 3)).reshape(x_fixed.shape)
+            in_zoom, seen_zoom = visible(model.zoom.stops[0], x_zoom0, board, margin_px)
             good = np.logical_and(good, in_zoom) if shared else good
         gains: list[tuple[float, int]] = []
         for k in np.flatnonzero(good):
@@ -148,8 +166,31 @@ def plan_placement(
             gains.append((gain, int(k)))
         if gains:
             best = max(gains)[1]
-            return RigidTransform.from_components(t[best], turns[best])
-    return None
+            chosen.append(RigidTransform.from_components(t[best], turns[best]))
+    return chosen
+
+
+def where_in(lens: Intrinsics, board: BoardConfig, T_fixed_board: RigidTransform) -> tuple[Array, float]:
+    """Where a board's middle is in the fixed camera's image, (2,) [px], and its depth [m]."""
+    x = T_fixed_board.apply(board_points(board).mean(axis=0))
+    return lens.project(x), float(x[2])
+
+
+def preferred_share(number: int) -> float:
+    """Of the way from near to far: successive placements are spread evenly."""
+    return (number * GOLDEN) % 1.0
+
+
+def _between(x_fixed: Array, center_fixed: Array) -> Rotation:
+    """Half the turn from the fixed camera's line of sight to the other camera's, for points (n, 3): both see alike."""
+    here = x_fixed / np.linalg.norm(x_fixed, axis=-1, keepdims=True)
+    there = x_fixed - center_fixed
+    there = there / np.linalg.norm(there, axis=-1, keepdims=True)
+    axis = np.cross(here, there)
+    sine = np.linalg.norm(axis, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, np.sum(here * there, axis=-1, keepdims=True))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return Rotation.from_rotvec(np.where(sine > 0, axis / sine * angle / 2, 0.0))
 
 
 def plan_poses(

@@ -14,10 +14,10 @@ from cotarget.calibration.boards import board_points, check_board
 from cotarget.calibration.bootstrap import ROUGH_MARGIN, learn_fixed, learn_zoom, refitted
 from cotarget.calibration.intrinsics import pose_candidates
 from cotarget.calibration.model import View
-from cotarget.calibration.plan import Coverage, plan_placement, plan_poses, seen_at_home
+from cotarget.calibration.outlook import Outlook, outlook_of, planned_views
+from cotarget.calibration.plan import Coverage, plan_placements, plan_poses, preferred_share, seen_at_home, where_in
 from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.reprojection import RigModel
-from cotarget.calibration.start import at_home
 from cotarget.calibration.stops import spread_stops
 from cotarget.calibration.zooming import see_stops
 from cotarget.errors import CalibrationError
@@ -28,9 +28,8 @@ Progress = Callable[[int, int, str], None]  # done, total, text
 FINE_MARGIN = 0.008  # of the image's width, that plans keep clear once the model is fine
 MARGIN_GROWTH, WIDEST_MARGIN = 3.0, 0.15  # at every miss, and at most
 MOVED_VIEWS = 3  # zoom views with the head away from home, a placement
-SHARED_SHARE = 0.75  # of the placements are to be seen by both cameras at home
+CHOICES = 6  # places among which the next is chosen, half of them seen by both cameras at home where there are such
 REFIT_ALWAYS, REFIT_EVERY = 8, 6  # refit the rough model at each of the first placements, later now and then
-PATIENCE = 4  # placements before the lack of a common view at home is believed
 MOST_MISSES = 4  # placements in a row without a view before giving up
 
 
@@ -90,31 +89,39 @@ def _cover(
     tell: Callable[[str], None],
 ) -> RigModel:
     """Present the board all over both images and turn the head at each placement."""
-    rig = recorder.rig
+    rig, points = recorder.rig, board_points(recorder.board)
     coverage = {"fixed": Coverage(rig.fixed.size), "zoom": Coverage(rig.zoom.size)}
     for view in recorder.views:
-        coverage[view.camera].add(view.corners_px)
-    shared_count = misses = done = 0
+        coverage[view.camera].add(view.corners_px[view.seen])
+    outlook: Outlook | None = None
+    misses = done = 0
     while recorder.number + 1 < placements:
         # A miss means that the rough model bends the image wrongly where nothing was seen yet: keep farther inside.
         margin = min((ROUGH_MARGIN if done < REFIT_ALWAYS else FINE_MARGIN) * MARGIN_GROWTH**misses, WIDEST_MARGIN)
-        shared = shared_count <= SHARED_SHARE * done
         recorder.turn(0.0, 0.0)
-        wish = _next_placement(recorder, model, coverage, rng, shared=shared, margin=margin, patient=done < PATIENCE)
+        wish = _next_placement(recorder, model, coverage, rng, margin, outlook)
         recorder.present(wish)
-        tell(f"board {recorder.number + 1} of {placements}")
+        error = "" if outlook is None else f", predicted error {np.degrees(outlook.error()):.4f} degrees"
+        tell(f"board {recorder.number + 1} of {placements}{error}")
         missed = misses > 0
         fixed_view = recorder.see_fixed()
         misses = 0 if fixed_view is not None else misses + 1
         if misses > MOST_MISSES:
             raise CalibrationError(f"the fixed camera lost the board: not seen {misses} times in a row")
         if fixed_view is None:
+            assert model.fixed is not None
+            coverage["fixed"].misses.append(where_in(model.fixed, recorder.board, wish))
             continue
-        shared_count += _see_from_everywhere(recorder, model, wish, fixed_view, coverage, margin, rng)
+        T = _see_from_everywhere(recorder, model, wish, fixed_view, coverage, margin, rng)
         done += 1
         if done <= REFIT_ALWAYS or done % REFIT_EVERY == 0 or missed:
-            model = refitted(model, recorder)
-    return refitted(model, recorder)
+            found = refitted(model, recorder)
+            model = found.model
+            outlook = outlook_of(found, recorder.board.square) if "hand" in found.free else None
+        elif outlook is not None:
+            seen = recorder.of_placement(recorder.number)
+            outlook = outlook.with_views(seen, {recorder.number: T}, points)
+    return refitted(model, recorder).model
 
 
 def _next_placement(
@@ -122,25 +129,34 @@ def _next_placement(
     model: RigModel,
     coverage: dict[str, Coverage],
     rng: np.random.Generator,
-    *,
-    shared: bool,
     margin: float,
-    patient: bool,
+    outlook: Outlook | None,
 ) -> RigidTransform:
-    """Where to hold the board next; for the fixed camera alone where no place is visible to both."""
+    """Where to hold the board next: of several places, near and far, the one that makes the predicted error smallest.
+
+    While nothing is predicted yet, the one from which most head poses show the board.
+    """
     assert model.fixed is not None
-    for both in (True, False) if shared else (False,):
-        wish = plan_placement(
-            model, recorder.board, coverage, recorder.number, rng, shared=both, margin_px=margin * model.fixed.size[0]
-        )
-        if wish is not None:
-            return wish
-        if both and not patient and not any(at_home(v) for v in recorder.views if v.camera == "zoom"):
-            raise CalibrationError(
-                "the cameras have no common view at pan = tilt = 0 that would show a whole board to both; "
-                "turn the zoom camera's mounting towards what the fixed camera sees"
-            )
-    raise CalibrationError("no placement of the board is visible to the fixed camera; use a smaller board")
+    assert model.zoom is not None
+    board, limits, points = recorder.board, recorder.rig.head.limits, board_points(recorder.board)
+    margin_px = margin * model.fixed.size[0]
+    shares = [preferred_share(recorder.number), *rng.uniform(size=CHOICES - 1)]
+    wishes = plan_placements(model, board, coverage, shares[: CHOICES // 2], rng, shared=True, margin_px=margin_px)
+    wishes += plan_placements(model, board, coverage, shares[len(wishes) :], rng, shared=False, margin_px=margin_px)
+    best, least = None, (np.inf, np.inf)
+    for wish in wishes:
+        turns = plan_poses(model, wish, board, coverage["zoom"], limits, MOVED_VIEWS, rng, margin * model.zoom.size[0])
+        if seen_at_home(model, wish, board):
+            turns = [(0.0, 0.0), *turns]
+        error = np.inf
+        if outlook is not None and turns:
+            views = planned_views(recorder.number + 1, turns, len(points))
+            error = outlook.error(outlook.worth(views, {recorder.number + 1: wish}, points))
+        if (error, -len(turns)) < least:
+            best, least = wish, (error, -len(turns))
+    if best is None:
+        raise CalibrationError("no placement of the board is visible to the fixed camera; use a smaller board")
+    return best
 
 
 def _see_from_everywhere(
@@ -151,21 +167,22 @@ def _see_from_everywhere(
     coverage: dict[str, Coverage],
     margin: float,
     rng: np.random.Generator,
-) -> bool:
-    """Take the zoom views of a placement, home first; whether the zoom camera saw it at home."""
+) -> RigidTransform:
+    """Take the zoom views of a placement, home first; where the board really is, T_fixed_board."""
     assert model.fixed is not None
     rig, board = recorder.rig, recorder.board
-    # Where the board really is, in that of its two possible poses which is nearer to the wish.
+    # In that of its two possible poses which is nearer to the wish.
     poses = pose_candidates(model.fixed, fixed_view.corners_px, board_points(board))
     T = min(poses, key=lambda pose: float((pose.rotation * wish.rotation.inv()).magnitude()))
     home = seen_at_home(model, T, board)
     turns = plan_poses(
         model, T, board, coverage["zoom"], rig.head.limits, MOVED_VIEWS + (not home), rng, margin * rig.zoom.size[0]
     )
-    seen_home = home and recorder.see_zoom() is not None
+    if home:
+        recorder.see_zoom()
     for pan, tilt in turns:
         recorder.turn(pan, tilt)
         recorder.see_zoom()
     for view in recorder.of_placement(recorder.number):
-        coverage[view.camera].add(view.corners_px)
-    return seen_home
+        coverage[view.camera].add(view.corners_px[view.seen])
+    return T

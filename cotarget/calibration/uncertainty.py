@@ -4,6 +4,9 @@ The covariance speaks of the corners' noise, and of a head that does not stand q
 leaves out is noticed by captures kept out of the fit (`cotarget.calibration.heldout`), which widen it.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 from cotarget.calibration.bundle import Fit
@@ -76,7 +79,8 @@ def line_of_sight_covariance(
     is d(p). The head is sent to the q that makes a = d by the parameters found, p0. There it stays, while the true
     parameters p0 + e put the target at m = E^T (a(p0 + e, q) - d(p0 + e)), E being the two directions across d. To
     first order m = J e with J = dm/dp at fixed q, so that cov(m) = J cov(e) J^T; how q was solved does not matter.
-    The head's jitter, where there is any, adds what a turn of that size moves.
+    The head's jitter, where there is any, adds what a turn of that size moves, and the zoom lens what its stops leave
+    in doubt between and beyond them.
 
     Args:
         calibration: with a covariance and a T.
@@ -104,37 +108,59 @@ def line_of_sight_covariance(
     shape = np.broadcast_shapes(np.shape(pixel)[:-1], depth.shape)
     pixels = np.array(np.broadcast_to(pixel, (*shape, 2)), dtype=float).reshape(-1, 2)
     depths = np.array(np.broadcast_to(depth, shape)).ravel()
-    if pan_tilt is None:
-        lens = calibration.zoom.at(nominal)
-        x_base = (model.hand * model.gamma).apply(calibration.fixed.ray(pixels) * depths[:, None])
-        hand = calibration.hand_eye(nominal)
-        found = solve(x_base, hand, calibration.head, lens.ray(lens.image_center_px))
-        pan, tilt = found.pan[:, 0], found.tilt[:, 0]
-    else:
+    turned = None
+    if pan_tilt is not None:
         pan, tilt = (np.array(np.broadcast_to(angle, shape), dtype=float).ravel() for angle in pan_tilt)
+        turned = pan, tilt
+    by_parameter, by_turn = miss_derivatives(model, covariance.parameters, pixels, depths, nominal, turned)
+    found = by_parameter @ covariance.matrix @ by_parameter.swapaxes(-1, -2)
+    found = found + calibration.jitter**2 * by_turn @ by_turn.swapaxes(-1, -2)
+    doubt = calibration.zoom.center_doubt_px(nominal) / np.array(calibration.zoom.at(nominal).focal_px)
+    return np.asarray(found + np.diag(doubt**2)).reshape(*shape, 2, 2)
 
-    across = _across(_line_of_sight(model, nominal))
 
-    def miss(step: Array) -> Array:
+def miss_derivatives(
+    model: RigModel,
+    parameters: Sequence[str],
+    pixels: Array,
+    depths: Array,
+    nominal_px: float,
+    pan_tilt: tuple[Array, Array] | None = None,
+) -> tuple[Array, Array]:
+    """How the miss m of `line_of_sight_covariance` changes with parameters, and with the head's pan and tilt.
+
+    Args:
+        model: the rig.
+        parameters: names, k of them.
+        pixels: of targets in the fixed view, (n, 2) [px].
+        depths: of these along the fixed camera's axis [m], (n,).
+        nominal_px: the zoom camera's nominal focal length [px].
+        pan_tilt: where the head is [rad], (n,) each; by default the exact solution that faces forward.
+
+    Returns:
+        Derivatives (n, 2, k) and (n, 2, 2); nan for targets that cannot be reached.
+    """
+    assert model.fixed is not None
+    assert model.zoom is not None
+    if pan_tilt is None:
+        lens = model.zoom.at(nominal_px)
+        x_base = (model.hand * model.gamma).apply(model.fixed.ray(pixels) * depths[:, None])
+        hand = model.hand * RigidTransform.from_translation([0.0, 0.0, model.zoom.pupil_at(nominal_px)])
+        found = solve(x_base, hand, model.head, lens.ray(lens.image_center_px))
+        pan_tilt = found.pan[:, 0], found.tilt[:, 0]
+    across = _across(_line_of_sight(model, nominal_px))
+    known, model = parameter_names(EVERY_BLOCK, model.stops), replace(model, boards={})
+
+    def miss(step: Array, turn: Array) -> Array:
         at = stepped(model, step, np.empty((0, POSE_PARAMETERS)), EVERY_BLOCK)
-        return (_directions(at, pixels, depths, pan, tilt, nominal) - _line_of_sight(at, nominal)) @ across
+        pan, tilt = pan_tilt[0] + turn[0], pan_tilt[1] + turn[1]
+        return (_directions(at, pixels, depths, pan, tilt, nominal_px) - _line_of_sight(at, nominal_px)) @ across
 
-    steps = STEP * np.eye(len(known))[[known.index(name) for name in covariance.parameters]]
-    J = np.stack([(miss(step) - miss(-step)) / (2 * STEP) for step in steps], axis=-1)  # (n, 2, parameters)
-    found_covariance = J @ covariance.matrix @ J.swapaxes(-1, -2)
-    if calibration.jitter:
-        turned = [
-            (
-                _directions(model, pixels, depths, pan + STEP * d_pan, tilt + STEP * d_tilt, nominal)
-                - _directions(model, pixels, depths, pan - STEP * d_pan, tilt - STEP * d_tilt, nominal)
-            )
-            @ across
-            / (2 * STEP)
-            for d_pan, d_tilt in np.eye(2)
-        ]
-        J_turn = np.stack(turned, axis=-1)
-        found_covariance = found_covariance + calibration.jitter**2 * J_turn @ J_turn.swapaxes(-1, -2)
-    return found_covariance.reshape(*shape, 2, 2)
+    still, unturned = np.zeros(len(known)), np.zeros(2)
+    steps = STEP * np.eye(len(known))[[known.index(name) for name in parameters]]
+    by_parameter = [(miss(step, unturned) - miss(-step, unturned)) / (2 * STEP) for step in steps]
+    by_turn = [(miss(still, turn) - miss(still, -turn)) / (2 * STEP) for turn in STEP * np.eye(2)]
+    return np.stack(by_parameter, axis=-1), np.stack(by_turn, axis=-1)
 
 
 def model_of(calibration: Calibration) -> RigModel:

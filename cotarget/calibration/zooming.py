@@ -12,7 +12,7 @@ import numpy as np
 from cotarget.calibration.boards import board_points
 from cotarget.calibration.model import View
 from cotarget.calibration.placing import place_boards
-from cotarget.calibration.plan import Coverage, plan_placement
+from cotarget.calibration.plan import Coverage, plan_placements, where_in
 from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.reprojection import RigModel, base_heads
 from cotarget.calibration.stops import (
@@ -33,6 +33,7 @@ from cotarget.rig import PanTiltLimits
 NEAREST_SHARE, FARTHEST_SHARE = 0.6, 1.0
 VIEWS_A_STOP = 2  # of each placement
 FIRST_VIEWS = 3  # of the first placement, from which a stop is learnt
+ATTEMPTS = 3  # times as many placements are tried, where some are not seen
 CANDIDATES = 60  # ways to bring a part of the board into the image that are tried for each view
 BORDER_PX = 12.0  # a point of the board is brought anywhere but this near to the image's border
 
@@ -62,31 +63,27 @@ def see_stops(
     coverage = {"fixed": Coverage(recorder.rig.fixed.size), "zoom": Coverage(size)}
     for view in recorder.views:
         if view.camera == "fixed":
-            coverage["fixed"].add(view.corners_px)
+            coverage["fixed"].add(view.corners_px[view.seen])
     at_stop = [Coverage(size) for _ in stops]
     only_fixed = replace(model, zoom=None)
     reached = list(model.zoom.nominal_px)
-    for k in range(placements):
-        share = FARTHEST_SHARE - (FARTHEST_SHARE - NEAREST_SHARE) * k / max(placements - 1, 1)
-        wish = plan_placement(
-            only_fixed,
-            recorder.board,
-            coverage,
-            recorder.number + 1,
-            rng,
-            shared=False,
-            margin_px=BORDER_PX,
-            share=share,
-        )
-        if wish is None:
+    done = 0
+    for _ in range(ATTEMPTS * placements):
+        if done == placements:
+            break
+        share = FARTHEST_SHARE - (FARTHEST_SHARE - NEAREST_SHARE) * done / max(placements - 1, 1)
+        wishes = plan_placements(only_fixed, recorder.board, coverage, [share], rng, shared=False, margin_px=BORDER_PX)
+        if not wishes:
             continue
-        recorder.present(wish)
+        recorder.present(wishes[0])
         fixed_view = recorder.see_fixed()
         if fixed_view is None:
+            coverage["fixed"].misses.append(where_in(model.fixed, recorder.board, wishes[0]))
             continue
-        coverage["fixed"].add(fixed_view.corners_px)
+        done += 1
+        coverage["fixed"].add(fixed_view.corners_px[fixed_view.seen])
         for i, stop in enumerate(stops[1:], start=1):
-            tell(f"zoom stop {i + 1} of {len(stops)}, board {k + 1} of {placements}")
+            tell(f"zoom stop {i + 1} of {len(stops)}, board {done} of {placements}")
             nominal = recorder.zoom(stop)
             new = i >= len(reached)
             if new:
