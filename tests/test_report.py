@@ -207,6 +207,8 @@ def test_the_verdict_says_the_plain_truth(plain):
     open_ = judge(replace(plain, covariance=plain.covariance.scaled({"T_head_zoom.rx": 1e6})))
     assert open_.level == "bad"
     assert "T_head_zoom" in open_.text
+    others = tuple(replace(view, corners_px=view.corners_px[::-1] / 2) for view in plain.views)
+    assert "not what it was made from" in verdict(replace(plain, views=others))
     assert "% of the close-up's width" in verdict(replace(plain, jitter=np.radians(3.0)))
 
 
@@ -239,6 +241,22 @@ def test_stored_corners_give_back_their_noise(plain):
     assert 2.5 < evidence.distances.min() < evidence.distances.max() < 10
     assert evidence.per_stop == (sum(view.camera == "zoom" for view in plain.views),)
     assert gather(bare(plain)) is None
+
+
+def test_a_bent_board_is_seen_and_said(plain):
+    bent = POINTS.copy()
+    bent[:, 2] = 0.003 * np.sin(4 * POINTS[:, 0])
+    flat = np.polyval(np.polyfit(POINTS[:, 0], bent[:, 2], 1), POINTS[:, 0])  # what a pose takes up
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(2), boards=12, moved=2, shape=bent)
+    calibration = calibrate_views(views, BOARD, SIZES)
+    evidence = gather(calibration)
+    assert evidence.shape.wrong
+    assert evidence.shape.out == pytest.approx(np.std(bent[:, 2] - flat), rel=0.2)  # noise adds a tenth
+    found = judge(calibration)
+    assert found.level == "care"
+    assert "not counting that the board's corners are 1." in found.text
+    assert any("mount it on something flat" in item for item in advice(calibration, (), (), evidence))
+    assert not gather(plain).shape.wrong
 
 
 def test_a_pattern_in_the_residuals_and_a_bare_corner_are_seen():

@@ -7,7 +7,7 @@ import numpy as np
 from cotarget.calibration.model import Calibration
 from cotarget.calibration.observability import BOTH, NEARER, OUTWARD, TILT_BOARDS
 from cotarget.calibration.plan import distance
-from cotarget.report.evidence import CAMERAS, Evidence, averaged, empty_places, head_poses
+from cotarget.report.evidence import CAMERAS, BoardShape, Evidence, averaged, empty_places, head_poses
 from cotarget.report.figures import NAMES
 from cotarget.report.pointing import JITTER_GROUP, AtFocal, Contribution, corner_errors, undetermined
 from cotarget.report.wording import count, digits, listed, percent
@@ -23,7 +23,7 @@ ACTIONS = {
 }
 WORTH_SAYING = 0.1  # share of the squared error
 MUCH_WORSE = 3.0  # than in the middle
-PATTERN = 0.1  # share of cells beyond chance, ten times what chance gives
+PATTERN = 0.1  # share of averages beyond chance, ten times what chance gives or more
 FAR_SHARE, FEW_FAR = 0.5, 0.25  # farther than half-way on the plan's scale; fewer placements than this are few
 LEAST_TURN = np.radians(10.0)  # of each axis of the head, over all poses
 TURNED, FEW_TURNED = np.radians(20.0), 1 / 3  # boards that tell the focal length, and fewer than this are few
@@ -80,7 +80,9 @@ def _disagreement(calibration: Calibration) -> Iterator[str]:
 
 def _largest_part(at: tuple[AtFocal, ...], parts: tuple[Contribution, ...]) -> Iterator[str]:
     """Where the error comes from."""
-    total = at[-1].rms if at else np.nan
+    total = at[-1].rms if at else 0.0
+    if not total > 0:
+        return
     for part in parts[:2]:
         share = 1 - (part.left / total) ** 2
         if not share > WORTH_SAYING:
@@ -126,15 +128,31 @@ def _images(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
         )
 
 
+def board_in_words(shape: BoardShape) -> str:
+    """Say how far the board's corners are off."""
+    number = int(shape.beyond_chance.sum())
+    if not number:
+        return "The board's corners are where they are believed to be, as far as noise lets see."
+    return (
+        f"{number} of the board's {len(shape.beyond_chance)} corners are off by more than chance makes them: of all "
+        f"corners {digits(1000 * shape.within)} mm within the board and {digits(1000 * shape.out)} mm out of it (rms)."
+    )
+
+
 def _patterns(evidence: Evidence) -> Iterator[str]:
     """What the residuals have in common."""
+    if evidence.shape.wrong:
+        yield (
+            f"{board_in_words(evidence.shape)} Measure the board, and mount it on something flat: what is predicted "
+            "here does not count it."
+        )
     for name in CAMERAS:
         cells = averaged(evidence.corners[name])
         known, beyond = int(np.isfinite(cells.means[:, 0]).sum()), int(cells.beyond_chance.sum())
         if beyond > PATTERN * known:
             yield (
                 f"The {NAMES[name]}'s residuals keep a pattern: {beyond} of {known} averages are larger than chance "
-                "makes them. The board may be bent, or the lens may bend the image as the model cannot."
+                "makes them. The lens may bend the image as its model cannot, or the board is bent."
             )
 
 
@@ -160,8 +178,8 @@ def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
             f"Only {far} of {count(number, 'placement')} are farther than {digits(limit)} m: add far ones, which tell "
             "the directions of the cameras best."
         )
-    ranges = np.ptp(head_poses(evidence.views), axis=0)
-    for axis, turn in zip(("pan", "tilt"), ranges, strict=True):
+    poses = head_poses(evidence.views)
+    for axis, turn in zip(("pan", "tilt"), np.ptp(poses, axis=0) if len(poses) else (), strict=False):
         if turn < LEAST_TURN:
             yield f"The head's {axis} changed by {digits(np.degrees(turn))} degrees in all: {NEARER}."
     for nominal, views in zip(calibration.zoom.nominal_px, evidence.per_stop, strict=True):
@@ -178,9 +196,9 @@ def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
 
 def _more_of_the_same(at: tuple[AtFocal, ...], parts: tuple[Contribution, ...], placements: int) -> Iterator[str]:
     """What more placements of the same kind would bring: their part of the error goes with 1 / sqrt(placements)."""
-    if not at or not np.isfinite(at[-1].rms):
+    total = at[-1].rms if at else 0.0
+    if not total > 0:
         return
-    total = at[-1].rms
     fitted = next((part.left for part in parts if part.group == JITTER_GROUP), total)  # without the head's jitter
     still2 = max(total**2 - fitted**2, 0.0)
     then = float(np.sqrt(still2 + fitted**2 * placements / (placements + MORE)))

@@ -11,7 +11,7 @@ from cotarget.calibration.bundle import Fit, fit, robust_sigma
 from cotarget.calibration.intrinsics import FEWEST_CORNERS
 from cotarget.calibration.model import Calibration, CameraName, View
 from cotarget.calibration.placing import place_boards
-from cotarget.calibration.reprojection import stop_of
+from cotarget.calibration.reprojection import predict_pixels, stop_of
 from cotarget.calibration.uncertainty import model_of
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
@@ -20,6 +20,9 @@ CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
 CELLS = (16, 12)  # across and down an image, in which residuals are averaged
 FEWEST_IN_CELL = 5  # corners, below which an average says nothing
 BEYOND_CHANCE = 3.0  # standard deviations of an average of two coordinates, which chance exceeds at one cell in 90
+SHAPE_CHI2 = 16.3  # chi-square of three, which chance exceeds once in a thousand
+WRONG_SHARE = 0.1  # of a board's corners
+POINT_STEP = 1e-5  # [m]; pixels change by their derivatives, to rounding
 COVER = (10, 8)  # cells in which corners are counted, as the capture plan does
 # How the thirds of an image are called.
 ROWS, COLUMNS = ("upper", "", "lower"), ("left", "", "right")
@@ -61,6 +64,34 @@ class Cells:
 
 
 @dataclass(frozen=True, eq=False)
+class BoardShape:
+    """How the board departs from what everybody believes, told by the residuals.
+
+    Attributes:
+        offsets: of every corner, right, down and out of the board [m], (N, 3); 0 where it is hardly seen.
+        beyond_chance: which are larger than noise alone makes them, (N,).
+    """
+
+    offsets: Array
+    beyond_chance: npt.NDArray[np.bool_]
+
+    @property
+    def wrong(self) -> bool:
+        """Whether so many corners are off that the board is not what it is believed to be."""
+        return bool(self.beyond_chance.mean() > WRONG_SHARE)
+
+    @property
+    def within(self) -> float:
+        """Rms offset within the board [m]."""
+        return float(np.sqrt(np.mean(np.sum(self.offsets[:, :2] ** 2, axis=1))))
+
+    @property
+    def out(self) -> float:
+        """Rms offset out of the board [m]."""
+        return float(np.std(self.offsets[:, 2]))
+
+
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """Everything told by the corners.
 
@@ -70,6 +101,7 @@ class Evidence:
         distances: of the boards' middles from the fixed camera, one a placement [m].
         leanings: by which boards were turned from facing the fixed camera [rad].
         per_stop: how many views each stop of the zoom lens has.
+        shape: of the board.
     """
 
     views: tuple[View, ...]
@@ -77,6 +109,7 @@ class Evidence:
     distances: Array
     leanings: Array
     per_stop: tuple[int, ...]
+    shape: BoardShape
 
 
 def gather(calibration: Calibration) -> Evidence | None:
@@ -106,6 +139,7 @@ def gather(calibration: Calibration) -> Evidence | None:
         distances=distances,
         leanings=np.arccos(np.clip(facing, 0.0, 1.0)),
         per_stop=tuple(np.bincount(stops, minlength=len(calibration.zoom.stops)).tolist()),
+        shape=_shape(found, points),
     )
 
 
@@ -116,6 +150,26 @@ def _corners(calibration: Calibration, found: Fit, name: CameraName) -> Corners:
     at = [found.views[i].corners_px[s] for i, s in zip(mine, seen, strict=True)]
     off = [found.left[i][s] for i, s in zip(mine, seen, strict=True)]
     return Corners(size, np.concatenate([np.empty((0, 2)), *at]), np.concatenate([np.empty((0, 2)), *off]))
+
+
+def _shape(found: Fit, points: Array) -> BoardShape:
+    """Fit an offset to every corner of the board, of what the boards' poses left; it is that or less.
+
+    With residuals r = predicted - seen and their derivatives J by the corner's place, the offset is -J^+ r, and
+    r^T J J^+ r over the variance is chi-square of three where there is only noise.
+    """
+    seen = np.isfinite(found.left[..., 0])
+    ends = [[predict_pixels(found.model, found.views, points + d) for d in (e, -e)] for e in POINT_STEP * np.eye(3)]
+    J = np.stack([(plus - minus) / (2 * POINT_STEP) for plus, minus in ends], axis=-1)  # (views, N, 2, 3)
+    J, r = np.where(seen[..., None, None], J, 0.0), np.where(seen[..., None], found.left, 0.0)
+    normal, gradient = np.einsum("vnki,vnkj->nij", J, J), np.einsum("vnki,vnk->ni", J, r)
+    offsets, beyond = np.zeros((len(points), 3)), np.zeros(len(points), dtype=bool)
+    enough = np.count_nonzero(seen, axis=0) >= FEWEST_IN_CELL
+    variance = robust_sigma(found.left[seen]) ** 2
+    for i in np.flatnonzero(enough):
+        offsets[i] = -np.linalg.pinv(normal[i]) @ gradient[i]
+        beyond[i] = -offsets[i] @ gradient[i] > SHAPE_CHI2 * variance
+    return BoardShape(offsets, beyond)
 
 
 def averaged(corners: Corners) -> Cells:

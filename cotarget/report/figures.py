@@ -101,7 +101,14 @@ def residual_figure(evidence: Evidence) -> Figure:
             for those, colour in ((~cells.beyond_chance, GREY), (cells.beyond_chance, RED)):
                 middles, means = cells.middles[those], cells.means[those]
                 row[1].quiver(
-                    *middles.T, *(factor * means).T, color=colour, angles="xy", scale_units="xy", scale=1, width=0.004
+                    *middles.T,
+                    *(factor * means).T,
+                    color=colour,
+                    angles="xy",
+                    scale_units="xy",
+                    scale=1,
+                    width=0.004,
+                    in_layout=False,  # an arrow out of the image shall not push it aside
                 )
             row[1].set_title(f"{NAMES[name]}: averages, ×{factor:g}")
         return figure
@@ -120,7 +127,7 @@ def _arrows(ax: Any, at: Any, residuals: Any, factor: float, lengths: Any) -> No
         cmap="viridis_r",
         alpha=0.75,
         clim=(0, np.percentile(lengths, 99) if len(lengths) else 1),
-        rasterized=True,
+        in_layout=False,
     )
     ax.figure.colorbar(drawn, ax=ax, label="length [px]", shrink=0.8, pad=0.02)
 

@@ -10,7 +10,7 @@ from cotarget.calibration.model import Calibration
 from cotarget.calibration.reprojection import EVERY_BLOCK, parameter_names
 from cotarget.errors import CalibrationError
 from cotarget.report import markup, pictures
-from cotarget.report.advice import advice
+from cotarget.report.advice import advice, board_in_words
 from cotarget.report.evidence import CAMERAS, Evidence, averaged, gather, share_beyond
 from cotarget.report.figures import NAMES
 from cotarget.report.markup import Picture
@@ -42,8 +42,8 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
     """
     check(calibration)
     at = pointing(calibration)
-    found = judge(calibration, at)
     evidence = gather(calibration)
+    found = judge(calibration, at, evidence)
     made = pictures.draw(calibration, at, evidence)
     body = _body(calibration, source, found, at, contributions(calibration), evidence, made)
     page = markup.document(f"Calibration report: {source}", STYLE.read_text(encoding="utf-8"), body)
@@ -188,6 +188,7 @@ def _residuals(calibration: Calibration, evidence: Evidence | None, made: dict[s
             f"beyond three of them (0.3 % of Gaussian ones); {beyond} of {count(known, 'average')} larger than chance "
             "makes it (one in 90 of noise alone)."
         )
+    lines.append(board_in_words(evidence.shape))
     yield markup.bullets(lines)
     yield markup.figure(made["residuals"])
     yield markup.figure(made["histogram"])

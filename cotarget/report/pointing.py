@@ -1,14 +1,14 @@
 """What a calibration predicts of its own pointing, all over the wide view, and which parameters that comes from."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from cotarget.calibration.model import Calibration, Covariance
 from cotarget.calibration.observability import name_directions, weak_directions
-from cotarget.calibration.uncertainty import predicted_pointing
+from cotarget.calibration.uncertainty import miss_derivatives, model_of, predicted_pointing
 from cotarget.geometry import Array
 
 DEPTHS = (4.0, 30.0)  # where targets are [m]
@@ -134,15 +134,30 @@ def contributions(calibration: Calibration) -> tuple[Contribution, ...]:
     covariance = calibration.covariance
     if not can_point(calibration) or covariance is None:
         return ()
-    nominal = calibration.zoom.nominal_px[-1]
+    pixels, depths = sample_pixels(calibration), sample_depths()
+    by_parameter, by_turn = miss_derivatives(
+        model_of(calibration),
+        covariance.parameters,
+        np.tile(pixels, (len(depths), 1)),
+        np.repeat(depths, len(pixels)),
+        calibration.zoom.nominal_px[-1],
+    )
+    reached = np.isfinite(by_parameter).all(axis=(1, 2))
+    if not reached.any():
+        return ()
+    J, turned = by_parameter[reached], by_turn[reached]
+    weights = np.einsum("nik,nil->kl", J, J) / len(J)  # the mean of trace(J C J^T) is the sum of weights * C
+    turns = float(np.sum(turned**2)) / len(J)
+
+    def rms(matrix: Array, jitter: float) -> float:
+        return float(np.sqrt(max(np.sum(weights * matrix) + jitter**2 * turns, 0.0)))
+
     found = []
     for group in dict.fromkeys(group_of(name) for name in covariance.parameters):
         known = np.array([group_of(name) == group for name in covariance.parameters])
-        found.append(
-            Contribution(group, _over_the_view(replace(calibration, covariance=given(covariance, known)), nominal)[0])
-        )
+        found.append(Contribution(group, rms(given(covariance, known).matrix, calibration.jitter)))
     if calibration.jitter:
-        found.append(Contribution(JITTER_GROUP, _over_the_view(replace(calibration, jitter=0.0), nominal)[0]))
+        found.append(Contribution(JITTER_GROUP, rms(covariance.matrix, 0.0)))
     return tuple(sorted(found, key=lambda c: c.left))
 
 
@@ -161,7 +176,7 @@ def given(covariance: Covariance, known: npt.NDArray[np.bool_]) -> Covariance:
 def undetermined(calibration: Calibration) -> str:
     """Say what the covariance leaves undetermined, and what to add; empty where all is determined."""
     covariance = calibration.covariance
-    if covariance is None:
+    if covariance is None or not covariance.matrix.any():
         return ""
     stops = calibration.zoom.stops
     focal = {"fixed": calibration.fixed.focal_px[0]} | {f"zoom[{i}]": s.focal_px[0] for i, s in enumerate(stops)}

@@ -86,7 +86,8 @@ def depth_figure(calibration: Calibration, at: AtFocal, boards: Array | None) ->
             ax.plot(depths, np.degrees(worst), color=colour, lw=1.6, label=label)
         ax.set_ylim(bottom=0)
         ax.axvspan(*DEPTHS, color=BLUE, alpha=0.06, lw=0, label="range of the verdict")
-        if boards is not None and len(boards):
+        boards = np.empty(0) if boards is None else boards[(boards > depths[0]) & (boards < depths[-1])]
+        if len(boards):
             ax.plot(boards, np.zeros(len(boards)), "|", color=INK, ms=12, clip_on=False, label="boards")
         ax.set(xscale="log", xlabel="depth [m]", ylabel="predicted error [degrees]", xlim=(depths[0], depths[-1]))
         ticks = [t for t in (1, 2, 5, 10, 20, 50, 100) if depths[0] <= t <= depths[-1]]

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 
 from cotarget.calibration.model import Calibration
+from cotarget.report.evidence import Evidence, gather
 from cotarget.report.pointing import DEPTHS, AtFocal, pointing, sigma_of, undetermined
 from cotarget.report.wording import digits, percent
 
@@ -21,6 +22,8 @@ ALIKE = 1.25
 # Shares of the close-up's width by which a target may be off the middle: beyond the first it is worth a word, beyond
 # the second it is not in the picture.
 FAR_OFF, OUT_OF_SIGHT = 0.05, 0.5
+# Corners explained so many times worse than was recorded are other corners; exact ones are rounded to the floor.
+CONTRADICTION, RECORDED_FLOOR_PX = 3.0, 1e-3
 MOSTLY = 0.5  # share of the squared error
 
 
@@ -37,14 +40,25 @@ def verdict(calibration: Calibration) -> str:
     return judge(calibration).text
 
 
-def judge(calibration: Calibration, at: tuple[AtFocal, ...] | None = None) -> Verdict:
-    """Give the verdict on a calibration; `pointing` of it, where that is known already."""
+def judge(calibration: Calibration, at: tuple[AtFocal, ...] | None = None, evidence: Evidence | None = None) -> Verdict:
+    """Give the verdict on a calibration.
+
+    Args:
+        calibration: of any kind.
+        at: what `pointing` gives of it, where that is known already.
+        evidence: what `gather` gives of it, likewise.
+    """
     if calibration.T_head_zoom is None:
         return Verdict(_without_head(calibration), "unknown")
     if calibration.covariance is None:
         return _without_covariance(calibration)
     if open_ := undetermined(calibration):
         return Verdict(f"Does not determine the rig: {open_}.", "bad")
+    evidence = gather(calibration) if evidence is None else evidence
+    if evidence is not None and _contradicts(calibration, evidence):
+        return Verdict(
+            "Does not explain the corners that are stored with it: they are not what it was made from.", "bad"
+        )
     at = pointing(calibration) if at is None else at
     if not np.isfinite(at[-1].rms):
         return Verdict("Reaches no point of the wide view with the head: its geometry cannot be right.", "bad")
@@ -57,8 +71,22 @@ def judge(calibration: Calibration, at: tuple[AtFocal, ...] | None = None) -> Ve
     if calibration.jitter:
         level = "care" if level == "good" else level
         parts.append(_jitter(calibration, at[-1]))
+    if evidence is not None and evidence.shape.wrong:
+        level = "care" if level == "good" else level
+        size = digits(1000 * np.hypot(evidence.shape.within, evidence.shape.out))
+        parts.append(f"not counting that the board's corners are {size} mm off where they are believed to be")
     text, agrees = _held_out(calibration)
     return Verdict("; ".join([*parts, text]) + ".", level if agrees or level == "bad" else "care")
+
+
+def _contradicts(calibration: Calibration, evidence: Evidence) -> bool:
+    """Whether the stored corners are explained far worse than was recorded."""
+    r = calibration.residuals
+    if r is None:
+        return False
+    recorded = (r.fixed_rms_px, r.zoom_rms_px, r.stereo_rms_px or 0.0, r.handeye_rms_px or 0.0, RECORDED_FLOOR_PX)
+    sigma = max(corners.sigma for corners in evidence.corners.values())
+    return np.sqrt(2) * sigma > CONTRADICTION * max(recorded)
 
 
 def _how_well(at: tuple[AtFocal, ...]) -> str:

@@ -9,13 +9,15 @@ VALUE_DIGITS = 6  # of a value whose uncertainty is not known
 
 
 def digits(value: float, count: int = 2) -> str:
-    """Write a number with so many significant digits and without an exponent: 0.0021, 12, 7200."""
+    """Write a number with so many significant digits and, unless it is tiny, without an exponent: 0.0021, 12, 7200."""
     if not math.isfinite(value):
         return "unknown"
     if value == 0:
         return "0"
     decimals = _decimals(value, count)
-    return f"{round(value, decimals):.{min(max(decimals, 0), MOST_DECIMALS)}f}"
+    if decimals > MOST_DECIMALS:
+        return f"{value:.{count - 1}e}"
+    return f"{round(value, decimals):.{max(decimals, 0)}f}"
 
 
 def _decimals(value: float, count: int) -> int:
