@@ -148,8 +148,9 @@ def pointing_errors(
     count: int,
     method: Method = "exact",
     nominal_px: float | None = None,
+    step: float = 0.0,
 ) -> Array:
-    """Pointing error of a calibration: pixel and depth given exactly, before rounding to steps.
+    """Pointing error of a calibration: pixel and depth given exactly.
 
     Args:
         calibration: to be judged.
@@ -159,6 +160,7 @@ def pointing_errors(
         count: how many targets.
         method: the exact inverse, or the paper's shortcut.
         nominal_px: what the zoom camera's device calls the focal length [px]; the shortest by default.
+        step: to which the head's angles are rounded [rad]; 0 for not at all, which is how the error is stated.
 
     Returns:
         Angle between the line of sight and the true target for each that can be reached [rad], (n,), n <= count.
@@ -173,5 +175,6 @@ def pointing_errors(
             found = aim(calibration, calibration.fixed.ray(pixel) * depth, reach, nominal_px=nominal_px, method=method)
         except UnreachableError:
             continue
-        errors.append(truth.line_of_sight_miss(found.pan, found.tilt, found.nominal_px, x_world))
+        pan, tilt = (round(angle / step) * step if step else angle for angle in (found.pan, found.tilt))
+        errors.append(truth.line_of_sight_miss(pan, tilt, found.nominal_px, x_world))
     return np.array(errors)

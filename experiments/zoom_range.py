@@ -1,0 +1,199 @@
+"""How well a rig points over its whole zoom range, calibrated from rendered boards, with an ideal head and with steps.
+
+The default rig with all effects on, once a seed with a head that stands wherever it is sent and once with one of
+0.0514 degree steps. The pointing error is stated at the shortest focal length and over all others (the angle between
+the line of sight and targets all over the wide view at 4 to 30 m, pixel and depth given exactly); beside it how far
+focal length and boresight are off at and between the stops. With steps, the aim is rounded to them, and the error
+stands beside that of a true calibration rounded alike.
+
+    python -m experiments.zoom_range [--seeds 100] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration, calibrate_rig, predicted_pointing
+from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.config import RigConfig, SimConfig, SimEffects
+from cotarget.geometry import RigidTransform, angle_between
+from cotarget.judging import pointing_errors
+from cotarget.loop import reach_of
+from cotarget.pantilt import HeadGeometry
+from cotarget.safety import SafeRig
+from cotarget.sim.truth import Truth
+from cotarget.sim.world import SimWorld
+from experiments import harness
+from experiments.harness import Experiment, Row, over_seeds, rms, seeds_of, table
+
+STREAM = 6  # of random numbers, apart from the world's own
+FOCAL_LENGTHS = 15  # over the range, evenly in the logarithm: every stop and the middle between any two
+HEADS = {"ideal": False, "steps": True}
+# A grid of targets for the prediction: pixels as shares of the image, and depths [m].
+SHARES, DEPTHS = np.linspace(0.05, 0.95, 4), np.array([5.0, 10.0, 25.0])
+
+
+@dataclass(frozen=True)
+class Settings(harness.Settings):
+    """How many seeds, how many targets at each focal length, and which heads."""
+
+    seeds: int = 100
+    targets: int = 60
+    heads: tuple[str, ...] = tuple(HEADS)
+
+
+def run(settings: Settings) -> list[Row]:
+    """Calibrate once a seed and head; one row for each focal length."""
+    return over_seeds(one, settings)
+
+
+def one(settings: Settings, seed: int) -> list[Row]:
+    """Calibrate with each head."""
+    rows: list[Row] = []
+    for head in settings.heads:
+        sim = SimConfig(scene="indoor", seed=seed, effects=SimEffects(steps=HEADS[head]))
+        config = RigConfig(sim=sim)
+        world = SimWorld(config)
+        with SafeRig(world.rig, config.safety) as rig:
+            calibration = calibrate_rig(rig, config.board, seed=seed)
+            reach, truth = reach_of(rig), world.truth()
+            for i, nominal in enumerate(np.geomspace(*reach.focal_px, FOCAL_LENGTHS)):
+                judged = {"nominal_px": float(nominal), "count": settings.targets}
+                errors = pointing_errors(
+                    calibration, truth, reach, rng=np.random.default_rng((seed, STREAM, i)), **judged
+                )
+                row: Row = {
+                    "head": head,
+                    "seed": seed,
+                    "nominal_px": float(nominal),
+                    "median_deg": float(np.degrees(np.median(errors))),
+                    "p95_deg": float(np.degrees(np.percentile(errors, 95))),
+                    "rms_deg": rms(np.degrees(errors)),
+                    "predicted_deg": float(np.degrees(predicted(calibration, float(nominal)))),
+                    **lens_errors(calibration, truth, float(nominal)),
+                }
+                if HEADS[head]:
+                    for name, one_calibration in (
+                        ("rounded", calibration),
+                        ("rounding", true_calibration(config, truth, float(nominal))),
+                    ):
+                        rng = np.random.default_rng((seed, STREAM, i))
+                        rounded = pointing_errors(one_calibration, truth, reach, rng=rng, step=reach.step, **judged)
+                        row[f"{name}_rms_deg"] = rms(np.degrees(rounded))
+                rows.append(row)
+    return rows
+
+
+def predicted(calibration: Calibration, nominal_px: float) -> float:
+    """Predicted rms pointing error over the wide view and depth [rad]."""
+    u, v, z = np.meshgrid(SHARES, SHARES, DEPTHS)
+    pixels = np.stack([u.ravel(), v.ravel()], axis=-1) * (np.array(calibration.fixed.size) - 1)
+    return rms(predicted_pointing(calibration, pixels, z.ravel(), nominal_px=nominal_px))
+
+
+def lens_errors(calibration: Calibration, truth: Truth, nominal_px: float) -> dict[str, float]:
+    """How far off the focal length is [%], and the ray through the image's middle in the head's frame [degrees]."""
+    found, true = calibration.zoom.at(nominal_px), truth.zoom_lens_for(nominal_px)
+    middle = found.image_center_px
+    here = calibration.hand_eye().rotation.apply(found.ray(middle))
+    there = truth_hand(truth).rotation.apply(np.append(true.directions(middle), 1.0))
+    return {
+        "focal_off_percent": 100 * abs(found.focal_px[0] / true.focal_px[0] - 1),
+        "boresight_off_deg": float(np.degrees(angle_between(here, there))),
+    }
+
+
+def truth_hand(truth: Truth) -> RigidTransform:
+    """The true T_head_zoom, from the world's own poses at home."""
+    return truth.T_world_base.inv() * truth.T_world_camera("zoom", 0.0)
+
+
+def true_calibration(config: RigConfig, truth: Truth, nominal_px: float) -> Calibration:
+    """What a calibration without any error would be at one focal length."""
+    sim, lens = config.sim, truth.zoom_lens_for(nominal_px)
+    to_pupil = RigidTransform.from_translation([0.0, 0.0, lens.pupil])
+    fixed = truth.fixed_lens
+    return Calibration(
+        fixed=Intrinsics(fixed.size, fixed.focal_px, fixed.center_px, fixed.distortion),
+        zoom=ZoomLens((nominal_px,), (Intrinsics(lens.size, lens.focal_px, lens.center_px, lens.distortion),)),
+        T_zoom0_fixed=to_pupil.inv() * sim.T_zoom0_fixed,
+        T_head_zoom=sim.T_head_zoom * to_pupil,
+        head=HeadGeometry(sim.head.axis_offset_mm / 1000, np.radians(sim.head.squareness_deg)),
+    )
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Medians over the seeds, and the worst of the lens."""
+    summary: dict[str, Any] = {}
+    for head in dict.fromkeys(row["head"] for row in rows):
+        mine = [row for row in rows if row["head"] == head]
+        shortest = min(row["nominal_px"] for row in mine)
+        at_shortest = [row for row in mine if row["nominal_px"] == shortest]
+        by_seed: dict[int, list[Row]] = {}
+        for row in mine:
+            by_seed.setdefault(row["seed"], []).append(row)
+        found = {
+            "calibrations": len(by_seed),
+            "shortest_median_deg": median(row["median_deg"] for row in at_shortest),
+            "shortest_p95_deg": median(row["p95_deg"] for row in at_shortest),
+            "range_median_deg": median(np.median([r["median_deg"] for r in same]) for same in by_seed.values()),
+            "range_p95_deg": median(np.percentile([r["p95_deg"] for r in same], 95) for same in by_seed.values()),
+            "worst_seed_range_p95_deg": max(max(r["p95_deg"] for r in same) for same in by_seed.values()),
+            "rms_over_predicted": rms(r["rms_deg"] for r in mine) / rms(r["predicted_deg"] for r in mine),
+            "focal_off_percent": median(max(r["focal_off_percent"] for r in same) for same in by_seed.values()),
+            "worst_focal_off_percent": max(r["focal_off_percent"] for r in mine),
+            "boresight_off_deg": median(max(r["boresight_off_deg"] for r in same) for same in by_seed.values()),
+            "worst_boresight_off_deg": max(r["boresight_off_deg"] for r in mine),
+        }
+        if "rounded_rms_deg" in mine[0]:
+            found["rounded_rms_deg"] = rms(row["rounded_rms_deg"] for row in mine)
+            found["rounding_alone_rms_deg"] = rms(row["rounding_rms_deg"] for row in mine)
+            found["ratio"] = found["rounded_rms_deg"] / found["rounding_alone_rms_deg"]
+        summary[head] = found
+    return summary
+
+
+def median(values: Any) -> float:
+    """Median of an iterable."""
+    return float(np.median(list(values)))
+
+
+def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
+    """A line for each figure, a column for each head."""
+    names = list(dict.fromkeys(name for found in summary.values() for name in found))
+    lines = [[name, *(found.get(name, float("nan")) for found in summary.values())] for name in names]
+    return "\n".join([f"over the zoom range, {seeds_of(settings)}", table(["", *summary], lines)])
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Pointing error over the focal length: medians of all seeds, and what was predicted."""
+    ax = figure.subplots()
+    for head in dict.fromkeys(row["head"] for row in rows):
+        mine = [row for row in rows if row["head"] == head]
+        focal = sorted({row["nominal_px"] for row in mine})
+        for key, style in (("median_deg", "-"), ("p95_deg", "--"), ("predicted_deg", ":")):
+            values = [median(row[key] for row in mine if row["nominal_px"] == f) for f in focal]
+            ax.loglog(focal, values, style, label=f"{head}: {key.removesuffix('_deg')}")
+    ax.set(xlabel="nominal focal length [px]", ylabel="pointing error [degrees]")
+    ax.legend(frameon=False)
+
+
+SETTINGS = Settings()
+EXPERIMENT = Experiment(
+    "zoom_range",
+    "How well a rig points over its whole zoom range, calibrated from rendered boards.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, targets=20, heads=("steps",)),
+    run,
+    summarise,
+    describe,
+    plot,
+)
+
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())
