@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+import cotarget
 from cotarget import cli
 from cotarget.calibration import Calibration, save_calibration
 from cotarget.camera import Intrinsics, ZoomLens
@@ -379,4 +380,4 @@ def test_help_and_version(capsys):
         status, out, err = call(capsys, command, "--help")
         assert (status, err) == (0, "")
         assert out.startswith(f"usage: cotarget {command}")
-    assert call(capsys, "--version")[:2] == (0, f"cotarget {cli.cotarget.__version__}\n")
+    assert call(capsys, "--version")[:2] == (0, f"cotarget {cotarget.__version__}\n")

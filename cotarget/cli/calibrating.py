@@ -1,0 +1,121 @@
+"""The commands that make, judge and prepare calibrations: calibrate, report, board."""
+
+import argparse
+import dataclasses
+import json
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cotarget.cli.arguments import check_outputs, progress_bar
+from cotarget.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cotarget.calibration import Calibration
+
+
+def calibrate(options: argparse.Namespace) -> None:
+    """Cotarget calibrate."""
+    from cotarget import calibration as cal
+    from cotarget.config import BoardConfig, load_config
+    from cotarget.rig import open_rig
+    from cotarget.safety import SafeRig
+
+    check_outputs([options.out], [options.rig, options.source and options.source / "index.json"])
+    photos = {name: getattr(options, name) for name in ("fixed", "zoom", "board", "square")}
+    given = [name for name, value in photos.items() if value is not None]
+    how = cal.Options(options.method, encoders=options.encoders, insist=options.insist)
+    session = {name: getattr(options, name) for name in ("placements", "stops") if getattr(options, name) is not None}
+    if options.rig is None and session:
+        raise ConfigError(f"--{next(iter(session))} goes with --rig; saved captures have what they have")
+    with progress_bar() as progress:
+
+        def tell(done: int, total: int, text: str) -> None:
+            progress(f"calibrating: {text}", done, total)
+
+        if options.rig is not None:
+            if given:
+                raise ConfigError(f"--{given[0]} goes with --from DIR; with --rig, the board is in rig.toml")
+            config = load_config(options.rig)
+            with SafeRig(open_rig(config), config.safety) as rig:
+                found = cal.calibrate_rig(
+                    rig,
+                    config.board,
+                    captures_dir=options.captures,
+                    progress=tell,
+                    pitch_mm=config.sim.zoom.pitch_mm,
+                    seed=config.sim.seed,
+                    options=how,
+                    **session,
+                )
+        elif options.captures is not None:
+            raise ConfigError("--captures goes with --rig; saved captures are read with --from DIR alone")
+        elif given:
+            if missing := [name for name in photos if name not in given]:
+                raise ConfigError(f"plain photos need --{missing[0]} too: --fixed, --zoom, --board and --square")
+            board = BoardConfig(corners=options.board, square=options.square)
+            found = cal.calibrate_photos(options.source, options.fixed, options.zoom, board, options=how, progress=tell)
+        else:
+            if not (options.source / "index.json").exists():
+                raise ConfigError(
+                    f"{options.source}: holds no index.json of captures; plain photos need --fixed, --zoom, --board "
+                    "and --square"
+                )
+            found = cal.calibrate_captures(options.source, options=how, progress=tell)
+        cal.save_calibration(options.out, found)
+    assert found.residuals is not None
+    for rejected in found.residuals.rejected:
+        print(f"not used: {rejected.name}: {rejected.reason}", file=sys.stderr)
+    print(json.dumps(_summary(found, options.out), indent=2))
+
+
+def _summary(found: "Calibration", path: Path) -> dict[str, Any]:
+    """What calibrate prints: the residuals, how well it points, and the verdict."""
+    import numpy as np
+
+    from cotarget.report.pointing import can_point, pointing
+    from cotarget.report.verdict import judge
+
+    assert found.residuals is not None
+    residuals = {k: v for k, v in dataclasses.asdict(found.residuals).items() if k != "rejected"}
+    summary = residuals | {
+        "rejected": len(found.residuals.rejected),
+        "baseline_m": float(np.linalg.norm(found.T_zoom0_fixed.translation)),
+        "head_jitter_deg": math.degrees(found.jitter),
+        "held_out": None if found.held_out is None else dataclasses.asdict(found.held_out),
+    }
+    if can_point(found):
+        at = pointing(found)
+        error = math.degrees(at[0].rms)
+        placements = len({view.board for view in found.views})
+        summary |= {
+            "predicted_error_deg": {f"{one.nominal_px:.0f} px": math.degrees(one.rms) for one in at},
+            # The corners' noise averages out over placements of the same kind.
+            "predicted_error_deg_with_10_more_placements": error * math.sqrt(placements / (placements + 10)),
+        }
+    return summary | {"verdict": judge(found).text, "calibration": str(path)}
+
+
+def report(options: argparse.Namespace) -> None:
+    """Cotarget report."""
+    from cotarget.calibration import load_calibration
+    from cotarget.report.page import write_report
+
+    check_outputs([options.out], [options.calibration])
+    calibration = load_calibration(options.calibration)
+    print(write_report(options.out, calibration, options.calibration.name).text)
+    print(f"the page is {options.out}, and its pictures are in {options.out.stem}_pictures beside it")
+
+
+def board(options: argparse.Namespace) -> None:
+    """Cotarget board."""
+    from cotarget.calibration.printing import print_board
+    from cotarget.config import BoardConfig
+
+    check_outputs([options.out], [])
+    width, height = print_board(options.out, BoardConfig(options.kind, options.board, options.square))
+    print(
+        f"{options.out}: {1000 * width:.1f} x {1000 * height:.1f} mm with its white border; print it at 100 %, stick it"
+    )
+    print("on something flat, and measure ten squares before you trust it")

@@ -1,0 +1,158 @@
+"""The commands. Machine-readable output goes to stdout or the named file; a mistake ends in one line on stderr."""
+
+import argparse
+import logging
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+import cotarget
+from cotarget.cli import calibrating, running
+from cotarget.cli.arguments import corners, count, not_negative, positive
+from cotarget.errors import CotargetError
+
+# Heavy modules (MuJoCo, OpenCV, matplotlib) are imported by the command that needs them, so that --help and
+# mistakes in the arguments answer at once, and `doctor` runs where one of them is broken.
+
+USAGE = 2  # argparse's own exit status
+INTERRUPTED = 130  # a shell's exit status for Ctrl-C
+TERMINATED = 143  # and for SIGTERM
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; return its exit status."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    # A polite end is an end: the rig halts and half-written files go, as on Ctrl-C.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    logging.basicConfig(level=logging.INFO if options.verbose else logging.WARNING, format="%(message)s")
+    try:
+        status = int(options.run(options) or 0)
+        sys.stdout.flush()
+        return status
+    except CotargetError as error:
+        print(f"cotarget {options.command}: {error}", file=sys.stderr)
+        return 1
+    except BrokenPipeError:
+        return 1
+    except OSError as error:  # a full disk, a folder without permission: whatever the commands' own checks missed
+        where = "" if error.filename is None else f"{error.filename}: "
+        print(f"cotarget {options.command}: {where}{error.strerror or error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"cotarget {options.command}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose mistakes, too, end in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, without the usage in front of it."""
+        self.exit(USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="cotarget", description=cotarget.__doc__)
+    parser.add_argument("--version", action="version", version=f"cotarget {cotarget.__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, run: Callable[[argparse.Namespace], int | None], summary: str) -> argparse.ArgumentParser:
+        made = commands.add_parser(name, help=summary, description=summary)
+        made.add_argument("-v", "--verbose", action="store_true", help="say more about what is done")
+        made.set_defaults(run=run)
+        return made
+
+    demo = command("demo", running.demo, "calibrate a simulated rig and follow a book, a person and a bird")
+    demo.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="where to write (demo-out)")
+    demo.add_argument("--seed", type=not_negative, default=0, help="of everything random (0)")
+
+    calibrate = command(
+        "calibrate", calibrating.calibrate, "calibrate from a rig, from saved captures, or from plain photos"
+    )
+    source = calibrate.add_mutually_exclusive_group(required=True)
+    source.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml: drive that rig through a capture plan")
+    source.add_argument("--from", type=Path, metavar="DIR", dest="source", help="captures taken earlier, or photos")
+    calibrate.add_argument(
+        "--out", type=Path, default=Path("calibration.json"), metavar="FILE", help="what to write (calibration.json)"
+    )
+    calibrate.add_argument("--captures", type=Path, metavar="DIR", help="with --rig: keep the images there")
+    calibrate.add_argument("--fixed", metavar="GLOB", help="photos of the fixed camera, such as 'left*.jpg'")
+    calibrate.add_argument(
+        "--zoom", metavar="GLOB", help="photos of the zoom camera, paired by the numbers in the names"
+    )
+    calibrate.add_argument("--board", type=corners, metavar="CxR", help="inner corners of the board, such as 9x6")
+    calibrate.add_argument("--square", type=positive, metavar="M", help="side of a square [m]")
+    calibrate.add_argument(
+        "--placements", type=count, metavar="N", help="with --rig: how many placements of the board (30)"
+    )
+    calibrate.add_argument(
+        "--stops",
+        type=count,
+        metavar="N",
+        help="with --rig: how many stops of the zoom lens; 1 for the shortest alone (8)",
+    )
+    calibrate.add_argument(
+        "--method",
+        choices=("joint", "sequential"),
+        default="joint",
+        help="one fit of everything, or the paper's (joint)",
+    )
+    calibrate.add_argument("--encoders", action="store_true", help="find the encoders' scales and zeros too")
+    calibrate.add_argument(
+        "--insist",
+        action="store_true",
+        help="go on where the motions leave something open, with an uncertainty to match",
+    )
+
+    report = command("report", calibrating.report, "tell whether to trust a calibration, on one page with pictures")
+    report.add_argument("calibration", type=Path, metavar="FILE", help="calibration.json")
+    report.add_argument(
+        "--out", type=Path, default=Path("report.html"), metavar="PAGE", help="what to write (report.html)"
+    )
+
+    aim = command(
+        "aim", running.aim, "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout"
+    )
+    aim.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
+    aim.add_argument("--pixel", type=float, nargs=2, required=True, metavar=("U", "V"), help="in the fixed view [px]")
+    how_far = aim.add_mutually_exclusive_group(required=True)
+    how_far.add_argument("--depth", type=positive, metavar="M", help="along the fixed camera's axis [m]")
+    how_far.add_argument("--size-px", type=positive, metavar="S", help="how large the target of --target appears [px]")
+    aim.add_argument("--target", metavar="NAME", help="a target of rig.toml, for its size")
+    how_close = aim.add_mutually_exclusive_group()
+    how_close.add_argument("--wanted-px", type=positive, metavar="N", help="how large it shall appear [px]")
+    how_close.add_argument("--focal-mm", type=positive, metavar="F", help="the focal length to use [mm]")
+    aim.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml, for limits and targets (the default rig)")
+    aim.add_argument("--ik", choices=("exact", "paper-table", "paper-example"), default="exact", help="(exact)")
+
+    follow = command("follow", running.follow, "follow a target with a calibrated rig")
+    follow.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
+    follow.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
+    follow.add_argument("--target", required=True, metavar="NAME", help="a target of rig.toml")
+    follow.add_argument("--seconds", type=positive, default=20.0, metavar="S", help="for how long (20)")
+    follow.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
+    follow.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
+
+    detect = command("detect", running.detect, "run the fixed camera's detector and tracker on any film")
+    detect.add_argument("film", type=Path, metavar="VIDEO")
+    detect.add_argument("--target", required=True, metavar="NAME", help="a target of rig.toml")
+    detect.add_argument(
+        "--csv", type=Path, required=True, metavar="FILE", help="confirmed tracks, one line each a frame"
+    )
+    detect.add_argument("--video", type=Path, metavar="OUT", help="write the film with the tracks drawn (.mp4)")
+    detect.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml, for targets of your own")
+
+    board = command("board", calibrating.board, "write a calibration board to print, to scale")
+    board.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .pdf, .svg or .png")
+    kinds = ("chessboard", "charuco")
+    board.add_argument("--kind", choices=kinds, default=kinds[0], help="charuco has markers in it (chessboard)")
+    board.add_argument("--board", type=corners, default=(9, 6), metavar="CxR", help="inner corners (9x6)")
+    board.add_argument("--square", type=positive, default=0.025, metavar="M", help="side of a square [m] (0.025)")
+
+    command(
+        "doctor", running.doctor, "versions, rendering, and for each thing that is missing the command that fixes it"
+    )
+    return parser

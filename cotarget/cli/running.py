@@ -1,0 +1,154 @@
+"""The commands that run what was calibrated, and look around: demo, aim, follow, detect, doctor."""
+
+import argparse
+import dataclasses
+import json
+import math
+
+from cotarget.cli.arguments import check_outputs, nothing, progress_bar
+from cotarget.errors import ConfigError
+
+
+def demo(options: argparse.Namespace) -> None:
+    """Cotarget demo."""
+    from cotarget.demo import run_demo, summary
+
+    with progress_bar() as progress:
+        metrics = run_demo(options.out, options.seed, progress)
+    print(summary(metrics))
+    print(f"pictures, video and metrics.json are in {options.out} ({metrics['wall_s']:.0f} s)")
+
+
+def aim(options: argparse.Namespace) -> None:
+    """Cotarget aim."""
+    import numpy as np
+
+    from cotarget.calibration import load_calibration
+    from cotarget.config import RigConfig, load_config
+    from cotarget.targeting import Closeup, Reach, aim, depth_of, error_budget, point_at
+
+    config = RigConfig() if options.rig is None else load_config(options.rig)
+    calibration = load_calibration(options.calibration)
+    if options.rig is not None:
+        calibration = calibration.for_streams(config.sim.fixed.size, config.sim.zoom.size)
+    target = None if options.target is None else config.target(options.target)
+    if options.size_px is not None and target is None:
+        raise ConfigError("--size-px needs --target NAME, whose true size gives the depth")
+    if options.wanted_px is not None and target is None:
+        raise ConfigError("--wanted-px needs --target NAME, whose true size gives the focal length")
+    depth = (
+        options.depth
+        if target is None or options.size_px is None
+        else depth_of(calibration, target, options.size_px, np.array(options.pixel))
+    )
+    pitch_mm = calibration.pitch_mm or config.sim.zoom.pitch_mm
+    shortest, longest = config.focal_range_px
+    if options.rig is None:  # the calibration knows its own lens's shortest focal length
+        shortest = calibration.zoom.nominal_px[0]
+    reach = Reach(*config.head_limits, (shortest, max(shortest, longest)), step=config.head_step)
+    closeup = (
+        Closeup(target.size, options.wanted_px, target.dimension == "height")
+        if target and options.wanted_px is not None
+        else None
+    )
+    nominal = None if options.focal_mm is None else options.focal_mm / pitch_mm
+    if nominal is not None and not reach.focal_px[0] <= nominal <= reach.focal_px[1]:
+        shortest, longest = (f * pitch_mm for f in reach.focal_px)
+        raise ConfigError(f"--focal-mm: {options.focal_mm:g} is beyond the lens's {shortest:g} to {longest:g} mm")
+    pixel = np.array(options.pixel)
+    size = calibration.fixed.size
+    if not (np.all(pixel >= -0.5) and np.all(pixel <= np.array(size) - 0.5)):
+        raise ConfigError(
+            f"--pixel: ({pixel[0]:g}, {pixel[1]:g}) is not in the fixed camera's {size[0]}x{size[1]} image"
+        )
+    found = aim(
+        calibration, point_at(calibration, pixel, depth), reach, closeup=closeup, nominal_px=nominal, method=options.ik
+    )
+    budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px)
+    print(
+        json.dumps(
+            {
+                "pan_deg": math.degrees(found.pan),
+                "tilt_deg": math.degrees(found.tilt),
+                "focal_px": found.focal_px,
+                "focal_mm": found.nominal_px * pitch_mm,
+                "focal_limited": found.limited,
+                "depth_m": found.depth,
+                "range_m": found.range,
+                "predicted_error_deg": {name: math.degrees(part) for name, part in budget.items()},
+                "predicted_error_px": math.tan(budget["total"]) * found.focal_px,
+            },
+            indent=2,
+        )
+    )
+
+
+def follow(options: argparse.Namespace) -> None:
+    """Cotarget follow."""
+    from cotarget.calibration import load_calibration
+    from cotarget.config import load_config
+    from cotarget.detection import make_detector
+    from cotarget.drawing import side_by_side
+    from cotarget.loop import FollowSettings, State, follow
+    from cotarget.recording import StepTable
+    from cotarget.rig import open_rig
+    from cotarget.safety import SafeRig
+    from cotarget.video import FilmWriter
+
+    config = load_config(options.rig)
+    target = config.target(options.target)
+    calibration = load_calibration(options.calibration)
+    if config.backend == "sim" and options.target not in config.sim.targets:
+        raise ConfigError(
+            f"{options.rig}: the simulated scene has no {options.target}; add it: [sim] targets = "
+            f"{json.dumps([*config.sim.targets, options.target])}"
+        )
+    detector = make_detector(target, config.sim.fixed.rate_hz)
+    check_outputs([options.csv, options.video], [options.rig, options.calibration, target.template])
+    settings = FollowSettings(command_delay_s=config.command_delay_s)
+    states: dict[str, int] = dict.fromkeys(State, 0)
+    frames = math.ceil(options.seconds * config.sim.fixed.rate_hz)
+    with (
+        SafeRig(open_rig(config), config.safety) as rig,
+        StepTable(options.csv) as table,
+        FilmWriter(options.video, config.sim.fixed.rate_hz) if options.video else nothing() as video,
+        progress_bar() as progress,
+    ):
+        for step in follow(rig, calibration, target, detector, seconds=options.seconds, settings=settings):
+            table.write(step)
+            states[step.state] += 1
+            if video is not None:
+                video.write(side_by_side(step, options.target))
+            progress(f"following: {options.target}: {step.state}", min(step.index + 1, frames), frames)
+    print(json.dumps({"steps": sum(states.values()), "states": states}, indent=2))
+
+
+def detect(options: argparse.Namespace) -> None:
+    """Cotarget detect."""
+    from cotarget.config import RigConfig, load_config
+    from cotarget.film import run_on_film
+
+    config = RigConfig() if options.rig is None else load_config(options.rig)
+    target = config.target(options.target)
+    check_outputs([options.csv, options.video], [options.film, options.rig, target.template])
+    with progress_bar() as progress:
+        found = run_on_film(
+            options.film,
+            target,
+            options.csv,
+            options.video,
+            lambda done, total: progress(f"detecting: {options.target}", done, total or done),
+        )
+    print(json.dumps(dataclasses.asdict(found), indent=2))
+
+
+def doctor(options: argparse.Namespace) -> int:
+    """Cotarget doctor."""
+    from cotarget.doctor import examine
+
+    findings = examine()
+    for finding in findings:
+        print(f"{'ok     ' if finding.ok else 'MISSING'}  {finding.name}: {finding.text}")
+        if finding.fix:
+            print(f"         fix: {finding.fix}")
+    return 0 if all(finding.ok for finding in findings) else 1
