@@ -8,7 +8,8 @@ Lenses vary by a few per cent, corners have 0.1 to 0.2 px of noise. The head's l
 camera see them, turned to face halfway between both, at 2.5 to 8 m, with squares of 0.1 m; from a baseline of 3 m on,
 depths and squares grow with it. A mounting from which the zoom camera cannot look at a third of the fixed camera's view
 is none, and is drawn again. Targets lie all over the wide view at 4 to 30 m (grown likewise), wherever the head
-reaches.
+reaches. Beside the number of rigs beyond twice their predicted error stands how many chance would put there if every
+covariance were true.
 
     python -m experiments.random_rigs [--seeds 200] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -21,8 +22,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from cotarget.calibration import calibrate_views, predicted_pointing
+from cotarget.calibration import Calibration, calibrate_views, predicted_pointing
 from cotarget.calibration.boards import board_points
+from cotarget.calibration.reprojection import ALL_BLOCKS, POSE_PARAMETERS, stepped
+from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
@@ -40,6 +43,7 @@ from experiments.synthetic import (
     draw_targets,
     misses,
     spread_views,
+    truth_of,
     undistorted,
 )
 
@@ -50,6 +54,7 @@ GROWS_FROM = 3.0  # baseline from which boards and depths grow with it [m]
 NOISE_PX = (0.1, 0.2)
 SERVED = 1 / 3  # of the fixed camera's view that the zoom camera must reach
 WITHIN = 2.0  # times the predicted error
+CHANCE_DRAWS, CHANCE_TARGETS = 50, 50
 
 
 @dataclass(frozen=True)
@@ -101,6 +106,7 @@ def one(settings: RigsSettings, seed: int) -> list[Row]:
         "measured_px": None,
         "predicted_px": None,
         "ratio": None,
+        "beyond_by_chance": None,
         "gamma_off_m": None,
         "gamma_off_deg": None,
     }
@@ -122,10 +128,39 @@ def one(settings: RigsSettings, seed: int) -> list[Row]:
             "measured_px": measured,
             "predicted_px": predicted,
             "ratio": measured / predicted,
+            "beyond_by_chance": by_chance(calibration, pixels[reached], depths[reached], rng),
             "gamma_off_m": float(np.linalg.norm(away.translation)),
             "gamma_off_deg": float(np.degrees(away.rotation.magnitude())),
         }
     ]
+
+
+def by_chance(calibration: Calibration, pixels: Array, depths: Array, rng: np.random.Generator) -> float:
+    """How often an rms error is beyond twice the predicted one although the covariance is true.
+
+    A rig's error has few degrees of freedom, so that its rms over many targets scatters. Calibrations are drawn from
+    the covariance and judged as if the one found were the truth.
+    """
+    covariance = calibration.covariance
+    assert covariance is not None
+    pixels, depths = pixels[:CHANCE_TARGETS], depths[:CHANCE_TARGETS]
+    predicted = rms(predicted_pointing(calibration, pixels, depths))
+    truth, model = truth_of(calibration), model_of(calibration)
+    beyond = 0
+    for step in rng.multivariate_normal(np.zeros(len(covariance.matrix)), covariance.matrix, CHANCE_DRAWS):
+        other = stepped(model, step, np.empty((0, POSE_PARAMETERS)), ALL_BLOCKS)
+        assert other.fixed is not None
+        assert other.zoom is not None
+        wrong = replace(
+            calibration,
+            fixed=other.fixed,
+            zoom=other.zoom,
+            T_zoom0_fixed=other.gamma,
+            T_head_zoom=other.hand,
+            head=other.head,
+        )
+        beyond += rms(misses(wrong, truth, pixels, depths)) > WITHIN * predicted
+    return beyond / CHANCE_DRAWS
 
 
 def draw_rig(rng: np.random.Generator) -> Drawn:
@@ -196,6 +231,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "no_common_view_at_home": sum(row["pairs_at_home"] == 0 for row in rows),
         "widened": sum((row["widened"] or 1) > 1 for row in found),
         "beyond_twice": int((ratios > WITHIN).sum()),
+        "beyond_twice_by_chance": float(sum(row["beyond_by_chance"] for row in found)),
         "ratio_median": float(np.median(ratios)) if len(ratios) else float("nan"),
         "ratio_worst": float(ratios.max()) if len(ratios) else float("nan"),
         "measured_px_median": float(np.median([row["measured_px"] for row in found])) if found else float("nan"),

@@ -29,6 +29,7 @@ WIDEST = 1.2  # tangent of the angle off the axis beyond which distortion may ha
 # Of the head in use: pan and tilt [rad].
 HEAD_LIMITS = ((np.radians(-158.9), np.radians(158.9)), (np.radians(-46.6), np.radians(31.1)))
 CELLS = (5, 3)  # of the wide view, in columns and rows, over which boards are spread
+CELL_STEP = 7  # cells are taken in this step, so that a few boards reach all over as well
 FLATTEST = np.cos(np.radians(65.0))  # a board is not found that is seen at a flatter angle
 FARTHER = 0.03  # by which a board moves away that is not wholly seen, relative to its depth
 GOLDEN = (np.sqrt(5) - 1) / 2  # multiples of it, modulo 1, are evenly spread from the first on
@@ -177,6 +178,25 @@ def _stacked(rows: Sequence[Sequence[Array]]) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def truth_of(calibration: Calibration) -> Truth:
+    """The rig that a calibration describes, at its shortest focal length."""
+    fixed, zoom = (
+        Lens(*lens.focal_px, *lens.center_px, lens.distortion)
+        for lens in (calibration.fixed, calibration.zoom.stops[0])
+    )
+    head = calibration.head
+    return Truth(
+        fixed=fixed,
+        zoom=zoom,
+        gamma=calibration.T_zoom0_fixed,
+        hand=calibration.hand_eye(),
+        dz=head.axis_offset,
+        eps=head.squareness,
+        pan_scale=head.pan_scale,
+        tilt_scale=head.tilt_scale,
+    )
+
+
 def other_rig() -> Truth:
     """A wide baseline, toed in, with a long lever and a rolled camera."""
     return Truth(gamma=pose([-1.5, 0.1, -0.1], [1.0, 12.0, 5.0]), hand=pose([0.1, -0.15, 0.08], [2.0, 1.5, 5.0]))
@@ -307,7 +327,7 @@ def placed(truth: Truth, points: Array, rng: np.random.Generator, placing: Placi
         AssertionError: there is none.
     """
     centered = points - points.mean(axis=0)
-    column, row = number % CELLS[0], number // CELLS[0] % CELLS[1]
+    row, column = divmod(number * CELL_STEP % (CELLS[0] * CELLS[1]), CELLS[0])
     near, far = np.log(np.array(placing.depths))
     depth = near + (far - near) * (GOLDEN * number % 1)
     zoom_at = truth.gamma.inv().translation
@@ -435,9 +455,7 @@ def aim(calibration: Calibration, x_fixed: Array) -> Array:
         As the head reports them [rad], (2,) or (n, 2); nan where there is no such pose.
     """
     head = calibration.head
-    model = Truth(
-        gamma=calibration.T_zoom0_fixed, hand=calibration.hand_eye(), dz=head.axis_offset, eps=head.squareness
-    )
+    model = truth_of(calibration)
     lens = calibration.zoom.stops[0]
     q = aimed(model, np.atleast_2d(x_fixed), lens.ray(lens.image_center_px))
     q = (q - [head.pan_zero, head.tilt_zero]) / [head.pan_scale, head.tilt_scale]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import binom, chi2
+from scipy.stats import binom
 
 from cotarget.calibration import (
     Calibration,
@@ -27,7 +27,8 @@ from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform
 from cotarget.targeting import Reach, aim, error_budget, point_at
-from experiments.synthetic import SIZE, Truth, other_rig, pointing_errors, synthetic_views
+from experiments.honesty import GROUPS, error_of, inside
+from experiments.synthetic import SIZE, Truth, draw_targets, other_rig, pointing_errors, synthetic_views
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)
@@ -52,57 +53,6 @@ def calibrated(model, covariance):
     return Calibration(model.fixed, model.zoom, model.gamma, model.hand, model.head, covariance=covariance)
 
 
-def error_of(calibration, truth):
-    """Truth less what was found, by name; a transform's as a turn exp(w) in front of R and a shift of t."""
-    pairs = [("fixed", truth.fixed, calibration.fixed), ("zoom[0]", truth.zoom, calibration.zoom.stops[0])]
-    error = {
-        f"{camera}.{name}": a - b
-        for camera, true, lens in pairs
-        for name, a, b in zip(
-            ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
-            (true.fx, true.fy, true.cx, true.cy, *true.distortion[:4]),
-            (*lens.focal_px, *lens.center_px, *lens.distortion[:4]),
-            strict=True,
-        )
-    }
-    transforms = [
-        ("T_zoom0_fixed", truth.gamma, calibration.T_zoom0_fixed),
-        ("T_head_zoom", truth.hand, calibration.T_head_zoom),
-    ]
-    for name, true, found in transforms:
-        turn, shift = (true.rotation * found.rotation.inv()).as_rotvec(), true.translation - found.translation
-        error |= {f"{name}.{k}": v for k, v in zip(("rx", "ry", "rz", "tx", "ty", "tz"), (*turn, *shift), strict=True)}
-    error["head.axis_offset"] = truth.dz - calibration.head.axis_offset
-    error["head.squareness"] = truth.eps - calibration.head.squareness
-    return error
-
-
-def inside(calibration, truth, names, level):
-    """Whether the truth lies within the ellipsoid of a level that these parameters span."""
-    covariance, error = calibration.covariance, error_of(calibration, truth)
-    rows = [covariance.parameters.index(name) for name in names]
-    e = np.array([error[name] for name in names])
-    return e @ np.linalg.solve(covariance.matrix[np.ix_(rows, rows)], e) < chi2.ppf(level, len(rows))
-
-
-def same_targets(seed):
-    """The targets that experiments.synthetic.draw_targets draws: pixels and depths."""
-    rng = np.random.default_rng(seed)
-    drawn = [
-        (rng.uniform([0, 0], np.array(SIZE) - 1.0), np.exp(rng.uniform(np.log(4), np.log(30)))) for _ in range(TARGETS)
-    ]
-    return np.array([pixel for pixel, _ in drawn]), np.array([depth for _, depth in drawn])
-
-
-GROUPS = {
-    "T": [n for n in parameter_names(ALL_BLOCKS) if n.startswith("T_head_zoom")],
-    "Gamma": [n for n in parameter_names(ALL_BLOCKS) if n.startswith("T_zoom0_fixed")],
-    "wide focal length": ["fixed.fx", "fixed.fy"],
-    "zoom focal length": ["zoom[0].fx", "zoom[0].fy"],
-    "everything": parameter_names(ALL_BLOCKS),
-}
-
-
 def honesty(truth, seeds, outliers=0.0):
     """Fraction of 90 % ellipsoids that hold the truth, of each group; measured and predicted rms pointing error."""
     exact = synthetic_views(truth, POINTS, np.random.default_rng(7), boards=8, noise_px=0.0)
@@ -113,9 +63,9 @@ def honesty(truth, seeds, outliers=0.0):
         result = fit(start, noisy(exact, np.random.default_rng([seed, 1]), outliers), POINTS, ALL_BLOCKS)
         calibration = calibrated(result.model, covariance_of(result))
         for name, parameters in GROUPS.items():
-            hits[name] += bool(inside(calibration, truth, parameters, 0.9))
+            hits[name] += inside(calibration, truth, parameters, 0.9)
         measured.append(np.radians(pointing_errors(calibration, truth, np.random.default_rng(seed), TARGETS)))
-        predicted.append(predicted_pointing(calibration, *same_targets(seed)))
+        predicted.append(predicted_pointing(calibration, *draw_targets(np.random.default_rng(seed), TARGETS)))
     rms = [float(np.sqrt(np.mean(np.square(errors)))) for errors in (measured, predicted)]
     return {name: count / seeds for name, count in hits.items()}, *rms
 

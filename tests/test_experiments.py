@@ -1,0 +1,186 @@
+"""The experiments' harness, and the synthetic rig's truth against what is worked by hand."""
+
+import csv
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.geometry import RigidTransform, pose
+from experiments import photos, random_rigs
+from experiments.harness import Experiment, Settings, over_seeds, rms, spread, table
+from experiments.synthetic import (
+    SIZE,
+    Lens,
+    Placing,
+    Stop,
+    Truth,
+    aimed,
+    spread_views,
+    undistorted,
+    views_at_stops,
+    with_lever_shifted,
+)
+
+PHOTOS = Path(__file__).parents[2] / "shared" / "data" / "opencv_stereo"
+STILL = RigidTransform.identity()
+PLAIN = Lens(500.0, 500.0, 320.0, 240.0)
+# Everything in one place, looking along +z.
+PLAIN_RIG = Truth(fixed=PLAIN, zoom=PLAIN, gamma=STILL, hand=STILL, dz=0.0, eps=0.0)
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class DummySettings(Settings):
+    factor: float = 2.0
+
+
+def dummy(settings, seed):
+    return [{"seed": seed, "value": settings.factor * seed, "missing": None}, {"seed": seed, "extra": "a"}]
+
+
+def summed(rows):
+    return {"sum": sum(row.get("value", 0.0) for row in rows), "nothing": float("nan"), "by": {1: np.float64(2.5)}}
+
+
+EXPERIMENT = Experiment(
+    "dummy",
+    "Sums.",
+    DummySettings(seeds=4),
+    DummySettings(seeds=2),
+    lambda settings: over_seeds(dummy, settings),
+    summed,
+    lambda _, summary: f"sum {summary['sum']}",
+    lambda rows, figure: figure.subplots().plot([row.get("value", 0.0) for row in rows]),
+)
+
+
+def test_a_run_writes_its_files(tmp_path, capsys):
+    out = tmp_path / "new" / "folder"
+    assert EXPERIMENT.main(["--seeds", "3", "--seed-base", "10", "--processes", "1", "--out", str(out)]) == 0
+    assert capsys.readouterr().out == "sum 66.0\n"
+    result = json.loads((out / "result.json").read_text())
+    assert result["settings"] == {"seeds": 3, "seed_base": 10, "processes": 1, "factor": 2.0}
+    assert result["summary"] == {"sum": 66.0, "nothing": None, "by": {"1": 2.5}}
+    assert set(result["versions"]) == {"cotarget", "opencv", "numpy", "scipy"}
+    rows = list(csv.DictReader((out / "rows.csv").read_text().splitlines()))
+    assert [row["seed"] for row in rows] == ["10", "10", "11", "11", "12", "12"]
+    assert (rows[0]["value"], rows[0]["extra"], rows[1]["extra"]) == ("20.0", "", "a")
+    assert cv2.imread(str(out / "figure.png")) is not None
+    assert EXPERIMENT.main(["--quick", "--processes", "1"]) == 0
+    assert capsys.readouterr().out == "sum 2.0\n"
+
+
+def test_processes_change_nothing():
+    assert list(spread(str, range(3), 2)) == list(spread(str, range(3), 1)) == ["0", "1", "2"]
+
+
+def test_tables_and_rms():
+    text = table(("a", "b"), [["x", 1.0], ["long", 123.4], ["y", float("nan")]])
+    assert text.splitlines() == ["a        b", "x     1.00", "long   123", "y        -"]
+    assert rms([3.0, float("nan"), 4.0]) == pytest.approx(np.sqrt(12.5))
+    assert np.isnan(rms([]))
+
+
+@pytest.mark.parametrize("lens", [
+    PLAIN,
+    Lens(686.0, 684.0, 325.0, 239.0, (-0.2, 0.05, 0.001, -0.002, 0.01)),
+    Lens(686.0, 684.0, 325.0, 239.0, (0.5, 0, 0, 0, 0, 1.0, 0.3, 0)),
+    Lens(686.0, 684.0, 325.0, 239.0, (-0.2, 0, 0, 0, 0, 0, 0, 0, 0.003, 0.002, -0.002, 0.001)),
+    Lens(686.0, 684.0, 325.0, 239.0, (-0.15, 0.1, 0, 0), fisheye=True),
+], ids=["plain", "usual", "rational", "thin prism", "fisheye"])  # fmt: skip
+def test_undistorting_is_the_inverse_of_projecting(lens):
+    pixels = np.array([[0.0, 0.0], [639.0, 479.0], [320.0, 240.0], [10.0, 400.0]])
+    xy = undistorted(pixels, lens)
+    assert np.allclose(lens.project(np.c_[xy, np.ones(4)]), pixels, rtol=0, atol=1e-7)
+    assert np.allclose(undistorted(pixels[1], lens), xy[1])
+
+
+def test_an_equidistant_fisheye():
+    lens = replace(PLAIN, distortion=(0, 0, 0, 0), fisheye=True)
+    assert np.allclose(lens.project([[np.tan(0.3), 0.0, 1.0]]), [[320.0 + 500.0 * 0.3, 240.0]])
+
+
+def test_where_the_head_stands():
+    at, came = np.array([0.2, -0.1]), np.array([0.1, 0.3])
+    assert PLAIN_RIG.stands(at, came) == (0.2, -0.1)
+    assert np.allclose(replace(PLAIN_RIG, play=0.02).stands(at, came), (0.19, -0.09))  # it lags behind
+    assert np.allclose(replace(PLAIN_RIG, play=0.02).stands(at, at), at)
+    assert np.allclose(replace(PLAIN_RIG, sag=0.01).stands(np.array([0.0, np.pi / 3])), (0.0, np.pi / 3 + 0.005))
+    assert np.allclose(replace(PLAIN_RIG, pan_scale=1.1).stands(at), (0.22, -0.1))
+    jittery = replace(PLAIN_RIG, jitter=0.01)
+    drawn = np.array([jittery.stands(at, None, np.random.default_rng(i)) for i in range(400)])
+    assert np.allclose(drawn.std(axis=0), 0.01, rtol=0.15)  # 400 tell it to 3.5 %
+    assert jittery.stands(at) == (0.2, -0.1)
+
+
+def test_a_lever_that_gives_or_slips():
+    x = np.array([[0.0, 0.0, 5.0]])
+    giving = replace(PLAIN_RIG, give=(0.0, 0.0, 0.1))
+    assert np.allclose(giving.in_zoom(x, 0.0, 0.0), x)
+    # Tilted up by 0.2, the camera has moved forward by 0.02 along its own axis.
+    tilted = PLAIN_RIG.in_zoom(x, 0.0, 0.2)
+    assert np.allclose(giving.in_zoom(x, 0.0, 0.2), tilted - [0.0, 0.0, 0.02])
+    slipped = with_lever_shifted(replace(PLAIN_RIG, gamma=pose([-0.4, 0, 0], [0, 0, 0])), (0.0, 0.1, 0.0))
+    # The camera is 0.1 lower on a head that stands where it stood.
+    assert np.allclose(slipped.in_zoom(x, 0.0, 0.0), [[-0.4, -0.1, 5.0]])
+
+
+def test_aiming_at_points_one_each():
+    x, rays = np.array([[1.0, 0.0, 1.0], [0.0, -1.0, 2.0], [0.0, 0.0, -3.0]]), np.array([0.0, 0.0, 1.0])
+    assert np.allclose(np.abs(aimed(PLAIN_RIG, x, rays)[:2]), [[np.pi / 4, 0.0], [0.0, np.arctan(0.5)]])
+    x_zoom = Truth().in_zoom(x[:2] * 5, *aimed(Truth(), x[:2] * 5, rays).T)
+    assert np.allclose(x_zoom[:, :2] / x_zoom[:, 2:], 0.0, atol=ROUNDING)
+
+
+def test_boards_are_spread_and_seen():
+    points = np.array([[x, y, 0.0] for y in (0.0, 0.5) for x in (0.0, 0.8)])
+    placing = Placing(boards=15, looks=3)
+    views = spread_views(Truth(), points, np.random.default_rng(0), 0.0, placing)
+    assert len(views) == 15 * 4
+    for view in views:
+        assert ((view.corners_px >= 0) & (view.corners_px <= np.array(SIZE) - 1)).all()
+    fixed = np.concatenate([view.corners_px for view in views if view.camera == "fixed"])
+    assert (fixed.min(axis=0) < [60, 60]).all()
+    assert (fixed.max(axis=0) > [580, 420]).all()
+    shape = points + np.array([[0.01], [0.0], [0.0], [0.01]]) * [0.0, 0.0, 1.0]
+    bent = spread_views(Truth(), points, np.random.default_rng(0), 0.0, placing, shape=shape)
+    assert not np.allclose(bent[0].corners_px, views[0].corners_px, atol=0.01)
+
+
+def test_a_board_seen_in_part_through_a_longer_lens():
+    v, u = np.mgrid[:6, :9]
+    x_fixed = np.c_[u.ravel() * 0.1 - 0.4, v.ravel() * 0.1 - 0.25, np.full(54, 5.0)]
+    stop = Stop(4000.0, replace(PLAIN, fx=4000.0, fy=4000.0), pupil=0.5)
+    views = views_at_stops(replace(PLAIN_RIG, stops=(stop,)), [x_fixed], np.random.default_rng(0), 0.0, looks=4)
+    assert views
+    for view in views:
+        assert view.focal_px == 4000.0
+        across = np.diff(view.corners_px.reshape(6, 9, 2)[..., 0], axis=1)
+        # 0.1 m at 4.5 m from the pupil, a little stretched by the tilt; not all corners are within 640 px.
+        assert np.nanmedian(across) == pytest.approx(4000 * 0.1 / 4.5, rel=0.05)
+        assert 12 <= view.seen.sum() < 54
+
+
+def test_random_rigs_are_within_what_is_promised():
+    rigs = [random_rigs.draw_rig(np.random.default_rng(i)) for i in range(20)]
+    for rig in rigs:
+        baseline = np.linalg.norm(rig.truth.gamma.inv().translation)
+        assert 0.1 <= baseline <= 10
+        assert rig.served >= random_rigs.SERVED
+        assert rig.grown == pytest.approx(max(1.0, baseline / 3))
+        assert np.linalg.norm(rig.truth.hand.translation) <= 0.3
+
+
+@pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"the real stereo photos are not at {PHOTOS}")
+def test_the_real_photos(capsys):
+    assert photos.main([str(PHOTOS), "--quick", "--processes", "1"]) == 0
+    assert "left13.jpg, right13.jpg" not in capsys.readouterr().out  # two pairs only
+
+
+def test_no_photos(tmp_path, capsys):
+    assert photos.main([str(tmp_path)]) == 1
+    assert "no file matches 'left*.jpg'" in capsys.readouterr().err
