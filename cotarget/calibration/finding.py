@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from cotarget.calibration.boards import board_points, find_corners
+from cotarget.calibration.boards import another_board, board_points, find_corners, guess_corners
 from cotarget.calibration.captures import CaptureIndex, read_images
 from cotarget.calibration.joint import joint
 from cotarget.calibration.model import CameraName, Capture, Options, Rejected, View, unseen
@@ -30,6 +30,8 @@ from cotarget.geometry import Array
 Progress = Callable[[int, int, str], None]  # done, total, text
 
 NO_BOARD = "no whole board of {}x{} corners is seen"
+TWO_BOARDS = "two boards are in this picture; show one"
+GUESSES = 10  # pictures in which another board is looked for when the one configured is in none
 NO_PLACE = "its board is seen by neither camera at the shortest focal length, so that nothing tells where it is"
 NOT_EXPECTED = "no part of the board is seen where it should be"
 TEACHING_VIEWS = 4  # of a stop, after each of which it is fitted again
@@ -77,14 +79,12 @@ def find_views(directory: Path, index: CaptureIndex, progress: Progress | None =
         view = find_view(capture, index.board)
         if view is None:
             rejected.append(Rejected(str(capture.source), NO_BOARD.format(*index.board.corners)))
+        elif another_board(capture.image, index.board, view.corners_px):
+            rejected.append(Rejected(str(capture.source), TWO_BOARDS))
         else:
             views.append(view)
     if not views:
-        columns, rows = index.board.corners
-        raise CalibrationError(
-            f"{directory}: no picture shows a whole {index.board.kind} of {columns}x{rows} inner corners; "
-            "check the board's corners, and that every picture shows all of it"
-        )
+        raise CalibrationError(f"{directory}: {_why_none(directory, index, rejected)}")
     if later:
         if progress is not None:
             progress(len(index.captures), len(index.captures), "fitting the shortest focal length")
@@ -92,6 +92,19 @@ def find_views(directory: Path, index: CaptureIndex, progress: Progress | None =
         views += more
         rejected += lost
     return Found(tuple(views), tuple(rejected), sizes)
+
+
+def _why_none(directory: Path, index: CaptureIndex, rejected: Sequence[Rejected]) -> str:
+    """Why no picture has given a view, as far as a look at some of them tells."""
+    board = index.board
+    name = f"{board.kind} of {board.corners[0]}x{board.corners[1]} inner corners"
+    if any(one.reason == TWO_BOARDS for one in rejected):
+        return f"no picture shows one {name} alone; {TWO_BOARDS}, like {rejected[0].name}"
+    every = max(len(index.captures) // GUESSES, 1)
+    for capture in read_images(directory, index.captures[::every]):
+        if board.kind == "chessboard" and (seen := guess_corners(capture.image)) not in (None, board.corners):
+            return f"no picture shows a whole {name}; a board of {seen[0]}x{seen[1]} is seen in {capture.source}"
+    return f"no picture shows a whole {name}; check the board's corners, and that every picture shows all of it"
 
 
 def _find_parts(
