@@ -182,6 +182,14 @@ def test_the_verdict_is_as_true_as_it_says(plain, stops):
     )
 
 
+def test_the_verdict_speaks_of_focal_lengths_between_the_stops(stops):
+    at = pointing(stops)
+    worse = replace(at[0], focal_px=1000.0, rms=2 * max(one.rms for one in at))
+    said = f"and to {digits(np.degrees(worse.rms))} degrees ({digits(worse.rms_px)} px) between its stops, at 1000 px"
+    assert said in judge(stops, at, (worse,)).text
+    assert "between its stops" not in judge(stops, at, ()).text
+
+
 def test_the_verdict_says_the_plain_truth(plain):
     well, kept = judge(plain), plain.held_out
     assert well.level == "good"
@@ -255,7 +263,7 @@ def test_a_bent_board_is_seen_and_said(plain):
     found = judge(calibration)
     assert found.level == "care"
     assert "not counting that the board's corners are 1." in found.text
-    assert any("mount it on something flat" in item for item in advice(calibration, (), (), evidence))
+    assert any("mount it on something flat" in item for item in advice(calibration, (), (), (), evidence))
     assert not gather(plain).shape.wrong
 
 
@@ -273,14 +281,16 @@ def test_a_pattern_in_the_residuals_and_a_bare_corner_are_seen():
 
 def test_advice_follows_from_the_figures(plain):
     at, parts = pointing(plain), contributions(plain)
-    words = advice(plain, at, parts, gather(plain))
+    words = advice(plain, at, (), parts, gather(plain))
     assert f"Were {parts[0].group} known exactly" in words[0]
     assert f"the error would be {digits(np.degrees(parts[0].left))} instead" in words[0]
     assert any("36 more would halve it" in item for item in words)  # a quarter of the variance takes 4 * 12
     still = replace(plain, views=tuple(replace(v, tilt=0.0) if v.camera == "zoom" else v for v in plain.views))
-    assert any("The head's tilt changed by 0 degrees" in item for item in advice(still, at, parts, gather(still)))
+    assert any("The head's tilt changed by 0 degrees" in item for item in advice(still, at, (), parts, gather(still)))
     much = replace(at[0], rms=10 * at[0].rms)
-    words = advice(plain, (much,), (Contribution(JITTER_GROUP, at[0].rms),), gather(plain))
+    words = advice(plain, (much,), (), (Contribution(JITTER_GROUP, at[0].rms),), gather(plain))
+    between = (replace(at[0], nominal_px=777.0, rms=4 * at[0].rms),)
+    assert any("at 777 px" in item and "Add a stop" in item for item in advice(plain, at, between, parts, None))
     assert any("makes 99 % of the squared error" in item for item in words)
     assert any("play in the gears" in item for item in words)
     assert any("no number of them would halve it" in item for item in words)

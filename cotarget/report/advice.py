@@ -36,12 +36,13 @@ MORE = 10  # placements
 def advice(
     calibration: Calibration,
     at: tuple[AtFocal, ...],
+    between: tuple[AtFocal, ...],
     parts: tuple[Contribution, ...],
     evidence: Evidence | None,
 ) -> list[str]:
     """Say what would help most, in that order; empty where nothing stands out."""
     items = [*_missing(calibration), *_disagreement(calibration), *_largest_part(at, parts)]
-    items += _worst_corner(calibration, at)
+    items += [*_between_stops(at, between), *_worst_corner(calibration, at)]
     if evidence is not None:
         items += [*_images(calibration, evidence), *_patterns(evidence), *_situation(calibration, evidence)]
         items += _more_of_the_same(at, parts, len(evidence.distances))
@@ -97,6 +98,16 @@ def _largest_part(at: tuple[AtFocal, ...], parts: tuple[Contribution, ...]) -> I
         else:
             action = ACTIONS.get(part.group, BOTH)
             yield f"Were {part.group} known exactly, {gain}: {action}."
+
+
+def _between_stops(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Iterator[str]:
+    """Where the zoom lens is interpolated too far."""
+    worst = max(between, key=lambda one: one.rms, default=None)
+    if worst is not None and worst.rms > MUCH_WORSE * max(stop.rms for stop in at):
+        yield (
+            f"Between the zoom lens's stops it is only interpolated: at {worst.nominal_px:.0f} px by the lens's own "
+            f"account the error is {_degrees(worst.rms)} degrees. Add a stop there."
+        )
 
 
 def _worst_corner(calibration: Calibration, at: tuple[AtFocal, ...]) -> Iterator[str]:

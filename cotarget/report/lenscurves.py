@@ -35,7 +35,10 @@ class LensCurves:
 
 
 def lens_curves(calibration: Calibration) -> LensCurves:
-    """Evaluate the zoom lens between its stops; standard deviations by linear propagation of the covariance."""
+    """Evaluate the zoom lens between its stops.
+
+    Standard deviations are by linear propagation of the covariance, and of what is in doubt between stops.
+    """
     lens = calibration.zoom
     nominal = np.geomspace(lens.nominal_px[0], lens.nominal_px[-1], POINTS)
     return LensCurves(
@@ -74,4 +77,6 @@ def _sigmas(calibration: Calibration, nominal_px: Array) -> dict[str, Array]:
         columns.append((plus - minus) / (2 * STEP))
     J = np.array(columns)  # (parameters, 6, n)
     variance = np.einsum("pcn,pq,qcn->cn", J, covariance.matrix[np.ix_(own, own)], J)
-    return dict(zip(CURVES, np.sqrt(np.maximum(variance, 0.0)), strict=True))
+    sigmas = dict(zip(CURVES, np.sqrt(np.maximum(variance, 0.0)), strict=True))
+    doubt = np.array([calibration.zoom.center_doubt_px(float(n)) for n in nominal_px])
+    return sigmas | {name: np.hypot(sigmas[name], doubt[:, i]) for i, name in enumerate(("cx", "cy"))}

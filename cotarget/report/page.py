@@ -14,7 +14,7 @@ from cotarget.report.advice import advice, board_in_words
 from cotarget.report.evidence import CAMERAS, Evidence, averaged, gather, share_beyond
 from cotarget.report.figures import NAMES
 from cotarget.report.markup import Picture
-from cotarget.report.pointing import DEPTHS, AtFocal, Contribution, contributions, pointing
+from cotarget.report.pointing import DEPTHS, AtFocal, Contribution, between_stops, contributions, pointing
 from cotarget.report.tables import STRONG, Table, correlations, key_figures, parameter_tables, provenance
 from cotarget.report.verdict import LABELS, Verdict, judge
 from cotarget.report.wording import count, digits, percent
@@ -42,10 +42,13 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
     """
     check(calibration)
     at = pointing(calibration)
+    between = pointing(calibration, between_stops(calibration))
     evidence = gather(calibration)
-    found = judge(calibration, at, evidence)
-    made = pictures.draw(calibration, at, evidence)
-    body = _body(calibration, source, found, at, contributions(calibration), evidence, made)
+    found = judge(calibration, at, between, evidence)
+    parts = contributions(calibration)
+    made = pictures.draw(calibration, at, between, evidence)
+    items = advice(calibration, at, between, parts, evidence)
+    body = _body(calibration, source, found, at, parts, evidence, made, items)
     page = markup.document(f"Calibration report: {source}", STYLE.read_text(encoding="utf-8"), body)
     _write_pictures(path.with_name(f"{path.stem}_pictures"), made)
     write_atomically(path, page.encode())
@@ -93,6 +96,7 @@ def _body(
     parts: tuple[Contribution, ...],
     evidence: Evidence | None,
     made: dict[str, Picture],
+    items: list[str],
 ) -> str:
     several = len(calibration.zoom.stops) > 1
     sections = [
@@ -104,7 +108,7 @@ def _body(
         *([("lens", "The zoom lens over its focal lengths", [markup.figure(made["lens"])])] if several else []),
         ("heldout", "Captures kept out of the fit", _held_out(calibration)),
         ("rejected", "Images not used", _rejected(calibration)),
-        ("advice", "What would make it better", _advice(advice(calibration, at, parts, evidence))),
+        ("advice", "What would make it better", _advice(items)),
     ]
     return "\n".join([_header(calibration, source, found), *(markup.section(*each) for each in sections)])
 

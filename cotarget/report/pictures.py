@@ -28,7 +28,9 @@ Add = Callable[[str, Figure, str, str], None]  # name, figure, alt, caption
 DENSE = {"pointing_map": figures.PNG_DPI, "residuals": 140, "coverage": figures.PNG_DPI}
 
 
-def draw(calibration: Calibration, at: tuple[AtFocal, ...], evidence: Evidence | None) -> dict[str, Picture]:
+def draw(
+    calibration: Calibration, at: tuple[AtFocal, ...], between: tuple[AtFocal, ...], evidence: Evidence | None
+) -> dict[str, Picture]:
     """Draw what the calibration has the data for, by the names of `NAMES`."""
     made: dict[str, Picture] = {}
 
@@ -38,7 +40,7 @@ def draw(calibration: Calibration, at: tuple[AtFocal, ...], evidence: Evidence |
         made[name] = Picture(name, png, None if dense else figures.as_bytes(figure, "svg"), alt, caption)
 
     if at and np.isfinite(at[-1].rms):
-        _pointing(calibration, at, evidence, add)
+        _pointing(calibration, at, between, evidence, add)
     if evidence is not None:
         _corners(calibration, evidence, add)
     if len(calibration.zoom.stops) > 1:
@@ -53,7 +55,13 @@ def draw(calibration: Calibration, at: tuple[AtFocal, ...], evidence: Evidence |
     return made
 
 
-def _pointing(calibration: Calibration, at: tuple[AtFocal, ...], evidence: Evidence | None, add: Add) -> None:
+def _pointing(
+    calibration: Calibration,
+    at: tuple[AtFocal, ...],
+    between: tuple[AtFocal, ...],
+    evidence: Evidence | None,
+    add: Add,
+) -> None:
     last = at[-1]
     add(
         "pointing_map",
@@ -73,9 +81,10 @@ def _pointing(calibration: Calibration, at: tuple[AtFocal, ...], evidence: Evide
     if len(at) > 1:
         add(
             "pointing_focal",
-            pointingfigures.focal_figure(calibration, at),
+            pointingfigures.focal_figure(at, between),
             "Curves of the predicted pointing error over the focal length, in degrees and in pixels of the zoom image",
-            "Over focal length, rms over the wide view and the depths; the dots are the calibrated stops.",
+            "Over focal length, rms over the wide view and the depths; the dots are the calibrated stops. Between "
+            "them the lens is interpolated, and what that leaves in doubt is counted.",
         )
 
 

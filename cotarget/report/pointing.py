@@ -1,5 +1,6 @@
 """What a calibration predicts of its own pointing, all over the wide view, and which parameters that comes from."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from cotarget.geometry import Array
 DEPTHS = (4.0, 30.0)  # where targets are [m]
 CELLS = (9, 7)  # across and down the wide view, at whose middles pointing is predicted
 DEPTH_STEPS = 5
+BETWEEN_STOPS = 6  # focal lengths to look at between the stops, shared out, but never fewer than one each
 # Groups of parameters in the order of the page: how people call them, and how their names begin.
 GROUPS = (
     ("the fixed camera's lens", ("fixed.",)),
@@ -94,6 +96,13 @@ def pointing(calibration: Calibration, nominal_px: Sequence[float] | None = None
         rms, worst = _over_the_view(calibration, nominal)
         found.append(AtFocal(nominal, float(np.mean(calibration.zoom.at(nominal).focal_px)), rms, worst))
     return tuple(found)
+
+
+def between_stops(calibration: Calibration) -> list[float]:
+    """Nominal focal lengths between the stops of the zoom lens, where it is only interpolated [px]."""
+    stops = calibration.zoom.nominal_px
+    each = max(1, BETWEEN_STOPS // max(len(stops) - 1, 1))
+    return [float(n) for a, b in itertools.pairwise(stops) for n in np.geomspace(a, b, each + 2)[1:-1]]
 
 
 def _over_the_view(calibration: Calibration, nominal_px: float) -> tuple[float, float]:

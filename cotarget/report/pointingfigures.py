@@ -1,6 +1,5 @@
 """Pictures of the predicted pointing error: over the wide view, over depth and over focal length."""
 
-import itertools
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from cotarget.calibration.model import Calibration
 from cotarget.calibration.uncertainty import predicted_pointing
 from cotarget.geometry import Array
 from cotarget.report.figures import BLUE, HEAT, INK, ORANGE, as_image, focal_ticks, styled
-from cotarget.report.pointing import DEPTHS, AtFocal, pointing, sample_depths
+from cotarget.report.pointing import DEPTHS, AtFocal, sample_depths
 from cotarget.report.wording import digits
 
 MAP_DEPTHS = 3
@@ -21,7 +20,6 @@ TICKS = 5
 LOG_RATIO = 8.0  # from where on colours go by the logarithm
 CURVE_REACH = 3.0  # the curve goes so many times nearer and farther than targets are
 CURVE_POINTS = 60
-BETWEEN_STOPS = 6  # focal lengths evaluated between the stops, shared out, but never fewer than two each
 
 
 def map_figure(calibration: Calibration, at: AtFocal) -> Figure:
@@ -99,12 +97,8 @@ def depth_figure(calibration: Calibration, at: AtFocal, boards: Array | None) ->
         return figure
 
 
-def focal_figure(calibration: Calibration, stops: tuple[AtFocal, ...]) -> Figure:
+def focal_figure(stops: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Figure:
     """Draw the predicted error over focal length, rms over the wide view and the depths, in degrees and in px."""
-    known = [stop.nominal_px for stop in stops]
-    each = max(2, BETWEEN_STOPS // (len(known) - 1))
-    ends = itertools.pairwise(known)
-    between = pointing(calibration, [float(n) for a, b in ends for n in np.geomspace(a, b, each + 2)[1:-1]])
     curve = sorted((*stops, *between), key=lambda at: at.nominal_px)
     with styled(2.7) as figure:
         for ax, unit in zip(figure.subplots(1, 2), ("degrees", "px in the zoom image"), strict=True):
@@ -113,5 +107,5 @@ def focal_figure(calibration: Calibration, stops: tuple[AtFocal, ...]) -> Figure
                 ax.plot([at.nominal_px for at in those], y, look, color=BLUE, lw=1.6, ms=4)
             ax.set(xscale="log", xlabel="nominal focal length [px]", ylabel=f"[{unit}]", title="predicted error")
             ax.set_ylim(bottom=0)
-            focal_ticks(ax, known)
+            focal_ticks(ax, [stop.nominal_px for stop in stops])
         return figure

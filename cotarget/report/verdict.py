@@ -7,7 +7,7 @@ import numpy as np
 
 from cotarget.calibration.model import Calibration
 from cotarget.report.evidence import Evidence, gather
-from cotarget.report.pointing import DEPTHS, AtFocal, pointing, sigma_of, undetermined
+from cotarget.report.pointing import DEPTHS, AtFocal, between_stops, pointing, sigma_of, undetermined
 from cotarget.report.wording import digits, percent
 
 Level = Literal["good", "care", "bad", "unknown"]
@@ -40,12 +40,18 @@ def verdict(calibration: Calibration) -> str:
     return judge(calibration).text
 
 
-def judge(calibration: Calibration, at: tuple[AtFocal, ...] | None = None, evidence: Evidence | None = None) -> Verdict:
+def judge(
+    calibration: Calibration,
+    at: tuple[AtFocal, ...] | None = None,
+    between: tuple[AtFocal, ...] | None = None,
+    evidence: Evidence | None = None,
+) -> Verdict:
     """Give the verdict on a calibration.
 
     Args:
         calibration: of any kind.
-        at: what `pointing` gives of it, where that is known already.
+        at: what `pointing` gives of its stops, where that is known already.
+        between: what it gives of `between_stops`, likewise.
         evidence: what `gather` gives of it, likewise.
     """
     if calibration.T_head_zoom is None:
@@ -60,11 +66,12 @@ def judge(calibration: Calibration, at: tuple[AtFocal, ...] | None = None, evide
             "Does not explain the corners that are stored with it: they are not what it was made from.", "bad"
         )
     at = pointing(calibration) if at is None else at
+    between = pointing(calibration, between_stops(calibration)) if between is None else between
     if not np.isfinite(at[-1].rms):
         return Verdict("Reaches no point of the wide view with the head: its geometry cannot be right.", "bad")
     width = calibration.zoom.size[0]
     level: Level = "good"
-    parts = [_how_well(at)]
+    parts = [_how_well(at, between)]
     if at[-1].rms_px > FAR_OFF * width:
         level = "bad" if at[-1].rms_px > OUT_OF_SIGHT * width else "care"
         parts.append(f"that is {percent(at[-1].rms_px / width)} of the close-up's width")
@@ -89,14 +96,15 @@ def _contradicts(calibration: Calibration, evidence: Evidence) -> bool:
     return np.sqrt(2) * sigma > CONTRADICTION * max(recorded)
 
 
-def _how_well(at: tuple[AtFocal, ...]) -> str:
+def _how_well(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> str:
     last = at[-1]
     which = "the longest focal length calibrated" if len(at) > 1 else "the one focal length calibrated"
     in_px = f"{digits(last.rms_px)} px at {last.focal_px:.0f} px, {which}"
     text = f"Points to {digits(np.degrees(last.rms))} degrees ({in_px})"
-    worst = max(at, key=lambda stop: stop.rms)
+    worst = max((*at, *between), key=lambda one: one.rms)
     if worst.rms > ALIKE * last.rms:
-        text += f" and to {digits(np.degrees(worst.rms))} degrees at {worst.focal_px:.0f} px"
+        where = f"between its stops, at {worst.focal_px:.0f} px" if worst in between else f"at {worst.focal_px:.0f} px"
+        text += f" and to {digits(np.degrees(worst.rms))} degrees ({digits(worst.rms_px)} px) {where}"
     near, far = DEPTHS
     return f"{text}, one standard deviation, all over the wide view from {near:g} to {far:g} m"
 
