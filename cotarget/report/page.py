@@ -14,7 +14,15 @@ from cotarget.report.advice import advice, board_in_words
 from cotarget.report.evidence import CAMERAS, Evidence, averaged, gather, share_beyond
 from cotarget.report.figures import NAMES
 from cotarget.report.markup import Picture
-from cotarget.report.pointing import DEPTHS, AtFocal, Contribution, between_stops, contributions, pointing
+from cotarget.report.pointing import (
+    DEPTHS,
+    AtFocal,
+    Contribution,
+    between_stops,
+    contributions,
+    corner_errors,
+    pointing,
+)
 from cotarget.report.tables import STRONG, Table, correlations, key_figures, parameter_tables, provenance
 from cotarget.report.verdict import LABELS, Verdict, judge
 from cotarget.report.wording import count, digits, percent
@@ -101,7 +109,7 @@ def _body(
     several = len(calibration.zoom.stops) > 1
     sections = [
         ("figures", "Key figures", _key_figures(calibration)),
-        ("pointing", "Predicted pointing error", _pointing(at, parts, made)),
+        ("pointing", "Predicted pointing error", _pointing(calibration, at, parts, made)),
         ("parameters", "Parameters", _parameters(calibration)),
         ("residuals", "Residuals of the corners", _residuals(calibration, evidence, made)),
         ("coverage", "Where boards were seen", _coverage(evidence, made)),
@@ -129,15 +137,20 @@ def _header(calibration: Calibration, source: str, found: Verdict) -> str:
     )
 
 
-def _pointing(at: tuple[AtFocal, ...], parts: tuple[Contribution, ...], made: dict[str, Picture]) -> Iterator[str]:
+def _pointing(
+    calibration: Calibration, at: tuple[AtFocal, ...], parts: tuple[Contribution, ...], made: dict[str, Picture]
+) -> Iterator[str]:
     if not at or not np.isfinite(at[-1].rms):
         yield markup.paragraph("Nothing can be predicted: that takes a head, and a fit that tells its uncertainty.")
         return
     near, far = DEPTHS
+    middle, corners = corner_errors(calibration, at[-1].nominal_px)
+    worst = max(corners.values(), default=np.nan)
     yield markup.paragraph(
         "The angle by which the zoom camera's line of sight misses a target whose pixel and depth are known exactly: "
         f"what the calibration itself leaves, one standard deviation. From {near:g} to {far:g} m and all over the wide "
-        f"view it is {digits(np.degrees(at[-1].rms))} degrees (rms) and {digits(np.degrees(at[-1].worst))} at worst."
+        f"view it is {digits(np.degrees(at[-1].rms))} degrees (rms) at the longest focal length: "
+        f"{digits(np.degrees(middle))} in the middle, {digits(np.degrees(worst))} in the worst corner."
     )
     for name in ("pointing_map", "pointing_depth", "pointing_focal"):
         if name in made:

@@ -67,7 +67,7 @@ def _pointing(
         "pointing_map",
         pointingfigures.map_figure(calibration, last),
         f"Heat maps of the predicted pointing error over the wide view at three depths; {digits(np.degrees(last.rms))} "
-        f"degrees on average, {digits(np.degrees(last.worst))} at worst",
+        f"degrees on average",
         "The wide view with targets at three depths; lines join places of equal error, written in degrees. The error "
         "grows towards places that no board reached, and with distance where boards were near only.",
     )

@@ -37,13 +37,11 @@ class AtFocal:
         nominal_px: the stop's nominal focal length [px].
         focal_px: its true one, the mean of both directions [px].
         rms: predicted angle [rad].
-        worst: the largest anywhere [rad].
     """
 
     nominal_px: float
     focal_px: float
     rms: float
-    worst: float
 
     @property
     def rms_px(self) -> float:
@@ -93,8 +91,8 @@ def pointing(calibration: Calibration, nominal_px: Sequence[float] | None = None
         return ()
     found = []
     for nominal in calibration.zoom.nominal_px if nominal_px is None else nominal_px:
-        rms, worst = _over_the_view(calibration, nominal)
-        found.append(AtFocal(nominal, float(np.mean(calibration.zoom.at(nominal).focal_px)), rms, worst))
+        focal = float(np.mean(calibration.zoom.at(nominal).focal_px))
+        found.append(AtFocal(nominal, focal, _over_the_view(calibration, nominal)))
     return tuple(found)
 
 
@@ -105,12 +103,12 @@ def between_stops(calibration: Calibration) -> list[float]:
     return [float(n) for a, b in itertools.pairwise(stops) for n in np.geomspace(a, b, each + 2)[1:-1]]
 
 
-def _over_the_view(calibration: Calibration, nominal_px: float) -> tuple[float, float]:
-    """Rms and largest predicted angle over all pixels and depths that can be reached [rad]."""
+def _over_the_view(calibration: Calibration, nominal_px: float) -> float:
+    """Rms of the predicted angle over all pixels and depths that can be reached [rad]."""
     pixels, depths = sample_pixels(calibration), sample_depths()
     errors = predicted_pointing(calibration, pixels[None], depths[:, None], nominal_px=nominal_px)
     reached = errors[np.isfinite(errors)]
-    return (float(np.sqrt(np.mean(reached**2))), float(reached.max())) if len(reached) else (np.nan, np.nan)
+    return float(np.sqrt(np.mean(reached**2))) if len(reached) else np.nan
 
 
 def corner_errors(calibration: Calibration, nominal_px: float) -> tuple[float, dict[str, float]]:
