@@ -211,7 +211,10 @@ def _centred(recorder: Recorder, view: View, by_pan: View, by_tilt: View) -> Vie
 
     The two turns tell how pan and tilt move the board in the image, whatever the camera's roll.
     """
-    middle, at_pan, at_tilt = (v.corners_px.mean(axis=0) for v in (view, by_pan, by_tilt))
+    common = view.seen & by_pan.seen & by_tilt.seen
+    if not common.any():
+        return view
+    middle, at_pan, at_tilt = (v.corners_px[common].mean(axis=0) for v in (view, by_pan, by_tilt))
     off = (np.array(recorder.rig.zoom.size) - 1) / 2 - middle
     if np.linalg.norm(off) <= CENTRAL * recorder.rig.zoom.size[0]:
         return view

@@ -20,7 +20,8 @@ from cotarget.rig import PanTiltLimits
 
 # Distances for squares of 0.1 m and a focal length of 1.07 image widths: nearer, the board fills the image and moves
 # out of it at every turn; farther, squares of 8 px and less are no longer found.
-NEAR, FAR = 2.5, 8.0
+# Markers are read to half that distance, and a board that is seen in part counts.
+NEAR_FAR = {"chessboard": (2.5, 8.0), "charuco": (1.7, 4.0)}
 REFERENCE_SQUARE = 0.1  # [m]
 REFERENCE_FOCAL = 1.07  # in image widths
 MOST_TILTED, LEAST_TILTED = np.radians(40.0), np.radians(8.0)  # from facing the camera; beyond, squares get too thin
@@ -31,7 +32,7 @@ HIDDEN_REACH = 0.12  # of the image's width: so near to a board that was not see
 SAME_DEPTH = 0.9  # boards this much nearer are
 CANDIDATES = 150  # placements tried before one is chosen; the choice hardly improves with more
 POSES = 120  # head poses tried for a placement
-SMALLEST_SPACING_PX = 7.0  # on average over the board, of the thinner direction
+SMALLEST_SPACING_PX = {"chessboard": 7.0, "charuco": 14.0}  # on average over the board, of the thinner direction
 
 
 @dataclass(eq=False)
@@ -98,7 +99,7 @@ def visible(
         grid = px[:, 4:].reshape(-1, rows, columns, 2)
         across = np.linalg.norm(grid[:, :, -1] - grid[:, :, 0], axis=-1).min(axis=1) / (columns - 1)
         down = np.linalg.norm(grid[:, -1] - grid[:, 0], axis=-1).min(axis=1) / (rows - 1)
-        large = np.minimum(across, down) >= SMALLEST_SPACING_PX
+        large = np.minimum(across, down) >= SMALLEST_SPACING_PX[board.kind]
     right, below = x_camera[:, 1] - x_camera[:, 0], x_camera[:, 3] - x_camera[:, 0]
     facing = np.sum(np.cross(right, below) * x_camera[:, 0], axis=-1) > 0
     return inside.all(axis=(1, 2)) & large & facing, px[:, 4:]
@@ -113,7 +114,8 @@ def facing_board(board: BoardConfig, x_fixed: Array, turn: Rotation) -> RigidTra
 def distance(board: BoardConfig, lens: Intrinsics, share: float) -> float:
     """A distance [m] from the nearest (share 0) to the farthest (share 1) for this board and camera."""
     scale = board.square / REFERENCE_SQUARE * (lens.focal_px[0] / lens.size[0]) / REFERENCE_FOCAL
-    return float(scale * NEAR * (FAR / NEAR) ** share)
+    near, far = NEAR_FAR[board.kind]
+    return float(scale * near * (far / near) ** share)
 
 
 def plan_placements(

@@ -28,7 +28,7 @@ SAME_FOCAL = 1e-3  # relative; a step of a usual lens changes the focal length t
 PUPIL_SIGMA = 0.2  # [m]
 BENT_SIGMAS = {"k1": (0.5, 2), "k2": (1.0, 4), "p1": (0.05, 1), "p2": (0.05, 1)}  # and the power of the focal length
 INSIDE_PX = 2.0  # a corner predicted this far inside the image is expected to be seen
-FEWEST_CORNERS = 8  # of a board seen in part, that tell how a lens magnifies and where its axis is
+FEWEST_CORNERS = 6  # of a board seen in part, that tell how a lens magnifies and where its axis is
 
 
 def spread_stops(shortest_px: float, longest_px: float, count: int) -> list[float]:
