@@ -15,7 +15,7 @@ from cotarget.geometry import Array
 DEPTHS = (4.0, 30.0)  # where targets are [m]
 CELLS = (9, 7)  # across and down the wide view, at whose middles pointing is predicted
 DEPTH_STEPS = 5
-BETWEEN_STOPS = 6  # focal lengths to look at between the stops, shared out, but never fewer than one each
+BETWEEN_STOPS = 4  # focal lengths to look at between the stops, shared out, but never fewer than one each
 # Groups of parameters in the order of the page: how people call them, and how their names begin.
 GROUPS = (
     ("the fixed camera's lens", ("fixed.",)),
