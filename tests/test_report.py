@@ -174,7 +174,7 @@ def test_numbers_in_the_page_are_those_of_the_calibration(plain, tmp_path):
 
 def test_the_verdict_is_as_true_as_it_says(plain, stops):
     for calibration in (plain, stops):
-        said = float(re.match(r"Points to ([\d.]+) degrees", verdict(calibration)).group(1))
+        said = float(re.match(r"Points to ([\d.]+) degrees", judge(calibration, between=()).text).group(1))
         errors = pointing_errors(calibration, Truth(), np.random.default_rng(1), 30)
         # One calibration's error is one draw; over the view it is within a factor of three but once in hundreds.
         assert said / 3 < np.sqrt(np.mean(errors**2)) < said * 3
