@@ -108,6 +108,7 @@ def error_of(calibration: Calibration, truth: Truth) -> dict[str, float]:
         }
     error["head.axis_offset"] = truth.dz - calibration.head.axis_offset
     error["head.squareness"] = truth.eps - calibration.head.squareness
+    error |= {f"board.warp_{axis}": -warp for axis, warp in zip("xy", calibration.board_warp, strict=True)}
     return error
 
 

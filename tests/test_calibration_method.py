@@ -134,6 +134,21 @@ def test_gamma_comes_from_moved_head_poses_where_there_is_no_common_view_at_home
         calibrate_views(apart, BOARD, SIZES)
 
 
+def test_a_bent_board_is_fitted_with_its_bend():
+    """Bulging by 4 mm along x and -2 mm along y, on a board of 0.8 by 0.5 m."""
+    middle, half = POINTS.mean(axis=0), np.ptp(POINTS, axis=0) / 2
+    u, v = ((POINTS - middle)[:, :2] / half[:2]).T
+    bent = POINTS + np.outer(0.004 * (1 - u**2) - 0.002 * (1 - v**2), [0, 0, 1])
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(2), boards=15, shape=bent)
+    calibration = calibrate_views(views, BOARD, SIZES)
+    for name, found, true in zip(("warp_x", "warp_y"), calibration.board_warp, (0.004, -0.002), strict=True):
+        sigma = calibration.covariance.sigma(f"board.{name}")
+        assert found == pytest.approx(true, abs=4 * sigma)
+        assert sigma < 0.0005
+    # A flat board's model leaves 0.01 degrees with it.
+    assert np.median(pointing_errors(calibration, Truth(), np.random.default_rng(5), 40)) < 0.004
+
+
 def test_an_outlying_view_is_left_out_and_named():
     views = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=8)
     bad = replace(

@@ -139,7 +139,7 @@ def calibration(views):
 def test_every_free_parameter_has_its_place(calibration):
     covariance = calibration.covariance
     assert covariance.parameters == parameter_names(ALL_BLOCKS)
-    assert len(covariance.parameters) == 8 + 8 + 6 + 6 + 2
+    assert len(covariance.parameters) == 8 + 8 + 6 + 6 + 2 + 2
     assert not [name for name in covariance.parameters if "k3" in name]  # it is held
     assert np.linalg.eigvalsh(covariance.matrix / np.sqrt(np.multiply.outer(*2 * [np.diag(covariance.matrix)])))[0] > 0
     error = error_of(calibration, Truth())
@@ -182,7 +182,7 @@ def test_where_there_is_none(views, calibration):
     with pytest.raises(CalibrationError, match="no covariance"):
         predicted_pointing(sequential_only, np.array([320.0, 240.0]), 8.0)
     pair_only = calibrate_views([v for v in views if v.camera == "fixed" or at_home(v)], BOARD, SIZES)
-    assert pair_only.covariance.parameters == parameter_names(("fixed", "zoom", "gamma"))
+    assert pair_only.covariance.parameters == parameter_names(("fixed", "zoom", "gamma", "warp"))
     with pytest.raises(CalibrationError, match="no T_head_zoom"):
         predicted_pointing(pair_only, np.array([320.0, 240.0]), 8.0)
     strange = replace(calibration, covariance=Covariance(("fixed.k3",), np.eye(1)))

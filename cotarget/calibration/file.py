@@ -1,9 +1,9 @@
 """calibration.json: readable, replaced atomically, checked when it is read, and with the corners it came from.
 
 Keys: schema; fixed; zoom (stops over the focal length); T_zoom0_fixed; T_head_zoom (or null); head; pitch_mm (or
-null); residuals; covariance (or null); held_out (or null); board; provenance; views, with null for a corner that is
-not seen. Lengths are metres; angles are degrees where people read them, and radians in the views, so that a refit
-starts from the very same numbers.
+null); residuals; covariance (or null); held_out (or null); board and board_warp [m]; provenance; views, with null for
+a corner that is not seen. Lengths are metres; angles are degrees where people read them, and radians in the views, so
+that a refit starts from the very same numbers.
 """
 
 import dataclasses
@@ -64,6 +64,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
         else {"parameters": list(covariance.parameters), "matrix": covariance.matrix.tolist()},
         "held_out": None if calibration.held_out is None else dataclasses.asdict(calibration.held_out),
         "board": None if calibration.board is None else write_board(calibration.board),
+        "board_warp": [float(w) for w in calibration.board_warp],
         "provenance": dict(calibration.provenance),
         "views": [_write_view(view) for view in calibration.views],
     }
@@ -173,6 +174,7 @@ def _parse(table: Table) -> Calibration:
     if views and board is None:
         raise CalibrationError("board: is null, but there are views of one")
     fixed = parsing.as_table(get(table, "fixed"), "fixed")
+    warp = parsing.as_numbers(get(table, "board_warp"), "board_warp", 2)
 
     def angle(name: str) -> float:
         return math.radians(parsing.as_number(get(head, f"{name}_deg", "head"), f"head.{name}_deg"))
@@ -195,6 +197,7 @@ def _parse(table: Table) -> Calibration:
         residuals=_parse_residuals(get(table, "residuals")),
         covariance=_parse_covariance(get(table, "covariance")),
         held_out=_parse_held_out(get(table, "held_out")),
+        board_warp=(warp[0], warp[1]),
         board=board,
         views=tuple(_parse_view(view, f"views[{i}]", board) for i, view in enumerate(views) if board is not None),
         provenance=parsing.as_table(get(table, "provenance"), "provenance"),

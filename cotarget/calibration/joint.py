@@ -36,6 +36,8 @@ from cotarget.geometry import Array
 WRONG_SIGMAS, WRONG_FLOOR_PX = 6.0, 0.5
 WRONG_SHARE = 0.3  # a view with more wrong corners than this is left out as a whole
 FEWEST_STOP_VIEWS, FEWEST_STOP_PLACEMENTS = 3, 2  # of a stop of the zoom lens
+# A board of one metre, glued to a sheet of something, is flat to some millimetres (as a share of its length).
+WARP_SHARE = 0.004
 # Encoders, where they are asked for: gears are cut to a thousandth or two, zeros are found to half a degree.
 ENCODER_SIGMAS = {
     "head.pan_scale": 0.002,
@@ -74,17 +76,18 @@ def joint(
     model = replace(model, gamma=rough_gamma(model, of_both(steps.views), points))
     used, rejected = list(steps.views), list(steps.rejected)
     blocks = tuple(block for block in ALL_BLOCKS if steps.has_head or block not in ("hand", "head"))
+    warp_sigma = WARP_SHARE * float(np.ptp(points, axis=0).max())
     ties: tuple[Block, ...] = ("gamma", "hand") if steps.has_head else ("gamma",)
     if options.encoders and steps.has_head:
         blocks = (*blocks, "scale", "zero")
     start = model
-    prior = _known(model, start, blocks, options)
+    prior = _known(model, start, blocks, options, warp_sigma)
     model = fit(place_boards(model, used, points), used, points, ties, prior=prior).model
     result = fit(model, used, points, blocks, prior=prior)
     if len(nominal_px) > 1:
         model, used, more = _all_stops(result, views, points, nominal_px)
         rejected += more
-        prior = _known(model, start, blocks, options)
+        prior = _known(model, start, blocks, options, warp_sigma)
         result = fit(model, used, points, blocks, prior=prior)
         check_stops(result.model)
     result, wrong, more = _without_wrong_corners(result, points, prior)
@@ -120,22 +123,24 @@ def undetermined(found: Fit) -> str:
     return name_directions(names, weak_directions(found.normal, names, found.variance or 0.0, focal), focal)
 
 
-def _known(model: RigModel, start: RigModel, blocks: Sequence[Block], options: Options) -> Prior | None:
-    """What is known before the corners speak, beyond nothing: of the zoom lens, of encoders, and what is insisted on.
+def _known(model: RigModel, start: RigModel, blocks: Sequence[Block], options: Options, warp_sigma: float) -> Prior:
+    """What is known before the corners speak: of the board, the zoom lens, encoders, and what is insisted on.
 
     Who insists holds T, Gamma and the head's geometry near the start, as loosely as they are of any use: directions
     that the corners determine do not notice, and the others get an uncertainty that says so.
     """
-    reference, sigmas = replace(start, zoom=model.zoom), {}
+    reference, sigmas = replace(start, zoom=model.zoom), dict.fromkeys(("board.warp_x", "board.warp_y"), warp_sigma)
     if model.stops > 1:
         lens = lens_prior(model)
-        reference, sigmas = replace(reference, zoom=lens.reference.zoom), dict(lens.sigmas)
+        reference, sigmas = replace(reference, zoom=lens.reference.zoom), {**sigmas, **lens.sigmas}
     if options.insist:
-        names = [name for name in parameter_names(blocks, model.stops) if not name.startswith(("fixed.", "zoom["))]
+        names = [
+            name for name in parameter_names(blocks, model.stops) if not name.startswith(("fixed.", "zoom[", "board."))
+        ]
         sigmas |= dict(zip(names, limits_of_use(names).tolist(), strict=True))
     if "scale" in blocks:
         sigmas |= ENCODER_SIGMAS
-    return Prior(reference, sigmas) if sigmas else None
+    return Prior(reference, sigmas)
 
 
 def _all_stops(
@@ -170,7 +175,7 @@ def _stop_of(nominal_px: Sequence[float], view: View) -> int:
 
 def _without_wrong_corners(found: Fit, points: Array, prior: Prior | None) -> tuple[Fit, int, list[Rejected]]:
     """Leave out the corners that nothing explains, and tell the head's jitter; the fit then, and how many they were."""
-    jitter = estimate_jitter(found, points, prior)
+    jitter = estimate_jitter(found, points, prior) if "hand" in found.free else 0.0
     if jitter:
         found = fit(found.model, found.views, points, found.free, prior=prior, jitter=jitter)
     lengths = np.linalg.norm(found.left, axis=-1)

@@ -88,6 +88,7 @@ def calibrate_views(
         covariance=solution.covariance,
         jitter=solution.jitter,
         held_out=solution.held_out,
+        board_warp=solution.model.warp,
         board=board,
         views=solution.views,
         provenance={

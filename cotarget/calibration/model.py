@@ -144,6 +144,7 @@ class Covariance:
         head.axis_offset .squareness         [m] and [rad]
         head.pan_scale .tilt_scale           without unit, where they were asked for
         head.pan_zero .tilt_zero             [rad], where they were asked for
+        board.warp_x .warp_y                 [m], see `Calibration.board_warp`
 
     An error (w, d) of a transform (R, t) means exp(w) R and t + d: w turns about the axes of the frame that the
     transform leads to, and leaves t as it is.
@@ -206,6 +207,7 @@ class Calibration:
         jitter: standard deviation by which each axis of the head misses what it reports, at every pose anew [rad];
             beyond the head itself it stands for whatever of the rig the model leaves out.
         held_out: what captures kept out of the fit say; None where there were too few, or the method tells none.
+        board_warp: by how much the board's middle stands out towards its z, along its x and along its y [m].
         board: the board, None for a calibration that comes from no board.
         views: the corners themselves, so that the calibration can be checked and refitted.
         provenance: versions, method, when, from which captures; JSON values only.
@@ -221,6 +223,7 @@ class Calibration:
     covariance: Covariance | None = None
     jitter: float = 0.0
     held_out: HeldOut | None = None
+    board_warp: tuple[float, float] = (0.0, 0.0)
     board: BoardConfig | None = None
     views: tuple[View, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)

@@ -35,6 +35,7 @@ WORDS = {
     **dict.fromkeys(("fx", "fy"), ("focal length", TILT_BOARDS)),
     **dict.fromkeys(("cx", "cy"), ("principal point", TILT_BOARDS)),
     **dict.fromkeys(("k1", "k2", "p1", "p2"), ("distortion", OUTWARD)),
+    **dict.fromkeys(("warp_x", "warp_y"), ("bend", TILT_BOARDS)),
     "pupil": ("pupil's shift", "show boards near and far at that focal length"),
     "axis_offset": ("axis offset", NEARER),
     "squareness": ("squareness", NEARER),
@@ -199,7 +200,7 @@ def limits_of_use(parameters: Sequence[str], focal_px: Mapping[str, float] = NO_
         match kind:
             case "rx" | "ry" | "rz" | "squareness" | "pan_zero" | "tilt_zero":
                 limits.append(USELESS_ROTATION)
-            case "tx" | "ty" | "tz" | "axis_offset" | "pupil":
+            case "tx" | "ty" | "tz" | "axis_offset" | "pupil" | "warp_x" | "warp_y":
                 limits.append(USELESS_POSITION)
             case "fx" | "fy":
                 limits.append(USELESS_PX / r)
@@ -222,7 +223,9 @@ def _owner(owner: str) -> str:
     """How people call a block of parameters."""
     if owner.startswith("zoom["):
         return f"the zoom camera's stop {owner[5:-1]}"
-    return {"fixed": "the fixed camera", "zoom": "the zoom camera", "head": "the head"}.get(owner, owner)
+    return {"fixed": "the fixed camera", "zoom": "the zoom camera", "head": "the head", "board": "the board"}.get(
+        owner, owner
+    )
 
 
 def _still(basis: Array, rows: Sequence[int]) -> Array:

@@ -5,8 +5,9 @@ Boards are placed in the fixed camera's frame, so that a corner X of placement b
     by the fixed camera at      x_fixed = T_fixed_board X
     by the zoom camera at       x_zoom = T_head_zoom^-1 T_base_head^-1 T_head_zoom T_zoom0_fixed x_fixed       (Eq. 2)
 
-less the way that its entrance pupil has moved forward at the focal length in use. Poses are stepped as R <- exp(w) R,
-t <- t + d. The derivatives are analytic; OpenCV's cv2.projectPoints gives those of the lens.
+less the way that its entrance pupil has moved forward at the focal length in use. A board that is not flat bulges
+towards its z by a parabola along each side. Poses are stepped as R <- exp(w) R, t <- t + d. The derivatives are
+analytic; OpenCV's cv2.projectPoints gives those of the lens.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -23,9 +24,9 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import IDEAL_HEAD, HeadGeometry
 
-Block = Literal["fixed", "zoom", "pupil", "gamma", "hand", "head", "scale", "zero"]
+Block = Literal["fixed", "zoom", "pupil", "gamma", "hand", "head", "warp", "scale", "zero"]
 # What a calibration finds by default, in the order of the parameters; "scale" and "zero" are the encoders'.
-ALL_BLOCKS: tuple[Block, ...] = ("fixed", "zoom", "pupil", "gamma", "hand", "head")
+ALL_BLOCKS: tuple[Block, ...] = ("fixed", "zoom", "pupil", "gamma", "hand", "head", "warp")
 EVERY_BLOCK: tuple[Block, ...] = (*ALL_BLOCKS, "scale", "zero")
 
 # fx fy cx cy k1 k2 p1 p2, the order of OpenCV's Jacobian after the pose; k3, the next, stays as it is: it hardly
@@ -39,6 +40,7 @@ HEAD_NAMES = {
     "scale": ("pan_scale", "tilt_scale"),
     "zero": ("pan_zero", "tilt_zero"),
 }
+WARP_NAMES = ("warp_x", "warp_y")
 STILL = RigidTransform.identity()
 E3 = np.array([0.0, 0.0, 1.0])
 
@@ -54,6 +56,7 @@ class RigModel:
         hand: T_head_zoom, at the first stop.
         head: the pan-tilt unit's geometry.
         boards: T_fixed_board by the number of the placement.
+        warp: by how much the board's middle stands out towards its z from its edges along x, and along y [m].
     """
 
     boards: Mapping[int, RigidTransform]
@@ -62,6 +65,7 @@ class RigModel:
     gamma: RigidTransform = STILL
     hand: RigidTransform = STILL
     head: HeadGeometry = IDEAL_HEAD
+    warp: tuple[float, float] = (0.0, 0.0)
 
     @property
     def stops(self) -> int:
@@ -230,6 +234,8 @@ def _names(block: str, stops: int) -> list[str]:
             return [f"T_zoom0_fixed.{name}" for name in POSE_NAMES]
         case "hand":
             return [f"T_head_zoom.{name}" for name in POSE_NAMES]
+        case "warp":
+            return [f"board.{name}" for name in WARP_NAMES]
         case _:
             return [f"head.{name}" for name in HEAD_NAMES[block]]
 
@@ -258,6 +264,7 @@ def stepped(model: RigModel, shared: Array, boards: Array, free: Collection[Bloc
         gamma=_moved(model.gamma, steps.get("gamma")),
         hand=_moved(model.hand, steps.get("hand")),
         head=head,
+        warp=model.warp if "warp" not in steps else _pair(np.add(model.warp, steps["warp"])),
     )
 
 
@@ -282,6 +289,8 @@ def difference(model: RigModel, reference: RigModel, free: Collection[Block]) ->
                 T, T_ref = getattr(model, block), getattr(reference, block)
                 parts.append((T.rotation * T_ref.rotation.inv()).as_rotvec())
                 parts.append(T.translation - T_ref.translation)
+            case "warp":
+                parts.append(np.subtract(model.warp, reference.warp))
             case _:
                 parts.append(np.array([getattr(model.head, k) - getattr(reference.head, k) for k in HEAD_NAMES[block]]))
     return np.concatenate(parts) if parts else np.zeros(0)
@@ -316,11 +325,13 @@ def _bent(lens: Intrinsics, step: Array) -> Intrinsics:
 def _points_in_camera(model: RigModel, batch: Batch, points: Array) -> tuple[Array, dict[str, Array]]:
     """Map the board's points into the camera of each view, (v, N, 3), with derivatives (v, N, 3, parameters)."""
     M = np.stack([T.as_matrix() for T in model.boards.values()])[batch.owners]
-    turned = points @ M[:, :3, :3].swapaxes(1, 2)
+    bulge = _bulge(points)
+    turned = (points + np.outer(bulge @ model.warp, E3)) @ M[:, :3, :3].swapaxes(1, 2)
     y = turned + M[:, None, :3, 3]  # x_fixed
     d_board = _pose_derivative(turned)
+    d_warp = M[:, None, :3, 2:3] * bulge[:, None]  # dy/dwarp, (v, N, 3, 2)
     if batch.stop is None:
-        return y, {"board": d_board}
+        return y, {"board": d_board, "warp": d_warp}
     assert model.zoom is not None
     R_g, R_h = model.gamma.rotation.as_matrix(), model.hand.rotation.as_matrix()
     t_h = model.hand.translation
@@ -338,6 +349,7 @@ def _points_in_camera(model: RigModel, batch: Batch, points: Array) -> tuple[Arr
     d_turn = R_xp @ _by_turn(model.head, A, p)
     return x, {
         "board": (R_xw @ R_g)[:, None] @ d_board,
+        "warp": (R_xw @ R_g)[:, None] @ d_warp,
         "gamma": R_xw[:, None] @ _pose_derivative(turned_g),
         "hand": d_hand,
         "head": R_xp @ _by_head(model.head, A, p),
@@ -345,6 +357,18 @@ def _points_in_camera(model: RigModel, batch: Batch, points: Array) -> tuple[Arr
         "zero": d_turn,
         "turn": d_turn,
     }
+
+
+def _bulge(points: Array) -> Array:
+    """How far each corner of a board stands out for a unit of warp along x and along y, (N, 2): 1 in the middle."""
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    half = np.maximum((high - low) / 2, np.finfo(float).tiny)
+    return np.asarray(1 - ((points[:, :2] - (low + high) / 2) / half) ** 2)
+
+
+def _pair(values: Array) -> tuple[float, float]:
+    first, second = values
+    return float(first), float(second)
 
 
 def base_heads(head: HeadGeometry, pan: Array, tilt: Array) -> tuple[Array, Array, Array]:

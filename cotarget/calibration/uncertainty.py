@@ -173,6 +173,7 @@ def model_of(calibration: Calibration) -> RigModel:
         gamma=calibration.T_zoom0_fixed,
         hand=RigidTransform.identity() if hand is None else hand,
         head=calibration.head,
+        warp=calibration.board_warp,
     )
 
 

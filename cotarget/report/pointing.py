@@ -25,6 +25,7 @@ GROUPS = (
     ("the zoom camera's place on the head", ("T_head_zoom.",)),
     ("the encoders", ("head.pan_", "head.tilt_")),
     ("the head's axes", ("head.",)),
+    ("the board's bend", ("board.",)),
 )
 JITTER_GROUP = "the head's jitter"
 

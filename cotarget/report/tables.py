@@ -59,7 +59,15 @@ def parameter_tables(calibration: Calibration) -> list[Table]:
         title = "Place of the zoom camera on the head"
         tables.append(_pose_table(calibration, title, "T_head_zoom", calibration.T_head_zoom))
         tables.append(Table("Pan-tilt head", header, tuple(_head(calibration))))
+    if calibration.board is not None:
+        rows = zip(("x", "y"), calibration.board_warp, strict=True)
+        tables.append(Table("Board", header, tuple(_bend(calibration, axis, value) for axis, value in rows)))
     return tables
+
+
+def _bend(calibration: Calibration, axis: str, value: float) -> tuple[str, ...]:
+    sigma = sigma_of(calibration, f"board.warp_{axis}")
+    return f"bulge of its middle along {axis}", value_and_sigma(1000 * value, sigma and 1000 * sigma), "mm"
 
 
 def _held(lens: Intrinsics) -> str:
