@@ -4,7 +4,8 @@ Every pixel's ray meets the board's plane; the squares' edges are blurred over o
 they should be to a few hundredths of a pixel.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -13,11 +14,35 @@ from cotarget.config import BoardConfig
 from cotarget.errors import StaleFrameError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
-from experiments.synthetic import SIZE, Lens, Truth
+from experiments.synthetic import NOMINAL_PX, SIZE, Lens, Stop, Truth
 
 PERIOD = 0.04
 LATENCY = 0.05
 BLACK, WHITE, WALL = 30.0, 220.0, 120.0
+ZOOM_TIME = 0.4  # the lens takes this long to any focal length [s]
+FOURFOLD = 4.0
+# What a fourfold lens has gone through at its end, beyond being magnified: the true focal length over the nominal one,
+# the axis [px], the share of the image's distortion that is gone, and the entrance pupil [m], backwards.
+RATIO, AXIS_PX, STRAIGHTER, PUPIL = 0.02, (6.0, -4.0), 0.5, -0.04
+
+
+def fourfold(nominal_px: float) -> Stop:
+    """A zoom lens from 667 to 2668 px nominal; at its shortest focal length it is that of the default rig."""
+    m = nominal_px / NOMINAL_PX
+    s = np.log(m) / np.log(FOURFOLD)
+    wide, bend = Truth().zoom, np.sin(np.pi / 2 * s)  # no polynomial, so that no interpolant has it exactly
+    f = m * (1 + RATIO * bend)
+    (k1, *_), share = wide.distortion, 1 - STRAIGHTER * bend
+    lens = Lens(
+        wide.fx * f, wide.fy * f, wide.cx + AXIS_PX[0] * bend, wide.cy + AXIS_PX[1] * s, (k1 * share * m**2, 0, 0, 0, 0)
+    )
+    return Stop(nominal_px, lens, PUPIL * bend)
+
+
+def zoomed(truth: Truth, stop: Stop) -> Truth:
+    """The rig at one stop of its zoom lens, as if it had no other: Gamma and T lead to where the pupil is."""
+    to_pupil = RigidTransform.from_translation([0.0, 0.0, stop.pupil])
+    return replace(truth, zoom=stop.lens, gamma=to_pupil.inv() * truth.gamma, hand=truth.hand * to_pupil, stops=())
 
 
 def draw(lens: Lens, T_camera_board: np.ndarray, board: BoardConfig, rays: np.ndarray) -> np.ndarray:
@@ -29,7 +54,8 @@ def draw(lens: Lens, T_camera_board: np.ndarray, board: BoardConfig, rays: np.nd
     if (x[:, 2] < 0.1).any() or T_camera_board[:3, 2] @ x.mean(axis=0) <= 0:
         return image
     # The pixels to look at: those around the outline, clipped to where the distortion is sane.
-    xy = np.clip(x[:, :2] / x[:, 2:], -0.9, 0.9)
+    sane = min(0.9, 2 * np.abs(rays[..., :2]).max())
+    xy = np.clip(x[:, :2] / x[:, 2:], -sane, sane)
     px = lens.project(np.c_[xy, np.ones(4)])
     low = np.clip(np.floor(px.min(axis=0)) - 30, 0, SIZE).astype(int)
     high = np.clip(np.ceil(px.max(axis=0)) + 30, 0, SIZE).astype(int)
@@ -72,7 +98,11 @@ def pixel_rays(lens: Lens) -> np.ndarray:
 
 @dataclass
 class SyntheticRig:
-    """The whole rig is one object: its cameras, head, clock and board are views of it."""
+    """The whole rig is one object: its cameras, head, clock and board are views of it.
+
+    It zooms where it is given optics, the truth at each nominal focal length; the truth's own zoom lens is theirs at
+    the shortest one.
+    """
 
     truth: Truth = field(default_factory=Truth)
     board_config: BoardConfig = field(default_factory=BoardConfig)
@@ -81,6 +111,7 @@ class SyntheticRig:
     stuck: bool = False
     frozen_camera: bool = False
     short_of: float = 0.0
+    optics: Callable[[float], Stop] | None = None
     limits: PanTiltLimits = field(
         default_factory=lambda: PanTiltLimits(
             (np.radians(-159), np.radians(159)), (np.radians(-47), np.radians(31)), 2.6, 3.6, np.radians(0.0514286)
@@ -90,8 +121,9 @@ class SyntheticRig:
     def __post_init__(self):
         self.t = 0.0
         self.rng = np.random.default_rng(self.seed)
-        self.rays = {"fixed": pixel_rays(self.truth.fixed), "zoom": pixel_rays(self.truth.zoom)}
+        self.rays = {"fixed": pixel_rays(self.truth.fixed), NOMINAL_PX: pixel_rays(self.truth.zoom)}
         self.pose, self.arrives = (0.0, 0.0), 0.0
+        self.focal_px, self.lens_arrives = NOMINAL_PX, 0.0
         self.placed = [(-1.0, None)]
         self.frames = 0
         self.fixed, self.zoom = _Camera(self, "fixed"), _Zoom(self, "zoom")
@@ -102,14 +134,20 @@ class SyntheticRig:
         T = next(T for since, T in reversed(self.placed) if since <= t)
         grey = np.full(SIZE[::-1], WALL)
         if T is not None:
-            M = T.as_matrix()
+            M, lens, rays = T.as_matrix(), self.truth.fixed, self.rays["fixed"]
             if camera == "zoom":
                 assert t >= self.arrives, "a calibration image was taken while the head moved"
+                assert t >= self.lens_arrives, "a calibration image was taken while the lens moved"
                 pan, tilt = (0.0, 0.0) if self.frozen_camera else self.pose
-                M = self.truth.zoom_fixed(pan, tilt) @ M
-            grey = draw(getattr(self.truth, camera), M, self.board_config, self.rays[camera])
+                now = self.true_now()
+                M, lens, rays = now.zoom_fixed(pan, tilt) @ M, now.zoom, self.rays[self.focal_px]
+            grey = draw(lens, M, self.board_config, rays)
         noisy = grey + self.rng.normal(0, self.noise, grey.shape)
         return cv2.cvtColor(np.clip(np.round(noisy), 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+
+    def true_now(self):
+        """The truth at the focal length where the lens stands."""
+        return self.truth if self.optics is None else zoomed(self.truth, self.optics(self.focal_px))
 
     def close(self):
         pass
@@ -140,13 +178,21 @@ class _Camera:
 
 
 class _Zoom(_Camera):
-    focal_range = (667.0, 667.0)  # it does not zoom
+    @property
+    def focal_range(self):
+        return NOMINAL_PX, NOMINAL_PX * (1 if self.rig.optics is None else FOURFOLD)
 
     def zoom(self, focal_px):
-        return focal_px
+        rig = self.rig
+        wanted = float(np.clip(focal_px, *self.focal_range))
+        if wanted != rig.focal_px:
+            rig.focal_px, rig.lens_arrives = wanted, rig.t + ZOOM_TIME
+            if wanted not in rig.rays:
+                rig.rays[wanted] = pixel_rays(rig.true_now().zoom)
+        return wanted
 
     def state(self):
-        return ZoomState(667.0, False, self.rig.t)
+        return ZoomState(self.rig.focal_px, self.rig.t < self.rig.lens_arrives, self.rig.t)
 
     def capture(self):
         return self.read(self.rig.t)
