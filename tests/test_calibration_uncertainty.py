@@ -185,8 +185,8 @@ def test_where_there_is_none(views, calibration):
     assert pair_only.covariance.parameters == parameter_names(("fixed", "zoom", "gamma", "warp"))
     with pytest.raises(CalibrationError, match="no T_head_zoom"):
         predicted_pointing(pair_only, np.array([320.0, 240.0]), 8.0)
-    strange = replace(calibration, covariance=Covariance(("fixed.k3",), np.eye(1)))
-    with pytest.raises(CalibrationError, match=r"'fixed.k3' is no parameter; they are: fixed.fx, "):
+    strange = replace(calibration, covariance=Covariance(("fixed.k4",), np.eye(1)))
+    with pytest.raises(CalibrationError, match=r"'fixed.k4' is no parameter; they are: fixed.fx, "):
         predicted_pointing(strange, np.array([320.0, 240.0]), 8.0)
 
 

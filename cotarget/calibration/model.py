@@ -134,10 +134,10 @@ class Residuals:
 class Covariance:
     """What is left uncertain.
 
-    The truth differs from what was found by an error of this covariance. Parameters that were held (k3) are left out.
+    The truth differs from what was found by an error of this covariance. Parameters that were held are left out.
 
         fixed.fx .fy .cx .cy                 [px], of the image size calibrated
-        fixed.k1 .k2 .p1 .p2                 without unit
+        fixed.k1 .k2 .p1 .p2                 without unit; and .k3, where the corners ask for it
         zoom[i].fx ... zoom[i].p2            the same of the zoom lens's stop i, counted from 0
         zoom[i].pupil                        [m], of all stops but the first
         T_zoom0_fixed.rx .ry .rz .tx .ty .tz     [rad] and [m]; T_head_zoom.* likewise

@@ -34,7 +34,7 @@ NEARER = "move both pan and tilt further, with boards nearer"
 WORDS = {
     **dict.fromkeys(("fx", "fy"), ("focal length", TILT_BOARDS)),
     **dict.fromkeys(("cx", "cy"), ("principal point", TILT_BOARDS)),
-    **dict.fromkeys(("k1", "k2", "p1", "p2"), ("distortion", OUTWARD)),
+    **dict.fromkeys(("k1", "k2", "k3", "p1", "p2"), ("distortion", OUTWARD)),
     **dict.fromkeys(("warp_x", "warp_y"), ("bend", TILT_BOARDS)),
     "pupil": ("pupil's shift", "show boards near and far at that focal length"),
     "axis_offset": ("axis offset", NEARER),
@@ -210,6 +210,8 @@ def limits_of_use(parameters: Sequence[str], focal_px: Mapping[str, float] = NO_
                 limits.append(USELESS_PX / (f * r**3))
             case "k2":
                 limits.append(USELESS_PX / (f * r**5))
+            case "k3":
+                limits.append(USELESS_PX / (f * r**7))
             case "p1" | "p2":
                 limits.append(USELESS_PX / (3 * f * r**2))
             case "pan_scale" | "tilt_scale":

@@ -24,13 +24,15 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import IDEAL_HEAD, HeadGeometry
 
-Block = Literal["fixed", "zoom", "pupil", "gamma", "hand", "head", "warp", "scale", "zero"]
-# What a calibration finds by default, in the order of the parameters; "scale" and "zero" are the encoders'.
+Block = Literal["fixed", "zoom", "pupil", "gamma", "hand", "head", "warp", "k3", "scale", "zero"]
+# What a calibration finds by default, in the order of the parameters; "k3" is the fixed camera's, "scale" and "zero"
+# are the encoders'.
 ALL_BLOCKS: tuple[Block, ...] = ("fixed", "zoom", "pupil", "gamma", "hand", "head", "warp")
-EVERY_BLOCK: tuple[Block, ...] = (*ALL_BLOCKS, "scale", "zero")
+EVERY_BLOCK: tuple[Block, ...] = (*ALL_BLOCKS, "k3", "scale", "zero")
 
-# fx fy cx cy k1 k2 p1 p2, the order of OpenCV's Jacobian after the pose; k3, the next, stays as it is: it hardly
-# changes the residuals of real photos (0.0002 px) but bends the image where no board was seen.
+# fx fy cx cy k1 k2 p1 p2, the order of OpenCV's Jacobian after the pose; k3, the next, is a block by itself, for lenses
+# that ask for it: elsewhere it hardly changes the residuals (0.0002 px on real photos) but bends the image where no
+# board was seen.
 LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 LENS_PARAMETERS = len(LENS_NAMES)
 POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -174,13 +176,16 @@ def predict(model: RigModel, batch: Batch, points: Array, free: Collection[Block
         assert model.zoom is not None
         lens, own = model.zoom.stops[batch.stop], "zoom"
     x, moved = _points_in_camera(model, batch, points)
-    pixels, by_x, by_lens = _project(lens, x)
+    pixels, by_x, by_lens, by_k3 = _project(lens, x)
     columns = columns_of(free, model.stops)
     parts, where = [], []
     if own in columns:
         first = columns[own].start + LENS_PARAMETERS * (batch.stop or 0)
         parts.append(by_lens)
         where.append(np.arange(first, first + LENS_PARAMETERS))
+    if batch.stop is None and "k3" in columns:
+        parts.append(by_k3)
+        where.append(np.array([columns["k3"].start]))
     if batch.stop and "pupil" in columns:
         parts.append(-by_x[..., 2:])  # the camera moves forward along its own z
         where.append(np.array([columns["pupil"].start + batch.stop - 1]))
@@ -234,6 +239,8 @@ def _names(block: str, stops: int) -> list[str]:
             return [f"T_zoom0_fixed.{name}" for name in POSE_NAMES]
         case "hand":
             return [f"T_head_zoom.{name}" for name in POSE_NAMES]
+        case "k3":
+            return ["fixed.k3"]
         case "warp":
             return [f"board.{name}" for name in WARP_NAMES]
         case _:
@@ -257,9 +264,14 @@ def stepped(model: RigModel, shared: Array, boards: Array, free: Collection[Bloc
             tuple(_bent(stop, step) for stop, step in zip(zoom.stops, lenses, strict=True)),
             tuple(float(old + step) for old, step in zip(zoom.pupil, pupils, strict=True)),
         )
+    fixed = model.fixed
+    if fixed is not None and "fixed" in steps:
+        fixed = _bent(fixed, steps["fixed"])
+    if fixed is not None and "k3" in steps:
+        fixed = replace(fixed, distortion=(*fixed.distortion[:4], fixed.distortion[4] + float(steps["k3"][0])))
     return RigModel(
         boards=_all_moved(model.boards, boards),
-        fixed=_bent(model.fixed, steps["fixed"]) if model.fixed is not None and "fixed" in steps else model.fixed,
+        fixed=fixed,
         zoom=zoom,
         gamma=_moved(model.gamma, steps.get("gamma")),
         hand=_moved(model.hand, steps.get("hand")),
@@ -289,6 +301,10 @@ def difference(model: RigModel, reference: RigModel, free: Collection[Block]) ->
                 T, T_ref = getattr(model, block), getattr(reference, block)
                 parts.append((T.rotation * T_ref.rotation.inv()).as_rotvec())
                 parts.append(T.translation - T_ref.translation)
+            case "k3":
+                assert model.fixed is not None
+                assert reference.fixed is not None
+                parts.append(np.array([model.fixed.distortion[4] - reference.fixed.distortion[4]]))
             case "warp":
                 parts.append(np.subtract(model.warp, reference.warp))
             case _:
@@ -423,12 +439,13 @@ def _pose_derivative(turned: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _project(lens: Intrinsics, x_camera: Array) -> tuple[Array, Array, Array]:
-    """Project points (v, N, 3): pixels, derivatives by the point (v, N, 2, 3) and by the lens (v, N, 2, 8)."""
+def _project(lens: Intrinsics, x_camera: Array) -> tuple[Array, Array, Array, Array]:
+    """Project points (v, N, 3): pixels, derivatives by the point (v, N, 2, 3), the lens (..., 8) and k3 (..., 1)."""
     v, n = x_camera.shape[:2]
     x = np.ascontiguousarray(x_camera.reshape(-1, 1, 3))
     x = np.where(x[..., 2:] > 0, x, np.nan)
     px, J = cv2.projectPoints(x, np.zeros(3), np.zeros(3), lens.matrix, np.array(lens.distortion))
     J = np.asarray(J).reshape(v, n, 2, -1)
-    by_lens = J[..., POSE_PARAMETERS : POSE_PARAMETERS + LENS_PARAMETERS]
-    return np.asarray(px).reshape(v, n, 2), J[..., 3:POSE_PARAMETERS], by_lens  # by t, which equals by the point
+    last = POSE_PARAMETERS + LENS_PARAMETERS
+    by_point = J[..., 3:POSE_PARAMETERS]  # by t, which is the same
+    return np.asarray(px).reshape(v, n, 2), by_point, J[..., POSE_PARAMETERS:last], J[..., last : last + 1]
