@@ -50,9 +50,7 @@ class Table:
 def parameter_tables(calibration: Calibration) -> list[Table]:
     """All parameters, value ± one standard deviation, in groups."""
     header = ("parameter", "value ± σ", "unit")
-    fixed = Table(
-        "Fixed camera", header, tuple(_lens(calibration, calibration.fixed, "fixed")), _held(calibration.fixed)
-    )
+    fixed = Table("Fixed camera", header, tuple(_lens(calibration, calibration.fixed, "fixed")), _about_k3(calibration))
     tables = [fixed, *_zoom(calibration)]
     tables.append(_pose_table(calibration, "Offset between the cameras", "T_zoom0_fixed", calibration.T_zoom0_fixed))
     if calibration.T_head_zoom is not None:
@@ -72,6 +70,13 @@ def _bend(calibration: Calibration, axis: str, value: float) -> tuple[str, ...]:
 
 def _held(lens: Intrinsics) -> str:
     return f"k3 is held at {digits(lens.distortion[4], 3)}." if lens.distortion[4] else "k3 is held at 0."
+
+
+def _about_k3(calibration: Calibration) -> str:
+    k3, sigma = calibration.fixed.distortion[4], sigma_of(calibration, "fixed.k3")
+    if sigma is None:
+        return _held(calibration.fixed)
+    return f"The corners ask for k3: it is {value_and_sigma(k3, sigma)}. Beyond the boards such a lens is less certain."
 
 
 def _numbers(lens: Intrinsics) -> dict[str, float]:
