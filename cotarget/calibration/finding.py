@@ -18,7 +18,7 @@ from cotarget.calibration.stops import (
     SAME_FOCAL,
     expected_corners,
     find_expected,
-    fit_last_stop,
+    fit_stop,
     same_focal,
     stops_of,
     with_stop,
@@ -144,4 +144,4 @@ def _taught(model: RigModel, known: Sequence[View], here: Sequence[View], points
     """The model with its last stop fitted to the views at it."""
     numbers = {view.board for view in here}
     fixed = [view for view in known if view.camera == "fixed" and view.board in numbers]
-    return fit_last_stop(model, [*fixed, *here], points)
+    return fit_stop(model, model.stops - 1, [*fixed, *here], points)

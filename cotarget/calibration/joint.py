@@ -26,7 +26,7 @@ from cotarget.calibration.reprojection import (
 )
 from cotarget.calibration.sequential import Solution, Steps, both_cameras, stereo
 from cotarget.calibration.start import of_both, pairs_at_home, rough_gamma, rough_hand
-from cotarget.calibration.stops import check_stops, fit_last_stop, lens_prior, with_stop
+from cotarget.calibration.stops import check_stops, fit_stop, lens_prior, with_stop
 from cotarget.calibration.uncertainty import covariance_of
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
@@ -169,7 +169,7 @@ def _all_stops(
         seen_too = {view.board for view in here}
         with_fixed = [view for view in used if view.camera == "fixed" and view.board in seen_too]
         start = replace(model, zoom=with_stop(model.zoom, nominal))
-        model = fit_last_stop(start, [*with_fixed, *here], points)
+        model = fit_stop(start, start.stops - 1, [*with_fixed, *here], points)
         used += here
     return model, used, rejected
 

@@ -100,17 +100,18 @@ def lens_prior(model: RigModel) -> Prior:
     return Prior(replace(model, zoom=still), sigmas)
 
 
-def fit_last_stop(model: RigModel, views: Sequence[View], points: Array) -> RigModel:
-    """Fit the last stop alone to views at it, the boards where they are, everything else as it is.
+def fit_stop(model: RigModel, number: int, views: Sequence[View], points: Array) -> RigModel:
+    """Fit one stop alone to views at it, the boards where they are, everything else as it is.
 
     Args:
         model: with the boards of the views' placements.
-        views: of the zoom camera at its last stop, and of the fixed camera of the same placements.
+        number: of the stop.
+        views: of the zoom camera at that stop, and of the fixed camera of the same placements.
         points: the board's corners in its frame [m], (N, 3).
     """
     known = lens_prior(model)
-    last = f"zoom[{model.stops - 1}]."  # nothing draws the other stops, which have no views here
-    prior = Prior(known.reference, {name: sigma for name, sigma in known.sigmas.items() if name.startswith(last)})
+    own = f"zoom[{number}]."  # nothing is to draw the other stops, which have no views here
+    prior = Prior(known.reference, {name: sigma for name, sigma in known.sigmas.items() if name.startswith(own)})
     found = fit(model, views, points, ("zoom", "pupil"), prior=prior)
     return replace(found.model, boards=model.boards)
 

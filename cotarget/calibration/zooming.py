@@ -17,10 +17,12 @@ from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.reprojection import RigModel, base_heads
 from cotarget.calibration.stops import (
     FEWEST_CORNERS,
+    SAME_FOCAL,
     expected_corners,
     expected_inside,
     find_expected,
-    fit_last_stop,
+    fit_stop,
+    same_focal,
     with_stop,
 )
 from cotarget.camera import Intrinsics
@@ -64,9 +66,8 @@ def see_stops(
     for view in recorder.views:
         if view.camera == "fixed":
             coverage["fixed"].add(view.corners_px[view.seen])
-    at_stop = [Coverage(size) for _ in stops]
+    at_stop: dict[int, Coverage] = {}
     only_fixed = replace(model, zoom=None)
-    reached = list(model.zoom.nominal_px)
     done = 0
     for _ in range(ATTEMPTS * placements):
         if done == placements:
@@ -82,27 +83,46 @@ def see_stops(
             continue
         done += 1
         coverage["fixed"].add(fixed_view.corners_px[fixed_view.seen])
-        for i, stop in enumerate(stops[1:], start=1):
-            tell(f"zoom stop {i + 1} of {len(stops)}, board {done} of {placements}")
+        for i, stop in enumerate(stops[1:], start=2):
+            tell(f"zoom stop {i} of {len(stops)}, board {done} of {placements}")
             nominal = recorder.zoom(stop)
-            new = i >= len(reached)
-            if new:
-                reached.append(nominal)
-                assert model.zoom is not None
-                model = replace(model, zoom=with_stop(model.zoom, nominal))
-            placed = place_boards(model, [fixed_view], points)
-            for _ in range(FIRST_VIEWS if new else VIEWS_A_STOP):
-                seen = _see_part(recorder, placed, nominal, at_stop[i], rng, points)
-                if seen is not None and new:
-                    placed = fit_last_stop(placed, [fixed_view, *_at(recorder, nominal)], points)
-                    model = replace(model, zoom=placed.zoom)
+            number, model = _stop_at(model, nominal)
+            if number:  # a lens with few positions may offer the first one again
+                cover = at_stop.setdefault(number, Coverage(size))
+                model = _see_stop(recorder, model, number, fixed_view, cover, rng, points)
         recorder.zoom(stops[0])
     return model
 
 
-def _at(recorder: Recorder, nominal: float) -> list[View]:
-    """The views of the present placement at a focal length."""
-    return [view for view in recorder.of_placement(recorder.number) if view.focal_px == nominal]
+def _stop_at(model: RigModel, nominal: float) -> tuple[int, RigModel]:
+    """The number of the stop at a focal length, and the model with it: a new one only beyond the last."""
+    assert model.zoom is not None
+    away = np.abs(np.log(np.array(model.zoom.nominal_px) / nominal))
+    if nominal <= model.zoom.nominal_px[-1] or away.min() <= SAME_FOCAL:
+        return int(np.argmin(away)), model
+    return model.stops, replace(model, zoom=with_stop(model.zoom, nominal))
+
+
+def _see_stop(
+    recorder: Recorder,
+    model: RigModel,
+    number: int,
+    fixed_view: View,
+    coverage: Coverage,
+    rng: np.random.Generator,
+    points: Array,
+) -> RigModel:
+    """Take views of the present placement at a stop; the model, which learns the stop when it is first seen."""
+    assert model.zoom is not None
+    nominal = model.zoom.nominal_px[number]
+    known = any(view.camera == "zoom" and same_focal(view, nominal) for view in recorder.views)
+    placed = place_boards(model, [fixed_view], points)
+    for _ in range(VIEWS_A_STOP if known else FIRST_VIEWS):
+        seen = _see_part(recorder, placed, nominal, coverage, rng, points)
+        if seen is not None and not known:
+            here = [view for view in recorder.of_placement(recorder.number) if same_focal(view, nominal)]
+            placed = fit_stop(placed, number, [fixed_view, *here], points)
+    return replace(model, zoom=placed.zoom)
 
 
 def _see_part(
