@@ -131,22 +131,24 @@ def test_single_wrong_corners_are_left_out_and_counted(views, calibration):
 
 JITTER = np.radians(0.03)
 SEEDS = 12
-# Eight boards seen four times give 64 angles, which tell their scatter to 9 %, and 12 seeds to 2.6 %: thrice that. Any
-# one seed: thrice 9 %.
-JITTER_TOLERANCE, ONE_JITTER_TOLERANCE = 0.08, 0.27
-# Rms over 12 seeds. The calibration's own error, of two or three directions that matter, is known to a sixth: thrice
-# that is a half. With the head's jitter in every aim as well, which is the larger part, 12 x 40 aims tell it to 3 %.
-CALIBRATION_TOLERANCE, AIM_TOLERANCE = 0.5, 0.1
+# Six boards seen four times give 48 angles, which tell their scatter to 11 %, and 12 seeds to 3 %: thrice that. Any one
+# seed: thrice 11 %.
+JITTER_TOLERANCE, ONE_JITTER_TOLERANCE = 0.09, 0.33
+# The calibration's own error, of two or three directions that matter, is known to a sixth from 12 seeds: thrice that is
+# a half. With the jitter in every aim as well, which is the larger part, three times 40 aims tell it to 6 %.
+CALIBRATION_TOLERANCE, AIM_TOLERANCE = 0.5, 0.18
+AIM_SEEDS = 3
 
 
 def test_a_jittery_head_is_noticed_and_its_pointing_predicted():
     truth = replace(Truth(), jitter=JITTER)
     jitters, with_head, without = [], [], []
     for seed in range(SEEDS):
-        found = calibrated(drawn(truth, seed, Placing(boards=8, looks=4)))
+        found = calibrated(drawn(truth, seed, Placing(boards=6, looks=4)))
         jitters.append(found.jitter)
-        with_head.append(pointing(found, truth, seed, np.random.default_rng((seed, 5))))
         without.append(pointing(replace(found, jitter=0.0), Truth(), seed))
+        if seed < AIM_SEEDS:
+            with_head.append(pointing(found, truth, seed, np.random.default_rng((seed, 5))))
     assert rms(jitters) == pytest.approx(JITTER, rel=JITTER_TOLERANCE)
     assert jitters == pytest.approx([JITTER] * SEEDS, rel=ONE_JITTER_TOLERANCE)
     for pairs, tolerance in ((with_head, AIM_TOLERANCE), (without, CALIBRATION_TOLERANCE)):
@@ -156,8 +158,7 @@ def test_a_jittery_head_is_noticed_and_its_pointing_predicted():
 
 def test_an_exact_head_has_no_jitter(calibration):
     assert calibration.jitter == 0.0
-    for seed in (1, 2):
-        assert calibrated(drawn(other_rig(), seed, Placing(boards=8, looks=3))).jitter == 0.0
+    assert calibrated(drawn(other_rig(), 1)).jitter == 0.0
 
 
 SCALES = (1.001, 0.999)
@@ -199,7 +200,7 @@ def test_cameras_far_apart_that_never_share_a_view_at_home(side):
 # What the uncertainty says of what pan alone leaves free: that it is of no use.
 USELESS_POSITION, USELESS_TURN = 0.2, np.radians(2.0)
 KNOWN_TURN = np.radians(0.2)
-# What is insisted on is held as loosely as it is of any use, 0.5 m and 5 degrees, a hundred times what the corners tell.
+# What is insisted on is held as loosely as it is of any use, 0.5 m and 5 degrees: a hundred times what corners tell.
 LOOSE_SIGMAS = 0.01
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cotarget.calibration import calibrate_captures, calibrate_rig, predicted_pointing
+from cotarget.calibration import Options, calibrate_captures, calibrate_rig, predicted_pointing
 from cotarget.calibration.captures import INDEX
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
@@ -15,6 +15,7 @@ from experiments.synthetic import NOMINAL_PX, SIZE, Truth, draw_targets, misses,
 from tests.synthetic_rig import FOURFOLD, SyntheticRig, fourfold, zoomed
 
 BOARD = BoardConfig()
+QUICK = Options(folds=0)
 STOPS = 4
 # Every stop, and the middle between any two.
 FOCAL_LENGTHS = np.geomspace(NOMINAL_PX, FOURFOLD * NOMINAL_PX, 2 * STOPS - 1)
@@ -25,10 +26,11 @@ TARGETS = 40
 FOCAL_TOLERANCE = 0.003
 # A dozen placements leave the principal point 0.2 px uncertain (0.017 degrees) and T, with which it goes, likewise.
 BORESIGHT_TOLERANCE = np.radians(0.04)
-# What was predicted is 0.0015 to 0.003 degrees. One seed's error is mostly one draw of some twenty parameters, of
-# which two or three matter: thrice the prediction is beyond chance.
+# One seed's error is one draw of some thirty parameters, of which two or three matter: thrice the prediction is beyond
+# chance. The prediction itself is 0.002 to 0.005 degrees, most of it at the wide image's corners, where a dozen
+# placements hardly reach.
 POINTING_FACTOR = 3.0
-POINTING_TOLERANCE = np.radians(0.006)
+PREDICTED_TOLERANCE = np.radians(0.01)
 # Corners are rounded to 1e-4 px, but those of parts of boards are sought from where they are predicted, which differs
 # in the last digits as the order does: a hundredth of what noise leaves uncertain.
 SAME_PX, SAME_POSE = 0.005, 1e-6  # focal lengths and centres [px]; rotations [rad] and positions [m]
@@ -39,10 +41,8 @@ SAME_PUPIL = 1e-5  # [m]
 def session(tmp_path_factory):
     """A calibration from a dozen placements and three far ones, and the folder of its captures."""
     directory = tmp_path_factory.mktemp("captures")
-    calibration = calibrate_rig(
-        SyntheticRig(optics=fourfold), BOARD, captures_dir=directory, placements=12, stops=STOPS, far_placements=3
-    )
-    return calibration, directory
+    rig, asked = SyntheticRig(optics=fourfold), {"placements": 12, "stops": STOPS, "far_placements": 3}
+    return calibrate_rig(rig, BOARD, captures_dir=directory, options=QUICK, **asked), directory
 
 
 def at(calibration, nominal_px):
@@ -79,7 +79,6 @@ def test_every_stop_is_found(session):
     assert calibration.zoom.nominal_px == pytest.approx(FOCAL_LENGTHS[::2])
     assert {view.focal_px for view in calibration.views if view.camera == "zoom"} == set(calibration.zoom.nominal_px)
     assert calibration.residuals.rejected == ()
-    assert calibration.held_out is not None
     in_part = [view for view in calibration.views if not view.seen.all()]
     assert in_part, "at four times the focal length a board fills more than the image"
 
@@ -97,7 +96,8 @@ def test_it_points_over_the_whole_range(session, nominal):
     targets = draw_targets(np.random.default_rng(5), TARGETS)
     measured = rms(misses(found, true, *targets))
     predicted = rms(predicted_pointing(calibration, *targets, nominal_px=nominal))
-    assert measured < min(POINTING_FACTOR * predicted, POINTING_TOLERANCE)
+    assert measured < POINTING_FACTOR * predicted
+    assert predicted < PREDICTED_TOLERANCE
 
 
 def rms(errors):
@@ -109,7 +109,7 @@ def test_captures_in_any_order_give_the_same_calibration(session):
     table = json.loads((directory / INDEX).read_text())
     np.random.default_rng(0).shuffle(table["captures"])
     (directory / INDEX).write_text(json.dumps(table))
-    again = calibrate_captures(directory)
+    again = calibrate_captures(directory, options=QUICK)
     assert {(view.source, int(view.seen.sum())) for view in again.views} == {
         (view.source, int(view.seen.sum())) for view in calibration.views
     }
