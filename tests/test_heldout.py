@@ -32,11 +32,11 @@ def fitted(start, views):
 
 
 RIGS = (Truth(), other_rig())
-SEEDS, FOLDS = 5, 3  # seeds of each rig
+SEEDS, FOLDS = 4, 3  # seeds of each rig
 # Eight placements' misses are two coordinates each, some of them alike: the mean squared, whitened miss of one seed
-# scatters by 0.42 (over a hundred others), that of ten by 0.13. Thrice that.
-RATIO_TOLERANCE = 0.4
-MOST_WIDENED = 1  # of ten, where the threshold of three standard deviations is passed by chance once in fifty
+# scatters by 0.42 (over a hundred others), that of eight by 0.15. Thrice that.
+RATIO_TOLERANCE = 0.45
+MOST_WIDENED = 1  # of eight, where the threshold of three standard deviations is passed by chance once in fifty
 
 
 def test_an_exact_model_predicts_what_it_has_not_seen(monkeypatch):
@@ -95,14 +95,14 @@ THIN_PRISM = (-0.2, 0, 0, 0, 0, 0, 0, 0, 0.012, 0.008, -0.008, 0.004)  # some 0.
     replace(Truth(), zoom=Lens(692.0, 693.0, 326.0, 235.0, THIN_PRISM)),
 ], ids=["sag", "thin prism"])  # fmt: skip
 def test_what_the_head_seems_to_do_becomes_jitter(truth):
-    assert calibrate_views(drawn(truth, 0, boards=10), BOARD, SIZES, options=QUICK).jitter > 0
+    assert calibrate_views(drawn(truth, 0), BOARD, SIZES, options=QUICK).jitter > 0
 
 
 def test_a_fixed_lens_of_another_kind_widens_the_uncertainty():
     """No turn of the head is an excuse for the fixed camera."""
     truth = replace(Truth(), fixed=Lens(686.0, 684.0, 325.0, 239.0, THIN_PRISM))
-    views = drawn(truth, 0, boards=12, looks=4)
-    found, plain = calibrate_views(views, BOARD, SIZES), calibrate_views(views, BOARD, SIZES, options=QUICK)
+    views = drawn(truth, 0, looks=4)
+    found, plain = (calibrate_views(views, BOARD, SIZES, options=Options(folds=folds)) for folds in (FOLDS, 0))
     assert found.held_out.measured_px > found.held_out.predicted_px
     assert plain.held_out is None
     factor = found.held_out.widened
@@ -112,6 +112,12 @@ def test_a_fixed_lens_of_another_kind_widens_the_uncertainty():
 
 
 def test_too_few_placements_tell_nothing():
-    views = [v for v in drawn(Truth(), 0) if v.board < 4]
-    assert calibrate_views(views, BOARD, SIZES, options=Options(folds=5)).held_out is None
-    assert calibrate_views(views, BOARD, SIZES, options=Options(folds=4)).held_out is not None
+    views = drawn(Truth(), 0, boards=4)
+    start = model_of(calibrate_views(views, BOARD, SIZES, options=QUICK))
+    found = fitted(start, views)
+    assert cross_validate(found, POINTS, None, folds=5) is None
+    assert cross_validate(found, POINTS, None, folds=4) is not None
+    # The fixed camera tells where the board is; without it a placement says nothing of pointing.
+    half = fitted(start, [v for v in views if v.camera == "zoom" or v.board > 0])
+    assert cross_validate(half, POINTS, None, folds=4) is None
+    assert cross_validate(half, POINTS, None, folds=3).views == sum(v.camera == "zoom" for v in views if v.board > 0)
