@@ -8,10 +8,10 @@ import pytest
 
 from cotarget.calibration import Calibration, Options, calibrate_views, heldout
 from cotarget.calibration.boards import board_points
-from cotarget.calibration.bundle import fit
+from cotarget.calibration.bundle import Prior, fit
 from cotarget.calibration.heldout import cross_validate
 from cotarget.calibration.placing import place_boards
-from cotarget.calibration.reprojection import ALL_BLOCKS
+from cotarget.calibration.reprojection import ALL_BLOCKS, parameter_names
 from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from experiments.synthetic import SIZES, Lens, Placing, Truth, other_rig, spread_views, truth_of
@@ -22,13 +22,13 @@ NOISE_PX = 0.1
 QUICK = Options(folds=0)
 
 
-def drawn(truth, seed, boards=8, looks=3):
+def drawn(truth, seed, boards=8, looks=3, noise_px=NOISE_PX):
     rng = np.random.default_rng((seed, 3))
-    return spread_views(truth, POINTS, rng, NOISE_PX, Placing(boards=boards, looks=looks))
+    return spread_views(truth, POINTS, rng, noise_px, Placing(boards=boards, looks=looks))
 
 
-def fitted(start, views):
-    return fit(place_boards(start, views, POINTS), views, POINTS, ALL_BLOCKS)
+def fitted(start, views, prior=None):
+    return fit(place_boards(start, views, POINTS), views, POINTS, ALL_BLOCKS, prior=prior)
 
 
 RIGS = (Truth(), other_rig())
@@ -56,6 +56,20 @@ def test_an_exact_model_predicts_what_it_has_not_seen(monkeypatch):
     monkeypatch.undo()
     limit = 1 + heldout.CHANCE_SIGMAS / np.sqrt(8)
     assert np.count_nonzero(np.array(ratios) > limit) <= MOST_WIDENED
+
+
+PLACEMENTS = 24
+# Each placement's views miss alike, by its own two coordinates: a mean over so many scatters by a fifth. Thrice that.
+NOISE_TOLERANCE = 0.6
+
+
+def test_of_a_rig_that_is_known_only_the_boards_noise_is_left(monkeypatch):
+    """Then every miss comes from the board's pose, as one view of the fixed camera tells it."""
+    monkeypatch.setattr(heldout, "CHANCE_SIGMAS", -np.inf)
+    exact = model_of(calibrate_views(drawn(Truth(), 0, noise_px=0.0), BOARD, SIZES, options=QUICK))
+    known = Prior(exact, dict.fromkeys(parameter_names(ALL_BLOCKS), 1e-8))
+    found = cross_validate(fitted(exact, drawn(Truth(), 1, PLACEMENTS, looks=2), known), POINTS, known, folds=2)
+    assert found.widened**2 == pytest.approx(1.0, abs=NOISE_TOLERANCE)
 
 
 # The pose of a board comes from OpenCV here, of plain least squares in place of Huber's, which gives the corners beyond

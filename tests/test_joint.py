@@ -221,9 +221,9 @@ def test_pan_alone_is_refused_or_owned_up_to(views, calibration):
 
 
 CUT_SHARE = 0.6  # of the views
-# Less than half of what was told is gone, so that the standard deviations grow by less than the root of two; those of
-# what is told at the board's edges, by more.
-CUT_GROWTH = 2.0
+# Three tenths of the corners are gone, and with them a fifth of the precision if they told like any others; half a
+# board tells its pose less well.
+CUT_GROWTH = (1.1, 2.0)
 
 
 def test_boards_seen_in_part(views, calibration):
@@ -243,4 +243,4 @@ def test_boards_seen_in_part(views, calibration):
     measured, predicted = pointing(found, Truth())
     assert measured < POINTING_FACTOR * predicted
     whole = pointing(calibration, Truth())[1]
-    assert whole < predicted < CUT_GROWTH * whole
+    assert CUT_GROWTH[0] * whole < predicted < CUT_GROWTH[1] * whole
