@@ -32,11 +32,11 @@ def fitted(start, views, prior=None):
 
 
 RIGS = (Truth(), other_rig())
-SEEDS, FOLDS = 4, 3  # seeds of each rig
+SEEDS, FOLDS = 3, 3  # seeds of each rig
 # Eight placements' misses are two coordinates each, some of them alike: the mean squared, whitened miss of one seed
-# scatters by 0.42 (over a hundred others), that of eight by 0.15. Thrice that.
-RATIO_TOLERANCE = 0.45
-MOST_WIDENED = 1  # of eight, where the threshold of three standard deviations is passed by chance once in fifty
+# scatters by 0.42 (over a hundred others), that of six by 0.17. Thrice that.
+RATIO_TOLERANCE = 0.5
+MOST_WIDENED = 1  # of six, where the threshold of three standard deviations is passed by chance once in fifty
 
 
 def test_an_exact_model_predicts_what_it_has_not_seen(monkeypatch):
