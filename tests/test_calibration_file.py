@@ -39,7 +39,7 @@ def example():
         residuals=Residuals(0.1, 0.2, None, 0.4, 5, 6, 7, 8, (Rejected("a.png", "no board"),)),
         covariance=Covariance(("x", "y"), rng.normal(size=(2, 2))),
         jitter=0.0003,
-        held_out=HeldOut(9, 0.4, 0.2, 0.1, 2.0),
+        held_out=HeldOut(9, 0.4, 0.2, 0.1, 2.0, 2.0),
         board=BoardConfig(),
         views=(
             View("fixed", rng.uniform(0, 640, (54, 2)), 0),

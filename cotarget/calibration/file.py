@@ -260,7 +260,7 @@ def _parse_held_out(value: Any) -> HeldOut | None:
     table = parsing.as_table(value, "held_out")
     numbers = {
         name: parsing.as_number(get(table, name, "held_out"), f"held_out.{name}")
-        for name in ("measured_px", "predicted_px", "corners_rms_px", "widened")
+        for name in ("measured_px", "predicted_px", "corners_rms_px", "ratio", "widened")
     }
     return HeldOut(views=parsing.as_whole(get(table, "views", "held_out"), "held_out.views"), **numbers)
 

@@ -67,6 +67,7 @@ def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -
         measured_px=float(np.sqrt(np.mean(np.sum(miss**2, axis=-1)))),
         predicted_px=float(np.sqrt(np.mean(np.trace(covariances, axis1=1, axis2=2)))),
         corners_rms_px=rms(np.concatenate(left)),
+        ratio=float(np.sqrt(ratio2)),
         widened=float(np.sqrt(ratio2)) if ratio2 > by_chance else 1.0,
     )
 

@@ -38,8 +38,8 @@ WRONG_SHARE = 0.3  # a view with more wrong corners than this is left out as a w
 FEWEST_STOP_VIEWS, FEWEST_STOP_PLACEMENTS = 3, 2  # of a stop of the zoom lens
 # A board of one metre, glued to a sheet of something, is flat to some millimetres (as a share of its length).
 WARP_SHARE = 0.004
-# The fixed camera's k3 is found too where it is this many standard deviations from 0; by chance, of one lens in twenty.
-K3_SIGMAS, K3_WIDE = 2.0, 1.0
+# The fixed camera's k3 is found too where it is this many standard deviations from 0; by chance, of one in 400.
+K3_SIGMAS, K3_WIDE = 3.0, 1.0
 # A lens that asks for k3 is not of this model, and departs from it further where no board was seen: the uncertainty is
 # widened by this, which covers rational and fisheye lenses whose nearest fit is 0.2 px off (experiments.mismatch).
 K3_WIDENED = 1.4
@@ -95,20 +95,19 @@ def joint(
         prior = _known(model, start, blocks, options, warp_sigma)
         result = fit(model, used, points, blocks, prior=prior)
         check_stops(result.model)
+    result, prior = _with_k3_where_needed(result, points, prior)
     result, wrong, more = _without_wrong_corners(result, points, prior)
     rejected += more
-    result, prior = _with_k3_where_needed(result, points, prior)
     if not options.insist and (text := undetermined(result)):
         raise CalibrationError(text)
     covariance = covariance_of(result)
-    if covariance is not None and "k3" in result.free:
-        covariance = replace(covariance, matrix=covariance.matrix * K3_WIDENED**2)
     held_out = None
-    if covariance is not None and options.folds:
-        held_out = cross_validate(result, points, prior, options.folds)
-        if held_out is not None and held_out.widened > 1:
-            covariance = replace(covariance, matrix=covariance.matrix * held_out.widened**2)
-    widened = held_out.widened if held_out is not None else 1.0
+    widened = K3_WIDENED if "k3" in result.free else 1.0
+    if covariance is not None:
+        if options.folds:
+            held_out = cross_validate(result, points, prior, options.folds)
+            widened = max(widened, 1.0 if held_out is None else held_out.widened)
+        covariance = replace(covariance, matrix=covariance.matrix * widened**2)
     return Solution(
         model=result.model,
         residuals=_residuals(steps, result, points, rejected, wrong),

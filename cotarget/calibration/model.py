@@ -180,6 +180,7 @@ class HeldOut:
         measured_px: rms distance between predicted and seen, at each view's own focal length brought to the shortest.
         predicted_px: what the covariance, the jitter and the corners' noise let expect of that.
         corners_rms_px: rms of single corners of all views kept out, with only their board's pose fitted.
+        ratio: rms of every distance over what was expected of it; 1 where the uncertainty is honest.
         widened: factor by which the standard deviations were widened, because the measured distance was larger than
             predicted beyond chance; 1 where they agree.
     """
@@ -188,6 +189,7 @@ class HeldOut:
     measured_px: float
     predicted_px: float
     corners_rms_px: float
+    ratio: float
     widened: float = 1.0
 
 

@@ -3,7 +3,7 @@
 Plans need only a rough model of the rig. Whatever is planned is a wish: what counts is what is then seen.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -127,6 +127,7 @@ def plan_placements(
     *,
     shared: bool,
     margin_px: float,
+    accept: Callable[[RigidTransform], bool] | None = None,
 ) -> list[RigidTransform]:
     """Choose where the board may be held: for each distance, the place that covers most of what was not yet covered.
 
@@ -138,6 +139,7 @@ def plan_placements(
         rng: random numbers.
         shared: whether the zoom camera must see it too, at pan = tilt = 0.
         margin_px: how far inside the images the board must stay.
+        accept: whether a place will do in other respects.
 
     Returns:
         T_fixed_board, one for each distance at which a candidate is visible.
@@ -166,9 +168,11 @@ def plan_placements(
             if model.zoom is not None and in_zoom[k]:
                 gain += coverage["zoom"].gain(seen_zoom[k])
             gains.append((gain, int(k)))
-        if gains:
-            best = max(gains)[1]
-            chosen.append(RigidTransform.from_components(t[best], turns[best]))
+        for _, candidate in sorted(gains, reverse=True):
+            place = RigidTransform.from_components(t[candidate], turns[candidate])
+            if accept is None or accept(place):
+                chosen.append(place)
+                break
     return chosen
 
 

@@ -4,6 +4,7 @@ Boards are held far away, where the fixed camera still sees them whole; at each 
 head brings parts of the board all over the zoom image. The first board teaches each stop before the next one is tried.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -66,6 +67,7 @@ def see_stops(
     for view in recorder.views:
         if view.camera == "fixed":
             coverage["fixed"].add(view.corners_px[view.seen])
+    reachable = functools.partial(_reachable, model, recorder.rig.head.limits, points)
     at_stop: dict[int, Coverage] = {}
     only_fixed = replace(model, zoom=None)
     done = 0
@@ -73,7 +75,9 @@ def see_stops(
         if done == placements:
             break
         share = FARTHEST_SHARE - (FARTHEST_SHARE - NEAREST_SHARE) * done / max(placements - 1, 1)
-        wishes = plan_placements(only_fixed, recorder.board, coverage, [share], rng, shared=False, margin_px=BORDER_PX)
+        wishes = plan_placements(
+            only_fixed, recorder.board, coverage, [share], rng, shared=False, margin_px=BORDER_PX, accept=reachable
+        )
         if not wishes:
             continue
         recorder.present(wishes[0])
@@ -86,12 +90,28 @@ def see_stops(
         for i, stop in enumerate(stops[1:], start=2):
             tell(f"zoom stop {i} of {len(stops)}, board {done} of {placements}")
             nominal = recorder.zoom(stop)
-            number, model = _stop_at(model, nominal)
-            if number:  # a lens with few positions may offer the first one again
-                cover = at_stop.setdefault(number, Coverage(size))
-                model = _see_stop(recorder, model, number, fixed_view, cover, rng, points)
+            number, guessed = _stop_at(model, nominal)
+            if not number:  # a lens with few positions offers the first one again
+                continue
+            cover = at_stop.setdefault(number, Coverage(size))
+            learnt = _see_stop(recorder, guessed, number, fixed_view, cover, rng, points)
+            if learnt is None:
+                break  # a guess of the next stop would be one of a guess
+            model = learnt
         recorder.zoom(stops[0])
     return model
+
+
+def _reachable(model: RigModel, limits: PanTiltLimits, points: Array, wish: RigidTransform) -> bool:
+    """Whether the head can look at all of a board held there."""
+    assert model.zoom is not None
+    lens = model.zoom.stops[0]
+    corners = (model.hand * model.gamma * wish).apply(points)
+    found = solve(corners, model.hand, model.head, lens.ray(lens.image_center_px))
+    with np.errstate(invalid="ignore"):
+        pan = (found.pan[:, 0] >= limits.pan[0]) & (found.pan[:, 0] <= limits.pan[1])
+        tilt = (found.tilt[:, 0] >= limits.tilt[0]) & (found.tilt[:, 0] <= limits.tilt[1])
+    return bool((pan & tilt).all())
 
 
 def _stop_at(model: RigModel, nominal: float) -> tuple[int, RigModel]:
@@ -111,18 +131,22 @@ def _see_stop(
     coverage: Coverage,
     rng: np.random.Generator,
     points: Array,
-) -> RigModel:
-    """Take views of the present placement at a stop; the model, which learns the stop when it is first seen."""
+) -> RigModel | None:
+    """Take views of the present placement at a stop; the model, which learns the stop when it is first seen.
+
+    None where a stop that is not yet known was not seen.
+    """
     assert model.zoom is not None
     nominal = model.zoom.nominal_px[number]
     known = any(view.camera == "zoom" and same_focal(view, nominal) for view in recorder.views)
     placed = place_boards(model, [fixed_view], points)
+    here: list[View] = []
     for _ in range(VIEWS_A_STOP if known else FIRST_VIEWS):
         seen = _see_part(recorder, placed, nominal, coverage, rng, points)
         if seen is not None and not known:
-            here = [view for view in recorder.of_placement(recorder.number) if same_focal(view, nominal)]
+            here.append(seen)
             placed = fit_stop(placed, number, [fixed_view, *here], points)
-    return replace(model, zoom=placed.zoom)
+    return replace(model, zoom=placed.zoom) if known or here else None
 
 
 def _see_part(
