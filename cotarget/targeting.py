@@ -219,5 +219,5 @@ def _paper(calibration: Calibration, x_fixed: Array, method: Method, reach: Reac
     found = shortcut(x_fixed, calibration.T_zoom0_fixed, calibration.hand_eye(), reading)
     if not np.isfinite(found.pan):
         raise UnreachableError("the paper's shortcut has no solution for this point; use the exact method")
-    both = Pointing(np.atleast_1d(found.pan), np.atleast_1d(found.tilt), np.atleast_1d(found.range))
-    return nearest(both, reach.pan, reach.tilt, reach.now)
+    pan, tilt = calibration.head.reported_angles(np.atleast_1d(found.pan), np.atleast_1d(found.tilt))
+    return nearest(Pointing(pan, tilt, np.atleast_1d(found.range)), reach.pan, reach.tilt, reach.now, calibration.head)

@@ -135,6 +135,23 @@ def test_the_papers_worked_point():
     assert METHODS == ("exact", "paper-table", "paper-example")
 
 
+@pytest.mark.parametrize("method", ["paper-table", "paper-example"])
+def test_the_shortcut_too_is_told_as_the_head_reports(method):
+    """An encoder that counts 1 for every 1.01 turned, and 0 where the axis is at 0.02 rad."""
+    x_fixed = np.array([1.0, -0.7, 10.0])
+    true = aim(shifted(0.3), x_fixed, ANYWHERE, method=method)
+    told = aim(
+        replace(shifted(0.3), head=HeadGeometry(0.0, 0.0, 1.01, 1.01, 0.02, 0.02)), x_fixed, ANYWHERE, method=method
+    )
+    assert told.pan == pytest.approx((true.pan - 0.02) / 1.01, rel=RELATIVE)
+    assert told.tilt == pytest.approx((true.tilt - 0.02) / 1.01, rel=RELATIVE)
+    assert told.range == true.range
+    # A whole turn further is reported as 1 / 1.01 of one.
+    beyond = replace(ANYWHERE, pan=(3.2, 7.0), now=(6.0, 0.0))
+    around = aim(replace(shifted(0.3), head=HeadGeometry(pan_scale=1.01)), x_fixed, beyond, method=method)
+    assert around.pan == pytest.approx((true.pan + 2 * math.pi) / 1.01, rel=RELATIVE)
+
+
 def test_the_shortcut_says_where_it_has_no_solution():
     """The depth in x_fixed is 1 m, but the point is 3 m below the zoom camera: |b| > r1."""
     with pytest.raises(UnreachableError, match=r"shortcut has no solution.*use the exact method") as caught:
