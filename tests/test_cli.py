@@ -18,8 +18,8 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig, RigConfig
 from cotarget.geometry import pose
 from cotarget.pantilt import HeadGeometry
-from experiments.synthetic import Truth, undistorted
-from tests.synthetic_rig import draw, pixel_rays
+from experiments.synthetic import NOMINAL_PX, Truth, undistorted
+from tests.synthetic_rig import draw, fourfold, pixel_rays, zoomed
 
 OLD = "what was there before\n"
 PIXEL = 1e-5  # an angle of 1e-11 rad, printed in full, at 692 px; and a text's rounding
@@ -38,6 +38,14 @@ def true_calibration(config, zoom_size=None, with_head=True):
         head=HeadGeometry(sim.head.axis_offset_mm / 1000, math.radians(sim.head.squareness_deg)),
         pitch_mm=sim.zoom.pitch_mm,
     )
+
+
+CAPTURE = {"board": 0, "pan": 0.0, "tilt": 0.0, "focal_px": None, "t": 0.0}
+
+
+def write_index(folder, rows):
+    table = {"schema": 1, "board": {"kind": "chessboard", "corners": [9, 6], "square": 0.1}, "pitch_mm": None}
+    (folder / "index.json").write_text(json.dumps(table | {"captures": rows}))
 
 
 @pytest.fixture
@@ -62,6 +70,11 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "nothing").mkdir()
     (tmp_path / "index").mkdir()
     (tmp_path / "index" / "index.json").write_text('{"schema": 1, "board": 5, "pitch_mm": null, "captures": [1]}')
+    for camera, other in (("zoom", "fixed"), ("fixed", "zoom")):
+        folder = tmp_path / f"no_{other}"
+        folder.mkdir()
+        cv2.imwrite(str(folder / "a.png"), draw_photo())
+        write_index(folder, [CAPTURE | {"file": "a.png", "camera": camera}])
     (tmp_path / "cut").mkdir()
     (tmp_path / "cut" / "index.json").write_text('{"schema": 1, "boa')
     grey = np.full((120, 160, 3), 128, np.uint8)
@@ -142,6 +155,8 @@ MISTAKES = {
     "no folder": ([*FROM, "none", *PHOTOS], ["none: no such folder"]),
     "no captures": ([*FROM, "nothing"], ["holds no index.json of captures"]),
     "a malformed index": ([*FROM, "index"], ["index.json: ", "board"]),
+    "captures without the fixed camera": ([*FROM, "no_fixed"], ["no_fixed: has no capture of the fixed camera"]),
+    "captures without the zoom camera": ([*FROM, "no_zoom"], ["no_zoom: has no capture of the zoom camera"]),
     "half an index": ([*FROM, "cut"], ["index.json: is not JSON"]),
     "a board that is no board": (changed([*FROM, "single", *PHOTOS], "--board", "9by6"), ["--board", "9by6", "9x6"]),
     "a board too small": (changed([*FROM, "single", *PHOTOS], "--board", "2x6"), ["--board", "2x6", "3 at least"]),
@@ -333,6 +348,64 @@ def test_photos_are_calibrated(folder, capsys):
     assert told["baseline_m"] == pytest.approx(np.linalg.norm(truth.gamma.translation), abs=0.01)
     assert max(told["fixed_rms_px"], told["zoom_rms_px"], told["stereo_rms_px"]) < 0.1
     assert json.loads((folder / "out.json").read_text())["T_head_zoom"] is None
+
+
+@pytest.fixture(scope="module")
+def zooming(tmp_path_factory):
+    """A folder of captures of a head that pans and tilts, most at the shortest focal length and some at twice that."""
+    directory = tmp_path_factory.mktemp("zooming")
+    truth, board, rng, rows = Truth(), BoardConfig(), np.random.default_rng(1), []
+    far = zoomed(truth, fourfold(2 * NOMINAL_PX))
+    rays = {lens: pixel_rays(lens) for lens in (truth.fixed, truth.zoom, far.zoom)}
+
+    def take(camera, number, T_camera_board, lens, turn=(0.0, 0.0), focal_px=None):
+        name = f"{len(rows):02d}.png"
+        cv2.imwrite(str(directory / name), np.round(draw(lens, T_camera_board, board, rays[lens])).astype(np.uint8))
+        rows.append({"file": name, "camera": camera, "board": number, "pan": turn[0], "tilt": turn[1],
+                     "focal_px": focal_px, "t": float(len(rows))})  # fmt: skip
+
+    for number in range(8):
+        turned = pose([0.0, 0.0, 0.0], rng.uniform(-25, 25, 3))
+        middle = np.array([*rng.uniform(-0.3, 0.3, 2), rng.uniform(2.8, 4.0)])
+        T = turned.as_matrix()
+        T[:3, 3] = middle - turned.apply([0.4, 0.25, 0.0])
+        take("fixed", number, T, truth.fixed)
+        ahead = truth.gamma.apply(middle)
+        pan, tilt = math.atan2(ahead[0], ahead[2]), math.atan2(-ahead[1], ahead[2])
+        for turn in ((0.0, 0.0), (pan, 0.0), (pan + 0.1, 0.0), (pan, tilt), (pan, tilt - 0.1)):
+            take("zoom", number, truth.zoom_fixed(*turn) @ T, truth.zoom, turn, NOMINAL_PX)
+        if number < 4:
+            take("zoom", number, far.zoom_fixed(pan, 0.0) @ T, far.zoom, (pan, 0.0), 2 * NOMINAL_PX)
+    write_index(directory, rows)
+    return directory, rows
+
+
+def test_who_insists_is_heard_at_every_focal_length(folder, capsys, zooming):
+    """With pan alone the first fit, of the shortest focal length, is refused already."""
+    directory, rows = zooming
+    write_index(directory, [row for row in rows if row["tilt"] == 0])
+    status, out, err = call(capsys, *FROM, directory)
+    assert (status, out) == (1, "")
+    assert "only pan moved" in err
+    status, out, err = call(capsys, *FROM, directory, "--insist")
+    assert (status, err) == (0, "")
+    assert len(json.loads((folder / "out.json").read_text())["zoom"]["stops"]) == 2
+
+
+def test_the_sequential_method_leaves_other_focal_lengths_alone(folder, capsys, zooming, monkeypatch):
+    def never(*_):
+        raise AssertionError("the joint method was asked")
+
+    monkeypatch.setattr("cotarget.calibration.finding.joint", never)
+    directory, rows = zooming
+    write_index(directory, rows)
+    status, out, err = call(capsys, *FROM, directory, "--method", "sequential")
+    assert status == 0, err
+    assert json.loads(out)["rejected"] == 4
+    far = [row["file"] for row in rows if row["focal_px"] == 2 * NOMINAL_PX]
+    assert err == "".join(
+        f"not used: {name}: taken at 1334 px, not at the shortest focal length, 667 px\n" for name in far
+    )
 
 
 @pytest.mark.render

@@ -11,7 +11,7 @@ from pathlib import Path
 from cotarget.calibration.boards import another_board, board_points, find_corners, guess_corners
 from cotarget.calibration.captures import CaptureIndex, read_images
 from cotarget.calibration.joint import joint
-from cotarget.calibration.model import CameraName, Capture, Options, Rejected, View, unseen
+from cotarget.calibration.model import DEFAULT_OPTIONS, CameraName, Capture, Options, Rejected, View, unseen
 from cotarget.calibration.recorder import view_of
 from cotarget.calibration.reprojection import RigModel
 from cotarget.calibration.stops import (
@@ -52,29 +52,41 @@ def find_view(capture: Capture, board: BoardConfig) -> View | None:
     return None if corners is None else view_of(capture, corners)
 
 
-def find_views(directory: Path, index: CaptureIndex, progress: Progress | None = None) -> Found:
-    """Find the boards in all images of an index.
+def beyond_shortest(name: str, focal_px: float, shortest_px: float) -> Rejected:
+    """What is not used of the zoom camera where only its shortest nominal focal length is."""
+    return Rejected(name, f"taken at {focal_px:.0f} px, not at the shortest focal length, {shortest_px:.0f} px")
+
+
+def find_views(
+    directory: Path, index: CaptureIndex, progress: Progress | None = None, *, options: Options = DEFAULT_OPTIONS
+) -> Found:
+    """Find the boards in all images of an index; the sequential method's only at the shortest focal length.
 
     Args:
         directory: where the images lie.
         index: what they are.
         progress: called with what is done, of how much, and in words.
+        options: how the views will be calibrated.
 
     Raises:
-        CalibrationError: an image is missing or malformed, or none shows a board.
+        CalibrationError: an image is missing or malformed, none shows a board, or those at the shortest focal length
+            do not determine the rig.
     """
     sizes: dict[CameraName, tuple[int, int]] = {}
     views: list[View] = []
     rejected: list[Rejected] = []
     later: list[Capture] = []
     focals = [c.focal_px for c in index.captures if c.camera == "zoom" and c.focal_px is not None]
-    shortest = min(focals, default=0.0) * (1 + SAME_FOCAL)
+    shortest = min(focals, default=0.0)
     for done, capture in enumerate(read_images(directory, index.captures)):
         if progress is not None:
             progress(done, len(index.captures), f"looking for the board in {capture.source}")
         sizes[capture.camera] = (capture.image.shape[1], capture.image.shape[0])
-        if capture.camera == "zoom" and capture.focal_px is not None and capture.focal_px > shortest:
-            later.append(capture)
+        if capture.camera == "zoom" and capture.focal_px is not None and capture.focal_px > shortest * (1 + SAME_FOCAL):
+            if options.method == "sequential":
+                rejected.append(beyond_shortest(str(capture.source), capture.focal_px, shortest))
+            else:
+                later.append(capture)
             continue
         view = find_view(capture, index.board)
         if view is None:
@@ -88,7 +100,7 @@ def find_views(directory: Path, index: CaptureIndex, progress: Progress | None =
     if later:
         if progress is not None:
             progress(len(index.captures), len(index.captures), "fitting the shortest focal length")
-        more, lost = _find_parts(views, later, index.board, sizes)
+        more, lost = _find_parts(views, later, index.board, sizes, replace(options, folds=0))
         views += more
         rejected += lost
     return Found(tuple(views), tuple(rejected), sizes)
@@ -98,8 +110,8 @@ def _why_none(directory: Path, index: CaptureIndex, rejected: Sequence[Rejected]
     """Why no picture has given a view, as far as a look at some of them tells."""
     board = index.board
     name = f"{board.kind} of {board.corners[0]}x{board.corners[1]} inner corners"
-    if any(one.reason == TWO_BOARDS for one in rejected):
-        return f"no picture shows one {name} alone; {TWO_BOARDS}, like {rejected[0].name}"
+    if two := [one.name for one in rejected if one.reason == TWO_BOARDS]:
+        return f"no picture shows one {name} alone; {TWO_BOARDS}, like {two[0]}"
     every = max(len(index.captures) // GUESSES, 1)
     for capture in read_images(directory, index.captures[::every]):
         if board.kind == "chessboard" and (seen := guess_corners(capture.image)) not in (None, board.corners):
@@ -108,11 +120,15 @@ def _why_none(directory: Path, index: CaptureIndex, rejected: Sequence[Rejected]
 
 
 def _find_parts(
-    views: Sequence[View], captures: Sequence[Capture], board: BoardConfig, sizes: Mapping[CameraName, tuple[int, int]]
+    views: Sequence[View],
+    captures: Sequence[Capture],
+    board: BoardConfig,
+    sizes: Mapping[CameraName, tuple[int, int]],
+    options: Options,
 ) -> tuple[list[View], list[Rejected]]:
     """Find whole or partly seen boards in images at the stops beyond the first, one stop after the other."""
     points = board_points(board)
-    solution = joint(views, points, sizes, stops_of(views), Options(folds=0))
+    solution = joint(views, points, sizes, stops_of(views), options)
     model, known = solution.model, list(solution.views)
     blank = [(capture.image, view_of(capture, unseen(len(points)))) for capture in captures]
     rejected = [Rejected(view.name, NO_PLACE) for _, view in blank if view.board not in model.boards]

@@ -14,7 +14,7 @@ import numpy as np
 from cotarget import __version__
 from cotarget.calibration.boards import board_points, check_board
 from cotarget.calibration.captures import CaptureIndex, pair_photos, read_index
-from cotarget.calibration.finding import find_views
+from cotarget.calibration.finding import beyond_shortest, find_views
 from cotarget.calibration.intrinsics import FEWEST_CORNERS
 from cotarget.calibration.joint import joint
 from cotarget.calibration.model import DEFAULT_OPTIONS, Calibration, CameraName, Options, Rejected, View
@@ -33,6 +33,7 @@ PLACEMENTS = 30
 # Eight stops follow a twelvefold zoom to some hundredths of a percent; six placements see each twelve times.
 STOPS, FAR_PLACEMENTS = 8, 6
 METHODS = ("joint", "sequential")
+CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
 
 
 def calibrate_views(
@@ -131,9 +132,9 @@ def _at_shortest(views: Sequence[View], nominal: Sequence[float]) -> tuple[list[
         return view.camera == "fixed" or view.focal_px is None or view.focal_px <= nominal[0] * (1 + SAME_FOCAL)
 
     left_out = [
-        Rejected(view.name, f"taken at {view.focal_px:.0f} px, not at the shortest focal length, {nominal[0]:.0f} px")
+        beyond_shortest(view.name, view.focal_px, nominal[0])
         for view in views
-        if not keep(view)
+        if view.focal_px is not None and not keep(view)
     ]
     return [view for view in views if keep(view)], left_out
 
@@ -195,7 +196,10 @@ def _calibrate_images(
     what: str,
 ) -> Calibration:
     check_board(index.board)
-    found = find_views(directory, index, progress)
+    for camera in CAMERAS:
+        if not any(capture.camera == camera for capture in index.captures):
+            raise CalibrationError(f"{directory}: has no capture of the {camera} camera; both cameras are needed")
+    found = find_views(directory, index, progress, options=options)
     if progress is not None:
         progress(len(index.captures), len(index.captures), "fitting")
     return calibrate_views(
