@@ -150,7 +150,7 @@ def test_numbers_in_the_page_are_those_of_the_calibration(plain, tmp_path):
         residuals=replace(plain.residuals, rejected=rejected, outliers=3),
         provenance={**plain.provenance, "rig": "<img src=x onerror=alert(1)>"},
         jitter=np.radians(0.02),
-        held_out=HeldOut(20, 0.123, 0.0456, 0.1, 2.0),
+        held_out=HeldOut(20, 0.123, 0.0456, 0.1, 1.95, 2.0),
     )
     write_report(tmp_path / "r.html", changed, "<i>x</i>.json")
     page = (tmp_path / "r.html").read_text()
@@ -357,5 +357,5 @@ def test_mistakes_end_in_one_line_and_leave_the_page(plain, tmp_path, capsys):
     with pytest.raises(CalibrationError, match="is no parameter"):
         write_report(page, bare(plain, covariance=wrong))
     negative = replace(plain.covariance, matrix=-plain.covariance.matrix)
-    with pytest.raises(CalibrationError, match="is no covariance"):
+    with pytest.raises(CalibrationError, match="is no variance"):
         write_report(page, bare(plain, covariance=negative))

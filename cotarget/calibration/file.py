@@ -19,6 +19,7 @@ from cotarget.calibration import parsing
 from cotarget.calibration.atomic import write_atomically
 from cotarget.calibration.model import Calibration, Covariance, HeldOut, Rejected, Residuals, View
 from cotarget.calibration.parsing import Table, get, join
+from cotarget.calibration.reprojection import EVERY_BLOCK, parameter_names
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
@@ -26,6 +27,9 @@ from cotarget.geometry import pose_dict
 from cotarget.pantilt import HeadGeometry
 
 SCHEMA = 2
+# Rounding leaves a covariance, scaled to a unit diagonal, no less symmetric and its smallest eigenvalue no further
+# below zero than this, for every parameter.
+ROUNDING = 1e-9
 
 
 def save_calibration(path: Path, calibration: Calibration) -> None:
@@ -86,6 +90,37 @@ def load_calibration(path: Path) -> Calibration:
         return _parse(table)
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from None
+
+
+def check_covariance(covariance: Covariance, stops: int) -> None:
+    """Refuse a covariance that is none, or of other parameters than a rig has.
+
+    Args:
+        covariance: of a calibration.
+        stops: how many its zoom lens has.
+
+    Raises:
+        CalibrationError: with the key in the file.
+    """
+    names, C = covariance.parameters, covariance.matrix
+    known = parameter_names(EVERY_BLOCK, stops)
+    if unknown := [name for name in names if name not in known]:
+        raise CalibrationError(f"covariance.parameters: '{unknown[0]}' is no parameter; they are: {', '.join(known)}")
+    if not names:
+        raise CalibrationError("covariance.parameters: is empty; a method that tells no uncertainty has null instead")
+    if twice := [name for i, name in enumerate(names) if name in names[:i]]:
+        raise CalibrationError(f"covariance.parameters: '{twice[0]}' is there twice")
+    variances = np.diagonal(C)
+    for i in np.flatnonzero((variances < 0) | ((variances == 0) & C.any(axis=1))):
+        raise CalibrationError(
+            f"covariance.matrix[{i}][{i}]: {variances[i]:g} is no variance of {names[i]}; that is greater than zero"
+        )
+    scale = np.where(variances > 0, np.sqrt(variances), 1.0)
+    with np.errstate(over="ignore"):
+        R = C / scale / scale[:, None]
+    rounding = ROUNDING * len(C)
+    if not np.isfinite(R).all() or np.abs(R - R.T).max() > rounding or np.linalg.eigvalsh(R)[0] < -rounding:
+        raise CalibrationError("covariance.matrix: is no covariance: not symmetric, or with a variance below zero")
 
 
 def write_board(board: BoardConfig) -> dict[str, Any]:
@@ -179,9 +214,10 @@ def _parse(table: Table) -> Calibration:
     def angle(name: str) -> float:
         return math.radians(parsing.as_number(get(head, f"{name}_deg", "head"), f"head.{name}_deg"))
 
+    zoom = _parse_lens(parsing.as_table(get(table, "zoom"), "zoom"))
     return Calibration(
         fixed=_parse_intrinsics(fixed, parsing.as_size(get(fixed, "size", "fixed"), "fixed.size"), "fixed"),
-        zoom=_parse_lens(parsing.as_table(get(table, "zoom"), "zoom")),
+        zoom=zoom,
         T_zoom0_fixed=parsing.as_pose(get(table, "T_zoom0_fixed"), "T_zoom0_fixed"),
         T_head_zoom=None if T_head_zoom is None else parsing.as_pose(T_head_zoom, "T_head_zoom"),
         head=HeadGeometry(
@@ -192,10 +228,10 @@ def _parse(table: Table) -> Calibration:
             pan_zero=angle("pan_zero"),
             tilt_zero=angle("tilt_zero"),
         ),
-        jitter=angle("jitter"),
+        jitter=math.radians(_at_least(0, get(head, "jitter_deg", "head"), "head.jitter_deg")),
         pitch_mm=None if pitch is None else parsing.as_number(pitch, "pitch_mm", positive=True),
         residuals=_parse_residuals(get(table, "residuals")),
-        covariance=_parse_covariance(get(table, "covariance")),
+        covariance=_parse_covariance(get(table, "covariance"), len(zoom.stops)),
         held_out=_parse_held_out(get(table, "held_out")),
         board_warp=(warp[0], warp[1]),
         board=board,
@@ -240,7 +276,7 @@ def _parse_residuals(value: Any) -> Residuals | None:
         item = get(table, key, where)
         if key.endswith("_px"):
             missing = item is None and key in ("handeye_rms_px", "stereo_rms_px")
-            numbers[key] = None if missing else parsing.as_number(item, join(where, key))
+            numbers[key] = None if missing else _at_least(0, item, join(where, key))
         else:
             numbers[key] = parsing.as_whole(item, join(where, key))
     rejected = []
@@ -258,23 +294,34 @@ def _parse_held_out(value: Any) -> HeldOut | None:
     if value is None:
         return None
     table = parsing.as_table(value, "held_out")
+    lowest = {"measured_px": 0, "predicted_px": 0, "corners_rms_px": 0, "ratio": 0, "widened": 1}
     numbers = {
-        name: parsing.as_number(get(table, name, "held_out"), f"held_out.{name}")
-        for name in ("measured_px", "predicted_px", "corners_rms_px", "ratio", "widened")
+        name: _at_least(least, get(table, name, "held_out"), f"held_out.{name}") for name, least in lowest.items()
     }
     return HeldOut(views=parsing.as_whole(get(table, "views", "held_out"), "held_out.views"), **numbers)
 
 
-def _parse_covariance(value: Any) -> Covariance | None:
+def _at_least(lowest: int, value: Any, where: str) -> float:
+    """Expect a number that is not below some lowest one."""
+    number = parsing.as_number(value, where)
+    if number < lowest:
+        raise CalibrationError(f"{where}: {number:g} is less than {lowest}")
+    return number
+
+
+def _parse_covariance(value: Any, stops: int) -> Covariance | None:
     if value is None:
         return None
     table = parsing.as_table(value, "covariance")
     names = parsing.as_list(get(table, "parameters", "covariance"), "covariance.parameters")
     rows = parsing.as_list(get(table, "matrix", "covariance"), "covariance.matrix", len(names))
-    return Covariance(
+    matrix = [parsing.as_numbers(r, f"covariance.matrix[{i}]", len(names)) for i, r in enumerate(rows)]
+    covariance = Covariance(
         parameters=tuple(parsing.as_text(n, f"covariance.parameters[{i}]") for i, n in enumerate(names)),
-        matrix=np.array([parsing.as_numbers(r, f"covariance.matrix[{i}]", len(names)) for i, r in enumerate(rows)]),
+        matrix=np.array(matrix).reshape(len(names), len(names)),
     )
+    check_covariance(covariance, stops)
+    return covariance
 
 
 def _parse_view(value: Any, where: str, board: BoardConfig) -> View:

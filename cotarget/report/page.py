@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from cotarget.calibration.atomic import write_atomically
+from cotarget.calibration.file import check_covariance
 from cotarget.calibration.model import Calibration
-from cotarget.calibration.reprojection import EVERY_BLOCK, parameter_names
 from cotarget.errors import CalibrationError
 from cotarget.report import markup, pictures
 from cotarget.report.advice import advice, board_in_words
@@ -30,8 +30,6 @@ from cotarget.report.wording import count, digits, percent
 FOLDED_FROM = 8  # a longer list of rejected images is folded
 TWO_COLUMNS = 3  # tables with more columns take the whole width
 STYLE = Path(__file__).with_name("page.css")
-# Rounding leaves a covariance's smallest eigenvalue no further below zero than this, scaled to a unit diagonal.
-ROUNDING = 1e-9
 
 
 def write_report(path: Path, calibration: Calibration, source: str = "calibration.json") -> Verdict:
@@ -48,7 +46,8 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
     Raises:
         CalibrationError: a file cannot be written, or the calibration contradicts itself.
     """
-    check(calibration)
+    if calibration.covariance is not None:
+        check_covariance(calibration.covariance, len(calibration.zoom.stops))
     at = pointing(calibration)
     between = pointing(calibration, between_stops(calibration))
     evidence = gather(calibration)
@@ -61,26 +60,6 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
     _write_pictures(path.with_name(f"{path.stem}_pictures"), made)
     write_atomically(path, page.encode())
     return found
-
-
-def check(calibration: Calibration) -> None:
-    """Refuse a covariance that is none, or of other parameters.
-
-    Raises:
-        CalibrationError: with the key in the file.
-    """
-    covariance = calibration.covariance
-    if covariance is None:
-        return
-    known = parameter_names(EVERY_BLOCK, len(calibration.zoom.stops))
-    if unknown := [name for name in covariance.parameters if name not in known]:
-        raise CalibrationError(f"covariance.parameters: '{unknown[0]}' is no parameter; they are: {', '.join(known)}")
-    C = covariance.matrix
-    if len(set(covariance.parameters)) < len(covariance.parameters) or not len(C):
-        raise CalibrationError("covariance.parameters: is empty, or names one twice")
-    scale = np.sqrt(np.maximum(np.diagonal(C), np.finfo(float).tiny))
-    if not np.allclose(C, C.T) or np.linalg.eigvalsh(C / np.outer(scale, scale))[0] < -ROUNDING * len(C):
-        raise CalibrationError("covariance.matrix: is no covariance: not symmetric, or a variance below zero")
 
 
 def _write_pictures(folder: Path, made: dict[str, Picture]) -> None:
