@@ -255,6 +255,27 @@ def test_stored_corners_give_back_their_noise(plain):
     assert gather(bare(plain)) is None
 
 
+def one_line(view, seen=slice(0, 5)):
+    """The view with a few corners of one row alone."""
+    corners = np.full_like(view.corners_px, np.nan)
+    corners[seen] = view.corners_px[seen]
+    return replace(view, corners_px=corners, source="line.png")
+
+
+def test_a_view_of_corners_on_one_line_is_named_and_ends_no_report(plain, caplog):
+    for bad in (
+        one_line(plain.views[0]),
+        one_line(plain.views[0], slice(0, 40, 10)),  # the diagonal
+        replace(plain.views[0], corners_px=np.full((54, 2), 100.0), source="line.png"),
+    ):
+        views = (bad, *plain.views[1:])
+        with pytest.raises(CalibrationError, match=r"line\.png: all corners seen lie on one line"):
+            calibrate_views(views, BOARD, SIZES)
+        caplog.clear()
+        assert len(gather(replace(plain, views=views)).views) == len(plain.views) - 1
+        assert caplog.messages == ["line.png: not in the report: its corners are too few, or all on one line"]
+
+
 def test_a_wavy_board_is_seen_and_said(plain):
     bent = POINTS.copy()
     bent[:, 2] = 0.003 * np.sin(12 * POINTS[:, 0])  # waves, which no parabola takes up

@@ -24,6 +24,7 @@ from cotarget.calibration.session import capture_session
 from cotarget.calibration.stops import SAME_FOCAL, stops_of
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, choices
+from cotarget.geometry import Array
 from cotarget.rig import Rig
 
 Progress = Callable[[int, int, str], None]  # done, total, text
@@ -34,6 +35,8 @@ PLACEMENTS = 30
 STOPS, FAR_PLACEMENTS = 8, 6
 METHODS = ("joint", "sequential")
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
+# Corners that depart from a line by less are on it: the board's by rounding [m], the image's as corners are rounded.
+LINE_M, LINE_PX = 1e-9, 1e-3
 
 
 def calibrate_views(
@@ -105,8 +108,9 @@ def calibrate_views(
 
 
 def _check_views(views: Sequence[View], board: BoardConfig) -> None:
-    """Refuse corners that are not of this board."""
+    """Refuse corners that are not of this board, or do not tell its pose."""
     columns, rows = board.corners
+    points = board_points(board)
     for view in views:
         corners = view.corners_px
         if corners.shape != (columns * rows, 2) or np.isinf(corners).any() or view.seen.sum() < FEWEST_CORNERS:
@@ -114,6 +118,24 @@ def _check_views(views: Sequence[View], board: BoardConfig) -> None:
                 f"{view.name}: has not the {columns * rows} finite corners of a {columns}x{rows} board, or the "
                 f"{FEWEST_CORNERS} of them that tell its pose"
             )
+        if not tells_pose(view, points):
+            raise CalibrationError(
+                f"{view.name}: all corners seen lie on one line, which does not tell the board's pose; leave it out"
+            )
+
+
+def tells_pose(view: View, points: Array) -> bool:
+    """Whether the corners seen are enough for the board's pose, and not all on one line.
+
+    Args:
+        view: of a board.
+        points: the board's corners in its frame [m], (N, 3).
+    """
+    seen = view.seen
+    if np.count_nonzero(seen) < FEWEST_CORNERS:
+        return False
+    both = ((points[seen], LINE_M), (view.corners_px[seen], LINE_PX))
+    return all(np.linalg.matrix_rank(at - at.mean(axis=0), tol=tol) > 1 for at, tol in both)
 
 
 def _in_canonical_order(views: Sequence[View]) -> list[View]:

@@ -1,5 +1,6 @@
 """What the stored corners say: residuals, where they were seen, how far away the boards were and how they were held."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,13 +9,15 @@ import numpy.typing as npt
 
 from cotarget.calibration.boards import board_points
 from cotarget.calibration.bundle import Fit, fit, robust_sigma
-from cotarget.calibration.intrinsics import FEWEST_CORNERS
+from cotarget.calibration.method import tells_pose
 from cotarget.calibration.model import Calibration, CameraName, View
 from cotarget.calibration.placing import place_boards
 from cotarget.calibration.reprojection import predict_pixels, stop_of
 from cotarget.calibration.uncertainty import model_of
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
+
+log = logging.getLogger(__name__)
 
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
 CELLS = (16, 12)  # across and down an image, in which residuals are averaged
@@ -115,13 +118,20 @@ class Evidence:
 def gather(calibration: Calibration) -> Evidence | None:
     """Fit the boards' poses, and nothing else, to the stored corners; None where a calibration stores none.
 
+    Views whose corners do not tell a pose are left out: of those in a fit, too many may have been wrong.
+
     Raises:
         CalibrationError: the stored corners do not belong to this calibration.
     """
-    views = tuple(view for view in calibration.views if view.seen.sum() >= FEWEST_CORNERS)
-    if not views or calibration.board is None:
+    if calibration.board is None:
         return None
     points = board_points(calibration.board)
+    views = tuple(view for view in calibration.views if tells_pose(view, points))
+    for view in calibration.views:
+        if view not in views:
+            log.warning("%s: not in the report: its corners are too few, or all on one line", view.name)
+    if not views:
+        return None
     try:
         model = place_boards(model_of(calibration), views, points)
         found = fit(model, views, points, (), jitter=calibration.jitter)
