@@ -13,7 +13,7 @@ import pytest
 
 import cotarget
 from cotarget import cli
-from cotarget.calibration import Calibration, save_calibration
+from cotarget.calibration import Calibration, draw_board, save_calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig, RigConfig
 from cotarget.geometry import pose
@@ -167,6 +167,16 @@ MISTAKES = {
                               ["--square", "0 is not greater"]),
     "half the options for photos": ([*FROM, "single", "--fixed", "left*.png"], ["--zoom", "--board", "--square"]),
     "photos with a rig": ([*FROM_RIG, "rig.toml", "--board", "9x6"], ["--board goes with --from"]),
+    "a kind of board with a rig": ([*FROM_RIG, "rig.toml", "--kind", "charuco"], ["--kind goes with --from"]),
+    "a kind of board with captures": ([*FROM, "index", "--kind", "charuco"], ["--fixed, --zoom, --board and --square"]),
+    "an unknown kind of board": ([*FROM, "single", *PHOTOS, "--kind", "circles"], ["--kind", "circles", "charuco"]),
+    "another kind of board": ([*FROM, "single", *PHOTOS, "--kind", "charuco"],
+                              ["single: no picture shows", "charuco of 9x6"]),
+    "encoders step by step": ([*FROM, "index", "--encoders", "--method", "sequential"],
+                              ["--encoders goes with --method joint"]),
+    "insisting step by step": ([*FROM_RIG, "rig.toml", "--insist", "--method", "sequential"],
+                               ["--insist goes with --method joint"]),
+    "encoders on photos": ([*FROM, "single", *PHOTOS, "--encoders"], ["--encoders goes with --rig or saved captures"]),
     "captures without a rig": ([*FROM, "index", "--captures", "x"], ["--captures goes with --rig"]),
     "neither rig nor captures": (["calibrate"], ["--rig", "--from"]),
     # films
@@ -348,6 +358,28 @@ def test_photos_are_calibrated(folder, capsys):
     assert told["baseline_m"] == pytest.approx(np.linalg.norm(truth.gamma.translation), abs=0.01)
     assert max(told["fixed_rms_px"], told["zoom_rms_px"], told["stereo_rms_px"]) < 0.1
     assert json.loads((folder / "out.json").read_text())["T_head_zoom"] is None
+
+
+def test_photos_of_a_board_with_markers_are_calibrated(folder, capsys):
+    """8x6 corners, which no plain chessboard may have, seen by two cameras without any distortion."""
+    (folder / "photos").mkdir()
+    truth, rng, square_px = Truth(), np.random.default_rng(0), 40
+    picture = draw_board(BoardConfig("charuco", (8, 6), 0.1), square_px)
+    first = 2 * square_px - 0.5  # where the first inner corner is drawn
+    to_board = np.diag([0.1 / square_px, 0.1 / square_px, 1.0]) @ [[1, 0, -first], [0, 1, -first], [0, 0, 1]]
+    for number in range(8):
+        T = pose([*rng.uniform([-0.8, -0.5], [0.0, 0.0]), rng.uniform(1.6, 2.0)], rng.uniform(-25, 25, 3)).as_matrix()
+        for side, lens, M in (("left", truth.fixed, T), ("right", truth.zoom, truth.gamma.as_matrix() @ T)):
+            photo = cv2.warpPerspective(
+                picture, lens.K @ M[:3, [0, 1, 3]] @ to_board, (640, 480), borderValue=(160,) * 3
+            )
+            cv2.imwrite(str(folder / "photos" / f"{side}{number}.png"), photo)
+    status, out, err = call(capsys, *FROM, "photos", *changed(PHOTOS, "--board", "8x6"), "--kind", "charuco")
+    assert (status, err) == (0, "")
+    told = json.loads(out)
+    assert told["fixed_views"] == told["zoom_views"] == 8
+    assert told["baseline_m"] == pytest.approx(np.linalg.norm(truth.gamma.translation), abs=0.01)
+    assert json.loads((folder / "out.json").read_text())["board"]["kind"] == "charuco"
 
 
 @pytest.fixture(scope="module")

@@ -23,8 +23,13 @@ def calibrate(options: argparse.Namespace) -> None:
     from cotarget.safety import SafeRig
 
     check_outputs([options.out], [options.rig, options.source and options.source / "index.json"])
-    photos = {name: getattr(options, name) for name in ("fixed", "zoom", "board", "square")}
-    given = [name for name, value in photos.items() if value is not None]
+    needed = ("fixed", "zoom", "board", "square")
+    given = [name for name in (*needed, "kind") if getattr(options, name) is not None]
+    for name in ("encoders", "insist"):
+        if getattr(options, name) and options.method == "sequential":
+            raise ConfigError(f"--{name} goes with --method joint; the sequential method does as the paper does")
+    if options.encoders and options.rig is None and given:
+        raise ConfigError("--encoders goes with --rig or saved captures; plain photos know nothing of a head")
     how = cal.Options(options.method, encoders=options.encoders, insist=options.insist)
     session = {name: getattr(options, name) for name in ("placements", "stops") if getattr(options, name) is not None}
     if options.rig is None and session:
@@ -52,9 +57,9 @@ def calibrate(options: argparse.Namespace) -> None:
         elif options.captures is not None:
             raise ConfigError("--captures goes with --rig; saved captures are read with --from DIR alone")
         elif given:
-            if missing := [name for name in photos if name not in given]:
+            if missing := [name for name in needed if name not in given]:
                 raise ConfigError(f"plain photos need --{missing[0]} too: --fixed, --zoom, --board and --square")
-            board = BoardConfig(corners=options.board, square=options.square)
+            board = BoardConfig(options.kind or "chessboard", options.board, options.square)
             found = cal.calibrate_photos(options.source, options.fixed, options.zoom, board, options=how, progress=tell)
         else:
             if not (options.source / "index.json").exists():

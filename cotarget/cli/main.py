@@ -19,6 +19,7 @@ from cotarget.errors import CotargetError
 USAGE = 2  # argparse's own exit status
 INTERRUPTED = 130  # a shell's exit status for Ctrl-C
 TERMINATED = 143  # and for SIGTERM
+KINDS = ("chessboard", "charuco")  # of boards
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -85,6 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     calibrate.add_argument("--board", type=corners, metavar="CxR", help="inner corners of the board, such as 9x6")
     calibrate.add_argument("--square", type=positive, metavar="M", help="side of a square [m]")
+    calibrate.add_argument("--kind", choices=KINDS, help=f"of the board on photos ({KINDS[0]})")
     calibrate.add_argument(
         "--placements", type=count, metavar="N", help="with --rig: how many placements of the board (30)"
     )
@@ -147,8 +149,7 @@ def _parser() -> argparse.ArgumentParser:
 
     board = command("board", calibrating.board, "write a calibration board to print, to scale")
     board.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .pdf, .svg or .png")
-    kinds = ("chessboard", "charuco")
-    board.add_argument("--kind", choices=kinds, default=kinds[0], help="charuco has markers in it (chessboard)")
+    board.add_argument("--kind", choices=KINDS, default=KINDS[0], help="charuco has markers in it (chessboard)")
     board.add_argument("--board", type=corners, default=(9, 6), metavar="CxR", help="inner corners (9x6)")
     board.add_argument("--square", type=positive, default=0.025, metavar="M", help="side of a square [m] (0.025)")
 
