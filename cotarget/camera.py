@@ -18,9 +18,10 @@ from cotarget.geometry import Array
 UNDISTORT_STEPS = 20
 # A pixel counts as explained when its ray projects back to within this normalised distance (about 1e-9 px).
 UNDISTORT_TOLERANCE = 1e-12
-# By how much a zoom lens's optical axis wanders for every doubling of its focal length [px]: that of consumer cameras
-# comes to some 10 to 30 px of 640 over a tenfold range.
-WANDER_PX = 5.0
+# By how much a zoom lens's optical axis wanders for every doubling of its focal length, as a share of the image's
+# width: that of consumer cameras comes to some 10 to 30 px of 640 over a tenfold range.
+WANDER = 5.0 / 640.0
+FEW_STOPS = 4  # from here on a spline through them is smooth enough to judge itself by
 CENTER = slice(2, 4)  # of what a lens interpolates
 # The ratio of true to nominal focal length hardly changes over the range, so that this fixed point is there at once.
 NOMINAL_ROUNDS = 20
@@ -242,13 +243,16 @@ class ZoomLens:
     def center_doubt_px(self, nominal_px: float) -> Array:
         """How far off the principal point may be for want of stops, one standard deviation, (2,) [px].
 
-        Between stops, what two interpolants differ by: the spline used, and the one with straight ends. Beyond them, as
-        much as a usual zoom lens's axis wanders.
+        Between stops, what two interpolants differ by: the spline used, and the one with straight ends. Beyond them,
+        and between a few, as much as a usual zoom lens's axis wanders on the way from the stops.
         """
-        beyond = abs(math.log2(nominal_px / min(max(nominal_px, self.nominal_px[0]), self.nominal_px[-1])))
-        doubt = np.full(2, WANDER_PX * beyond)
-        if len(self.stops) < 3 or beyond:
-            return doubt
+        away = np.abs(np.log2(nominal_px / np.array(self.nominal_px)))
+        inside = self.nominal_px[0] <= nominal_px <= self.nominal_px[-1]
+        if not inside:
+            return np.full(2, WANDER * self.size[0] * float(away.min()))
+        if len(self.stops) < FEW_STOPS:
+            near, far = np.sort(away)[:2] if len(self.stops) > 1 else (0.0, 1.0)
+            return np.full(2, WANDER * self.size[0] * float(near * far / (near + far)))
         x = math.log(nominal_px)
         straight = CubicSpline(self._curve.x, self._curve(self._curve.x), bc_type="natural")
         return np.abs(straight(x) - self._curve(x))[CENTER]

@@ -121,7 +121,9 @@ def test_a_fixed_lens_of_another_kind_widens_the_uncertainty():
     assert plain.held_out is None
     factor = found.held_out.widened
     assert factor > 1
-    assert np.allclose(found.covariance.matrix, plain.covariance.matrix * factor**2, rtol=SAME_FIT, atol=0)
+    sigmas = np.sqrt(np.diag(found.covariance.matrix))  # correlations near 0 are known to no share of themselves
+    apart = (found.covariance.matrix - plain.covariance.matrix * factor**2) / np.outer(sigmas, sigmas)
+    assert np.abs(apart).max() < SAME_FIT
     assert found.jitter == pytest.approx(plain.jitter * factor, rel=SAME_FIT)
 
 

@@ -124,9 +124,9 @@ def test_captures_in_any_order_give_the_same_calibration(session):
         assert np.allclose(one, other, rtol=0, atol=SAME_POSE)
 
 
-# With centres 0, d, 0 one step apart, half a step in: the parabola is at 0.75 d; the spline with straight ends, whose
-# middle curvature is -3 d, at d / 2 + 3 d / 6 (1 / 2 - 1 / 8) = 0.6875 d.
-DOUBT_SHARE = 0.75 - 0.6875
+# With centres 0, d, d, 0 one step apart, half a step in: the cubic through them is the parabola d (3 x - x^2) / 2, at
+# 0.625 d; the spline with straight ends, whose inner curvatures are -1.2 d, at 1.2 d / 2 - 0.2 d / 8 = 0.575 d.
+DOUBT_SHARE = 0.625 - 0.575
 WANDER_PX = 5.0  # a doubling; what is said of a lens beyond its stops
 ROUNDING = 1e-9
 
@@ -139,11 +139,15 @@ def lens_of(centers, step=2.0):
 
 
 def test_the_doubt_about_the_center_between_stops():
-    lens = lens_of([(320.0, 240.0), (328.0, 236.0), (320.0, 240.0)])
+    lens = lens_of([(320.0, 240.0), (328.0, 236.0), (328.0, 236.0), (320.0, 240.0)])
     for nominal in lens.nominal_px:
         assert np.allclose(lens.center_doubt_px(nominal), 0.0, atol=ROUNDING)
-    for factor in (2**0.5, 2**1.5):
+    for factor in (2**0.5, 2**2.5):
         assert np.allclose(lens.center_doubt_px(factor * NOMINAL_PX), DOUBT_SHARE * np.array([8.0, 4.0]))
+    for few in (2, 3):  # a bridge: half an octave from either stop is a quarter of one
+        bridge = lens_of([(320.0, 240.0 + i) for i in range(few)])
+        assert np.allclose(bridge.center_doubt_px(2**0.5 * NOMINAL_PX), WANDER_PX / 4)
+        assert np.allclose(bridge.center_doubt_px(2 * NOMINAL_PX), 0.0, atol=ROUNDING)
     straight = lens_of([(320.0, 240.0), (324.0, 240.0), (328.0, 240.0), (332.0, 240.0)])
     assert np.allclose(straight.center_doubt_px(1.3 * NOMINAL_PX), 0.0, atol=ROUNDING)  # a line is a line
 

@@ -25,7 +25,6 @@ from cotarget.calibration.reprojection import (
     Prediction,
     RigModel,
     batches_of,
-    columns_of,
     difference,
     parameter_names,
     predict,
@@ -48,6 +47,8 @@ RELATIVE_ROUNDING = 1e-10  # of a normal matrix whose boards were eliminated by 
 # exp(2.71 / 2), which chance exceeds once in twenty times (a half chi-square at its border).
 JITTER_RANGE = (1e-7, 0.1)
 JITTER_EVIDENCE = 2.71
+JITTER_ROUNDS = 3
+TURN_ROUNDS = 6
 TURNS = 2  # pan and tilt
 
 
@@ -161,7 +162,7 @@ def information(model: RigModel, views: Sequence[View], points: Array, free: Col
         free: the blocks.
 
     Returns:
-        (n, n), in the order of `parameter_names` [1/px^2]; views of the same placement must come together.
+        (n, n), in the order of `parameter_names` [1/px^2].
     """
     model = replace(model, boards={number: model.boards[number] for number in sorted({v.board for v in views})})
     problem = _Problem(batches_of(model, views), points, tuple(free), None, 0.0)
@@ -182,7 +183,38 @@ def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> fl
     Returns:
         Standard deviation of each axis [rad]; 0 where the corners do not speak for any.
     """
-    problem = _Problem(batches_of(found.model, found.views), points, found.free, prior, 0.0)
+    jitter = 0.0
+    for _ in range(JITTER_ROUNDS):  # the first weights take what is jitter for wrong corners
+        jitter = _one_estimate(found, points, prior, jitter)
+    return jitter
+
+
+def head_turns(found: Fit, points: Array) -> Array:
+    """By how much every zoom view's own pan and tilt would have to differ for its corners to fit best, (V, 2) [rad].
+
+    nan for the fixed camera's views; the boards and everything else stay where the fit has put them.
+    """
+    problem = _Problem(batches_of(found.model, found.views), points, (), None, 0.0)
+    here = problem.at(found.model)
+    turns = np.full((len(found.views), TURNS), np.nan)
+    for batch, p, r in zip(problem.batches, here.predictions, here.residuals, strict=True):
+        if p.by_turn is None:
+            continue
+        Q, after = _masked(p.by_turn, batch), r
+        for _ in range(TURN_ROUNDS):  # wrong corners are not to turn a view
+            weighted = Q * _weights(after, _robust_scale(here))[..., None, None]
+            own = np.einsum("vnik,vnil->vkl", weighted, Q)
+            turn = -np.linalg.solve(
+                own + _damped(own, RELATIVE_ROUNDING), np.einsum("vnik,vni->vk", weighted, r)[..., None]
+            )[..., 0]
+            after = r + np.einsum("vnik,vk->vni", Q, turn)
+        turns[batch.rows] = turn
+    return turns
+
+
+def _one_estimate(found: Fit, points: Array, prior: Prior | None, before: float) -> float:
+    """One round of `estimate_jitter`, with corners weighted as a jitter estimated before leaves them."""
+    problem = _Problem(batches_of(found.model, found.views), points, found.free, prior, before)
     here = problem.at(found.model)
     grams = problem.grams(here, _robust_scale(here))
     if found.variance is None or not any(batch.stop is not None for batch in problem.batches):
@@ -321,7 +353,7 @@ class _Problem:
 
     def variance(self, here: _Evaluation) -> float | None:
         """See `Fit.variance`."""
-        n = sum(len(range(*c.indices(10**6))) for c in columns_of(self.free, here.model.stops).values())
+        n = len(parameter_names(self.free, here.model.stops))
         parameters = float(n + POSE_PARAMETERS * len(here.model.boards))
         if self.jitter:
             penalty = (here.sigma / self.jitter) ** 2

@@ -4,6 +4,7 @@ The placements are dealt into folds; each fold is left out once, everything else
 the zoom camera are predicted from the fixed camera's view of the same board alone. That is what pointing does.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -12,14 +13,15 @@ import numpy as np
 from cotarget.calibration.bundle import Fit, Prior, fit, rms
 from cotarget.calibration.model import HeldOut, View
 from cotarget.calibration.placing import place_boards
-from cotarget.calibration.reprojection import Batch, batches_of, parameter_names, predict
+from cotarget.calibration.reprojection import Batch, batches_of, parameter_names, predict, stop_of
 from cotarget.calibration.uncertainty import covariance_of
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
 
-# Measured and predicted agree when the mean squared, whitened miss is below 1 + this many standard deviations of it,
-# each placement counting as one independent miss of two coordinates.
-CHANCE_SIGMAS = 3.0
+# Measured and predicted agree when the mean squared, whitened miss is below 1 + this many standard deviations of it.
+# The misses of a fold share the error of its fit: a placement counts as half an independent miss of two coordinates.
+CHANCE_SIGMAS, SHARE = 3.0, 0.5
+FEWEST_VIEWS = 3  # of a zoom stop that must remain for a fold's views at it to be predicted
 
 
 def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -> HeldOut | None:
@@ -45,7 +47,14 @@ def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -
     for k in range(folds):
         out = set(numbers[k::folds])
         rest = [view for view in found.views if view.board not in out]
-        kept = [view for view in found.views if view.board in out]
+        lens = found.model.zoom
+        assert lens is not None
+        remaining = Counter(stop_of(lens, view) for view in rest if view.camera == "zoom")
+        kept = [
+            view
+            for view in found.views
+            if view.board in out and (view.camera == "fixed" or remaining[stop_of(lens, view)] >= FEWEST_VIEWS)
+        ]
         try:
             partial = fit(found.model, rest, points, found.free, prior=prior, jitter=found.jitter)
         except CalibrationError:
@@ -61,7 +70,7 @@ def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -
     miss, covariances = np.concatenate(misses), np.concatenate(expected)
     whitened = np.einsum("vi,vij,vj->v", miss, np.linalg.inv(covariances), miss) / 2
     ratio2 = float(np.mean(whitened))
-    by_chance = 1 + CHANCE_SIGMAS / np.sqrt(len(numbers))
+    by_chance = 1 + CHANCE_SIGMAS / np.sqrt(SHARE * len(numbers))
     return HeldOut(
         views=len(miss),
         measured_px=float(np.sqrt(np.mean(np.sum(miss**2, axis=-1)))),

@@ -4,7 +4,8 @@
    from the motions of head and camera, Gamma from every placement that both cameras see, whatever the head's pose.
 2. One fit of both cameras, Gamma, T and the head's geometry from all views at the shortest focal length.
 3. The zoom lens's stops one after the other, each beginning where the one before ended; then everything together.
-4. Single corners that are wrong are left out; the head's jitter is estimated; what captures kept out of the fit say
+4. Views for which the head stood elsewhere than it says, and single corners that are wrong, are left out; the head's
+   jitter is estimated; and the fixed camera's k3, where the corners ask for it. What captures kept out of the fit say
    widens the uncertainty where they disagree with it.
 """
 
@@ -13,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cotarget.calibration.bundle import Fit, Prior, estimate_jitter, fit, rms, robust_sigma
+from cotarget.calibration.bundle import MEDIAN_TO_SIGMA, Fit, Prior, estimate_jitter, fit, head_turns, rms, robust_sigma
 from cotarget.calibration.heldout import cross_validate
 from cotarget.calibration.model import DEFAULT_OPTIONS, CameraName, Options, Rejected, Residuals, View
 from cotarget.calibration.observability import limits_of_use, name_directions, weak_directions
@@ -25,7 +26,7 @@ from cotarget.calibration.reprojection import (
     parameter_names,
 )
 from cotarget.calibration.sequential import Solution, Steps, both_cameras, stereo
-from cotarget.calibration.start import of_both, pairs_at_home, rough_gamma, rough_hand
+from cotarget.calibration.start import at_home, of_both, pairs_at_home, rough_gamma, rough_hand
 from cotarget.calibration.stops import check_stops, fit_stop, lens_prior, with_stop
 from cotarget.calibration.uncertainty import covariance_of
 from cotarget.errors import CalibrationError
@@ -35,6 +36,10 @@ from cotarget.geometry import Array
 # 65 million is.
 WRONG_SIGMAS, WRONG_FLOOR_PX = 6.0, 0.5
 WRONG_SHARE = 0.3  # a view with more wrong corners than this is left out as a whole
+NO_PLACE = "its board is seen by neither camera at the shortest focal length, so that nothing tells where it is"
+# A view is left out when the head would have to stand this many times further than usual from where it says, and by
+# more than the floor: backlash and sag of usual heads.
+ELSEWHERE_SIGMAS, ELSEWHERE_FLOOR = 6.0, np.radians(0.05)
 FEWEST_STOP_VIEWS, FEWEST_STOP_PLACEMENTS = 3, 2  # of a stop of the zoom lens
 # A board of one metre, glued to a sheet of something, is flat to some millimetres (as a share of its length).
 WARP_SHARE = 0.004
@@ -75,6 +80,8 @@ def joint(
     steps = both_cameras(shortest, points, sizes, nominal_px[0] if nominal_px else None)
     if not of_both(steps.views):
         raise CalibrationError("no placement of the board is seen by both cameras; turn the head so that both see it")
+    if not steps.has_head and any(view.camera == "zoom" and not at_home(view) for view in views):
+        raise CalibrationError("the head moved only at other focal lengths than the shortest; turn it there as well")
     model = steps.model
     if steps.has_head:
         model = replace(model, hand=rough_hand(model, steps.views, points, insist=options.insist))
@@ -95,9 +102,14 @@ def joint(
         prior = _known(model, start, blocks, options, warp_sigma)
         result = fit(model, used, points, blocks, prior=prior)
         check_stops(result.model)
-    result, prior = _with_k3_where_needed(result, points, prior)
-    result, wrong, more = _without_wrong_corners(result, points, prior)
-    rejected += more
+    everything = result
+    result, wrong, left_out = _cleaned(everything, points, prior)
+    with_k3, k3_prior = _with_k3_where_needed(result, points, prior)
+    if "k3" in with_k3.free:  # what such a lens does to corners is not the corners' fault
+        prior = k3_prior
+        again = fit(with_k3.model, everything.views, points, with_k3.free, prior=prior)
+        result, wrong, left_out = _cleaned(again, points, prior)
+    rejected += left_out
     if not options.insist and (text := undetermined(result)):
         raise CalibrationError(text)
     covariance = covariance_of(result)
@@ -157,9 +169,9 @@ def _all_stops(
     model, used, rejected = found.model, list(found.views), []
     for number, nominal in enumerate(nominal_px[1:], start=1):
         assert model.zoom is not None
-        here = [
-            v for v in views if v.camera == "zoom" and _stop_of(nominal_px, v) == number and v.board in model.boards
-        ]
+        at_stop = [v for v in views if v.camera == "zoom" and _stop_of(nominal_px, v) == number]
+        here = [v for v in at_stop if v.board in model.boards]
+        rejected += [Rejected(v.name, NO_PLACE) for v in at_stop if v.board not in model.boards]
         if len(here) < FEWEST_STOP_VIEWS or len({view.board for view in here}) < FEWEST_STOP_PLACEMENTS:
             rejected += [
                 Rejected(v.name, f"{len(here)} views at {nominal:.0f} px are too few for a zoom stop") for v in here
@@ -178,6 +190,32 @@ def _stop_of(nominal_px: Sequence[float], view: View) -> int:
     if not nominal_px:
         return 0
     return int(np.argmin(np.abs(np.log(np.array(nominal_px) / (view.focal_px or nominal_px[0])))))
+
+
+def _cleaned(found: Fit, points: Array, prior: Prior) -> tuple[Fit, int, list[Rejected]]:
+    """Leave out what is wrong, and tell the head's jitter; how many single corners went, and which views."""
+    found, elsewhere = _without_heads_elsewhere(found, points, prior)
+    found, wrong, spoilt = _without_wrong_corners(found, points, prior)
+    return found, wrong, [*elsewhere, *spoilt]
+
+
+def _without_heads_elsewhere(found: Fit, points: Array, prior: Prior) -> tuple[Fit, list[Rejected]]:
+    """Leave out the views for which the head did not stand where it said: far more than for others."""
+    if "hand" not in found.free:
+        return found, []
+    off = np.linalg.norm(head_turns(found, points), axis=-1)
+    turned = np.isfinite(off)
+    limit = max(ELSEWHERE_SIGMAS * float(np.median(off[turned])) * MEDIAN_TO_SIGMA, ELSEWHERE_FLOOR)
+    elsewhere = turned & (np.where(turned, off, 0.0) > limit)
+    if not elsewhere.any():
+        return found, []
+    rejected = [
+        Rejected(view.name, f"the head stood {np.degrees(angle):.2f} degrees from where it says")
+        for view, angle, out in zip(found.views, off, elsewhere, strict=True)
+        if out
+    ]
+    kept = [view for view, out in zip(found.views, elsewhere, strict=True) if not out]
+    return fit(found.model, kept, points, found.free, prior=prior), rejected
 
 
 def _without_wrong_corners(found: Fit, points: Array, prior: Prior) -> tuple[Fit, int, list[Rejected]]:

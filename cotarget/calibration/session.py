@@ -6,14 +6,14 @@ focal length; a scan with the head finds it in the zoom camera; two small turns 
 from then on a rough model plans every placement and every head pose, and each refines the model.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from cotarget.calibration.boards import board_points, check_board
 from cotarget.calibration.bootstrap import ROUGH_MARGIN, learn_fixed, learn_zoom, refitted
 from cotarget.calibration.intrinsics import pose_candidates
-from cotarget.calibration.model import View
+from cotarget.calibration.model import Rejected, View
 from cotarget.calibration.outlook import Outlook, outlook_of, planned_views
 from cotarget.calibration.plan import Coverage, plan_placements, plan_poses, preferred_share, seen_at_home, where_in
 from cotarget.calibration.recorder import Recorder
@@ -53,7 +53,7 @@ def capture_session(
         progress: called with what is done, of how much, and in words.
 
     Raises:
-        CalibrationError: a camera never sees the board, the cameras have no common view at home, or the head fails.
+        CalibrationError: a camera never sees the board, or the head or the lens fails.
     """
     check_board(recorder.board)
     nominal = spread_stops(*recorder.rig.zoom.focal_range, stops)
@@ -73,12 +73,24 @@ def capture_session(
         model = _cover(recorder, model, placements, rng, tell)
         if len(nominal) > 1:
             see_stops(recorder, model, nominal, far_placements, rng, tell)
+            recorder.rejected += _stops_without_views(recorder, nominal)
         recorder.turn(0.0, 0.0)
     finally:
         recorder.save_index()
         recorder.rig.board.present(None)
     if progress is not None:
         progress(total, total, "fitting")
+
+
+def _stops_without_views(recorder: Recorder, stops: Sequence[float]) -> list[Rejected]:
+    """The stops that were asked for and not seen, each by the nearest views [px]."""
+    half = np.log(stops[1] / stops[0]) / 2
+    seen = np.log([view.focal_px for view in recorder.views if view.camera == "zoom" and view.focal_px is not None])
+    return [
+        Rejected(f"zoom stop at {stop:.0f} px", "no part of a board was seen there; hold boards where the head reaches")
+        for stop in stops[1:]
+        if not (np.abs(seen - np.log(stop)) < half).any()
+    ]
 
 
 def _cover(

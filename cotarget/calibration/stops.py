@@ -22,7 +22,7 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
-SAME_FOCAL = 1e-3  # relative; a step of a usual lens changes the focal length twenty times more
+SAME_FOCAL = 0.008  # relative; a step of a usual lens changes the focal length by 0.02
 # What is known of a lens before it is seen: its pupil moves by some decimetres over the range; and distortion, measured
 # in the image, stays within several times of what lenses have. Boards all over the image know either far better.
 PUPIL_SIGMA = 0.2  # [m]
