@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from cotarget import cli
 from cotarget.calibration import Covariance, HeldOut, Options, Rejected, View, calibrate_views, save_calibration
 from cotarget.calibration.boards import board_points
+from cotarget.cli.calibrating import summary
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.report import verdict
@@ -20,7 +22,15 @@ from cotarget.report.advice import advice
 from cotarget.report.evidence import Corners, averaged, empty_places, gather
 from cotarget.report.lenscurves import lens_curves
 from cotarget.report.page import write_report
-from cotarget.report.pointing import JITTER_GROUP, Contribution, contributions, given, pointing
+from cotarget.report.pointing import (
+    JITTER_GROUP,
+    Contribution,
+    contributions,
+    given,
+    pointing,
+    what_stays,
+    with_more_placements,
+)
 from cotarget.report.tables import correlations
 from cotarget.report.verdict import judge
 from cotarget.report.wording import digits, percent, value_and_sigma
@@ -313,12 +323,36 @@ def test_advice_follows_from_the_figures(plain):
     still = replace(plain, views=tuple(replace(v, tilt=0.0) if v.camera == "zoom" else v for v in plain.views))
     assert any("The head's tilt changed by 0 degrees" in item for item in advice(still, at, (), parts, gather(still)))
     much = replace(at[0], rms=10 * at[0].rms)
-    words = advice(plain, (much,), (), (Contribution(JITTER_GROUP, at[0].rms),), gather(plain))
+    shaky = replace(plain, jitter=np.radians(0.05))
+    words = advice(shaky, (much,), (), (Contribution(JITTER_GROUP, at[0].rms),), None)
+    words += advice(shaky, pointing(shaky), (), (), gather(shaky))
     between = (replace(at[0], nominal_px=777.0, rms=4 * at[0].rms),)
     assert any("at 777 px" in item and "Add a stop" in item for item in advice(plain, at, between, parts, None))
     assert any("makes 99 % of the squared error" in item for item in words)
     assert any("play in the gears" in item for item in words)
     assert any("no number of them would halve it" in item for item in words)
+
+
+def test_more_placements_take_nothing_from_the_jitter_nor_from_a_lens_between_its_stops(plain, stops):
+    (exact,) = pointing(plain)
+    assert what_stays(plain, exact) == 0.0
+    assert with_more_placements(plain, exact, 36) == pytest.approx(exact.rms / 2)  # 12 placements and 36 more
+    jitter = np.radians(0.05)
+    shaky = replace(plain, jitter=jitter)
+    (at,) = pointing(shaky)
+    # Turns of pan count by the cosine of the tilt: a little less than both axes' together.
+    assert 0.9 * np.sqrt(2) * jitter < what_stays(shaky, at) < np.sqrt(2) * jitter
+    assert with_more_placements(shaky, at, 36) ** 2 == pytest.approx(at.rms**2 - 0.75 * exact.rms**2)
+    (between,) = pointing(stops, [1.7 * NOMINAL_PX])
+    doubt = np.linalg.norm(stops.zoom.center_doubt_px(1.7 * NOMINAL_PX)) / between.focal_px
+    assert doubt > 0
+    assert what_stays(stops, between) == pytest.approx(doubt, rel=0.01)
+    said = f"from {digits(np.degrees(at.rms))} to {digits(np.degrees(with_more_placements(shaky, at)))} degrees"
+    assert any(said in item for item in advice(shaky, (at,), (), (), gather(shaky)))
+    told = summary(shaky, Path("c.json"))
+    assert told["predicted_error_deg_with_10_more_placements"] == {
+        "667 px": pytest.approx(np.degrees(with_more_placements(shaky, at)))
+    }
 
 
 def test_what_is_left_when_a_parameter_is_known():

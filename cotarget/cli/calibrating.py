@@ -72,19 +72,19 @@ def calibrate(options: argparse.Namespace) -> None:
     assert found.residuals is not None
     for rejected in found.residuals.rejected:
         print(f"not used: {rejected.name}: {rejected.reason}", file=sys.stderr)
-    print(json.dumps(_summary(found, options.out), indent=2))
+    print(json.dumps(summary(found, options.out), indent=2))
 
 
-def _summary(found: "Calibration", path: Path) -> dict[str, Any]:
+def summary(found: "Calibration", path: Path) -> dict[str, Any]:
     """What calibrate prints: the residuals, how well it points, and the verdict."""
     import numpy as np
 
-    from cotarget.report.pointing import can_point, pointing
+    from cotarget.report.pointing import MORE_PLACEMENTS, can_point, pointing, with_more_placements
     from cotarget.report.verdict import judge
 
     assert found.residuals is not None
     residuals = {k: v for k, v in dataclasses.asdict(found.residuals).items() if k != "rejected"}
-    summary = residuals | {
+    told = residuals | {
         "rejected": len(found.residuals.rejected),
         "baseline_m": float(np.linalg.norm(found.T_zoom0_fixed.translation)),
         "head_jitter_deg": math.degrees(found.jitter),
@@ -92,14 +92,13 @@ def _summary(found: "Calibration", path: Path) -> dict[str, Any]:
     }
     if can_point(found):
         at = pointing(found)
-        error = math.degrees(at[0].rms)
-        placements = len({view.board for view in found.views})
-        summary |= {
+        told |= {
             "predicted_error_deg": {f"{one.nominal_px:.0f} px": math.degrees(one.rms) for one in at},
-            # The corners' noise averages out over placements of the same kind.
-            "predicted_error_deg_with_10_more_placements": error * math.sqrt(placements / (placements + 10)),
+            f"predicted_error_deg_with_{MORE_PLACEMENTS}_more_placements": {
+                f"{one.nominal_px:.0f} px": math.degrees(with_more_placements(found, one)) for one in at
+            },
         }
-    return summary | {"verdict": judge(found).text, "calibration": str(path)}
+    return told | {"verdict": judge(found).text, "calibration": str(path)}
 
 
 def report(options: argparse.Namespace) -> None:

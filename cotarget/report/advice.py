@@ -9,7 +9,17 @@ from cotarget.calibration.observability import BOTH, NEARER, OUTWARD, TILT_BOARD
 from cotarget.calibration.plan import distance
 from cotarget.report.evidence import CAMERAS, BoardShape, Evidence, averaged, empty_places, head_poses
 from cotarget.report.figures import NAMES
-from cotarget.report.pointing import JITTER_GROUP, AtFocal, Contribution, corner_errors, undetermined
+from cotarget.report.pointing import (
+    JITTER_GROUP,
+    MORE_PLACEMENTS,
+    AtFocal,
+    Contribution,
+    corner_errors,
+    placements,
+    undetermined,
+    what_stays,
+    with_more_placements,
+)
 from cotarget.report.wording import count, digits, listed, percent
 
 ACTIONS = {
@@ -30,7 +40,6 @@ TURNED, FEW_TURNED = np.radians(20.0), 1 / 3  # boards that tell the focal lengt
 FEWEST_AT_STOP = 6  # views
 FEWEST_SHARED = 5  # placements seen by both cameras, so that some can be kept out
 MANY_REJECTED, MANY_WRONG = 0.2, 0.01  # of the images, of the corners
-MORE = 10  # placements
 
 
 def advice(
@@ -45,7 +54,7 @@ def advice(
     items += [*_between_stops(at, between), *_worst_corner(calibration, at)]
     if evidence is not None:
         items += [*_images(calibration, evidence), *_patterns(evidence), *_situation(calibration, evidence)]
-        items += _more_of_the_same(at, parts, len(evidence.distances))
+        items += _more_of_the_same(calibration, at)
     return items
 
 
@@ -205,21 +214,19 @@ def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
         )
 
 
-def _more_of_the_same(at: tuple[AtFocal, ...], parts: tuple[Contribution, ...], placements: int) -> Iterator[str]:
-    """What more placements of the same kind would bring: their part of the error goes with 1 / sqrt(placements)."""
+def _more_of_the_same(calibration: Calibration, at: tuple[AtFocal, ...]) -> Iterator[str]:
+    """What more placements of the same kind would bring."""
     total = at[-1].rms if at else 0.0
     if not total > 0:
         return
-    fitted = next((part.left for part in parts if part.group == JITTER_GROUP), total)  # without the head's jitter
-    still2 = max(total**2 - fitted**2, 0.0)
-    then = float(np.sqrt(still2 + fitted**2 * placements / (placements + MORE)))
+    number = placements(calibration)
     text = (
-        f"{MORE} more placements of the same kind as these {placements} would bring the error from {_degrees(total)} "
-        f"to {_degrees(then)} degrees"
+        f"{MORE_PLACEMENTS} more placements of the same kind as these {number} would bring the error from "
+        f"{_degrees(total)} to {_degrees(with_more_placements(calibration, at[-1]))} degrees"
     )
-    if 4 * still2 < total**2:
-        quarter = total**2 / 4 - still2
-        more = int(np.ceil(placements * (fitted**2 / quarter - 1)))
+    stays2 = what_stays(calibration, at[-1]) ** 2
+    if 4 * stays2 < total**2:
+        more = int(np.ceil(number * ((total**2 - stays2) / (total**2 / 4 - stays2) - 1)))
         yield f"{text}; {more} more would halve it."
     else:
         yield f"{text}; no number of them would halve it, because the head's jitter stays."

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from cotarget.geometry import Array
 DEPTHS = (4.0, 30.0)  # where targets are [m]
 CELLS = (9, 7)  # across and down the wide view, at whose middles pointing is predicted
 DEPTH_STEPS = 5
+MORE_PLACEMENTS = 10  # of which people are told what they would bring
 BETWEEN_STOPS = 4  # focal lengths to look at between the stops, shared out, but never fewer than one each
 # Groups of parameters in the order of the page: how people call them, and how their names begin.
 GROUPS = (
@@ -95,6 +96,28 @@ def pointing(calibration: Calibration, nominal_px: Sequence[float] | None = None
         focal = float(np.mean(calibration.zoom.at(nominal).focal_px))
         found.append(AtFocal(nominal, focal, _over_the_view(calibration, nominal)))
     return tuple(found)
+
+
+def placements(calibration: Calibration) -> int:
+    """How many placements of the board are stored with a calibration."""
+    return len({view.board for view in calibration.views})
+
+
+def what_stays(calibration: Calibration, at: AtFocal) -> float:
+    """What placements take nothing from: the head's jitter, and what the zoom lens's stops leave in doubt [rad]."""
+    covariance = calibration.covariance
+    assert covariance is not None
+    known = replace(covariance, matrix=np.zeros_like(covariance.matrix))
+    return _over_the_view(replace(calibration, covariance=known), at.nominal_px)
+
+
+def with_more_placements(calibration: Calibration, at: AtFocal, more: int = MORE_PLACEMENTS) -> float:
+    """What the error would be with so many more placements of the same kind [rad].
+
+    Their part of it, the parameters' covariance, goes with 1 / placements.
+    """
+    here, stays2 = placements(calibration), what_stays(calibration, at) ** 2
+    return float(np.sqrt(stays2 + max(at.rms**2 - stays2, 0.0) * here / (here + more)))
 
 
 def between_stops(calibration: Calibration) -> list[float]:
