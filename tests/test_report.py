@@ -172,7 +172,8 @@ def test_numbers_in_the_page_are_those_of_the_calibration(plain, tmp_path):
     assert float(printed) == pytest.approx(sigma, rel=ROUNDED)
     shift = plain.T_zoom0_fixed.translation[0] * 1000
     assert float(re.search(r"position x (-?[\d.]+) ±", text).group(1)) == pytest.approx(shift, abs=0.5)
-    assert "measured 0.123 px predicted 0.0456 px" in text
+    assert "distance measured 0.123 px distance predicted 0.0456 px" in text
+    assert "every distance over what was predicted of it 1.95" in text
     assert "They disagree: the miss is 2.0 times what it should be" in text
     assert "0.020 degrees an axis" in text
     assert "9 images, 3 single corners" in text
@@ -210,7 +211,19 @@ def test_the_verdict_says_the_plain_truth(plain):
     assert well.text.endswith("; captures kept out of the fit agree.")
     worse = judge(replace(plain, held_out=replace(kept, widened=1.84)))
     assert worse.level == "care"
-    assert "miss 1.8 times as far as was predicted" in worse.text
+    assert worse.text.startswith("Captures kept out of the fit miss 1.8 times as far as was predicted, and ")
+    assert "the uncertainty is widened so; points to " in worse.text
+    # However far a wrong model has them miss, that leaves nothing undetermined; what is so is still said.
+    far, wide = replace(kept, widened=3000.0), plain.covariance.scaled(dict.fromkeys(plain.covariance.parameters, 3e3))
+    wrong = replace(plain, held_out=far, covariance=wide)
+    assert judge(wrong).text.startswith("Captures kept out of the fit miss 3000 times")
+    assert "not determine" not in judge(wrong).text
+    assert verdict(replace(wrong, held_out=kept)).startswith("Does not determine the rig")
+    words = advice(wrong, (), (), (), None)
+    assert words[0].startswith("Captures kept out miss 3000 times")
+    assert not any("Add what is missing" in item for item in words)
+    both = judge(replace(wrong, covariance=wide.scaled({"T_head_zoom.rx": 1e6})))
+    assert re.match("Captures kept out .*; does not determine the rig: .*T_head_zoom", both.text)
     shaky = judge(replace(plain, jitter=np.radians(0.05)))
     assert shaky.level == "care"
     assert "most of it because the head misses what it reports by 0.050 degrees an axis" in shaky.text

@@ -50,8 +50,8 @@ def advice(
     evidence: Evidence | None,
 ) -> list[str]:
     """Say what would help most, in that order; empty where nothing stands out."""
-    items = [*_missing(calibration), *_disagreement(calibration), *_largest_part(at, parts)]
-    items += [*_between_stops(at, between), *_worst_corner(calibration, at)]
+    items = [*_disagreement(calibration), *_missing(calibration), *_unconfirmed(calibration)]
+    items += [*_largest_part(at, parts), *_between_stops(at, between), *_worst_corner(calibration, at)]
     if evidence is not None:
         items += [*_images(calibration, evidence), *_patterns(evidence), *_situation(calibration, evidence)]
         items += _more_of_the_same(calibration, at)
@@ -79,7 +79,11 @@ def _disagreement(calibration: Calibration) -> Iterator[str]:
             "as the model has it: a board that is bent or not printed to scale, a mount that gives way, a lens that "
             "moved between captures. More captures will not mend that."
         )
-    elif held_out is None and calibration.covariance is not None and calibration.provenance.get("folds"):
+
+
+def _unconfirmed(calibration: Calibration) -> Iterator[str]:
+    """What is missing so that captures could be kept out."""
+    if calibration.held_out is None and calibration.covariance is not None and calibration.provenance.get("folds"):
         shared = [{v.board for v in calibration.views if v.camera == camera} for camera in CAMERAS]
         number = len(shared[0] & shared[1])
         yield (

@@ -215,11 +215,12 @@ def _held_out(calibration: Calibration) -> Iterator[str]:
     yield markup.table(
         Table(
             "",
-            ("", "rms distance"),
+            ("", "rms"),
             (
-                ("measured", f"{digits(held_out.measured_px, 3)} px"),
-                ("predicted", f"{digits(held_out.predicted_px, 3)} px"),
+                ("distance measured", f"{digits(held_out.measured_px, 3)} px"),
+                ("distance predicted", f"{digits(held_out.predicted_px, 3)} px"),
                 ("single corners, their board's pose fitted", f"{digits(held_out.corners_rms_px, 3)} px"),
+                ("every distance over what was predicted of it", digits(held_out.ratio, 3)),
             ),
             f"Of {count(held_out.views, 'view')} of the zoom camera, brought to the shortest focal length.",
         )

@@ -205,11 +205,15 @@ def given(covariance: Covariance, known: npt.NDArray[np.bool_]) -> Covariance:
 
 
 def undetermined(calibration: Calibration) -> str:
-    """Say what the covariance leaves undetermined, and what to add; empty where all is determined."""
-    covariance = calibration.covariance
+    """Say what the covariance leaves undetermined, and what to add; empty where all is determined.
+
+    What captures kept out have widened it by is taken out: that tells of a model that is wrong, and no views mend it.
+    """
+    covariance, held_out = calibration.covariance, calibration.held_out
     if covariance is None or not covariance.matrix.any():
         return ""
     stops = calibration.zoom.stops
     focal = {"fixed": calibration.fixed.focal_px[0]} | {f"zoom[{i}]": s.focal_px[0] for i, s in enumerate(stops)}
-    normal = np.asarray(np.linalg.pinv(covariance.matrix, hermitian=True, rcond=np.finfo(float).tiny), dtype=float)
+    matrix = covariance.matrix / (1.0 if held_out is None else held_out.widened**2)
+    normal = np.asarray(np.linalg.pinv(matrix, hermitian=True, rcond=np.finfo(float).tiny), dtype=float)
     return name_directions(covariance.parameters, weak_directions(normal, covariance.parameters, 1.0, focal), focal)

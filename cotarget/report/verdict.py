@@ -58,8 +58,9 @@ def judge(
         return Verdict(_without_head(calibration), "unknown")
     if calibration.covariance is None:
         return _without_covariance(calibration)
+    mismatch = _mismatch(calibration)
     if open_ := undetermined(calibration):
-        return Verdict(f"Does not determine the rig: {open_}.", "bad")
+        return Verdict(_sentence([*mismatch, f"does not determine the rig: {open_}"]), "bad")
     evidence = gather(calibration) if evidence is None else evidence
     if evidence is not None and _contradicts(calibration, evidence):
         return Verdict(
@@ -70,8 +71,8 @@ def judge(
     if not np.isfinite(at[-1].rms):
         return Verdict("Reaches no point of the wide view with the head: its geometry cannot be right.", "bad")
     width = calibration.zoom.size[0]
-    level: Level = "good"
-    parts = [_how_well(at, between)]
+    level: Level = "care" if mismatch or calibration.held_out is None else "good"
+    parts = [*mismatch, _how_well(at, between)]
     if at[-1].rms_px > FAR_OFF * width:
         level = "bad" if at[-1].rms_px > OUT_OF_SIGHT * width else "care"
         parts.append(f"that is {percent(at[-1].rms_px / width)} of the close-up's width")
@@ -82,8 +83,16 @@ def judge(
         level = "care" if level == "good" else level
         size = digits(1000 * np.hypot(evidence.shape.within, evidence.shape.out))
         parts.append(f"not counting that the board's corners are {size} mm off where they are believed to be")
-    text, agrees = _held_out(calibration)
-    return Verdict("; ".join([*parts, text]) + ".", level if agrees or level == "bad" else "care")
+    if calibration.held_out is None:
+        parts.append("no captures were kept out of the fit to confirm it")
+    elif not mismatch:
+        parts.append("captures kept out of the fit agree")
+    return Verdict(_sentence(parts), level)
+
+
+def _sentence(parts: list[str]) -> str:
+    text = "; ".join(parts)
+    return f"{text[0].upper()}{text[1:]}."
 
 
 def _contradicts(calibration: Calibration, evidence: Evidence) -> bool:
@@ -100,7 +109,7 @@ def _how_well(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> str:
     last = at[-1]
     which = "the longest focal length calibrated" if len(at) > 1 else "the one focal length calibrated"
     in_px = f"{digits(last.rms_px)} px at {last.focal_px:.0f} px, {which}"
-    text = f"Points to {digits(np.degrees(last.rms))} degrees ({in_px})"
+    text = f"points to {digits(np.degrees(last.rms))} degrees ({in_px})"
     worst = max((*at, *between), key=lambda one: one.rms)
     if worst.rms > ALIKE * last.rms:
         where = f"between its stops, at {worst.focal_px:.0f} px" if worst in between else f"at {worst.focal_px:.0f} px"
@@ -117,22 +126,19 @@ def _jitter(calibration: Calibration, last: AtFocal) -> str:
     return f"in it the {angle} degrees by which each axis of the head misses what it reports"
 
 
-def _held_out(calibration: Calibration) -> tuple[str, bool]:
-    """What captures kept out of the fit say, and whether they agree."""
+def _mismatch(calibration: Calibration) -> list[str]:
+    """That captures kept out of the fit disagree, where they do, which comes before all that it makes wider."""
     held_out = calibration.held_out
-    if held_out is None:
-        return "no captures were kept out of the fit to confirm it", False
-    if held_out.widened > 1:
-        factor = digits(held_out.widened)
-        return (
-            f"captures kept out of the fit miss {factor} times as far as was predicted, and this is widened so",
-            False,
-        )
-    return "captures kept out of the fit agree", True
+    if held_out is None or held_out.widened <= 1:
+        return []
+    factor = digits(held_out.widened)
+    return [
+        f"captures kept out of the fit miss {factor} times as far as was predicted, and the uncertainty is widened so"
+    ]
 
 
 def _without_head(calibration: Calibration) -> str:
-    parts = ["Cannot point, because it was made without a head"]
+    parts = ["cannot point, because it was made without a head", *_mismatch(calibration)]
     residuals, covariance = calibration.residuals, calibration.covariance
     if residuals is not None and residuals.stereo_rms_px is not None:
         parts.append(f"the two cameras agree on the corners to {digits(residuals.stereo_rms_px)} px")
@@ -147,7 +153,7 @@ def _without_head(calibration: Calibration) -> str:
             parts.append(
                 f"the offset between them is known to {digits(1000 * shift)} mm and {digits(np.degrees(turn))} degrees"
             )
-    return "; ".join(parts) + "."
+    return _sentence(parts)
 
 
 def _without_covariance(calibration: Calibration) -> Verdict:
