@@ -22,8 +22,8 @@ from matplotlib.figure import Figure
 from cotarget.calibration import Calibration, Covariance, Options, calibrate_views, predicted_pointing
 from cotarget.calibration.boards import board_points
 from cotarget.calibration.bundle import fit
+from cotarget.calibration.parameters import ALL_BLOCKS, Block, parameter_names
 from cotarget.calibration.placing import place_boards
-from cotarget.calibration.reprojection import ALL_BLOCKS, Block, parameter_names
 from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from cotarget.geometry import Array

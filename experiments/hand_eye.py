@@ -21,7 +21,7 @@ from cotarget.calibration.bundle import fit
 from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye_from_poses
 from cotarget.calibration.intrinsics import board_pose
 from cotarget.calibration.model import View
-from cotarget.calibration.reprojection import RigModel
+from cotarget.calibration.parameters import RigModel
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import base_head

@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from cotarget.calibration import Calibration, Options, calibrate_views, predicted_pointing
 from cotarget.calibration.boards import board_points
-from cotarget.calibration.reprojection import ALL_BLOCKS, parameter_names
+from cotarget.calibration.parameters import ALL_BLOCKS, parameter_names
 from cotarget.config import BoardConfig
 from experiments.harness import Experiment, Row, Settings, over_seeds, rms, seeds_of, table
 from experiments.synthetic import LONGEST_PX, SIZES, Placing, Truth, draw_targets, misses, other_rig, spread_views

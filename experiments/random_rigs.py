@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration, calibrate_views, predicted_pointing
 from cotarget.calibration.boards import board_points
-from cotarget.calibration.reprojection import ALL_BLOCKS, POSE_PARAMETERS, stepped
+from cotarget.calibration.parameters import ALL_BLOCKS, POSE_PARAMETERS, stepped
 from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError

@@ -10,15 +10,8 @@ from cotarget.calibration import Options, calibrate_photos, calibrate_views
 from cotarget.calibration.boards import board_points
 from cotarget.calibration.bundle import fit
 from cotarget.calibration.model import View
-from cotarget.calibration.reprojection import (
-    EVERY_BLOCK,
-    RigModel,
-    batches_of,
-    difference,
-    parameter_names,
-    predict,
-    stepped,
-)
+from cotarget.calibration.parameters import EVERY_BLOCK, RigModel, difference, parameter_names, stepped
+from cotarget.calibration.reprojection import batches_of, predict
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, ConfigError

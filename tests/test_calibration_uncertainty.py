@@ -17,9 +17,10 @@ from cotarget.calibration import (
     save_calibration,
 )  # fmt: skip
 from cotarget.calibration.boards import board_points
-from cotarget.calibration.bundle import Fit, coordinate_variance, fit
+from cotarget.calibration.bundle import Fit, fit
 from cotarget.calibration.joint import joint
-from cotarget.calibration.reprojection import ALL_BLOCKS, RigModel, parameter_names
+from cotarget.calibration.parameters import ALL_BLOCKS, RigModel, parameter_names
+from cotarget.calibration.robust import coordinate_variance
 from cotarget.calibration.start import at_home
 from cotarget.calibration.uncertainty import covariance_of
 from cotarget.camera import Intrinsics, ZoomLens

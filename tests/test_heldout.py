@@ -8,10 +8,11 @@ import pytest
 
 from cotarget.calibration import Calibration, Options, calibrate_views, heldout
 from cotarget.calibration.boards import board_points
-from cotarget.calibration.bundle import Prior, fit
+from cotarget.calibration.bundle import fit
 from cotarget.calibration.heldout import cross_validate
+from cotarget.calibration.normal import Prior
+from cotarget.calibration.parameters import ALL_BLOCKS, parameter_names
 from cotarget.calibration.placing import place_boards
-from cotarget.calibration.reprojection import ALL_BLOCKS, parameter_names
 from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from experiments.synthetic import SIZES, Lens, Placing, Truth, other_rig, spread_views, truth_of

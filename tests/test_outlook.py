@@ -9,8 +9,8 @@ from cotarget.calibration import Calibration, Options, calibrate_views, predicte
 from cotarget.calibration.boards import board_points
 from cotarget.calibration.bundle import fit
 from cotarget.calibration.outlook import BORDER, DEPTHS_SQUARES, GRID, outlook_of, planned_views
+from cotarget.calibration.parameters import ALL_BLOCKS
 from cotarget.calibration.placing import place_boards
-from cotarget.calibration.reprojection import ALL_BLOCKS
 from cotarget.calibration.uncertainty import covariance_of, model_of
 from cotarget.config import BoardConfig
 from experiments.synthetic import SIZE, SIZES, Placing, Truth, spread_views, synthetic_views

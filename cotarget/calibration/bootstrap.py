@@ -16,10 +16,10 @@ from cotarget.calibration.bundle import Fit, fit
 from cotarget.calibration.handeye import motions, park_martin
 from cotarget.calibration.intrinsics import board_pose, pose_candidates, rough_intrinsics
 from cotarget.calibration.model import View
+from cotarget.calibration.parameters import Block, RigModel
 from cotarget.calibration.placing import place_boards
 from cotarget.calibration.plan import Coverage, distance, facing_board, plan_placements, preferred_share
 from cotarget.calibration.recorder import Recorder
-from cotarget.calibration.reprojection import Block, RigModel
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation

@@ -18,8 +18,8 @@ import numpy as np
 from cotarget.calibration import parsing
 from cotarget.calibration.atomic import write_atomically
 from cotarget.calibration.model import Calibration, Covariance, HeldOut, Rejected, Residuals, View
+from cotarget.calibration.parameters import EVERY_BLOCK, parameter_names
 from cotarget.calibration.parsing import Table, get, join
-from cotarget.calibration.reprojection import EVERY_BLOCK, parameter_names
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError

@@ -12,8 +12,8 @@ from cotarget.calibration.boards import another_board, board_points, find_corner
 from cotarget.calibration.captures import CaptureIndex, read_images
 from cotarget.calibration.joint import joint
 from cotarget.calibration.model import DEFAULT_OPTIONS, CameraName, Capture, Options, Rejected, View, unseen
+from cotarget.calibration.parameters import RigModel
 from cotarget.calibration.recorder import view_of
-from cotarget.calibration.reprojection import RigModel
 from cotarget.calibration.stops import (
     SAME_FOCAL,
     expected_corners,

@@ -10,10 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from cotarget.calibration.bundle import Fit, Prior, fit, rms
+from cotarget.calibration.bundle import Fit, fit
 from cotarget.calibration.model import HeldOut, View
+from cotarget.calibration.normal import Prior
+from cotarget.calibration.parameters import parameter_names, stop_of
 from cotarget.calibration.placing import place_boards
-from cotarget.calibration.reprojection import Batch, batches_of, parameter_names, predict, stop_of
+from cotarget.calibration.reprojection import Batch, batches_of, predict
+from cotarget.calibration.robust import rms
 from cotarget.calibration.uncertainty import covariance_of
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array

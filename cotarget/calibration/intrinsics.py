@@ -8,7 +8,7 @@ import numpy as np
 
 from cotarget.calibration.bundle import Fit, fit
 from cotarget.calibration.model import CameraName, View
-from cotarget.calibration.reprojection import RigModel
+from cotarget.calibration.parameters import RigModel
 from cotarget.camera import Intrinsics
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation

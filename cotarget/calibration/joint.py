@@ -14,17 +14,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from cotarget.calibration.bundle import MEDIAN_TO_SIGMA, Fit, Prior, estimate_jitter, fit, head_turns, rms, robust_sigma
+from cotarget.calibration.bundle import Fit, fit
 from cotarget.calibration.heldout import cross_validate
+from cotarget.calibration.jitter import estimate_jitter, head_turns
 from cotarget.calibration.model import DEFAULT_OPTIONS, CameraName, Options, Rejected, Residuals, View
+from cotarget.calibration.normal import Prior
 from cotarget.calibration.observability import limits_of_use, name_directions, weak_directions
+from cotarget.calibration.parameters import ALL_BLOCKS, Block, RigModel, parameter_names
 from cotarget.calibration.placing import place_boards
-from cotarget.calibration.reprojection import (
-    ALL_BLOCKS,
-    Block,
-    RigModel,
-    parameter_names,
-)
+from cotarget.calibration.robust import MEDIAN_TO_SIGMA, rms, robust_sigma
 from cotarget.calibration.sequential import Solution, Steps, both_cameras, stereo
 from cotarget.calibration.start import at_home, of_both, pairs_at_home, rough_gamma, rough_hand
 from cotarget.calibration.stops import check_stops, fit_stop, lens_prior, with_stop

@@ -7,7 +7,7 @@ import numpy as np
 
 from cotarget.calibration.bundle import Fit, information
 from cotarget.calibration.model import View, unseen
-from cotarget.calibration.reprojection import Block, RigModel, parameter_names
+from cotarget.calibration.parameters import Block, RigModel, parameter_names
 from cotarget.calibration.uncertainty import miss_derivatives
 from cotarget.geometry import Array, RigidTransform
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from cotarget.calibration.intrinsics import pose_candidates
 from cotarget.calibration.model import View
-from cotarget.calibration.reprojection import RigModel, predict_pixels, stop_of
+from cotarget.calibration.parameters import RigModel, stop_of
+from cotarget.calibration.reprojection import predict_pixels
 from cotarget.geometry import Array, RigidTransform
 from cotarget.pantilt import zoom_fixed
 

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.calibration.boards import board_outline, board_points
-from cotarget.calibration.reprojection import RigModel, base_heads
+from cotarget.calibration.parameters import RigModel
+from cotarget.calibration.reprojection import base_heads
 from cotarget.camera import Intrinsics
 from cotarget.config import BoardConfig
 from cotarget.errors import UnreachableError

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 from cotarget.calibration.bundle import Fit, fit
 from cotarget.calibration.model import CameraName, Covariance, HeldOut, Rejected, Residuals, View
+from cotarget.calibration.parameters import RigModel
 from cotarget.calibration.placing import place_boards
-from cotarget.calibration.reprojection import RigModel
 from cotarget.calibration.start import at_home, of_both, one_camera, pairs_at_home, rough_gamma, rough_hand
 from cotarget.camera import ZoomLens
 from cotarget.errors import CalibrationError

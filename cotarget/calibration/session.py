@@ -15,9 +15,9 @@ from cotarget.calibration.bootstrap import ROUGH_MARGIN, learn_fixed, learn_zoom
 from cotarget.calibration.intrinsics import pose_candidates
 from cotarget.calibration.model import Rejected, View
 from cotarget.calibration.outlook import Outlook, outlook_of, planned_views
+from cotarget.calibration.parameters import RigModel
 from cotarget.calibration.plan import Coverage, plan_placements, plan_poses, preferred_share, seen_at_home, where_in
 from cotarget.calibration.recorder import Recorder
-from cotarget.calibration.reprojection import RigModel
 from cotarget.calibration.stops import spread_stops
 from cotarget.calibration.zooming import see_stops
 from cotarget.errors import CalibrationError

@@ -9,11 +9,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cotarget.calibration.bundle import Fit, robust_sigma
+from cotarget.calibration.bundle import Fit
 from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye
 from cotarget.calibration.intrinsics import board_pose, calibrate_camera
 from cotarget.calibration.model import CameraName, Rejected, View
-from cotarget.calibration.reprojection import RigModel
+from cotarget.calibration.parameters import RigModel
+from cotarget.calibration.robust import robust_sigma
 from cotarget.camera import Intrinsics
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation

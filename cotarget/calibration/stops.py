@@ -12,10 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from cotarget.calibration.boards import find_corners
-from cotarget.calibration.bundle import Prior, fit
+from cotarget.calibration.bundle import fit
 from cotarget.calibration.model import View
+from cotarget.calibration.normal import Prior
+from cotarget.calibration.parameters import RigModel
 from cotarget.calibration.partial import find_near
-from cotarget.calibration.reprojection import RigModel, predict_pixels
+from cotarget.calibration.reprojection import predict_pixels
 from cotarget.camera import ZoomLens
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError

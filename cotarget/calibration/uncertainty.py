@@ -11,14 +11,8 @@ import numpy as np
 
 from cotarget.calibration.bundle import Fit
 from cotarget.calibration.model import Calibration, Covariance
-from cotarget.calibration.reprojection import (
-    EVERY_BLOCK,
-    POSE_PARAMETERS,
-    RigModel,
-    base_heads,
-    parameter_names,
-    stepped,
-)
+from cotarget.calibration.parameters import EVERY_BLOCK, POSE_PARAMETERS, RigModel, parameter_names, stepped
+from cotarget.calibration.reprojection import base_heads
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
 from cotarget.pantilt import solve

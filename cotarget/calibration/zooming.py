@@ -12,10 +12,11 @@ import numpy as np
 
 from cotarget.calibration.boards import board_points
 from cotarget.calibration.model import View
+from cotarget.calibration.parameters import RigModel
 from cotarget.calibration.placing import place_boards
 from cotarget.calibration.plan import Coverage, plan_placements, where_in
 from cotarget.calibration.recorder import Recorder
-from cotarget.calibration.reprojection import RigModel, base_heads
+from cotarget.calibration.reprojection import base_heads
 from cotarget.calibration.stops import (
     FEWEST_CORNERS,
     SAME_FOCAL,

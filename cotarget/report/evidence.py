@@ -8,11 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.calibration.boards import board_points
-from cotarget.calibration.bundle import Fit, fit, robust_sigma
+from cotarget.calibration.bundle import Fit, fit
 from cotarget.calibration.method import tells_pose
 from cotarget.calibration.model import Calibration, CameraName, View
+from cotarget.calibration.parameters import stop_of
 from cotarget.calibration.placing import place_boards
-from cotarget.calibration.reprojection import predict_pixels, stop_of
+from cotarget.calibration.reprojection import predict_pixels
+from cotarget.calibration.robust import robust_sigma
 from cotarget.calibration.uncertainty import model_of
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array

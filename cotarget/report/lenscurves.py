@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cotarget.calibration.model import Calibration
-from cotarget.calibration.reprojection import EVERY_BLOCK, POSE_PARAMETERS, parameter_names, stepped
+from cotarget.calibration.parameters import EVERY_BLOCK, POSE_PARAMETERS, parameter_names, stepped
 from cotarget.calibration.uncertainty import STEP, model_of
 from cotarget.camera import ZoomLens
 from cotarget.geometry import Array

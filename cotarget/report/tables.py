@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cotarget.calibration.model import Calibration
-from cotarget.calibration.reprojection import LENS_NAMES
+from cotarget.calibration.parameters import LENS_NAMES
 from cotarget.camera import Intrinsics
 from cotarget.geometry import RigidTransform
 from cotarget.pantilt import IDEAL_HEAD

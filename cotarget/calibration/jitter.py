@@ -1,0 +1,97 @@
+"""How far the head stands from where it says: every view by itself, and the scatter of all."""
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from cotarget.calibration.bundle import Fit
+from cotarget.calibration.normal import TURNS, Prior, Problem, damped, masked, reduced, robust_scale
+from cotarget.calibration.parameters import POSE_PARAMETERS
+from cotarget.calibration.reprojection import batches_of
+from cotarget.calibration.robust import SMALLEST_SIGMA_PX, huber_weights
+from cotarget.geometry import Array
+
+# Jitter is looked for between these [rad], and believed when its likelihood is this many times that of none:
+# exp(2.71 / 2), which chance exceeds once in twenty times (a half chi-square at its border).
+JITTER_RANGE = (1e-7, 0.1)
+JITTER_EVIDENCE = 2.71
+JITTER_ROUNDS = 3
+TURN_ROUNDS = 6
+RELATIVE_ROUNDING = 1e-10  # of a normal matrix whose boards were eliminated by subtraction
+
+
+def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> float:
+    """Estimate how far the head's angles scatter about the reported ones, by restricted maximum likelihood.
+
+    With the corners' own variance profiled out, the likelihood of a jitter needs only the normal equations of the fit
+    without one (Patterson and Thompson 1971; Harville 1977).
+
+    Args:
+        found: a fit without jitter.
+        points: the board's corners in its frame [m], (N, 3).
+        prior: that of the fit.
+
+    Returns:
+        Standard deviation of each axis [rad]; 0 where the corners do not speak for any.
+    """
+    jitter = 0.0
+    for _ in range(JITTER_ROUNDS):  # the first weights take what is jitter for wrong corners
+        jitter = _one_estimate(found, points, prior, jitter)
+    return jitter
+
+
+def head_turns(found: Fit, points: Array) -> Array:
+    """By how much every zoom view's own pan and tilt would have to differ for its corners to fit best, (V, 2) [rad].
+
+    nan for the fixed camera's views; the boards and everything else stay where the fit has put them.
+    """
+    problem = Problem(batches_of(found.model, found.views), points, (), None, 0.0)
+    here = problem.at(found.model)
+    turns = np.full((len(found.views), TURNS), np.nan)
+    for batch, p, r in zip(problem.batches, here.predictions, here.residuals, strict=True):
+        if p.by_turn is None:
+            continue
+        Q, after = masked(p.by_turn, batch), r
+        for _ in range(TURN_ROUNDS):  # wrong corners are not to turn a view
+            weighted = Q * huber_weights(after, robust_scale(here))[..., None, None]
+            own = np.einsum("vnik,vnil->vkl", weighted, Q)
+            turn = -np.linalg.solve(
+                own + damped(own, RELATIVE_ROUNDING), np.einsum("vnik,vni->vk", weighted, r)[..., None]
+            )[..., 0]
+            after = r + np.einsum("vnik,vk->vni", Q, turn)
+        turns[batch.rows] = turn
+    return turns
+
+
+def _one_estimate(found: Fit, points: Array, prior: Prior | None, before: float) -> float:
+    """One round of `estimate_jitter`, with corners weighted as a jitter estimated before leaves them."""
+    problem = Problem(batches_of(found.model, found.views), points, found.free, prior, before)
+    here = problem.at(found.model)
+    grams = problem.grams(here, robust_scale(here))
+    if found.variance is None or not any(batch.stop is not None for batch in problem.batches):
+        return 0.0
+    coordinates = 2 * sum(int(batch.seen.sum()) for batch in problem.batches)
+    freedom = coordinates - len(found.normal) - POSE_PARAMETERS * len(found.model.boards)
+
+    def profiled(ratio: float) -> tuple[float, Array, Array]:
+        """Squares left, and the reduced matrix and the boards' inverses, at jitter^2 = ratio * variance."""
+        equations = problem.assembled(here, grams, 1 / ratio if ratio else np.inf)
+        matrix, gradient, inverse = reduced(equations, 0.0)
+        matrix = matrix + damped(matrix, RELATIVE_ROUNDING)  # where a direction is open, it stands still
+        left = equations.squares - gradient @ np.linalg.solve(matrix, gradient)
+        left -= np.einsum("bi,bij,bj->", equations.board_gradient, inverse, equations.board_gradient)
+        return max(float(left), SMALLEST_SIGMA_PX**2), matrix, inverse
+
+    def minus_twice_log_likelihood(ratio: float) -> float:
+        left, matrix, inverse = profiled(ratio)
+        spread = float(np.linalg.slogdet(matrix)[1] - np.linalg.slogdet(inverse)[1].sum())
+        turns = slice(-1 - TURNS, -1)
+        for batch, (_, gram) in zip(problem.batches, grams, strict=True):
+            if batch.stop is not None:
+                spread += float(np.linalg.slogdet(np.eye(TURNS) + ratio * gram[:, turns, turns])[1].sum())
+        return float(freedom * np.log(left) + spread)
+
+    lowest, highest = (float(2 * np.log(sigma) - np.log(found.variance)) for sigma in JITTER_RANGE)
+    best = minimize_scalar(lambda x: minus_twice_log_likelihood(np.exp(x)), bounds=(lowest, highest), method="bounded")
+    if minus_twice_log_likelihood(0.0) - best.fun < JITTER_EVIDENCE:
+        return 0.0
+    return float(np.sqrt(np.exp(best.x) * profiled(np.exp(best.x))[0] / freedom))
