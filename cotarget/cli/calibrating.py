@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,10 @@ if TYPE_CHECKING:
     from cotarget.calibration import Calibration
 
 
+PHOTOS = ("fixed", "zoom", "board", "square")  # options that plain photos need
+SESSION = ("placements", "stops")  # and those of a capture session
+
+
 def calibrate(options: argparse.Namespace) -> None:
     """Cotarget calibrate."""
     from cotarget import calibration as cal
@@ -23,25 +28,14 @@ def calibrate(options: argparse.Namespace) -> None:
     from cotarget.safety import SafeRig
 
     check_outputs([options.out], [options.rig, options.source and options.source / "index.json"])
-    needed = ("fixed", "zoom", "board", "square")
-    given = [name for name in (*needed, "kind") if getattr(options, name) is not None]
-    for name in ("encoders", "insist"):
-        if getattr(options, name) and options.method == "sequential":
-            raise ConfigError(f"--{name} goes with --method joint; the sequential method does as the paper does")
-    if options.encoders and options.rig is None and given:
-        raise ConfigError("--encoders goes with --rig or saved captures; plain photos know nothing of a head")
+    _check_together(options)
     how = cal.Options(options.method, encoders=options.encoders, insist=options.insist)
-    session = {name: getattr(options, name) for name in ("placements", "stops") if getattr(options, name) is not None}
-    if options.rig is None and session:
-        raise ConfigError(f"--{next(iter(session))} goes with --rig; saved captures have what they have")
     with progress_bar() as progress:
 
         def tell(done: int, total: int, text: str) -> None:
             progress(f"calibrating: {text}", done, total)
 
         if options.rig is not None:
-            if given:
-                raise ConfigError(f"--{given[0]} goes with --from DIR; with --rig, the board is in rig.toml")
             config = load_config(options.rig)
             with SafeRig(open_rig(config), config.safety) as rig:
                 found = cal.calibrate_rig(
@@ -52,27 +46,47 @@ def calibrate(options: argparse.Namespace) -> None:
                     pitch_mm=config.sim.zoom.pitch_mm,
                     seed=config.sim.seed,
                     options=how,
-                    **session,
+                    **{name: getattr(options, name) for name in _given(options, SESSION)},
                 )
-        elif options.captures is not None:
-            raise ConfigError("--captures goes with --rig; saved captures are read with --from DIR alone")
-        elif given:
-            if missing := [name for name in needed if name not in given]:
-                raise ConfigError(f"plain photos need --{missing[0]} too: --fixed, --zoom, --board and --square")
+        elif options.board is not None:
             board = BoardConfig(options.kind or "chessboard", options.board, options.square)
             found = cal.calibrate_photos(options.source, options.fixed, options.zoom, board, options=how, progress=tell)
         else:
-            if not (options.source / "index.json").exists():
-                raise ConfigError(
-                    f"{options.source}: holds no index.json of captures; plain photos need --fixed, --zoom, --board "
-                    "and --square"
-                )
             found = cal.calibrate_captures(options.source, options=how, progress=tell)
         cal.save_calibration(options.out, found)
     assert found.residuals is not None
     for rejected in found.residuals.rejected:
         print(f"not used: {rejected.name}: {rejected.reason}", file=sys.stderr)
     print(json.dumps(summary(found, options.out), indent=2))
+
+
+def _given(options: argparse.Namespace, names: Sequence[str]) -> list[str]:
+    return [name for name in names if getattr(options, name) is not None]
+
+
+def _check_together(options: argparse.Namespace) -> None:
+    """Refuse options of calibrate that do not go together, or would have no effect."""
+    photos = _given(options, (*PHOTOS, "kind"))
+    for name in ("encoders", "insist"):
+        if getattr(options, name) and options.method == "sequential":
+            raise ConfigError(f"--{name} goes with --method joint; the sequential method does as the paper does")
+    if options.rig is not None:
+        if photos:
+            raise ConfigError(f"--{photos[0]} goes with --from DIR; with --rig, the board is in rig.toml")
+        return
+    if session := _given(options, SESSION):
+        raise ConfigError(f"--{session[0]} goes with --rig; saved captures have what they have")
+    if options.captures is not None:
+        raise ConfigError("--captures goes with --rig; saved captures are read with --from DIR alone")
+    if photos:
+        if missing := [name for name in PHOTOS if name not in photos]:
+            raise ConfigError(f"plain photos need --{missing[0]} too: --fixed, --zoom, --board and --square")
+        if options.encoders:
+            raise ConfigError("--encoders goes with --rig or saved captures; plain photos know nothing of a head")
+    elif not (options.source / "index.json").exists():
+        raise ConfigError(
+            f"{options.source}: holds no index.json of captures; photos need --fixed, --zoom, --board and --square"
+        )
 
 
 def summary(found: "Calibration", path: Path) -> dict[str, Any]:
