@@ -92,6 +92,7 @@ def captures(tmp_path, rows, **changes):
 
 
 ROW = {"file": "a.png", "camera": "fixed", "board": 0, "pan": 0.0, "tilt": 0.0, "focal_px": None, "t": 0.0}
+ZOOM_ROW = {**ROW, "file": "z.png", "camera": "zoom", "focal_px": 667.0}
 
 
 @pytest.mark.parametrize(("rows", "changes", "message"), [
@@ -102,12 +103,14 @@ ROW = {"file": "a.png", "camera": "fixed", "board": 0, "pan": 0.0, "tilt": 0.0, 
     ([{k: v for k, v in ROW.items() if k != "pan"}], {}, r"missing key 'captures\[0\].pan'"),
     ([{**ROW, "tilt": "up"}], {}, r"captures\[0\].tilt: 'up' is not a finite number"),
     ([{**ROW, "file": "missing.png"}], {}, "missing.png: no such file"),
-    ([{**ROW, "file": "text.png"}], {}, "text.png: is not an image"),
-    ([ROW, {**ROW, "file": "small.png"}], {}, "small.png: is 32x24 px where a.png .* is 64x48"),
+    ([ROW], {}, "has no capture of the zoom camera"),
+    ([{**ROW, "file": "text.png"}, ZOOM_ROW], {}, "text.png: is not an image"),
+    ([ROW, {**ROW, "file": "small.png"}, ZOOM_ROW], {}, "small.png: is 32x24 px where a.png .* is 64x48"),
     ([ROW], {"board": {"kind": "chessboard", "corners": [9, 6]}}, "missing key 'board.square'"),
 ])  # fmt: skip
 def test_malformed_captures_are_refused_by_name(tmp_path, rows, changes, message):
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((48, 64, 3), np.uint8))
+    cv2.imwrite(str(tmp_path / "z.png"), np.zeros((48, 64, 3), np.uint8))
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((24, 32, 3), np.uint8))
     (tmp_path / "text.png").write_text("no image")
     with pytest.raises(CalibrationError, match=message) as caught:
