@@ -163,6 +163,8 @@ MISTAKES = {
     "another board": (changed([*FROM, "single", *PHOTOS], "--board", "7x6"),
                       ["single: no picture shows", "7x6 inner corners"]),
     "a symmetric board": (changed([*FROM, "single", *PHOTOS], "--board", "7x7"), ["7x7"]),
+    "a square in millimetres": (changed([*FROM, "single", *PHOTOS], "--square", "25"), ["25 mm are 0.025"]),
+    "a device for a result": (["board", "--out", "/dev/null"], ["/dev/null: is a device"]),
     "a square without a side": (changed([*FROM, "single", *PHOTOS], "--square", "0"),
                               ["--square", "0 is not greater"]),
     "half the options for photos": ([*FROM, "single", "--fixed", "left*.png"], ["--zoom", "--board", "--square"]),
@@ -286,7 +288,10 @@ def test_a_machine_without_opengl(folder):
 
 def aim_json(capsys, *arguments):
     status, out, err = call(capsys, *arguments)
-    assert (status, err) == (0, "")
+    assert status == 0
+    beyond = json.loads(out)["focal_calibrated"] is False
+    assert ("beyond the focal lengths calibrated" in err) is beyond
+    assert len(err.splitlines()) == beyond
     return json.loads(out)
 
 
@@ -319,6 +324,12 @@ def test_aim_takes_depth_from_a_size_and_focal_length_from_a_close_up(folder, ca
     limited = aim_json(capsys, *AIM, "--depth", "30", "--target", "book", "--wanted-px", "160")
     assert limited["focal_limited"] is True
     assert limited["focal_mm"] == pytest.approx(72.0)
+
+
+def test_the_shortcut_is_told_without_a_prediction_that_is_of_the_exact_inverse(folder, capsys):
+    told = aim_json(capsys, *AIM, "--depth", "9", "--ik", "paper-table")
+    assert told["predicted_error_deg"] is None
+    assert told["predicted_error_px"] is None
 
 
 @pytest.mark.parametrize("focal_mm", ["6", "50", "72"])

@@ -23,7 +23,7 @@ from cotarget.geometry import Array
 
 # Measured and predicted agree when the mean squared, whitened miss is below 1 + this many standard deviations of it.
 # The misses of a fold share the error of its fit: a placement counts as half an independent miss of two coordinates.
-CHANCE_SIGMAS, SHARE = 3.0, 0.5
+CHANCE_SIGMAS, SHARE = 2.0, 0.5
 FEWEST_VIEWS = 3  # of a zoom stop that must remain for a fold's views at it to be predicted
 
 

@@ -14,7 +14,6 @@ from cotarget.geometry import Array
 # exp(2.71 / 2), which chance exceeds once in twenty times (a half chi-square at its border).
 JITTER_RANGE = (1e-7, 0.1)
 JITTER_EVIDENCE = 2.71
-JITTER_ROUNDS = 3
 TURN_ROUNDS = 6
 RELATIVE_ROUNDING = 1e-10  # of a normal matrix whose boards were eliminated by subtraction
 
@@ -26,45 +25,14 @@ def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> fl
     without one (Patterson and Thompson 1971; Harville 1977).
 
     Args:
-        found: a fit without jitter.
+        found: a fit, without jitter or with one found before, by which its corners are then judged.
         points: the board's corners in its frame [m], (N, 3).
         prior: that of the fit.
 
     Returns:
         Standard deviation of each axis [rad]; 0 where the corners do not speak for any.
     """
-    jitter = 0.0
-    for _ in range(JITTER_ROUNDS):  # the first weights take what is jitter for wrong corners
-        jitter = _one_estimate(found, points, prior, jitter)
-    return jitter
-
-
-def head_turns(found: Fit, points: Array) -> Array:
-    """By how much every zoom view's own pan and tilt would have to differ for its corners to fit best, (V, 2) [rad].
-
-    nan for the fixed camera's views; the boards and everything else stay where the fit has put them.
-    """
-    problem = Problem(batches_of(found.model, found.views), points, (), None, 0.0)
-    here = problem.at(found.model)
-    turns = np.full((len(found.views), TURNS), np.nan)
-    for batch, p, r in zip(problem.batches, here.predictions, here.residuals, strict=True):
-        if p.by_turn is None:
-            continue
-        Q, after = masked(p.by_turn, batch), r
-        for _ in range(TURN_ROUNDS):  # wrong corners are not to turn a view
-            weighted = Q * huber_weights(after, robust_scale(here))[..., None, None]
-            own = np.einsum("vnik,vnil->vkl", weighted, Q)
-            turn = -np.linalg.solve(
-                own + damped(own, RELATIVE_ROUNDING), np.einsum("vnik,vni->vk", weighted, r)[..., None]
-            )[..., 0]
-            after = r + np.einsum("vnik,vk->vni", Q, turn)
-        turns[batch.rows] = turn
-    return turns
-
-
-def _one_estimate(found: Fit, points: Array, prior: Prior | None, before: float) -> float:
-    """One round of `estimate_jitter`, with corners weighted as a jitter estimated before leaves them."""
-    problem = Problem(batches_of(found.model, found.views), points, found.free, prior, before)
+    problem = Problem(batches_of(found.model, found.views), points, found.free, prior, found.jitter)
     here = problem.at(found.model)
     grams = problem.grams(here, robust_scale(here))
     if found.variance is None or not any(batch.stop is not None for batch in problem.batches):
@@ -95,3 +63,26 @@ def _one_estimate(found: Fit, points: Array, prior: Prior | None, before: float)
     if minus_twice_log_likelihood(0.0) - best.fun < JITTER_EVIDENCE:
         return 0.0
     return float(np.sqrt(np.exp(best.x) * profiled(np.exp(best.x))[0] / freedom))
+
+
+def head_turns(found: Fit, points: Array) -> Array:
+    """By how much every zoom view's own pan and tilt would have to differ for its corners to fit best, (V, 2) [rad].
+
+    nan for the fixed camera's views; the boards and everything else stay where the fit has put them.
+    """
+    problem = Problem(batches_of(found.model, found.views), points, (), None, 0.0)
+    here = problem.at(found.model)
+    turns = np.full((len(found.views), TURNS), np.nan)
+    for batch, p, r in zip(problem.batches, here.predictions, here.residuals, strict=True):
+        if p.by_turn is None:
+            continue
+        Q, after = masked(p.by_turn, batch), r
+        for _ in range(TURN_ROUNDS):  # wrong corners are not to turn a view
+            weighted = Q * huber_weights(after, robust_scale(here))[..., None, None]
+            own = np.einsum("vnik,vnil->vkl", weighted, Q)
+            turn = -np.linalg.solve(
+                own + damped(own, RELATIVE_ROUNDING), np.einsum("vnik,vni->vk", weighted, r)[..., None]
+            )[..., 0]
+            after = r + np.einsum("vnik,vk->vni", Q, turn)
+        turns[batch.rows] = turn
+    return turns

@@ -38,11 +38,13 @@ NO_PLACE = "its board is seen by neither camera at the shortest focal length, so
 # A view is left out when the head would have to stand this many times further than usual from where it says, and by
 # more than the floor: backlash and sag of usual heads.
 ELSEWHERE_SIGMAS, ELSEWHERE_FLOOR = 6.0, np.radians(0.05)
+JITTER_ROUNDS, SETTLED = 5, 0.03  # the jitter found and the parameters depend on each other
+LARGEST_JITTER = np.radians(1.5)
 FEWEST_STOP_VIEWS, FEWEST_STOP_PLACEMENTS = 3, 2  # of a stop of the zoom lens
 # A board of one metre, glued to a sheet of something, is flat to some millimetres (as a share of its length).
 WARP_SHARE = 0.004
-# The fixed camera's k3 is found too where it is this many standard deviations from 0; by chance, of one in 400.
-K3_SIGMAS, K3_WIDE = 3.0, 1.0
+# The fixed camera's k3 is found too where it is this many standard deviations from 0; by chance, of one lens in eighty.
+K3_SIGMAS, K3_WIDE = 2.5, 1.0
 # A lens that asks for k3 is not of this model, and departs from it further where no board was seen: the uncertainty is
 # widened by this, which covers rational and fisheye lenses whose nearest fit is 0.2 px off (experiments.mismatch).
 K3_WIDENED = 1.4
@@ -218,9 +220,7 @@ def _without_heads_elsewhere(found: Fit, points: Array, prior: Prior) -> tuple[F
 
 def _without_wrong_corners(found: Fit, points: Array, prior: Prior) -> tuple[Fit, int, list[Rejected]]:
     """Leave out the corners that nothing explains, and tell the head's jitter; the fit then, and how many they were."""
-    jitter = estimate_jitter(found, points, prior) if "hand" in found.free else 0.0
-    if jitter:
-        found = fit(found.model, found.views, points, found.free, prior=prior, jitter=jitter)
+    found = _with_jitter(found, points, prior)
     lengths = np.linalg.norm(found.left, axis=-1)
     seen = np.isfinite(lengths)
     limit = max(WRONG_SIGMAS * robust_sigma(found.left[seen]), WRONG_FLOOR_PX)
@@ -235,12 +235,31 @@ def _without_wrong_corners(found: Fit, points: Array, prior: Prior) -> tuple[Fit
             continue
         count += int(bad.sum())
         views.append(replace(view, corners_px=np.where(bad[:, None], np.nan, view.corners_px)) if bad.any() else view)
-    again = fit(found.model, views, points, found.free, prior=prior, jitter=jitter)
-    if rejected and jitter:  # whole views that were off look like jitter
-        again = fit(again.model, views, points, found.free, prior=prior)
-        jitter = estimate_jitter(again, points, prior)
-        again = fit(again.model, views, points, found.free, prior=prior, jitter=jitter) if jitter else again
+    again = fit(found.model, views, points, found.free, prior=prior, jitter=found.jitter)
+    if found.jitter:  # views and corners that were off look like jitter
+        again = _with_jitter(again, points, prior)
     return again, count, rejected
+
+
+def _with_jitter(found: Fit, points: Array, prior: Prior) -> Fit:
+    """The fit with the head's jitter, as it and the parameters settle together.
+
+    Raises:
+        CalibrationError: it is so large that no head has it.
+    """
+    if "hand" not in found.free:
+        return found
+    for _ in range(JITTER_ROUNDS):
+        jitter = estimate_jitter(found, points, prior)
+        if jitter > LARGEST_JITTER:
+            raise CalibrationError(
+                f"the head misses what it reports by {np.degrees(jitter):.1f} degrees in each axis; check that pan and "
+                "tilt are not exchanged, that every image has its own angles, and that boards stood still"
+            )
+        if abs(jitter - found.jitter) <= SETTLED * jitter:
+            break
+        found = fit(found.model, found.views, points, found.free, prior=prior, jitter=jitter)
+    return found
 
 
 def _with_k3_where_needed(found: Fit, points: Array, prior: Prior) -> tuple[Fit, Prior]:

@@ -42,6 +42,8 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None])
             continue
         if path.is_dir():
             raise ConfigError(f"{path}: is a folder; name the file to write")
+        if path.exists() and not path.is_file():
+            raise ConfigError(f"{path}: is a device, not a file; name the file to write")
         if not path.absolute().parent.is_dir():
             raise ConfigError(f"{path}: its folder does not exist; create it first")
         if path.resolve() in taken:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from cotarget.calibration import Calibration
 
 
+LARGEST_SQUARE = 2.0  # [m]; more is surely meant in millimetres
 PHOTOS = ("fixed", "zoom", "board", "square")  # options that plain photos need
 SESSION = ("placements", "stops")  # and those of a capture session
 
@@ -81,6 +82,8 @@ def _check_together(options: argparse.Namespace) -> None:
     if photos:
         if missing := [name for name in PHOTOS if name not in photos]:
             raise ConfigError(f"plain photos need --{missing[0]} too: --fixed, --zoom, --board and --square")
+        if options.square > LARGEST_SQUARE:
+            raise ConfigError(f"--square: {options.square:g} m is no board's square; 25 mm are 0.025")
         if options.encoders:
             raise ConfigError("--encoders goes with --rig or saved captures; plain photos know nothing of a head")
     elif not (options.source / "index.json").exists():

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import json
 import math
+import sys
 
 from cotarget.cli.arguments import check_outputs, nothing, progress_bar
 from cotarget.errors import ConfigError
@@ -24,6 +25,7 @@ def aim(options: argparse.Namespace) -> None:
     import numpy as np
 
     from cotarget.calibration import load_calibration
+    from cotarget.calibration.stops import SAME_FOCAL
     from cotarget.config import RigConfig, load_config
     from cotarget.targeting import Closeup, Reach, aim, depth_of, error_budget, point_at
 
@@ -64,7 +66,16 @@ def aim(options: argparse.Namespace) -> None:
     found = aim(
         calibration, point_at(calibration, pixel, depth), reach, closeup=closeup, nominal_px=nominal, method=options.ik
     )
-    budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px)
+    # The budget speaks of the exact inverse; what the paper's shortcut loses beside it, nothing here knows.
+    budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px) if options.ik == "exact" else None
+    calibrated = calibration.zoom.nominal_px
+    within = calibrated[0] * (1 - SAME_FOCAL) <= found.nominal_px <= calibrated[-1] * (1 + SAME_FOCAL)
+    if not within:
+        print(
+            f"cotarget aim: {found.nominal_px * pitch_mm:.1f} mm is beyond the focal lengths calibrated, "
+            f"{calibrated[0] * pitch_mm:.1f} to {calibrated[-1] * pitch_mm:.1f} mm: the prediction only guesses there",
+            file=sys.stderr,
+        )
     print(
         json.dumps(
             {
@@ -73,10 +84,11 @@ def aim(options: argparse.Namespace) -> None:
                 "focal_px": found.focal_px,
                 "focal_mm": found.nominal_px * pitch_mm,
                 "focal_limited": found.limited,
+                "focal_calibrated": within,
                 "depth_m": found.depth,
                 "range_m": found.range,
-                "predicted_error_deg": {name: math.degrees(part) for name, part in budget.items()},
-                "predicted_error_px": math.tan(budget["total"]) * found.focal_px,
+                "predicted_error_deg": budget and {name: math.degrees(part) for name, part in budget.items()},
+                "predicted_error_px": budget and math.tan(budget["total"]) * found.focal_px,
             },
             indent=2,
         )

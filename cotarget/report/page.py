@@ -24,7 +24,7 @@ from cotarget.report.pointing import (
     pointing,
 )
 from cotarget.report.tables import STRONG, Table, correlations, key_figures, parameter_tables, provenance
-from cotarget.report.verdict import LABELS, Verdict, judge
+from cotarget.report.verdict import LABELS, TOO_CAREFUL, Verdict, judge
 from cotarget.report.wording import count, digits, percent
 
 FOLDED_FROM = 8  # a longer list of rejected images is folded
@@ -229,6 +229,11 @@ def _held_out(calibration: Calibration) -> Iterator[str]:
         yield markup.paragraph(
             f"They disagree: the miss is {digits(held_out.widened)} times what it should be, beyond chance. Something "
             "is not as the model has it. Every uncertainty on this page is widened by that factor already."
+        )
+    elif held_out.ratio < TOO_CAREFUL:
+        yield markup.paragraph(
+            "They are predicted better than the calibration says: its uncertainty is larger than it need be, as where "
+            "the errors of a few views are taken for those of all."
         )
     else:
         yield markup.paragraph(

@@ -24,6 +24,7 @@ ALIKE = 1.25
 FAR_OFF, OUT_OF_SIGHT = 0.05, 0.5
 # Corners explained so many times worse than was recorded are other corners; exact ones are rounded to the floor.
 CONTRADICTION, RECORDED_FLOOR_PX = 3.0, 1e-3
+TOO_CAREFUL = 0.6  # misses below this share of what was predicted are no chance either
 MOSTLY = 0.5  # share of the squared error
 
 
@@ -85,6 +86,11 @@ def judge(
         parts.append(f"not counting that the board's corners are {size} mm off where they are believed to be")
     if calibration.held_out is None:
         parts.append("no captures were kept out of the fit to confirm it")
+    elif calibration.held_out.ratio < TOO_CAREFUL:
+        level = "care" if level == "good" else level
+        parts.append(
+            f"captures kept out of the fit miss only {digits(calibration.held_out.ratio)} times as far as that"
+        )
     elif not mismatch:
         parts.append("captures kept out of the fit agree")
     return Verdict(_sentence(parts), level)
