@@ -91,6 +91,8 @@ def find_views(
         view = find_view(capture, index.board)
         if view is None:
             rejected.append(Rejected(str(capture.source), NO_BOARD.format(*index.board.corners)))
+            if not views and len(rejected) == GUESSES and (other := _another_kind(capture, index.board)):
+                raise CalibrationError(f"{directory}: {other}")  # long before all pictures were searched in vain
         elif another_board(capture.image, index.board, view.corners_px):
             rejected.append(Rejected(str(capture.source), TWO_BOARDS))
         else:
@@ -114,9 +116,20 @@ def _why_none(directory: Path, index: CaptureIndex, rejected: Sequence[Rejected]
         return f"no picture shows one {name} alone; {TWO_BOARDS}, like {two[0]}"
     every = max(len(index.captures) // GUESSES, 1)
     for capture in read_images(directory, index.captures[::every]):
-        if board.kind == "chessboard" and (seen := guess_corners(capture.image)) not in (None, board.corners):
-            return f"no picture shows a whole {name}; a board of {seen[0]}x{seen[1]} is seen in {capture.source}"
+        if other := _another_kind(capture, board):
+            return other
     return f"no picture shows a whole {name}; check the board's corners, and that every picture shows all of it"
+
+
+def _another_kind(capture: Capture, board: BoardConfig) -> str:
+    """That a picture shows a chessboard of another size than the one configured; empty where it does not."""
+    seen = guess_corners(capture.image) if board.kind == "chessboard" else None
+    if seen is None or seen == board.corners:
+        return ""
+    return (
+        f"no picture shows a whole chessboard of {board.corners[0]}x{board.corners[1]} inner corners; "
+        f"a board of {seen[0]}x{seen[1]} is seen in {capture.source}"
+    )
 
 
 def _find_parts(

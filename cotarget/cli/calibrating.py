@@ -5,7 +5,8 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +39,7 @@ def calibrate(options: argparse.Namespace) -> None:
 
         if options.rig is not None:
             config = load_config(options.rig)
-            with SafeRig(open_rig(config), config.safety) as rig:
+            with _captures_kept(options.captures), SafeRig(open_rig(config), config.safety) as rig:
                 found = cal.calibrate_rig(
                     rig,
                     config.board,
@@ -59,6 +60,17 @@ def calibrate(options: argparse.Namespace) -> None:
     for rejected in found.residuals.rejected:
         print(f"not used: {rejected.name}: {rejected.reason}", file=sys.stderr)
     print(json.dumps(summary(found, options.out), indent=2))
+
+
+@contextmanager
+def _captures_kept(directory: Path | None) -> Iterator[None]:
+    """Say, when a session is interrupted, that what it has taken so far can be used."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if directory is not None and (directory / "index.json").exists():
+            print(f"the captures so far are in {directory}; calibrate --from {directory} reads them", file=sys.stderr)
+        raise
 
 
 def _given(options: argparse.Namespace, names: Sequence[str]) -> list[str]:
