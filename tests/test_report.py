@@ -299,6 +299,16 @@ def test_a_view_of_corners_on_one_line_is_named_and_ends_no_report(plain, caplog
         assert caplog.messages == ["line.png: not in the report: its corners are too few, or all on one line"]
 
 
+def test_a_lens_that_zooms_further_than_was_calibrated_is_told(plain):
+    known = replace(plain, provenance={"focal_range_px": [667.0, plain.zoom.nominal_px[-1]]})
+    further = replace(plain, provenance={"focal_range_px": [667.0, 3 * plain.zoom.nominal_px[-1]]})
+    assert "goes to" not in judge(known).text
+    assert "the lens goes to 2001 px by its own account" in judge(further).text
+    assert judge(further).level == "care"
+    said = advice(further, (), (), (), gather(further))
+    assert any("but was calibrated to 667 px" in item for item in said)
+
+
 def test_a_wavy_board_is_seen_and_said(plain):
     bent = POINTS.copy()
     bent[:, 2] = 0.003 * np.sin(12 * POINTS[:, 0])  # waves, which no parabola takes up

@@ -275,6 +275,7 @@ def calibrate_rig(
         "placements": placements,
         "stops": stops,
         "far_placements": far_placements,
+        "focal_range_px": [float(focal) for focal in rig.zoom.focal_range],
     }
     return calibrate_views(
         recorder.views,

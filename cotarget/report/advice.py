@@ -16,6 +16,7 @@ from cotarget.report.pointing import (
     Contribution,
     corner_errors,
     placements,
+    uncalibrated_px,
     undetermined,
     what_stays,
     with_more_placements,
@@ -209,6 +210,12 @@ def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
     for nominal, views in zip(calibration.zoom.nominal_px, evidence.per_stop, strict=True):
         if views < FEWEST_AT_STOP:
             yield f"The stop at {nominal:.0f} px has {count(views, 'view')}: add some, {FEWEST_AT_STOP} at least."
+    if (longest := uncalibrated_px(calibration)) is not None:
+        yield (
+            f"The lens goes to {longest:.0f} px by its own account, but was calibrated to "
+            f"{calibration.zoom.nominal_px[-1]:.0f} px: no part of a board was seen beyond. Hold boards far away "
+            "where the head reaches, with squares that still show several corners there."
+        )
     zooms = any(view.focal_px is not None for view in evidence.views if view.camera == "zoom")
     if zooms and len(calibration.zoom.stops) == 1:
         yield (

@@ -69,7 +69,7 @@ def _pointing(
         f"Heat maps of the predicted pointing error over the wide view at three depths; {digits(np.degrees(last.rms))} "
         f"degrees on average",
         "The wide view with targets at three depths; lines join places of equal error, written in degrees. The error "
-        "grows towards places that no board reached, and with distance where boards were near only.",
+        "grows where no board reached, and with distance where boards were near only.",
     )
     add(
         "pointing_depth",

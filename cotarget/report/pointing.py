@@ -15,6 +15,7 @@ from cotarget.geometry import Array
 DEPTHS = (4.0, 30.0)  # where targets are [m]
 CELLS = (9, 7)  # across and down the wide view, at whose middles pointing is predicted
 DEPTH_STEPS = 5
+FARTHER = 1.1  # times the longest focal length calibrated, up to which a lens may go without a word
 MORE_PLACEMENTS = 10  # of which people are told what they would bring
 BETWEEN_STOPS = 4  # focal lengths to look at between the stops, shared out, but never fewer than one each
 # Groups of parameters in the order of the page: how people call them, and how their names begin.
@@ -76,6 +77,13 @@ def sigma_of(calibration: Calibration, name: str) -> float | None:
     """Standard deviation of a parameter; None where the calibration tells none."""
     covariance = calibration.covariance
     return covariance.sigma(name) if covariance is not None and name in covariance.parameters else None
+
+
+def uncalibrated_px(calibration: Calibration) -> float | None:
+    """The longest focal length of a lens that was not calibrated so far [px]; None where it was, or is not known."""
+    told = calibration.provenance.get("focal_range_px")
+    longest = told[-1] if isinstance(told, list) and told and isinstance(told[-1], int | float) else None
+    return longest if longest is not None and longest > calibration.zoom.nominal_px[-1] * FARTHER else None
 
 
 def can_point(calibration: Calibration) -> bool:

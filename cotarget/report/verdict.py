@@ -7,7 +7,7 @@ import numpy as np
 
 from cotarget.calibration.model import Calibration
 from cotarget.report.evidence import Evidence, gather
-from cotarget.report.pointing import DEPTHS, AtFocal, between_stops, pointing, sigma_of, undetermined
+from cotarget.report.pointing import DEPTHS, AtFocal, between_stops, pointing, sigma_of, uncalibrated_px, undetermined
 from cotarget.report.wording import digits, percent
 
 Level = Literal["good", "care", "bad", "unknown"]
@@ -77,6 +77,9 @@ def judge(
     if at[-1].rms_px > FAR_OFF * width:
         level = "bad" if at[-1].rms_px > OUT_OF_SIGHT * width else "care"
         parts.append(f"that is {percent(at[-1].rms_px / width)} of the close-up's width")
+    if (longest := uncalibrated_px(calibration)) is not None:
+        level = "care" if level == "good" else level
+        parts.append(f"the lens goes to {longest:.0f} px by its own account, and nothing is known of it beyond these")
     if calibration.jitter:
         level = "care" if level == "good" else level
         parts.append(_jitter(calibration, at[-1]))
