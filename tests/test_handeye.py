@@ -35,6 +35,11 @@ def test_exact_motions_give_t_exactly(angles):
         assert np.linalg.norm(error.translation) < EXACT
 
 
+def test_matrices_are_refused_in_words():
+    with pytest.raises(CalibrationError, match=r"RigidTransform\.from_matrix makes them"):
+        solve_hand_eye_from_poses([np.eye(4)] * 3, [np.eye(4)] * 3)
+
+
 @pytest.mark.parametrize(("angles", "message"), [
     ([(0.0, 0.1), (0.2, 0.1), (-0.3, 0.1)], "only pan moved.*along the pan axis.*add tilt"),
     ([(0.1, 0.0), (0.1, 0.2), (0.1, -0.3)], "only tilt moved.*along the tilt axis.*add pan"),

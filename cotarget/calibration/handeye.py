@@ -133,7 +133,7 @@ def solve_hand_eye(
     """
     if len(A) < 2 or len(A) != len(B):
         raise CalibrationError(f"hand-eye: {len(A)} and {len(B)} motions; it takes two or more, as many of each")
-    a, b = RigidTransform.concatenate(list(A)), RigidTransform.concatenate(list(B))
+    a, b = _together(A), _together(B)
     problem = motion_problem(a, b, len(A) if independent is None else independent)
     X = RigidTransform.concatenate([_start(a, b)])
     return _solved(problem, X, HandMotions(a.rotation.as_rotvec(), a.translation), insist)
@@ -158,8 +158,8 @@ def solve_hand_eye_from_poses(
     For a camera that stands still and a board in the hand, give the inverse of T_base_hand: X is T_base_camera then.
 
     Args:
-        T_base_hand: of each view, three or more.
-        T_camera_board: of each view.
+        T_base_hand: of each view, a list of three scipy RigidTransforms or more [m].
+        T_camera_board: of each view: where the board is in the camera's frame, not the other way round.
         placements: where the board stood during each view, by number; in one place throughout, by default.
         middle: of the board's points, in its frame [m], (3,): that is the point which the camera sees best. With a
             board whose origin is a corner it makes a difference.
@@ -175,7 +175,7 @@ def solve_hand_eye_from_poses(
     pairs = [(i, j) for i, j in itertools.combinations(range(len(where)), 2) if where[i] == where[j]]
     if len(pairs) < 2:
         raise CalibrationError("hand-eye: it takes three views of a board in one place, or two each in two places")
-    hands, seen = (RigidTransform.concatenate(list(poses)) for poses in (T_base_hand, T_camera_board))
+    hands, seen = _together(T_base_hand), _together(T_camera_board)
     to_middle = RigidTransform.from_translation(np.asarray(middle, dtype=float))
     seen = seen * to_middle
     i, j = np.array(pairs).T
@@ -187,6 +187,21 @@ def solve_hand_eye_from_poses(
     moved = HandMotions(A.rotation.as_rotvec(), A.translation, turns_base)
     result = _solved(pose_problem(hands, seen, owners), start, moved, insist)
     return replace(result, boards=tuple(board * to_middle.inv() for board in result.boards))
+
+
+def _together(transforms: Sequence[RigidTransform]) -> RigidTransform:
+    """Many transforms as one object of scipy's.
+
+    Raises:
+        CalibrationError: they are something else.
+    """
+    try:
+        return RigidTransform.concatenate(list(transforms))
+    except TypeError:
+        raise CalibrationError(
+            "hand-eye: poses and motions are scipy's RigidTransform; "
+            "RigidTransform.from_matrix makes them of 4x4 matrices"
+        ) from None
 
 
 def _solved(problem: Problem, start: RigidTransform, moved: HandMotions, insist: bool) -> HandEye:
@@ -298,7 +313,7 @@ def _check_axes(alpha: Array) -> None:
     moved, missing = ("pan", "tilt") if abs(Vt[0][1]) > abs(Vt[0][0]) else ("tilt", "pan")
     raise CalibrationError(
         f"hand-eye: only {moved} moved: the position of the camera along the {moved} axis and its rotation about it "
-        f"are free; add {missing}"
+        f"are free; add {missing}, while a board stays where it is"
     )
 
 
