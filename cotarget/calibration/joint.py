@@ -266,7 +266,7 @@ def _with_k3_where_needed(found: Fit, points: Array, prior: Prior) -> tuple[Fit,
     """Free the fixed camera's k3 as well, if the corners speak for it, and by as much as they do.
 
     Its prior is what its own estimate lets expect of such a lens (empirical Bayes): k3^2 less its variance. So a k3
-    that noise explains stays 0, a large one is free, and between them neither its value nor its uncertainty jumps.
+    that noise explains stays 0, a large one is free, and one between is drawn towards 0.
     """
     free: tuple[Block, ...] = (*found.free, "k3")
 
