@@ -12,7 +12,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from cotarget.errors import ConfigError
-from cotarget.geometry import Array
+from cotarget.geometry import Array, RigidTransform
 
 # Newton's iteration for the inverse distortion: quadratic, so 20 steps are ample wherever an inverse exists.
 UNDISTORT_STEPS = 20
@@ -228,13 +228,18 @@ class ZoomLens:
         if len(self.stops) == 1:
             return self.stops[0].scaled(nominal_px / self.nominal_px[0])
         log_x, log_y, cx, cy, k1, k2, p1, p2, k3, _ = (float(value) for value in self._values(nominal_px))
-        m = nominal_px / self.nominal_px[0]
+        bent = np.array([k1, k2, p1, p2, k3]) * distortion_growth(nominal_px / self.nominal_px[0])
+        k1, k2, p1, p2, k3 = (float(k) for k in bent)
         return Intrinsics(
             size=self.size,
             focal_px=(math.exp(log_x) * nominal_px, math.exp(log_y) * nominal_px),
             center_px=(cx, cy),
-            distortion=(k1 * m**2, k2 * m**4, p1 * m, p2 * m, k3 * m**6),
+            distortion=(k1, k2, p1, p2, k3),
         )
+
+    def to_pupil(self, nominal_px: float) -> RigidTransform:
+        """The camera's frame at a focal length, seen from that at the first stop: moved forward by `pupil_at`."""
+        return RigidTransform.from_translation([0.0, 0.0, self.pupil_at(nominal_px)])
 
     def pupil_at(self, nominal_px: float) -> float:
         """How far the entrance pupil has moved forward since the first stop [m]."""
@@ -286,12 +291,17 @@ class ZoomLens:
         nominal = np.array(self.nominal_px)
         m = nominal / nominal[0]
         rows = [
-            [*np.log(np.array(stop.focal_px) / n), *stop.center_px, *(np.array(stop.distortion) / _growth(g)), pupil]
+            [
+                *np.log(np.array(stop.focal_px) / n),
+                *stop.center_px,
+                *(np.array(stop.distortion) / distortion_growth(g)),
+                pupil,
+            ]
             for stop, n, g, pupil in zip(self.stops, nominal, m, self.pupil, strict=True)
         ]
         return CubicSpline(np.log(nominal), np.array(rows))
 
 
-def _growth(magnified: float) -> Array:
-    """By what the distortion coefficients grow with the focal length for the image to be bent the same."""
+def distortion_growth(magnified: float) -> Array:
+    """By what (k1, k2, p1, p2, k3) grow with the focal length for the image to be bent the same, (5,)."""
     return np.array([magnified**2, magnified**4, magnified, magnified, magnified**6])

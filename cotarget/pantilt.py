@@ -45,6 +45,11 @@ class HeadGeometry:
     pan_zero: float = 0.0
     tilt_zero: float = 0.0
 
+    @property
+    def tilt_axis(self) -> Array:
+        """The tilt axis at pan = 0: cos(eps) X + sin(eps) Y, (3,)."""
+        return np.array([np.cos(self.squareness), np.sin(self.squareness), 0.0])
+
     def true_angles(self, pan: Array | float, tilt: Array | float) -> tuple[Array, Array]:
         """The axes' true angles [rad] where the head reports these."""
         return (
@@ -85,7 +90,7 @@ def base_head(pan: float, tilt: float, head: HeadGeometry = IDEAL_HEAD) -> Rigid
     """
     true_pan, true_tilt = (float(angle) for angle in head.true_angles(pan, tilt))
     offset = RigidTransform.from_translation([0.0, 0.0, head.axis_offset])
-    tilting = RigidTransform.from_rotation(Rotation.from_rotvec(_tilt_axis(head) * true_tilt))
+    tilting = RigidTransform.from_rotation(Rotation.from_rotvec(head.tilt_axis * true_tilt))
     return RigidTransform.from_rotation(rot_y(true_pan)) * offset * tilting * offset.inv()
 
 
@@ -237,16 +242,11 @@ def miss(
     shape = np.broadcast_shapes(np.shape(pan), np.shape(tilt), np.shape(x_base)[:-1])
     dz = np.array([0.0, 0.0, head.axis_offset])
     pans = Rotation.from_rotvec(np.multiply.outer(np.broadcast_to(pan, shape).ravel(), [0.0, 1.0, 0.0]))
-    tilts = Rotation.from_rotvec(np.multiply.outer(np.broadcast_to(tilt, shape).ravel(), _tilt_axis(head)))
+    tilts = Rotation.from_rotvec(np.multiply.outer(np.broadcast_to(tilt, shape).ravel(), head.tilt_axis))
     points = np.array(np.broadcast_to(x_base, (*shape, 3))).reshape(-1, 3)
     x_head = tilts.inv().apply(pans.inv().apply(points) - dz) + dz
     x_zoom = T_head_zoom.inv().apply(x_head).reshape(*shape, 3)
     return angle_between(x_zoom, np.broadcast_to(np.asarray(ray, float), x_zoom.shape))
-
-
-def _tilt_axis(head: HeadGeometry) -> Array:
-    """The tilt axis at pan = 0: cos(eps) X + sin(eps) Y."""
-    return np.array([np.cos(head.squareness), np.sin(head.squareness), 0.0])
 
 
 def _closed_form(x_base: Array, d: Array, t: Array, head: HeadGeometry) -> tuple[Array, Array, Array]:
@@ -269,7 +269,7 @@ def _closed_form(x_base: Array, d: Array, t: Array, head: HeadGeometry) -> tuple
         y, z, height = q[..., 1] - on_axis * sin_eps, cos_eps * q[..., 2], b - on_axis * sin_eps
         root = np.sqrt(np.maximum(y * y + z * z - height * height, 0.0)) * np.array([1.0, -1.0])
         tilt = np.arctan2(y, z) - np.arctan2(height, root)  # (13)
-        turned = _turn(_tilt_axis(head), tilt, q)  # (14)
+        turned = _turn(head.tilt_axis, tilt, q)  # (14)
         ahead = turned[..., 2]
     x, z2 = turned[..., 0], turned[..., 2] + head.axis_offset
     pan = np.arctan2(a * z2 - c * x, a * x + c * z2)  # (16)
@@ -306,7 +306,7 @@ def _newton(
 def _residual(unknowns: Array, target: Array, d: Array, t: Array, head: HeadGeometry) -> tuple[Array, Array]:
     """base_head(pan, tilt) (range d + t) - x_base, (n, 3), and its derivative by (pan, tilt, range), (n, 3, 3)."""
     pan, tilt, reach = unknowns.T
-    dz, axis, e_y = np.array([0.0, 0.0, head.axis_offset]), _tilt_axis(head), np.array([0.0, 1.0, 0.0])
+    dz, axis, e_y = np.array([0.0, 0.0, head.axis_offset]), head.tilt_axis, np.array([0.0, 1.0, 0.0])
     q = _turn(axis, tilt, reach[:, None] * d + t - dz)
     reached = _turn(e_y, pan, q + dz)
     J = np.stack(

@@ -65,6 +65,11 @@ class PanTiltLimits:
     acceleration: float
     step: float
 
+    def allow(self, pan: npt.ArrayLike, tilt: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Whether angles [rad] are within the limits; nan is not."""
+        pan, tilt = np.asarray(pan, dtype=float), np.asarray(tilt, dtype=float)
+        return np.asarray((pan >= self.pan[0]) & (pan <= self.pan[1]) & (tilt >= self.tilt[0]) & (tilt <= self.tilt[1]))
+
 
 class Camera(Protocol):
     """A camera that streams."""

@@ -158,11 +158,7 @@ def _find_with_zoom(recorder: Recorder, model: RigModel) -> View:
         for reach in (SCAN_PAN, SCAN_TILT)
     ]
     grid = sorted(itertools.product(*steps), key=lambda pose: (np.hypot(*pose), pose))
-    grid = [
-        (pan, tilt)
-        for pan, tilt in grid
-        if limits.pan[0] <= pan <= limits.pan[1] and limits.tilt[0] <= tilt <= limits.tilt[1]
-    ]
+    grid = [(pan, tilt) for pan, tilt in grid if limits.allow(pan, tilt)]
     tried = []
     for share, turned in SHOWN:
         depth = distance(recorder.board, model.fixed, share)
@@ -191,7 +187,7 @@ def _turn_a_little(recorder: Recorder, view: View) -> tuple[View, View]:
     for name, d_pan, d_tilt in (("pan", SMALL_TURN, 0.0), ("tilt", 0.0, SMALL_TURN)):
         for factor in (1.0, -1.0, 0.5, -0.5):
             pan, tilt = view.pan + factor * d_pan, view.tilt + factor * d_tilt
-            if not (limits.pan[0] <= pan <= limits.pan[1] and limits.tilt[0] <= tilt <= limits.tilt[1]):
+            if not limits.allow(pan, tilt):
                 continue
             recorder.turn(pan, tilt)
             turned = recorder.see_zoom(expected=False)

@@ -4,14 +4,14 @@ Parts of a plain chessboard are told apart by where they should be, so that the 
 until those at the shortest have told the rig, and each zoom stop until the one before it is known; see `stops`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cotarget.calibration.boards import another_board, board_points, find_corners, guess_corners
 from cotarget.calibration.captures import CaptureIndex, read_images
-from cotarget.calibration.joint import joint
-from cotarget.calibration.model import DEFAULT_OPTIONS, CameraName, Capture, Options, Rejected, View, unseen
+from cotarget.calibration.joint import NO_PLACE, joint
+from cotarget.calibration.model import DEFAULT_OPTIONS, CameraName, Capture, Options, Progress, Rejected, View, unseen
 from cotarget.calibration.parameters import RigModel
 from cotarget.calibration.recorder import view_of
 from cotarget.calibration.stops import (
@@ -27,12 +27,9 @@ from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
 
-Progress = Callable[[int, int, str], None]  # done, total, text
-
 NO_BOARD = "no whole board of {}x{} corners is seen"
 TWO_BOARDS = "two boards are in this picture; show one"
 GUESSES = 10  # pictures in which another board is looked for when the one configured is in none
-NO_PLACE = "its board is seen by neither camera at the shortest focal length, so that nothing tells where it is"
 NOT_EXPECTED = "no part of the board is seen where it should be"
 TEACHING_VIEWS = 4  # of a stop, after each of which it is fitted again
 

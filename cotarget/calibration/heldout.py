@@ -12,9 +12,8 @@ import numpy as np
 
 from cotarget.calibration.bundle import Fit, fit
 from cotarget.calibration.model import HeldOut, View
-from cotarget.calibration.normal import Prior
-from cotarget.calibration.parameters import parameter_names, stop_of
-from cotarget.calibration.placing import place_boards
+from cotarget.calibration.normal import Prior, masked
+from cotarget.calibration.parameters import POSE_PARAMETERS, parameter_names, stop_of
 from cotarget.calibration.reprojection import Batch, batches_of, predict
 from cotarget.calibration.robust import rms
 from cotarget.calibration.uncertainty import covariance_of
@@ -50,13 +49,13 @@ def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -
     for k in range(folds):
         out = set(numbers[k::folds])
         rest = [view for view in found.views if view.board not in out]
-        lens = found.model.zoom
-        assert lens is not None
-        remaining = Counter(stop_of(lens, view) for view in rest if view.camera == "zoom")
+        assert found.model.zoom is not None
+        stops = found.model.zoom.nominal_px
+        remaining = Counter(stop_of(stops, view) for view in rest if view.camera == "zoom")
         kept = [
             view
             for view in found.views
-            if view.board in out and (view.camera == "fixed" or remaining[stop_of(lens, view)] >= FEWEST_VIEWS)
+            if view.board in out and (view.camera == "fixed" or remaining[stop_of(stops, view)] >= FEWEST_VIEWS)
         ]
         try:
             partial = fit(found.model, rest, points, found.free, prior=prior, jitter=found.jitter)
@@ -65,11 +64,11 @@ def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -
         covariance = covariance_of(partial)
         if covariance is None or partial.variance is None:
             return None
-        more_misses, more_expected = _predicted(partial, covariance.matrix, kept, points)
+        started = replace(partial, model=replace(partial.model, boards=found.model.boards))
+        more_misses, more_expected = _predicted(started, covariance.matrix, kept, points)
         misses.append(more_misses)
         expected.append(more_expected)
-        boards = {number: found.model.boards[number] for number in sorted(out)}
-        left.append(fit(replace(partial.model, boards=boards), kept, points, ()).residuals)
+        left.append(fit(started.model, kept, points, ()).residuals)
     miss, covariances = np.concatenate(misses), np.concatenate(expected)
     whitened = np.einsum("vi,vij,vj->v", miss, np.linalg.inv(covariances), miss) / 2
     ratio2 = float(np.mean(whitened))
@@ -95,17 +94,17 @@ def _predicted(found: Fit, covariance: Array, kept: Sequence[View], points: Arra
     assert model.zoom is not None
     fixed = [view for view in kept if view.camera == "fixed"]
     zoom = [view for view in kept if view.camera == "zoom"]
-    told = fit(replace(model, boards=place_boards(model, kept, points).boards), fixed, points, ()).model
+    told = fit(model, fixed, points, ()).model
     boards = list(told.boards)
     n = len(parameter_names(found.free, model.stops))
-    by_p, spread = np.zeros((len(boards), 6, n)), np.zeros((len(boards), 6, 6))
+    by_p, spread = (np.zeros((len(boards), POSE_PARAMETERS, width)) for width in (n, POSE_PARAMETERS))
     for batch in batches_of(told, fixed):
         p = predict(told, batch, points, found.free)
-        B = np.where(batch.seen[..., None, None], p.by_board, 0.0).reshape(len(batch.rows), -1, 6)
-        J = np.where(batch.seen[..., None, None], p.by_shared, 0.0).reshape(len(batch.rows), B.shape[1], -1)
+        B = masked(p.by_board, batch).reshape(len(batch.rows), -1, POSE_PARAMETERS)
+        J = masked(p.by_shared, batch).reshape(len(batch.rows), B.shape[1], -1)
         inverse = np.linalg.inv(B.swapaxes(1, 2) @ B)
         spread[batch.owners] = inverse
-        full = np.zeros((len(batch.rows), 6, n))
+        full = np.zeros((len(batch.rows), POSE_PARAMETERS, n))
         full[:, :, p.columns] = inverse @ B.swapaxes(1, 2) @ J
         by_p[batch.owners] = full
     misses, covariances = np.empty((len(zoom), 2)), np.empty((len(zoom), 2, 2))

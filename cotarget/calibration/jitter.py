@@ -33,10 +33,10 @@ def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> fl
         Standard deviation of each axis [rad]; 0 where the corners do not speak for any.
     """
     problem = Problem(batches_of(found.model, found.views), points, found.free, prior, found.jitter)
-    here = problem.at(found.model)
-    grams = problem.grams(here, robust_scale(here))
     if found.variance is None or not any(batch.stop is not None for batch in problem.batches):
         return 0.0
+    here = problem.at(found.model)
+    grams = problem.grams(here, robust_scale(here))
     coordinates = 2 * sum(int(batch.seen.sum()) for batch in problem.batches)
     freedom = coordinates - len(found.normal) - POSE_PARAMETERS * len(found.model.boards)
 

@@ -20,7 +20,7 @@ from cotarget.calibration.jitter import estimate_jitter, head_turns
 from cotarget.calibration.model import DEFAULT_OPTIONS, CameraName, Options, Rejected, Residuals, View
 from cotarget.calibration.normal import Prior
 from cotarget.calibration.observability import limits_of_use, name_directions, weak_directions
-from cotarget.calibration.parameters import ALL_BLOCKS, Block, RigModel, parameter_names
+from cotarget.calibration.parameters import ALL_BLOCKS, Block, RigModel, parameter_names, stop_of
 from cotarget.calibration.placing import place_boards
 from cotarget.calibration.robust import MEDIAN_TO_SIGMA, rms, robust_sigma
 from cotarget.calibration.sequential import Solution, Steps, both_cameras, stereo
@@ -76,7 +76,7 @@ def joint(
     Raises:
         CalibrationError: the views do not determine the rig; the message says what is missing.
     """
-    shortest = [view for view in views if view.camera == "fixed" or _stop_of(nominal_px, view) == 0]
+    shortest = [view for view in views if view.camera == "fixed" or stop_of(nominal_px, view) == 0]
     steps = both_cameras(shortest, points, sizes, nominal_px[0] if nominal_px else None)
     if not of_both(steps.views):
         raise CalibrationError("no placement of the board is seen by both cameras; turn the head so that both see it")
@@ -134,11 +134,7 @@ def joint(
 def undetermined(found: Fit) -> str:
     """What a fit leaves undetermined, in words with what to add; empty where nothing is."""
     names = parameter_names(found.free, found.model.stops)
-    focal = (
-        {f"zoom[{i}]": stop.focal_px[0] for i, stop in enumerate(found.model.zoom.stops)} if found.model.zoom else {}
-    )
-    if found.model.fixed is not None:
-        focal["fixed"] = found.model.fixed.focal_px[0]
+    focal = found.model.focal_px
     return name_directions(names, weak_directions(found.normal, names, found.variance or 0.0, focal), focal)
 
 
@@ -169,7 +165,7 @@ def _all_stops(
     model, used, rejected = found.model, list(found.views), []
     for number, nominal in enumerate(nominal_px[1:], start=1):
         assert model.zoom is not None
-        at_stop = [v for v in views if v.camera == "zoom" and _stop_of(nominal_px, v) == number]
+        at_stop = [v for v in views if v.camera == "zoom" and stop_of(nominal_px, v) == number]
         here = [v for v in at_stop if v.board in model.boards]
         rejected += [Rejected(v.name, NO_PLACE) for v in at_stop if v.board not in model.boards]
         if len(here) < FEWEST_STOP_VIEWS or len({view.board for view in here}) < FEWEST_STOP_PLACEMENTS:
@@ -183,13 +179,6 @@ def _all_stops(
         model = fit_stop(start, start.stops - 1, [*with_fixed, *here], points)
         used += here
     return model, used, rejected
-
-
-def _stop_of(nominal_px: Sequence[float], view: View) -> int:
-    """The stop of a view among all that were visited."""
-    if not nominal_px:
-        return 0
-    return int(np.argmin(np.abs(np.log(np.array(nominal_px) / (view.focal_px or nominal_px[0])))))
 
 
 def _cleaned(found: Fit, points: Array, prior: Prior) -> tuple[Fit, int, list[Rejected]]:

@@ -1,7 +1,7 @@
 """From views, saved captures or plain photos to a `Calibration`, by a method that is named."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -17,7 +17,7 @@ from cotarget.calibration.captures import CaptureIndex, pair_photos, read_index
 from cotarget.calibration.finding import beyond_shortest, find_views
 from cotarget.calibration.intrinsics import FEWEST_CORNERS
 from cotarget.calibration.joint import joint
-from cotarget.calibration.model import DEFAULT_OPTIONS, Calibration, CameraName, Options, Rejected, View
+from cotarget.calibration.model import DEFAULT_OPTIONS, Calibration, CameraName, Options, Progress, Rejected, View
 from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.sequential import sequential
 from cotarget.calibration.session import capture_session
@@ -26,8 +26,6 @@ from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.geometry import Array
 from cotarget.rig import Rig
-
-Progress = Callable[[int, int, str], None]  # done, total, text
 
 # Thirty placements point to a few thousandths of a degree; a session of them takes about 15 s on two cores.
 PLACEMENTS = 30

@@ -1,6 +1,6 @@
 """What a calibration takes and gives: captures, views (the corners of one image), and the calibration itself."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from cotarget.pantilt import IDEAL_HEAD, HeadGeometry
 from cotarget.rig import Image
 
 CameraName = Literal["fixed", "zoom"]
+Progress = Callable[[int, int, str], None]  # done, total, text
 
 
 @dataclass(frozen=True)
@@ -244,7 +245,7 @@ class Calibration:
             raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
         if nominal_px is None:
             return self.T_head_zoom
-        return self.T_head_zoom * RigidTransform.from_translation([0.0, 0.0, self.zoom.pupil_at(nominal_px)])
+        return self.T_head_zoom * self.zoom.to_pupil(nominal_px)
 
     def for_streams(self, fixed_size: tuple[int, int], zoom_size: tuple[int, int]) -> "Calibration":
         """The same calibration for streams (width, height) [px] that are scaled.

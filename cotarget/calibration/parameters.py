@@ -3,7 +3,7 @@
 Poses are stepped as R <- exp(w) R, t <- t + d.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -64,6 +64,13 @@ class RigModel:
         """How many stops the zoom lens has here."""
         return 0 if self.zoom is None else len(self.zoom.stops)
 
+    @property
+    def focal_px(self) -> dict[str, float]:
+        """Focal length of every lens [px], by how the names of its parameters begin."""
+        found = {} if self.fixed is None else {"fixed": self.fixed.focal_px[0]}
+        stops = () if self.zoom is None else self.zoom.stops
+        return found | {f"zoom[{i}]": stop.focal_px[0] for i, stop in enumerate(stops)}
+
     def lens_of(self, view: View) -> Intrinsics:
         """The intrinsics with which a view was taken.
 
@@ -73,15 +80,15 @@ class RigModel:
         if view.camera == "fixed" and self.fixed is not None:
             return self.fixed
         if view.camera == "zoom" and self.zoom is not None:
-            return self.zoom.stops[stop_of(self.zoom, view)]
+            return self.zoom.stops[stop_of(self.zoom.nominal_px, view)]
         raise CalibrationError(f"there are views of the {view.camera} camera, but no model of it")
 
 
-def stop_of(lens: ZoomLens, view: View) -> int:
+def stop_of(nominal_px: Sequence[float], view: View) -> int:
     """The stop that is nearest to a view's nominal focal length; the first where none was told."""
-    if view.focal_px is None:
+    if view.focal_px is None or not nominal_px:
         return 0
-    return int(np.argmin(np.abs(np.log(np.array(lens.nominal_px) / view.focal_px))))
+    return int(np.argmin(np.abs(np.log(np.array(nominal_px) / view.focal_px))))
 
 
 def columns_of(free: Collection[Block], stops: int) -> dict[str, slice]:

@@ -50,7 +50,7 @@ def _suggested(model: RigModel, view: View, points: Array) -> list[RigidTransfor
     if view.camera == "fixed":
         return poses
     assert model.zoom is not None
-    pupil = RigidTransform.from_translation([0.0, 0.0, model.zoom.pupil[stop_of(model.zoom, view)]])
+    pupil = RigidTransform.from_translation([0.0, 0.0, model.zoom.pupil[stop_of(model.zoom.nominal_px, view)]])
     T_fixed_zoom = zoom_fixed(view.pan, view.tilt, model.hand, model.gamma, model.head).inv() * pupil
     return [T_fixed_zoom * T for T in poses]
 

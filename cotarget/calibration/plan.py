@@ -226,7 +226,7 @@ def plan_poses(
     reach = np.arctan(np.hypot(*lens.size) / 2 / lens.focal_px[0])
     pan = float(centred.pan) + rng.uniform(-reach, reach, POSES)
     tilt = float(centred.tilt) + rng.uniform(-reach, reach, POSES)
-    allowed = (pan >= limits.pan[0]) & (pan <= limits.pan[1]) & (tilt >= limits.tilt[0]) & (tilt <= limits.tilt[1])
+    allowed = limits.allow(pan, tilt)
     pan, tilt = pan[allowed], tilt[allowed]
     x_base = (model.hand * model.gamma * T_fixed_board).apply(board_body(board))
     R, t, _ = base_heads(model.head, pan, tilt)

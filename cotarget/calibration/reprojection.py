@@ -85,7 +85,7 @@ def batches_of(model: RigModel, views: Sequence[View]) -> list[Batch]:
     lenses: dict[int | None, list[int]] = {}
     for row, view in enumerate(views):
         model.lens_of(view)
-        stop = None if view.camera == "fixed" or model.zoom is None else stop_of(model.zoom, view)
+        stop = None if view.camera == "fixed" or model.zoom is None else stop_of(model.zoom.nominal_px, view)
         lenses.setdefault(stop, []).append(row)
     found = []
     for stop, rows in lenses.items():
@@ -206,13 +206,9 @@ def base_heads(head: HeadGeometry, pan: Array, tilt: Array) -> tuple[Array, Arra
     """
     pan, tilt = head.true_angles(pan, tilt)
     turns = Rotation.from_rotvec(pan[:, None] * np.array([0.0, 1.0, 0.0])).as_matrix()
-    A = Rotation.from_rotvec(tilt[:, None] * _tilt_axis(head)).as_matrix()
+    A = Rotation.from_rotvec(tilt[:, None] * head.tilt_axis).as_matrix()
     offset = head.axis_offset * (E3 - A @ E3)  # Trans(dz) A Trans(-dz) is A with this translation
     return turns @ A, np.einsum("vij,vj->vi", turns, offset), A
-
-
-def _tilt_axis(head: HeadGeometry) -> Array:
-    return np.array([np.cos(head.squareness), np.sin(head.squareness), 0.0])
 
 
 def _by_head(head: HeadGeometry, A: Array, x_head: Array) -> Array:
@@ -233,7 +229,7 @@ def _by_turn(head: HeadGeometry, A: Array, x_head: Array) -> Array:
     a = x_head - head.axis_offset * E3
     q = a @ A.swapaxes(1, 2) + head.axis_offset * E3
     by_pan = -np.cross(np.array([0.0, 1.0, 0.0]), q) @ A  # dq/dpan = -e2 x q, then A^T
-    by_tilt = -np.cross(_tilt_axis(head), a)
+    by_tilt = -np.cross(head.tilt_axis, a)
     return np.stack([by_pan, by_tilt], axis=-1)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from cotarget.calibration.boards import board_points, check_board
 from cotarget.calibration.bootstrap import ROUGH_MARGIN, learn_fixed, learn_zoom, refitted
 from cotarget.calibration.intrinsics import pose_candidates
-from cotarget.calibration.model import Rejected, View
+from cotarget.calibration.model import Progress, Rejected, View
 from cotarget.calibration.outlook import Outlook, outlook_of, planned_views
 from cotarget.calibration.parameters import RigModel
 from cotarget.calibration.plan import Coverage, plan_placements, plan_poses, preferred_share, seen_at_home, where_in
@@ -22,8 +22,6 @@ from cotarget.calibration.stops import spread_stops
 from cotarget.calibration.zooming import see_stops
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform
-
-Progress = Callable[[int, int, str], None]  # done, total, text
 
 FINE_MARGIN = 0.008  # of the image's width, that plans keep clear once the model is fine
 MARGIN_GROWTH, WIDEST_MARGIN = 3.0, 0.15  # at every miss, and at most

@@ -18,7 +18,7 @@ from cotarget.calibration.normal import Prior
 from cotarget.calibration.parameters import RigModel
 from cotarget.calibration.partial import find_near
 from cotarget.calibration.reprojection import predict_pixels
-from cotarget.camera import ZoomLens
+from cotarget.camera import ZoomLens, distortion_growth
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
@@ -58,14 +58,8 @@ def with_stop(lens: ZoomLens, nominal_px: float) -> ZoomLens:
     """A lens with one more stop beyond its last, guessed: ratio and centre go on as they went, the rest stays."""
     last = lens.stops[-1]
     magnified = nominal_px / lens.nominal_px[-1]
-    k1, k2, p1, p2, k3 = last.distortion
-    distortion = (
-        k1 * magnified**2,
-        k2 * magnified**4,
-        p1 * magnified,
-        p2 * magnified,
-        k3 * magnified**6,
-    )
+    k1, k2, p1, p2, k3 = (float(k) for k in np.array(last.distortion) * distortion_growth(magnified))
+    distortion = (k1, k2, p1, p2, k3)
     focal, center = np.array(last.focal_px) * magnified, np.array(last.center_px)
     if len(lens.stops) > 1:
         before = lens.stops[-2]

@@ -139,7 +139,7 @@ def miss_derivatives(
     if pan_tilt is None:
         lens = model.zoom.at(nominal_px)
         x_base = (model.hand * model.gamma).apply(model.fixed.ray(pixels) * depths[:, None])
-        hand = model.hand * RigidTransform.from_translation([0.0, 0.0, model.zoom.pupil_at(nominal_px)])
+        hand = model.hand * model.zoom.to_pupil(nominal_px)
         found = solve(x_base, hand, model.head, lens.ray(lens.image_center_px))
         pan_tilt = found.pan[:, 0], found.tilt[:, 0]
     across = _across(_line_of_sight(model, nominal_px))

@@ -64,7 +64,7 @@ def see_stops(
     assert model.zoom is not None
     points = board_points(recorder.board)
     size = recorder.rig.zoom.size
-    coverage = {"fixed": Coverage(recorder.rig.fixed.size), "zoom": Coverage(size)}
+    coverage = {"fixed": Coverage(recorder.rig.fixed.size)}
     for view in recorder.views:
         if view.camera == "fixed":
             coverage["fixed"].add(view.corners_px[view.seen])
@@ -109,10 +109,7 @@ def _reachable(model: RigModel, limits: PanTiltLimits, points: Array, wish: Rigi
     lens = model.zoom.stops[0]
     corners = (model.hand * model.gamma * wish).apply(points)
     found = solve(corners, model.hand, model.head, lens.ray(lens.image_center_px))
-    with np.errstate(invalid="ignore"):
-        pan = (found.pan[:, 0] >= limits.pan[0]) & (found.pan[:, 0] <= limits.pan[1])
-        tilt = (found.tilt[:, 0] >= limits.tilt[0]) & (found.tilt[:, 0] <= limits.tilt[1])
-    return bool((pan & tilt).all())
+    return bool(limits.allow(found.pan[:, 0], found.tilt[:, 0]).all())
 
 
 def _stop_at(model: RigModel, nominal: float) -> tuple[int, RigModel]:
@@ -187,14 +184,13 @@ def plan_part(
     """
     assert model.zoom is not None
     lens = model.zoom.at(nominal)
-    hand = model.hand * RigidTransform.from_translation([0.0, 0.0, model.zoom.pupil_at(nominal)])
+    hand = model.hand * model.zoom.to_pupil(nominal)
     T_base_board = model.hand * model.gamma * model.boards[board]
     chosen = points[rng.integers(len(points), size=CANDIDATES)]
     pixels = rng.uniform(BORDER_PX, np.array(lens.size) - 1 - BORDER_PX, size=(CANDIDATES, 2))
     found = solve(T_base_board.apply(chosen), hand, model.head, lens.ray(pixels))
     pan, tilt = found.pan[:, 0], found.tilt[:, 0]
-    with np.errstate(invalid="ignore"):
-        allowed = (pan >= limits.pan[0]) & (pan <= limits.pan[1]) & (tilt >= limits.tilt[0]) & (tilt <= limits.tilt[1])
+    allowed = limits.allow(pan, tilt)
     best, most = None, 0.0
     R, t, _ = base_heads(model.head, np.nan_to_num(pan), np.nan_to_num(tilt))
     x_zoom = hand.inv().apply(((T_base_board.apply(points) - t[:, None]) @ R).reshape(-1, 3)).reshape(CANDIDATES, -1, 3)

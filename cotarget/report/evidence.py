@@ -144,7 +144,7 @@ def gather(calibration: Calibration) -> Evidence | None:
     normals = np.array([T.rotation.as_matrix()[:, 2] for T in boards])
     distances = np.linalg.norm(middles, axis=-1)
     facing = np.abs(np.sum(normals * middles, axis=-1)) / distances
-    stops = [stop_of(calibration.zoom, view) for view in views if view.camera == "zoom"]
+    stops = [stop_of(calibration.zoom.nominal_px, view) for view in views if view.camera == "zoom"]
     return Evidence(
         views=views,
         corners={name: _corners(calibration, found, name) for name in CAMERAS},

@@ -220,8 +220,7 @@ def undetermined(calibration: Calibration) -> str:
     covariance, held_out = calibration.covariance, calibration.held_out
     if covariance is None or not covariance.matrix.any():
         return ""
-    stops = calibration.zoom.stops
-    focal = {"fixed": calibration.fixed.focal_px[0]} | {f"zoom[{i}]": s.focal_px[0] for i, s in enumerate(stops)}
+    focal = model_of(calibration).focal_px
     matrix = covariance.matrix / (1.0 if held_out is None else held_out.widened**2)
     normal = np.asarray(np.linalg.pinv(matrix, hermitian=True, rcond=np.finfo(float).tiny), dtype=float)
     return name_directions(covariance.parameters, weak_directions(normal, covariance.parameters, 1.0, focal), focal)
