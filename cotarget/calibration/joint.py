@@ -5,8 +5,9 @@
 2. One fit of both cameras, Gamma, T and the head's geometry from all views at the shortest focal length.
 3. The zoom lens's stops one after the other, each beginning where the one before ended; then everything together.
 4. Views for which the head stood elsewhere than it says, and single corners that are wrong, are left out; the head's
-   jitter is estimated; and the fixed camera's k3, where the corners ask for it. What captures kept out of the fit say
-   widens the uncertainty where they disagree with it.
+   jitter is estimated; and the fixed camera's k3, where the corners ask for it.
+5. The uncertainty counts what is held and may be wrong all the same, k3 and the encoders' scales; what captures kept
+   out of the fit say widens it where they disagree with it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from cotarget.calibration.bundle import Fit, fit
+from cotarget.calibration.considered import with_considered
 from cotarget.calibration.heldout import cross_validate
 from cotarget.calibration.jitter import estimate_jitter, head_turns
 from cotarget.calibration.model import DEFAULT_OPTIONS, CameraName, Options, Rejected, Residuals, View
@@ -48,6 +50,8 @@ K3_SIGMAS, K3_WIDE = 2.5, 1.0
 # A lens that asks for k3 is not of this model, and departs from it further where no board was seen: the uncertainty is
 # widened by this, which covers rational and fisheye lenses whose nearest fit is 0.2 px off (experiments.mismatch).
 K3_WIDENED = 1.4
+# Held where they are not found, and doubted where the corners speak against that.
+CONSIDERED: tuple[Block, ...] = ("k3", "scale")
 # Encoders, where they are asked for: gears are cut to a thousandth or two, zeros are found to half a degree.
 ENCODER_SIGMAS = {
     "head.pan_scale": 0.002,
@@ -119,6 +123,9 @@ def joint(
         if options.folds:
             held_out = cross_validate(result, points, prior, options.folds)
             widened = max(widened, 1.0 if held_out is None else held_out.widened)
+        held = [block for block in CONSIDERED if block not in result.free and (block != "scale" or steps.has_head)]
+        usual = Prior(prior.reference, {**prior.sigmas, "fixed.k3": K3_WIDE, **ENCODER_SIGMAS})
+        covariance = with_considered(covariance, result, points, held, usual)
         covariance = replace(covariance, matrix=covariance.matrix * widened**2)
     return Solution(
         model=result.model,

@@ -1,7 +1,8 @@
 """How uncertain a calibration is: the covariance of its parameters, and what that leaves of error in pointing.
 
-The covariance speaks of the corners' noise, and of a head that does not stand quite where it says. What else a model
-leaves out is noticed by captures kept out of the fit (`cotarget.calibration.heldout`), which widen it.
+The covariance speaks of the corners' noise, and of a head that does not stand quite where it says; of parameters that
+are held, by `cotarget.calibration.considered`. What else a model leaves out is noticed by captures kept out of the fit
+(`cotarget.calibration.heldout`), which widen it.
 """
 
 from collections.abc import Sequence

@@ -30,7 +30,7 @@ ACTIONS = {
     "the offset between the cameras": BOTH,
     "the zoom camera's place on the head": NEARER,
     "the head's axes": NEARER,
-    "the encoders": "move both pan and tilt from end to end",
+    "the encoders": "calibrate with --encoders, and move both pan and tilt from end to end",
 }
 WORTH_SAYING = 0.1  # share of the squared error
 MUCH_WORSE = 3.0  # than in the middle

@@ -76,6 +76,8 @@ def _about_k3(calibration: Calibration) -> str:
     k3, sigma = calibration.fixed.distortion[4], sigma_of(calibration, "fixed.k3")
     if sigma is None:
         return _held(calibration.fixed)
+    if not k3:
+        return f"k3 is held at 0; the corners lean to one of {digits(sigma, 1)}, a doubt that is counted everywhere."
     return f"The corners ask for k3: it is {value_and_sigma(k3, sigma)}. Beyond the boards such a lens is less certain."
 
 
