@@ -5,7 +5,6 @@ Defaults are the rig that the project's figures are stated for.
 """
 
 import dataclasses
-import itertools
 import math
 import tomllib
 import types
@@ -14,17 +13,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from cotarget.assets import assets_dir
-from cotarget.camera import Intrinsics
 from cotarget.errors import ConfigError, choices
+from cotarget.hwconfig import HardwareConfig, check_hardware
+from cotarget.simchecks import check_sim
 from cotarget.simconfig import Pair, SimCamera, SimConfig, SimEffects, SimHead, SimZoomCamera, Size
 from cotarget.tables import build, expect_table
 
 __all__ = [
     "DEFAULT_TARGETS",
     "BoardConfig",
+    "HardwareConfig",
     "RigConfig",
     "SafetyConfig",
     "SimCamera",
@@ -95,10 +94,22 @@ class SafetyConfig:
 
 @dataclass(frozen=True)
 class RigConfig:
-    """The whole of rig.toml."""
+    """The whole of rig.toml.
 
-    backend: Literal["sim"] = "sim"
+    Attributes:
+        backend: which rig it is.
+        sim: the simulated one.
+        hardware: the real one.
+        recording: folder of the one that was recorded; a relative path is relative to rig.toml.
+        board: for calibration.
+        safety: soft limits.
+        targets: what can be followed.
+    """
+
+    backend: Literal["sim", "hardware", "replay"] = "sim"
     sim: SimConfig = field(default_factory=SimConfig)
+    hardware: HardwareConfig = field(default_factory=HardwareConfig)
+    recording: Path | None = None
     board: BoardConfig = field(default_factory=BoardConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     targets: Mapping[str, TargetConfig] = field(default_factory=lambda: DEFAULT_TARGETS)
@@ -106,7 +117,7 @@ class RigConfig:
     @property
     def head_limits(self) -> tuple[Pair, Pair]:
         """Pan and tilt limits [rad]: the device's, and the soft ones where they are tighter."""
-        head, soft = self.sim.head, self.safety
+        head, soft = self.sim.head if self.backend == "sim" else self.hardware.head, self.safety
         pan = _overlap(head.pan_deg, soft.pan_deg, "safety.pan_deg")
         tilt = _overlap(head.tilt_deg, soft.tilt_deg, "safety.tilt_deg")
         return (math.radians(pan[0]), math.radians(pan[1])), (math.radians(tilt[0]), math.radians(tilt[1]))
@@ -114,17 +125,41 @@ class RigConfig:
     @property
     def head_step(self) -> float:
         """The head's resolution [rad]; 0 for a continuous one."""
+        if self.backend != "sim":
+            return math.radians(self.hardware.head.step_deg)
         return math.radians(self.sim.head.step_deg) if self.sim.effects.steps else 0.0
 
     @property
     def focal_range_px(self) -> Pair:
         """The zoom camera's shortest and longest nominal focal length [px]."""
-        shortest, longest = (focal / self.sim.zoom.pitch_mm for focal in self.sim.zoom.focal_mm)
-        return shortest, longest
+        if self.backend == "sim":
+            shortest, longest = self.sim.zoom.focal_mm
+        else:
+            shortest, longest = self.hardware.zoom.lens[0][1], self.hardware.zoom.lens[-1][1]
+        return shortest / self.pitch_mm, longest / self.pitch_mm
+
+    @property
+    def pitch_mm(self) -> float:
+        """Size of a pixel of the zoom camera's stream [mm]."""
+        return self.sim.zoom.pitch_mm if self.backend == "sim" else self.hardware.zoom.pitch_mm
+
+    @property
+    def stream_sizes(self) -> tuple[Size, Size]:
+        """(width, height) of the fixed and the zoom camera's stream [px]."""
+        if self.backend == "sim":
+            return self.sim.fixed.size, self.sim.zoom.size
+        return self.hardware.fixed.size, self.hardware.zoom.size
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames of the fixed camera a second."""
+        return self.sim.fixed.rate_hz if self.backend == "sim" else self.hardware.fixed.rate_hz
 
     @property
     def command_delay_s(self) -> float:
         """From a command to the start of motion, as far as it is known [s]."""
+        if self.backend != "sim":
+            return self.hardware.head.command_delay_s
         return self.sim.head.command_delay_s if self.sim.effects.command_delay else 0.0
 
     def target(self, name: str) -> TargetConfig:
@@ -165,7 +200,8 @@ def load_config(path: Path) -> RigConfig:
     }
     scene = path.parent / config.sim.scene
     sim = dataclasses.replace(config.sim, scene=str(scene)) if scene.is_file() else config.sim
-    return dataclasses.replace(config, targets=beside, sim=sim)
+    recording = config.recording and path.parent / config.recording
+    return dataclasses.replace(config, targets=beside, sim=sim, recording=recording)
 
 
 def parse_config(table: Mapping[str, Any]) -> RigConfig:
@@ -188,10 +224,6 @@ def parse_config(table: Mapping[str, Any]) -> RigConfig:
     return config
 
 
-# The curves of the zoom lens are checked at this many focal lengths.
-CHECKED_FOCALS = 33
-# Farther than any lens is long: an entrance pupil that moves so far was given in millimetres [m].
-FARTHEST_PUPIL = 1.0
 # No effect of a real rig but the quality of the rendering, which `all` leaves alone.
 QUALITY = ("multisampling", "shadows")
 
@@ -206,47 +238,6 @@ def _expand_all(effects: dict[str, Any]) -> dict[str, Any]:
     return {f.name: every for f in dataclasses.fields(SimEffects) if f.name not in QUALITY} | effects
 
 
-def _sees_nothing(lens: Intrinsics) -> bool:
-    """Whether part of the image has no ray."""
-    w, h = lens.size
-    rim = np.array([(u, v) for u in np.linspace(-1, w, 9) for v in np.linspace(-1, h, 9)])
-    return not np.isfinite(lens.ray(rim)).all()
-
-
-def _check_lens(where: str, camera: SimCamera) -> None:
-    """Refuse a lens through which part of the image sees nothing."""
-    if min(*camera.size, *camera.focal_px) <= 0:
-        return  # said elsewhere
-    if _sees_nothing(Intrinsics(camera.size, camera.focal_px, camera.center_px, camera.distortion)):
-        raise ConfigError(
-            f"{where}.distortion: {list(camera.distortion)} folds back inside the image, so that parts of it see "
-            "nothing; give a weaker distortion, a longer focal_px or a smaller size"
-        )
-
-
-def _check_optics(zoom: SimZoomCamera) -> None:
-    """Refuse a zoom lens whose curves no real lens follows."""
-    shortest_mm, longest_mm = zoom.focal_mm
-    before = 0.0
-    for magnification in np.geomspace(1.0, longest_mm / shortest_mm, CHECKED_FOCALS).tolist():
-        optics, at = zoom.optics_at(magnification), f"at {magnification:.3g} times the shortest focal length"
-        focal = optics.focal_px[0]
-        if not before < focal < math.inf:
-            raise ConfigError(f"sim.zoom.focal_curve: the true focal length does not grow with the nominal one {at}")
-        before = focal
-        drift = np.abs(np.subtract(optics.center_px, zoom.center_px))
-        if not (drift < zoom.size).all():
-            raise ConfigError(f"sim.zoom.center_drift_px: moves the centre by the whole image or more {at}")
-        if not abs(optics.pupil) < FARTHEST_PUPIL:
-            raise ConfigError(f"sim.zoom.pupil: {optics.pupil:g} m {at} is {FARTHEST_PUPIL:g} m or more; give metres")
-        lens = Intrinsics(zoom.size, optics.focal_px, optics.center_px, optics.distortion)
-        if not np.isfinite(optics.distortion).all() or _sees_nothing(lens):
-            raise ConfigError(
-                f"sim.zoom.distortion_drift: the distortion folds back inside the image {at}, so that parts of it see "
-                "nothing; give smaller coefficients"
-            )
-
-
 def _overlap(own: Pair, soft: Pair | None, where: str) -> Pair:
     both = own if soft is None else (max(own[0], soft[0]), min(own[1], soft[1]))
     if both[0] >= both[1]:
@@ -256,64 +247,26 @@ def _overlap(own: Pair, soft: Pair | None, where: str) -> Pair:
 
 def _check(config: RigConfig) -> None:
     """Refuse values of the right type that make no sense."""
-    sim = config.sim
-    positive: dict[str, tuple[float, ...]] = {
-        "board.square": (config.board.square,),
-        "safety.max_frame_age_s": (config.safety.max_frame_age_s,),
-        "sim.zoom.pitch_mm": (sim.zoom.pitch_mm,),
-        "sim.zoom.lens_speed": (sim.zoom.lens_speed,),
-        "sim.head.speed_deg_s": (sim.head.speed_deg_s,),
-        "sim.head.accel_deg_s2": (sim.head.accel_deg_s2,),
+    check_sim(config.sim)
+    check_hardware(config.hardware)
+    positive: dict[str, float] = {
+        "board.square": config.board.square,
+        "safety.max_frame_age_s": config.safety.max_frame_age_s,
     }
-    not_negative: dict[str, tuple[float, ...]] = {
-        "sim.seed": (sim.seed,),
-        "sim.head.step_deg": (sim.head.step_deg,),
-        "sim.head.command_delay_s": (sim.head.command_delay_s,),
-        "sim.head.backlash_deg": (sim.head.backlash_deg,),
-    }
-    for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
-        positive[f"sim.{name}.size"] = camera.size
-        positive[f"sim.{name}.focal_px"] = camera.focal_px
-        positive[f"sim.{name}.rate_hz"] = (camera.rate_hz,)
-        not_negative[f"sim.{name}.noise"] = (camera.noise,)
-        not_negative[f"sim.{name}.latency_s"] = (camera.latency_s,)
-        not_negative[f"sim.{name}.exposure_s"] = (camera.exposure_s,)
-        if not 1 <= camera.jpeg_quality <= 100:
-            raise ConfigError(f"sim.{name}.jpeg_quality: {camera.jpeg_quality} is not within 1 to 100")
-        _check_lens(f"sim.{name}", camera)
     for name, target in config.targets.items():
-        positive[f"targets.{name}.size"] = (target.size,)
-        positive[f"targets.{name}.wanted_px"] = (target.wanted_px,)
-    for where, values in positive.items():
-        if min(values) <= 0:
-            raise ConfigError(f"{where}: {min(values):g} is not greater than zero")
-    for where, values in not_negative.items():
-        if min(values) < 0:
-            raise ConfigError(f"{where}: {min(values):g} is negative")
-    ranges = {
-        "sim.head.pan_deg": sim.head.pan_deg,
-        "sim.head.tilt_deg": sim.head.tilt_deg,
-        "sim.zoom.focal_mm": sim.zoom.focal_mm,
-        "safety.pan_deg": config.safety.pan_deg,
-        "safety.tilt_deg": config.safety.tilt_deg,
-    }
-    for where, limits in ranges.items():
+        positive |= {f"targets.{name}.size": target.size, f"targets.{name}.wanted_px": target.wanted_px}
+    for where, value in positive.items():
+        if value <= 0:
+            raise ConfigError(f"{where}: {value:g} is not greater than zero")
+    for where, limits in (("safety.pan_deg", config.safety.pan_deg), ("safety.tilt_deg", config.safety.tilt_deg)):
         if limits is not None and limits[0] >= limits[1]:
             raise ConfigError(f"{where}: {list(limits)} is not [lowest, highest]")
-    if sim.zoom.focal_mm[0] <= 0:
-        raise ConfigError(f"sim.zoom.focal_mm: {sim.zoom.focal_mm[0]:g} is not greater than zero")
-    if sim.effects.optics:
-        _check_optics(sim.zoom)
-    if sim.zoom.lens_steps < 2:
-        raise ConfigError(f"sim.zoom.lens_steps: {sim.zoom.lens_steps} is fewer than 2")
     if config.safety.speed_deg_s is not None and config.safety.speed_deg_s <= 0:
         raise ConfigError(f"safety.speed_deg_s: {config.safety.speed_deg_s:g} is not greater than zero")
     if min(config.board.corners) < 3:
         raise ConfigError(f"board.corners: {list(config.board.corners)} has fewer than 3 corners a side")
-    for name in sim.targets:
+    for name in config.sim.targets:
         config.target(name)
-    for name, waypoints in sim.paths.items():
+    for name in config.sim.paths:
         if name not in config.targets:
             raise ConfigError(f"sim.paths.{name}: is no target; the targets are: {choices(config.targets)}")
-        if len(waypoints) < 2 or any(b[0] <= a[0] for a, b in itertools.pairwise(waypoints)):
-            raise ConfigError(f"sim.paths.{name}: needs two or more waypoints [t, x, y, z] with increasing t")

@@ -87,7 +87,11 @@ class Camera(Protocol):
 
 
 class ZoomCamera(Camera, Protocol):
-    """A camera whose focal length can be commanded. Focal lengths are the device's nominal pixels."""
+    """A camera whose focal length can be commanded. Focal lengths are the device's nominal pixels of its stream."""
+
+    @property
+    def still_size(self) -> tuple[int, int]:
+        """(width, height) of full stills [px]; that of the stream, where the device has no separate stills."""
 
     @property
     def focal_range(self) -> tuple[float, float]:
@@ -176,11 +180,13 @@ def open_rig(config: "RigConfig") -> Rig:
     """Open the rig that a configuration describes; the only place that imports a backend.
 
     Raises:
-        ConfigError: this build has no such backend.
-        DeviceError: the backend could not be opened.
+        ConfigError: the configuration does not say enough of that rig.
+        DeviceError: a device could not be opened.
     """
-    if config.backend == "sim":
-        from cotarget.sim.world import SimWorld
+    match config.backend:
+        case "sim":
+            from cotarget.sim.world import SimWorld
 
-        return SimWorld(config).rig
-    raise ConfigError(f"backend '{config.backend}' has no driver in this version; use 'sim'")
+            return SimWorld(config).rig
+        case _:
+            raise ConfigError(f"backend '{config.backend}' has no driver in this version; use 'sim'")

@@ -59,8 +59,8 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     if origin is types.UnionType:  # the only unions are "or None", which TOML cannot say
         return _convert(args[0], value, where)
     if origin is Literal:
-        if value not in args:
-            raise ConfigError(f"{where}: {value!r} is not one of: {choices(args)}")
+        if value not in args or isinstance(value, bool):
+            raise ConfigError(f"{where}: {value!r} is not one of: {choices(map(str, args))}")
         return value
     if hint is Path:
         return Path(_convert(str, value, where))

@@ -179,6 +179,10 @@ class _Camera:
 
 class _Zoom(_Camera):
     @property
+    def still_size(self):
+        return self.size
+
+    @property
     def focal_range(self):
         return NOMINAL_PX, NOMINAL_PX * (1 if self.rig.optics is None else FOURFOLD)
 

@@ -65,8 +65,8 @@ def test_offsets_and_targets_are_taken(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("backend = 'real'", "backend: 'real' is not one of: sim"),
-        ("[simm]", "unknown key 'simm'; valid here: backend, board, safety, sim, targets"),
+        ("backend = 'real'", "backend: 'real' is not one of: hardware, replay, sim"),
+        ("[simm]", "unknown key 'simm'; valid here: backend, board, hardware, recording, safety, sim, targets"),
         ("[sim.fixed]\nnoize = 1", "unknown key 'sim.fixed.noize'"),
         ("[sim.fixed]\nnoise = 'much'", "sim.fixed.noise: 'much' is not a finite number"),
         ("[sim.fixed]\nnoise = -1", "sim.fixed.noise: -1 is negative"),

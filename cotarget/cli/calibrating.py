@@ -45,7 +45,7 @@ def calibrate(options: argparse.Namespace) -> None:
                     config.board,
                     captures_dir=options.captures,
                     progress=tell,
-                    pitch_mm=config.sim.zoom.pitch_mm,
+                    pitch_mm=config.pitch_mm,
                     seed=config.sim.seed,
                     options=how,
                     **{name: getattr(options, name) for name in _given(options, SESSION)},

@@ -32,7 +32,7 @@ def aim(options: argparse.Namespace) -> None:
     config = RigConfig() if options.rig is None else load_config(options.rig)
     calibration = load_calibration(options.calibration)
     if options.rig is not None:
-        calibration = calibration.for_streams(config.sim.fixed.size, config.sim.zoom.size)
+        calibration = calibration.for_streams(*config.stream_sizes)
     target = None if options.target is None else config.target(options.target)
     if options.size_px is not None and target is None:
         raise ConfigError("--size-px needs --target NAME, whose true size gives the depth")
@@ -43,7 +43,7 @@ def aim(options: argparse.Namespace) -> None:
         if target is None or options.size_px is None
         else depth_of(calibration, target, options.size_px, np.array(options.pixel))
     )
-    pitch_mm = calibration.pitch_mm or config.sim.zoom.pitch_mm
+    pitch_mm = calibration.pitch_mm or config.pitch_mm
     shortest, longest = config.focal_range_px
     if options.rig is None:  # the calibration knows its own lens's shortest focal length
         shortest = calibration.zoom.nominal_px[0]
@@ -115,15 +115,15 @@ def follow(options: argparse.Namespace) -> None:
             f"{options.rig}: the simulated scene has no {options.target}; add it: [sim] targets = "
             f"{json.dumps([*config.sim.targets, options.target])}"
         )
-    detector = make_detector(target, config.sim.fixed.rate_hz)
+    detector = make_detector(target, config.rate_hz)
     check_outputs([options.csv, options.video], [options.rig, options.calibration, target.template])
     settings = FollowSettings(command_delay_s=config.command_delay_s)
     states: dict[str, int] = dict.fromkeys(State, 0)
-    frames = math.ceil(options.seconds * config.sim.fixed.rate_hz)
+    frames = math.ceil(options.seconds * config.rate_hz)
     with (
         SafeRig(open_rig(config), config.safety) as rig,
         StepTable(options.csv) as table,
-        FilmWriter(options.video, config.sim.fixed.rate_hz) if options.video else nothing() as video,
+        FilmWriter(options.video, config.rate_hz) if options.video else nothing() as video,
         progress_bar() as progress,
     ):
         for step in follow(rig, calibration, target, detector, seconds=options.seconds, settings=settings):

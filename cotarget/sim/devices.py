@@ -104,6 +104,11 @@ class SimZoomStream(SimStream):
         self._rests = 0.0
 
     @property
+    def still_size(self) -> tuple[int, int]:
+        """That of the stream."""
+        return self.size
+
+    @property
     def focal_range(self) -> tuple[float, float]:
         """Shortest and longest focal length [px], as the maker states them."""
         return self._drive.shortest_px, self._drive.longest_px
