@@ -45,8 +45,9 @@ LARGEST_JITTER = np.radians(1.5)
 FEWEST_STOP_VIEWS, FEWEST_STOP_PLACEMENTS = 3, 2  # of a stop of the zoom lens
 # A board of one metre, glued to a sheet of something, is flat to some millimetres (as a share of its length).
 WARP_SHARE = 0.004
-# The fixed camera's k3 is found too where it is this many standard deviations from 0; by chance, of one lens in eighty.
-K3_SIGMAS, K3_WIDE = 2.5, 1.0
+# The fixed camera's k3 is found too where it is this many standard deviations from 0, by chance of one lens in sixteen
+# thousand; below that it is doubted (`considered`).
+K3_SIGMAS, K3_WIDE = 4.0, 1.0
 # A lens that asks for k3 is not of this model, and departs from it further where no board was seen: the uncertainty is
 # widened by this, which covers rational and fisheye lenses whose nearest fit is 0.2 px off (experiments.mismatch).
 K3_WIDENED = 1.4
