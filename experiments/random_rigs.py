@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration, calibrate_views, predicted_pointing
 from cotarget.calibration.boards import board_points
-from cotarget.calibration.parameters import ALL_BLOCKS, POSE_PARAMETERS, stepped
+from cotarget.calibration.parameters import EVERY_BLOCK, POSE_PARAMETERS, parameter_names, stepped
 from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
@@ -146,9 +146,13 @@ def by_chance(calibration: Calibration, pixels: Array, depths: Array, rng: np.ra
     pixels, depths = pixels[:CHANCE_TARGETS], depths[:CHANCE_TARGETS]
     predicted = rms(predicted_pointing(calibration, pixels, depths))
     truth, model = truth_of(calibration), model_of(calibration)
+    names = parameter_names(EVERY_BLOCK, model.stops)
+    columns = [names.index(name) for name in covariance.parameters]
     beyond = 0
-    for step in rng.multivariate_normal(np.zeros(len(covariance.matrix)), covariance.matrix, CHANCE_DRAWS):
-        other = stepped(model, step, np.empty((0, POSE_PARAMETERS)), ALL_BLOCKS)
+    for drawn in rng.multivariate_normal(np.zeros(len(columns)), covariance.matrix, CHANCE_DRAWS):
+        step = np.zeros(len(names))
+        step[columns] = drawn
+        other = stepped(model, step, np.empty((0, POSE_PARAMETERS)), EVERY_BLOCK)
         assert other.fixed is not None
         assert other.zoom is not None
         wrong = replace(
