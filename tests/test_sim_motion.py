@@ -154,3 +154,17 @@ def test_the_lens_steps_and_takes_its_time():
     said = lens.zoom(3000.0)
     assert said == pytest.approx(3000.0, rel=step - 1)
     assert math.log(said / shortest, step) == pytest.approx(round(math.log(said / shortest, step)))
+
+
+def test_an_axis_that_forgets_goes_on_as_if_it_remembered():
+    """Also where play hangs on the way it came: up to 1, back by less than the play, forget, then on."""
+    axes = [Axis(1.0, 10.0, backlash=0.1) for _ in range(2)]
+    for t, goal in ((0.0, 1.0), (3.0, 0.95), (5.0, 0.4)):
+        for axis in axes:
+            axis.command(t, goal)
+        if t == 3.0:
+            axes[1].forget(4.5)
+    assert len(axes[1]._segments) < len(axes[0]._segments)
+    for t in (4.6, 5.2, 5.5, 7.0):
+        assert axes[1].driven(t) == axes[0].driven(t)
+        assert axes[1].motor(t) == axes[0].motor(t)

@@ -7,7 +7,7 @@ from types import TracebackType
 from cotarget.config import SimCamera, SimEffects, SimHead, SimZoomCamera
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
-from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, ZoomState
+from cotarget.rig import Clock, Frame, Image, PanTiltLimits, PanTiltState, ZoomState
 from cotarget.sim.motion import Axis, HeadDrive, LensDrive
 
 # Frame times are multiples of the frame period; this much of a period [1] absorbs their rounding.
@@ -42,7 +42,7 @@ class SimStream:
     """
 
     def __init__(
-        self, camera: SimCamera, effects: SimEffects, clock: SimClock, expose: Callable[[int, float], Image]
+        self, camera: SimCamera, effects: SimEffects, clock: Clock, expose: Callable[[int, float], Image]
     ) -> None:
         self._camera, self._clock, self._expose = camera, clock, expose
         # Light falls until half an exposure after a frame's time; no link is faster than that.
@@ -94,7 +94,7 @@ class SimZoomStream(SimStream):
         self,
         camera: SimZoomCamera,
         effects: SimEffects,
-        clock: SimClock,
+        clock: Clock,
         expose: Callable[[int, float], Image],
         drive: LensDrive,
         delay: float,
@@ -150,7 +150,7 @@ def head_drive(head: SimHead, effects: SimEffects) -> HeadDrive:
 class SimPanTilt:
     """A pan-tilt unit: delayed commands, trapezoidal profiles, steps, limits and play."""
 
-    def __init__(self, head: SimHead, effects: SimEffects, clock: SimClock, drive: HeadDrive) -> None:
+    def __init__(self, head: SimHead, effects: SimEffects, clock: Clock, drive: HeadDrive) -> None:
         self._clock, self._drive = clock, drive
         self._delay = head.command_delay_s if effects.command_delay else 0.0
         self._limits = PanTiltLimits(
@@ -222,7 +222,7 @@ class SimRig:
         fixed: SimStream,
         zoom: SimZoomStream,
         head: SimPanTilt,
-        clock: SimClock,
+        clock: Clock,
         board: SimBoard,
         release: Callable[[], None],
     ) -> None:

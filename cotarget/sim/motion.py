@@ -64,9 +64,11 @@ class Axis:
     backlash: float = 0.0
     position: float = 0.0
     _segments: list[Segment] = field(default_factory=list)
+    _before: float = 0.0  # the driven side where the history begins
 
     def __post_init__(self) -> None:
         self._segments = [(-math.inf, self.position, 0.0, 0.0)]
+        self._before = self.position
 
     def command(self, t: float, goal: float, speed: float | None = None) -> float:
         """Replace the motion from time t on; return when it will rest [s]."""
@@ -83,30 +85,43 @@ class Axis:
             return self.command(t, x)
         return self.command(t, x + v * abs(v) / (2 * self.acceleration))
 
+    def forget(self, t: float) -> None:
+        """Drop the history before time t, after which alone the axis can be asked then."""
+        first = max(i for i, segment in enumerate(self._segments) if segment[0] <= t)
+        if first:
+            self._before = self.driven(self._segments[first][0])
+            self._segments = self._segments[first:]
+
     def motor(self, t: float) -> tuple[float, float]:
         """Position and speed of the driving side at time t."""
-        start, x, v, a = next(s for s in reversed(self._segments) if s[0] <= t)
-        if v == 0.0 and a == 0.0:
-            return x, 0.0
-        dt = t - start
-        return x + v * dt + a * dt * dt / 2, v + a * dt
+        return _at(self._segments, t)
 
     def driven(self, t: float) -> float:
         """Position of the driven side at time t: the motor's, behind the play (a hysteresis)."""
+        segments = self._segments  # replaced as a whole, maybe by another thread
         if self.backlash == 0.0:
-            return self.motor(t)[0]
+            return _at(segments, t)[0]
         half = self.backlash / 2
-        y = self._segments[0][1]
-        for i, (start, _, v, a) in enumerate(self._segments):
+        y = self._before
+        for i, (start, _, v, a) in enumerate(segments):
             if start > t:
                 break
-            end = min(t, self._segments[i + 1][0] if i + 1 < len(self._segments) else t)
+            end = min(t, segments[i + 1][0] if i + 1 < len(segments) else t)
             turns = start - v / a if a else math.nan  # the motor's turning point within this segment
             for when in (turns, end):
                 if start < when <= end:
-                    x = self.motor(when)[0]
+                    x = _at(segments, when)[0]
                     y = min(max(y, x - half), x + half)
         return y
+
+
+def _at(segments: list[Segment], t: float) -> tuple[float, float]:
+    """Position and speed at time t."""
+    start, x, v, a = next(s for s in reversed(segments) if s[0] <= t)
+    if v == 0.0 and a == 0.0:
+        return x, 0.0
+    dt = t - start
+    return x + v * dt + a * dt * dt / 2, v + a * dt
 
 
 @dataclass(frozen=True)

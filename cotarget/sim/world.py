@@ -3,12 +3,13 @@
 import math
 import zlib
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from cotarget.config import RigConfig, SimCamera
 from cotarget.geometry import RigidTransform
-from cotarget.rig import Image
+from cotarget.rig import Clock, Image
 from cotarget.sim.devices import (
     SimBoard,
     SimClock,
@@ -49,8 +50,12 @@ BLUR_RENDERS = 4
 class SimWorld:
     """A world with a rig in it. The pipeline gets `rig`; tests and experiments also get `truth()`."""
 
-    def __init__(self, config: RigConfig) -> None:
+    def __init__(self, config: RigConfig, clock: Clock | None = None) -> None:
         """Build and compile the world.
+
+        Args:
+            config: the rig.
+            clock: what its time goes by; by default its own, which only moves when somebody waits.
 
         Raises:
             ConfigError: an unknown scene or target.
@@ -58,11 +63,11 @@ class SimWorld:
         """
         sim, effects = config.sim, config.sim.effects
         self.config = config
-        self._clock = SimClock()
+        self._clock = SimClock() if clock is None else clock
         self.targets = {name: self._make_target(name) for name in sim.targets}
         self._fixed_lens = self._lens(sim.fixed)
         self._zoom_lens = self._lens(sim.zoom)
-        self._head_drive, self._lens_drive = head_drive(sim.head, effects), lens_drive(sim.zoom, effects)
+        self.head_drive, self.lens_drive = head_drive(sim.head, effects), lens_drive(sim.zoom, effects)
         self._render_size = self._common_render_size()
         self._model = build_model(config, tuple(self.targets.values()), self._render_size)
         self._data = mujoco.MjData(self._model)
@@ -77,9 +82,9 @@ class SimWorld:
             "zoom": Sensor(sim.zoom, effects, (sim.seed, ZOOM_NOISE)),
         }
         self.rig = SimRig(
-            SimStream(sim.fixed, effects, self._clock, self._expose_fixed),
-            SimZoomStream(sim.zoom, effects, self._clock, self._expose_zoom, self._lens_drive, delay),
-            SimPanTilt(sim.head, effects, self._clock, self._head_drive),
+            SimStream(sim.fixed, effects, self._clock, partial(self.expose, "fixed")),
+            SimZoomStream(sim.zoom, effects, self._clock, partial(self.expose, "zoom"), self.lens_drive, delay),
+            SimPanTilt(sim.head, effects, self._clock, self.head_drive),
             self._clock,
             SimBoard(self._place_board),
             self.close,
@@ -91,22 +96,22 @@ class SimWorld:
             model=self._model,
             set_state=self._set_state,
             fixed_lens=self._fixed_lens,
-            nominal_at=self._lens_drive.focal_at,
+            nominal_at=self.lens_drive.focal_at,
             zoom_lens_for=self.zoom_lens_for,
             T_world_fixed=self._T_world_fixed,
             T_world_base=base_pose(self._T_world_fixed, self.config.sim),
-            head_at=self._head_drive.angles_at,
+            head_at=self.head_drive.angles_at,
             focal_range=self.rig.zoom.focal_range,
             targets=self.targets,
         )
 
     def zoom_lens_at(self, t: float) -> TrueLens:
         """The zoom camera's true optics at a time up to now."""
-        return self.zoom_lens_for(self._lens_drive.focal_at(t))
+        return self.zoom_lens_for(self.lens_drive.focal_at(t))
 
     def zoom_lens_for(self, nominal_px: float) -> TrueLens:
         """The zoom camera's true optics at what its device calls a focal length [px]."""
-        factor = nominal_px / self._lens_drive.shortest_px
+        factor = nominal_px / self.lens_drive.shortest_px
         if self.config.sim.effects.optics:
             optics = self.config.sim.zoom.optics_at(factor)
             distortion = optics.distortion if self.config.sim.effects.distortion else NO_DISTORTION
@@ -150,7 +155,7 @@ class SimWorld:
 
     def _common_render_size(self) -> tuple[int, int]:
         """A size at which the render of either camera is as fine as its image, over all of its focal lengths."""
-        drive, count = self._lens_drive, SIZED_FOCALS if self.config.sim.effects.optics else 1
+        drive, count = self.lens_drive, SIZED_FOCALS if self.config.sim.effects.optics else 1
         zooms = [self.zoom_lens_for(float(f)) for f in np.geomspace(drive.shortest_px, drive.longest_px, count)]
         sizes = [
             tuple(2 * half * focal + 2 for half, focal in zip(covering_half_field(lens), lens.focal_px, strict=True))
@@ -158,14 +163,9 @@ class SimWorld:
         ]
         return math.ceil(max(s[0] for s in sizes)), math.ceil(max(s[1] for s in sizes))
 
-    def _expose_fixed(self, index: int, t: float) -> Image:
-        return self._expose("fixed", self.config.sim.fixed, index, t)
-
-    def _expose_zoom(self, index: int, t: float) -> Image:
-        return self._expose("zoom", self.config.sim.zoom, index, t)
-
-    def _expose(self, name: CameraName, camera: SimCamera, index: int, t: float) -> Image:
-        """Gather light around time t, then add the sensor's effects."""
+    def expose(self, name: CameraName, index: int, t: float) -> Image:
+        """Gather light around time t, up to now, then add the sensor's effects to frame number ``index``."""
+        camera: SimCamera = self.config.sim.fixed if name == "fixed" else self.config.sim.zoom
         exposure = camera.exposure_s if self.config.sim.effects.blur else 0.0
         moments = t + exposure * ((np.arange(BLUR_RENDERS) + 0.5) / BLUR_RENDERS - 0.5) if exposure else [t]
         images = [
@@ -184,7 +184,7 @@ class SimWorld:
     def _set_state(self, t: float) -> "mujoco.MjData":
         """Everything's pose at time t."""
         data = self._data
-        pan, tilt = self._head_drive.angles_at(t)
+        pan, tilt = self.head_drive.angles_at(t)
         data.joint(RIG + "pan").qpos[0], data.joint(RIG + "tilt").qpos[0] = pan, tilt
         for name, target in self.targets.items():
             pose = target.pose(t)

@@ -1,0 +1,273 @@
+"""The simulated rig in real time: one thread owns the world and its OpenGL, exposes both cameras, and publishes.
+
+Pictures leave through `Feed`s when their latency is over, by a thread that does nothing else, so that a slow render
+does not make the other camera late. Axes and lens are commanded from the servers' threads.
+"""
+
+import heapq
+import itertools
+import logging
+import math
+import queue
+import threading
+import time
+from dataclasses import dataclass, replace
+
+from cotarget.config import RigConfig
+from cotarget.emulators.plant import Feed, Picture
+from cotarget.errors import DeviceError
+from cotarget.geometry import RigidTransform
+from cotarget.rig import Image
+from cotarget.sim.motion import Axis, LensDrive
+from cotarget.sim.truth import CameraName
+from cotarget.sim.world import SimWorld
+
+log = logging.getLogger(__name__)
+
+FIXED_HZ, ZOOM_HZ = 15.0, 10.0  # what one core renders beside a client on another
+REMEMBERED = 5.0  # how far back the axes are asked for exposures [s]
+STILL_TIMEOUT = 5.0  # [s]
+START_TIMEOUT = 60.0  # to compile the world and open OpenGL on a slow machine [s]
+STILL_INDEX = 1_000_000_000  # stills draw their noise from numbers that no stream reaches
+UNTIL_NEXT_LOOK = 0.25  # at most, so that an end is noticed [s]
+
+
+class WallClock:
+    """The machine's monotonic clock from a start."""
+
+    def __init__(self) -> None:
+        self._start = time.monotonic()
+
+    def now(self) -> float:
+        """Seconds since it was made."""
+        return time.monotonic() - self._start
+
+    def sleep_until(self, t: float) -> None:
+        """Return when the clock shows ``t`` [s]."""
+        time.sleep(max(t - self.now(), 0.0))
+
+    def monotonic(self, t: float) -> float:
+        """The machine's monotonic time when this clock shows ``t`` [s]."""
+        return self._start + t
+
+
+class EmulatedAxis:
+    """One axis of the simulated head in the steps of a pan-tilt unit; an `AxisPlant`.
+
+    Args:
+        axis: of the simulation, in radians.
+        clock: the world's.
+        step: of the unit, negative where it counts the other way [rad].
+        delay: from a command to motion [s].
+    """
+
+    def __init__(self, axis: Axis, clock: WallClock, step: float, delay: float) -> None:
+        self._axis, self._clock, self._step, self._delay = axis, clock, step, delay
+        self._rests = 0.0
+        self._lock = threading.Lock()
+
+    def command(self, goal: int, speed: float, acceleration: float) -> None:
+        """Go there from now on: steps, steps/s, steps/s^2."""
+        with self._lock:
+            t = self._begin(acceleration)
+            self._rests = self._axis.command(t, goal * self._step, speed * abs(self._step))
+
+    def halt(self, acceleration: float) -> None:
+        """Brake from now on."""
+        with self._lock:
+            self._rests = self._axis.halt(self._begin(acceleration))
+
+    def position(self) -> int:
+        """Where it is now [steps]."""
+        return round(self._axis.motor(self._clock.now())[0] / self._step)
+
+    def speed(self) -> float:
+        """How fast it turns now [steps/s]."""
+        return self._axis.motor(self._clock.now())[1] / self._step
+
+    def moving(self) -> bool:
+        """Whether it turns, or is about to."""
+        return self._clock.now() < self._rests
+
+    def _begin(self, acceleration: float) -> float:
+        """When a command given now takes effect; what nobody asks for any more is forgotten."""
+        now = self._clock.now()
+        self._axis.forget(now - REMEMBERED)
+        if math.isfinite(self._axis.acceleration):
+            self._axis.acceleration = acceleration * abs(self._step)
+        return now + self._delay
+
+
+class EmulatedLens:
+    """The simulated zoom lens; a `LensPlant`."""
+
+    def __init__(self, drive: LensDrive, clock: WallClock, delay: float) -> None:
+        self._drive, self._clock, self._delay = drive, clock, delay
+        self._rests = 0.0
+        self._lock = threading.Lock()
+
+    @property
+    def last(self) -> int:
+        """The number of its last position."""
+        return self._drive.last
+
+    def command(self, position: int) -> None:
+        """Go there from now on."""
+        with self._lock:
+            now = self._clock.now()
+            self._drive.axis.forget(now - REMEMBERED)
+            self._rests = self._drive.axis.command(now + self._delay, float(min(max(position, 0), self.last)))
+
+    def position(self) -> int:
+        """Where it is now."""
+        return round(self._drive.axis.motor(self._clock.now())[0])
+
+    def moving(self) -> bool:
+        """Whether it moves, or is about to."""
+        return self._clock.now() < self._rests
+
+
+@dataclass(frozen=True, eq=False)
+class _Still:
+    """A still that was asked for, and where it goes."""
+
+    t: float
+    answer: "queue.SimpleQueue[Image]"
+
+
+def paced(config: RigConfig) -> RigConfig:
+    """A configuration for real time: fewer frames a second, no shadows, no multisampling, and JPEG by the servers."""
+    sim = config.sim
+    effects = replace(sim.effects, shadows=False, multisampling=False, jpeg=False)
+    fixed = replace(sim.fixed, rate_hz=min(sim.fixed.rate_hz, FIXED_HZ))
+    zoom = replace(sim.zoom, rate_hz=min(sim.zoom.rate_hz, ZOOM_HZ))
+    return replace(config, sim=replace(sim, effects=effects, fixed=fixed, zoom=zoom))
+
+
+class LiveWorld:
+    """The simulated world in real time. A context manager.
+
+    Args:
+        config: of the rig, as it shall run; see `paced`.
+        pan_sign: -1 where the unit counts pan to the left.
+
+    Raises:
+        ConfigError: an unknown scene or target.
+        DeviceError: the machine cannot render.
+    """
+
+    def __init__(self, config: RigConfig, *, pan_sign: int = 1) -> None:
+        self.config = config
+        self.feeds: dict[CameraName, Feed] = {"fixed": Feed(), "zoom": Feed()}
+        self.clock = WallClock()
+        self._stills: queue.SimpleQueue[_Still] = queue.SimpleQueue()
+        self._due: queue.SimpleQueue[tuple[float, CameraName, Picture] | None] = queue.SimpleQueue()
+        self._ended = threading.Event()
+        self._started: queue.SimpleQueue[SimWorld | BaseException] = queue.SimpleQueue()
+        self._threads = [
+            threading.Thread(target=run, name=f"world {name}", daemon=True)
+            for name, run in (("render", self._render), ("publish", self._publish))
+        ]
+        for thread in self._threads:
+            thread.start()
+        try:
+            world = self._started.get(timeout=START_TIMEOUT)
+        except queue.Empty:
+            world = DeviceError(f"the simulated world did not start within {START_TIMEOUT:g} s")
+        if isinstance(world, BaseException):
+            self.close()
+            raise world
+        self._world = world
+        head, effects = config.sim.head, config.sim.effects
+        step = math.radians(head.step_deg)
+        delay = head.command_delay_s if effects.command_delay else 0.0
+        self.pan = EmulatedAxis(world.head_drive.pan, self.clock, step * pan_sign, delay)
+        self.tilt = EmulatedAxis(world.head_drive.tilt, self.clock, step, delay)
+        self.lens = EmulatedLens(world.lens_drive, self.clock, delay)
+
+    def still(self) -> Image:
+        """Take a picture with the zoom camera now, (H, W, 3) BGR.
+
+        Raises:
+            DeviceError: the world has ended, or is far too slow.
+        """
+        answer: queue.SimpleQueue[Image] = queue.SimpleQueue()
+        self._stills.put(_Still(self.clock.now(), answer))
+        try:
+            return answer.get(timeout=STILL_TIMEOUT)
+        except queue.Empty:
+            raise DeviceError(f"the simulated world took no still within {STILL_TIMEOUT:g} s") from None
+
+    def present(self, T_fixed_board: RigidTransform | None) -> None:
+        """Put the board there; None takes it away."""
+        self._world.rig.board.present(T_fixed_board)
+
+    def head_truth(self) -> tuple[float, float]:
+        """Pan and tilt of the platform now [rad], whatever the unit says."""
+        return self._world.head_drive.angles_at(self.clock.now())
+
+    def close(self) -> None:
+        """End the threads and release the renderer; more than once does no harm."""
+        self._ended.set()
+        self._due.put(None)
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join()
+
+    def __enter__(self) -> "LiveWorld":
+        """Give the world itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def _render(self) -> None:
+        """Expose both cameras at their rates, and stills on demand."""
+        try:
+            world = SimWorld(self.config, self.clock)
+        except BaseException as error:
+            self._started.put(error)
+            return
+        self._started.put(world)
+        sim = self.config.sim
+        cameras = {"fixed": sim.fixed, "zoom": sim.zoom}
+        late = {n: c.latency_s if sim.effects.latency else 0.0 for n, c in cameras.items()}
+        next_index: dict[CameraName, int] = {"fixed": 0, "zoom": 0}
+        numbers = itertools.count(STILL_INDEX)
+        while not self._ended.is_set():
+            try:
+                still = self._stills.get_nowait()
+            except queue.Empty:
+                pass
+            else:
+                still.answer.put(world.expose("zoom", next(numbers), still.t))
+                continue
+            name = min(next_index, key=lambda n: next_index[n] / cameras[n].rate_hz)
+            t = next_index[name] / cameras[name].rate_hz
+            wait = t - self.clock.now()
+            if wait > 0:
+                self._ended.wait(min(wait, UNTIL_NEXT_LOOK))
+                continue
+            image = world.expose(name, next_index[name], t)
+            self._due.put((t + late[name], name, Picture(image, next_index[name], self.clock.monotonic(t))))
+            # A world that cannot keep up leaves frames out, but tells the truth of those it shows.
+            next_index[name] = max(next_index[name] + 1, math.ceil(self.clock.now() * cameras[name].rate_hz - 1))
+        world.close()
+
+    def _publish(self) -> None:
+        """Let pictures out when they are due."""
+        waiting: list[tuple[float, int, CameraName, Picture]] = []
+        while not self._ended.is_set():
+            wait = waiting[0][0] - self.clock.now() if waiting else None
+            if wait is not None and wait <= 0:
+                _, _, name, picture = heapq.heappop(waiting)
+                self.feeds[name].publish(picture)
+                continue
+            try:
+                item = self._due.get(timeout=wait)
+            except queue.Empty:
+                continue
+            if item is not None:
+                t, name, picture = item
+                heapq.heappush(waiting, (t, picture.index, name, picture))
