@@ -137,6 +137,10 @@ class Clock(Protocol):
 class Board(Protocol):
     """Somebody, or something, that can hold a calibration board."""
 
+    @property
+    def patience(self) -> float:
+        """How long it may take until the board is held still where it was wished [s]; 0 where it is there at once."""
+
     def present(self, T_fixed_board: RigidTransform | None) -> None:
         """Wish for the board at a pose (its first corner's frame), or for no board; nobody is told the result."""
 

@@ -246,6 +246,7 @@ class _Clock:
 @dataclass
 class _Board:
     rig: SyntheticRig
+    patience: float = 0.0
 
     def present(self, T_fixed_board: RigidTransform | None):
         self.rig.placed.append((self.rig.t, T_fixed_board))

@@ -121,6 +121,10 @@ class ProxyBoard:
     def __init__(self, line: Line) -> None:
         self._line = line
 
+    @property
+    def patience(self) -> float:
+        return self._line.ask("board", "patience")
+
     def present(self, T_fixed_board) -> None:
         return self._line.ask("board", "present", T_fixed_board)
 

@@ -21,6 +21,9 @@ SETTLE = 0.05  # after a stop, for vibrations and for an exposure that had begun
 POLL = 0.02  # between looks at a state [s]
 FRAME_TIMEOUT = 5.0  # a slow network camera's latency, several times [s]
 HEAD_PATIENCE = 2.0  # beyond what the way takes at the head's own speed and acceleration [s]
+# A board in somebody's hands counts as held when its corners move less than this between two looks so far apart, and
+# have moved at least so far since the wish (mean over the corners).
+HELD_PX, HELD_FOR, LEFT_PX = 0.3, 0.4, 8.0
 LENS_TIMEOUT = 15.0  # the slowest zoom lenses take some ten seconds from end to end [s]
 LENS_TOLERANCE = 0.03  # of the focal length; a step of a usual lens is 0.02
 POSE_TOLERANCE = np.radians(0.2)  # between commanded and reached, above the head's own step [rad]
@@ -112,10 +115,35 @@ class Recorder:
             np.round(T_fixed_board.translation, WISH_DECIMALS),
             Rotation.from_rotvec(np.round(T_fixed_board.rotation.as_rotvec(), WISH_DECIMALS)),
         )
+        before = self._fixed_corners() if self.rig.board.patience else None
         self.rig.board.present(wish)
+        if self.rig.board.patience:
+            self._wait_until_held(before)
         self._still_since = max(self._still_since, self.rig.clock.now() + SETTLE)
         self.number += 1
         return self.number
+
+    def _fixed_corners(self) -> Array | None:
+        """Where the fixed camera sees the board now, in a frame that was exposed after now."""
+        frame = self.rig.fixed.read(newer_than=self.rig.clock.now(), timeout=FRAME_TIMEOUT)
+        return find_corners(frame.image, self.board, thorough=False)
+
+    def _wait_until_held(self, before: Array | None) -> None:
+        """Wait until the board has left where it was and stands still, at most for the holder's patience.
+
+        Args:
+            before: its corners in the fixed view before the wish, (N, 2) [px]; None where it was not seen.
+        """
+        clock = self.rig.clock
+        deadline = clock.now() + self.rig.board.patience
+        last = None
+        while clock.now() < deadline:
+            corners = self._fixed_corners()
+            has_left = corners is not None and (before is None or _apart(corners, before) > LEFT_PX)
+            if has_left and last is not None and corners is not None and _apart(corners, last) < HELD_PX:
+                return
+            last = corners
+            clock.sleep_until(clock.now() + HELD_FOR)
 
     def turn(self, pan: float, tilt: float) -> None:
         """Turn the head and wait until it stands.
@@ -193,3 +221,8 @@ class Recorder:
             view = replace(view, source=None)
         self.views.append(view)
         return view
+
+
+def _apart(a: Array, b: Array) -> float:
+    """Mean distance between two findings of the same corners [px]."""
+    return float(np.mean(np.linalg.norm(a - b, axis=-1)))

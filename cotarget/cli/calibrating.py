@@ -28,6 +28,7 @@ def calibrate(options: argparse.Namespace) -> None:
     from cotarget.config import BoardConfig, load_config
     from cotarget.rig import open_rig
     from cotarget.safety import SafeRig
+    from cotarget.stills import with_stills
 
     check_outputs([options.out], [options.rig, options.source and options.source / "index.json"])
     _check_together(options)
@@ -40,12 +41,13 @@ def calibrate(options: argparse.Namespace) -> None:
         if options.rig is not None:
             config = load_config(options.rig)
             with _captures_kept(options.captures), SafeRig(open_rig(config), config.safety) as rig:
+                finer = rig.zoom.still_size[0] / rig.zoom.size[0]
                 found = cal.calibrate_rig(
-                    rig,
+                    with_stills(rig),
                     config.board,
                     captures_dir=options.captures,
                     progress=tell,
-                    pitch_mm=config.pitch_mm,
+                    pitch_mm=config.pitch_mm / finer,
                     seed=config.sim.seed,
                     options=how,
                     **{name: getattr(options, name) for name in _given(options, SESSION)},

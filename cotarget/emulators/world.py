@@ -13,7 +13,7 @@ import threading
 import time
 from dataclasses import dataclass, replace
 
-from cotarget.config import RigConfig
+from cotarget.config import RigConfig, SimCamera
 from cotarget.emulators.plant import Feed, Picture
 from cotarget.errors import DeviceError
 from cotarget.geometry import RigidTransform
@@ -229,11 +229,13 @@ class LiveWorld:
         except BaseException as error:
             self._started.put(error)
             return
-        self._started.put(world)
         sim = self.config.sim
-        cameras = {"fixed": sim.fixed, "zoom": sim.zoom}
+        cameras: dict[CameraName, SimCamera] = {"fixed": sim.fixed, "zoom": sim.zoom}
         late = {n: c.latency_s if sim.effects.latency else 0.0 for n, c in cameras.items()}
-        next_index: dict[CameraName, int] = {"fixed": 0, "zoom": 0}
+        for name in cameras:
+            world.expose(name, 0, 0.0)  # the first render of each takes seconds where shaders are compiled
+        next_index = {name: math.ceil(self.clock.now() * camera.rate_hz) for name, camera in cameras.items()}
+        self._started.put(world)
         numbers = itertools.count(STILL_INDEX)
         while not self._ended.is_set():
             try:

@@ -206,6 +206,8 @@ class SimPanTilt:
 class SimBoard:
     """A board that appears wherever it is wished."""
 
+    patience = 0.0
+
     def __init__(self, place: Callable[[RigidTransform | None], None]) -> None:
         self._place = place
 
