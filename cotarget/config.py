@@ -77,19 +77,24 @@ DEFAULT_TARGETS: Mapping[str, TargetConfig] = types.MappingProxyType(
 
 @dataclass(frozen=True)
 class SafetyConfig:
-    """Soft limits inside the device's own.
+    """Soft limits inside the device's own, and when the head is halted or does not move at all.
 
     Attributes:
         pan_deg: lowest and highest pan [degrees]; None for the device's.
         tilt_deg: lowest and highest tilt [degrees]; None for the device's.
         speed_deg_s: speed cap [degrees/s]; None for the device's.
         max_frame_age_s: a frame older than this is not acted on [s].
+        watchdog_s: a head that may be moving is halted when for so long neither a fresh frame was read nor a command
+            given [s].
+        stop_file: while this file exists, the head does not move; None for no such file.
     """
 
     pan_deg: Pair | None = None
     tilt_deg: Pair | None = None
     speed_deg_s: float | None = None
     max_frame_age_s: float = 1.0
+    watchdog_s: float = 0.5
+    stop_file: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -252,6 +257,7 @@ def _check(config: RigConfig) -> None:
     positive: dict[str, float] = {
         "board.square": config.board.square,
         "safety.max_frame_age_s": config.safety.max_frame_age_s,
+        "safety.watchdog_s": config.safety.watchdog_s,
     }
     for name, target in config.targets.items():
         positive |= {f"targets.{name}.size": target.size, f"targets.{name}.wanted_px": target.wanted_px}
@@ -263,6 +269,11 @@ def _check(config: RigConfig) -> None:
             raise ConfigError(f"{where}: {list(limits)} is not [lowest, highest]")
     if config.safety.speed_deg_s is not None and config.safety.speed_deg_s <= 0:
         raise ConfigError(f"safety.speed_deg_s: {config.safety.speed_deg_s:g} is not greater than zero")
+    if config.safety.watchdog_s * config.rate_hz <= 1:
+        raise ConfigError(
+            f"safety.watchdog_s: {config.safety.watchdog_s:g} s would halt the head between any two frames of the "
+            f"fixed camera, of which {config.rate_hz:g} come a second"
+        )
     if min(config.board.corners) < 3:
         raise ConfigError(f"board.corners: {list(config.board.corners)} has fewer than 3 corners a side")
     for name in config.sim.targets:

@@ -23,6 +23,10 @@ class StaleFrameError(DeviceError):
     """A frame came too late or is too old to act on."""
 
 
+class EmergencyStopError(DeviceError):
+    """The head is stopped until an operator clears it."""
+
+
 class UnreachableError(CotargetError):
     """No pan and tilt within the limits brings the target to the wanted pixel."""
 

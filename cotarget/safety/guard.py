@@ -1,0 +1,240 @@
+"""Knows whether the head may be moving and whether it may move, and halts it when it may not.
+
+Devices, the watching thread and the operator all come here, each from a thread of its own. The lock is held for
+bookkeeping only and never while a device is called, so that a device that hangs keeps nobody from halting the head.
+"""
+
+import logging
+import math
+import threading
+from dataclasses import dataclass, replace
+
+from cotarget.config import SafetyConfig
+from cotarget.errors import DeviceError, EmergencyStopError
+from cotarget.rig import Clock, PanTilt, PanTiltState
+from cotarget.safety.stopfile import refuse_if_stopped, stop_reason, stopped_by_file
+
+log = logging.getLogger(__name__)
+
+HALT_TRIES = 3  # when the rig is closed; a driver's own deadlines bound each
+AT_GOAL = math.radians(0.1)  # as near as this, and a step, a head that rests has arrived [rad]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A command to the head.
+
+    Attributes:
+        goal: pan and tilt [rad].
+        halts: how many halts there had been when it was given.
+        patience_s: how long the device itself may wait for the head to arrive; 0 where it does not [s].
+        on_its_way: whether the device has not yet returned from it.
+    """
+
+    goal: tuple[float, float]
+    halts: int
+    patience_s: float
+    on_its_way: bool = True
+
+
+class Guard:
+    """The memory of a rig's watchdog and emergency stop.
+
+    The head may be moving from a command until a halt, until the device has waited for its arrival, or until it is
+    seen to rest at the goal. Through that time there must be a sign of life every ``watchdog_s``: a command, or a
+    frame newer than all before.
+    """
+
+    def __init__(self, head: PanTilt, clock: Clock, config: SafetyConfig) -> None:
+        self._head, self._clock = head, clock
+        self._timeout_s, self._stop_file = config.watchdog_s, config.stop_file
+        self._lock = threading.RLock()  # reentrant: a signal's handler may call stop() anywhere
+        self._motion: Motion | None = None
+        self._alive_at = -math.inf
+        self._halts = 0
+        self._owed: str | None = None  # why the head has still to be halted, where that failed
+        self._stopped: str | None = None  # by this process
+        self._stopped_by_file: str | None = None
+        self._shut = False
+
+    def begin(self, goal: tuple[float, float], patience_s: float = 0.0) -> Motion:
+        """Note that a command is about to be given.
+
+        Raises:
+            EmergencyStopError: the head is stopped.
+            DeviceError: the rig is closed, or the head has still to be halted and cannot be.
+        """
+        self.watch()
+        with self._lock:
+            self.refuse_if_stopped()
+            if self._shut:
+                raise DeviceError("the rig is closed, so the head does not move any more")
+            if self._owed is not None:
+                raise DeviceError(f"the head does not move before it could be halted: {self._owed}")
+            self._motion = Motion(goal, self._halts, patience_s)
+            self._alive_at = self._clock.now()
+            return self._motion
+
+    def end(self, motion: Motion, arrived: bool) -> bool:
+        """Note that the device has returned from a command, and whether the head has arrived.
+
+        Returns:
+            Whether the head was halted meanwhile. Then the command may have reached the unit after the halt, and the
+            head has been halted once more.
+        """
+        with self._lock:
+            stopped = self._stopped is not None or self._stopped_by_file is not None
+            interrupted = stopped or self._halts != motion.halts
+            self._alive_at = self._clock.now()
+            if self._motion is motion and not interrupted:
+                self._motion = None if arrived else replace(motion, patience_s=0.0, on_its_way=False)
+        if interrupted:
+            self._halt("a command was still on its way when the head was halted")
+        return interrupted
+
+    def alive(self) -> None:
+        """Note a sign of life: a frame newer than all before."""
+        self._alive_at = self._clock.now()
+
+    def saw(self, state: PanTiltState, step: float) -> None:
+        """Note where the head says it is: one that rests at its goal needs no watching."""
+        with self._lock:
+            motion = self._motion
+            if motion is None or motion.on_its_way or state.moving:
+                return
+            off = max(abs(state.pan - motion.goal[0]), abs(state.tilt - motion.goal[1]))
+            if off <= step + AT_GOAL:
+                self._motion = None
+
+    def deadline(self) -> float | None:
+        """When the head will be halted without a sign of life, on the rig's clock [s]; None while it rests."""
+        with self._lock:
+            return None if self._motion is None else self._alive_at + self._motion.patience_s + self._timeout_s
+
+    def pause(self, longest: float) -> float:
+        """How long nobody need watch [s]."""
+        deadline = self.deadline()
+        if deadline is None or self._owed is not None:
+            return longest
+        return min(max(deadline - self._clock.now(), 0.0), longest)
+
+    def watch(self) -> None:
+        """Halt the head if that is due: no sign of life, a stop file, or a halt that failed before."""
+        self._look_for_stop_file()
+        if self._owed is not None:
+            self._halt(self._owed)
+            return
+        # In this order, a clock that goes forward shows no less than when the last sign of life was noted.
+        alive_at, deadline = self._alive_at, self.deadline()
+        if deadline is None:
+            return
+        now = self._clock.now()
+        if alive_at <= now < deadline:
+            return
+        if now < alive_at:
+            reason = f"the rig's clock ran backwards by {alive_at - now:.3g} s"
+        else:
+            reason = f"neither a fresh frame nor a command for {now - alive_at:.2g} s"
+        log.warning("halting the head: %s", reason)
+        self._halt(reason)
+
+    def halt(self) -> None:
+        """Halt the head because the program says so; where the device fails, the watchdog tries again.
+
+        Raises:
+            Exception: whatever the device raised.
+        """
+        with self._lock:
+            motion, self._halts = self._motion, self._halts + 1
+        try:
+            self._head.halt()
+        except Exception as error:
+            with self._lock:
+                self._owed = str(error)
+            raise
+        self._rests(motion)
+
+    def stop(self, reason: str) -> None:
+        """Halt the head, and let it not move until `clear`."""
+        with self._lock:
+            self._stopped = reason  # first of all, so that no command slips in behind the halt
+        log.warning("emergency stop: %s", reason)
+        self._halt(reason)
+
+    def clear(self) -> str | None:
+        """End this process's emergency stop; return its reason.
+
+        Raises:
+            EmergencyStopError: there still is a stop file.
+        """
+        refuse_if_stopped(self._stop_file)
+        with self._lock:
+            reason, self._stopped, self._stopped_by_file = self._stopped, None, None
+        return reason
+
+    @property
+    def reason(self) -> str | None:
+        """Why the head is stopped; None if it is not."""
+        return self._stopped if self._stopped is not None else stop_reason(self._stop_file)
+
+    def refuse_if_stopped(self) -> None:
+        """Raise while the head is stopped, by what was last seen of the stop file.
+
+        Raises:
+            EmergencyStopError: with the reason, and how to clear it.
+        """
+        if self._stopped is not None:
+            raise EmergencyStopError(f"emergency stop: {self._stopped}; the head moves again after clear()")
+        if self._stopped_by_file is not None:
+            raise stopped_by_file(self._stop_file, self._stopped_by_file)
+
+    def shut(self) -> None:
+        """Halt the head for good.
+
+        Raises:
+            Exception: whatever the device raised at the last of several tries.
+        """
+        with self._lock:
+            self._shut, self._halts = True, self._halts + 1
+        for left in reversed(range(HALT_TRIES)):
+            try:
+                self._head.halt()
+                break
+            except Exception as error:
+                if not left:
+                    log.error("the head could not be halted: %s", error)
+                    raise
+        with self._lock:
+            self._motion = self._owed = None
+
+    def _halt(self, reason: str) -> None:
+        """Halt the head; where the device fails, say so and owe it."""
+        with self._lock:
+            motion, self._halts = self._motion, self._halts + 1
+        try:
+            self._head.halt()
+        except Exception as error:  # whatever it is, the head has to be halted all the same
+            with self._lock:
+                first, self._owed = self._owed is None, str(error)
+            if first and not self._shut:
+                log.error("the head could not be halted (%s) and will be halted again: %s", reason, error)
+            return
+        self._rests(motion)
+
+    def _rests(self, motion: Motion | None) -> None:
+        """Note that a halt was obeyed; a command given meanwhile is watched on."""
+        with self._lock:
+            late, self._owed = self._owed is not None, None
+            if self._motion is motion:
+                self._motion = None
+        if late:
+            log.warning("the head is halted now")
+
+    def _look_for_stop_file(self) -> None:
+        reason = stop_reason(self._stop_file)
+        with self._lock:
+            new = reason is not None and self._stopped_by_file is None
+            self._stopped_by_file = reason
+        if new:
+            log.warning("emergency stop: %s", reason)
+            self._halt(f"emergency stop: {reason}")

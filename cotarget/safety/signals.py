@@ -1,0 +1,85 @@
+"""Signals: none may keep the head from being halted, and none may end a program with a moving head behind it."""
+
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from types import FrameType
+from typing import Any
+
+# Signals that would end the process on the spot: a polite request, and a terminal or connection that has gone.
+ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+HELD = (signal.SIGINT, *ENDING)
+SHELL_STATUS = 128  # a shell's exit status for a signal is this and its number
+# So many signals, while the devices are released after the halt, end the wait for devices that do not answer.
+IMPATIENCE = 3
+
+
+class HeldSignals:
+    """Keeps Ctrl-C and SIGTERM back while the head is halted; they are delivered afterwards.
+
+    Only the main thread gets signals, so elsewhere there is nothing to hold.
+    """
+
+    def __init__(self) -> None:
+        self.pending: list[int] = []
+        self._previous: dict[int, Any] = {}
+        self._halted = False
+
+    def hold(self) -> None:
+        """From now on note signals; may be called again where a signal cut it short."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        for number in HELD:
+            previous = signal.getsignal(number)
+            if number not in self._previous and previous not in (None, signal.SIG_IGN, self._note):
+                self._previous[number] = previous
+                signal.signal(number, self._note)
+
+    def halted(self) -> None:
+        """The head is halted or cannot be; from now on enough signals end the wait for the devices."""
+        self._halted = True
+
+    def restore(self) -> None:
+        """Put the former handlers back."""
+        while self._previous:
+            number, previous = self._previous.popitem()
+            if signal.getsignal(number) == self._note:
+                signal.signal(number, previous)
+
+    def deliver(self) -> None:
+        """Let the signal act that was held back, if there was one."""
+        if self.pending:
+            signal.raise_signal(self.pending[0])
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.pending.append(number)
+        if self._halted and len(self.pending) >= IMPATIENCE:
+            raise KeyboardInterrupt
+
+
+def end_politely() -> Callable[[], None]:
+    """Let signals that would end the process on the spot raise SystemExit, so that ``with`` blocks are left.
+
+    Handlers that the program itself has set stay.
+
+    Returns:
+        What undoes it.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return lambda: None
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        sys.exit(SHELL_STATUS + number)
+
+    ours = [number for number in ENDING if signal.getsignal(number) is signal.SIG_DFL]
+    for number in ours:
+        signal.signal(number, leave)
+
+    def undo() -> None:
+        if threading.current_thread() is threading.main_thread():
+            for number in ours:
+                if signal.getsignal(number) is leave:
+                    signal.signal(number, signal.SIG_DFL)
+
+    return undo

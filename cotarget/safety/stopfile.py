@@ -1,0 +1,89 @@
+"""The emergency stop across processes: while a certain file exists, the head does not move; its content says why."""
+
+import os
+from pathlib import Path
+
+from cotarget.errors import DeviceError, EmergencyStopError
+
+NO_REASON = "no reason given"
+LONGEST_REASON = 200  # characters of the file's first line that are shown
+
+
+def stop_reason(path: Path | None) -> str | None:
+    """Why the head must not move; None if it may.
+
+    A file that cannot be looked at stops too: nobody knows then whether somebody has called for a stop.
+    """
+    if path is None:
+        return None
+    try:
+        with path.open("rb") as file:
+            content = file.read(4 * LONGEST_REASON)  # a character takes at most 4 bytes
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        return f"the file cannot be read: {error.strerror}"
+    lines = content.decode("utf-8", "replace").strip().splitlines()
+    said = "".join(c if c.isprintable() else " " for c in lines[0])[:LONGEST_REASON].strip() if lines else ""
+    return said or NO_REASON
+
+
+def refuse_if_stopped(path: Path | None) -> None:
+    """Raise while the file exists.
+
+    Raises:
+        EmergencyStopError: with the reason, and how to clear it.
+    """
+    if (reason := stop_reason(path)) is not None:
+        raise stopped_by_file(path, reason)
+
+
+def stopped_by_file(path: Path | None, reason: str) -> EmergencyStopError:
+    """The error that says why, and how to clear it."""
+    return EmergencyStopError(
+        f"emergency stop: {reason}; when it is safe to move, run 'cotarget clear' or remove {path}"
+    )
+
+
+def write_stop_file(path: Path, reason: str) -> None:
+    """Stop every rig that watches this file; a reader finds the whole reason or no file.
+
+    Raises:
+        DeviceError: the file cannot be made, so nothing is stopped by it.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with temporary.open("w", encoding="utf-8") as file:
+                file.write(f"{reason}\n")
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except OSError:
+            temporary.unlink(missing_ok=True)
+            path.touch()  # a full disk still has room for a file without a reason
+    except OSError as error:
+        raise DeviceError(f"{path}: NOT stopped: the file cannot be written: {error.strerror}") from None
+
+
+def clear_stop_file(path: Path) -> str | None:
+    """End the stop; return its reason, or None where there was none.
+
+    What is removed is what is returned: a stop that is called meanwhile stays.
+
+    Raises:
+        DeviceError: the file cannot be removed, so the stop lasts.
+    """
+    taken = path.with_name(f".{path.name}.{os.getpid()}.cleared")
+    try:
+        if path.is_dir():
+            raise DeviceError(f"{path}: is a folder, and stops the head as a file does; remove it")
+        path.rename(taken)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise DeviceError(f"{path}: still stopped: the file cannot be removed: {error.strerror}") from None
+    reason = stop_reason(taken)
+    taken.unlink(missing_ok=True)
+    return reason
