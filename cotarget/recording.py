@@ -1,12 +1,37 @@
-"""Writes what a run of Steps did."""
+"""Writes what a run did: a table of its Steps, and a recording of all that its rig saw and was told."""
 
+import contextlib
 import csv
+import dataclasses
+import json
 import math
+import platform
+import shutil
+from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 
-from cotarget.errors import ConfigError
+import cv2
+import numpy as np
+
+from cotarget import __version__
+from cotarget.config import RigConfig
+from cotarget.errors import ConfigError, CotargetError
 from cotarget.loop import Step
+from cotarget.recordformat import (
+    CALIBRATION,
+    COMPLETE,
+    FIXED,
+    LOG,
+    META,
+    SCHEMA,
+    TEMPLATE,
+    ZOOM,
+    config_table,
+)
+from cotarget.recordingrig import RecordingRig
+from cotarget.recordwriter import RecordWriter
+from cotarget.rig import Rig
 
 COLUMNS = (
     "index", "t_s", "t_fixed_s", "t_zoom_s", "state", "reason", "track", "u_px", "v_px", "width_px", "height_px",
@@ -63,3 +88,109 @@ class StepTable:
             self._part.replace(self._path)
         else:
             self._part.unlink(missing_ok=True)
+
+
+class Recorder:
+    """Records a run into a folder, so that `cotarget.replay` can open it as a rig. A context manager.
+
+    Wrap the rig below the safety layer and close it before the recorder:
+
+        with Recorder(folder, config, calibration, target) as recorder:
+            with SafeRig(recorder.wrap(open_rig(config)), config.safety) as rig:
+                ...
+    """
+
+    def __init__(self, directory: Path, config: RigConfig, calibration: Path, target: str) -> None:
+        """Make the folder and write down what the run begins with.
+
+        Args:
+            directory: the recording's; it must not exist yet, or be empty.
+            config: of the rig; passwords in it are not recorded.
+            calibration: calibration.json, of which the recording gets a copy.
+            target: name of the target that will be followed.
+
+        Raises:
+            ConfigError: the folder is not empty, something cannot be read or written, or there is no such target.
+        """
+        self._directory = directory
+        self._wrapped = False
+        try:
+            self._made = not directory.exists()
+            directory.mkdir(parents=True, exist_ok=True)
+            if any(directory.iterdir()):
+                raise ConfigError(f"{directory}: is not empty; give a new folder for the recording")
+        except OSError as error:
+            raise ConfigError(f"{directory}: cannot hold a recording: {error.strerror}") from None
+        try:
+            self._write_beginning(config, calibration, target)
+            self._writer = RecordWriter(directory)
+        except BaseException as error:
+            self._remove()
+            if isinstance(error, OSError):
+                raise ConfigError(f"{error.filename or directory}: cannot be recorded: {error.strerror}") from None
+            raise
+
+    @property
+    def dropped(self) -> int:
+        """Images of the zoom camera that were left out so far, because the disk was too slow."""
+        return self._writer.dropped
+
+    def wrap(self, rig: Rig) -> Rig:
+        """Give a rig that records; one a recording. The rig is closed with it, and at once if this fails."""
+        assert not self._wrapped, "a recording is of one rig"
+        self._wrapped = True
+        return RecordingRig(rig, self._writer)
+
+    def __enter__(self) -> "Recorder":
+        """Give the recorder itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Write what still waits and how the run ended; remove a recording of a rig that was never opened.
+
+        Raises:
+            CotargetError: the recording is not complete, as on a full disk.
+        """
+        ending = COMPLETE if kind is None else f"{kind.__name__}: {error}".removesuffix(": ")
+        self._writer.put({"end": ending, "dropped": self._writer.dropped})
+        self._writer.close()
+        if not self._wrapped:
+            self._remove()
+        elif self._writer.failure and kind is None:
+            raise CotargetError(f"{self._directory}: the recording is cut short: {self._writer.failure}")
+
+    def _write_beginning(self, config: RigConfig, calibration: Path, target: str) -> None:
+        chosen = config.target(target)
+        if chosen.template is not None:
+            copy = TEMPLATE + chosen.template.suffix
+            shutil.copyfile(chosen.template, self._directory / copy)
+            chosen = dataclasses.replace(chosen, template=Path(copy))
+        shutil.copyfile(calibration, self._directory / CALIBRATION)
+        table = {
+            "schema": SCHEMA,
+            "cotarget": __version__,
+            "python": platform.python_version(),
+            "machine": platform.machine(),
+            "opencv": cv2.__version__,
+            "numpy": np.__version__,
+            "when": datetime.now(UTC).isoformat(timespec="seconds"),
+            "target": target,
+            "config": config_table(dataclasses.replace(config, targets={**config.targets, target: chosen})),
+        }
+        part = self._directory / f"{META}.part"
+        part.write_text(json.dumps(table, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        part.replace(self._directory / META)
+
+    def _remove(self) -> None:
+        """Take away what was made: nothing in it can be replayed, and it would be in the way of the next try."""
+        for folder in (FIXED, ZOOM):
+            with contextlib.suppress(OSError):
+                (self._directory / folder).rmdir()
+        for path in self._directory.iterdir():
+            if path.name in (META, f"{META}.part", LOG, CALIBRATION) or path.stem == TEMPLATE:
+                path.unlink(missing_ok=True)
+        if self._made:
+            with contextlib.suppress(OSError):
+                self._directory.rmdir()

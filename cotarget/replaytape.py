@@ -1,0 +1,224 @@
+"""What was recorded, dealt out again: call by call as long as the run asks the same, by time where it does not.
+
+A run that is what it was when it was recorded asks the same calls in the same order and gets the very same answers, so
+it does the same to the last bit. Where it has changed, the frames of the fixed camera still come one after the other,
+each with what was asked between it and the next; whatever else is asked gets what was so at that time.
+"""
+
+import math
+import threading
+from collections import defaultdict, deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import cotarget.errors
+from cotarget.errors import CotargetError, DeviceError, StaleFrameError
+from cotarget.recordformat import COMPLETE, Event
+from cotarget.recordreader import Recording
+
+COMMANDS = ("head.move", "zoom.zoom", "head.halt")
+
+
+class RecordingEndedError(CotargetError):
+    """The recording holds nothing beyond this; every replay ends with it."""
+
+
+@dataclass(frozen=True)
+class Differences:
+    """How a replay's commands differ from those that were recorded.
+
+    Attributes:
+        moves: of the head, that were compared.
+        moves_differing: of them.
+        largest_deg: difference of pan or tilt between them [degrees].
+        zooms: of the lens, that were compared.
+        zooms_differing: of them.
+        largest_px: difference of focal length between them [px].
+        missing: commands that were given then and not now, between the same two frames.
+        extra: moves of head and lens that were given now and not then.
+    """
+
+    moves: int = 0
+    moves_differing: int = 0
+    largest_deg: float = 0.0
+    zooms: int = 0
+    zooms_differing: int = 0
+    largest_px: float = 0.0
+    missing: int = 0
+    extra: int = 0
+
+    @property
+    def same(self) -> bool:
+        """Whether the replay commanded exactly what was commanded then."""
+        return not (self.moves_differing or self.zooms_differing or self.missing or self.extra)
+
+    def __str__(self) -> str:
+        """Say it in one line."""
+        if self.same:
+            return f"all {self.moves + self.zooms} commands as recorded"
+        return (
+            f"{self.moves_differing} of {self.moves} moves differ, by {self.largest_deg:.3g} degrees at most; "
+            f"{self.zooms_differing} of {self.zooms} focal lengths, by {self.largest_px:.3g} px at most; "
+            f"{self.missing} commands missing, {self.extra} more"
+        )
+
+
+@dataclass
+class _Span:
+    """What was asked from one frame of the fixed camera to the next."""
+
+    calls: dict[str, deque[Event]] = field(default_factory=lambda: defaultdict(deque))
+
+
+class Tape:
+    """A recording that runs.
+
+    Attributes:
+        now: the replay's clock [s].
+        differences: between the commands so far and those recorded; those recorded after the newest frame are not
+            missed yet.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._spans, self._frames = _cut(recording.events)
+        self._broke_off = not recording.truncated and recording.ending != COMPLETE
+        self._index = 0
+        self._ended = False
+        self._thread = threading.get_ident()
+        self.differences = Differences()
+        self.now = recording.events[0].at if recording.events else 0.0
+
+    @property
+    def is_aside(self) -> bool:
+        """Whether another thread than the run's own asks, such as a watchdog; it has what is so at this time."""
+        return threading.get_ident() != self._thread
+
+    def take(self, call: str) -> Event | None:
+        """The recorded event of a call that the run asked then too, between the same two frames; else None.
+
+        Raises:
+            RecordingEndedError: the run broke off before it.
+        """
+        if self.is_aside:
+            return None
+        if waiting := self._spans[self._index].calls.get(call):
+            return waiting.popleft()
+        if self._broke_off and self._index == len(self._spans) - 1 and not self._ended and call not in COMMANDS:
+            raise self._end()
+        return None
+
+    def play(self, event: Event) -> Event:
+        """Let the time of an event come, and its error.
+
+        Raises:
+            CotargetError: as recorded.
+        """
+        self.pass_to(event.at)
+        if event.error is not None:
+            raise _recorded_error(*event.error)
+        return event
+
+    def answer(self, call: str) -> Event | None:
+        """Take an event and play it, where there is one."""
+        event = self.take(call)
+        return None if event is None else self.play(event)
+
+    def next_frame(self, newer_than: float | None, timeout: float) -> Event:
+        """The next frame of the fixed camera; the newest at this time, where the replay has fallen behind.
+
+        Args:
+            newer_than: exposed after this time [s].
+            timeout: how long to wait [s].
+
+        Raises:
+            RecordingEndedError: there are no more.
+            DeviceError: no such frame came within ``timeout``.
+            CotargetError: as recorded.
+        """
+        for index in range(self._index + 1, len(self._spans)):
+            frame, following = self._frames[index - 1], self._frames[index : index + 1]
+            overtaken = bool(following) and following[0].at < self.now
+            too_old = newer_than is not None and frame.error is None and time_of(frame) <= newer_than
+            if frame.error is not None or not (overtaken or too_old):
+                break
+        else:
+            self._miss(self._spans[self._index :])
+            raise self._end()
+        if frame.args != (newer_than, timeout) and frame.at > self.now + timeout:
+            self.now += timeout
+            raise StaleFrameError(f"no frame within {timeout:g} s")
+        self._miss(self._spans[self._index : index])
+        self._index = index
+        return self.play(frame)
+
+    def compare(self, call: str, recorded: Event | None, args: Sequence[float | bool | None]) -> None:
+        """Count a command, and by how much it differs from the one recorded."""
+        if self.is_aside:
+            return
+        counts = self.differences
+        if recorded is None:
+            self.differences = replace(counts, extra=counts.extra + (not self._ended))
+            return
+        differs = tuple(args) != recorded.args
+        axes = 2 if call == "head.move" else 1
+        pairs = zip(recorded.args[:axes], args[:axes], strict=True)
+        off = max(abs(float(now or 0.0) - float(then or 0.0)) for then, now in pairs)
+        if call == "head.move":
+            self.differences = replace(
+                counts,
+                moves=counts.moves + 1,
+                moves_differing=counts.moves_differing + differs,
+                largest_deg=max(counts.largest_deg, math.degrees(off)),
+            )
+        else:
+            self.differences = replace(
+                counts,
+                zooms=counts.zooms + 1,
+                zooms_differing=counts.zooms_differing + differs,
+                largest_px=max(counts.largest_px, off),
+            )
+
+    def pass_to(self, t: float) -> None:
+        """Let the clock show at least ``t`` [s]."""
+        self.now = max(self.now, t)
+
+    def _miss(self, spans: Sequence[_Span]) -> None:
+        """Count the commands of spans that are over; the last one's halts are not due before the rig is closed."""
+        missing = 0
+        for span in spans:
+            due = COMMANDS[:-1] if span is self._spans[-1] else COMMANDS
+            for call in due:
+                missing += len(span.calls.pop(call, ()))
+        self.differences = replace(self.differences, missing=self.differences.missing + missing)
+
+    def _end(self) -> RecordingEndedError:
+        self._ended = True
+        return RecordingEndedError(f"{self._recording.directory}: the recording ends here, at {self.now:.2f} s")
+
+
+def time_of(frame: Event) -> float:
+    """When a frame was exposed [s]."""
+    return float(frame.result[0] or 0.0)
+
+
+def _cut(events: Sequence[Event]) -> tuple[list[_Span], list[Event]]:
+    """Spans from frame to frame, the first before any, and the frames; other threads' calls are left out."""
+    spans, frames = [_Span()], []
+    for event in events:
+        if event.aside:
+            continue
+        if event.call == "fixed.read":
+            spans.append(_Span())
+            frames.append(event)
+        else:
+            spans[-1].calls[event.call].append(event)
+    return spans, frames
+
+
+def _recorded_error(name: str, message: str) -> CotargetError:
+    """The exception that was raised then; one that is not cotarget's own is a device's failure."""
+    kind = getattr(cotarget.errors, name, None)
+    if isinstance(kind, type) and issubclass(kind, CotargetError):
+        return kind(message)
+    return DeviceError(f"{name}: {message}")
