@@ -1,0 +1,813 @@
+"""The driver of a zoom camera by gphoto2, against a camera that fails on command, and against the emulated one.
+
+Most of it runs in simulated time without a thread. What happens on a real USB line (a claimed interface, a pulled
+cable) is injected at the thin layer of calls: PTP/IP, which the wire tests use, has none of it.
+"""
+
+import contextlib
+import logging
+import math
+import sys
+import threading
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.errors import ConfigError, DeviceError, StaleFrameError
+from cotarget.hardware.canon import GphotoCamera
+from cotarget.hardware.clock import MonotonicClock
+from cotarget.hardware.gphoto import GphotoLink, LinkError, Setting, full_port, probe
+from cotarget.hardware.gphoto_desk import Desk
+from cotarget.hardware.gphoto_work import Shooting
+from cotarget.hwconfig import HardwareZoom
+
+SIZE, STILL_SIZE = (32, 24), (64, 48)
+CONFIG = HardwareZoom(port="usb:", size=SIZE, still_size=STILL_SIZE, latency_s=0.1)
+PERIOD = 1 / 10  # of the fake viewfinder [s]
+CALL_S = 0.002  # that a call takes [s]
+DEADLINE_S = 20.0  # for whatever should happen at once: only a hang takes as long
+GREY = 2.0  # grey levels by which JPEG may change an even picture
+BUSY, BAD, IO, TIMEOUT, CLAIM = -110, -2, -7, -10, -53  # libgphoto2's results
+
+
+def jpeg(size, grey):
+    return cv2.imencode(".jpg", np.full((size[1], size[0], 3), grey, np.uint8))[1].tobytes()
+
+
+class SimClock:
+    """Time that moves when somebody waits."""
+
+    def __init__(self):
+        self.t = 100.0
+
+    def now(self):
+        return self.t
+
+    def sleep_until(self, t):
+        self.t = max(self.t, t)
+
+
+class Camera:
+    """A link to a camera with a lens from 0 to 134 that shows only when it shoots, as PowerShots do.
+
+    ``fail`` holds, by call, results to fail with: one after the other, and the last one for ever if it is a list's
+    Ellipsis. ``take`` is what a call takes [s], ``ignore`` lets commands to the lens have no effect.
+    """
+
+    def __init__(self, clock):
+        self.clock, self.log, self.fail, self.take = clock, [], {}, {}
+        self.connected, self.ignore, self.frozen, self.threads = False, 0, None, set()
+        self.choices = {"iso": ("Auto", "80", "100"), "capturetarget": ("Internal RAM", "Memory card")}
+        self.values = {"capture": 0.0, "zoom": 0.0, "iso": "Auto", "capturetarget": "Memory card", "owner": "nobody"}
+        self.readonly, self.hidden = set(), {"zoom", "iso"}
+        self.range = (0.0, 134.0, 1.0)
+        self.preview_size, self.still_size = SIZE, STILL_SIZE
+        self.still = None
+        self.shown = []
+
+    def _do(self, name, *what):
+        self.threads.add(threading.get_ident())
+        self.log.append((name, *what))
+        if isinstance(self.clock, SimClock):
+            self.clock.t += self.take.get(name, CALL_S)
+        queue = self.fail.get(name)
+        if queue:
+            code = queue[0]
+            if queue[1:] != [...]:
+                queue.pop(0)
+            if code is not None:
+                raise LinkError(code, "what gphoto2 calls it")
+        assert self.connected or name in ("open", "close"), f"{name} without a connection"
+
+    def open(self):
+        self._do("open")
+        self.connected = True
+        return "Fake S5"
+
+    def close(self):
+        self._do("close")
+        self.connected = False
+
+    def names(self):
+        shooting = self.values.get("capture", 1.0)
+        return [name for name in self.values if shooting or name not in self.hidden]
+
+    def get(self, name):
+        self._do("get", name)
+        value, readonly = self.values[name], name in self.readonly
+        if name in self.choices:
+            return Setting("choice", value, choices=self.choices[name], readonly=readonly)
+        if name == "zoom":
+            return Setting("range", value, *self.range, readonly=readonly)
+        return Setting("switch" if name == "capture" else "text", value, readonly=readonly)
+
+    def put(self, name, value):
+        self._do("put", name, value)
+        if name == "zoom" and self.ignore:
+            self.ignore -= 1
+            return
+        self.values[name] = value
+
+    def preview(self):
+        self._do("preview")
+        if self.frozen is not None:
+            return self.frozen
+        index = math.floor(self.clock.now() / PERIOD)
+        self.shown.append(index)
+        return jpeg(self.preview_size, 10 + index % 200)
+
+    def shoot(self):
+        self._do("shoot")
+        return "/", "capt0000.jpg"
+
+    def fetch(self, still):
+        self._do("fetch", *still)
+        return jpeg(self.still_size, 200) if self.still is None else self.still
+
+    def commands(self, name):
+        return [entry[2] for entry in self.log if entry[:2] == ("put", name)]
+
+
+class Bench:
+    """The driver's work in simulated time, and what its users would do."""
+
+    def __init__(self, config=CONFIG, prepare=lambda camera: None):
+        self.clock, self.desk = SimClock(), Desk()
+        self.camera = Camera(self.clock)
+        prepare(self.camera)
+        self.work = Shooting(config, self.clock, self.camera, self.desk)
+        self.zoom = self.work.open()
+        self.frames = []
+
+    def run(self, seconds):
+        until = self.clock.t + seconds
+        while self.clock.t < until:
+            due = self.work.work()
+            if self.desk.frame is not None and (not self.frames or self.desk.frame is not self.frames[-1]):
+                self.frames.append(self.desk.frame)
+            self.clock.t = max(self.clock.t, min(due, until))
+
+    def send(self, position):
+        self.desk.wanted, self.desk.order = position, self.desk.order + 1
+        self.desk.standing, self.desk.lens_trouble = False, ""
+
+
+def opening_fails(config=CONFIG, **changes):
+    def prepare(camera):
+        for name, value in changes.items():
+            setattr(camera, name, value)
+
+    with pytest.raises((ConfigError, DeviceError)) as error:
+        Bench(config, prepare)
+    assert "\n" not in str(error.value)
+    return error
+
+
+# --- opening
+
+
+def test_opening_enters_shooting_before_it_looks_for_the_lens():
+    bench = Bench()
+    assert bench.camera.log[:2] == [("open",), ("put", "capture", 1)]
+    assert bench.camera.values["capturetarget"] == "Internal RAM"
+    assert bench.zoom.lens.focal_range == pytest.approx((6.0 / 0.01794, 72.0 / 0.01794))
+    assert bench.camera.commands("zoom") == []
+    assert bench.desk.frame.image.shape == (24, 32, 3)
+
+
+def test_a_camera_that_always_shoots_and_has_no_targets_is_taken_as_it_is():
+    def prepare(camera):
+        del camera.values["capture"], camera.values["capturetarget"]
+
+    assert Bench(prepare=prepare).camera.commands("capture") == []
+
+
+def test_settings_are_applied_and_a_target_of_the_users_own_is_left():
+    config = replace(CONFIG, settings={"iso": "80", "owner": "us", "capturetarget": "Memory card"})
+    camera = Bench(config).camera
+    assert (camera.values["iso"], camera.values["owner"], camera.values["capturetarget"]) == ("80", "us", "Memory card")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"isso": "80"}, "hardware.zoom.settings: the Fake S5 has no setting 'isso'; valid here: iso, capture"),
+        ({"iso": "81"}, "hardware.zoom.settings.iso: '81' is not one of: 80, 100, Auto"),
+        ({"zoom": "135"}, "hardware.zoom.settings.zoom: '135' is not within 0 to 134"),
+        ({"zoom": "wide"}, "hardware.zoom.settings.zoom: 'wide' is not within 0 to 134"),
+        ({"capture": "yes"}, "hardware.zoom.settings.capture: 'yes' is not one of: 0, 1"),
+    ],
+)
+def test_wrong_settings_are_named_with_the_valid_ones(settings, message):
+    error = opening_fails(replace(CONFIG, settings=settings))
+    assert error.type is ConfigError
+    assert str(error.value).startswith(message)
+
+
+def test_settings_that_can_only_be_read_and_those_taken_otherwise(caplog):
+    error = opening_fails(replace(CONFIG, settings={"iso": "80"}), readonly={"iso"})
+    assert str(error.value) == "hardware.zoom.settings.iso: this camera's can only be read; it is 'Auto'"
+
+    def prepare(camera):
+        put = camera.put
+        camera.put = lambda name, value: put(name, "NOBODY" if name == "owner" else value)
+
+    with caplog.at_level(logging.WARNING):
+        Bench(replace(CONFIG, settings={"owner": "us"}), prepare)
+    assert caplog.messages == ["the Fake S5 took 'us' for its setting 'owner' as 'NOBODY'"]
+
+
+def test_a_camera_without_zoom():
+    values = {f"d{i:03}": "" for i in range(100)} | {"eoszoom": "", "capture": 0.0}
+    error = opening_fails(values=values)
+    assert error.type is ConfigError
+    assert str(error.value).startswith(
+        "hardware.zoom: the Fake S5 has no setting 'zoom'; it cannot be zoomed; its settings are: eoszoom, "
+    )
+    assert str(error.value).endswith(" and 90 more")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"range": (0.0, 100.0, 1.0)},
+            "hardware.zoom.lens: positions 0 to 128 exceed those of the Fake S5's 'zoom', 0",
+        ),
+        (
+            {"range": (3.0, 134.0, 1.0)},
+            "hardware.zoom.lens: positions 0 to 128 exceed those of the Fake S5's 'zoom', 3",
+        ),
+        ({"range": (0.0, 1000.0, 500.0)}, "hardware.zoom.lens: the Fake S5 cannot be sent to positions between 0 and"),
+        ({"readonly": {"zoom"}}, "hardware.zoom.zoom_key: 'zoom' of the Fake S5 can only be read; it cannot be zoomed"),
+        ({"choices": {"zoom": ("wide", "tele")}}, "hardware.zoom.zoom_key: 'zoom' of the Fake S5 is neither a range"),
+    ],
+)
+def test_lenses_that_are_not_as_configured(changes, message):
+    error = opening_fails(**changes)
+    assert error.type is ConfigError
+    assert str(error.value).startswith(message)
+
+
+def test_a_lens_by_choices_is_sent_by_their_own_text():
+    def prepare(camera):
+        camera.choices = {"zoom": ("000", "064", "128", "Digital")}
+        camera.values["zoom"] = "000"
+
+    bench = Bench(prepare=prepare)
+    assert bench.zoom.lens.positions == (0, 64, 128)
+    bench.send(bench.zoom.lens.position_for(21.3 / 0.01794))
+    bench.run(0.1)
+    assert bench.camera.commands("zoom") == ["064"]
+    assert bench.desk.standing
+
+
+def test_frames_of_another_size_say_what_to_write():
+    error = opening_fails(preview_size=(40, 30))
+    assert error.type is ConfigError
+    assert str(error.value) == (
+        "hardware.zoom.size: the viewfinder's frames are 40 x 30, not 32 x 24; "
+        "write size = [40, 30], and pitch_mm for it"
+    )
+
+
+def test_a_viewfinder_without_a_picture():
+    assert str(opening_fails(frozen=b"no jpeg").value) == "the camera at 'usb:' shows no frame of its viewfinder"
+
+
+def test_a_lens_outside_the_table_is_brought_back():
+    """At 134, in the digital zoom; the optical one ends at 128."""
+    bench = Bench(prepare=lambda camera: camera.values.update(zoom=134.0))
+    bench.run(0.5)
+    assert bench.camera.commands("zoom") == [128]
+
+
+def test_opening_tries_once_more_and_then_says_why():
+    bench = Bench(prepare=lambda camera: camera.fail.update(open=[IO]))
+    assert bench.desk.frame is not None
+    error = opening_fails(fail={"open": [CLAIM, ...]})
+    assert error.type is DeviceError
+    assert "gvfs-gphoto2-volume-monitor" in str(error.value)
+    error = opening_fails(fail={"open": [-105, -1]})
+    assert str(error.value) == "the camera at 'usb:' cannot be used: gphoto2 says [-105] what gphoto2 calls it"
+
+
+@pytest.mark.parametrize("call", ["put", "get", "preview"])
+@pytest.mark.parametrize("code", [BUSY, BAD])
+def test_a_camera_that_is_busy_at_first_is_waited_for(call, code):
+    assert Bench(prepare=lambda camera: camera.fail.update({call: [code] * 5})).desk.frame is not None
+
+
+@pytest.mark.parametrize("call", ["put", "get", "preview"])
+@pytest.mark.parametrize("code", [BUSY, IO, TIMEOUT])
+def test_what_fails_while_opening_leaves_no_connection(call, code):
+    camera = []
+    with pytest.raises(DeviceError, match=rf"the camera at 'usb:' cannot be used: gphoto2 says \[{code}\]"):
+        Bench(prepare=lambda each: (camera.append(each), each.fail.update({call: [code, ...]})))
+    assert not camera[0].connected
+
+
+# --- frames
+
+
+def test_frames_are_dated_at_their_arrival_less_the_latency():
+    bench = Bench()
+    bench.run(2.0)
+    times = [frame.t for frame in bench.frames]
+    assert len(times) == pytest.approx(2.0 / PERIOD, abs=2)
+    # A picture appears at a multiple of the period, is asked for within a repeat's pause and two calls after that, and
+    # has been on its way for latency_s.
+    late = [(t + 0.1) % PERIOD for t in times[1:]]
+    assert max(late) < 0.005 + 2 * CALL_S + 1e-6
+    assert not bench.frames[-1].image.flags.writeable
+    assert len({frame.image.tobytes() for frame in bench.frames}) == len(bench.frames)
+
+
+def test_no_more_frames_are_fetched_than_the_rate_allows():
+    bench = Bench(replace(CONFIG, rate_hz=4.0))
+    bench.camera.log.clear()
+    bench.run(5.0)
+    assert len([entry for entry in bench.camera.log if entry == ("preview",)]) == pytest.approx(20, abs=1)
+
+
+def test_a_frozen_viewfinder_gives_no_new_frames_and_is_not_hammered():
+    bench = Bench()
+    bench.camera.frozen = jpeg(SIZE, 77)
+    bench.run(5.0)
+    count = len(bench.frames)
+    bench.camera.log.clear()
+    bench.run(10.0)
+    assert len(bench.frames) == count
+    assert len(bench.camera.log) == pytest.approx(10.0 * CONFIG.rate_hz, rel=0.1)
+    bench.camera.frozen = None
+    bench.run(0.2)
+    assert len(bench.frames) > count
+
+
+@pytest.mark.parametrize(
+    ("data", "trouble"),
+    [
+        (jpeg(SIZE, 50)[:-40], "its frames are broken"),
+        (jpeg(SIZE, 50)[2:], "its frames are broken"),
+        (b"", "its frames are broken"),
+        (b"\xff\xd8 nothing \xff\xd9", "its frames are broken"),
+        (jpeg((40, 30), 50), "its frames are 40 x 30 now"),
+    ],
+)
+def test_broken_frames_are_dropped_and_counted(data, trouble):
+    bench = Bench()
+    bench.run(0.5)
+    newest = bench.desk.frame
+    bench.camera.frozen = data
+    bench.run(0.1)
+    assert bench.desk.frame is newest
+    assert bench.desk.dropped >= 1
+    assert bench.desk.trouble == trouble
+    bench.camera.frozen = None
+    bench.run(0.3)
+    assert bench.desk.frame is not newest
+    assert bench.desk.trouble == ""
+
+
+def test_zeros_after_a_jpeg_are_padding():
+    bench = Bench()
+    bench.camera.frozen = jpeg(SIZE, 50) + bytes(30)
+    bench.run(0.2)
+    assert bench.desk.dropped == 0
+    assert np.abs(bench.desk.frame.image - 50.0).max() <= GREY
+
+
+# --- the lens
+
+
+def test_the_lens_is_sent_at_once_read_back_and_moves_as_estimated():
+    """From 0 to 60 at 60 a second after 50 ms."""
+    bench = Bench()
+    bench.run(0.5)
+    bench.send(60)
+    start = bench.clock.t
+    bench.run(0.01)
+    assert bench.camera.commands("zoom") == [60.0]
+    assert bench.desk.standing
+    assert bench.desk.motion.arrives == pytest.approx(start + 0.05 + 1.0)
+    assert bench.desk.motion.position(start + 0.55) == pytest.approx(30.0)
+
+
+def test_the_latest_command_wins():
+    bench = Bench()
+    for position in (10, 20, 30):
+        bench.send(position)
+    bench.run(0.5)
+    assert bench.camera.commands("zoom") == [30.0]
+
+
+@pytest.mark.parametrize("code", [BUSY, BAD])
+def test_a_busy_camera_gets_its_command_again_while_frames_go_on(code):
+    bench = Bench()
+    bench.camera.fail["put"] = [code] * 10
+    bench.send(30)
+    bench.run(0.5)
+    assert not bench.desk.standing
+    assert len(bench.frames) >= 3
+    bench.run(1.5)
+    assert bench.desk.standing
+    assert bench.camera.values["zoom"] == 30.0
+
+
+def test_a_command_that_is_refused_for_long_is_given_up_until_the_next():
+    bench = Bench()
+    bench.camera.fail["put"] = [BAD, ...]
+    bench.send(30)
+    bench.run(5.0)
+    assert bench.desk.lens_trouble == (
+        "the zoom camera's lens did not go to position 30: gphoto2 says [-2] what gphoto2 calls it"
+    )
+    frames = len(bench.frames)
+    bench.camera.fail.clear()
+    bench.send(31)
+    bench.run(0.5)
+    assert (bench.desk.standing, bench.camera.values["zoom"]) == (True, 31.0)
+    assert len(bench.frames) > frames
+
+
+def test_a_lens_that_ignores_a_command_is_sent_again():
+    bench = Bench()
+    bench.camera.ignore = 1
+    bench.send(12)
+    bench.run(1.0)
+    assert not bench.desk.standing
+    bench.run(1.0)
+    assert bench.desk.standing
+    assert bench.camera.commands("zoom") == [12.0, 12.0]
+
+
+def test_a_lens_that_never_goes_is_told():
+    bench = Bench()
+    bench.camera.ignore = 99
+    bench.send(12)
+    bench.run(5.0)
+    assert bench.desk.lens_trouble == "the zoom camera's lens did not go to position 12: its setting 'zoom' reads 0"
+    assert len(bench.camera.commands("zoom")) == 2
+
+
+def test_a_setting_that_follows_the_lens_is_waited_for():
+    """Some cameras show where the lens is, not where it was sent."""
+    bench = Bench()
+    get = bench.camera.get
+
+    def following(name):
+        setting = get(name)
+        return replace(setting, value=float(round(bench.desk.motion.position(bench.clock.t))))
+
+    bench.camera.get = following
+    bench.send(60)
+    bench.run(0.9)
+    assert not bench.desk.standing
+    bench.run(0.5)
+    assert bench.desk.standing
+    assert bench.camera.commands("zoom") == [60.0]
+
+
+# --- lost and found
+
+
+@pytest.mark.parametrize("call", ["preview", "get", "put"])
+@pytest.mark.parametrize("code", [IO, TIMEOUT, -52])
+def test_a_camera_that_is_lost_is_found_again_and_its_lens_sent_back(call, code):
+    bench = Bench()
+    bench.send(40)
+    bench.run(1.0)
+    bench.camera.fail[call] = [code]
+    bench.send(50)
+    bench.run(0.05)
+    bench.camera.values.update(capture=0.0, zoom=0.0)  # it was switched off, too
+    bench.run(2.0)
+    assert bench.camera.values["capture"] == 1
+    assert bench.camera.values["zoom"] == 50.0
+    assert bench.desk.standing
+    assert bench.desk.trouble == ""
+    assert bench.clock.t - bench.desk.arrived < 2 * PERIOD
+    assert bench.camera.threads == {threading.get_ident()}
+
+
+def test_a_lens_that_is_where_it_was_is_not_sent_again():
+    bench = Bench()
+    bench.send(40)
+    bench.run(1.0)
+    bench.camera.fail["preview"] = [IO]
+    bench.run(2.0)
+    assert bench.camera.commands("zoom") == [40.0]
+    assert bench.desk.standing
+
+
+def test_a_camera_that_stays_away_is_gone_within_seconds():
+    bench = Bench()
+    bench.camera.fail = {"preview": [IO], "open": [IO, ...]}
+    bench.camera.take = {"open": 2.5}
+    bench.run(0.5)
+    assert "looking for the camera again" in bench.desk.trouble
+    bench.run(10.0)
+    assert bench.desk.gone.startswith("the zoom camera at 'usb:' is gone: gphoto2 says [-7] what gphoto2 calls it")
+    assert "\n" not in bench.desk.gone
+    assert bench.work.work() == math.inf
+
+
+def test_a_camera_that_comes_back_as_another_is_gone():
+    bench = Bench()
+    bench.camera.fail["preview"] = [IO]
+    bench.camera.preview_size = (40, 30)
+    bench.run(2.0)
+    assert "hardware.zoom.size" in bench.desk.gone
+
+
+def test_a_viewfinder_that_is_busy_for_long_is_opened_again():
+    bench = Bench()
+    bench.camera.fail["preview"] = [BUSY] * 40
+    bench.run(10.0)
+    assert bench.camera.log.count(("open",)) == 2
+    assert bench.desk.trouble == ""
+
+
+def test_closing_ends_shooting_unless_the_camera_is_lost():
+    bench = Bench()
+    bench.work.close()
+    assert bench.camera.commands("capture") == [1, 0]
+    assert not bench.camera.connected
+    bench = Bench()
+    bench.camera.fail["put"] = [IO]
+    bench.work.close()
+    assert not bench.camera.connected
+
+
+# --- what users see: on the camera's own thread
+
+
+class Rig:
+    """The driver in real time, on a camera that answers at once."""
+
+    def __init__(self, config=CONFIG, prepare=lambda camera: None):
+        self.link = Camera(MonotonicClock())
+        prepare(self.link)
+        self.camera = GphotoCamera(config, self.link.clock, self.link)
+
+
+@contextlib.contextmanager
+def opened(config=CONFIG, prepare=lambda camera: None):
+    rig = Rig(config, prepare)
+    try:
+        yield rig
+    finally:
+        rig.camera.close()
+        assert "zoom camera" not in [thread.name for thread in threading.enumerate()]
+        assert not rig.link.connected
+
+
+def wait_for(condition):
+    """Wait for what happens at once, without a notice."""
+    clock = MonotonicClock()
+    deadline = clock.now() + DEADLINE_S
+    while not condition():
+        assert clock.now() < deadline
+        clock.sleep_until(clock.now() + 0.002)
+
+
+def test_a_camera_in_use():
+    with opened() as rig:
+        camera, clock = rig.camera, rig.link.clock
+        assert (camera.size, camera.still_size) == (SIZE, STILL_SIZE)
+        assert camera.focal_range == pytest.approx((6.0 / 0.01794, 72.0 / 0.01794))
+        first = camera.read(timeout=DEADLINE_S)
+        second = camera.read(first.t, DEADLINE_S)
+        assert second.t > first.t
+        assert camera.zoom(21.0 / 0.01794) == pytest.approx(camera.zoom(21.3 / 0.01794), rel=0.05)
+        assert camera.state().moving
+        assert camera.zoom(6.0 / 0.01794) == pytest.approx(6.0 / 0.01794)
+        wait_for(lambda: not camera.state().moving)
+        assert camera.state().focal_px == pytest.approx(6.0 / 0.01794)
+        before = clock.now()
+        still = camera.capture()
+        assert still.image.shape == (48, 64, 3)
+        assert before <= still.t <= clock.now()
+        assert np.abs(still.image - 200.0).max() <= GREY
+        assert len(rig.link.threads) == 1
+        assert threading.get_ident() not in rig.link.threads
+    assert rig.link.commands("capture") == [1, 0]
+
+
+def test_reading_says_why_no_frame_comes():
+    with opened() as rig:
+        newest = rig.camera.read(timeout=DEADLINE_S)
+        with pytest.raises(StaleFrameError, match=r"no frame newer than \d+\.\d{3} s from the zoom camera within 0 s"):
+            rig.camera.read(newest.t + 1000.0, 0.0)
+        rig.link.fail["preview"] = [BUSY, ...]
+        wait_for(lambda: rig.camera._desk.trouble)
+        with pytest.raises(StaleFrameError, match=r"within 0\.01 s: gphoto2 says \[-110\]"):
+            rig.camera.read(newest.t + 1000.0, 0.01)
+
+
+def test_an_old_frame_is_not_the_newest():
+    """While the viewfinder is blind the last frame grows old; half a second later it is none."""
+    with opened() as rig:
+        rig.camera.read(timeout=DEADLINE_S)
+        rig.link.fail["preview"] = [BUSY, ...]
+        clock = rig.link.clock
+        wait_for(lambda: clock.now() > rig.camera._desk.arrived + 0.5)
+        with pytest.raises(StaleFrameError, match="no frame from the zoom camera within 0 s"):
+            rig.camera.read(timeout=0.0)
+        rig.link.fail.clear()
+        assert rig.camera.read(timeout=DEADLINE_S).t > clock.now() - DEADLINE_S
+
+
+@pytest.mark.parametrize("focal_px", [0.0, -1.0, math.nan, math.inf])
+def test_what_is_no_focal_length(focal_px):
+    with opened() as rig, pytest.raises(DeviceError, match="the lens cannot go to a focal length of"):
+        rig.camera.zoom(focal_px)
+
+
+def test_a_lens_in_trouble_is_told_until_it_is_sent_again(monkeypatch):
+    monkeypatch.setattr("cotarget.hardware.gphoto_duties.VERIFY_S", 0.0)
+    with opened(replace(CONFIG, lens_speed=1e4)) as rig:
+        rig.link.ignore = 2
+        rig.camera.zoom(1000.0)
+
+        def troubled():
+            try:
+                rig.camera.state()
+            except DeviceError as error:
+                return "did not go to position" in str(error)
+            return False
+
+        wait_for(troubled)
+        rig.camera.read(timeout=DEADLINE_S)
+        rig.camera.zoom(1000.0)
+        wait_for(lambda: not rig.camera.state().moving)
+        assert len(rig.link.commands("zoom")) == 3
+
+
+def test_stills_of_another_size_say_what_to_write():
+    with opened(prepare=lambda camera: setattr(camera, "still_size", (80, 60))) as rig:
+        with pytest.raises(ConfigError) as error:
+            rig.camera.capture()
+        assert str(error.value) == (
+            "hardware.zoom.still_size: stills are 80 x 60, not 64 x 48; write still_size = [80, 60]"
+        )
+        rig.camera.read(timeout=DEADLINE_S)
+
+
+def test_stills_that_cannot_be_read_or_taken():
+    with opened() as rig:
+        rig.link.still = b"raw"
+        with pytest.raises(
+            DeviceError, match=r"still 'capt0000\.jpg' is no JPEG that can be read; set it to take JPEG"
+        ):
+            rig.camera.capture()
+        rig.link.still = None
+        rig.link.fail["shoot"] = [BUSY, BAD, None]
+        assert rig.camera.capture().image.shape == (48, 64, 3)
+        rig.link.fail["shoot"] = [IO]
+        with pytest.raises(DeviceError, match=r"the zoom camera was lost while it took a still: gphoto2 says \[-7\]"):
+            rig.camera.capture()
+        assert rig.camera.capture().image.shape == (48, 64, 3)  # it was found again
+
+
+def test_a_still_waits_its_turn_and_its_limit(monkeypatch):
+    monkeypatch.setattr("cotarget.hardware.canon.STILL_LIMIT_S", 0.01)
+    with opened() as rig:
+        rig.link.fail["shoot"] = [BUSY, ...]
+        with pytest.raises(DeviceError, match=r"the zoom camera took no still within 0\.01 s"):
+            rig.camera.capture()
+        rig.link.fail.clear()
+        monkeypatch.setattr("cotarget.hardware.canon.STILL_LIMIT_S", DEADLINE_S)
+        assert rig.camera.capture().image.shape == (48, 64, 3)
+
+
+def test_a_still_that_is_always_refused(monkeypatch):
+    monkeypatch.setattr("cotarget.hardware.gphoto_duties.BUSY_PATIENCE_S", 0.0)
+    with opened() as rig:
+        rig.link.fail["shoot"] = [-1, ...]
+        with pytest.raises(DeviceError, match=r"the zoom camera takes no still: gphoto2 says \[-1\]"):
+            rig.camera.capture()
+
+
+def test_reading_waits_while_a_still_is_taken():
+    release = threading.Event()
+
+    def prepare(camera):
+        shoot = camera.shoot
+
+        def slow():
+            shooting.set()
+            assert release.wait(DEADLINE_S)
+            return shoot()
+
+        camera.shoot = slow
+
+    shooting = threading.Event()
+    with opened(prepare=prepare) as rig:
+        stills = []
+        taker = threading.Thread(target=lambda: stills.append(rig.camera.capture()), daemon=True)
+        taker.start()
+        assert shooting.wait(DEADLINE_S)
+        now = rig.link.clock.now()
+        with pytest.raises(StaleFrameError):
+            rig.camera.read(now, 0.02)
+        assert rig.camera.zoom(1000.0) > 0  # returns at once all the same
+        release.set()
+        assert rig.camera.read(now - CONFIG.latency_s, DEADLINE_S).t > now - CONFIG.latency_s
+        taker.join(DEADLINE_S)
+        assert len(stills) == 1
+
+
+def test_a_gone_camera_says_so_at_every_call(monkeypatch):
+    monkeypatch.setattr("cotarget.hardware.gphoto_work.RECONNECT_S", 0.0)
+    with opened() as rig:
+        rig.link.fail = {"open": [IO, ...], "preview": [IO, ...]}
+        wait_for(lambda: rig.camera._desk.gone)
+        calls = (rig.camera.read, rig.camera.state, rig.camera.capture, lambda: rig.camera.zoom(1000.0))
+        for call in calls:
+            with pytest.raises(DeviceError, match="the zoom camera at 'usb:' is gone: gphoto2 says"):
+                call()
+
+
+def test_waiting_ends_when_the_camera_is_gone_or_closed(monkeypatch):
+    monkeypatch.setattr("cotarget.hardware.gphoto_work.RECONNECT_S", 0.0)
+    with opened() as rig:
+        rig.link.fail = {"open": [IO, ...], "shoot": [BUSY, ...], "preview": [BUSY, BUSY, IO]}
+        with pytest.raises(DeviceError, match="is gone"):
+            rig.camera.capture()
+    with opened() as rig:
+        errors = []
+
+        def read():
+            try:
+                rig.camera.read(math.inf, DEADLINE_S)
+            except DeviceError as error:
+                errors.append(str(error))
+
+        reader = threading.Thread(target=read, daemon=True)
+        reader.start()
+        rig.camera.close()
+        rig.camera.close()
+        reader.join(DEADLINE_S)
+        assert errors == ["the zoom camera is closed"]
+
+
+def test_opening_fails_on_the_callers_thread():
+    before = threading.active_count()
+    with pytest.raises(ConfigError, match=r"hardware\.zoom\.size"):
+        Rig(prepare=lambda camera: setattr(camera, "preview_size", (40, 30)))
+    with pytest.raises(DeviceError, match=r"cannot be used: gphoto2 says \[-53\]"):
+        Rig(prepare=lambda camera: camera.fail.update(open=[CLAIM, ...]))
+    assert threading.active_count() == before
+
+
+def test_a_mistake_in_the_driver_is_no_silence(caplog):
+    def wrong():
+        raise RuntimeError("a mistake")
+
+    with opened() as rig:
+        rig.link.preview = wrong
+        wait_for(lambda: rig.camera._desk.gone)
+        with pytest.raises(DeviceError, match=r"the driver of the zoom camera failed: RuntimeError\('a mistake'\)"):
+            rig.camera.read()
+    assert "the driver of the zoom camera failed" in caplog.text
+
+
+# --- gphoto2 itself
+
+
+@pytest.mark.parametrize(
+    ("port", "full"),
+    [
+        ("usb:", "usb:"),
+        ("usb:001,005", "usb:001,005"),
+        ("ptpip:127.0.0.1", "ptpip:127.0.0.1:15740:15740"),
+        ("ptpip:127.0.0.1:4000", "ptpip:127.0.0.1:4000:4000"),
+        ("ptpip:127.0.0.1:4000:4001", "ptpip:127.0.0.1:4000:4001"),
+        ("ptpip:localhost:4000:4000", "ptpip:127.0.0.1:4000:4000"),
+    ],
+)
+def test_ports_are_told_in_full(port, full):
+    assert full_port(port) == full
+
+
+@pytest.mark.parametrize("port", ["", "usb", "usb:5", "/dev/video0", "ptpip:", "ptpip:a:b", "serial:/dev/ttyS0"])
+def test_other_ports_are_refused(port):
+    with pytest.raises(ConfigError, match=r"is not like usb:, usb:001,005 or ptpip:host:port:port"):
+        GphotoCamera(replace(CONFIG, port=port), MonotonicClock())
+
+
+def test_ports_that_cannot_be():
+    with pytest.raises(ConfigError, match="above 65535"):
+        full_port("ptpip:127.0.0.1:70000")
+    with pytest.raises(ConfigError, match=r"hardware\.zoom\.port: there is no host 'no\.host\.invalid'"):
+        full_port("ptpip:no.host.invalid:4000")
+
+
+def test_without_gphoto2_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gphoto2", None)
+    for call in (probe, GphotoLink("usb:", "").open):
+        with pytest.raises(ConfigError, match=r"gphoto2 is not installed; pip install 'cotarget\[hardware\]'"):
+            call()
