@@ -144,6 +144,9 @@ class Board(Protocol):
     def present(self, T_fixed_board: RigidTransform | None) -> None:
         """Wish for the board at a pose (its first corner's frame), or for no board; nobody is told the result."""
 
+    def swing(self, T_fixed_board: RigidTransform) -> None:
+        """Wish for the board to be swung to and fro along its x axis about a pose, until the next wish."""
+
 
 class Rig(Protocol):
     """The whole: two cameras, a head, a clock and a board. A context manager that halts, then closes."""

@@ -128,6 +128,9 @@ class ProxyBoard:
     def present(self, T_fixed_board) -> None:
         return self._line.ask("board", "present", T_fixed_board)
 
+    def swing(self, T_fixed_board) -> None:
+        return self._line.ask("board", "swing", T_fixed_board)
+
 
 class ProxyRig:
     def __init__(self, line: Line) -> None:

@@ -202,6 +202,10 @@ class LiveWorld:
         """Put the board there; None takes it away."""
         self._world.rig.board.present(T_fixed_board)
 
+    def swing(self, T_fixed_board: RigidTransform) -> None:
+        """Swing the board about that pose."""
+        self._world.rig.board.swing(T_fixed_board)
+
     def head_truth(self) -> tuple[float, float]:
         """Pan and tilt of the platform now [rad], whatever the unit says."""
         return self._world.head_drive.angles_at(self.clock.now())

@@ -1,8 +1,9 @@
 """Who holds the calibration board before real cameras: a person who is told where, or a program at a socket.
 
 The program's protocol is one JSON object a line: `{"present": {"translation": [x, y, z], "rotvec_deg": [rx, ry, rz]}}`
-asks for the board at T_fixed_board [m, degrees], `{"present": null}` for no board; the answer `{"ok": true}` comes when
-it is there and still, `{"error": "..."}` when it cannot be.
+asks for the board at T_fixed_board [m, degrees], `{"present": null}` for no board, `{"swing": {...}}` for one that
+swings along its x axis until the next wish. The answer `{"ok": true}` comes when it is so, `{"error": "..."}` when it
+cannot be.
 """
 
 import json
@@ -50,11 +51,17 @@ class PersonBoard:
 
     def present(self, T_fixed_board: RigidTransform | None) -> None:
         """Say where to hold the board, or that it is not needed any more."""
-        text = "take the board away" if T_fixed_board is None else in_words(T_fixed_board)
-        print(f"\n{text}", file=self._out, flush=True)
+        self._say("take the board away" if T_fixed_board is None else in_words(T_fixed_board))
+
+    def swing(self, T_fixed_board: RigidTransform) -> None:
+        """Say where to swing the board."""
+        self._say(f"{in_words(T_fixed_board)}; swing it left and right by 15 cm, to and fro in two seconds")
 
     def close(self) -> None:
         """There is nothing to let go."""
+
+    def _say(self, text: str) -> None:
+        print(f"\n{text}", file=self._out, flush=True)
 
 
 class SocketBoard:
@@ -83,9 +90,25 @@ class SocketBoard:
         Raises:
             DeviceError: it cannot be, or the program is gone.
         """
+        self._ask("present", T_fixed_board)
+
+    def swing(self, T_fixed_board: RigidTransform) -> None:
+        """Ask for the board to swing.
+
+        Raises:
+            DeviceError: it cannot, or the program is gone.
+        """
+        self._ask("swing", T_fixed_board)
+
+    def close(self) -> None:
+        """Hang up."""
+        self._lines.close()
+        self._socket.close()
+
+    def _ask(self, what: str, T_fixed_board: RigidTransform | None) -> None:
         wish = None if T_fixed_board is None else pose_dict(T_fixed_board)
         try:
-            self._socket.sendall(json.dumps({"present": wish}).encode() + b"\n")
+            self._socket.sendall(json.dumps({what: wish}).encode() + b"\n")
             line = self._lines.readline(LONGEST_ANSWER)
         except OSError as error:
             raise DeviceError(f"{self._name}: the board's holder does not answer: {error}") from None
@@ -97,11 +120,6 @@ class SocketBoard:
         if not (isinstance(answer, dict) and answer.get("ok") is True):
             reason = answer.get("error", "no reason given") if isinstance(answer, dict) else answer
             raise DeviceError(f"{self._name}: the board cannot be held there: {reason}")
-
-    def close(self) -> None:
-        """Hang up."""
-        self._lines.close()
-        self._socket.close()
 
 
 def in_words(T_fixed_board: RigidTransform) -> str:

@@ -204,16 +204,24 @@ class SimPanTilt:
 
 
 class SimBoard:
-    """A board that appears wherever it is wished."""
+    """A board that appears wherever it is wished.
+
+    Args:
+        place: puts the board somewhere from now on, given whether it swings there.
+    """
 
     patience = 0.0
 
-    def __init__(self, place: Callable[[RigidTransform | None], None]) -> None:
+    def __init__(self, place: Callable[[RigidTransform | None, bool], None]) -> None:
         self._place = place
 
     def present(self, T_fixed_board: RigidTransform | None) -> None:
         """Put the board there, in the true fixed camera's frame, from now on; None takes it away."""
-        self._place(T_fixed_board)
+        self._place(T_fixed_board, False)
+
+    def swing(self, T_fixed_board: RigidTransform) -> None:
+        """Swing the board about that pose from now on."""
+        self._place(T_fixed_board, True)
 
 
 class SimRig:

@@ -45,6 +45,7 @@ FIXED_NOISE, ZOOM_NOISE, TARGETS = 1, 2, 3
 SIZED_FOCALS = 17
 # A blurred image is the mean of this many renders spread over the exposure.
 BLUR_RENDERS = 4
+SWING, SWING_PERIOD = 0.15, 1.7  # of a board that swings, to each side [m], and there and back [s]
 
 
 class SimWorld:
@@ -72,7 +73,7 @@ class SimWorld:
         self._model = build_model(config, tuple(self.targets.values()), self._render_size)
         self._data = mujoco.MjData(self._model)
         self._T_world_fixed = mount_pose(self._model)
-        self._boards: list[tuple[float, RigidTransform | None]] = [(-math.inf, None)]
+        self._boards: list[tuple[float, RigidTransform | None, bool]] = [(-math.inf, None, False)]
         self._renderer = make_renderer(self._model, *self._render_size)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = effects.shadows
         # The lens obeys as late as the head does.
@@ -175,11 +176,14 @@ class SimWorld:
         light = images[0] if len(images) == 1 else np.rint(np.mean(images, axis=0)).astype(np.uint8)
         return self._sensors[name].expose(light, index)
 
-    def _place_board(self, T_fixed_board: RigidTransform | None) -> None:
-        self._boards.append((self._clock.now(), T_fixed_board))
+    def _place_board(self, T_fixed_board: RigidTransform | None, swings: bool) -> None:
+        self._boards.append((self._clock.now(), T_fixed_board, swings))
 
     def _board_at(self, t: float) -> RigidTransform | None:
-        return next(T for since, T in reversed(self._boards) if since <= t)
+        since, T, swings = next(placed for placed in reversed(self._boards) if placed[0] <= t)
+        if T is None or not swings:
+            return T
+        return T * RigidTransform.from_translation([SWING * math.sin(2 * math.pi * (t - since) / SWING_PERIOD), 0, 0])
 
     def _set_state(self, t: float) -> "mujoco.MjData":
         """Everything's pose at time t."""

@@ -1,0 +1,245 @@
+"""Measures how late cameras and head are, by what moves: at bring-up, and in tests against a known truth.
+
+- The zoom camera against the head's reports: the head is wiggled, and its angle and the picture's shift are the same
+  motion, the one later than the other.
+- The fixed camera against the zoom camera: a board swings before both.
+- The head against its commands: from a command to where the acceleration that follows began.
+
+Two records of one motion are matched by the delay between them at which one is best told by the other times a factor,
+plus a constant.
+"""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from cotarget.calibration import Calibration
+from cotarget.calibration.boards import board_points, find_corners
+from cotarget.config import BoardConfig
+from cotarget.errors import CalibrationError, StaleFrameError
+from cotarget.geometry import Array, RigidTransform, pose
+from cotarget.loop import reach_of
+from cotarget.rig import Camera, Frame, Image, PanTiltState, Rig
+from cotarget.targeting import aim
+
+WIGGLE = np.radians(1.5)  # of the head to each side: some 18 px of a usual wide lens [rad]
+# Between its turns [s]: no multiple of usual frame periods, so that frames fall on all parts of the motion.
+TURNS_EVERY = (0.53, 0.47, 0.61)
+WIGGLE_SECONDS, SWING_SECONDS = 8.0, 10.0
+LOOK = 0.01  # how long to wait for a frame before looking at the head again [s]
+LONGEST_DELAY = 0.6  # that is looked for, either way [s]
+COARSE = 0.01  # steps of the delays tried first [s]
+FEWEST = 20  # samples of a motion
+AGREEMENT = 0.9  # of both records, as their correlation; less is no measurement
+EARLY = 0.4  # of a turn's way, in which the head still accelerates
+BOARD_SHARE, BOARD_TURNED = 0.35, 15.0  # of the wide view's width that a board fills, and how it is turned [degrees]
+
+
+@dataclass(frozen=True)
+class Delay:
+    """By how much one record is later than another [s], and how well they agree (correlation, at most 1)."""
+
+    seconds: float
+    agreement: float
+
+
+@dataclass(frozen=True)
+class HeadLatency:
+    """What a wiggle of the head tells.
+
+    Attributes:
+        zoom: by how much the zoom camera's frames are dated too late; to be added to its latency.
+        command: from a command to the start of motion [s].
+        frames: of the zoom camera.
+    """
+
+    zoom: Delay
+    command: float
+    frames: int
+
+
+def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
+    """Wiggle the head and watch it through the zoom camera.
+
+    Raises:
+        CalibrationError: the picture does not move with the head: it shows nothing, or something that moves by itself.
+        StaleFrameError: frames stopped coming.
+    """
+    rig.zoom.zoom(rig.zoom.focal_range[0])
+    home = rig.head.state()
+    low, high = rig.head.limits.pan
+    way = WIGGLE if home.pan + WIGGLE <= high else -WIGGLE
+    frames: list[Frame] = []
+    states: list[PanTiltState] = []
+    starts: list[tuple[float, float, float]] = []
+    side = itertools.cycle((1.0, 0.0))
+    pauses = itertools.cycle(TURNS_EVERY)
+    end = rig.clock.now() + seconds
+    while rig.clock.now() < end:
+        goal = min(max(home.pan + way * next(side), low), high)
+        before = rig.head.state().pan
+        t = rig.clock.now()
+        goal, _ = rig.head.move(goal, home.tilt)
+        starts.append((t, before, goal))
+        for frame in _frames(rig, rig.zoom, t + next(pauses), frames[-1].t if frames else None, states):
+            frames.append(frame)
+    rig.head.move(home.pan, home.tilt, wait=True)
+    if len(frames) < FEWEST:
+        raise StaleFrameError(f"the zoom camera gave {len(frames)} frames in {seconds:g} s; {FEWEST} are needed")
+    shifts = picture_shifts([frame.image for frame in frames])
+    t, pan = np.array([(state.t, state.pan) for state in states]).T
+    zoom = delay_between(np.array([frame.t for frame in frames]), shifts, t, pan)
+    if zoom.agreement < AGREEMENT:
+        raise CalibrationError(
+            f"the zoom camera's picture does not move with the head (correlation {zoom.agreement:.2f}); point it at "
+            "something with structure that stands still"
+        )
+    return HeadLatency(zoom, command_delay(starts, states, rig.head.limits.acceleration), len(frames))
+
+
+def measure_fixed(
+    rig: Rig, calibration: Calibration, board: BoardConfig, seconds: float = SWING_SECONDS
+) -> tuple[Delay, int]:
+    """Watch a swinging board with both cameras.
+
+    Args:
+        rig: whose zoom camera is dated right already.
+        calibration: of it, to look at the board with both cameras.
+        board: that swings.
+        seconds: how long to watch.
+
+    Returns:
+        By how much the fixed camera's frames are dated too late, to be added to its latency; and how many frames of it
+        showed the board.
+
+    Raises:
+        CalibrationError: one of the cameras does not see the board often enough, or the records do not agree.
+        UnreachableError: the head cannot look there.
+    """
+    calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
+    T_fixed_board = in_both_views(calibration, board)
+    middle = T_fixed_board.apply(board_points(board).mean(axis=0))
+    goal = aim(calibration, middle, reach_of(rig))
+    rig.zoom.zoom(rig.zoom.focal_range[0])
+    rig.head.move(goal.pan, goal.tilt, wait=True)
+    rig.board.swing(T_fixed_board)
+    seen: dict[str, list[tuple[float, float]]] = {"fixed": [], "zoom": []}
+    begin = rig.clock.now()
+    newest: dict[str, float] = {"fixed": begin, "zoom": begin}
+    while rig.clock.now() < begin + seconds + rig.board.patience / 2:
+        for name, camera in (("fixed", rig.fixed), ("zoom", rig.zoom)):
+            for frame in _frames(rig, camera, rig.clock.now() + LOOK, newest[name]):
+                newest[name] = frame.t
+                corners = find_corners(frame.image, board, thorough=False)
+                if corners is not None:
+                    seen[name].append((frame.t, float(corners[:, 0].mean())))
+    rig.board.present(None)
+    for name, found in seen.items():
+        if len(found) < FEWEST:
+            raise CalibrationError(
+                f"the {name} camera saw the swinging board in {len(found)} frames; {FEWEST} are needed: hold it where "
+                "both cameras see all of it"
+            )
+    (t_fixed, u_fixed), (t_zoom, u_zoom) = (np.array(found).T for found in seen.values())
+    delay = delay_between(t_fixed, u_fixed, t_zoom, u_zoom)
+    if delay.agreement < AGREEMENT:
+        raise CalibrationError(
+            f"the cameras do not see the board swing alike (correlation {delay.agreement:.2f}); swing it left and right"
+        )
+    return delay, len(t_fixed)
+
+
+def delay_between(t: Array, values: Array, t_other: Array, other: Array) -> Delay:
+    """By how much a record of a motion is dated later than another one of it.
+
+    Args:
+        t: times of the record [s], (n,).
+        values: the motion there, in any unit, (n,).
+        t_other: times of the other record, increasing [s], (m,).
+        other: the same motion there, times any factor plus any constant, (m,).
+
+    Returns:
+        The delay d for which values(t) is best told by other(t - d); no agreement where nothing moves.
+    """
+    if np.ptp(values) == 0 or np.ptp(other) == 0:
+        return Delay(0.0, 0.0)
+
+    def disagreement(delay: float) -> float:
+        inside = (t - delay >= t_other[0]) & (t - delay <= t_other[-1])
+        if inside.sum() < FEWEST:
+            return 1.0
+        told = np.interp(t[inside] - delay, t_other, other)
+        if np.ptp(told) == 0 or np.ptp(values[inside]) == 0:
+            return 1.0
+        return 1.0 - float(np.corrcoef(values[inside], told)[0, 1] ** 2)
+
+    tried = np.arange(-LONGEST_DELAY, LONGEST_DELAY + COARSE / 2, COARSE)
+    best = float(tried[np.argmin([disagreement(delay) for delay in tried])])
+    found = minimize_scalar(disagreement, bounds=(best - COARSE, best + COARSE), method="bounded")
+    return Delay(float(found.x), float(np.sqrt(1.0 - found.fun)))
+
+
+def picture_shifts(images: Sequence[Image]) -> Array:
+    """How far each picture is shifted to the side against the first one [px], (n,), by phase correlation."""
+    greys = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32) for image in images]
+    window = cv2.createHanningWindow(greys[0].shape[::-1], cv2.CV_32F)
+    return np.array([cv2.phaseCorrelate(greys[0], grey, window)[0][0] for grey in greys])
+
+
+def command_delay(
+    starts: Sequence[tuple[float, float, float]], states: Sequence[PanTiltState], acceleration: float
+) -> float:
+    """From a command to where the motion that follows began, the median over all commands [s].
+
+    An axis that begins at t0 has gone acceleration / 2 (t - t0)^2 at t, as long as it accelerates: each report in the
+    first part of the way tells t0.
+
+    Args:
+        starts: of each command the time [s], and from where to where the axis is sent [rad].
+        states: the head's reports.
+        acceleration: of the axis [rad/s^2].
+
+    Returns:
+        nan where no report fell into the early part of any turn.
+    """
+    times = np.array([state.t for state in states])
+    pans = np.array([state.pan for state in states])
+    found = []
+    for (t, before, goal), (until, *_) in zip(starts, [*starts[1:], (np.inf, 0.0, 0.0)], strict=True):
+        gone = np.abs(pans - before)
+        early = (times > t) & (times < until) & (gone > 0) & (gone < EARLY * abs(goal - before))
+        began = times[early] - np.sqrt(2 * gone[early] / acceleration)
+        if early.any():
+            found.append(float(np.median(began)) - t)
+    return float(np.median(found)) if found else np.nan
+
+
+def in_both_views(calibration: Calibration, board: BoardConfig) -> RigidTransform:
+    """A pose of the board ahead of the fixed camera, of a good size in its view, T_fixed_board."""
+    points = board_points(board)
+    width = float(np.ptp(points[:, 0]))
+    depth = calibration.fixed.focal_px[0] * width / (BOARD_SHARE * calibration.fixed.size[0])
+    ray = calibration.fixed.ray(calibration.fixed.image_center_px)
+    turned = pose([0.0, 0.0, 0.0], [0.0, BOARD_TURNED, 0.0])
+    return RigidTransform.from_translation(ray * depth - turned.apply(points.mean(axis=0))) * turned
+
+
+def _frames(
+    rig: Rig, camera: Camera, until: float, newer_than: float | None, states: list[PanTiltState] | None = None
+) -> Iterator[Frame]:
+    """Frames of a camera as they come until a time, the head looked at in between where its states are kept."""
+    while rig.clock.now() < until:
+        if states is not None:
+            state = rig.head.state()
+            if not states or state.t > states[-1].t:
+                states.append(state)
+        try:
+            frame = camera.read(newer_than=newer_than, timeout=LOOK)
+        except StaleFrameError:
+            continue
+        newer_than = frame.t
+        yield frame
