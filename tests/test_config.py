@@ -1,11 +1,12 @@
 """rig.toml: defaults, every section, and one clear line for each mistake."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cotarget.config import SimEffects, load_config, parse_config
+from cotarget.config import SafetyConfig, SimEffects, load_config, parse_config
 from cotarget.errors import ConfigError
 
 OPTICS = "[sim.effects]\noptics = true\n[sim.zoom]\n"
@@ -90,6 +91,17 @@ def test_offsets_and_targets_are_taken(tmp_path):
             "targets.bird.dimension: 'depth' is not one of: height, width, wingspan",
         ),
         ("[board]\ncorners = [2, 6]", "board.corners: [2, 6] has fewer than 3 corners a side"),
+        ("[safety]\nwatchdog_s = 0", "safety.watchdog_s: 0 is not greater than zero"),
+        ("[safety]\nwatchdog_s = inf", "safety.watchdog_s: inf is not a finite number"),
+        (
+            "[safety]\nwatchdog_s = 0.04",
+            "safety.watchdog_s: 0.04 s would halt the head between any two frames of the fixed camera, of which 25",
+        ),
+        ("[safety]\nstop_file = 1", "safety.stop_file: 1 is not a text"),
+        (
+            "[safety]\nwatchdog = 1",
+            "valid here: max_frame_age_s, pan_deg, speed_deg_s, stop_file, tilt_deg, watchdog_s",
+        ),
         ("[sim.zoom]\npupil = -0.08", "sim.zoom.pupil: -0.08 is not a list"),
         ("[sim.zoom]\nfocal_curve = [0.1, nan]", "sim.zoom.focal_curve[1]: nan is not a finite number"),
         ("[sim.zoom]\ncenter_drift_px = [[1, 2]]", "sim.zoom.center_drift_px: has 1 values where 2 are wanted"),
@@ -115,6 +127,12 @@ def test_each_mistake_is_one_line_that_names_it(tmp_path, text, said):
         load_config(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
+
+
+def test_safety_is_taken():
+    safety = parse_config({"safety": {"watchdog_s": 0.3, "stop_file": "stop"}}).safety
+    assert (safety.watchdog_s, safety.stop_file) == (0.3, Path("stop"))
+    assert (SafetyConfig().watchdog_s, SafetyConfig().stop_file) == (0.5, None)
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -1,5 +1,6 @@
 """The safety layer in front of a head that notes what it is told, and of a camera that may be late."""
 
+import itertools
 import math
 from types import SimpleNamespace
 
@@ -93,6 +94,46 @@ def test_no_command_leaves_the_limits_or_exceeds_the_cap(step, soft):
     assert safe.limits.speed == pytest.approx(cap)
 
 
+# Every pair of these as angles [rad], with each of the speeds: what arithmetic can make of a command, and edges.
+AWKWARD = [
+    *(math.radians(d) for d in range(-200, 201, 8)),
+    *(e + d for limits in (LIMITS.pan, LIMITS.tilt) for e in limits for d in (-STEP, -1e-9, 0.0, 1e-9, STEP)),
+    0.0, -0.0, 5e-324, 1e-300, 1e300, -1e300, 1.8e308, math.inf, -math.inf, math.nan,
+]  # fmt: skip
+SPEEDS = [None, 5e-324, 1e-9, math.radians(40.0), SPEED, 1e300, math.inf, 0.0, -0.0, -1.0, -math.inf, math.nan]
+
+
+@pytest.mark.parametrize("step", [STEP, 0.0])
+def test_every_command_is_done_within_the_limits_or_refused(step):
+    head = Head(PanTiltLimits(LIMITS.pan, LIMITS.tilt, SPEED, 3.6, step))
+    safe = SafeRig(Rig(head), SafetyConfig(pan_deg=(-90.0, 45.0), speed_deg_s=30.0)).head
+    pan_limits, cap = (math.radians(-90.0), math.radians(45.0)), math.radians(30.0)
+    for pan, tilt in itertools.product(AWKWARD, AWKWARD):
+        for speed in SPEEDS:
+            head.log.clear()
+            good = not math.isnan(pan) and not math.isnan(tilt) and (speed is None or speed > 0)
+            if not good:
+                with pytest.raises(DeviceError, match="the head cannot"):
+                    safe.move(pan, tilt, speed)
+                assert not head.log
+                continue
+            safe.move(pan, tilt, speed)
+            ((done_pan, done_tilt, done_speed, _),) = head.log
+            assert inside(done_pan, pan_limits)
+            assert inside(done_tilt, LIMITS.tilt)
+            assert 0 < done_speed <= cap + ROUNDING
+
+
+@pytest.mark.parametrize("said", [(1.9, 0.0), (0.0, -1.5), (math.nan, 0.0)])
+def test_a_head_that_says_it_goes_beyond_the_limits_is_halted(said):
+    rig = Rig()
+    rig.head.move = lambda *a: said
+    with pytest.raises(DeviceError, match=r"was sent to pan 28\.648.* beyond the limits") as caught:
+        SafeRig(rig, SafetyConfig(pan_deg=(-90.0, 90.0))).head.move(0.5, 0.1)
+    assert rig.head.log == ["halt"]
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("angles", [(math.nan, 0.0), (0.0, math.nan)])
 def test_what_is_not_a_number_never_reaches_the_head(angles):
     head = Head(PanTiltLimits((-1.0, 1.0), (-1.0, 1.0), 1.0, 1.0, 0.0))
@@ -123,6 +164,54 @@ def test_a_stale_frame_is_refused():
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("camera", ["fixed", "zoom"])
+@pytest.mark.parametrize(("t", "newer_than", "message"), [
+    (4.4, None, r"the newest frame is 0\.60 s old; at most 0\.5 s is acted on \(CAMERA camera\)"),
+    (5.2, None, r"the CAMERA camera's frame is from 0\.20 s in the future"),
+    (9e9, 4.0, "in the future"),
+    (-math.inf, None, "inf s old"),
+    (math.nan, None, "nan s old"),
+    (4.9, 4.9, r"the CAMERA camera gave a frame of 4\.900 s for one after that time"),
+    (4.8, 4.9, r"the CAMERA camera gave a frame of 4\.800 s for one after that time"),
+])  # fmt: skip
+def test_neither_camera_gives_a_frame_that_cannot_be_acted_on(camera, t, newer_than, message):
+    rig = Rig()
+    reader = SimpleNamespace(size=(2, 2), read=lambda *a: Frame(np.zeros((2, 2, 3), np.uint8), t))
+    setattr(rig, camera, reader)
+    safe = SafeRig(rig, SafetyConfig(max_frame_age_s=0.5))
+    with pytest.raises(StaleFrameError, match=message.replace("CAMERA", camera)) as caught:
+        getattr(safe, camera).read(newer_than)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_still_may_be_old_when_it_arrives_but_not_older_than_its_request():
+    rig, now = Rig(), [5.0]
+    rig.clock.now = lambda: now[0]
+
+    def capture():
+        now[0] += 3.0
+        return Frame(np.zeros((2, 2, 3), np.uint8), exposed)
+
+    rig.zoom = SimpleNamespace(capture=capture)
+    safe = SafeRig(rig, SafetyConfig(max_frame_age_s=0.5))
+    exposed = 5.4
+    assert safe.zoom.capture().t == 5.4
+    exposed = 5.4  # once more the same, 2.6 s before it was asked for
+    with pytest.raises(StaleFrameError, match=r"the still is from 2\.60 s before it was asked for"):
+        safe.zoom.capture()
+
+
+def test_the_zoom_camera_is_otherwise_passed_on():
+    rig, told = Rig(), []
+    rig.zoom = SimpleNamespace(
+        size=(320, 240), still_size=(3264, 2448), focal_range=(300.0, 4000.0), state=lambda: "state",
+        zoom=lambda f: told.append(f) or 512.0,
+    )  # fmt: skip
+    safe = SafeRig(rig, SafetyConfig()).zoom
+    assert (safe.size, safe.still_size, safe.focal_range) == ((320, 240), (3264, 2448), (300.0, 4000.0))
+    assert (safe.state(), safe.zoom(500.0), told) == ("state", 512.0, [500.0])
+
+
 def test_what_a_frame_is_asked_for_is_passed_on():
     rig = Rig()
     SafeRig(rig, SafetyConfig()).fixed.read(3.0, 0.2)
@@ -147,16 +236,44 @@ def test_the_head_halts_before_the_rig_closes_on_every_way_out(error):
     assert rig.head.log[1:] == ["halt", "close"]
 
 
+def broken(*_):
+    raise OSError("the cable is out")
+
+
 def test_a_head_that_cannot_halt_does_not_keep_the_rig_open():
     rig = Rig()
-
-    def broken():
-        raise OSError("the cable is out")
-
     rig.head.halt = broken
     with pytest.raises(OSError, match="cable"), SafeRig(rig, SafetyConfig()):
         pass
     assert rig.closed
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
+@pytest.mark.parametrize("failing", ["halt", "close"])
+def test_what_fails_on_the_way_out_does_not_hide_why(error, failing, caplog):
+    rig = Rig()
+    setattr(rig.head if failing == "halt" else rig, failing, broken)
+    with pytest.raises(error, match="why"), SafeRig(rig, SafetyConfig()):
+        raise error("why")
+    assert rig.closed or failing == "close"
+    assert "cable" in caplog.text
+
+
+def test_a_halt_that_fails_once_is_tried_again_before_the_rig_closes():
+    rig, tries = Rig(), iter([broken, broken, lambda: rig.head.log.append("halt")])
+    rig.head.halt = lambda: next(tries)()
+    SafeRig(rig, SafetyConfig()).close()
+    assert rig.head.log == ["halt", "close"]
+
+
+def test_closing_twice_is_closing_once_and_nothing_moves_afterwards():
+    rig = Rig()
+    with SafeRig(rig, SafetyConfig()) as safe:
+        safe.close()
+    assert rig.head.log == ["halt", "close"]
+    with pytest.raises(DeviceError, match="the rig is closed"):
+        safe.head.move(0.1, 0.1)
+    assert rig.head.log == ["halt", "close"]
 
 
 @pytest.mark.parametrize(("soft", "message"), [
