@@ -13,8 +13,8 @@ from cotarget.safety.limits import capped, clipped
 
 # A frame cannot be from later than now; this much is left for a latency that is compensated too far [s].
 FUTURE_S = 0.05
-# A loaded unit may take this much longer than its limits, speed and acceleration say, and be turning the other way.
-SLOWNESS, RAMPS = 1.5, 3
+# A loaded unit may take this much longer than its speed and acceleration say.
+SLOWNESS = 1.5
 FINE = 1e-9  # rounding of an angle [rad]
 
 
@@ -72,7 +72,10 @@ class SafeHead:
             return 0.0  # only a simulated head is so fast, and nobody watches its waiting
         state = self._head.state()
         way = max(abs(goal[0] - state.pan), abs(goal[1] - state.tilt))
-        return SLOWNESS * (way / speed + RAMPS * speed / acceleration)
+        peak = min(speed, math.sqrt(way * acceleration))
+        from_rest = way / peak + peak / acceleration if way > 0 else 0.0
+        # A head that turns the other way brakes first, and makes up for it then.
+        return SLOWNESS * (from_rest + (2 * self._limits.speed / acceleration if state.moving else 0.0))
 
 
 def _inside(angle: float, bounds: tuple[float, float], limits: PanTiltLimits) -> bool:

@@ -1,0 +1,285 @@
+"""The watchdog: in simulated time to the instant, and in real time by its thread, which a hung program cannot stop."""
+
+import logging
+import math
+import threading
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from cotarget.config import SafetyConfig, SimHead
+from cotarget.errors import DeviceError, StaleFrameError
+from cotarget.rig import Frame
+from cotarget.safety import SafeRig
+from tests.safety_rigs import IMAGE, RealRig, SimulatedRig
+
+WATCHDOG_S = 0.5  # the default, which is what is asked for
+FAR = math.radians(100)
+EXACT = 1e-9  # rounding of times and angles
+SHORT_S = 0.1  # a watchdog for tests in real time
+TIMELY_S = 1.0  # beyond the watchdog's time, for a thread of a busy machine to wake up; it takes 1 ms on an idle one
+
+
+@pytest.fixture
+def rig():
+    return SimulatedRig()
+
+
+@pytest.fixture
+def safe(rig):
+    with SafeRig(rig, SafetyConfig()) as opened:
+        yield opened
+
+
+@pytest.fixture
+def real():
+    """A rig in real time, and its safe one with a short watchdog."""
+    rig = RealRig()
+    with SafeRig(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
+        yield rig, safe
+        rig.head.failing = 0
+    assert "cotarget-watchdog" not in {thread.name for thread in threading.enumerate()}
+
+
+def warnings(caplog):
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+def test_a_head_left_alone_is_halted_half_a_second_after_the_command(rig, safe, caplog):
+    safe.head.move(FAR, 0.0)
+    safe.clock.sleep_until(10.0)
+    assert rig.head.halts == [pytest.approx(WATCHDOG_S, abs=EXACT)]
+    # It sped up for half a second and braked as long: a t^2 in all, far from its goal.
+    acceleration = math.radians(SimHead().accel_deg_s2)
+    assert acceleration * WATCHDOG_S < math.radians(SimHead().speed_deg_s)
+    step = rig.head.limits.step
+    assert safe.head.state().pan == pytest.approx(acceleration * WATCHDOG_S**2, abs=step)
+    assert warnings(caplog) == ["halting the head: neither a fresh frame nor a command for 0.5 s"]
+
+
+def test_the_next_command_is_obeyed_and_watched_again(rig, safe, caplog):
+    for start in (0.0, 5.0):
+        safe.clock.sleep_until(start)
+        safe.head.move(FAR, 0.0)
+        safe.clock.sleep_until(start + 3.0)
+    assert rig.head.halts == [pytest.approx(WATCHDOG_S, abs=EXACT), pytest.approx(5.0 + WATCHDOG_S, abs=EXACT)]
+    assert len(warnings(caplog)) == 2
+
+
+@pytest.mark.parametrize("camera", ["fixed", "zoom"])
+def test_fresh_frames_of_either_camera_let_it_go_on(rig, safe, camera):
+    safe.head.move(FAR, 0.0)
+    t = None
+    while safe.clock.now() < 3.0:
+        t = getattr(safe, camera).read(newer_than=t).t
+    assert safe.head.state().pan == pytest.approx(FAR, abs=rig.head.limits.step)
+    safe.clock.sleep_until(60.0)
+    assert not rig.head.halts
+
+
+def test_stills_are_frames_too(rig, safe):
+    safe.head.move(FAR, 0.0)
+    while safe.clock.now() < 3.0:
+        safe.zoom.capture()
+    assert not rig.head.halts
+
+
+def test_commands_let_it_go_on(rig, safe):
+    for k in range(10):
+        safe.clock.sleep_until(0.4 * k)
+        safe.head.move(FAR, 0.0)
+    assert not rig.head.halts
+
+
+def test_a_frozen_frame_is_no_sign_of_life(rig, safe):
+    rig.fixed.frozen_at = 0.0
+    last = safe.fixed.read() and safe.clock.now()
+    safe.head.move(FAR, 0.0)
+    while safe.clock.now() < 0.9:
+        safe.fixed.read()
+    assert len(rig.head.halts) == 1
+    assert WATCHDOG_S <= rig.head.halts[0] - last <= WATCHDOG_S + rig.fixed.period
+
+
+def test_looking_at_the_head_is_no_sign_of_life(rig, safe):
+    safe.head.move(FAR, 0.0)
+    while safe.clock.now() < 2.0:
+        safe.head.state()
+        safe.clock.sleep_until(safe.clock.now() + 0.02)
+    assert rig.head.halts == [pytest.approx(WATCHDOG_S, abs=EXACT)]
+
+
+@pytest.mark.parametrize("camera", ["fixed", "zoom"])
+def test_a_dead_camera_halts_the_head_before_its_timeout(rig, safe, camera):
+    getattr(rig, camera).dead = True
+    safe.head.move(FAR, 0.0)
+    with pytest.raises(StaleFrameError, match="no frame"):
+        getattr(safe, camera).read(timeout=1.0)
+    assert rig.head.halts == [pytest.approx(WATCHDOG_S, abs=EXACT)]
+    assert safe.clock.now() == pytest.approx(1.0, abs=EXACT)
+
+
+def test_a_head_that_waits_for_a_person_is_left_in_peace(rig, safe, caplog):
+    """As in a capture session: the way itself takes longer than the watchdog's time, and so does the person."""
+    safe.head.move(FAR, 0.0, wait=True)
+    assert safe.clock.now() > 2 * WATCHDOG_S
+    safe.clock.sleep_until(60.0)
+    assert safe.head.state().pan == pytest.approx(FAR, abs=rig.head.limits.step)
+    assert not rig.head.halts
+    assert not warnings(caplog)
+
+
+def test_a_head_that_is_seen_to_rest_at_its_goal_is_left_in_peace(rig, safe, caplog):
+    safe.head.move(0.01, 0.0)
+    safe.head.state()  # about to move: not at rest yet
+    safe.clock.sleep_until(0.4)
+    assert not safe.head.state().moving
+    safe.clock.sleep_until(60.0)
+    assert not rig.head.halts
+    assert not warnings(caplog)
+
+
+def test_time_that_passes_behind_its_back_counts(rig, safe):
+    safe.head.move(FAR, 0.0)
+    rig.clock.sleep_until(0.7)
+    safe.head.state()
+    assert rig.head.halts == [0.7]
+
+
+def test_a_clock_that_runs_backwards_halts_the_head(caplog):
+    rig = SimulatedRig()
+    now = [100.0]
+    rig.clock = SimpleNamespace(now=lambda: now[0], sleep_until=lambda t: None)
+    with SafeRig(rig, SafetyConfig()) as safe:
+        safe.head.move(FAR, 0.0)
+        now[0] = 40.0
+        safe.head.state()
+        assert len(rig.head.halts) == 1
+        assert warnings(caplog) == ["halting the head: the rig's clock ran backwards by 60 s"]
+        safe.head.move(FAR, 0.0)  # a fresh command by the new time is allowed
+        now[0] = math.nan
+        safe.head.state()
+        assert len(rig.head.halts) == 2
+        now[0] = 41.0
+
+
+def test_a_halt_that_fails_is_told_and_tried_again_before_anything_else(rig, safe, caplog):
+    safe.head.move(FAR, 0.0)
+    rig.head.broken = 3
+    safe.clock.sleep_until(1.0)  # the first try
+    told = [r.getMessage() for r in caplog.records if r.levelno == logging.ERROR]
+    assert len(told) == 1
+    assert "could not be halted" in told[0]
+    assert "the cable is out" in told[0]
+    with pytest.raises(DeviceError, match="does not move before it could be halted: the cable is out"):
+        safe.head.move(FAR, 0.0)  # the second
+    safe.head.state()  # the third
+    assert not rig.head.halts
+    said = safe.head.move(FAR, 0.0)  # the fourth is obeyed, and so is the command
+    assert said[0] == pytest.approx(FAR, abs=rig.head.limits.step)
+    assert [what for what, _ in rig.head.log] == ["move", "halt", "move"]
+    assert warnings(caplog)[-1] == "the head is halted now"
+
+
+def test_a_halt_of_the_program_that_fails_is_tried_again(rig, safe):
+    safe.head.move(FAR, 0.0)
+    rig.head.broken = 1
+    with pytest.raises(OSError, match="cable"):
+        safe.head.halt()
+    safe.head.state()
+    assert len(rig.head.halts) == 1
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize("where", ["reading", "commanding", "computing"])
+def test_a_program_that_hangs_ends_in_a_halted_head(where, caplog):
+    """With the default watchdog; what hangs goes on hanging until the head is halted."""
+    rig = RealRig()
+    halted_at = []
+    halt = rig.head.halt
+    rig.head.halt = lambda: (halted_at.append(time.monotonic()), halt())
+    with SafeRig(rig, SafetyConfig()) as safe:
+        if where == "commanding":
+            rig.head.hang = rig.head.wait_for_halt
+        if where == "reading":
+            rig.fixed.read = lambda *a: (rig.head.wait_for_halt(), Frame(IMAGE, rig.clock.now()))[1]
+        begun = time.monotonic()
+        safe.head.move(1.0, 0.0)
+        if where == "reading":
+            safe.fixed.read()
+        rig.head.wait_for_halt()
+    late = halted_at[0] - begun - WATCHDOG_S
+    print(f"{where}: halted {late * 1000:.1f} ms after the watchdog's time")
+    assert -0.01 < late < TIMELY_S
+    assert warnings(caplog)[0].startswith("halting the head: neither")
+
+
+@pytest.mark.wire
+def test_a_command_that_was_stuck_when_the_head_was_halted_is_not_left_to_run(real):
+    rig, safe = real
+    rig.head.hang = rig.head.wait_for_halt
+    safe.head.move(1.0, 0.0)
+    assert rig.head.log == ["move", "halt", "moved", "halt"]
+    rig.head.hang = lambda: None
+    safe.head.move(1.0, 0.0)
+    assert rig.head.log[4:6] == ["move", "moved"]
+
+
+@pytest.mark.wire
+def test_a_wait_is_watched_for_no_longer_than_the_way_takes():
+    """1 rad at 4 rad/s with ramps of 0.1 s takes 0.35 s: the device may wait for that, half as long again, and some."""
+    rig = RealRig()
+    with SafeRig(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
+        rig.head.hang = rig.head.wait_for_halt
+        begun = time.monotonic()
+        safe.head.move(1.0, 0.0, wait=True)
+        took = time.monotonic() - begun
+    print(f"a wait that hung was ended after {took:.2f} s")
+    assert 0.35 * 1.5 + SHORT_S < took < 0.35 * 1.5 + SHORT_S + TIMELY_S
+
+
+@pytest.mark.wire
+def test_the_thread_halts_until_the_head_obeys(real, caplog):
+    rig, safe = real
+    rig.head.failing = 3
+    safe.head.move(1.0, 0.0)
+    rig.head.wait_for_halt()
+    safe.close()
+    assert rig.head.log == ["move", "moved", "failed", "failed", "failed", "halt", "halt"]
+    assert [record.levelname for record in caplog.records][:2] == ["WARNING", "ERROR"]
+
+
+@pytest.mark.wire
+def test_a_clock_that_fails_stops_the_head():
+    def now():
+        if broken:
+            raise OSError("no such clock")
+        return time.monotonic()
+
+    broken = []
+    rig = RealRig(SimpleNamespace(now=now, sleep_until=lambda t: None))
+    with SafeRig(rig, SafetyConfig()) as safe:
+        safe.head.move(1.0, 0.0)
+        broken.append(True)
+        rig.head.wait_for_halt()
+        broken.clear()
+        with pytest.raises(DeviceError, match="emergency stop: the watchdog failed: no such clock"):
+            safe.head.move(1.0, 0.0)
+
+
+@pytest.mark.wire
+def test_fresh_frames_keep_the_thread_quiet(real):
+    """Read as fast as they come, for several times the watchdog's time."""
+    rig, safe = real
+    safe.head.move(1.0, 0.0)
+    end = time.monotonic() + 5 * SHORT_S
+    longest, last = 0.0, time.monotonic()
+    while time.monotonic() < end:
+        safe.fixed.read()
+        longest, last = max(longest, time.monotonic() - last), time.monotonic()
+    assert "halt" not in rig.head.log or longest >= SHORT_S  # a machine that stood still is no failure
+
+
+def test_a_rig_in_simulated_time_has_no_thread(safe):
+    assert "cotarget-watchdog" not in {thread.name for thread in threading.enumerate()}
