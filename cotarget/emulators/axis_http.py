@@ -12,6 +12,8 @@ from urllib.parse import parse_qsl, urlsplit
 LINE_BYTES = 8192
 BODY_BYTES = 65536
 MAX_ARGUMENTS = 64
+# How clients call a form that they send; PyPI's axis calls it plain text, and real units take it.
+FORMS = ("application/x-www-form-urlencoded", "text/plain")
 
 
 class HttpError(Exception):
@@ -78,7 +80,7 @@ def _form(headers: Message, stream: BinaryIO) -> list[tuple[str, str]]:
     body = stream.read(length)
     if len(body) < length:
         raise ValueError
-    if headers.get_content_type() != "application/x-www-form-urlencoded":
+    if headers.get_content_type() not in FORMS:
         return []
     return parse_qsl(body.decode("latin-1"), keep_blank_values=True, max_num_fields=MAX_ARGUMENTS)
 
