@@ -76,6 +76,13 @@ def count(text: str) -> int:
     return int(text)
 
 
+def port(text: str) -> int:
+    """Read a TCP port; 0 is any."""
+    if not (text.isdecimal() and int(text) < 65536):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a port, 0 to 65535")
+    return int(text)
+
+
 def corners(text: str) -> tuple[int, int]:
     """Read a board's inner corners, such as 9x6."""
     columns, _, rows = text.partition("x")

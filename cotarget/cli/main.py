@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import NoReturn
 
 import cotarget
-from cotarget.cli import calibrating, running
-from cotarget.cli.arguments import corners, count, not_negative, positive
+from cotarget.cli import calibrating, emulating, running
+from cotarget.cli.arguments import corners, count, not_negative, port, positive
 from cotarget.errors import CotargetError
 
 # Heavy modules (MuJoCo, OpenCV, matplotlib) are imported by the command that needs them, so that --help and
@@ -137,6 +137,23 @@ def _parser() -> argparse.ArgumentParser:
     follow.add_argument("--seconds", type=positive, default=20.0, metavar="S", help="for how long (20)")
     follow.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
     follow.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
+
+    emulate = command(
+        "emulate", emulating.emulate, "put a simulated rig behind the real devices' protocols, in real time"
+    )
+    emulate.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml of the simulated rig (the default rig)")
+    emulate.add_argument(
+        "--write", type=Path, required=True, metavar="FILE", help="where to write the rig.toml that connects to it"
+    )
+    emulate.add_argument("--host", default="127.0.0.1", help="to listen at (127.0.0.1: this machine alone)")
+    for name in ("head", "fixed", "zoom", "board", "control"):
+        emulate.add_argument(f"--{name}", type=port, default=0, metavar="PORT", help="to listen at (any that is free)")
+    emulate.add_argument(
+        "--tcp", action="store_true", help="let the rig.toml reach the head by TCP, not by a serial port"
+    )
+    emulate.add_argument("--user", default="", metavar="NAME", help="who alone may look through the fixed camera")
+    emulate.add_argument("--fault", action="append", default=[], metavar="DEVICE.FAULT", help="to be on from the start")
+    emulate.add_argument("--seconds", type=positive, metavar="S", help="for how long (until Ctrl-C)")
 
     detect = command("detect", running.detect, "run the fixed camera's detector and tracker on any film")
     detect.add_argument("film", type=Path, metavar="VIDEO")

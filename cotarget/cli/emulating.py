@@ -1,0 +1,54 @@
+"""The command that puts a simulated rig behind the devices' protocols."""
+
+import argparse
+import os
+import sys
+import time
+import tomllib
+
+from cotarget.cli.arguments import check_outputs
+from cotarget.errors import ConfigError
+
+# Mesa's software renderer: one thread, which leaves the client a core. Read when OpenGL starts.
+RENDER_THREADS = ("LP_NUM_THREADS", "1")
+LOOK = 0.2  # between looks at the time [s]
+
+
+def emulate(options: argparse.Namespace) -> None:
+    """Cotarget emulate."""
+    os.environ.setdefault(*RENDER_THREADS)
+    from cotarget.calibration.atomic import write_atomically
+    from cotarget.config import RigConfig, load_config
+    from cotarget.emulators.emulation import Emulation, Ports, copied_tables
+    from cotarget.emulators.world import paced
+
+    config = RigConfig() if options.rig is None else load_config(options.rig)
+    if config.backend != "sim":
+        raise ConfigError(f"{options.rig}: backend is '{config.backend}'; what is emulated is a simulated rig")
+    beside = {}
+    if options.rig is not None:
+        beside = copied_tables(tomllib.loads(options.rig.read_text(encoding="utf-8")), options.rig.parent)
+    check_outputs([options.write], [options.rig])
+    ports = Ports(options.host, options.head, options.fixed, options.zoom, options.board, options.control)
+    password = os.environ.get("COTARGET_PASSWORD", "") if options.user else ""
+    if options.user and not password:
+        raise ConfigError("--user needs a password: put it into the environment variable COTARGET_PASSWORD")
+    with Emulation(paced(config), ports, user=options.user, password=password) as emulation:
+        for fault in options.fault:
+            emulation.switch(fault)
+        write_atomically(options.write, emulation.rig_toml(tcp=options.tcp, beside=beside).encode())
+        print(
+            f"head     {emulation.tty.port} and {emulation.tcp.url}\n"
+            f"fixed    {emulation.fixed.url}/mjpg/video.mjpg\n"
+            f"zoom     ptpip:{options.host}:{emulation.zoom.port}:{emulation.zoom.port}\n"
+            f"board    socket://{options.host}:{emulation.board.port}\n"
+            f"control  socket://{options.host}:{emulation.control.port}\n"
+            f"{options.write} connects to them; Ctrl-C ends them",
+            flush=True,
+        )
+        end = None if options.seconds is None else time.monotonic() + options.seconds
+        try:
+            while end is None or time.monotonic() < end:
+                time.sleep(LOOK)
+        except KeyboardInterrupt:
+            print("", file=sys.stderr)

@@ -1,0 +1,233 @@
+"""A whole rig behind its devices' protocols: one world, and servers for head, cameras, board, faults and truth."""
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from cotarget.config import RigConfig
+from cotarget.emulators.axis import AXIS_FAULTS, AxisServer
+from cotarget.emulators.d46 import D46, D46_FAULTS, UnitProfile
+from cotarget.emulators.faults import Faults
+from cotarget.emulators.jsonlines import JsonLines
+from cotarget.emulators.lines import SerialLine, TcpLine
+from cotarget.emulators.s5is import S5IS_FAULTS, S5isServer
+from cotarget.emulators.world import LiveWorld
+from cotarget.errors import ConfigError, choices
+from cotarget.geometry import RigidTransform, pose
+
+PREVIEW_SHARE = 2  # the viewfinder's pictures are smaller than stills by this
+QUALITY = 90  # of JPEG, as the simulated cameras have by default
+PAN_SIGN = -1  # the D46's manual has positive pan turn left
+LOCAL = "127.0.0.1"
+FAULTS: Mapping[str, tuple[str, ...]] = {"head": D46_FAULTS, "fixed": AXIS_FAULTS, "zoom": S5IS_FAULTS}
+COPIED = ("board", "safety", "targets")  # tables of the simulated rig's file that hold for the emulated one too
+
+
+@dataclasses.dataclass(frozen=True)
+class Ports:
+    """Where to listen; 0 for any port that is free.
+
+    Attributes:
+        host: address of all of them.
+        head: TCP port of the head, beside its pseudo-terminal.
+        fixed: HTTP port of the video server.
+        zoom: PTP/IP port of the zoom camera.
+        board: port of who holds the board.
+        control: port of who switches faults and tells the truth.
+    """
+
+    host: str = LOCAL
+    head: int = 0
+    fixed: int = 0
+    zoom: int = 0
+    board: int = 0
+    control: int = 0
+
+
+class Emulation:
+    """The emulated rig, from its construction until it is closed. A context manager.
+
+    Args:
+        config: of the rig, as it runs in real time; see `cotarget.emulators.world.paced`.
+        ports: where to listen.
+        user: who may look through the fixed camera; empty where everybody may.
+        password: of that user.
+
+    Raises:
+        ConfigError: the simulated rig is none that these devices could be.
+        DeviceError: a port cannot be had, or the machine cannot render.
+    """
+
+    def __init__(self, config: RigConfig, ports: Ports = Ports(), *, user: str = "", password: str = "") -> None:
+        sim = config.sim
+        if sim.zoom.size[0] % PREVIEW_SHARE or sim.zoom.size[1] % PREVIEW_SHARE:
+            raise ConfigError(f"sim.zoom.size: {list(sim.zoom.size)} cannot be halved for the viewfinder")
+        self.config, self._user = config, user
+        self.faults = {device: Faults(names) for device, names in FAULTS.items()}
+        low, high = sim.head.pan_deg
+        pan_deg = (low, high) if PAN_SIGN > 0 else (-high, -low)
+        unit = UnitProfile.from_degrees(
+            pan_deg, sim.head.tilt_deg, sim.head.step_deg, sim.head.speed_deg_s, sim.head.accel_deg_s2
+        )
+        width, height = (side // PREVIEW_SHARE for side in sim.zoom.size)
+        self.preview_size = width, height
+        with contextlib.ExitStack() as opened:
+            self.world = opened.enter_context(LiveWorld(config, pan_sign=PAN_SIGN))
+            world = self.world
+            units = [D46(world.pan, world.tilt, unit, self.faults["head"], world.clock.now) for _ in range(2)]
+            self.tty = opened.enter_context(SerialLine(units[0]))
+            self.tcp = opened.enter_context(TcpLine(units[1], ports.host, ports.head, paced=True))
+            self.fixed = opened.enter_context(
+                AxisServer(
+                    {1: world.feeds["fixed"]},
+                    host=ports.host,
+                    port=ports.fixed,
+                    user=user,
+                    password=password,
+                    quality=QUALITY,
+                    faults=self.faults["fixed"],
+                )
+            )
+            self.zoom = opened.enter_context(
+                S5isServer(
+                    world.feeds["zoom"],
+                    world.still,
+                    world.lens,
+                    host=ports.host,
+                    port=ports.zoom,
+                    preview_size=self.preview_size,
+                    quality=QUALITY,
+                    faults=self.faults["zoom"],
+                )
+            )
+            self.board = opened.enter_context(JsonLines(self._hold, ports.host, ports.board))
+            self.control = opened.enter_context(JsonLines(self._control, ports.host, ports.control))
+            self._host = ports.host
+            self._opened = opened.pop_all()
+
+    def rig_toml(self, *, tcp: bool = False, beside: Mapping[str, Any] | None = None) -> str:
+        """The rig.toml that connects to it.
+
+        Args:
+            tcp: whether the head is reached by TCP in place of its pseudo-terminal.
+            beside: tables of the simulated rig's own file, of which those that hold for any rig are taken over.
+        """
+        sim = self.config.sim
+        late = sim.effects.latency
+        delay = sim.head.command_delay_s if sim.effects.command_delay else 0.0
+        last = sim.zoom.lens_steps - 1
+        hardware: dict[str, Any] = {
+            "head": {
+                "port": self.tcp.url if tcp else self.tty.port,
+                "step_deg": sim.head.step_deg,
+                "pan_deg": list(sim.head.pan_deg),
+                "tilt_deg": list(sim.head.tilt_deg),
+                "pan_sign": PAN_SIGN,
+                "speed_deg_s": sim.head.speed_deg_s,
+                "command_delay_s": delay,
+            },
+            "fixed": {
+                "url": self.fixed.url,
+                "size": list(sim.fixed.size),
+                "resolution": "{}x{}".format(*sim.fixed.size),
+                "rate_hz": sim.fixed.rate_hz,
+                "latency_s": sim.fixed.latency_s if late else 0.0,
+            }
+            | ({"user": self._user} if self._user else {}),
+            "zoom": {
+                "port": f"ptpip:{self._host}:{self.zoom.port}:{self.zoom.port}",
+                "lens": [[0, sim.zoom.focal_mm[0]], [last, sim.zoom.focal_mm[1]]],
+                "lens_speed": sim.zoom.lens_speed,
+                "size": list(self.preview_size),
+                "still_size": list(sim.zoom.size),
+                "pitch_mm": sim.zoom.pitch_mm * PREVIEW_SHARE,
+                "rate_hz": sim.zoom.rate_hz,
+                "latency_s": sim.zoom.latency_s if late else 0.0,
+                "command_delay_s": delay,
+            },
+            "board": {"presenter": f"socket://{self._host}:{self.board.port}"},
+        }
+        copied = {name: (beside or {})[name] for name in COPIED if name in (beside or {})}
+        return tomli_w.dumps({"backend": "hardware", "hardware": hardware, **copied})
+
+    def close(self) -> None:
+        """End all servers, then the world; more than once does no harm."""
+        self._opened.close()
+
+    def __enter__(self) -> "Emulation":
+        """Give the emulation itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close."""
+        self.close()
+
+    def _hold(self, said: Any) -> Any:
+        """Answer who asks for the board."""
+        (what, wish), *more = said.items()
+        if more or what not in ("present", "swing"):
+            raise ConfigError(f"unknown wish '{what}'; valid here: present, swing")
+        T = None if wish is None else _parse_pose(wish)
+        if what == "present":
+            self.world.present(T)
+        elif T is None:
+            raise ConfigError("swing: needs a pose")
+        else:
+            self.world.swing(T)
+        return {"ok": True}
+
+    def _control(self, said: Any) -> Any:
+        """Switch a fault on or off, or tell the truth."""
+        if "truth" in said:
+            pan, tilt = self.world.head_truth()
+            return {
+                "t": self.world.clock.monotonic(self.world.clock.now()),
+                "pan_deg": math.degrees(pan),
+                "tilt_deg": math.degrees(tilt),
+                "moving": self.world.pan.moving() or self.world.tilt.moving(),
+                "lens": self.world.lens.position(),
+                "port": self.tty.port,
+            }
+        self.switch(str(said["fault"]), bool(said.get("on", True)))
+        return {"ok": True}
+
+    def switch(self, fault: str, on: bool = True) -> None:
+        """Switch a fault, named as device.fault.
+
+        Raises:
+            ConfigError: no such device or fault.
+        """
+        device, _, name = fault.partition(".")
+        if device not in self.faults:
+            raise ConfigError(f"unknown fault '{fault}'; they begin with: {choices(f'{d}.' for d in self.faults)}")
+        self.faults[device].set(name, on)
+
+
+def copied_tables(table: Mapping[str, Any], directory: Path) -> dict[str, Any]:
+    """The tables of a rig.toml that hold for any backend, with paths that hold in any folder.
+
+    Args:
+        table: the file as TOML has it.
+        directory: where it lies.
+    """
+    copied = {name: table[name] for name in COPIED if name in table}
+    if "targets" in copied:
+        copied["targets"] = {
+            name: {**target, "template": str((directory / target["template"]).resolve())}
+            if "template" in target
+            else target
+            for name, target in copied["targets"].items()
+        }
+    return copied
+
+
+def _parse_pose(wish: Any) -> RigidTransform:
+    translation, rotvec = ([float(v) for v in wish[key]] for key in ("translation", "rotvec_deg"))
+    if len(translation) != 3 or len(rotvec) != 3 or not all(map(math.isfinite, translation + rotvec)):
+        raise ConfigError("a pose is {translation: [x, y, z], rotvec_deg: [rx, ry, rz]} of finite numbers")
+    return pose(translation, rotvec)
