@@ -5,11 +5,16 @@ cable) is injected at the thin layer of calls: PTP/IP, which the wire tests use,
 """
 
 import contextlib
+import itertools
 import logging
 import math
+import os
+import subprocess
 import sys
 import threading
+import types
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -29,11 +34,15 @@ PERIOD = 1 / 10  # of the fake viewfinder [s]
 CALL_S = 0.002  # that a call takes [s]
 DEADLINE_S = 20.0  # for whatever should happen at once: only a hang takes as long
 GREY = 2.0  # grey levels by which JPEG may change an even picture
+HELD_S = 2.0  # a thread that waits this long stood still while libgphoto2 waited 2.5 s for an answer
 BUSY, BAD, IO, TIMEOUT, CLAIM = -110, -2, -7, -10, -53  # libgphoto2's results
 
 
 def jpeg(size, grey):
     return cv2.imencode(".jpg", np.full((size[1], size[0], 3), grey, np.uint8))[1].tobytes()
+
+
+ROOT = Path(__file__).parents[1]
 
 
 class SimClock:
@@ -811,3 +820,303 @@ def test_without_gphoto2_the_extra_is_named(monkeypatch):
     for call in (probe, GphotoLink("usb:", "").open):
         with pytest.raises(ConfigError, match=r"gphoto2 is not installed; pip install 'cotarget\[hardware\]'"):
             call()
+
+
+class FakeGphoto(types.ModuleType):
+    """As much of the module as looks for cameras."""
+
+    GPhoto2Error = type("GPhoto2Error", (Exception,), {"code": CLAIM, "string": "Could not claim the USB device"})
+
+    def __init__(self, found, models=("Canon S5", "Nikon Z")):
+        super().__init__("gphoto2")
+        self.found, self.models, self.opened = found, models, []
+        entries = types.SimpleNamespace(
+            load=lambda: None,
+            count=lambda: len(models),
+            get_abilities=lambda i: types.SimpleNamespace(model=models[i]),
+            lookup_model=models.index,
+            detect=lambda ports: dict(found),
+            get_info=lambda path: path,
+            lookup_path=lambda path: path,
+        )
+        self.PortInfoList = self.CameraAbilitiesList = lambda: entries
+        self.Camera = lambda: types.SimpleNamespace(
+            set_abilities=lambda abilities: self.opened.append(abilities.model),
+            set_port_info=self.opened.append,
+            init=self.init,
+        )
+        self.Camera.autodetect = lambda: dict(found)
+
+    def init(self):
+        pass
+
+    def refuse(self):
+        raise self.GPhoto2Error
+
+
+@pytest.fixture
+def gphoto2(monkeypatch):
+    """Puts a module in the place of gphoto2."""
+    monkeypatch.setattr("cotarget.hardware.gphoto.keep_settings_in_memory", lambda: None)
+
+    def put(*found):
+        module = FakeGphoto(found)
+        monkeypatch.setitem(sys.modules, "gphoto2", module)
+        return module
+
+    return put
+
+
+TWO = (("Canon S5", "usb:001,005"), ("Nikon Z", "usb:002,003"))
+
+
+def test_the_only_camera_is_found(gphoto2):
+    module = gphoto2(("Canon S5", "usb:001,005"), ("Mass Storage Camera", "disk:/media/card"))
+    assert GphotoLink("usb:", "").open() == "Canon S5"
+    assert module.opened == ["Canon S5", "usb:001,005"]
+    assert probe() == ["Canon S5 at usb:001,005", "Mass Storage Camera at disk:/media/card"]
+
+
+def test_one_of_two_cameras_is_chosen_by_its_port(gphoto2):
+    module = gphoto2(*TWO)
+    assert GphotoLink("usb:002,003", "").open() == "Nikon Z"
+    assert module.opened == ["Nikon Z", "usb:002,003"]
+    assert GphotoLink("usb:002,003", "Canon S5").open() == "Canon S5"
+
+
+@pytest.mark.parametrize(
+    ("port", "model", "found", "message"),
+    [
+        ("usb:", "", (), "hardware.zoom.port: no camera at 'usb:'; connect it and switch it on"),
+        (
+            "usb:",
+            "",
+            TWO,
+            "hardware.zoom.port: 'usb:' is more than one camera; write one of: usb:001,005 (Canon S5), "
+            "usb:002,003 (Nikon Z)",
+        ),
+        (
+            "usb:001,006",
+            "",
+            TWO[:1],
+            "hardware.zoom.port: no camera at 'usb:001,006'; connect it and switch it on, or write one of: "
+            "usb:001,005 (Canon S5)",
+        ),
+        ("usb:", "canon", TWO, "hardware.zoom.model: gphoto2 knows no 'canon'; it knows Canon S5, Nikon Z"),
+    ],
+)
+def test_cameras_that_are_not_found(gphoto2, port, model, found, message):
+    gphoto2(*found)
+    with pytest.raises((ConfigError, DeviceError)) as error:
+        GphotoLink(port, model).open()
+    assert str(error.value) == message
+
+
+def test_a_camera_of_another_user_and_one_of_another_program(gphoto2, monkeypatch):
+    module = gphoto2(TWO[0])
+    module.init = module.refuse
+    with pytest.raises(
+        LinkError, match=r"\[-53\] Could not claim the USB device; another program holds it: unmount it"
+    ):
+        GphotoLink("usb:", "").open()
+    monkeypatch.setattr(Path, "is_char_device", lambda path: path == Path("/dev/bus/usb/001/005"))
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(DeviceError, match=r"no permission to use /dev/bus/usb/001/005; add yourself to its group"):
+        GphotoLink("usb:", "").open()
+
+
+# libgphoto2 has a camera of its own on a USB port of its own, if that is asked for before it is loaded.
+VIRTUAL = """
+from cotarget.errors import ConfigError
+from cotarget.hardware.canon import GphotoCamera
+from cotarget.hardware.clock import MonotonicClock
+from cotarget.hardware.gphoto import probe
+from cotarget.hwconfig import HardwareZoom
+
+print(probe())
+try:
+    GphotoCamera(HardwareZoom(port="usb:"), MonotonicClock())
+except ConfigError as error:
+    print(error)
+"""
+
+
+def python(script, **environment):
+    pytest.importorskip("gphoto2")
+    command = [sys.executable, "-c", script]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT), **environment}, **pipes)
+
+
+def test_libgphoto2s_own_virtual_camera_cannot_be_zoomed(tmp_path):
+    """A DSLR whose lens is turned by hand, found on USB by libgphoto2 itself; nothing is left in the user's home."""
+    home, card = tmp_path / "home", tmp_path / "card"
+    home.mkdir()
+    card.mkdir()
+    with python(VIRTUAL, HOME=str(home), XDG_CONFIG_HOME="", VCAMERADIR=str(card)) as process:
+        found, error = process.communicate(timeout=DEADLINE_S)[0].splitlines()
+    assert found == "['Nikon DSC D750 at usb:001,001']"
+    assert error.startswith(
+        "hardware.zoom: the Nikon DSC D750 has no setting 'zoom'; it cannot be zoomed; its settings"
+    )
+    assert list(home.iterdir()) == []
+
+
+# --- on the wire: libgphoto2's Canon code against the emulated S5 IS, in a process of its own
+
+EMULATOR = """
+import json, sys, threading, time
+import numpy as np
+from cotarget.emulators.faults import Faults
+from cotarget.emulators.plant import Feed, Picture
+from cotarget.emulators.s5is import S5IS_FAULTS, S5isServer
+
+class Lens:
+    last, at = 128, 0
+    def command(self, position):
+        self.at = position
+    def position(self):
+        return self.at
+    def moving(self):
+        return False
+
+def show(feed, done):
+    index = 0
+    while not done.wait(0.05):
+        index += 1
+        feed.publish(Picture(np.full((480, 640, 3), 20 + index % 200, np.uint8), index, time.monotonic()))
+
+feed, lens, faults, done = Feed(), Lens(), Faults(S5IS_FAULTS), threading.Event()
+still = np.full((2448, 3264, 3), 90, np.uint8)
+threading.Thread(target=show, args=(feed, done), daemon=True).start()
+with S5isServer(feed, lambda: still, lens, faults=faults) as server:
+    print(server.port, flush=True)
+    for line in sys.stdin:
+        name, on = line.split()
+        faults.set(name, on == "on")
+        print(lens.at, flush=True)
+done.set()
+"""
+
+
+class Emulated:
+    """The emulator's process."""
+
+    def __init__(self, process):
+        self.process = process
+        self.port = int(process.stdout.readline())
+
+    def fault(self, name, on="on"):
+        """Switch a fault on or off; where the lens is."""
+        print(name, on, file=self.process.stdin, flush=True)
+        return int(self.process.stdout.readline())
+
+
+@pytest.fixture(scope="module")
+def process():
+    with python(EMULATOR) as process:
+        yield Emulated(process)
+        process.stdin.close()
+        process.wait(DEADLINE_S)
+
+
+@pytest.fixture
+def emulated(process, tmp_path, monkeypatch):
+    """The driver on the emulated camera; nothing is left in the user's home."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
+    camera = GphotoCamera(HardwareZoom(port=f"ptpip:localhost:{process.port}"), MonotonicClock())
+    process.camera = camera
+    yield process
+    camera.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def frame_after(camera, t):
+    """A frame newer than a time, however often the camera must be found again until then."""
+    clock = MonotonicClock()
+    deadline = clock.now() + DEADLINE_S
+    while clock.now() < deadline:
+        with contextlib.suppress(StaleFrameError):
+            return camera.read(t, 1.0)
+    raise AssertionError("no frame")
+
+
+@pytest.mark.wire
+def test_an_emulated_camera_in_use(emulated):
+    camera, clock = emulated.camera, MonotonicClock()
+    frames = [camera.read(timeout=DEADLINE_S)]
+    for _ in range(10):
+        frames.append(camera.read(frames[-1].t, DEADLINE_S))
+    greys = [round(float(frame.image.mean())) for frame in frames]
+    assert frames[0].image.shape == (240, 320, 3)
+    assert all(abs(b - a) >= 1 for a, b in itertools.pairwise(greys)), "a picture was given twice"
+    assert all(b.t > a.t for a, b in itertools.pairwise(frames))
+    camera.zoom(41.6 / 0.01794)  # position 86
+    wait_for(lambda: not camera.state().moving)
+    assert emulated.fault("busy", "off") == 86
+    before = clock.now()
+    still = camera.capture()
+    assert still.image.shape == (2448, 3264, 3)
+    assert before < still.t < clock.now()
+    assert np.abs(still.image[::100, ::100] - 90.0).max() <= GREY
+    assert frame_after(camera, still.t).t > still.t
+
+
+@pytest.mark.wire
+def test_an_emulated_camera_that_was_switched_off_gets_its_lens_back(emulated):
+    camera = emulated.camera
+    camera.zoom(21.3 / 0.01794)  # position 64
+    wait_for(lambda: not camera.state().moving)
+    assert emulated.fault("power-off") == 64
+    wait_for(lambda: camera._desk.trouble)
+    emulated.fault("power-off", "off")
+    frame_after(camera, MonotonicClock().now())
+    wait_for(lambda: not camera.state().moving)
+    assert emulated.fault("busy", "off") == 64
+
+
+@pytest.mark.wire
+def test_an_emulated_camera_that_is_busy(emulated):
+    camera = emulated.camera
+    emulated.fault("busy")
+    camera.zoom(61.4 / 0.01794)  # position 105
+    with pytest.raises(StaleFrameError):
+        camera.read(MonotonicClock().now(), 0.3)
+    emulated.fault("busy", "off")
+    wait_for(lambda: not camera.state().moving)
+    assert emulated.fault("busy", "off") == 105
+
+
+@pytest.mark.wire
+def test_a_hung_camera_stops_no_other_thread_and_is_found_again(emulated):
+    """libgphoto2 waits 2.5 s for each answer; that must not be spent with Python's interpreter lock held."""
+    camera, clock, gaps, done = emulated.camera, MonotonicClock(), [0.0], threading.Event()
+
+    def tick():
+        last = clock.now()
+        while not done.wait(0.01):
+            gaps.append(clock.now() - last)
+            last = clock.now()
+
+    ticker = threading.Thread(target=tick, daemon=True)
+    ticker.start()
+    emulated.fault("hung")
+    try:
+        wait_for(lambda: camera._desk.trouble)
+        leaving = clock.now()  # the camera, which asks it twice
+        wait_for(lambda: clock.now() > leaving + HELD_S)
+        with pytest.raises(StaleFrameError, match=r"looking for the camera again, gphoto2 says \[-"):
+            camera.read(leaving, 0.0)
+    finally:
+        emulated.fault("hung", "off")
+        done.set()
+        ticker.join(DEADLINE_S)
+    assert max(gaps) < HELD_S
+    assert frame_after(camera, leaving).t > leaving
+
+
+@pytest.mark.wire
+def test_where_nobody_listens():
+    with pytest.raises(DeviceError, match=r"hardware\.zoom\.port: no camera listens at 'ptpip:127\.0\.0\.1:1:1'"):
+        GphotoCamera(replace(CONFIG, port="ptpip:127.0.0.1:1"), MonotonicClock())

@@ -39,6 +39,7 @@ USB = re.compile(r"usb:(?:(\d+),(\d+))?")
 # What to do about errors that a user can do something about.
 HINTS = {
     USB_CLAIM: "; another program holds it: unmount it (gio mount -s gphoto2), or end gvfs-gphoto2-volume-monitor",
+    USB_FIND: "; it is unplugged, or not the configured model",
     IO: "; it does not answer: is it switched on, and its cable plugged in?",
 }
 
@@ -255,8 +256,9 @@ def full_port(port: str) -> str:
 def shortened(names: Iterable[str], wanted: str, most: int = 12) -> str:
     """Valid choices for the end of a message, those most like what was wanted first: cameras have a hundred."""
     names = sorted(set(names))
-    near = difflib.get_close_matches(wanted, names, n=most, cutoff=0.4)
-    shown = [*near, *(name for name in names if name not in near)][:most]
+    near = [name for name in names if wanted.lower() in name.lower()]
+    near += difflib.get_close_matches(wanted, names, n=most, cutoff=0.4)
+    shown = list(dict.fromkeys([*near, *names]))[:most]
     more = len(names) - len(shown)
     return (", ".join(shown) or "none") + (f" and {more} more" if more else "")
 

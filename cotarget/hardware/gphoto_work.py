@@ -83,10 +83,10 @@ class Shooting:
             if due is not None:
                 due.run()
         except LinkError as error:
-            self._disconnect()
+            log.warning("the zoom camera at '%s' is lost: %s", self._config.port, error)
             self._lost_at, self._pause = self._clock.now(), FIRST_PAUSE_S
             self._wait(error)
-            log.warning("the zoom camera at '%s' is lost: %s", self._config.port, error)
+            self._disconnect()  # takes 5 s where the camera is silent
             return self._attempt
         return min(duty.due() for duty in duties)
 
