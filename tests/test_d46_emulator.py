@@ -4,6 +4,8 @@ Most of it runs in simulated time; expectations are the sentences of the manuals
 """
 
 import math
+import random
+import socket
 import threading
 import time
 from dataclasses import replace
@@ -481,6 +483,40 @@ def test_a_menu_and_nonsense(bench):
     assert bench("PP ") == "* 0\r\n"
 
 
+@pytest.mark.parametrize("unit", [D46_STOCK, D46_PAPER, E_SERIES])
+def test_random_commands_neither_break_it_nor_leave_the_stops(unit):
+    rng = random.Random(1)
+    others = (
+        "PO",
+        "TS",
+        "LD",
+        "LE",
+        "LU",
+        "CV",
+        "CI",
+        "A",
+        "H",
+        "R",
+        "M-500,500",
+        "WTQ",
+        "DR",
+        "S",
+        "I",
+        "EE",
+        "RP",
+        "_",
+    )
+    names = [*(query for query, _, _ in SENTENCES), *others]
+    bench = Bench(unit)
+    for _ in range(2000):
+        text = rng.choice(names) + rng.choice(["", "0", "-100", "3000", "-99999999", chr(rng.randrange(256))])
+        bench(text + rng.choice(" \r\n"))
+        bench.t += rng.random()
+        bench.unit.output()
+        assert unit.pan[0] - unit.stop_margin <= bench.pan.position() <= unit.pan[1] + unit.stop_margin
+        assert unit.tilt[0] - unit.stop_margin <= bench.tilt.position() <= unit.tilt[1] + unit.stop_margin
+
+
 def test_a_profile_from_degrees():
     unit = UnitProfile.from_degrees((-180, 180), (-80, 30), 0.0514286, 100, 200)
     # 180 / 0.0514286 = 3499.998, 80 / 0.0514286 = 1555.555, 30 / 0.0514286 = 583.33
@@ -668,6 +704,13 @@ class TestSerialLine:
             port.baudrate = 19200
             assert ask(port, b"PP ") == b"* 50\r\n"
 
+    def test_a_unit_that_was_set_to_another_baud(self):
+        unit, _, _ = live()
+        with SerialLine(unit, 38400) as line, serial.Serial(line.port, 38400, timeout=DEADLINE_S) as port:
+            assert ask(port, b"TP ") == b"TP * Current Tilt position is 0\r\n"
+        with pytest.raises(ConfigError, match="baud: 9601 is not one of"):
+            SerialLine(unit, 9601)
+
     def test_a_client_may_come_and_go(self):
         unit, _, _ = live()
         with SerialLine(unit, 9600) as line:
@@ -698,7 +741,7 @@ class TestSerialLine:
             sent = sum(3 + len(ask(port, query)) for _ in range(pairs) for query in (b"PP ", b"TP "))
             took = time.monotonic() - start
         assert sent == pairs * 16
-        assert took > sent / 960 * 0.98  # the first byte's flight is not the client's to wait for
+        assert took >= sent / 960
 
     def test_no_thread_is_left(self):
         unit, _, _ = live()
@@ -722,8 +765,12 @@ class TestTcpLine:
 
     def test_an_e_series_greets(self):
         unit, _, _ = live(E_SERIES)
-        with TcpLine(unit) as line, serial.serial_for_url(line.url, timeout=DEADLINE_S) as port:
-            assert b"PAN-TILT" in port.read_until(b"*\r\n")
+        # pyserial would throw away what comes as it connects.
+        with TcpLine(unit) as line, socket.create_connection((line.host, line.port), DEADLINE_S) as client:
+            said = b""
+            while not said.endswith(b"*\r\n"):
+                said += client.recv(100)
+        assert b"PAN-TILT" in said
 
     def test_a_second_client_takes_the_first_ones_place(self):
         unit, _, _ = live()

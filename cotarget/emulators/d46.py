@@ -79,6 +79,10 @@ class D46:
         """Pause after each byte sent [s]."""
         return self._unit.byte_delay_s
 
+    def set_baud(self, baud: int) -> None:
+        """Set the serial line, as somebody may have done who saved it."""
+        self._unit.baud = self._unit.baud_at_power_up = baud
+
     def receive(self, data: bytes) -> None:
         """Take what comes in on the line now."""
         self._advance()

@@ -27,6 +27,9 @@ class Firmware(Protocol):
     def byte_delay_s(self) -> float:
         """Pause after each byte it sends [s]."""
 
+    def set_baud(self, baud: int) -> None:
+        """Set its serial port, at power-up too."""
+
     def receive(self, data: bytes) -> None:
         """Take what comes in."""
 

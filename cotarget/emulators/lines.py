@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Self
 
 from cotarget.emulators.d46_wire import Firmware, Wire
-from cotarget.errors import DeviceError
+from cotarget.errors import ConfigError, DeviceError
 
 # How often a firmware that is told nothing is asked for what it says by itself, and a close is noticed [s].
 TICK_S = 0.005
@@ -46,15 +46,20 @@ class SerialLine:
 
     Args:
         firmware: the unit.
-        baud: that the port has until a client sets it; the unit's own by default.
+        baud: to set the unit to, as if `@` had done so before; None leaves it as it is. The port is there with it too,
+            until a client sets another.
 
     Raises:
+        ConfigError: there is no such baud.
         DeviceError: the machine has no pseudo-terminal left.
     """
 
     def __init__(self, firmware: Firmware, baud: int | None = None) -> None:
         self._firmware = firmware
-        self._baud = baud or firmware.baud
+        if baud is not None and baud not in CODES:
+            raise ConfigError(f"baud: {baud} is not one of: {', '.join(map(str, sorted(CODES)[1:]))}")
+        if baud is not None:
+            firmware.set_baud(baud)
         self._wire = Wire(firmware)
         self._closing = threading.Event()
         self._ends: tuple[int, int] | None = None  # the emulator's and the client's; ours of the latter stays open,
@@ -91,7 +96,7 @@ class SerialLine:
         tty.setraw(master)
         tty.setraw(slave)
         attributes = termios.tcgetattr(slave)
-        attributes[4] = attributes[5] = CODES[self._baud]
+        attributes[4] = attributes[5] = CODES[self._firmware.baud]
         termios.tcsetattr(slave, termios.TCSANOW, attributes)
         os.set_blocking(master, False)
         self._ends, self._port = (master, slave), os.ttyname(slave)
