@@ -1,0 +1,254 @@
+"""Gets to know the PTU-D46 at a port: learns its manner of speaking, reads what it is, compares that with rig.toml.
+
+Also what is done with a unit outside of a rig: a harmless look at it, and the reset that an operator consented to.
+"""
+
+import logging
+import math
+from dataclasses import dataclass
+
+from cotarget.errors import ConfigError, DeviceError
+from cotarget.hardware import d46
+from cotarget.hardware.clock import MonotonicClock
+from cotarget.hardware.d46 import DELIMITER, HALT, AxisName, RefusedError, ReplyError, command
+from cotarget.hardware.line import PATIENCE_S, Line, LostError, SilentError, open_line
+from cotarget.hwconfig import HardwareHead
+from cotarget.rig import Clock
+
+log = logging.getLogger(__name__)
+
+TRIES = 2  # to come to terms with a unit that was interrupted in the middle of something
+GREETING_QUIET_S, GREETING_MOST_S = 0.25, 1.5  # at open nobody knows what it was last asked
+# Limits differ by a few steps from unit to unit and from reset to reset; more than this is another unit.
+LIMITS_DEG = 3.0
+STEP_SHARE = 2e-3  # of the resolution; the unit and people round it
+RESET_S = 120.0  # no manual says how long a reset takes; published drivers wait up to a minute
+
+
+@dataclass(frozen=True)
+class AxisFacts:
+    """What a unit says about one of its axes.
+
+    Attributes:
+        arcseconds: of a step.
+        lowest: position [steps].
+        highest: position [steps].
+        slowest: speed [steps/s].
+        fastest: speed [steps/s].
+        acceleration: [steps/s^2].
+    """
+
+    arcseconds: float
+    lowest: int
+    highest: int
+    slowest: int
+    fastest: int
+    acceleration: int
+
+    @property
+    def step(self) -> float:
+        """Size of a step [rad]."""
+        return math.radians(self.arcseconds / d46.ARCSECONDS)
+
+    def degrees(self, sign: int) -> tuple[float, float]:
+        """Lowest and highest angle in the sense of rig.toml, whose sign differs from the unit's or not [degrees]."""
+        a, b = (sign * end * self.arcseconds / d46.ARCSECONDS for end in (self.lowest, self.highest))
+        return min(a, b), max(a, b)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What a unit says about itself: its version, its step mode as far as it knows it, its axes."""
+
+    version: str
+    mode: str
+    pan: AxisFacts
+    tilt: AxisFacts
+
+
+def connect(line: Line, config: HardwareHead) -> Unit:
+    """Come to terms with the unit, check that it is the one that rig.toml describes, and make it ready; it halts.
+
+    Raises:
+        ConfigError: rig.toml describes another unit.
+        DeviceError: there is no unit, or none that can be used as it is.
+    """
+    greet(line)
+    unit = identify(line)
+    refuse_uncalibrated(line.name, unit)
+    compare(line.name, unit, config)
+    for order in (HALT, command("I")):
+        line.query(order, d46.done, PATIENCE_S)
+    _make_independent(line)
+    line.events.clear()
+    return unit
+
+
+def greet(line: Line) -> None:
+    """Switch the unit's echo and words off, whatever it was left at.
+
+    Raises:
+        DeviceError: there is no unit.
+    """
+    for _ in range(TRIES):
+        line.write(DELIMITER)
+        line.drain(GREETING_QUIET_S, GREETING_MOST_S)
+        try:
+            for order in ("ED", "FT"):
+                line.ask(command(order), PATIENCE_S)
+            echoes = d46.echoing(line.ask(command("E"), PATIENCE_S).text)
+            if not echoes and d46.terse(line.ask(command("F"), PATIENCE_S).text):
+                line.strict = True
+                return
+        except (SilentError, ReplyError, RefusedError) as error:
+            log.info("%s: %s", line.name, error)
+    raise _stranger(line)
+
+
+def identify(line: Line) -> Unit:
+    """Ask the unit what it is.
+
+    Raises:
+        DeviceError: it does not say.
+    """
+    return Unit(_told(line, "V"), _told(line, "WP"), _axis(line, "P"), _axis(line, "T"))
+
+
+def refuse_uncalibrated(name: str, unit: Unit) -> None:
+    """Refuse a unit that does not know where it is.
+
+    Raises:
+        DeviceError: with what an operator can do about it.
+    """
+    for word, axis in (("pan", unit.pan), ("tilt", unit.tilt)):
+        if axis.lowest >= axis.highest:
+            raise DeviceError(
+                f"the pan-tilt unit at {name} is not calibrated: its {word} goes from {axis.lowest} to {axis.highest}; "
+                "clear its way and run cotarget reset-head, which turns it through its whole range"
+            )
+
+
+def compare(name: str, unit: Unit, config: HardwareHead) -> None:
+    """Compare what the unit says with what rig.toml expects.
+
+    Raises:
+        ConfigError: with both and what to write.
+    """
+    for word, axis in (("pan", unit.pan), ("tilt", unit.tilt)):
+        own = axis.arcseconds / d46.ARCSECONDS
+        if abs(own - config.step_deg) > STEP_SHARE * config.step_deg:
+            raise ConfigError(
+                f"hardware.head.step_deg: the {word} of the unit at {name} has steps of {own:.6g} degrees, "
+                f"not {config.step_deg:.6g}; write step_deg = {own:.6g}, or change the unit's step mode"
+            )
+    for word, axis, expected, sign in (
+        ("pan", unit.pan, config.pan_deg, config.pan_sign),
+        ("tilt", unit.tilt, config.tilt_deg, config.tilt_sign),
+    ):
+        found = axis.degrees(sign)
+        if not _alike(found, expected):
+            turned = f", or {word}_sign = {-sign}" if _alike(axis.degrees(-sign), expected) else ""
+            raise ConfigError(
+                f"hardware.head.{word}_deg: the unit at {name} goes from {found[0]:.1f} to {found[1]:.1f} degrees, not "
+                f"from {expected[0]:g} to {expected[1]:g}; write {word}_deg = [{found[0]:.1f}, {found[1]:.1f}]{turned}"
+            )
+
+
+def probe(port: str, baud: int) -> str:
+    """Look who is at a port, by questions that change nothing: version and number on the network.
+
+    Raises:
+        DeviceError: no pan-tilt unit.
+    """
+    line = open_line(port, baud, MonotonicClock())
+    try:
+        line.write(DELIMITER)
+        line.drain(GREETING_QUIET_S, GREETING_MOST_S)
+        version = line.ask(command("V"), PATIENCE_S).text
+        if not version:
+            raise ReplyError(f"what answers at {port} tells no version")
+        return f"{version}, unit {d46.integer(line.ask(command('U'), PATIENCE_S).text)}"
+    except (SilentError, ReplyError, RefusedError) as error:
+        raise _stranger(line) from error
+    finally:
+        line.close()
+
+
+def reset(config: HardwareHead, clock: Clock) -> Unit:
+    """Let the unit find its limits anew: it turns through its whole range. Only with an operator's consent.
+
+    Returns:
+        The unit, with the limits that it found.
+
+    Raises:
+        DeviceError: it failed; the unit was halted.
+    """
+    line = open_line(config.port, config.baud, clock)
+    try:
+        greet(line)
+        try:
+            said = line.ask(command("R"), RESET_S, skipping=True).text
+            log.info("%s: reset: %s", line.name, said)
+        except BaseException as error:
+            if not isinstance(error, LostError):
+                line.write(DELIMITER + HALT)
+            raise
+        unit = identify(line)
+        refuse_uncalibrated(line.name, unit)
+        return unit
+    finally:
+        line.close()
+
+
+def _axis(line: Line, axis: AxisName) -> AxisFacts:
+    def number(what: str) -> int:
+        return line.query(command(axis + what), d46.integer, PATIENCE_S)[0]
+
+    arcseconds, _ = line.query(command(axis + "R"), d46.arcseconds, PATIENCE_S)
+    facts = AxisFacts(arcseconds, number("N"), number("X"), number("L"), number("U"), number("A"))
+    if not 0 <= facts.slowest < facts.fastest or facts.acceleration <= 0:
+        raise DeviceError(
+            f"the pan-tilt unit at {line.name} tells for {d46.AXIS_WORDS[axis]} speeds from {facts.slowest} to "
+            f"{facts.fastest} and an acceleration of {facts.acceleration}; restore its factory settings"
+        )
+    return facts
+
+
+def _told(line: Line, question: str) -> str:
+    """What the unit answers, in its own words; nothing where its firmware is too old for the question."""
+    try:
+        return line.query(command(question), str, PATIENCE_S)[0]
+    except RefusedError:
+        return ""
+
+
+def _make_independent(line: Line) -> None:
+    """See to it that positions can be commanded, and not velocities alone."""
+    try:
+        try:
+            if d46.independent(line.ask(command("C"), PATIENCE_S).text):
+                return
+        except ReplyError as error:
+            log.info("%s: control mode: %s", line.name, error)
+        line.query(command("CI"), d46.done, PATIENCE_S)
+    except RefusedError:
+        log.info("%s: the firmware has no control modes", line.name)
+
+
+def _alike(found: tuple[float, float], expected: tuple[float, float]) -> bool:
+    return max(abs(a - b) for a, b in zip(found, expected, strict=True)) <= LIMITS_DEG
+
+
+def _stranger(line: Line) -> DeviceError:
+    """Tell why there is no pan-tilt unit to talk with, from what was heard."""
+    heard, events = line.heard, d46.split_events(line.heard)[1]
+    if not heard.strip():
+        return DeviceError(
+            f"nothing answers at {line.name}: is the pan-tilt unit switched on and plugged in, and does it speak at "
+            f"{line.baud} baud?"
+        )
+    if events or d46.BANNER.search(heard):
+        return DeviceError(f"the pan-tilt unit at {line.name} is starting up; try again when it has come to rest")
+    return DeviceError(
+        f"what answers at {line.name} is no PTU-D46 that speaks at {line.baud} baud: it says {d46.shown(heard)}"
+    )
