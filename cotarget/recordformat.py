@@ -44,6 +44,7 @@ CALLS: Mapping[str, tuple[tuple[int, ...], int]] = {
     "clock.now": ((0,), 1),
     "clock.sleep_until": ((1,), 0),
     "board.present": ((0, 6), 0),  # translation and rotation vector [rad], or no board
+    "board.swing": ((6,), 0),
 }
 FRAMES = frozenset({"fixed.read", "zoom.read", "zoom.capture"})
 
@@ -83,6 +84,7 @@ class RigFacts:
         still_size: the same of its stills.
         focal_range: shortest and longest nominal focal length [px].
         limits: what the head can do.
+        real_time: whether its time passes by itself, which the safety layer wants to know.
     """
 
     fixed_size: tuple[int, int]
@@ -90,6 +92,7 @@ class RigFacts:
     still_size: tuple[int, int]
     focal_range: tuple[float, float]
     limits: PanTiltLimits
+    real_time: bool
 
 
 def event_line(event: Event) -> str:
@@ -149,6 +152,7 @@ def facts_table(facts: RigFacts) -> dict[str, Any]:
         "speed": _plain(limits.speed),
         "acceleration": _plain(limits.acceleration),
         "step": _plain(limits.step),
+        "real_time": facts.real_time,
     }
 
 
@@ -178,6 +182,7 @@ def parse_facts(table: Mapping[str, Any]) -> RigFacts:
         PanTiltLimits(
             pair("pan"), pair("tilt"), float(table["speed"]), float(table["acceleration"]), float(table["step"])
         ),
+        bool(table["real_time"]),
     )
 
 

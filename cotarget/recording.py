@@ -135,6 +135,11 @@ class Recorder:
         """Images of the zoom camera that were left out so far, because the disk was too slow."""
         return self._writer.dropped
 
+    @property
+    def waiting(self) -> int:
+        """Answers of the rig that are still on their way to the disk; a crash would lose these and no others."""
+        return self._writer.waiting
+
     def wrap(self, rig: Rig) -> Rig:
         """Give a rig that records; one a recording. The rig is closed with it, and at once if this fails."""
         assert not self._wrapped, "a recording is of one rig"

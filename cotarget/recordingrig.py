@@ -57,7 +57,8 @@ class _Notebook:
             self._writer.put(Event(call, self._clock.now(), args, error=failure, aside=aside))
             raise
         result, camera, frame = parts(given)
-        event = Event(call, self._clock.now(), args, result, aside=aside)
+        at = float(result[0] or 0.0) if call == "clock.now" else self._clock.now()
+        event = Event(call, at, args, result, aside=aside)
         self._writer.put(event, camera, None if frame is None else frame.image)
         return given
 
@@ -141,10 +142,16 @@ class _Board:
         return self._board.patience
 
     def present(self, T_fixed_board: RigidTransform | None) -> None:
-        args: tuple[float, ...] = ()
-        if T_fixed_board is not None:
-            args = tuple(float(v) for v in (*T_fixed_board.translation, *T_fixed_board.rotation.as_rotvec()))
+        args = () if T_fixed_board is None else _numbers(T_fixed_board)
         self._notes.ask("board.present", args, lambda: self._board.present(T_fixed_board), lambda _: ())
+
+    def swing(self, T_fixed_board: RigidTransform) -> None:
+        args = _numbers(T_fixed_board)
+        self._notes.ask("board.swing", args, lambda: self._board.swing(T_fixed_board), lambda _: ())
+
+
+def _numbers(T: RigidTransform) -> tuple[float, ...]:
+    return tuple(float(v) for v in (*T.translation, *T.rotation.as_rotvec()))
 
 
 class RecordingRig:
@@ -157,7 +164,10 @@ class RecordingRig:
         self._rig = rig
         try:
             zoom = rig.zoom
-            facts = RigFacts(rig.fixed.size, zoom.size, zoom.still_size, zoom.focal_range, rig.head.limits)
+            self.real_time = bool(getattr(rig, "real_time", False))
+            facts = RigFacts(
+                rig.fixed.size, zoom.size, zoom.still_size, zoom.focal_range, rig.head.limits, self.real_time
+            )
             writer.put({"rig": facts_table(facts)})
         except BaseException:
             rig.close()

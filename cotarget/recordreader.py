@@ -21,6 +21,7 @@ from cotarget.recordformat import (
     parse_facts,
     read_json,
 )
+from cotarget.tables import expect_table
 
 
 @dataclass(frozen=True)
@@ -118,17 +119,21 @@ class _DamageError(Exception):
 def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, RigConfig]:
     """The target's name and the configuration, whose picture of the target lies in the recording."""
     path = directory / META
+    name, table = meta["target"], meta["config"]
     try:
-        config = parse_config(meta["config"])
-        target = config.target(meta["target"])
-    except (ConfigError, TypeError) as error:
+        if not isinstance(name, str):
+            raise ConfigError("target: is not a text")
+        expect_table(table, "config")
+        config = parse_config(table)
+        target = config.target(name)
+    except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
-    recorded = meta["config"].get("targets", {}).get(meta["target"], {}).get("template")
+    recorded = table.get("targets", {}).get(name, {}).get("template")
     template = None if recorded is None else directory / Path(recorded).name
     if template is not None and not template.is_file():
         raise ConfigError(f"{template}: no such file; the recording is not whole")
     target = replace(target, template=template)
-    return meta["target"], dataclasses.replace(config, targets={**config.targets, meta["target"]: target})
+    return name, dataclasses.replace(config, targets={**config.targets, name: target})
 
 
 def _rows(path: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:

@@ -76,12 +76,17 @@ class RecordWriter:
         """
         with self._changed:
             picture = None
-            if image is not None:
+            if image is not None and not self.failure:
                 assert isinstance(event, Event)
                 picture = self._picture(camera, image, float(event.result[0] or 0.0))
-            if not self.failure:
+            if not self.failure:  # which may have come about while there was no room
                 self._queue.append((event, picture))
                 self._changed.notify_all()
+
+    @property
+    def waiting(self) -> int:
+        """How many events are still on their way to the disk."""
+        return len(self._queue)
 
     def close(self) -> None:
         """Write what still waits, and end."""
@@ -117,8 +122,9 @@ class RecordWriter:
                     self._changed.wait_for(lambda: self._queue or self._closing)
                     if not self._queue:
                         return
-                    event, picture = self._queue.popleft()
+                    event, picture = self._queue[0]
                 self._write(event, picture)
+                self._queue.popleft()  # only now, so that the queue holds whatever is not written yet
         except (OSError, cv2.error) as error:
             reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error).strip()
             log.warning("the recording ends here; it cannot be written: %s", reason)

@@ -185,6 +185,9 @@ class _Board:
     def present(self, T_fixed_board: RigidTransform | None) -> None:
         """Nothing to do: whatever was wished for is in the pictures."""
 
+    def swing(self, T_fixed_board: RigidTransform) -> None:
+        """Nothing to do."""
+
 
 class _Track:
     """States of a device over time: numbers, whether it moved, and the time, as they were recorded."""
@@ -208,6 +211,7 @@ class ReplayRig:
 
     def __init__(self, recording: Recording) -> None:
         self._tape = Tape(recording)
+        self.real_time = recording.facts.real_time
         self.fixed: Camera = _FixedCamera(self._tape, recording.directory, recording.facts.fixed_size)
         self.zoom: ZoomCamera = _ZoomCamera(self._tape, recording)
         self.head: PanTilt = _Head(self._tape, recording)

@@ -9,7 +9,7 @@ import math
 import threading
 from collections import defaultdict, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cotarget.errors
 from cotarget.errors import CotargetError, DeviceError, StaleFrameError
@@ -63,11 +63,42 @@ class Differences:
         )
 
 
-@dataclass
 class _Span:
-    """What was asked from one frame of the fixed camera to the next."""
+    """What was asked from one frame of the fixed camera to the next, each kind of call in its order.
 
-    calls: dict[str, deque[Event]] = field(default_factory=lambda: defaultdict(deque))
+    A look at the clock was between two other calls; it is given again only there. So a run that looks more often or
+    less often than the recorded one has the right time again as soon as it asks for something else.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[str, deque[tuple[int, Event]]] = defaultdict(deque)
+        self._size = 0
+        self._progress = 0  # behind the furthest of the other calls that was given again
+
+    def add(self, event: Event) -> None:
+        """Append a call."""
+        self._waiting[event.call].append((self._size, event))
+        self._size += event.call != "clock.now"
+
+    def take(self, call: str) -> Event | None:
+        """The next event of a call, if there is one and it is its turn."""
+        waiting, looks = self._waiting[call], self._waiting["clock.now"]
+        if not waiting or (call == "clock.now" and waiting[0][0] > self._progress):
+            return None
+        place, event = waiting.popleft()
+        if call != "clock.now":
+            self._progress = max(self._progress, place + 1)
+            while looks and looks[0][0] <= place:
+                looks.popleft()
+        return event
+
+    def left(self, call: str) -> int:
+        """How many events of a call were not taken."""
+        return len(self._waiting[call])
+
+    def forget(self, call: str) -> None:
+        """Take all events of a call."""
+        self._waiting[call].clear()
 
 
 class Tape:
@@ -94,6 +125,11 @@ class Tape:
         """Whether another thread than the run's own asks, such as a watchdog; it has what is so at this time."""
         return threading.get_ident() != self._thread
 
+    @property
+    def _breaks_off(self) -> bool:
+        """Whether the run was ended by an error after the newest frame, so that nothing is known of what followed."""
+        return self._broke_off and self._index == len(self._spans) - 1
+
     def take(self, call: str) -> Event | None:
         """The recorded event of a call that the run asked then too, between the same two frames; else None.
 
@@ -102,11 +138,11 @@ class Tape:
         """
         if self.is_aside:
             return None
-        if waiting := self._spans[self._index].calls.get(call):
-            return waiting.popleft()
-        if self._broke_off and self._index == len(self._spans) - 1 and not self._ended and call not in COMMANDS:
+        span = self._spans[self._index]
+        event = span.take(call)
+        if event is None and self._breaks_off and not span.left(call) and not self._ended and call not in COMMANDS:
             raise self._end()
-        return None
+        return event
 
     def play(self, event: Event) -> Event:
         """Let the time of an event come, and its error.
@@ -158,7 +194,8 @@ class Tape:
             return
         counts = self.differences
         if recorded is None:
-            self.differences = replace(counts, extra=counts.extra + (not self._ended))
+            if not (self._ended or self._breaks_off):
+                self.differences = replace(counts, extra=counts.extra + 1)
             return
         differs = tuple(args) != recorded.args
         axes = 2 if call == "head.move" else 1
@@ -189,7 +226,8 @@ class Tape:
         for span in spans:
             due = COMMANDS[:-1] if span is self._spans[-1] else COMMANDS
             for call in due:
-                missing += len(span.calls.pop(call, ()))
+                missing += span.left(call)
+                span.forget(call)
         self.differences = replace(self.differences, missing=self.differences.missing + missing)
 
     def _end(self) -> RecordingEndedError:
@@ -212,7 +250,7 @@ def _cut(events: Sequence[Event]) -> tuple[list[_Span], list[Event]]:
             spans.append(_Span())
             frames.append(event)
         else:
-            spans[-1].calls[event.call].append(event)
+            spans[-1].add(event)
     return spans, frames
 
 

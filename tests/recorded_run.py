@@ -6,6 +6,7 @@ As a program: `python -m tests.recorded_run FOLDER` records without end and prin
 import itertools
 import math
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,7 +39,8 @@ SETTINGS = FollowSettings(command_delay_s=0.04)
 class ToyRig:
     """A bright bird on a noisy sky; a head and a lens that go straight to where they are sent."""
 
-    def __init__(self, failing=None):
+    def __init__(self, failing=None, real_time=False):
+        self.real_time = real_time
         self.t, self.goal, self.start, self.since = 1000.0, np.zeros(2), np.zeros(2), 0.0
         self.failing = failing or {}  # the exception to raise at the n-th call of a device's method
         self.calls = dict.fromkeys(("fixed.read", "zoom.read", "head.move", "head.halt"), 0)
@@ -113,7 +115,7 @@ class ToyHead:
 
     def state(self):
         pan, tilt = np.round(self.rig.pose() / STEP) * STEP
-        return PanTiltState(pan, tilt, bool(np.any(self.rig.pose() != self.rig.goal)), self.rig.t)
+        return PanTiltState(float(pan), float(tilt), bool(np.any(self.rig.pose() != self.rig.goal)), self.rig.t)
 
     def move(self, pan, tilt, speed=None, wait=False):
         self.rig.count("head.move")
@@ -144,6 +146,8 @@ class ToyBoard:
 
     def present(self, T_fixed_board):
         pass
+
+    swing = present
 
 
 class Bright:
@@ -192,6 +196,8 @@ def main():
     path = calibration_file(folder)
     with Recorder(folder / "recording", CONFIG, path, "bird") as recorder:
         for index, _ in zip(itertools.count(), run(recorder.wrap(ToyRig()), load_calibration(path), math.inf)):
+            while recorder.waiting:  # this rig is faster than any real one, and than the disk
+                time.sleep(0.001)
             print(index, flush=True)
 
 

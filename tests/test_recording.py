@@ -1,18 +1,30 @@
-"""The table of Steps: one line each, complete or not there at all."""
+"""What a run leaves: the table of Steps, complete or not there at all; and its recording, whole whenever it stops."""
 
 import csv
+import dataclasses
+import errno
+import json
 import math
+import threading
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from cotarget import recordwriter
+from cotarget.calibration import load_calibration
+from cotarget.config import DEFAULT_TARGETS, RigConfig, parse_config
 from cotarget.detection import Detection
-from cotarget.errors import ConfigError
+from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.loop import State, Step
-from cotarget.recording import COLUMNS, StepTable
+from cotarget.recordformat import CALLS, Event, config_table, event_line, parse_event
+from cotarget.recording import COLUMNS, Recorder, StepTable
+from cotarget.replay import ReplayRig, open_recording
 from cotarget.rig import Frame, PanTiltState, ZoomState
 from cotarget.targeting import Aim
 from cotarget.tracking import Track
+from tests.recorded_run import CONFIG, SIZE, ToyRig, calibration_file, record, run
 
 PICTURE = np.zeros((4, 4, 3), np.uint8)
 
@@ -86,3 +98,252 @@ def test_no_path_writes_nothing(tmp_path, monkeypatch):
 def test_a_table_that_cannot_be_written_is_named_at_once(tmp_path):
     with pytest.raises(ConfigError, match=r"steps\.csv: cannot be written: No such file or directory"):
         StepTable(tmp_path / "none" / "steps.csv")
+
+
+@pytest.fixture
+def calibration_path(tmp_path):
+    return calibration_file(tmp_path)
+
+
+def rows_of(folder):
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def test_a_recording_holds_what_went_through_the_rig(tmp_path, calibration_path):
+    """Files that another program can read: PNGs, and JSON lines whose numbers are those of the Steps."""
+    steps = record(tmp_path / "run", calibration_path, seconds=0.5)
+    folder = tmp_path / "run"
+    assert (folder / "calibration.json").read_bytes() == calibration_path.read_bytes()
+    about = json.loads((folder / "recording.json").read_text())
+    assert (about["schema"], about["target"], about["config"]["backend"]) == (1, "bird", "sim")
+    assert about["config"]["targets"]["bird"]["wanted_px"] == 30.0
+    rows = rows_of(folder)
+    assert rows[0]["rig"]["fixed_size"] == list(SIZE)
+    assert rows[-1] == {"end": "complete", "dropped": 0}
+    looks = [row for row in rows if row.get("call") == "fixed.read"]
+    assert [row["result"] for row in looks] == [[step.fixed.t] for step in steps]
+    for row, step in zip(looks, steps, strict=True):
+        path = folder / row["image"]
+        assert path.stat().st_size == row["bytes"]
+        assert np.array_equal(cv2.imread(str(path)), step.fixed.image)
+    closeups = [row["image"] for row in rows if row.get("call") == "zoom.read"]
+    assert len(closeups) == len(steps)
+    assert len(set(closeups)) == len({step.zoom.t for step in steps}) < len(steps)  # a frame seen twice is kept once
+    moves = [row for row in rows if row.get("call") == "head.move"]
+    assert tuple(moves[-1]["result"]) == steps[-1].commanded[:2]
+    assert rows[-2]["call"] == "head.halt"
+    times = [row["at"] for row in rows[1:-1]]
+    assert times == sorted(times)
+    assert {path.suffix for path in folder.rglob("*") if path.is_file()} == {".json", ".jsonl", ".png"}
+    assert "recording" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_every_bit_of_a_number_comes_back():
+    rng = np.random.default_rng(1)
+    for call, (arities, count) in CALLS.items():
+        for arity in arities:
+            args = tuple(rng.normal(size=arity) * 10.0 ** rng.integers(-300, 300, arity))
+            result = tuple(rng.normal(size=count) * 1e-7)
+            event = Event(call, float(rng.normal()), tuple(map(float, args)), tuple(map(float, result)))
+            assert parse_event(json.loads(event_line(event))) == event
+    odd = Event("head.move", 1.0, (math.inf, -0.0, None, True), (-math.inf, 5e-324), aside=True)
+    back = parse_event(json.loads(event_line(odd)))
+    assert back == odd
+    assert math.copysign(1, back.args[1]) == -1
+    failed = Event("zoom.capture", 1.0, error=("DeviceError", 'two\nlines and a "quote"'))
+    assert "\n" not in event_line(failed)
+    assert parse_event(json.loads(event_line(failed))) == failed
+
+
+TABLES = [
+    {},
+    {"sim": {"scene": "indoor", "targets": ["book"], "seed": 3, "effects": {"all": False, "noise": True},
+             "T_head_zoom": {"translation": [0.1, 0.2, 0.3], "rotvec_deg": [1.0, 2.0, 3.0]}}},
+    {"backend": "hardware", "hardware": {"head": {"port": "/dev/ttyUSB0", "pan_sign": -1},
+     "zoom": {"settings": {"iso": "100"}, "lens": [[0, 6.0], [128, 72.0]]}, "fixed": {"url": "http://10.0.0.1:8080/"}},
+     "safety": {"pan_deg": [-20, 30], "speed_deg_s": 40.0},
+     "targets": {"kite": {"size": 2.0, "dimension": "width", "wanted_px": 99.5, "detector": "motion"}}},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_config_comes_back(table):
+    def plain(value):
+        if dataclasses.is_dataclass(value):
+            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        if hasattr(value, "as_matrix"):
+            return np.round(value.as_matrix(), 12).tolist()  # through degrees and back
+        return {k: plain(v) for k, v in value.items()} if hasattr(value, "items") else value
+
+    config = parse_config(table)
+    text = json.dumps(config_table(config), allow_nan=False)
+    assert plain(parse_config(json.loads(text))) == plain(config)
+
+
+def test_no_password_is_recorded(tmp_path, calibration_path):
+    table = {"backend": "hardware", "hardware": {"fixed": {"url": "http://me:secret@10.0.0.1/", "password": "secret"}}}
+    with Recorder(tmp_path / "run", parse_config(table), calibration_path, "bird") as recorder:
+        list(run(recorder.wrap(ToyRig()), load_calibration(calibration_path), seconds=0.1))
+    assert not [path for path in (tmp_path / "run").iterdir() if path.is_file() and b"secret" in path.read_bytes()]
+    assert open_recording(tmp_path / "run").config.hardware.fixed.url == "http://10.0.0.1/"
+
+
+def test_the_targets_picture_comes_along(tmp_path, calibration_path):
+    picture = tmp_path / "cover.png"
+    cv2.imwrite(str(picture), np.full((4, 5, 3), 99, np.uint8))
+    book = dataclasses.replace(DEFAULT_TARGETS["book"], template=picture)
+    with Recorder(tmp_path / "run", RigConfig(targets={"book": book}), calibration_path, "book") as recorder:
+        list(run(recorder.wrap(ToyRig()), load_calibration(calibration_path), seconds=0.1))
+    picture.unlink()
+    moved = (tmp_path / "run").rename(tmp_path / "elsewhere")
+    template = open_recording(moved).config.target("book").template
+    assert template == moved / "template.png"
+    assert cv2.imread(str(template)).shape == (4, 5, 3)
+    template.unlink()
+    with pytest.raises(ConfigError, match=r"template\.png: no such file; the recording is not whole"):
+        open_recording(moved)
+
+
+def prepare(tmp_path, what):
+    folder = tmp_path / "run"
+    if what == "full":
+        folder.mkdir()
+        (folder / "dear.txt").write_text("keep me")
+    if what == "file":
+        folder.write_text("keep me")
+    if what == "under a file":
+        (tmp_path / "file").write_text("")
+        folder = tmp_path / "file" / "run"
+    return folder
+
+
+@pytest.mark.parametrize(("what", "target", "calibration", "message"), [
+    ("full", "bird", "rig_calibration.json", r"run: is not empty; give a new folder for the recording"),
+    ("file", "bird", "rig_calibration.json", r"run: cannot hold a recording: File exists"),
+    ("under a file", "bird", "rig_calibration.json", r"run: cannot hold a recording: Not a directory"),
+    ("", "yeti", "rig_calibration.json", r"unknown target 'yeti'"),
+    ("", "bird", "none.json", r"none\.json: cannot be recorded: No such file or directory"),
+    ("", "book", "rig_calibration.json", r"nowhere\.png: cannot be recorded: No such file or directory"),
+])  # fmt: skip
+def test_a_recording_that_cannot_begin_is_refused_in_one_line_and_leaves_nothing(
+    tmp_path, calibration_path, what, target, calibration, message
+):
+    folder = prepare(tmp_path, what)
+    before = sorted(tmp_path.rglob("*"))
+    book = dataclasses.replace(DEFAULT_TARGETS["book"], template=Path("nowhere.png"))
+    config = dataclasses.replace(CONFIG, targets={**CONFIG.targets, "book": book})
+    with pytest.raises(ConfigError, match=message) as caught:
+        Recorder(folder, config, tmp_path / calibration, target)
+    assert "\n" not in str(caught.value)
+    assert sorted(tmp_path.rglob("*")) == before
+    assert "recording" not in {thread.name for thread in threading.enumerate()}
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_rig_that_cannot_be_opened_leaves_room_for_the_next_try(tmp_path, calibration_path, exists):
+    folder = tmp_path / "run"
+    if exists:
+        folder.mkdir()
+    with pytest.raises(DeviceError, match="no such port"), Recorder(folder, CONFIG, calibration_path, "bird"):
+        raise DeviceError("no such port")
+    assert folder.exists() == exists
+    assert not exists or not list(folder.iterdir())
+    assert record(folder, calibration_path, seconds=0.1)
+
+
+def test_a_rig_that_says_nothing_of_itself_is_closed(tmp_path, calibration_path):
+    rig = ToyRig()
+    rig.head = None
+    with pytest.raises(AttributeError), Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
+        recorder.wrap(rig)
+    assert rig.closed
+    with pytest.raises(ConfigError, match="run: holds nothing to replay"):
+        open_recording(tmp_path / "run")
+
+
+class Jammed:
+    """A disk that takes nothing until it is let go."""
+
+    def __init__(self, monkeypatch):
+        self.free, self.begun = threading.Event(), threading.Event()
+        write = recordwriter.RecordWriter._write_image
+
+        def wait_and_write(writer, name, image):
+            self.begun.set()
+            assert self.free.wait(60)
+            return write(writer, name, image)
+
+        monkeypatch.setattr(recordwriter.RecordWriter, "_write_image", wait_and_write)
+
+
+def test_a_slow_disk_costs_closeups_and_says_how_many(tmp_path, calibration_path, monkeypatch, caplog):
+    """The zoom camera's images stay out, and the fixed camera's are all there; the run is the same to the last bit."""
+    disk = Jammed(monkeypatch)
+    monkeypatch.setattr(recordwriter, "ZOOM_ROOM", 4)
+    steps = []
+    with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
+        for step in run(recorder.wrap(ToyRig()), load_calibration(calibration_path), seconds=2.0):
+            steps.append(step)
+        dropped = recorder.dropped
+        disk.free.set()
+    assert dropped == len({step.zoom.t for step in steps}) - 1  # of four images one, for its frames are rarer
+    assert [record.message for record in caplog.records] == [
+        "the disk is too slow for the recording: images of the zoom camera are left out"
+    ]
+    assert rows_of(tmp_path / "run")[-1] == {"end": "complete", "dropped": dropped}
+    recording = open_recording(tmp_path / "run")
+    assert recording.steps == len(steps)
+    assert "frames of the zoom camera lack their image" in recording.notes[0]
+    rig = ReplayRig(recording)
+    again = list(run(rig, load_calibration(calibration_path), seconds=2.0))
+    assert [step.commanded for step in again] == [step.commanded for step in steps]
+    assert rig.differences.same
+
+
+def test_a_run_waits_for_a_disk_that_has_no_room_for_the_fixed_cameras_images(tmp_path, calibration_path, monkeypatch):
+    disk = Jammed(monkeypatch)
+    monkeypatch.setattr(recordwriter, "ROOM", 3)
+    monkeypatch.setattr(recordwriter, "ZOOM_ROOM", 0)
+    steps = []
+
+    def work():
+        with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
+            for step in run(recorder.wrap(ToyRig()), load_calibration(calibration_path), seconds=0.5):
+                steps.append(step)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    assert disk.begun.wait(60)
+    thread.join(0.5)  # it does not end; were it slow, it would not either
+    assert len(steps) <= 3
+    assert thread.is_alive()
+    disk.free.set()
+    thread.join(60)
+    assert not thread.is_alive()
+    assert open_recording(tmp_path / "run").steps == len(steps)
+
+
+def test_a_full_disk_does_not_stop_the_run_but_is_told(tmp_path, calibration_path, monkeypatch, caplog):
+    write = recordwriter.RecordWriter._write_image
+
+    def fill_up(writer, name, image):
+        if name == "fixed/000010.png":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(writer, name, image)
+
+    monkeypatch.setattr(recordwriter.RecordWriter, "_write_image", fill_up)
+    steps = []
+
+    def work():
+        with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
+            steps.extend(run(recorder.wrap(ToyRig()), load_calibration(calibration_path), seconds=2.0))
+
+    with pytest.raises(CotargetError, match=r"run: the recording is cut short: No space left on device"):
+        work()
+    assert len(steps) > 40
+    assert [record.message for record in caplog.records] == [
+        "the recording ends here; it cannot be written: No space left on device"
+    ]
+    recording = open_recording(tmp_path / "run")
+    assert recording.truncated
+    assert recording.steps == 9
