@@ -260,7 +260,7 @@ def test_what_fails_on_the_way_out_does_not_hide_why(error, failing, caplog):
 
 
 def test_a_halt_that_fails_once_is_tried_again_before_the_rig_closes():
-    rig, tries = Rig(), iter([broken, broken, lambda: rig.head.log.append("halt")])
+    rig, tries = Rig(), iter([broken, lambda: rig.head.log.append("halt")])
     rig.head.halt = lambda: next(tries)()
     SafeRig(rig, SafetyConfig()).close()
     assert rig.head.log == ["halt", "close"]

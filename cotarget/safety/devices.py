@@ -31,7 +31,7 @@ class SafeHead:
 
     def state(self) -> PanTiltState:
         """The head's state now."""
-        self._guard.watch()
+        self._guard.on_call()
         state = self._head.state()
         self._guard.saw(state, self._limits.step)
         return state
@@ -87,9 +87,9 @@ def _inside(angle: float, bounds: tuple[float, float], limits: PanTiltLimits) ->
 class SafeCamera:
     """A camera whose frames are refused when they are too old to act on, or cannot be true."""
 
-    def __init__(self, camera: Camera, clock: Clock, guard: Guard, max_age_s: float, name: str, split: bool) -> None:
+    def __init__(self, camera: Camera, clock: Clock, guard: Guard, max_age_s: float, name: str) -> None:
         self._camera, self._clock, self._guard = camera, clock, guard
-        self._max_age_s, self._name, self._split = max_age_s, name, split
+        self._max_age_s, self._name = max_age_s, name
         self._newest = -math.inf
 
     @property
@@ -104,37 +104,39 @@ class SafeCamera:
             StaleFrameError: no new frame came, or the newest is too old to act on.
         """
         frame = self._read(newer_than, timeout)
-        age = self._clock.now() - frame.t
+        now = self._clock.now()
+        age = now - frame.t
         if not age <= self._max_age_s:
             raise StaleFrameError(
                 f"the newest frame is {age:.2f} s old; at most {self._max_age_s:g} s is acted on ({self._name} camera)"
             )
         if newer_than is not None and not frame.t > newer_than:
             raise StaleFrameError(f"the {self._name} camera gave a frame of {frame.t:.3f} s for one after that time")
-        self.accept(frame)
+        self.accept(frame, now)
         return frame
 
-    def accept(self, frame: Frame) -> None:
-        """Take a frame for a sign of life if it is newer than all before.
+    def accept(self, frame: Frame, now: float) -> None:
+        """Take a frame that was read at this time for a sign of life if it is newer than all before.
 
         Raises:
             StaleFrameError: it is from later than now.
         """
-        ahead = frame.t - self._clock.now()
+        ahead = frame.t - now
         if not ahead <= FUTURE_S:
             raise StaleFrameError(
                 f"the {self._name} camera's frame is from {ahead:.2f} s in the future; mind the clock"
             )
+        self._guard.on_call()
         if frame.t > self._newest:
             self._newest = frame.t
-            self._guard.alive()
+            self._guard.alive(now)
 
     def _read(self, newer_than: float | None, timeout: float) -> Frame:
-        if not self._split:
+        if self._guard.threaded:
             return self._camera.read(newer_than, timeout)
         self._guard.watch()
         deadline = self._guard.deadline()
-        if deadline is not None and (first := deadline - self._clock.now()) < timeout:
+        if deadline is not None and 0 < (first := deadline - self._clock.now()) < timeout:
             try:
                 return self._camera.read(newer_than, first)
             except StaleFrameError:
@@ -190,7 +192,7 @@ class SafeZoomCamera:
         frame = self._camera.capture()
         if not frame.t >= asked - FUTURE_S:
             raise StaleFrameError(f"the still is from {asked - frame.t:.2f} s before it was asked for (zoom camera)")
-        self._stream.accept(frame)
+        self._stream.accept(frame, self._clock.now())
         return frame
 
 

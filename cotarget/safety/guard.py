@@ -16,7 +16,7 @@ from cotarget.safety.stopfile import refuse_if_stopped, stop_reason, stopped_by_
 
 log = logging.getLogger(__name__)
 
-HALT_TRIES = 3  # when the rig is closed; a driver's own deadlines bound each
+HALT_TRIES = 2  # when the rig is closed; a driver's own deadlines bound each
 AT_GOAL = math.radians(0.1)  # as near as this, and a step, a head that rests has arrived [rad]
 
 
@@ -43,9 +43,16 @@ class Guard:
     The head may be moving from a command until a halt, until the device has waited for its arrival, or until it is
     seen to rest at the goal. Through that time there must be a sign of life every ``watchdog_s``: a command, or a
     frame newer than all before.
+
+    Args:
+        head: the device.
+        clock: the rig's.
+        config: how long without a sign of life, and the stop file.
+        threaded: whether a thread calls `watch`. Where none does, each call on the rig has to.
     """
 
-    def __init__(self, head: PanTilt, clock: Clock, config: SafetyConfig) -> None:
+    def __init__(self, head: PanTilt, clock: Clock, config: SafetyConfig, *, threaded: bool) -> None:
+        self.threaded = threaded
         self._head, self._clock = head, clock
         self._timeout_s, self._stop_file = config.watchdog_s, config.stop_file
         self._lock = threading.RLock()  # reentrant: a signal's handler may call stop() anywhere
@@ -64,7 +71,10 @@ class Guard:
             EmergencyStopError: the head is stopped.
             DeviceError: the rig is closed, or the head has still to be halted and cannot be.
         """
-        self.watch()
+        if self.threaded:
+            self._catch_up()
+        else:
+            self.watch()
         with self._lock:
             self.refuse_if_stopped()
             if self._shut:
@@ -92,9 +102,14 @@ class Guard:
             self._halt("a command was still on its way when the head was halted")
         return interrupted
 
-    def alive(self) -> None:
-        """Note a sign of life: a frame newer than all before."""
-        self._alive_at = self._clock.now()
+    def alive(self, now: float) -> None:
+        """Note a sign of life: a frame newer than all before, read at this time [s]."""
+        self._alive_at = now
+
+    def on_call(self) -> None:
+        """Watch, where no thread does."""
+        if not self.threaded:
+            self.watch()
 
     def saw(self, state: PanTiltState, step: float) -> None:
         """Note where the head says it is: one that rests at its goal needs no watching."""
@@ -120,13 +135,10 @@ class Guard:
 
     def watch(self) -> None:
         """Halt the head if that is due: no sign of life, a stop file, or a halt that failed before."""
-        self._look_for_stop_file()
-        if self._owed is not None:
-            self._halt(self._owed)
-            return
+        self._catch_up()
         # In this order, a clock that goes forward shows no less than when the last sign of life was noted.
         alive_at, deadline = self._alive_at, self.deadline()
-        if deadline is None:
+        if deadline is None or self._owed is not None:
             return
         now = self._clock.now()
         if alive_at <= now < deadline:
@@ -230,7 +242,8 @@ class Guard:
         if late:
             log.warning("the head is halted now")
 
-    def _look_for_stop_file(self) -> None:
+    def _catch_up(self) -> None:
+        """Look for a stop file, and try again to halt a head that could not be halted."""
         reason = stop_reason(self._stop_file)
         with self._lock:
             new = reason is not None and self._stopped_by_file is None
@@ -238,3 +251,5 @@ class Guard:
         if new:
             log.warning("emergency stop: %s", reason)
             self._halt(f"emergency stop: {reason}")
+        elif self._owed is not None:
+            self._halt(self._owed)

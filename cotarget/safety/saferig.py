@@ -38,11 +38,11 @@ class SafeRig:
         try:
             refuse_if_stopped(config.stop_file)
             real_time = bool(getattr(rig, "real_time", False))
-            self._guard = Guard(rig.head, rig.clock, config)
+            self._guard = Guard(rig.head, rig.clock, config, threaded=real_time)
             self.head: PanTilt = SafeHead(rig.head, soft_limits(rig.head.limits, config), self._guard)
 
             def guarded(camera: Camera, name: str) -> SafeCamera:
-                return SafeCamera(camera, rig.clock, self._guard, config.max_frame_age_s, name, split=not real_time)
+                return SafeCamera(camera, rig.clock, self._guard, config.max_frame_age_s, name)
 
             self.fixed: Camera = guarded(rig.fixed, "fixed")
             self.zoom: ZoomCamera = SafeZoomCamera(rig.zoom, guarded(rig.zoom, "zoom"), rig.clock)
