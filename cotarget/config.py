@@ -206,7 +206,10 @@ def load_config(path: Path) -> RigConfig:
     scene = path.parent / config.sim.scene
     sim = dataclasses.replace(config.sim, scene=str(scene)) if scene.is_file() else config.sim
     recording = config.recording and path.parent / config.recording
-    return dataclasses.replace(config, targets=beside, sim=sim, recording=recording)
+    safety = dataclasses.replace(
+        config.safety, stop_file=config.safety.stop_file and path.parent / config.safety.stop_file
+    )
+    return dataclasses.replace(config, targets=beside, sim=sim, recording=recording, safety=safety)
 
 
 def parse_config(table: Mapping[str, Any]) -> RigConfig:

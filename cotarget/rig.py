@@ -195,5 +195,14 @@ def open_rig(config: "RigConfig") -> Rig:
             from cotarget.sim.world import SimWorld
 
             return SimWorld(config).rig
-        case _:
-            raise ConfigError(f"backend '{config.backend}' has no driver in this version; use 'sim'")
+        case "hardware":
+            from cotarget.hardware.rig import open_hardware
+
+            return open_hardware(config)
+        case "replay":
+            from cotarget.recordreader import open_recording
+            from cotarget.replay import ReplayRig
+
+            if config.recording is None:
+                raise ConfigError("recording: is missing; backend 'replay' needs the folder of a recording")
+            return ReplayRig(open_recording(config.recording))

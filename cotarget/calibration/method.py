@@ -18,7 +18,7 @@ from cotarget.calibration.finding import beyond_shortest, find_views
 from cotarget.calibration.intrinsics import FEWEST_CORNERS
 from cotarget.calibration.joint import joint
 from cotarget.calibration.model import DEFAULT_OPTIONS, Calibration, CameraName, Options, Progress, Rejected, View
-from cotarget.calibration.recorder import Recorder
+from cotarget.calibration.recorder import SETTLE, Recorder
 from cotarget.calibration.sequential import sequential
 from cotarget.calibration.session import capture_session
 from cotarget.calibration.stops import SAME_FOCAL, stops_of
@@ -244,6 +244,7 @@ def calibrate_rig(
     far_placements: int = FAR_PLACEMENTS,
     seed: int = 0,
     pitch_mm: float | None = None,
+    settle: float = SETTLE,
     options: Options = DEFAULT_OPTIONS,
 ) -> Calibration:
     """Drive a rig through a capture session, then calibrate it.
@@ -258,13 +259,14 @@ def calibrate_rig(
         far_placements: how many more placements, far away, for the stops beyond the first.
         seed: of the choice among possible placements.
         pitch_mm: size of a pixel of the zoom camera [mm], where it is known.
+        settle: how long after a stop of head or board an image is still taken for one of before [s].
         options: how to calibrate.
 
     Raises:
         CalibrationError: a camera never sees the board, there is no common view, or the head fails.
         ConfigError: the board looks the same upside down.
     """
-    recorder = Recorder(rig, board, captures_dir, pitch_mm)
+    recorder = Recorder(rig, board, captures_dir, pitch_mm, settle)
     rng = np.random.default_rng(seed)
     capture_session(recorder, placements, rng, progress, stops=stops, far_placements=far_placements)
     provenance = {

@@ -17,7 +17,9 @@ from cotarget.rig import Image, Rig
 # Wishes are rounded to 0.1 mm and 0.1 mrad. Nobody holds a board better; and the fits behind a plan sum in an order
 # that varies with the threads: their last digits would otherwise make two runs with the same seed drift apart.
 WISH_DECIMALS = 4
-SETTLE = 0.05  # after a stop, for vibrations and for an exposure that had begun before [s]
+# After a stop, for vibrations and for an exposure that had begun before [s]; and where nobody has measured yet by how
+# much frames are dated too late.
+SETTLE, SETTLE_LONG = 0.05, 0.5
 POLL = 0.02  # between looks at a state [s]
 FRAME_TIMEOUT = 5.0  # a slow network camera's latency, several times [s]
 HEAD_PATIENCE = 2.0  # beyond what the way takes at the head's own speed and acceleration [s]
@@ -56,6 +58,7 @@ class Recorder:
         board: the board in use.
         directory: where captures go; None to keep the corners only.
         pitch_mm: size of a pixel of the zoom camera [mm], for the index.
+        settle: how long after a stop an image is still taken for one of before [s].
         views: found so far.
         rejected: images in which a board was expected and not found.
         number: of the board's placement now.
@@ -65,6 +68,7 @@ class Recorder:
     board: BoardConfig
     directory: Path | None = None
     pitch_mm: float | None = None
+    settle: float = SETTLE
     views: list[View] = field(default_factory=list)
     rejected: list[Rejected] = field(default_factory=list)
     number: int = -1
@@ -105,7 +109,7 @@ class Recorder:
             raise CalibrationError(
                 f"the zoom lens stands at {state.focal_px:.0f} px where {wanted:.0f} px was commanded"
             )
-        self._still_since = max(self._still_since, state.t + SETTLE)
+        self._still_since = max(self._still_since, state.t + self.settle)
         return state.focal_px
 
     def present(self, T_fixed_board: RigidTransform) -> int:
@@ -119,7 +123,7 @@ class Recorder:
         self.rig.board.present(wish)
         if self.rig.board.patience:
             self._wait_until_held(before)
-        self._still_since = max(self._still_since, self.rig.clock.now() + SETTLE)
+        self._still_since = max(self._still_since, self.rig.clock.now() + self.settle)
         self.number += 1
         return self.number
 
@@ -169,7 +173,7 @@ class Recorder:
                     f"where pan {np.degrees(wanted[0]):.2f}, tilt {np.degrees(wanted[1]):.2f} was commanded"
                 )
             clock.sleep_until(clock.now() + POLL)
-        self._still_since = max(self._still_since, state.t + SETTLE)
+        self._still_since = max(self._still_since, state.t + self.settle)
 
     def see_fixed(self, *, expected: bool = True) -> View | None:
         """Take an image with the fixed camera and find the board in it."""

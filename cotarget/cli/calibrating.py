@@ -25,6 +25,7 @@ SESSION = ("placements", "stops")  # and those of a capture session
 def calibrate(options: argparse.Namespace) -> None:
     """Cotarget calibrate."""
     from cotarget import calibration as cal
+    from cotarget.calibration.recorder import SETTLE, SETTLE_LONG
     from cotarget.config import BoardConfig, load_config
     from cotarget.rig import open_rig
     from cotarget.safety import SafeRig
@@ -48,6 +49,7 @@ def calibrate(options: argparse.Namespace) -> None:
                     captures_dir=options.captures,
                     progress=tell,
                     pitch_mm=config.pitch_mm / finer,
+                    settle=SETTLE if config.backend == "sim" else SETTLE_LONG,
                     seed=config.sim.seed,
                     options=how,
                     **{name: getattr(options, name) for name in _given(options, SESSION)},

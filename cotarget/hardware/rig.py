@@ -1,0 +1,69 @@
+"""Opens the real devices as one Rig; whatever happens, the head is halted and every device released."""
+
+import contextlib
+from types import TracebackType
+
+from cotarget.config import RigConfig
+from cotarget.errors import ConfigError
+from cotarget.hardware.axis import AxisCamera
+from cotarget.hardware.board import make_board
+from cotarget.hardware.canon import GphotoCamera
+from cotarget.hardware.clock import MonotonicClock
+from cotarget.hardware.head import D46Head
+from cotarget.rig import Board
+
+NEEDED = (("head", "port", "/dev/ttyUSB0"), ("fixed", "url", "http://192.168.0.90"), ("zoom", "port", "usb:"))
+
+
+class HardwareRig:
+    """The real rig: devices that are open, and what closes them."""
+
+    real_time = True  # its time passes by itself: the safety layer watches it from a thread
+
+    def __init__(
+        self,
+        fixed: AxisCamera,
+        zoom: GphotoCamera,
+        head: D46Head,
+        clock: MonotonicClock,
+        board: Board,
+        opened: contextlib.ExitStack,
+    ) -> None:
+        self.fixed, self.zoom, self.head, self.clock, self.board = fixed, zoom, head, clock, board
+        self._opened = opened
+
+    def close(self) -> None:
+        """Halt the head and release the devices; more than once does no harm."""
+        self._opened.close()
+
+    def __enter__(self) -> "HardwareRig":
+        """Give the rig itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Halt, then close."""
+        self.close()
+
+
+def open_hardware(config: RigConfig) -> HardwareRig:
+    """Open the devices that a configuration names, the head last, so that it does not move where another is missing.
+
+    Raises:
+        ConfigError: a device is not named, or is not as configured.
+        DeviceError: a device could not be opened.
+    """
+    hardware = config.hardware
+    for table, key, example in NEEDED:
+        if not getattr(getattr(hardware, table), key):
+            raise ConfigError(
+                f'hardware.{table}.{key}: is missing; the hardware backend needs it, for example {key} = "{example}"'
+            )
+    clock = MonotonicClock()
+    with contextlib.ExitStack() as opened:
+        board = opened.enter_context(contextlib.closing(make_board(hardware.board)))
+        fixed = opened.enter_context(contextlib.closing(AxisCamera(hardware.fixed, clock)))
+        zoom = opened.enter_context(contextlib.closing(GphotoCamera(hardware.zoom, clock)))
+        head = opened.enter_context(contextlib.closing(D46Head(hardware.head, clock)))
+        return HardwareRig(fixed, zoom, head, clock, board, opened.pop_all())
