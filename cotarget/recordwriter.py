@@ -16,10 +16,10 @@ from cotarget.rig import Image
 
 log = logging.getLogger(__name__)
 
-# Images that may wait for the disk, about a megabyte each. Frames of the zoom camera, from which nothing is decided,
-# go without their image when there are more; the fixed camera's never do: the run waits when there are this many.
-ZOOM_ROOM = 48
-ROOM = 96
+# Images that may wait for the disk [bytes]; 640x480 takes 0.92 MB. Frames of the zoom camera, from which nothing is
+# decided, go without their image when there is no more room; the fixed camera's never do: the run waits instead.
+ZOOM_ROOM = 64_000_000
+ROOM = 128_000_000
 # Without search for repetitions, which noise has none of, and with the one filter that pays: a noisy 640x480 image
 # takes 6 ms and 375 kB where zlib's level 1 with every filter takes 13 ms and 370 kB, and raw 922 kB.
 PNG_OPTIONS = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
@@ -104,14 +104,14 @@ class RecordWriter:
                 return last
         picture = _Picture(f"{camera}/{self._numbers[camera]:06d}.png", image)
         self._numbers[camera] += 1
-        if camera == ZOOM and self._waiting >= ZOOM_ROOM:
+        if camera == ZOOM and self._waiting + image.nbytes > ZOOM_ROOM:
             picture = replace(picture, image=None, dropped=True)
             if self.dropped == 0:
                 log.warning("the disk is too slow for the recording: images of the zoom camera are left out")
             self.dropped += 1
         else:
-            self._changed.wait_for(lambda: self._waiting < ROOM or bool(self.failure))
-            self._waiting += 1
+            self._changed.wait_for(lambda: not self._waiting or self._waiting + image.nbytes <= ROOM or self.failure)
+            self._waiting += image.nbytes
         self._last[camera] = (t, image, picture)
         return picture
 
@@ -143,9 +143,9 @@ class RecordWriter:
         if picture is not None:
             if picture.image is not None:
                 picture.size_bytes = self._write_image(picture.name, picture.image)
-                picture.image = None
                 with self._changed:
-                    self._waiting -= 1
+                    self._waiting -= picture.image.nbytes
+                    picture.image = None
                     self._changed.notify_all()
             if not picture.dropped:
                 assert isinstance(event, Event)

@@ -27,6 +27,7 @@ from cotarget.tracking import Track
 from tests.recorded_run import CONFIG, SIZE, ToyRig, calibration_file, record, run
 
 PICTURE = np.zeros((4, 4, 3), np.uint8)
+IMAGE_BYTES = SIZE[0] * SIZE[1] * 3
 
 
 def step(index=0, found=True):
@@ -279,7 +280,7 @@ class Jammed:
 def test_a_slow_disk_costs_closeups_and_says_how_many(tmp_path, calibration_path, monkeypatch, caplog):
     """The zoom camera's images stay out, and the fixed camera's are all there; the run is the same to the last bit."""
     disk = Jammed(monkeypatch)
-    monkeypatch.setattr(recordwriter, "ZOOM_ROOM", 4)
+    monkeypatch.setattr(recordwriter, "ZOOM_ROOM", 4 * IMAGE_BYTES)
     steps = []
     with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
         for step in run(recorder.wrap(ToyRig()), load_calibration(calibration_path), seconds=2.0):
@@ -302,7 +303,7 @@ def test_a_slow_disk_costs_closeups_and_says_how_many(tmp_path, calibration_path
 
 def test_a_run_waits_for_a_disk_that_has_no_room_for_the_fixed_cameras_images(tmp_path, calibration_path, monkeypatch):
     disk = Jammed(monkeypatch)
-    monkeypatch.setattr(recordwriter, "ROOM", 3)
+    monkeypatch.setattr(recordwriter, "ROOM", 3 * IMAGE_BYTES)
     monkeypatch.setattr(recordwriter, "ZOOM_ROOM", 0)
     steps = []
 
