@@ -99,6 +99,7 @@ def test_a_long_data_phase(length):
     start, *pieces = PacketReader().feed(b"".join(ptpip.data_phase(4, data)))
     assert start == StartData(4, length)
     assert b"".join(piece.data for piece in pieces) == data
+    assert len(pieces) == -(-length // 65536)
     assert [piece.last for piece in pieces] == [False] * (len(pieces) - 1) + [True]
 
 
@@ -142,6 +143,7 @@ def test_descriptions_of_properties():
     assert metering.describe(0) == bytes.fromhex("10d0 0200 01 03 00 02 0300 03 00 01")
     assert Property(0xD038, ptp.UINT16, 27).describe(27) == bytes.fromhex("38d0 0400 00 1b00 1b00 00")
     assert [zoom.allows(value) for value in (-1, 0, 134, 135)] == [False, True, True, False]
+    assert [Property(1, ptp.UINT8, 1, True, Range(1, 9, 4)).allows(value) for value in (5, 6)] == [True, False]
     assert [metering.allows(value) for value in (1, 2)] == [True, False]
 
 

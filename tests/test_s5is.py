@@ -25,6 +25,7 @@ OK, BUSY = 0x2001, 0x2019
 ZOOM, EVENT_MODE = 0xD02A, 0xD045
 DEADLINE_S = 20.0  # for whatever should happen at once: only a hang takes as long
 REPLY_S = 2.5  # that libgphoto2 waits for an answer
+DELAYED_ACK_S = 0.04  # by which Linux acknowledges late
 GREY = 2.0  # grey levels by which JPEG may change an even picture
 FRAME_S = 0.02  # between pictures of the feed
 
@@ -60,10 +61,10 @@ def decoded(jpeg):
 class Bench:
     """The camera without a wire, in an open session."""
 
-    def __init__(self, still=None, lens=None, shooting=True):
+    def __init__(self, still=None, lens=None, shooting=True, shutter_s=0.0):
         self.closing = threading.Event()
         self.preview, self.lens, self.faults = Feed(), lens or Lens(), Faults(S5IS_FAULTS)
-        self.shutter = Shutter(still or (lambda: plain((64, 48), 50)), 95, 0.0, self.closing)
+        self.shutter = Shutter(still or (lambda: plain((64, 48), 50)), 95, shutter_s, self.closing)
         viewfinder = Viewfinder(self.preview, (32, 24), 95, self.closing)
         self.camera = S5isCamera(viewfinder, self.shutter, self.lens, self.faults)
         self.ask(0x1002, 1)
@@ -367,25 +368,81 @@ def test_a_still_that_cannot_be_taken():
         assert bench.set(ZOOM, 5) == OK
 
 
-def test_a_still_is_lost_when_the_power_goes():
-    go = threading.Event()
+class Stills:
+    """Takes each still when it is let."""
 
-    def still():
-        assert go.wait(DEADLINE_S)
+    def __init__(self, count):
+        self.let = [threading.Event() for _ in range(count)]
+        self.begun = [threading.Event() for _ in range(count)]
+        self._calls = iter(range(count))
+
+    def __call__(self):
+        call = next(self._calls)
+        self.begun[call].set()
+        assert self.let[call].wait(DEADLINE_S)
         return plain((64, 48), 50)
 
-    with Bench(still=still) as bench:
+
+def test_a_still_is_lost_when_the_power_goes():
+    stills = Stills(2)
+    with Bench(still=stills) as bench:
         bench.set(ZOOM, 99)
+        before = set(threading.enumerate())
         bench.ask(0x901A)
+        (first,) = set(threading.enumerate()) - before
+        assert stills.begun[0].wait(DEADLINE_S)
         bench.camera.switch_off()
-        go.set()
-        bench.shutter.join()
         assert bench.code(0x1015, ZOOM) == 0x2003
         bench.ask(0x1002, 1)
         assert bench.code(0x1015, ZOOM) == 0x200A
         bench.ask(0x9008)
         assert bench.get(ZOOM) == bench.lens.position() == 0
         assert bench.events() == [(0xC00C, ())]
+        bench.ask(0x901A)
+        assert stills.begun[1].wait(DEADLINE_S)
+        stills.let[0].set()
+        first.join(DEADLINE_S)
+        assert bench.events() == []
+        assert bench.set(ZOOM, 5) == BUSY  # the second is still under way
+        stills.let[1].set()
+        assert [code for code, _ in bench.events_when(2)] == [0xC009, 0x400D]
+
+
+def test_the_shutter_goes_after_its_delay():
+    opened = []
+
+    def still():
+        opened.append(time.monotonic())
+        return plain((64, 48), 50)
+
+    with Bench(still=still, shutter_s=0.1) as bench:
+        asked = time.monotonic()
+        bench.ask(0x901A)
+        bench.events_when(2)
+        assert opened[0] - asked >= 0.1
+
+
+def test_whoever_comes_next_starts_anew(monkeypatch):
+    monkeypatch.setattr(s5is_pictures, "PICTURE_WAIT_S", 0.05)
+    stills = Stills(1)
+    with Bench(still=stills) as bench:
+        bench.ask(0x900B)
+        bench.ask(0x9009)
+        bench.ask(0x9008)
+        bench.ask(0x900B)
+        bench.camera.disconnected()
+        bench.ask(0x1002, 1)
+        assert bench.events() == []  # those were the one before's
+        bench.preview.publish(Picture(plain((64, 48), 40), 0, time.monotonic()))
+        assert bench.code(0x901D) == BUSY  # the viewfinder is off
+        bench.ask(0x900B)
+        bench.ask(0x901A)
+        bench.camera.disconnected()  # in the middle of a still
+        stills.let[0].set()
+        bench.shutter.join()
+        bench.ask(0x1002, 1)
+        bench.preview.publish(Picture(plain((64, 48), 40), 1, time.monotonic()))
+        assert bench.code(0x901D) == BUSY
 
 
 def test_a_busy_camera_refuses_to_do_and_goes_on_telling():
@@ -693,9 +750,38 @@ def test_it_closes_in_the_middle_of_everything(server):
 
 
 @pytest.mark.wire
+def test_closing_waits_for_a_still():
+    stills, before = Stills(1), set(threading.enumerate())
+    with S5isServer(Feed(), stills, Lens(), shutter_s=0.0) as server, Initiator(server.port) as camera:
+        camera.shoot()
+        assert camera.ask(0x901A)[0] == OK
+        assert stills.begun[0].wait(DEADLINE_S)
+        letting = threading.Timer(0.1, stills.let[0].set)
+        letting.start()
+        server.close()
+        assert set(threading.enumerate()) - before <= {letting}
+        letting.join()
+
+
+@pytest.mark.wire
+@pytest.mark.skipif(sys.platform != "linux", reason="acknowledging at once is an option of Linux")
+def test_requests_and_their_data_are_not_held_up(server):
+    with Initiator(server.port) as camera:  # which sends them apart and without TCP_NODELAY, as libgphoto2 does
+        camera.shoot()
+        took = []
+        for position in range(30):
+            began = time.monotonic()
+            assert camera.zoom(position) == OK
+            took.append(time.monotonic() - began)
+        assert min(took[10:]) < DELAYED_ACK_S / 2
+
+
+@pytest.mark.wire
 def test_a_port_that_is_taken(server):
     with pytest.raises(DeviceError, match=f"cannot listen on 127.0.0.1:{server.port}: .*in use"):
         S5isServer(Feed(), Feed(), Lens(), port=server.port)
+    with pytest.raises(DeviceError, match="cannot listen on 127.0.0.1:70000: port must be 0-65535"):
+        S5isServer(Feed(), Feed(), Lens(), port=70000)
 
 
 def test_faults_that_it_does_not_have(server):

@@ -131,8 +131,9 @@ class PtpIpServer:
         self._faults, self._absent = faults, absent
         try:
             self._listener: socket.socket | None = listen(host, port)
-        except OSError as error:
-            raise DeviceError(f"cannot listen on {host}:{port}: {error.strerror or error}") from None
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise DeviceError(f"cannot listen on {host}:{port}: {reason}") from None
         self._address: tuple[str, int] = self._listener.getsockname()[:2]
         self._closing = threading.Event()
         self._numbers = itertools.count(1)
