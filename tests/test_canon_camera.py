@@ -196,6 +196,7 @@ def test_a_camera_that_always_shoots_and_has_no_targets_is_taken_as_it_is():
 def test_settings_are_applied_and_a_target_of_the_users_own_is_left():
     config = replace(CONFIG, settings={"iso": "80", "owner": "us", "capturetarget": "Memory card"})
     camera = Bench(config).camera
+    assert camera.commands("capturetarget") == ["Memory card"]
     assert (camera.values["iso"], camera.values["owner"], camera.values["capturetarget"]) == ("80", "us", "Memory card")
 
 
@@ -388,6 +389,20 @@ def test_zeros_after_a_jpeg_are_padding():
     assert np.abs(bench.desk.frame.image - 50.0).max() <= GREY
 
 
+def test_images_are_not_turned_as_the_camera_felt_itself_held():
+    """Exif with one entry: orientation 6, to be shown turned by a quarter."""
+    tiff = bytes.fromhex("4d4d002a 00000008 0001 0112 0003 00000001 0006 0000 00000000")
+    app1 = b"\xff\xe1" + (2 + 6 + len(tiff)).to_bytes(2, "big") + b"Exif\0\0" + tiff
+    plain = jpeg(SIZE, 50)
+    turned = plain[:2] + app1 + plain[2:]
+    assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR).shape == (32, 24, 3)  # it is believed
+    bench = Bench()
+    bench.camera.frozen = turned
+    bench.run(0.2)
+    assert bench.desk.frame.image.shape == (24, 32, 3)
+    assert np.abs(bench.desk.frame.image - 50.0).max() <= GREY
+
+
 # --- the lens
 
 
@@ -439,6 +454,40 @@ def test_a_command_that_is_refused_for_long_is_given_up_until_the_next():
     bench.run(0.5)
     assert (bench.desk.standing, bench.camera.values["zoom"]) == (True, 31.0)
     assert len(bench.frames) > frames
+
+
+def test_a_camera_may_be_busy_now_and_then():
+    """Each command is refused for 2 s, as a busy camera may; together that is longer than one may be."""
+    bench = Bench()
+    for position in (10, 20, 30):
+        bench.camera.fail["put"] = [BUSY] * 20
+        bench.send(position)
+        bench.run(3.0)
+        assert (bench.desk.standing, bench.camera.values["zoom"]) == (True, float(position))
+    bench.camera.fail["preview"] = [*[BUSY] * 20, None] * 3
+    bench.run(10.0)
+    assert bench.camera.log.count(("open",)) == 1
+
+
+def test_a_command_that_replaces_a_refused_one_has_its_own_chance():
+    bench = Bench()
+    bench.camera.fail["put"] = [BAD, ...]
+    bench.send(30)
+    bench.run(3.0)
+    put = bench.camera.put
+
+    def replaced(name, value):
+        bench.send(40)
+        bench.camera.put = put
+        bench.clock.t += 1.0
+        put(name, value)
+
+    bench.camera.put = replaced
+    bench.run(1.5)
+    assert bench.desk.lens_trouble == ""
+    bench.camera.fail.clear()
+    bench.run(0.5)
+    assert (bench.desk.standing, bench.camera.values["zoom"]) == (True, 40.0)
 
 
 def test_a_lens_that_ignores_a_command_is_sent_again():
@@ -603,6 +652,24 @@ def test_a_camera_in_use():
         assert len(rig.link.threads) == 1
         assert threading.get_ident() not in rig.link.threads
     assert rig.link.commands("capture") == [1, 0]
+
+
+def test_a_lens_moves_until_it_should_have_arrived():
+    with opened(replace(CONFIG, lens_speed=0.001)) as rig:
+        goal = rig.camera.zoom(1000.0)
+        wait_for(lambda: rig.camera._desk.standing)
+        state = rig.camera.state()
+        assert state.moving
+        assert state.focal_px == pytest.approx(6.0 / 0.01794, rel=1e-3)
+        assert goal == pytest.approx(1000.0, rel=0.05)
+
+
+def test_commands_do_not_wait_for_the_next_frame():
+    """It would come in 100 s."""
+    with opened(replace(CONFIG, rate_hz=0.01)) as rig:
+        rig.camera.zoom(1000.0)
+        wait_for(lambda: rig.camera._desk.standing)
+        assert rig.camera.capture().image.shape == (48, 64, 3)
 
 
 def test_reading_says_why_no_frame_comes():
@@ -941,6 +1008,16 @@ except ConfigError as error:
 """
 
 
+def home_in(folder):
+    """A user's home in which libgphoto2 finds the folder that it would write its own settings to."""
+    (folder / "home" / ".config").mkdir(parents=True)
+    return folder / "home"
+
+
+def left_in(home):
+    return [path for path in home.rglob("*") if path.name != ".config"]
+
+
 def python(script, **environment):
     pytest.importorskip("gphoto2")
     command = [sys.executable, "-c", script]
@@ -950,8 +1027,7 @@ def python(script, **environment):
 
 def test_libgphoto2s_own_virtual_camera_cannot_be_zoomed(tmp_path):
     """A DSLR whose lens is turned by hand, found on USB by libgphoto2 itself; nothing is left in the user's home."""
-    home, card = tmp_path / "home", tmp_path / "card"
-    home.mkdir()
+    home, card = home_in(tmp_path), tmp_path / "card"
     card.mkdir()
     with python(VIRTUAL, HOME=str(home), XDG_CONFIG_HOME="", VCAMERADIR=str(card)) as process:
         found, error = process.communicate(timeout=DEADLINE_S)[0].splitlines()
@@ -959,7 +1035,7 @@ def test_libgphoto2s_own_virtual_camera_cannot_be_zoomed(tmp_path):
     assert error.startswith(
         "hardware.zoom: the Nikon DSC D750 has no setting 'zoom'; it cannot be zoomed; its settings"
     )
-    assert list(home.iterdir()) == []
+    assert left_in(home) == []
 
 
 # --- on the wire: libgphoto2's Canon code against the emulated S5 IS, in a process of its own
@@ -1023,13 +1099,14 @@ def process():
 @pytest.fixture
 def emulated(process, tmp_path, monkeypatch):
     """The driver on the emulated camera; nothing is left in the user's home."""
-    monkeypatch.setenv("HOME", str(tmp_path))
+    home = home_in(tmp_path)
+    monkeypatch.setenv("HOME", str(home))
     monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
     camera = GphotoCamera(HardwareZoom(port=f"ptpip:localhost:{process.port}"), MonotonicClock())
     process.camera = camera
     yield process
     camera.close()
-    assert list(tmp_path.iterdir()) == []
+    assert left_in(home) == []
 
 
 def frame_after(camera, t):

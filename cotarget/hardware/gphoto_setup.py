@@ -66,10 +66,10 @@ def set_up(link: CameraLink, config: HardwareZoom, clock: Clock, camera: str) ->
     if SHOOTING in link.names():
         patiently(clock, lambda: link.put(SHOOTING, 1))
     names = link.names()  # PowerShots show their lens only when they shoot
-    if TARGET in names and TARGET not in config.settings:
-        target = patiently(clock, lambda: link.get(TARGET))
-        if MEMORY in target.choices and target.value != MEMORY:
-            patiently(clock, lambda: link.put(TARGET, MEMORY))
+    # Even where it shows memory already: what was never set it shows so, and has PowerShots use the card.
+    own = TARGET not in names or TARGET in config.settings
+    if not own and MEMORY in patiently(clock, lambda: link.get(TARGET)).choices:
+        patiently(clock, lambda: link.put(TARGET, MEMORY))
     for name, value in config.settings.items():
         _apply(link, clock, camera, names, name, value)
     return _zoom_setting(link, config, clock, camera, names)
