@@ -41,6 +41,7 @@ LONGEST_DATA = 1 << 20  # bytes that an operation may bring along; a property's 
 # libgphoto2 sends a request and its data apart and without TCP_NODELAY: unless the first is acknowledged at once, which
 # is an option of Linux, the second leaves 40 ms late.
 QUICK_ACK: int | None = getattr(socket, "TCP_QUICKACK", None)
+HIGHEST_PORT = 65535
 REJECTED, BUSY = 1, 2  # reasons of a refusal
 
 
@@ -129,11 +130,12 @@ class PtpIpServer:
     ) -> None:
         self._device, self._guid, self._name = device, guid, name
         self._faults, self._absent = faults, absent
+        if not 0 <= port <= HIGHEST_PORT:
+            raise DeviceError(f"cannot listen on {host}:{port}: a port is a number from 0 to {HIGHEST_PORT}")
         try:
             self._listener: socket.socket | None = listen(host, port)
-        except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise DeviceError(f"cannot listen on {host}:{port}: {reason}") from None
+        except OSError as error:
+            raise DeviceError(f"cannot listen on {host}:{port}: {error.strerror or error}") from None
         self._address: tuple[str, int] = self._listener.getsockname()[:2]
         self._closing = threading.Event()
         self._numbers = itertools.count(1)
