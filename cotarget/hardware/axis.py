@@ -7,10 +7,8 @@ import contextlib
 import threading
 from dataclasses import dataclass, replace
 
-import cv2
-import numpy as np
-
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError
+from cotarget.hardware.jpeg import JpegDecoder
 from cotarget.hardware.multipart import MultipartReader, Picture
 from cotarget.hardware.vapix import BusyError, RefusedError, Stream, VideoServer
 from cotarget.hwconfig import HardwareFixed
@@ -67,7 +65,7 @@ class AxisCamera:
         self._server = VideoServer(config)
         self._api = ""
         self._closing = threading.Event()
-        self._decoding = threading.Lock()
+        self._decoder, self._decoding = JpegDecoder(), threading.Lock()
         self._decoded: tuple[Picture, Image] | None = None
         # All that follows is shared with the thread, and guarded by this.
         self._new = threading.Condition()
@@ -164,7 +162,7 @@ class AxisCamera:
         with self._decoding:
             if self._decoded is not None and self._decoded[0] is picture:
                 return self._decoded[1]
-            image = _decode(picture)
+            image = self._decoder.decode(picture.jpeg, picture.size)
             if image is not None:
                 self._decoded = (picture, image)
                 return image
@@ -282,16 +280,3 @@ def probe(config: HardwareFixed) -> str:
     """
     with contextlib.closing(VideoServer(config)) as server:
         return server.describe()
-
-
-def _decode(picture: Picture) -> Image | None:
-    try:
-        # A camera that is told to turn its pictures does so; a note in them to turn them is none of ours.
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), flags)
-    except cv2.error:
-        return None
-    if image is None or image.shape != (picture.size[1], picture.size[0], 3):
-        return None
-    image.flags.writeable = False
-    return image
