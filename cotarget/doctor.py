@@ -6,8 +6,13 @@ import platform
 import subprocess
 import sys
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from cotarget.assets import assets_dir
+from cotarget.errors import ConfigError, CotargetError
+
+if TYPE_CHECKING:
+    from cotarget.config import HardwareConfig, RigConfig
 
 PACKAGES = (
     "cotarget",
@@ -17,6 +22,7 @@ PACKAGES = (
     "scipy",
     "gymnasium",
     "pyserial",
+    "httpx",
     "av",
     "matplotlib",
     "tqdm",
@@ -41,9 +47,18 @@ class Finding:
     fix: str = ""
 
 
-def examine() -> list[Finding]:
-    """Look at everything that cotarget needs."""
-    return [_python(), *map(_package, PACKAGES), _assets(), _rendering(), _codec(), *_serial_ports()]
+def examine(config: "RigConfig | None" = None) -> list[Finding]:
+    """Look at everything that cotarget needs; with a rig's config also at its devices, by questions that do no harm."""
+    found = [
+        _python(),
+        *map(_package, PACKAGES),
+        _assets(),
+        _rendering(),
+        _codec(),
+        *_serial_ports(),
+        _gphoto_cameras(),
+    ]
+    return found if config is None or config.backend != "hardware" else [*found, *_devices(config.hardware)]
 
 
 def _python() -> Finding:
@@ -107,3 +122,38 @@ def _serial_ports() -> list[Finding]:
         return [Finding("serial ports", False, f"pyserial cannot be imported: {error}", fix)]
     found = [f"{port.device} ({port.description})" for port in list_ports.comports()]
     return [Finding("serial ports", True, ", ".join(found) or "none (none is needed for the simulation)")]
+
+
+def _gphoto_cameras() -> Finding:
+    try:
+        from cotarget.hardware.gphoto import probe
+
+        text = ", ".join(probe()) or "none on USB"
+    except (ImportError, CotargetError) as error:
+        text = str(error)
+    return Finding("gphoto2 cameras", True, f"{text} (none is needed for the simulation)")
+
+
+def _devices(hardware: "HardwareConfig") -> list[Finding]:
+    """Ask the devices who they are."""
+    from cotarget.hardware.axis import probe as probe_fixed
+    from cotarget.hardware.d46unit import probe as probe_head
+
+    def head() -> str:
+        return probe_head(hardware.head.port, hardware.head.baud)
+
+    def fixed() -> str:
+        return probe_fixed(hardware.fixed)
+
+    found = []
+    for name, there, ask in (
+        ("hardware.head", hardware.head.port, head),
+        ("hardware.fixed", hardware.fixed.url, fixed),
+    ):
+        try:
+            if not there:
+                raise ConfigError("is not configured")
+            found.append(Finding(name, True, ask()))
+        except CotargetError as error:
+            found.append(Finding(name, False, str(error), f"look at the device, its cable, and [{name}] in rig.toml"))
+    return found

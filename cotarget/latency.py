@@ -31,6 +31,7 @@ WIGGLE = np.radians(1.5)  # of the head to each side: some 18 px of a usual wide
 TURNS_EVERY = (0.53, 0.47, 0.61)
 WIGGLE_SECONDS, SWING_SECONDS = 8.0, 10.0
 LOOK = 0.01  # how long to wait for a frame before looking at the head again [s]
+LENS_TIMEOUT = 15.0  # the slowest zoom lenses take some ten seconds from end to end [s]
 LONGEST_DELAY = 0.6  # that is looked for, either way [s]
 COARSE = 0.01  # steps of the delays tried first [s]
 FEWEST = 20  # samples of a motion
@@ -69,7 +70,7 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
         CalibrationError: the picture does not move with the head: it shows nothing, or something that moves by itself.
         StaleFrameError: frames stopped coming.
     """
-    rig.zoom.zoom(rig.zoom.focal_range[0])
+    _zoom_out(rig)
     home = rig.head.state()
     low, high = rig.head.limits.pan
     way = WIGGLE if home.pan + WIGGLE <= high else -WIGGLE
@@ -124,7 +125,7 @@ def measure_fixed(
     T_fixed_board = in_both_views(calibration, board)
     middle = T_fixed_board.apply(board_points(board).mean(axis=0))
     goal = aim(calibration, middle, reach_of(rig))
-    rig.zoom.zoom(rig.zoom.focal_range[0])
+    _zoom_out(rig)
     rig.head.move(goal.pan, goal.tilt, wait=True)
     rig.board.swing(T_fixed_board)
     seen: dict[str, list[tuple[float, float]]] = {"fixed": [], "zoom": []}
@@ -226,6 +227,16 @@ def in_both_views(calibration: Calibration, board: BoardConfig) -> RigidTransfor
     ray = calibration.fixed.ray(calibration.fixed.image_center_px)
     turned = pose([0.0, 0.0, 0.0], [0.0, BOARD_TURNED, 0.0])
     return RigidTransform.from_translation(ray * depth - turned.apply(points.mean(axis=0))) * turned
+
+
+def _zoom_out(rig: Rig) -> None:
+    """Send the lens to its shortest focal length and wait until it stands there."""
+    rig.zoom.zoom(rig.zoom.focal_range[0])
+    deadline = rig.clock.now() + LENS_TIMEOUT
+    while rig.zoom.state().moving:
+        if rig.clock.now() > deadline:
+            raise CalibrationError(f"the zoom lens still moves after {LENS_TIMEOUT:g} s")
+        rig.clock.sleep_until(rig.clock.now() + LOOK)
 
 
 def _frames(

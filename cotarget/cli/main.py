@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import cotarget
-from cotarget.cli import calibrating, emulating, running
+from cotarget.cli import calibrating, emulating, operating, running
 from cotarget.cli.arguments import corners, count, not_negative, port, positive
 from cotarget.errors import CotargetError
 
@@ -137,6 +137,31 @@ def _parser() -> argparse.ArgumentParser:
     follow.add_argument("--seconds", type=positive, default=20.0, metavar="S", help="for how long (20)")
     follow.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
     follow.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
+    follow.add_argument("--record", type=Path, metavar="DIR", help="record everything, for cotarget replay")
+
+    replay = command("replay", running.replay, "run the pipeline again on a recording of follow --record")
+    replay.add_argument("recording", type=Path, metavar="DIR")
+    replay.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
+    replay.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
+
+    latency = command("latency", operating.latency, "measure how late cameras and head are, by what moves")
+    latency.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
+    latency.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="calibration.json, for the fixed camera: a board is swung"
+    )
+
+    stop = command("stop", operating.stop, "emergency stop of every rig that watches this rig.toml's stop file")
+    stop.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
+    stop.add_argument("--reason", default="stopped by the operator", metavar="TEXT", help="what everybody is told")
+
+    clear = command("clear", operating.clear, "end an emergency stop, when it is safe to move")
+    clear.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
+
+    reset_head = command(
+        "reset-head", operating.reset_head, "let the pan-tilt unit find its limits: it turns all the way"
+    )
+    reset_head.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
+    reset_head.add_argument("--yes", action="store_true", help="camera and cables are clear of it")
 
     emulate = command(
         "emulate", emulating.emulate, "put a simulated rig behind the real devices' protocols, in real time"
@@ -170,7 +195,10 @@ def _parser() -> argparse.ArgumentParser:
     board.add_argument("--board", type=corners, default=(9, 6), metavar="CxR", help="inner corners (9x6)")
     board.add_argument("--square", type=positive, default=0.025, metavar="M", help="side of a square [m] (0.025)")
 
-    command(
+    doctor = command(
         "doctor", running.doctor, "versions, rendering, and for each thing that is missing the command that fixes it"
+    )
+    doctor.add_argument(
+        "--rig", type=Path, metavar="FILE", help="rig.toml: look at its devices too, by harmless questions"
     )
     return parser

@@ -1,13 +1,20 @@
-"""The commands that run what was calibrated, and look around: demo, aim, follow, detect, doctor."""
+"""The commands that run what was calibrated, and look around: demo, aim, follow, replay, detect, doctor."""
 
 import argparse
 import dataclasses
 import json
 import math
 import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.arguments import check_outputs, nothing, progress_bar
 from cotarget.errors import ConfigError
+
+if TYPE_CHECKING:
+    from cotarget.calibration import Calibration
+    from cotarget.config import RigConfig
+    from cotarget.rig import Rig
 
 
 def demo(options: argparse.Namespace) -> None:
@@ -99,13 +106,9 @@ def follow(options: argparse.Namespace) -> None:
     """Cotarget follow."""
     from cotarget.calibration import load_calibration
     from cotarget.config import load_config
-    from cotarget.detection import make_detector
-    from cotarget.drawing import side_by_side
-    from cotarget.loop import FollowSettings, State, follow
-    from cotarget.recording import StepTable
+    from cotarget.recording import Recorder
     from cotarget.rig import open_rig
     from cotarget.safety import SafeRig
-    from cotarget.video import FilmWriter
 
     config = load_config(options.rig)
     target = config.target(options.target)
@@ -115,24 +118,71 @@ def follow(options: argparse.Namespace) -> None:
             f"{options.rig}: the simulated scene has no {options.target}; add it: [sim] targets = "
             f"{json.dumps([*config.sim.targets, options.target])}"
         )
-    detector = make_detector(target, config.rate_hz)
     check_outputs([options.csv, options.video], [options.rig, options.calibration, target.template])
+    with (
+        Recorder(options.record, config, options.calibration, options.target)
+        if options.record
+        else nothing() as recorder,
+        SafeRig(recorder.wrap(open_rig(config)) if recorder else open_rig(config), config.safety) as rig,
+    ):
+        states = _follow(rig, calibration, config, options.target, options.seconds, options.csv, options.video)
+    print(json.dumps(states, indent=2))
+
+
+def replay(options: argparse.Namespace) -> None:
+    """Cotarget replay."""
+    from cotarget.calibration import load_calibration
+    from cotarget.replay import ReplayRig, open_recording
+    from cotarget.safety import SafeRig
+
+    recording = open_recording(options.recording)
+    for note in recording.notes:
+        print(f"{options.recording}: {note}", file=sys.stderr)
+    calibration = load_calibration(recording.calibration)
+    check_outputs([options.csv, options.video], [recording.calibration])
+    played = ReplayRig(recording)
+    with SafeRig(played, recording.config.safety) as rig:
+        states = _follow(
+            rig, calibration, recording.config, recording.target, math.inf, options.csv, options.video, recording.steps
+        )
+    print(json.dumps(states | {"differences": dataclasses.asdict(played.differences)}, indent=2))
+
+
+def _follow(
+    rig: "Rig",
+    calibration: "Calibration",
+    config: "RigConfig",
+    name: str,
+    seconds: float,
+    csv: Path | None,
+    video: Path | None,
+    frames: int | None = None,
+) -> dict[str, Any]:
+    """Follow a target, show the progress, keep what is asked for; how many steps there were, and in which states."""
+    from cotarget.detection import make_detector
+    from cotarget.drawing import side_by_side
+    from cotarget.loop import FollowSettings, State, follow
+    from cotarget.recording import StepTable
+    from cotarget.replay import until_end
+    from cotarget.video import FilmWriter
+
+    target = config.target(name)
+    detector = make_detector(target, config.rate_hz)
     settings = FollowSettings(command_delay_s=config.command_delay_s)
     states: dict[str, int] = dict.fromkeys(State, 0)
-    frames = math.ceil(options.seconds * config.rate_hz)
+    expected = math.ceil(seconds * config.rate_hz) if frames is None else frames
     with (
-        SafeRig(open_rig(config), config.safety) as rig,
-        StepTable(options.csv) as table,
-        FilmWriter(options.video, config.rate_hz) if options.video else nothing() as video,
+        StepTable(csv) as table,
+        FilmWriter(video, config.rate_hz) if video else nothing() as film,
         progress_bar() as progress,
     ):
-        for step in follow(rig, calibration, target, detector, seconds=options.seconds, settings=settings):
+        for step in until_end(follow(rig, calibration, target, detector, seconds=seconds, settings=settings)):
             table.write(step)
             states[step.state] += 1
-            if video is not None:
-                video.write(side_by_side(step, options.target))
-            progress(f"following: {options.target}: {step.state}", min(step.index + 1, frames), frames)
-    print(json.dumps({"steps": sum(states.values()), "states": states}, indent=2))
+            if film is not None:
+                film.write(side_by_side(step, name))
+            progress(f"following: {name}: {step.state}", min(step.index + 1, expected), expected)
+    return {"steps": sum(states.values()), "states": states}
 
 
 def detect(options: argparse.Namespace) -> None:
@@ -158,7 +208,12 @@ def doctor(options: argparse.Namespace) -> int:
     """Cotarget doctor."""
     from cotarget.doctor import examine
 
-    findings = examine()
+    config = None
+    if options.rig is not None:
+        from cotarget.config import load_config
+
+        config = load_config(options.rig)
+    findings = examine(config)
     for finding in findings:
         print(f"{'ok     ' if finding.ok else 'MISSING'}  {finding.name}: {finding.text}")
         if finding.fix:
