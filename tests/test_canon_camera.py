@@ -9,6 +9,7 @@ import itertools
 import logging
 import math
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -23,8 +24,9 @@ import pytest
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError
 from cotarget.hardware.canon import GphotoCamera
 from cotarget.hardware.clock import MonotonicClock
-from cotarget.hardware.gphoto import GphotoLink, LinkError, Setting, full_port, probe
+from cotarget.hardware.gphoto import GphotoLink, LinkError, Setting, probe
 from cotarget.hardware.gphoto_desk import Desk
+from cotarget.hardware.gphoto_port import full_port
 from cotarget.hardware.gphoto_work import Shooting
 from cotarget.hwconfig import HardwareZoom
 
@@ -878,8 +880,9 @@ def test_other_ports_are_refused(port):
 def test_ports_that_cannot_be():
     with pytest.raises(ConfigError, match="above 65535"):
         full_port("ptpip:127.0.0.1:70000")
-    with pytest.raises(ConfigError, match=r"hardware\.zoom\.port: there is no host 'no\.host\.invalid'"):
-        full_port("ptpip:no.host.invalid:4000")
+    for host in ("no.host.invalid", 70 * "a"):
+        with pytest.raises(ConfigError, match=f"hardware.zoom.port: there is no host '{host}'"):
+            full_port(f"ptpip:{host}:4000")
 
 
 def test_without_gphoto2_the_extra_is_named(monkeypatch):
@@ -1191,6 +1194,23 @@ def test_a_hung_camera_stops_no_other_thread_and_is_found_again(emulated):
         ticker.join(DEADLINE_S)
     assert max(gaps) < HELD_S
     assert frame_after(camera, leaving).t > leaving
+
+
+@pytest.mark.wire
+def test_another_device_on_the_port():
+    """One that hangs up as soon as it is spoken to."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def hang_up():
+            with contextlib.suppress(OSError):
+                while True:
+                    server.accept()[0].close()
+
+        threading.Thread(target=hang_up, daemon=True).start()
+        port = f"ptpip:127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(DeviceError, match=r"cannot be used: gphoto2 says \[-\d+\] .*; is it a PTP/IP camera, "):
+            GphotoCamera(replace(CONFIG, port=port), MonotonicClock())
+        server.shutdown(socket.SHUT_RDWR)
 
 
 @pytest.mark.wire

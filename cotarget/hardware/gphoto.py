@@ -6,18 +6,13 @@ is called past Python. Listing the settings' names and looking for cameras do no
 """
 
 import ctypes
-import difflib
 import importlib
-import os
-import re
-import socket
-from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.hardware.gphoto_memory import keep_settings_in_memory, library
+from cotarget.hardware.gphoto_port import check_listening, check_permission, full_port, shortened
 
 # libgphoto2's result codes, gphoto2/gphoto2-port-result.h and gphoto2-result.h.
 BAD_PARAMETERS, IO, TIMEOUT = -2, -7, -10
@@ -29,14 +24,9 @@ LOST = frozenset({IO, TIMEOUT, IO_READ, IO_WRITE, USB_CLEAR_HALT, USB_FIND, USB_
 MISSING = "gphoto2 is not installed; pip install 'cotarget[hardware]'"
 # The protocol's own model name, for cameras in a network; gphoto2 cannot look for those.
 NETWORK_MODEL = "PTP/IP Camera"
-# PTP/IP's own TCP port (CIPA DC-005), for commands and events alike.
-NETWORK_PORT, HIGHEST_PORT = "15740", 65535
-NETWORK = re.compile(r"ptpip:([^:\s]+)(?::(\d+))?(?::(\d+))?")
-LISTENING_S = 2.5  # as long as libgphoto2 waits
-USB = re.compile(r"usb:(?:(\d+),(\d+))?")
 
-
-# What to do about errors that a user can do something about.
+# What to do about errors that a user can do something about; what goes wrong with a network camera says nothing itself.
+NETWORK_HINT = "; is it a PTP/IP camera, switched on, and used by no other program?"
 HINTS = {
     USB_CLAIM: "; another program holds it: unmount it (gio mount -s gphoto2), or end gvfs-gphoto2-volume-monitor",
     USB_FIND: "; it is unplugged, or not the configured model",
@@ -51,8 +41,8 @@ class LinkError(Exception):
         code: libgphoto2's result code.
     """
 
-    def __init__(self, code: int, text: str) -> None:
-        super().__init__(f"gphoto2 says [{code}] {text}{HINTS.get(code, '')}")
+    def __init__(self, code: int, text: str, hint: str = "") -> None:
+        super().__init__(f"gphoto2 says [{code}] {text}{hint or HINTS.get(code, '')}")
         self.code = code
 
 
@@ -141,7 +131,7 @@ class GphotoLink:
             camera.set_port_info(ports.get_info(ports.lookup_path(port)))
             camera.init()
         except gp.GPhoto2Error as error:
-            raise LinkError(error.code, error.string) from error
+            raise LinkError(error.code, error.string, NETWORK_HINT * self._port.startswith("ptpip:")) from error
         self._camera = camera
         return model
 
@@ -151,7 +141,7 @@ class GphotoLink:
         if self._model:
             _check_model(self._model, abilities)
         if port.startswith("ptpip:"):
-            _check_listening(port)
+            check_listening(port)
             return self._model or NETWORK_MODEL, port
         found = [(str(model), str(at)) for model, at in abilities.detect(ports).items() if str(at).startswith("usb:")]
         here = [(self._model or model, at) for model, at in found if port in ("usb:", at)]
@@ -160,7 +150,7 @@ class GphotoLink:
             raise DeviceError(f"hardware.zoom.port: no camera at '{port}'; connect it and switch it on{others}")
         if len(here) > 1:
             raise DeviceError(f"hardware.zoom.port: '{port}' is more than one camera; write one of: {_listed(here)}")
-        _check_permission(here[0][1])
+        check_permission(here[0][1])
         return here[0]
 
     def close(self) -> None:
@@ -231,62 +221,10 @@ def probe() -> list[str]:
     return [f"{model} at {port}" for model, port in _gphoto2().Camera.autodetect().items()]
 
 
-def full_port(port: str) -> str:
-    """A port as gphoto2 must be told it: of network cameras the address, and both TCP ports.
-
-    Raises:
-        ConfigError: it is no port of gphoto2, or its host is unknown.
-    """
-    if USB.fullmatch(port):
-        return port
-    match = NETWORK.fullmatch(port)
-    if match is None:
-        raise ConfigError(f"hardware.zoom.port: '{port}' is not like usb:, usb:001,005 or ptpip:host:port:port")
-    host, commands, events = match[1], match[2] or NETWORK_PORT, match[3] or match[2] or NETWORK_PORT
-    if max(int(commands), int(events)) > HIGHEST_PORT:
-        raise ConfigError(f"hardware.zoom.port: '{port}' has a TCP port above {HIGHEST_PORT}")
-    try:
-        address = socket.getaddrinfo(host, None, socket.AF_INET)[0][4][0]  # gphoto2 knows no names
-    except OSError as error:
-        raise ConfigError(f"hardware.zoom.port: there is no host '{host}' in '{port}'") from error
-    # Without a second port gphoto2 would take the usual one for events, whatever the first is.
-    return f"ptpip:{address}:{commands}:{events}"
-
-
-def shortened(names: Iterable[str], wanted: str, most: int = 12) -> str:
-    """Valid choices for the end of a message, those most like what was wanted first: cameras have a hundred."""
-    names = sorted(set(names))
-    near = [name for name in names if wanted.lower() in name.lower()]
-    near += difflib.get_close_matches(wanted, names, n=most, cutoff=0.4)
-    shown = list(dict.fromkeys([*near, *names]))[:most]
-    more = len(names) - len(shown)
-    return (", ".join(shown) or "none") + (f" and {more} more" if more else "")
-
-
 def _check_model(model: str, abilities: Any) -> None:
     names = {str(abilities.get_abilities(i).model) for i in range(abilities.count())}
     if model not in names:
         raise ConfigError(f"hardware.zoom.model: gphoto2 knows no '{model}'; it knows {shortened(names, model, 5)}")
-
-
-def _check_permission(port: str) -> None:
-    """Linux hides a camera's refusal to be opened behind a general I/O error, so it is looked for."""
-    match = USB.fullmatch(port)
-    device = Path("/dev/bus/usb", *(match.groups() if match else ()))
-    if device.is_char_device() and not os.access(device, os.R_OK | os.W_OK):
-        raise DeviceError(
-            f"hardware.zoom.port: no permission to use {device}; add yourself to its group (ls -l {device}), "
-            "or a udev rule as of libgphoto2's print-camera-list"
-        )
-
-
-def _check_listening(port: str) -> None:
-    """Where nobody listens libgphoto2 writes lines of its own to stderr, so it is tried before."""
-    _, address, commands, _ = port.split(":")
-    try:
-        socket.create_connection((address, int(commands)), LISTENING_S).close()
-    except OSError as error:
-        raise DeviceError(f"hardware.zoom.port: no camera listens at '{port}': {error.strerror or error}") from error
 
 
 def _listed(found: list[tuple[str, str]]) -> str:

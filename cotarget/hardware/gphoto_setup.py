@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from cotarget.errors import ConfigError
-from cotarget.hardware.gphoto import BAD_PARAMETERS, CAMERA_BUSY, CameraLink, LinkError, Setting, shortened
+from cotarget.hardware.gphoto import BAD_PARAMETERS, CAMERA_BUSY, CameraLink, LinkError, Setting
+from cotarget.hardware.gphoto_port import shortened
 from cotarget.hardware.lens import LensTable
 from cotarget.hwconfig import HardwareZoom
 from cotarget.rig import Clock

@@ -17,8 +17,8 @@ from cotarget.rig import Clock
 
 log = logging.getLogger(__name__)
 
-# A camera that another program left in the middle of something answers at the second attempt.
-OPEN_TRIES = 2
+# A camera on USB that another program left in the middle of something answers at the second attempt.
+USB_TRIES = 2
 # A lost camera is looked for after this pause, doubled each time, until this long after the loss.
 FIRST_PAUSE_S, RECONNECT_S = 0.1, 5.0
 
@@ -49,7 +49,8 @@ class Shooting:
             ConfigError: it is another camera than configured.
             DeviceError: it does not answer, or not as it should.
         """
-        for left in reversed(range(OPEN_TRIES)):
+        tries = USB_TRIES if self._config.port.startswith("usb:") else 1
+        for left in reversed(range(tries)):
             try:
                 return self._connect(first=True)
             except LinkError as error:
