@@ -5,10 +5,8 @@ snapshot: no locks, so that a signal handler may halt the head whatever it inter
 """
 
 import logging
-import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import TypeVar
 
 from cotarget.errors import DeviceError
@@ -16,7 +14,8 @@ from cotarget.hardware import d46
 from cotarget.hardware.d46 import HALT, RefusedError, ReplyError, command
 from cotarget.hardware.d46track import Snapshot, Track
 from cotarget.hardware.d46unit import Unit
-from cotarget.hardware.line import Line, LostError, SilentError
+from cotarget.hardware.d46wishes import CutError, DroppedError, Halt, Move, drained
+from cotarget.hardware.line import QUICK_S, Line, LostError, SilentError
 from cotarget.rig import Clock
 
 log = logging.getLogger(__name__)
@@ -24,47 +23,7 @@ Meaning = TypeVar("Meaning")
 
 TRIES = 3  # of one exchange, each but the first after getting back in step
 PATIENCE_S = 2.0  # for a move, beyond its way and its run-up [s]
-FAREWELL_S = 0.3  # for the answer to the last halt
-
-
-class DroppedError(DeviceError):
-    """A move did not come to its end because of another wish."""
-
-
-@dataclass(eq=False)
-class Move:
-    """A wish to go somewhere.
-
-    Attributes:
-        number: counts wishes; a move older than a halt is not sent any more.
-        goals: of pan and tilt [steps].
-        speeds: of pan and tilt [steps/s].
-        wait: whether somebody waits for its end, and is told the error.
-        deadline: when it should have arrived [s], once it is sent.
-        error: why it did not arrive.
-        done: set when the head has arrived, or never will.
-    """
-
-    number: int
-    goals: tuple[int, int]
-    speeds: tuple[int, int]
-    wait: bool = False
-    deadline: float | None = None
-    error: DeviceError | None = None
-    done: threading.Event = field(default_factory=threading.Event)
-
-    def finish(self, error: DeviceError | None = None) -> None:
-        """Tell whoever waits."""
-        self.error = error
-        self.done.set()
-
-
-@dataclass(eq=False)
-class Halt:
-    """A wish to stop; ``answered`` when the unit has said that it does."""
-
-    answered: bool = False
-    done: threading.Event = field(default_factory=threading.Event)
+HALT_S = 0.3  # for the answer to a halt, beyond the time to brake: some units may answer when they stand
 
 
 class Loop:
@@ -81,6 +40,7 @@ class Loop:
         halts: wishes to stop; they come first.
         halted: the number of the newest wish to stop.
         closing: set when no more wishes will come.
+        braking_s: the time that a halt can take [s].
         rests: whether the unit has acknowledged the last halt, after which nothing is sent any more.
         errors: what nobody was told yet.
         snapshot: the newest.
@@ -96,6 +56,7 @@ class Loop:
         self.halts: deque[Halt] = deque()
         self.halted = 0
         self.closing = False
+        self.braking_s = unit.braking_s
         self.rests = False
         self.errors: deque[DeviceError] = deque(maxlen=1)
         for _ in self._tracks:
@@ -118,6 +79,8 @@ class Loop:
                 self._poll()
         except DroppedError as dropped:
             self._abandon(dropped)
+        except CutError as cut:
+            self._take_up_again(cut)
         if self._line.events:
             # The motor has lost steps against its stop, or nobody knows what the cable did.
             what = " and ".join(dict.fromkeys(d46.EVENT_WORDS[event] for event in self._line.events))
@@ -130,23 +93,23 @@ class Loop:
         """Halt a last time, as well as can be, and tell everybody who waits."""
         self.closing = True
         if not isinstance(reason, LostError):
-            self._halt_at_last()
-        for move in [*([self._active] if self._active else []), *_drained(self.moves)]:
+            self._halt_at_last(HALT_S if isinstance(reason, SilentError) else HALT_S + self.braking_s)
+        for move in [*([self._active] if self._active else []), *drained(self.moves)]:
             move.finish(reason)
-        for halt in _drained(self.halts):
+        for halt in drained(self.halts):
             halt.done.set()
 
-    def _halt_at_last(self) -> None:
+    def _halt_at_last(self, patience: float) -> None:
         # A unit that was switched off and on echoes again, and stale answers may come first.
         self._line.hurry, self._line.strict = (lambda: False), False
         try:
-            self._line.ask(HALT, FAREWELL_S, skipping=True)
+            self._line.ask(HALT, patience, skipping=True)
             self.rests = True
         except DeviceError as error:
             log.warning("%s: the pan-tilt unit did not acknowledge the last halt: %s", self._line.name, error)
 
     def _halt(self) -> None:
-        wishes = _drained(self.halts)
+        wishes = drained(self.halts)
         try:
             self._abandon(DroppedError("the move was halted"))
             self._stop()
@@ -160,13 +123,13 @@ class Loop:
         """Order the halt and wait for the answer."""
         for track in self._tracks:
             track.goal = None
-        self._exchange(HALT, d46.done)
+        self._exchange(HALT, d46.done, patience=HALT_S + self.braking_s)
         self._expect_motion()
 
     def _move(self) -> None:
         # A snapshot that says moving must be there before the wish leaves the queue: see D46Head.state.
         self.snapshot = Snapshot(self.snapshot.pan, self.snapshot.tilt, True, self.snapshot.t)
-        *older, move = _drained(self.moves)
+        *older, move = drained(self.moves)
         for other in [*older, *([self._active] if self._active else [])]:
             other.finish(DroppedError("another move took this one's place"))
         self._active, self._polled = move, False
@@ -235,12 +198,16 @@ class Loop:
         self._next = 1 - self._next
 
     def _exchange(
-        self, order: bytes, understand: Callable[[str], Meaning], unless: Callable[[], str] = lambda: ""
+        self,
+        order: bytes,
+        understand: Callable[[str], Meaning],
+        unless: Callable[[], str] = lambda: "",
+        patience: float = QUICK_S,
     ) -> tuple[Meaning, float]:
         """Ask or order, and once more after getting back in step, unless there is a reason not to."""
         for attempt in range(TRIES):
             try:
-                answer = self._line.ask(order)
+                answer = self._line.ask(order, patience)
                 return understand(answer.text), answer.t
             except (SilentError, ReplyError) as error:
                 if self._line.resync(error):
@@ -248,7 +215,7 @@ class Loop:
                         track.goal = None
                     self._expect_motion()
                     if self._active is not None:
-                        raise DroppedError(f"the line was silent and the head was halted: {error}") from error
+                        raise CutError(f"the line was silent and the head was halted: {error}") from error
                 if reason := unless():
                     raise DroppedError(reason) from error
                 if attempt == TRIES - 1:
@@ -269,6 +236,17 @@ class Loop:
             self._active.finish(reason)
             self._active = None
 
+    def _take_up_again(self, cut: CutError) -> None:
+        """Set out anew on a move that somebody waits for; who does not wait sends another, or looks at the state."""
+        move, self._active = self._active, None
+        assert move is not None
+        if not move.wait or move.cuts == TRIES:
+            move.finish(cut)
+            return
+        move.cuts += 1
+        move.deadline = None
+        self.moves.appendleft(move)  # behind it may be a newer one, which takes its place, or a halt before it
+
     def _late(self, move: Move) -> DeviceError:
         stands = ", ".join(f"{d46.AXIS_WORDS[axis.name]} {axis.position}" for axis in self._tracks)
         wanted = ", ".join(map(str, move.goals))
@@ -285,11 +263,3 @@ class Loop:
         pan, tilt = self._tracks
         t = min(pan.polls[-1][0], tilt.polls[-1][0])
         return Snapshot(pan.at(t), tilt.at(t), self._active is not None or not self._stand(), t)
-
-
-Wish = TypeVar("Wish")
-
-
-def _drained(queue: deque[Wish]) -> list[Wish]:
-    """Take all wishes out of a queue that others go on filling."""
-    return [queue.popleft() for _ in range(len(queue))]

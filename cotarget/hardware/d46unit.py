@@ -65,6 +65,11 @@ class Unit:
     pan: AxisFacts
     tilt: AxisFacts
 
+    @property
+    def braking_s(self) -> float:
+        """Time to stop from the highest speed [s]."""
+        return max(axis.fastest / axis.acceleration for axis in (self.pan, self.tilt))
+
 
 def connect(line: Line, config: HardwareHead) -> Unit:
     """Come to terms with the unit, check that it is the one that rig.toml describes, and make it ready; it halts.
@@ -78,7 +83,7 @@ def connect(line: Line, config: HardwareHead) -> Unit:
     refuse_uncalibrated(line.name, unit)
     compare(line.name, unit, config)
     for order in (HALT, command("I")):
-        line.query(order, d46.done, PATIENCE_S)
+        line.query(order, d46.done, PATIENCE_S + unit.braking_s)
     _make_independent(line)
     line.events.clear()
     return unit

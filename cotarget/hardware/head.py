@@ -8,8 +8,9 @@ import threading
 
 from cotarget.errors import DeviceError
 from cotarget.hardware.d46 import DELIMITER, HALT
-from cotarget.hardware.d46loop import DroppedError, Halt, Loop, Move
+from cotarget.hardware.d46loop import Loop
 from cotarget.hardware.d46unit import AxisFacts, Unit, connect
+from cotarget.hardware.d46wishes import DroppedError, Halt, Move
 from cotarget.hardware.line import LostError, open_line
 from cotarget.hwconfig import HardwareHead
 from cotarget.rig import Clock, PanTiltLimits, PanTiltState
@@ -17,7 +18,7 @@ from cotarget.rig import Clock, PanTiltLimits, PanTiltState
 log = logging.getLogger(__name__)
 
 STANDS_S = 5.0  # for a head that turned when it was opened to stand after the halt
-HALT_S = 2.5  # for a halt to be acknowledged, with a line that has to be got back in step first
+HALT_S = 1.0  # for a halt to be acknowledged, beyond braking, with a line that has to be got back in step first
 CLOSE_S = 5.0  # for the thread to end
 LOOK_S = 0.2  # how often somebody who waits for a move looks whether the thread still lives
 
@@ -120,7 +121,7 @@ class D46Head:
         wish = Halt()
         self._loop.halted = next(self._numbers)
         self._loop.halts.append(wish)
-        wish.done.wait(HALT_S if self._thread.is_alive() else 0.0)
+        wish.done.wait(HALT_S + self._loop.braking_s if self._thread.is_alive() else 0.0)
         if wish.answered or self._loop.rests:
             return
         if not self._thread.is_alive() and not isinstance(self._dead, LostError):

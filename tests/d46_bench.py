@@ -1,0 +1,59 @@
+"""The driver of the PTU-D46 and the tests' own unit on a line in simulated time."""
+
+from cotarget.hardware.d46loop import Loop
+from cotarget.hardware.d46unit import connect
+from cotarget.hardware.d46wishes import Halt, Move
+from cotarget.hardware.line import Line
+from cotarget.hwconfig import HardwareHead
+from tests.d46_peer import SimClock, SimPort, Unit
+
+CONFIG = HardwareHead(port="PORT", pan_deg=(-158.9, 158.9), tilt_deg=(-46.6, 31.1), command_delay_s=0.04)
+
+
+class Bench:
+    """A unit on a line in simulated time."""
+
+    def __init__(self, echo=True, verbose=True):
+        self.clock = SimClock()
+        self.unit = Unit(self.clock, echo, verbose)
+        self.port = SimPort(self.unit, self.clock)
+        self.numbers = iter(range(1, 1000000))
+
+    def connect(self, config=CONFIG):
+        self.line = Line(self.port, "PORT", 9600, self.clock)
+        return connect(self.line, config)
+
+    def start(self, config=CONFIG):
+        facts = self.connect(config)
+        self.loop = Loop(self.line, facts, self.clock, config.command_delay_s)
+        self.until(lambda: not self.loop.snapshot.moving)
+        return self.loop
+
+    def until(self, there, most=20.0):
+        """Let the loop turn until something is so; how long that took [s]."""
+        start = self.clock.now()
+        while not there():
+            assert self.clock.now() < start + most
+            self.loop.turn()
+        return self.clock.now() - start
+
+    def run(self, seconds):
+        end = self.clock.now() + seconds
+        self.until(lambda: self.clock.now() >= end)
+
+    def move(self, pan, tilt, speed=1000, wait=False):
+        move = Move(next(self.numbers), (pan, tilt), (speed, speed), wait)
+        self.loop.moves.append(move)
+        return move
+
+    def orders(self):
+        """Commands since the last look, without polls."""
+        heard = [order for order in self.unit.heard if order not in ("PP", "TP")]
+        self.unit.heard.clear()
+        return heard
+
+    def halt(self):
+        wish = Halt()
+        self.loop.halted = next(self.numbers)
+        self.loop.halts.append(wish)
+        return wish
