@@ -681,7 +681,7 @@ def test_reading_says_why_no_frame_comes():
             rig.camera.read(newest.t + 1000.0, 0.0)
         rig.link.fail["preview"] = [BUSY, ...]
         wait_for(lambda: rig.camera._desk.trouble)
-        with pytest.raises(StaleFrameError, match=r"within 0\.01 s: gphoto2 says \[-110\]"):
+        with pytest.raises(StaleFrameError, match=r"within 0\.01 s: .*gphoto2 says \[-110\]"):
             rig.camera.read(newest.t + 1000.0, 0.01)
 
 
