@@ -3,6 +3,7 @@
 import base64
 import contextlib
 import hashlib
+import itertools
 import logging
 import queue
 import re
@@ -17,6 +18,8 @@ import cv2
 import numpy as np
 import pytest
 
+from cotarget.emulators.axis import AxisServer
+from cotarget.emulators.plant import Feed, Picture
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError
 from cotarget.hardware import axis, vapix
 from cotarget.hardware.axis import AxisCamera, probe
@@ -645,3 +648,111 @@ def test_a_slow_consumer_sees_fresh_pictures(server):
         end.set()
         sender.join()
     assert float(np.median(ages)) < LOOSE_AGE_S
+
+
+# Against the emulator, which was written by others from the same manuals
+
+
+@pytest.fixture
+def emulated():
+    """A 241Q whose input shows a new picture 25 times a second, each with its number in its first pixels."""
+    feed, sent, end = Feed(), {}, threading.Event()
+    rng = np.random.default_rng(0)
+    scene = cv2.resize(rng.integers(0, 255, (15, 20, 3), dtype=np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
+
+    def publish():
+        for index in itertools.count():
+            image = cv2.add(scene, rng.integers(0, 5, scene.shape, dtype=np.uint8))
+            for bit in range(16):
+                image[:16, 16 * bit : 16 * bit + 16] = 255 * (index >> bit & 1)
+            feed.publish(Picture(image, index, time.monotonic()))
+            if end.wait(0.04):
+                return
+
+    publisher = threading.Thread(target=publish)
+    publisher.start()
+    with AxisServer({1: feed}, user="root", password=PASSWORD, sent=sent.__setitem__) as unit:
+        unit.sent = sent
+        yield unit
+    end.set()
+    publisher.join()
+
+
+def watching(unit, **changes):
+    changes = {"size": (320, 240), "resolution": "320x240", "user": "root", "password": PASSWORD} | changes
+    return opened(unit, **changes)
+
+
+def number(image):
+    return sum(int(image[4:12, 16 * bit + 4 : 16 * bit + 12].mean() > 127) << bit for bit in range(16))
+
+
+def test_emulated_pictures_are_dated_by_their_first_byte(emulated):
+    with watching(emulated) as camera:
+        frame = camera.read()
+        for _ in range(10):
+            frame = camera.read(frame.t, PATIENCE_S)
+            # The driver cannot have seen it before it was sent.
+            delay = frame.t + LATENCY_S - emulated.sent[number(frame.image)]
+            assert 0 <= delay < LOOSE_AGE_S
+        assert camera.counters.broken == 0
+    assert probe(config(emulated, user="root", password=PASSWORD)) == "AXIS 241Q, firmware 4.48, input 1 has video"
+
+
+@pytest.mark.parametrize("fault", ["wrong-length", "no-length", "dashed-boundary"])
+def test_what_the_emulator_writes_oddly_is_read(emulated, fault):
+    emulated.faults.set(fault)
+    with watching(emulated) as camera:
+        frame = camera.read()
+        for _ in range(5):
+            frame = camera.read(frame.t, PATIENCE_S)
+        assert (camera.counters.broken, camera.counters.reconnects) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("stall", "has sent nothing for|has stopped sending"),
+        ("cut", "has closed the stream|sent no newer picture|are broken"),
+        ("unauthorized", r"refuses the user 'root' \(401\)"),
+        ("busy", r"is busy \(503\)"),
+        ("frozen", "repeats the same picture"),
+        ("no-video", "its input 1 has no video"),
+        ("refuse", "cannot be reached|broke off|does not speak HTTP"),
+    ],
+)
+def test_each_fault_is_told_and_recovered_from(emulated, fault, words, monkeypatch):
+    monkeypatch.setattr(axis, "FROZEN_S", 0.3)
+    monkeypatch.setattr(axis, "REFUSED_PAUSE_S", 0.3)
+    with watching(emulated) as camera:
+        emulated.faults.set(fault)
+        t, deadline, said = camera.read().t, time.monotonic() + PATIENCE_S, ""
+        while not re.search(words, said):
+            assert time.monotonic() < deadline, said
+            try:
+                t = camera.read(t, 0.2).t
+            except StaleFrameError as error:
+                said = str(error)
+        assert "\n" not in said
+        emulated.faults.set(fault, False)
+        assert camera.read(t, PATIENCE_S).t > t
+
+
+def test_emulated_damage_is_dropped_and_counted(emulated, capfd):
+    with watching(emulated) as camera:
+        t, deadline = camera.read().t, time.monotonic() + PATIENCE_S
+        emulated.faults.set("corrupt")
+        while camera.counters.broken < 9:
+            with contextlib.suppress(StaleFrameError):
+                t = camera.read(t, 0.2).t
+            assert time.monotonic() < deadline
+        emulated.faults.set("corrupt", False)
+        assert camera.read(t, PATIENCE_S).t > t
+
+
+def test_an_emulated_change_of_resolution(emulated):
+    with watching(emulated) as camera:
+        emulated.faults.set("resolution")
+        server_changes = time.monotonic() + PATIENCE_S
+        with pytest.raises(DeviceError, match="now sends 160x120 where it sent 320x240"):
+            all(camera.read() for _ in iter(lambda: time.monotonic() < server_changes, False))

@@ -186,7 +186,7 @@ class AxisCamera:
         elif self._frozen:
             reason = f"{name} repeats the same picture"
         elif self._spoilt:
-            reason = f"the pictures of {name} are broken"
+            return f"the pictures of {name} are broken, {self._counters.broken} so far"
         else:
             return f"{name} sent no newer picture within {timeout:g} s"
         video = f"; its input {self._config.camera} has no video" if self._video is False else ""
