@@ -227,6 +227,15 @@ def test_a_command_that_was_stuck_when_the_head_was_halted_is_not_left_to_run(re
 
 
 @pytest.mark.wire
+def test_somebody_who_looks_at_the_head_does_not_end_the_watch_over_a_command_on_its_way(real):
+    """The head rests at the goal already, but the command that hangs is still to come."""
+    rig, safe = real
+    rig.head.hang = lambda: (safe.head.state(), rig.head.wait_for_halt())
+    safe.head.move(0.0, 0.0)
+    assert rig.head.log == ["move", "halt", "moved", "halt"]
+
+
+@pytest.mark.wire
 def test_a_wait_is_watched_for_no_longer_than_the_way_takes():
     """1 rad at 4 rad/s with ramps of 0.1 s takes 0.35 s: the device may wait for that, half as long again, and some."""
     rig = RealRig()

@@ -150,7 +150,9 @@ def test_devices_that_do_not_let_go_do_not_hold_the_program_for_ever(start):
     child.signal(signal.SIGINT)
     child.process.stdin.write(b"\n")
     child.wait_for("closing")
+    deadline = time.monotonic() + DEADLINE_S
     while child.process.poll() is None:  # as a person would
+        assert time.monotonic() < deadline
         child.signal(signal.SIGINT)
         with contextlib.suppress(subprocess.TimeoutExpired):
             child.process.wait(0.05)

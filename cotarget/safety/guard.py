@@ -76,12 +76,13 @@ class Guard:
         else:
             self.watch()
         with self._lock:
+            halts = self._halts  # before anything is asked: a signal's handler may stop the head in between
             self.refuse_if_stopped()
             if self._shut:
                 raise DeviceError("the rig is closed, so the head does not move any more")
             if self._owed is not None:
                 raise DeviceError(f"the head does not move before it could be halted: {self._owed}")
-            self._motion = Motion(goal, self._halts, patience_s)
+            self._motion = Motion(goal, halts, patience_s)
             self._alive_at = self._clock.now()
             return self._motion
 
@@ -93,8 +94,7 @@ class Guard:
             head has been halted once more.
         """
         with self._lock:
-            stopped = self._stopped is not None or self._stopped_by_file is not None
-            interrupted = stopped or self._halts != motion.halts
+            interrupted = self._halts != motion.halts
             self._alive_at = self._clock.now()
             if self._motion is motion and not interrupted:
                 self._motion = None if arrived else replace(motion, patience_s=0.0, on_its_way=False)
