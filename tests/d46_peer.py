@@ -116,7 +116,7 @@ class Unit:
 class SimPort:
     """pyserial's port with a unit behind it, in simulated time: bytes take theirs in both directions."""
 
-    def __init__(self, unit, clock, baud=9600, timeout=0.02):
+    def __init__(self, unit, clock, baud=9600, timeout=0.01):
         self.unit, self._clock, self._byte_s, self._timeout = unit, clock, 10 / baud, timeout
         self._coming = deque()  # (time, byte)
         self.sent = []  # (time, bytes)

@@ -20,11 +20,11 @@ Meaning = TypeVar("Meaning")
 
 # Beyond the time that the bytes take on the wire [s]:
 PATIENCE_S = 1.0  # for an answer while a unit is opened
-QUICK_S = 0.1  # for an answer in the middle of work, so that a silent unit is noticed while it can still be halted
+QUICK_S = 0.08  # for an answer in the middle of work, so that a silent unit is noticed while it can still be halted
 LAST_S = 0.8  # for the answer that tells that a unit which was silent is in step again
 LAST_TRIES = 10  # to hear from a unit that is silent, before it counts as dead
 HURRY_S = 0.05  # for the answer in flight when somebody wants the head halted
-QUIET_S = 0.05  # of silence, after which no more of an old answer is expected
+QUIET_S = 0.03  # of silence, after which no more of an old answer is expected
 DRAIN_S = 0.15  # but something that never stops talking is not listened to for longer
 BITS = 10  # of a byte on the wire, 8N1
 WORDY_ANSWER = 100  # the longest of a healthy unit, with its echo [bytes]
@@ -228,7 +228,7 @@ class Line:
         while b"\n" not in self._buffer:
             now = self._clock.now()
             late = now > deadline  # a thread that slept too long still reads what came meanwhile
-            data = self._read()
+            data = self._read(wait=not late)
             if data and not begun:
                 first, begun = self._clock.now(), True
             self._buffer += data

@@ -5,7 +5,7 @@ from typing import Protocol
 
 from cotarget.errors import ConfigError, DeviceError
 
-SLICE_S = 0.02  # how long a read waits, so how often one that waits longer looks at its deadline
+SLICE_S = 0.01  # how long a read waits, so how often one that waits longer looks at its deadline
 WRITE_S = 0.5  # a line that takes no bytes for so long is dead
 
 
