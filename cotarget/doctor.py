@@ -22,7 +22,6 @@ PACKAGES = (
     "scipy",
     "gymnasium",
     "pyserial",
-    "httpx",
     "av",
     "matplotlib",
     "tqdm",

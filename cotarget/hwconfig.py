@@ -143,7 +143,7 @@ def check_hardware(hardware: HardwareConfig) -> None:
     for name, limits in (("pan_deg", head.pan_deg), ("tilt_deg", head.tilt_deg)):
         if limits[0] >= limits[1]:
             raise ConfigError(f"hardware.head.{name}: {list(limits)} is not [lowest, highest]")
-    if fixed.url and (urlsplit(fixed.url).scheme not in ("http", "https") or not urlsplit(fixed.url).hostname):
+    if fixed.url and not _is_web_address(fixed.url):
         raise ConfigError(f"hardware.fixed.url: '{fixed.url}' is not like http://192.168.0.90")
     if not 0 <= fixed.compression <= 100:
         raise ConfigError(f"hardware.fixed.compression: {fixed.compression} is not within 0 to 100")
@@ -177,3 +177,11 @@ def check_hardware(hardware: HardwareConfig) -> None:
     for where, value in not_negative.items():
         if value < 0:
             raise ConfigError(f"hardware.{where}: {value:g} is negative")
+
+
+def _is_web_address(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # an address in brackets that is none, a port that is no number
+        return False

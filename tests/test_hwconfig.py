@@ -16,6 +16,8 @@ MISTAKES = [
     ("hardware.head.tilt_deg = [30, -40]", "hardware.head.tilt_deg: [30.0, -40.0] is not [lowest, highest]"),
     ("hardware.head.step_deg = 0", "hardware.head.step_deg: 0 is not greater than zero"),
     ("hardware.fixed.url = '192.168.0.90'", "hardware.fixed.url: '192.168.0.90' is not like http://192.168.0.90"),
+    ("hardware.fixed.url = 'http://[::1'", "hardware.fixed.url: 'http://[::1' is not like http://192.168.0.90"),
+    ("hardware.fixed.url = 'http://host:port'", "hardware.fixed.url: 'http://host:port' is not like"),
     ("hardware.fixed.compression = 101", "hardware.fixed.compression: 101 is not within 0 to 100"),
     ("hardware.fixed.latency_s = -0.1", "hardware.fixed.latency_s: -0.1 is negative"),
     (

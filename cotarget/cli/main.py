@@ -29,6 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # A polite end is an end: the rig halts and half-written files go, as on Ctrl-C.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     logging.basicConfig(level=logging.INFO if options.verbose else logging.WARNING, format="%(message)s")
+    logging.getLogger("httpx").setLevel(logging.WARNING)  # which tells of every request
     try:
         status = int(options.run(options) or 0)
         sys.stdout.flush()
