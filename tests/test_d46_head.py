@@ -202,3 +202,14 @@ def test_a_failed_opening_releases_the_port(opened, bench):
     with pytest.raises(ConfigError):
         opened()
     assert bench.port.closed
+
+
+def test_a_mistake_in_the_driver_halts_too(opened, bench):
+    head = opened()
+    head.move(3000 * STEP, 0.0)
+    head._loop.turn = lambda: 1 / 0
+    with pytest.raises(DeviceError, match="the driver of the pan-tilt unit failed: ZeroDivisionError"):
+        for_ever(head.state)
+    head.halt()
+    assert bench.unit.heard[-1] == "H"
+    assert not bench.unit.turning()

@@ -233,6 +233,29 @@ def test_a_late_answer_is_not_taken_for_another(bench, late):
     assert bench.loop.snapshot.pan == 0
 
 
+def test_a_unit_that_keeps_answering_something_else_is_given_up(bench):
+    bench.start()
+    bench.unit.scripted = {"TP": [b"* 1 2\r\n"] * 10}
+    with pytest.raises(
+        DeviceError, match="the pan-tilt unit at PORT answers, but not what it was asked: '1 2' is not a number"
+    ):
+        bench.run(5.0)
+
+
+def test_a_move_from_before_a_halt_does_not_take_the_place_of_one_from_after(bench):
+    bench.start()
+    stale = bench.move(1000, 0)
+    bench.loop.moves.clear()  # its thread was interrupted before it got there
+    bench.halt()
+    move = bench.move(500, 0)
+    bench.run(0.2)
+    bench.loop.moves.append(stale)
+    bench.until(stale.done.is_set)
+    assert str(stale.error) == "the move was halted"
+    bench.until(move.done.is_set)
+    assert move.error is None
+
+
 def test_an_order_whose_answer_was_lost_is_sent_again(bench):
     bench.start()
     bench.orders()

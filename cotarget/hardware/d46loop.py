@@ -129,12 +129,17 @@ class Loop:
     def _move(self) -> None:
         # A snapshot that says moving must be there before the wish leaves the queue: see D46Head.state.
         self.snapshot = Snapshot(self.snapshot.pan, self.snapshot.tilt, True, self.snapshot.t)
-        *older, move = drained(self.moves)
+        wishes = drained(self.moves)
+        fresh = [wish for wish in wishes if wish.number > self.halted]
+        for wish in wishes:
+            if wish not in fresh:
+                wish.finish(DroppedError("the move was halted"))
+        if not fresh:
+            return
+        *older, move = fresh
         for other in [*older, *([self._active] if self._active else [])]:
             other.finish(DroppedError("another move took this one's place"))
         self._active, self._polled = move, False
-        if move.number < self.halted:
-            raise DroppedError("the move was halted")
         try:
             self._send(move)
         except RefusedError as error:
@@ -219,7 +224,7 @@ class Loop:
                 if reason := unless():
                     raise DroppedError(reason) from error
                 if attempt == TRIES - 1:
-                    raise
+                    raise self._line.nonsense(error) from error
         raise AssertionError("unreachable")
 
     def _give_up(self, move: Move, error: DeviceError) -> None:

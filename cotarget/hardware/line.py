@@ -123,7 +123,7 @@ class Line:
             except (SilentError, ReplyError) as error:
                 self.resync(error)
                 if attempt == tries - 1:
-                    raise
+                    raise self.nonsense(error) from error
         raise AssertionError("unreachable")
 
     def resync(self, reason: DeviceError) -> bool:
@@ -180,12 +180,16 @@ class Line:
 
     def close(self) -> None:
         """Release the port."""
-        # pyserial leaves a socket open if the other side closed first.
+        # pyserial leaves a socket open if the other side closed first
         socket = getattr(self._port, "_socket", None)
         with contextlib.suppress(OSError):
             self._port.close()
         if socket is not None:
             socket.close()
+
+    def nonsense(self, error: DeviceError) -> DeviceError:
+        """What to say of a unit whose answers were no good for the last time."""
+        return DeviceError(f"the pan-tilt unit at {self.name} answers, but not what it was asked: {error}")
 
     def _deadline(self, order: bytes, patience: float) -> float:
         answer = TERSE_ANSWER if self.strict else WORDY_ANSWER
