@@ -211,7 +211,7 @@ def _axis(line: Line, axis: AxisName) -> AxisFacts:
 
     arcseconds, _ = line.query(command(axis + "R"), d46.arcseconds, PATIENCE_S)
     facts = AxisFacts(arcseconds, number("N"), number("X"), number("L"), number("U"), number("A"))
-    if not 0 <= facts.slowest < facts.fastest or facts.acceleration <= 0:
+    if not 0 <= facts.slowest <= facts.fastest or min(facts.fastest, facts.acceleration) <= 0:
         raise DeviceError(
             f"the pan-tilt unit at {line.name} tells for {d46.AXIS_WORDS[axis]} speeds from {facts.slowest} to "
             f"{facts.fastest} and an acceleration of {facts.acceleration}; restore its factory settings"
