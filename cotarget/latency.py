@@ -232,6 +232,15 @@ def in_both_views(calibration: Calibration, board: BoardConfig) -> RigidTransfor
 def _zoom_out(rig: Rig) -> None:
     """Send the lens to its shortest focal length and wait until it stands there."""
     rig.zoom.zoom(rig.zoom.focal_range[0])
+    wait_for_lens(rig)
+
+
+def wait_for_lens(rig: Rig) -> None:
+    """Wait until the zoom lens stands.
+
+    Raises:
+        CalibrationError: it goes on moving.
+    """
     deadline = rig.clock.now() + LENS_TIMEOUT
     while rig.zoom.state().moving:
         if rig.clock.now() > deadline:

@@ -51,13 +51,21 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None])
         taken.add(path.resolve())
 
 
-def positive(text: str) -> float:
-    """Read an argument greater than zero."""
+def number(text: str) -> float:
+    """Read an argument that is a finite number."""
     try:
         value = float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is not a number") from None
-    if not (math.isfinite(value) and value > 0):
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
+    return value
+
+
+def positive(text: str) -> float:
+    """Read an argument greater than zero."""
+    value = number(text)
+    if value <= 0:
         raise argparse.ArgumentTypeError(f"{text} is not greater than zero")
     return value
 

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 import cotarget
 from cotarget.cli import calibrating, emulating, operating, running
-from cotarget.cli.arguments import corners, count, not_negative, port, positive
+from cotarget.cli.arguments import corners, count, not_negative, number, port, positive
 from cotarget.errors import CotargetError
 
 # Heavy modules (MuJoCo, OpenCV, matplotlib) are imported by the command that needs them, so that --help and
@@ -144,6 +144,13 @@ def _parser() -> argparse.ArgumentParser:
     replay.add_argument("recording", type=Path, metavar="DIR")
     replay.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
     replay.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
+
+    point = command("point", operating.point, "send head and lens somewhere, and take a picture with each camera")
+    point.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
+    point.add_argument("--pan-deg", type=number, metavar="A", help="positive turns right (where it is)")
+    point.add_argument("--tilt-deg", type=number, metavar="A", help="positive goes up (where it is)")
+    point.add_argument("--focal-mm", type=positive, metavar="F", help="of the zoom lens (where it is)")
+    point.add_argument("--pictures", type=Path, metavar="DIR", help="write fixed.png and zoom.png there")
 
     latency = command("latency", operating.latency, "measure how late cameras and head are, by what moves")
     latency.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")

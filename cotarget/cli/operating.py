@@ -1,4 +1,4 @@
-"""What an operator does with a rig: measure its latencies, stop it and clear the stop, reset the head."""
+"""What an operator does with a rig: point it, measure its latencies, stop it and clear the stop, reset the head."""
 
 import argparse
 import json
@@ -6,6 +6,7 @@ import math
 import sys
 from pathlib import Path
 
+from cotarget.cli.arguments import check_outputs
 from cotarget.errors import ConfigError
 
 CONSENT = "yes"
@@ -40,6 +41,49 @@ def latency(options: argparse.Namespace) -> None:
         print("the fixed camera's latency needs --calibration, to look at a board with both cameras", file=sys.stderr)
     rounded = {name: None if math.isnan(value) else round(value, ENOUGH_DIGITS) for name, value in found.items()}
     print(json.dumps({"measured": rounded, "agreement": agreement}, indent=2))
+
+
+def point(options: argparse.Namespace) -> None:
+    """Cotarget point."""
+    from cotarget.calibration.captures import write_image
+    from cotarget.config import load_config
+    from cotarget.latency import wait_for_lens
+    from cotarget.rig import open_rig
+    from cotarget.safety import SafeRig
+
+    config = load_config(options.rig)
+    shots = {} if options.pictures is None else {name: options.pictures / f"{name}.png" for name in ("fixed", "zoom")}
+    check_outputs(list(shots.values()), [options.rig])
+    with SafeRig(open_rig(config), config.safety) as rig:
+        if options.focal_mm is not None:
+            shortest, longest = (focal * config.pitch_mm for focal in rig.zoom.focal_range)
+            if not shortest <= options.focal_mm <= longest:
+                raise ConfigError(
+                    f"--focal-mm: {options.focal_mm:g} is beyond the lens's {shortest:g} to {longest:g} mm"
+                )
+            rig.zoom.zoom(options.focal_mm / config.pitch_mm)
+        now = rig.head.state()
+        pan, tilt = (
+            here if wanted is None else math.radians(wanted)
+            for wanted, here in ((options.pan_deg, now.pan), (options.tilt_deg, now.tilt))
+        )
+        rig.head.move(pan, tilt, wait=True)
+        wait_for_lens(rig)
+        head, lens = rig.head.state(), rig.zoom.state()
+        for name, path in shots.items():
+            frame = rig.fixed.read(newer_than=head.t) if name == "fixed" else rig.zoom.capture()
+            write_image(path, frame.image)
+    print(
+        json.dumps(
+            {
+                "pan_deg": math.degrees(head.pan),
+                "tilt_deg": math.degrees(head.tilt),
+                "focal_mm": lens.focal_px * config.pitch_mm,
+                "pictures": {name: str(path) for name, path in shots.items()},
+            },
+            indent=2,
+        )
+    )
 
 
 def stop(options: argparse.Namespace) -> None:
