@@ -1,0 +1,53 @@
+"""What the README shows is so: its configurations are read, its commands exist with the options that it names."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from cotarget.config import parse_config
+
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+# `cotarget NAME ... --option ...` up to where a line of code or of a shell ends.
+COMMANDS = re.findall(r"cotarget ([a-z-]+)((?: [^`\n]*)?)", README)
+
+
+def test_there_are_examples():
+    assert README.count("```toml") >= 1
+    assert len(COMMANDS) > 30
+
+
+@pytest.mark.parametrize("block", re.findall(r"(?:```toml|<<'TOML')\n(.*?)(?:```|TOML)\n", README, re.DOTALL))
+def test_configurations_are_read(block):
+    assert parse_config(tomllib.loads(block)) is not None
+
+
+@pytest.fixture(scope="module")
+def helps():
+    def ask(*arguments):
+        command = [sys.executable, "-m", "cotarget.cli", *arguments, "--help"]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    existing = known(ask())
+    return {name: ask(name) for name in sorted({name for name, _ in COMMANDS} & existing)}
+
+
+def known(text):
+    return set(re.findall(r"^    ([a-z-]+)", text, re.MULTILINE))
+
+
+def test_commands_and_their_options_exist(helps):
+    for name, rest in COMMANDS:
+        if name not in helps:
+            assert not rest.strip().startswith("--"), name  # prose, such as "cotarget makes the two cooperate"
+            continue
+        for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", rest):
+            assert option in helps[name], f"cotarget {name} {option}"
+
+
+def test_every_command_is_told_of(helps):
+    text = subprocess.run([sys.executable, "-m", "cotarget.cli", "--help"], capture_output=True, text=True, check=True)
+    assert known(text.stdout) <= set(helps)
