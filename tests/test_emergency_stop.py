@@ -74,17 +74,21 @@ def test_a_stop_while_a_command_is_on_its_way_halts_after_it():
         assert rig.head.log == ["move", "halt", "moved", "halt"]
 
 
-def test_a_command_that_fails_while_it_is_stopped_tells_of_its_failure():
+@pytest.mark.parametrize(("raised", "seen"), [
+    (DeviceError, EmergencyStopError),  # a driver's, that the move was halted
+    (KeyboardInterrupt, KeyboardInterrupt),
+])  # fmt: skip
+def test_a_command_that_a_stop_breaks_off_tells_of_the_stop_but_hides_no_ctrl_c(raised, seen):
     rig = RealRig()
     with SafeRig(rig, SafetyConfig()) as safe:
 
         def hang():
             safe.stop("smoke")
-            raise KeyboardInterrupt
+            raise raised("the move was halted")
 
         rig.head.hang = hang
-        with pytest.raises(KeyboardInterrupt):
-            safe.head.move(0.5, 0.0)
+        with pytest.raises(seen):
+            safe.head.move(0.5, 0.0, wait=True)
         assert rig.head.log == ["move", "halt", "halt"]
 
 

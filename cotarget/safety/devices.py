@@ -48,8 +48,9 @@ class SafeHead:
         motion = self._guard.begin((pan, tilt), self._patience((pan, tilt), speed) if wait else 0.0)
         try:
             said = self._head.move(pan, tilt, speed, wait)
-        except BaseException:
-            self._guard.end(motion, arrived=False)
+        except BaseException as error:
+            if self._guard.end(motion, arrived=False) and isinstance(error, Exception):
+                self._guard.refuse_if_stopped()  # which is why the device failed
             raise
         if self._guard.end(motion, arrived=wait):
             self._guard.refuse_if_stopped()

@@ -41,7 +41,7 @@ def refuse_if_stopped(path: Path | None) -> None:
 def stopped_by_file(path: Path | None, reason: str) -> EmergencyStopError:
     """The error that says why, and how to clear it."""
     return EmergencyStopError(
-        f"emergency stop: {reason}; when it is safe to move, run 'cotarget clear' or remove {path}"
+        f"emergency stop: {reason}; when it is safe to move, run 'cotarget clear --rig FILE' or remove {path}"
     )
 
 
