@@ -85,7 +85,7 @@ class SafetyConfig:
         speed_deg_s: speed cap [degrees/s]; None for the device's.
         max_frame_age_s: a frame older than this is not acted on [s].
         watchdog_s: a head that may be moving is halted when for so long neither a fresh frame was read nor a command
-            given [s].
+            given [s]; its braking comes after that.
         stop_file: while this file exists, the head does not move; None for no such file.
     """
 
@@ -93,7 +93,7 @@ class SafetyConfig:
     tilt_deg: Pair | None = None
     speed_deg_s: float | None = None
     max_frame_age_s: float = 1.0
-    watchdog_s: float = 0.5
+    watchdog_s: float = 0.35
     stop_file: Path | None = None
 
 

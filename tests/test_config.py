@@ -132,7 +132,7 @@ def test_each_mistake_is_one_line_that_names_it(tmp_path, text, said):
 def test_safety_is_taken():
     safety = parse_config({"safety": {"watchdog_s": 0.3, "stop_file": "stop"}}).safety
     assert (safety.watchdog_s, safety.stop_file) == (0.3, Path("stop"))
-    assert (SafetyConfig().watchdog_s, SafetyConfig().stop_file) == (0.5, None)
+    assert (SafetyConfig().watchdog_s, SafetyConfig().stop_file) == (0.35, None)
 
 
 def test_a_missing_file_is_named(tmp_path):
