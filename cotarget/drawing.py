@@ -90,8 +90,12 @@ def side_by_side(step: Step, title: str) -> Image:
     pan, tilt = np.degrees(step.head.pan), np.degrees(step.head.tilt)
     depth = f"depth {step.aim.depth:5.1f} m" if step.aim is not None else ""
     wide = captioned(draw_wide(step), f"{title}   t = {step.fixed.t:5.2f} s   {step.state}   {depth}")
+    zoomed = draw_zoom(step)
+    if zoomed.shape[0] < step.fixed.image.shape[0]:  # a preview: as high as the wide view, for the eye
+        factor = step.fixed.image.shape[0] / zoomed.shape[0]
+        zoomed = np.asarray(cv2.resize(zoomed, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC), np.uint8)
     close = captioned(
-        draw_zoom(step),
+        zoomed,
         f"zoom view   pan {pan:6.2f}   tilt {tilt:6.2f} deg   focal length {step.lens.focal_px:5.0f} px",
     )
     height = max(wide.shape[0], close.shape[0])
