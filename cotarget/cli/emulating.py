@@ -12,11 +12,15 @@ from cotarget.errors import ConfigError
 # Mesa's software renderer: one thread, which leaves the client a core. Read when OpenGL starts.
 RENDER_THREADS = ("LP_NUM_THREADS", "1")
 LOOK = 0.2  # between looks at the time [s]
+# How long a thread that works in Python keeps others waiting [s]; with Python's own 5 ms, a line that is paced by a
+# thread of its own loses half of its rate beside the world's rendering.
+SWITCH_S = 5e-4
 
 
 def emulate(options: argparse.Namespace) -> None:
     """Cotarget emulate."""
     os.environ.setdefault(*RENDER_THREADS)
+    sys.setswitchinterval(SWITCH_S)
     from cotarget.calibration.atomic import write_atomically
     from cotarget.config import RigConfig, load_config
     from cotarget.emulators.emulation import Emulation, Ports, copied_tables

@@ -185,8 +185,11 @@ class Emulation:
         """Switch a fault on or off, or tell the truth."""
         if "truth" in said:
             pan, tilt = self.world.head_truth()
+            now = self.world.clock.now()
             return {
-                "t": self.world.clock.monotonic(self.world.clock.now()),
+                "t": self.world.clock.monotonic(now),
+                "world": now,
+                "pictures": {name: feed.moments for name, feed in self.world.feeds.items()},
                 "pan_deg": math.degrees(pan),
                 "tilt_deg": math.degrees(tilt),
                 "moving": self.world.pan.moving() or self.world.tilt.moving(),

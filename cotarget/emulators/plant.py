@@ -4,6 +4,7 @@ The simulated world itself runs in `cotarget.emulators.world`; tests put ready-m
 """
 
 import threading
+import time
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -26,16 +27,22 @@ class Picture:
 
 
 class Feed:
-    """The newest picture of a camera, published by one thread and waited for by others."""
+    """The newest picture of a camera, published by one thread and waited for by others.
+
+    Attributes:
+        moments: when the light of the newest picture fell, and when it was published, on the machine's monotonic clock
+            [s]; None before the first.
+    """
 
     def __init__(self) -> None:
         self._picture: Picture | None = None
+        self.moments: tuple[float, float] | None = None
         self._new = threading.Condition()
 
     def publish(self, picture: Picture) -> None:
         """Replace the newest picture."""
         with self._new:
-            self._picture = picture
+            self._picture, self.moments = picture, (picture.t, time.monotonic())
             self._new.notify_all()
 
     def newest(self, after: int = -1, timeout: float = 0.0) -> Picture | None:
