@@ -11,7 +11,8 @@ import tomli_w
 
 from cotarget.config import RigConfig
 from cotarget.emulators.axis import AXIS_FAULTS, AxisServer
-from cotarget.emulators.d46 import D46, D46_FAULTS, UnitProfile
+from cotarget.emulators.d46 import D46_FAULTS, UnitProfile
+from cotarget.emulators.d46_twins import make_twins
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.jsonlines import JsonLines
 from cotarget.emulators.lines import SerialLine, TcpLine
@@ -79,9 +80,9 @@ class Emulation:
         with contextlib.ExitStack() as opened:
             self.world = opened.enter_context(LiveWorld(config, pan_sign=PAN_SIGN))
             world = self.world
-            units = [D46(world.pan, world.tilt, unit, self.faults["head"], world.clock.now) for _ in range(2)]
-            self.tty = opened.enter_context(SerialLine(units[0]))
-            self.tcp = opened.enter_context(TcpLine(units[1], ports.host, ports.head, paced=True))
+            twins = make_twins(world.pan, world.tilt, unit, self.faults["head"], world.clock.now)
+            self.tty = opened.enter_context(SerialLine(twins[0]))
+            self.tcp = opened.enter_context(TcpLine(twins[1], ports.host, ports.head, paced=True))
             self.fixed = opened.enter_context(
                 AxisServer(
                     {1: world.feeds["fixed"]},

@@ -1,0 +1,285 @@
+"""The emulated world: axes and lens in simulated time, two firmwares on one head, and once the whole in real time."""
+
+import math
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from cotarget.config import RigConfig, SimConfig, parse_config
+from cotarget.emulators.d46 import D46_FAULTS, D46_STOCK
+from cotarget.emulators.d46_twins import make_twins
+from cotarget.emulators.faults import Faults
+from cotarget.emulators.jsonlines import JsonLines
+from cotarget.emulators.world import FIXED_HZ, ZOOM_HZ, EmulatedAxis, EmulatedLens, LiveWorld, paced
+from cotarget.errors import ConfigError, DeviceError
+from cotarget.geometry import pose
+from cotarget.sim.motion import Axis, LensDrive
+
+STEP = math.radians(0.05)  # [rad]
+DELAY = 0.04  # from a command to motion [s]
+DEADLINE_S = 30.0  # for whatever must happen at all, on a machine that is busy with other things
+
+
+class FakeClock:
+    """Shows what the test says."""
+
+    def __init__(self):
+        self.t = 0.0
+
+    def now(self):
+        return self.t
+
+
+@pytest.fixture
+def clock():
+    return FakeClock()
+
+
+def axis(clock, step=STEP, **more):
+    """1000 steps/s at most, accelerating by 2000 steps/s^2 where nothing else is said."""
+    return EmulatedAxis(Axis(1000 * STEP, 2000 * STEP, **more), clock, step, DELAY)
+
+
+def test_an_axis_sets_out_after_the_delay_and_is_there_when_the_trapezoid_says(clock):
+    """1000 steps at 500/s and 1000/s^2: 0.5 s and 125 steps on either ramp, 750 steps in 1.5 s between them."""
+    plant = axis(clock)
+    plant.command(1000, 500, 1000)
+    for t, position, speed, moving in [
+        (0.0, 0, 0, True),
+        (0.04, 0, 0, True),
+        (0.29, 31, 250, True),  # 1000 / 2 * 0.25^2
+        (0.54, 125, 500, True),
+        (1.54, 625, 500, True),
+        (2.29, 969, 250, True),
+        (2.539, 1000, 1, True),
+        (2.541, 1000, 0, False),
+    ]:
+        clock.t = t
+        assert plant.position() == position, t
+        assert plant.speed() == pytest.approx(speed, abs=1.1)
+        assert plant.moving() is moving, t
+
+
+def test_a_unit_that_counts_the_other_way(clock):
+    """The simulated axis turns by minus what the unit says."""
+    inner = Axis(1000 * STEP, 2000 * STEP)
+    plant = EmulatedAxis(inner, clock, -STEP, DELAY)
+    plant.command(200, 500, 1000)
+    clock.t = 0.29
+    assert plant.speed() == pytest.approx(250, abs=0.1)
+    clock.t = 5.0
+    assert plant.position() == 200
+    assert inner.motor(5.0)[0] == pytest.approx(-200 * STEP)
+
+
+def test_an_axis_is_never_faster_than_the_simulated_one(clock):
+    plant = axis(clock)
+    plant.command(5000, 4000, 2000)
+    clock.t = 2.0
+    assert plant.speed() == pytest.approx(1000, abs=0.1)
+
+
+def test_a_halt_takes_the_braking_distance_after_the_delay(clock):
+    """From 500 steps/s, 20 steps in the delay, then 125 of braking at 1000/s^2."""
+    plant = axis(clock)
+    plant.command(1000, 500, 1000)
+    clock.t = 1.04
+    assert plant.position() == 375
+    plant.halt(1000)
+    clock.t = 1.6
+    assert not plant.moving()
+    assert plant.position() == 375 + 20 + 125
+
+
+def test_a_new_goal_on_the_fly_replaces_the_old_one(clock):
+    plant = axis(clock)
+    plant.command(1000, 500, 1000)
+    clock.t = 1.04
+    plant.command(0, 500, 1000)
+    clock.t = 1.08 + 0.5
+    assert plant.position() == 520
+    assert plant.speed() == pytest.approx(0, abs=0.1)
+    clock.t = 10.0
+    assert plant.position() == 0
+    assert not plant.moving()
+
+
+def test_an_axis_remembers_for_the_exposures_and_forgets_the_rest(clock):
+    inner = Axis(1000 * STEP, 2000 * STEP)
+    plant = EmulatedAxis(inner, clock, STEP, DELAY)
+    for i in range(200):
+        clock.t = float(i)
+        plant.command(100 * (i % 2), 1000, 2000)
+    assert inner.driven(195.9) == pytest.approx(100 * STEP)
+    assert inner.driven(196.9) == pytest.approx(0.0)
+    assert len(inner._segments) < 40
+
+
+def test_a_head_without_a_profile_jumps(clock):
+    plant = EmulatedAxis(Axis(math.inf, math.inf), clock, STEP, 0.0)
+    plant.command(700, 500, 1000)
+    assert plant.position() == 700
+    assert not plant.moving()
+
+
+def lens(clock):
+    """Positions 0 to 128, at 129 a second."""
+    drive = LensDrive(667.0, 8000.0, 128, True, Axis(129.0, math.inf))
+    return EmulatedLens(drive, clock, DELAY)
+
+
+def test_a_lens_goes_where_it_is_sent_and_no_farther_than_it_can(clock):
+    plant = lens(clock)
+    assert plant.last == 128
+    plant.command(500)
+    assert plant.moving()
+    clock.t = 20.0
+    assert (plant.position(), plant.moving()) == (128, False)
+    plant.command(-3)
+    clock.t = 40.0
+    assert (plant.position(), plant.moving()) == (0, False)
+
+
+@pytest.fixture
+def twins(clock):
+    faults = Faults(D46_FAULTS)
+    plants = axis(clock), axis(clock)
+    made = make_twins(*plants, D46_STOCK, faults, clock.now)
+    for twin in made:
+        twin.receive(b"ED FT ")
+        twin.output()
+    return *made, faults, plants[0]
+
+
+def later(clock, twins, seconds):
+    """What both say meanwhile; the one that nobody speaks to is asked first."""
+    said = dict.fromkeys(twins, b"")
+    for _ in range(round(seconds / 0.01)):
+        clock.t += 0.01
+        for twin in twins:
+            said[twin] += twin.output()
+    return list(said.values())
+
+
+def test_a_blow_is_told_to_who_moves_the_head(clock, twins):
+    idle, used, faults, pan = twins
+    used.receive(b"PP1000 ")
+    faults.set("limit-hit")
+    silence, said = later(clock, (idle, used), 0.5)
+    assert silence == b""
+    assert b"!P" in said
+    assert "limit-hit" not in faults
+    assert not pan.moving()
+    used.receive(b"PP0 ")
+    clock.t += 5.0
+    assert b"!P" not in used.output() + idle.output()
+
+
+def test_a_gap_in_the_power_is_met_by_who_speaks_to_it(clock, twins):
+    idle, used, faults, _ = twins
+    used.receive(b"PP ")
+    faults.set("power-cycle")
+    silence, said = later(clock, (idle, used), D46_STOCK.boot_s + 0.1)
+    assert silence == b""
+    assert D46_STOCK.title.encode() in said
+
+
+def test_what_lasts_is_wrong_with_both(twins):
+    for fault in ("silence", "error-replies"):
+        *both, faults, _ = twins
+        faults.set(fault)
+        for twin in both:
+            twin.receive(b"PP ")
+            assert twin.output() == (b"" if fault == "silence" else b"! Illegal argument\r\n")
+        faults.set(fault, False)
+        for twin in both:
+            assert fault not in twin.faults
+            twin.receive(b"PP ")
+            assert twin.output() == b"* 0\r\n"
+
+
+def test_who_speaks_at_a_twin_waits_for_its_faults(twins):
+    first, *_, faults, _ = twins
+    assert first.faults.wait_while("unplugged", 0.0)
+    first.faults.set("unplugged")
+    assert "unplugged" in faults
+    assert not first.faults.wait_while("unplugged", 0.0)
+    with pytest.raises(ConfigError, match="unknown fault 'rust'"):
+        first.faults.set("rust")
+
+
+def test_real_time_is_kept_by_fewer_frames_and_plainer_ones():
+    config = RigConfig()
+    sim = paced(config).sim
+    assert (sim.fixed.rate_hz, sim.zoom.rate_hz) == (FIXED_HZ, ZOOM_HZ)
+    assert not any((sim.effects.shadows, sim.effects.multisampling, sim.effects.jpeg))
+    slow = paced(
+        parse_config({"sim": {"fixed": {"rate_hz": 3.0}, "zoom": {"rate_hz": 2.0}}, "safety": {"watchdog_s": 1.0}})
+    )
+    assert (slow.sim.fixed.rate_hz, slow.sim.zoom.rate_hz) == (3.0, 2.0)
+
+
+@pytest.mark.wire
+@pytest.mark.render
+def test_the_world_lives_in_real_time():
+    """One world, because it takes seconds to make: its pictures, its board, its stills, its head, its end."""
+    config = paced(parse_config({"sim": {"scene": "indoor", "zoom": {"latency_s": 0.2}}}))
+    threads = threading.active_count()
+    world = LiveWorld(config, pan_sign=-1)
+    with world:
+        seen = {}
+        for name, camera in (("fixed", config.sim.fixed), ("zoom", config.sim.zoom)):
+            first = world.feeds[name].newest(timeout=DEADLINE_S)
+            second = world.feeds[name].newest(after=first.index, timeout=DEADLINE_S)
+            assert second.index > first.index
+            assert second.t - first.t == pytest.approx((second.index - first.index) / camera.rate_hz)
+            assert time.monotonic() - second.t >= camera.latency_s
+            assert second.image.shape == (480, 640, 3)
+            seen[name] = second
+        assert world.still().shape == (480, 640, 3)
+
+        world.present(pose([-0.4, -0.25, 2.5], [0, 0, 0]))
+        now = time.monotonic()
+        deadline = now + DEADLINE_S
+        shown = seen["fixed"]
+        while shown.t <= now and time.monotonic() < deadline:
+            shown = world.feeds["fixed"].newest(after=shown.index, timeout=DEADLINE_S)
+        # A board of 1 m at 2.5 m fills a sixth of the view: far more than noise changes.
+        assert np.mean(np.abs(shown.image.astype(int) - seen["fixed"].image) > 30) > 0.05
+        world.present(None)
+
+        world.pan.command(100, 3000, 4000)
+        while world.pan.moving():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert world.pan.position() == 100
+        assert world.head_truth()[0] == pytest.approx(-100 * math.radians(config.sim.head.step_deg))
+    world.close()
+    assert threading.active_count() == threads
+
+
+@pytest.mark.wire
+def test_a_world_that_cannot_be_made_says_why():
+    threads = threading.active_count()
+    with pytest.raises(ConfigError, match="unknown scene 'nowhere'"):
+        LiveWorld(RigConfig(sim=SimConfig(scene="nowhere")))
+    assert threading.active_count() == threads
+
+
+@pytest.mark.wire
+def test_a_server_of_lines_hangs_up_and_gives_its_port_back():
+    with JsonLines(lambda said: said) as server:
+        client = socket.create_connection(("127.0.0.1", server.port))
+        with pytest.raises(DeviceError, match=f"cannot listen at 127.0.0.1:{server.port}: Address already in use"):
+            JsonLines(lambda said: said, port=server.port)
+        with client, client.makefile("rwb") as lines:
+            lines.write(b'{"a": 1}\n')
+            lines.flush()
+            assert lines.readline() == b'{"a": 1}\n'
+            server.close()
+            assert lines.readline() == b""
+    with JsonLines(lambda said: said, port=server.port):
+        pass
