@@ -8,7 +8,7 @@ import importlib
 import sys
 from pathlib import Path
 
-EXPERIMENTS = ("hand_eye", "chain", "random_rigs", "mismatch", "honesty", "speed", "pointing", "zoom_range")
+EXPERIMENTS = ("hand_eye", "chain", "random_rigs", "mismatch", "honesty", "speed", "pointing", "zoom_range", "wire")
 
 
 def main() -> int:

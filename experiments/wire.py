@@ -1,0 +1,150 @@
+"""How the hardware backend does over the wire, through the emulated devices: the figures of the step that built it.
+
+- polls: pairs of D46 positions a second at 9600 baud over a paced pseudo-terminal, beside what the line can carry.
+- age: of the newest Axis frame at a consumer of 5 Hz, from its first byte sent.
+- command: from a frame's arrival to the first byte of the command on the wire, in its parts.
+- faults: from each fault of the emulated devices to a head that stands, or to recovery.
+- latency: of cameras and commands, as they are measured at bring-up, against the emulator's truth.
+- parity: where the head ends up, the simulation opened directly and through the wire.
+
+All run in real time beside the emulator, which needs a core of its own: figures from a busy machine are its own.
+
+    python -m experiments.wire [--only NAME ...] [--seed-base 0] [--quick] [--out DIR]
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from tqdm import tqdm
+
+from cotarget.errors import CotargetError
+from experiments import wire_age, wire_command, wire_faults, wire_latency, wire_parity, wire_polls
+from experiments.harness import Experiment, Row, Settings, table
+from experiments.wire_figures import FAULT_COLUMNS, PART_COLUMNS, summarise
+
+INTERRUPTED = 130  # exit status of who was ended by Ctrl-C
+
+
+@dataclass(frozen=True)
+class WireSettings(Settings):
+    """Which figures, and how long each is measured.
+
+    Attributes:
+        only: the figures.
+        poll_s: polling of one unit [s].
+        age_s: the consumer of the stream [s].
+        targets: that are followed to time commands.
+        command_s: how long, each [s].
+        faults: of the devices; all, if none is named.
+        repetitions: of each fault.
+        wiggle_s: of the head [s].
+        swing_s: of the board [s].
+        places: of the book that hangs still.
+        still_s: how long each is followed [s].
+    """
+
+    only: tuple[str, ...] = ("polls", "age", "command", "faults", "latency", "parity")
+    poll_s: float = 10.0
+    age_s: float = 60.0
+    targets: tuple[str, ...] = ("book", "person")
+    command_s: float = 30.0
+    faults: tuple[str, ...] = ()
+    repetitions: int = 3
+    wiggle_s: float = 8.0
+    swing_s: float = 10.0
+    places: int = 3
+    still_s: float = 6.0
+
+
+def run(settings: WireSettings) -> list[Row]:
+    """All rows of the figures asked for; one after the other, whatever the settings say of processes."""
+    rows: list[Row] = []
+    with TemporaryDirectory(prefix="cotarget-wire-") as name:
+        for figure in tqdm(settings.only, disable=None, leave=False):
+            rows += RUNS[figure](settings, Path(name))
+    return rows
+
+
+RUNS: Mapping[str, Callable[[WireSettings, Path], list[Row]]] = {
+    "polls": lambda s, folder: wire_polls.run(folder, s.poll_s),
+    "age": lambda s, _: wire_age.run(s.age_s, s.seed_base),
+    "command": lambda s, folder: wire_command.run(folder, s.targets, s.command_s),
+    "faults": lambda s, folder: wire_faults.run(
+        folder, s.faults or wire_faults.all_faults(), s.repetitions, s.seed_base
+    ),
+    "latency": lambda s, folder: wire_latency.run(folder, s.wiggle_s, s.swing_s),
+    "parity": lambda s, folder: wire_parity.run(folder, s.places, s.still_s, s.seed_base),
+}
+
+
+def describe(settings: WireSettings, summary: Mapping[str, Any]) -> str:
+    """The tables."""
+    found = summary["figures"]
+    texts = [
+        table(
+            ("figure", "measured", "wanted", "unit", "reached"),
+            ([n, f["measured"], f["wanted"], f["unit"], "yes" if f["reached"] else "NO"] for n, f in found.items()),
+        )
+    ]
+    for title, columns in (("parts", PART_COLUMNS), ("faults", FAULT_COLUMNS)):
+        if summary[title]:
+            lines = ([name, *(values[column] for column in columns)] for name, values in summary[title].items())
+            texts.append(table((title, *columns), lines))
+    texts.append("load of the machine meanwhile, the mean over a minute: {:.1f} to {:.1f}".format(*summary["load"]))
+    return "\n\n".join(texts)
+
+
+SETTINGS = WireSettings(seeds=1)
+EXPERIMENT = Experiment(
+    "wire",
+    "The hardware backend over the wire, through the emulated devices.",
+    SETTINGS,
+    replace(
+        SETTINGS,
+        poll_s=3.0,
+        age_s=10.0,
+        command_s=6.0,
+        faults=("head.silence", "fixed.stall", "zoom.gone"),
+        repetitions=1,
+        wiggle_s=5.0,
+        swing_s=6.0,
+        places=1,
+        still_s=4.0,
+    ),
+    run,
+    summarise,
+    describe,
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.wire", description=EXPERIMENT.purpose)
+    parser.add_argument("--only", nargs="+", choices=tuple(RUNS), default=SETTINGS.only, metavar="NAME", help="figures")
+    parser.add_argument("--fault", nargs="+", choices=wire_faults.all_faults(), metavar="DEVICE.FAULT", help="these")
+    parser.add_argument("--repetitions", type=int, metavar="N", help=f"of each fault ({SETTINGS.repetitions})")
+    parser.add_argument("--seed-base", type=int, default=0, metavar="B", help="the seed (0)")
+    parser.add_argument("--quick", action="store_true", help="each for some seconds only")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write result.json and rows.csv there")
+    given = parser.parse_args(arguments)
+    settings = replace(EXPERIMENT.quick if given.quick else SETTINGS, only=tuple(given.only), seed_base=given.seed_base)
+    if given.fault is not None:
+        settings = replace(settings, faults=tuple(given.fault))
+    if given.repetitions is not None:
+        settings = replace(settings, repetitions=given.repetitions)
+    try:
+        return EXPERIMENT.report(settings, given.out)
+    except CotargetError as error:
+        print(f"experiments.wire: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())
