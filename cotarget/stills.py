@@ -2,6 +2,7 @@
 
 from types import TracebackType
 
+from cotarget.errors import StaleFrameError
 from cotarget.rig import Board, Camera, Clock, Frame, PanTilt, Rig, ZoomCamera, ZoomState
 
 
@@ -13,8 +14,8 @@ def with_stills(rig: Rig) -> Rig:
 class StillCamera:
     """A zoom camera whose every frame is a full still; its focal lengths are in the still's pixels."""
 
-    def __init__(self, camera: ZoomCamera) -> None:
-        self._camera = camera
+    def __init__(self, camera: ZoomCamera, clock: Clock) -> None:
+        self._camera, self._clock = camera, clock
         self._factor = camera.still_size[0] / camera.size[0]
 
     @property
@@ -34,7 +35,15 @@ class StillCamera:
         return shortest * self._factor, longest * self._factor
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Take a still; it is newer than any time up to now, however long the camera needs for it."""
+        """Take a still, after ``newer_than`` [s] if that is still to come, however long the camera needs for it.
+
+        Raises:
+            StaleFrameError: that is farther away than ``timeout`` [s].
+        """
+        if newer_than is not None:
+            if (ahead := newer_than - self._clock.now()) > timeout:
+                raise StaleFrameError(f"a still is wanted of {ahead:.2f} s from now, and within {timeout:g} s")
+            self._clock.sleep_until(newer_than)
         return self._camera.capture()
 
     def zoom(self, focal_px: float) -> float:
@@ -57,7 +66,7 @@ class _StillsRig:
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self.fixed: Camera = rig.fixed
-        self.zoom: ZoomCamera = StillCamera(rig.zoom)
+        self.zoom: ZoomCamera = StillCamera(rig.zoom, rig.clock)
         self.head: PanTilt = rig.head
         self.clock: Clock = rig.clock
         self.board: Board = rig.board

@@ -1,0 +1,121 @@
+"""Opening the real devices as one rig: in which order, and what is left when one of them is missing."""
+
+import dataclasses
+
+import pytest
+
+from cotarget.config import HardwareConfig, RigConfig, parse_config
+from cotarget.errors import ConfigError, DeviceError
+from cotarget.hardware import rig as hardware_rig
+from cotarget.hardware.rig import open_hardware
+from cotarget.rig import open_rig
+
+ORDER = ("board", "fixed", "zoom", "head")
+CONFIG = parse_config(
+    {
+        "backend": "hardware",
+        "hardware": {
+            "head": {"port": "/dev/null/head"},
+            "fixed": {"url": "http://192.0.2.1"},
+            "zoom": {"port": "usb:"},
+        },
+    }
+)
+
+
+@pytest.fixture
+def devices(monkeypatch):
+    """Devices that note what happens to them; name one in ``missing`` to have it fail."""
+    log, missing, stuck = [], [], []
+
+    def maker(name):
+        class Device:
+            def __init__(self, *arguments):
+                if name in missing:
+                    log.append(f"no {name}")
+                    raise DeviceError(f"{name}: is not there")
+                log.append(f"open {name}")
+                self.arguments = arguments
+
+            def close(self):
+                log.append(f"close {name}")
+                if name in stuck:
+                    raise DeviceError(f"{name}: does not close")
+
+        return Device
+
+    for name, attribute in zip(ORDER, ("make_board", "AxisCamera", "GphotoCamera", "D46Head"), strict=True):
+        monkeypatch.setattr(hardware_rig, attribute, maker(name))
+    return log, missing, stuck
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "line"),
+    [
+        ("head", "port", 'hardware.head.port: is missing; the hardware backend needs it, for example port = "/dev/'),
+        ("fixed", "url", 'hardware.fixed.url: is missing; the hardware backend needs it, for example url = "http://'),
+        ("zoom", "port", 'hardware.zoom.port: is missing; the hardware backend needs it, for example port = "usb:"'),
+    ],
+)
+def test_a_device_that_is_not_named_is_asked_for_before_any_is_opened(devices, table, key, line):
+    log, *_ = devices
+    nameless = dataclasses.replace(getattr(CONFIG.hardware, table), **{key: ""})
+    config = dataclasses.replace(CONFIG, hardware=dataclasses.replace(CONFIG.hardware, **{table: nameless}))
+    with pytest.raises(ConfigError) as error:
+        open_hardware(config)
+    assert str(error.value).startswith(line)
+    assert log == []
+
+
+def test_a_rig_toml_with_a_sim_section_only_is_no_real_rig():
+    with pytest.raises(ConfigError, match=r"hardware\.head\.port: is missing"):
+        open_rig(RigConfig(backend="hardware", hardware=HardwareConfig()))
+
+
+def test_the_head_comes_last_and_is_let_go_first(devices):
+    log, *_ = devices
+    with open_rig(CONFIG) as rig:
+        assert log == [f"open {name}" for name in ORDER]
+        assert rig.real_time
+        assert rig.head.arguments == (CONFIG.hardware.head, rig.clock)
+        assert rig.fixed.arguments == (CONFIG.hardware.fixed, rig.clock)
+        assert rig.zoom.arguments == (CONFIG.hardware.zoom, rig.clock)
+        assert rig.board.arguments == (CONFIG.hardware.board,)
+        log.clear()
+    assert log == [f"close {name}" for name in reversed(ORDER)]
+    rig.close()
+    assert len(log) == len(ORDER)
+
+
+@pytest.mark.parametrize("missing", ORDER)
+def test_where_one_is_missing_the_others_are_let_go_and_the_head_is_not_touched(devices, missing):
+    log, lacking, _ = devices
+    lacking.append(missing)
+    with pytest.raises(DeviceError, match=f"{missing}: is not there"):
+        open_hardware(CONFIG)
+    there = ORDER[: ORDER.index(missing)]
+    assert log == [*(f"open {name}" for name in there), f"no {missing}", *(f"close {name}" for name in reversed(there))]
+
+
+@pytest.mark.parametrize("which", ORDER)
+def test_one_that_does_not_close_keeps_none_of_the_others(devices, which):
+    log, _, stuck = devices
+    rig = open_hardware(CONFIG)
+    stuck.append(which)
+    log.clear()
+    with pytest.raises(DeviceError, match=f"{which}: does not close"):
+        rig.close()
+    assert log == [f"close {name}" for name in reversed(ORDER)]
+    rig.close()
+
+
+def test_ctrl_c_while_it_opens_lets_go_too(devices, monkeypatch):
+    log, *_ = devices
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(hardware_rig, "D46Head", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        open_hardware(CONFIG)
+    assert log[-3:] == ["close zoom", "close fixed", "close board"]
