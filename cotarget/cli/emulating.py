@@ -23,7 +23,7 @@ def emulate(options: argparse.Namespace) -> None:
     sys.setswitchinterval(SWITCH_S)
     from cotarget.calibration.atomic import write_atomically
     from cotarget.config import RigConfig, load_config
-    from cotarget.emulators.emulation import Emulation, Ports, copied_tables
+    from cotarget.emulators.emulation import Emulation, Ports, copied_tables, parse_fault
     from cotarget.emulators.world import paced
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
@@ -33,6 +33,8 @@ def emulate(options: argparse.Namespace) -> None:
     if options.rig is not None:
         beside = copied_tables(tomllib.loads(options.rig.read_text(encoding="utf-8")), options.rig.parent)
     check_outputs([options.write], [options.rig])
+    for fault in options.fault:
+        parse_fault(fault)
     ports = Ports(options.host, options.head, options.fixed, options.zoom, options.board, options.control)
     password = os.environ.get("COTARGET_PASSWORD", "") if options.user else ""
     if options.user and not password:

@@ -22,7 +22,12 @@ def latency(options: argparse.Namespace) -> None:
     from cotarget.safety import SafeRig
 
     config = load_config(options.rig)
+    if config.backend == "replay":
+        raise ConfigError(f"{options.rig}: backend is 'replay'; a recording's latencies cannot be measured any more")
     calibration = None if options.calibration is None else load_calibration(options.calibration)
+    if calibration is not None:  # refused now, and not when the head has been wiggled
+        calibration.hand_eye()
+        calibration.for_streams(*config.stream_sizes)
     tables = config.sim if config.backend == "sim" else config.hardware
     where = "sim" if config.backend == "sim" else "hardware"
     with SafeRig(open_rig(config), config.safety) as rig:
@@ -117,15 +122,20 @@ def reset_head(options: argparse.Namespace) -> None:
         raise ConfigError(f'{options.rig}: names no pan-tilt unit; backend = "hardware" and [hardware.head] port do')
     refuse_if_stopped(config.safety.stop_file)
     if not options.yes:
-        print(
-            "The head will turn through its whole range. Are camera and cables clear of it? [yes/no] ",
-            end="",
-            flush=True,
-        )
-        if sys.stdin.readline().strip().lower() != CONSENT:
+        print("The head will turn through its whole range. Are camera and cables clear of it? [yes/no]", flush=True)
+        if _answer().strip().lower() != CONSENT:
             raise ConfigError("not reset; it needs the answer yes, or --yes")
     unit = reset(head, MonotonicClock())
-    print(f"reset: {unit}")
+    pan, tilt = (f"{axis.lowest} to {axis.highest}" for axis in (unit.pan, unit.tilt))
+    print(f"reset: {unit.version}: pan {pan}, tilt {tilt} steps")
+
+
+def _answer() -> str:
+    """What somebody types; nothing where nobody is there."""
+    try:
+        return sys.stdin.readline() if sys.stdin is not None else ""
+    except (OSError, ValueError):  # a terminal that has gone, a file that is closed, no text
+        return ""
 
 
 def _stop_file(rig: Path) -> Path:

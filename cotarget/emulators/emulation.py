@@ -206,10 +206,22 @@ class Emulation:
         Raises:
             ConfigError: no such device or fault.
         """
-        device, _, name = fault.partition(".")
-        if device not in self.faults:
-            raise ConfigError(f"unknown fault '{fault}'; they begin with: {choices(f'{d}.' for d in self.faults)}")
+        device, name = parse_fault(fault)
         self.faults[device].set(name, on)
+
+
+def parse_fault(fault: str) -> tuple[str, str]:
+    """Device and name of a fault, named as device.fault.
+
+    Raises:
+        ConfigError: no such device or fault.
+    """
+    device, _, name = fault.partition(".")
+    if device not in FAULTS:
+        raise ConfigError(f"unknown fault '{fault}'; they begin with: {choices(f'{d}.' for d in FAULTS)}")
+    if name not in FAULTS[device]:
+        raise ConfigError(f"unknown fault '{fault}'; those of {device} are: {choices(FAULTS[device])}")
+    return device, name
 
 
 def copied_tables(table: Mapping[str, Any], directory: Path) -> dict[str, Any]:
@@ -227,6 +239,8 @@ def copied_tables(table: Mapping[str, Any], directory: Path) -> dict[str, Any]:
             else target
             for name, target in copied["targets"].items()
         }
+    if "stop_file" in copied.get("safety", {}):
+        copied["safety"] = {**copied["safety"], "stop_file": str((directory / table["safety"]["stop_file"]).resolve())}
     return copied
 
 

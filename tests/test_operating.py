@@ -1,0 +1,226 @@
+"""What an operator does with a rig, and how it can be told wrong: one line, and the head is left alone."""
+
+import io
+import socket
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from cotarget import doctor
+from cotarget.calibration import save_calibration
+from cotarget.config import RigConfig
+from cotarget.doctor import Finding
+from cotarget.emulators.emulation import copied_tables
+from cotarget.errors import EmergencyStopError
+from cotarget.hardware import d46unit
+from cotarget.safety import refuse_if_stopped
+from tests.test_cli import call, true_calibration
+
+NOBODY = "/dev/nobody-is-here"
+HARDWARE = f"""
+backend = "hardware"
+[hardware.head]
+port = "{NOBODY}"
+[hardware.fixed]
+url = "http://127.0.0.1:9"
+[hardware.zoom]
+port = "usb:"
+"""
+STOP_FILE = '\n[safety]\nstop_file = "run/stop"\n'
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A working folder with rigs of every kind, none of which is there."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("COTARGET_PASSWORD", raising=False)
+    monkeypatch.setenv("LP_NUM_THREADS", "1")  # emulate sets it, and how long threads take turns, for its process
+    turns = sys.getswitchinterval()
+    (tmp_path / "sim.toml").write_text("[sim]\n")
+    (tmp_path / "stops.toml").write_text("[sim]\n" + STOP_FILE)
+    (tmp_path / "hw.toml").write_text(HARDWARE + STOP_FILE)
+    (tmp_path / "nameless.toml").write_text('backend = "hardware"\n')
+    (tmp_path / "replayed.toml").write_text('backend = "replay"\nrecording = "empty"\n')
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("no recording")
+    save_calibration(tmp_path / "good.json", true_calibration(RigConfig()))
+    save_calibration(tmp_path / "headless.json", true_calibration(RigConfig(), with_head=False))
+    save_calibration(tmp_path / "wide.json", true_calibration(RigConfig(), zoom_size=(640, 360)))
+    yield tmp_path
+    sys.setswitchinterval(turns)
+
+
+LATENCY = ("latency", "--rig", "hw.toml")
+EMULATE = ("emulate", "--write", "new.toml")
+MISTAKES = {
+    # latency: refused before any device is opened
+    "latency without a rig": (["latency", "--rig", "none.toml"], ["none.toml: no such file"]),
+    "latency of no devices": (["latency", "--rig", "nameless.toml"], ["hardware.head.port: is missing", "/dev/tty"]),
+    "latency of a recording": (["latency", "--rig", "replayed.toml"], ["replayed.toml: backend is 'replay'"]),
+    "latency without a calibration": ([*LATENCY, "--calibration", "none.json"], ["none.json: no such file"]),
+    "latency without T": ([*LATENCY, "--calibration", "headless.json"], ["T_head_zoom"]),
+    "latency of other cameras": ([*LATENCY, "--calibration", "wide.json"], ["aspect ratio"]),
+    "latency with nobody at the server": (["latency", "--rig", "hw.toml"], ["http://127.0.0.1:9", "cannot be reached"]),
+    # replay
+    "no recording": (["replay", "none"], ["none: no such folder; give the folder of a recording"]),
+    "a file as recording": (["replay", "file"], ["file: is a file; give the folder of a recording"]),
+    "an empty folder": (["replay", "empty"], ["empty: is no recording"]),
+    # emulate
+    "an emulated real rig": ([*EMULATE, "--rig", "hw.toml"], ["hw.toml: backend is 'hardware'", "a simulated rig"]),
+    "a user without a password": ([*EMULATE, "--user", "root"], ["--user needs a password", "COTARGET_PASSWORD"]),
+    "a fault of no device": ([*EMULATE, "--fault", "silence"], ["unknown fault 'silence'", "fixed., head., zoom."]),
+    "an unknown fault": ([*EMULATE, "--fault", "head.rust"], ["unknown fault 'head.rust'", "garbage", "silence"]),
+    "a port beyond the last": ([*EMULATE, "--head", "65536"], ["--head", "'65536' is not a port"]),
+    "an emulation for no time": ([*EMULATE, "--seconds", "0"], ["--seconds", "greater than zero"]),
+    "a rig over its own": (["emulate", "--rig", "sim.toml", "--write", "sim.toml"], ["sim.toml: is read or written"]),
+    "a rig over a folder": (["emulate", "--write", "empty"], ["empty: is a folder"]),
+    "a rig in no folder": (["emulate", "--write", "none/new.toml"], ["none/new.toml: its folder does not exist"]),
+    "no rig to write": (["emulate"], ["--write"]),
+    # stop, clear, reset-head
+    "no stop file": (["stop", "--rig", "sim.toml"], ["sim.toml: has no stop file", "[safety] stop_file ="]),
+    "nothing to clear": (["clear", "--rig", "sim.toml"], ["sim.toml: has no stop file", "[safety] stop_file ="]),
+    "stop what": (["stop"], ["--rig"]),
+    "reset a simulated head": (["reset-head", "--rig", "sim.toml", "--yes"], ["sim.toml: names no pan-tilt unit"]),
+    "reset no head": (["reset-head", "--rig", "nameless.toml", "--yes"], ["nameless.toml: names no pan-tilt unit"]),
+    "reset nobody": (["reset-head", "--rig", "hw.toml", "--yes"], [f"there is no port {NOBODY}"]),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_ends_in_one_line_that_names_it(folder, capsys, mistake):
+    arguments, parts = MISTAKES[mistake]
+    before = sorted(folder.rglob("*"))
+    status, out, err = call(capsys, *arguments)
+    assert status not in (0, None)
+    assert out == ""
+    assert err.startswith("cotarget")
+    assert len(err.splitlines()) == 1, err
+    for part in parts:
+        assert part in err
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.wire
+@pytest.mark.render
+def test_a_port_that_is_taken_is_told(folder, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        status, out, err = call(capsys, *EMULATE, "--control", port, "--seconds", "1")
+    assert (status, out, err) == (
+        1,
+        "",
+        f"cotarget emulate: cannot listen at 127.0.0.1:{port}: Address already in use\n",
+    )
+    assert not (folder / "new.toml").exists()
+
+
+def test_a_stop_lasts_until_it_is_cleared(folder, capsys):
+    """By the file of any rig.toml that names it; its folder need not be there before."""
+    path = folder / "run" / "stop"
+    assert call(capsys, "clear", "--rig", "stops.toml") == (0, f"{Path('run/stop')}: there was no stop\n", "")
+    status, out, err = call(capsys, "stop", "--rig", "stops.toml", "--reason", "a bird in the gears")
+    assert (status, out, err) == (0, "stopped: no head that watches run/stop moves until cotarget clear\n", "")
+    assert path.read_text() == "a bird in the gears\n"
+    with pytest.raises(EmergencyStopError, match="a bird in the gears"):
+        refuse_if_stopped(path)
+    status, out, err = call(capsys, "reset-head", "--rig", "hw.toml", "--yes")
+    assert (status, out) == (1, "")
+    assert err.startswith("cotarget reset-head: emergency stop: a bird in the gears")
+    assert call(capsys, "clear", "--rig", "hw.toml") == (0, "cleared: a bird in the gears\n", "")
+    assert not path.exists()
+    refuse_if_stopped(path)
+
+
+def test_a_stop_that_cannot_be_made_is_shouted(folder, capsys):
+    (folder / "run").write_text("in the way")
+    status, out, err = call(capsys, "stop", "--rig", "stops.toml")
+    assert (status, out) == (1, "")
+    assert err.startswith("cotarget stop: run/stop: NOT stopped: the file cannot be written")
+    assert len(err.splitlines()) == 1
+
+
+def test_a_stop_without_a_reason_has_one(folder, capsys):
+    call(capsys, "stop", "--rig", "stops.toml")
+    assert call(capsys, "clear", "--rig", "stops.toml")[1] == "cleared: stopped by the operator\n"
+
+
+@pytest.fixture
+def resets(monkeypatch):
+    """Resets that were asked for, none of which is done."""
+    axis = SimpleNamespace(lowest=-3090, highest=3090)
+    asked = []
+
+    def reset(config, clock):
+        asked.append(config.port)
+        return SimpleNamespace(version="v2.12.1d1", pan=axis, tilt=axis)
+
+    monkeypatch.setattr(d46unit, "reset", reset)
+    return asked
+
+
+@pytest.mark.parametrize("answer", ["yes\n", "YES", "--yes"])
+def test_the_head_is_reset_by_consent(folder, capsys, monkeypatch, resets, answer):
+    monkeypatch.setattr("sys.stdin", io.StringIO(answer))
+    status, out, err = call(capsys, "reset-head", "--rig", "hw.toml", *(["--yes"] if answer == "--yes" else []))
+    assert (status, err, resets) == (0, "", [NOBODY])
+    assert out.endswith("reset: v2.12.1d1: pan -3090 to 3090, tilt -3090 to 3090 steps\n")
+    assert ("camera and cables clear" in out) == (answer != "--yes")
+
+
+class Gone(io.StringIO):
+    """A terminal that was closed."""
+
+    def readline(self, size=-1, /):
+        raise OSError(5, "Input/output error")
+
+
+NO_TEXT = io.TextIOWrapper(io.BytesIO(b"\xff\xfe\n"), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "stdin",
+    [io.StringIO(text) for text in ("", "no\n", "y\n", "yes please\n", "\n")] + [Gone(), NO_TEXT, None],
+    ids=["end of file", "no", "y", "yes please", "return", "gone", "no text", "closed"],
+)
+def test_the_head_is_not_reset_without_consent(folder, capsys, monkeypatch, resets, stdin):
+    monkeypatch.setattr("sys.stdin", stdin)
+    status, _, err = call(capsys, "reset-head", "--rig", "hw.toml")
+    assert (status, resets) == (1, [])
+    assert err == "cotarget reset-head: not reset; it needs the answer yes, or --yes\n"
+
+
+def test_the_doctor_tells_which_devices_do_not_answer(folder, capsys, monkeypatch):
+    well = Finding("rendering", True, "replaced: it takes a second")
+    monkeypatch.setattr(doctor, "_rendering", lambda: well)
+    status, out, err = call(capsys, "doctor", "--rig", "hw.toml")
+    assert (status, err) == (1, "")
+    lines = out.splitlines()
+    head, fixed = (next(line for line in lines if f"hardware.{name}:" in line) for name in ("head", "fixed"))
+    assert head.startswith(f"MISSING  hardware.head: there is no port {NOBODY} for the pan-tilt unit")
+    assert fixed.startswith("MISSING  hardware.fixed: http://127.0.0.1:9 cannot be reached")
+    assert lines[lines.index(head) + 1].strip().startswith("fix: look at the device")
+    status, out, _ = call(capsys, "doctor", "--rig", "nameless.toml")
+    assert status == 1
+    assert "MISSING  hardware.head: is not configured\n" in out
+
+
+def test_the_doctor_asks_no_devices_of_a_simulated_rig(folder, capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "_rendering", lambda: Finding("rendering", True, "replaced"))
+    assert "hardware." not in call(capsys, "doctor", "--rig", "sim.toml")[1]
+
+
+def test_what_an_emulated_rig_takes_over_holds_in_any_folder(tmp_path):
+    """Paths are relative to the rig.toml that they stand in; those of what is written elsewhere are whole."""
+    table = {
+        "sim": {"seed": 1},
+        "board": {"square": 0.05},
+        "safety": {"stop_file": "run/stop", "pan_deg": [-5, 5]},
+        "targets": {"book": {"template": "covers/mine.png"}, "bird": {"size": 0.9}},
+    }
+    assert copied_tables(table, tmp_path) == {
+        "board": {"square": 0.05},
+        "safety": {"stop_file": str(tmp_path / "run/stop"), "pan_deg": [-5, 5]},
+        "targets": {"book": {"template": str(tmp_path / "covers/mine.png")}, "bird": {"size": 0.9}},
+    }
