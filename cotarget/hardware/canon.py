@@ -19,10 +19,12 @@ log = logging.getLogger(__name__)
 OPEN_LIMIT_S = 30.0
 # A still with focusing, flash and a slow line.
 STILL_LIMIT_S = 30.0
-# Leaving takes two round trips; libgphoto2 waits 2.5 s for each where a camera is silent.
-CLOSE_LIMIT_S = 10.0
-# The newest frame is the newest for this long, or this many frames; after that the viewfinder is blind.
-FRESH_S, FRESH_FRAMES = 0.5, 3.0
+# Leaving takes two round trips; libgphoto2 waits 2.5 s for each where a camera is silent, and a program that ends
+# because of that shall not hang.
+CLOSE_LIMIT_S = 3.0
+# The newest frame is the newest for this long, or this many frames; after that the viewfinder is blind. Whoever follows
+# waits for a frame then and lets the head come to rest, which it shall within half a second of the fault.
+FRESH_S, FRESH_FRAMES = 0.25, 2.5
 
 
 class GphotoCamera:
