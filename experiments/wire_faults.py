@@ -35,6 +35,7 @@ STILL_DEG, REST_S = 0.03, 0.25  # a head that moves by less for longer stands
 FOLLOWS_S, START_S = 1.0, 30.0  # a head that has moved for so long follows; it must begin to within the latter [s]
 MOMENT_S = (0.3, 2.0)  # from then to the fault [s]
 WATCH_S = 2.5  # how long a fault that has passed is watched [s]
+HELD_S = 5.0  # the same of one that is held [s]
 HANG_S = 5.0  # who neither follows nor ends for so long hangs [s]
 GIVEN_UP_S = 20.0  # and is given up after this [s]
 AFTER_S = 0.5  # that the head is watched after the command has ended [s]
@@ -197,12 +198,13 @@ def _one(watch: Watch, follower: Follower, fault: str, way: str) -> Row:
         emulated.switch(fault, False)
         watch.until(over + WATCH_S, process)
     else:
-        watch.until(began + HANG_S, process)
-    if watch.standing(began) is not None:
-        watch.until(over + HANG_S, process)
-        hangs = process.poll() is None and watch.standing(began) is not None
+        watch.until(began + HELD_S, process)
+    since = watch.standing(began)
+    if since is not None:
+        watch.until(since + HANG_S, process)
+        hangs = process.poll() is None and watch.standing(began) == since
         if hangs:
-            watch.until(over + GIVEN_UP_S, process)
+            watch.until(since + GIVEN_UP_S, process)
     ended = process.poll()
     ended_s = time.monotonic() - began if ended is not None else math.nan
     if ended is not None:
