@@ -133,6 +133,23 @@ def test_a_stop_lasts_until_it_is_cleared(folder, capsys):
     refuse_if_stopped(path)
 
 
+FOLLOW = ("follow", "--calibration", "good.json", "--target", "book", "--rig", "hw.toml")
+
+
+@pytest.mark.parametrize("command", [FOLLOW, ("calibrate", "--rig", "hw.toml"), ("point", "--rig", "hw.toml"), LATENCY])
+def test_a_stopped_rig_is_not_even_opened(folder, capsys, command):
+    """Its devices are not there, of which nothing is said."""
+    assert call(capsys, "stop", "--rig", "hw.toml")[0] == 0
+    status, out, err = call(capsys, *command)
+    assert (status, out) == (1, "")
+    assert err == (
+        f"cotarget {command[0]}: emergency stop: stopped by the operator; when it is safe to move, run 'cotarget clear "
+        "--rig FILE' or remove run/stop\n"
+    )
+    call(capsys, "clear", "--rig", "hw.toml")
+    assert "emergency stop" not in call(capsys, *command)[2]
+
+
 def test_a_stop_that_cannot_be_made_is_shouted(folder, capsys):
     (folder / "run").write_text("in the way")
     status, out, err = call(capsys, "stop", "--rig", "stops.toml")

@@ -28,7 +28,7 @@ def calibrate(options: argparse.Namespace) -> None:
     from cotarget.calibration.recorder import SETTLE, SETTLE_LONG
     from cotarget.config import BoardConfig, load_config
     from cotarget.rig import open_rig
-    from cotarget.safety import SafeRig
+    from cotarget.safety import SafeRig, refuse_if_stopped
     from cotarget.stills import with_stills
 
     check_outputs([options.out], [options.rig, options.source and options.source / "index.json"])
@@ -41,6 +41,7 @@ def calibrate(options: argparse.Namespace) -> None:
 
         if options.rig is not None:
             config = load_config(options.rig)
+            refuse_if_stopped(config.safety.stop_file)
             with _captures_kept(options.captures), SafeRig(open_rig(config), config.safety) as rig:
                 finer = rig.zoom.still_size[0] / rig.zoom.size[0]
                 found = cal.calibrate_rig(

@@ -19,9 +19,10 @@ def latency(options: argparse.Namespace) -> None:
     from cotarget.config import load_config
     from cotarget.latency import measure_fixed, measure_head
     from cotarget.rig import open_rig
-    from cotarget.safety import SafeRig
+    from cotarget.safety import SafeRig, refuse_if_stopped
 
     config = load_config(options.rig)
+    refuse_if_stopped(config.safety.stop_file)
     if config.backend == "replay":
         raise ConfigError(f"{options.rig}: backend is 'replay'; a recording's latencies cannot be measured any more")
     calibration = None if options.calibration is None else load_calibration(options.calibration)
@@ -54,9 +55,10 @@ def point(options: argparse.Namespace) -> None:
     from cotarget.config import load_config
     from cotarget.latency import wait_for_lens
     from cotarget.rig import open_rig
-    from cotarget.safety import SafeRig
+    from cotarget.safety import SafeRig, refuse_if_stopped
 
     config = load_config(options.rig)
+    refuse_if_stopped(config.safety.stop_file)
     shots = {} if options.pictures is None else {name: options.pictures / f"{name}.png" for name in ("fixed", "zoom")}
     check_outputs(list(shots.values()), [options.rig])
     with SafeRig(open_rig(config), config.safety) as rig:

@@ -108,9 +108,10 @@ def follow(options: argparse.Namespace) -> None:
     from cotarget.config import load_config
     from cotarget.recording import Recorder
     from cotarget.rig import open_rig
-    from cotarget.safety import SafeRig
+    from cotarget.safety import SafeRig, refuse_if_stopped
 
     config = load_config(options.rig)
+    refuse_if_stopped(config.safety.stop_file)
     target = config.target(options.target)
     calibration = load_calibration(options.calibration)
     if config.backend == "sim" and options.target not in config.sim.targets:
