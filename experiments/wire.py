@@ -13,6 +13,7 @@ All run in real time beside the emulator, which needs a core of its own: figures
 """
 
 import argparse
+import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +28,7 @@ from experiments import wire_age, wire_command, wire_faults, wire_latency, wire_
 from experiments.harness import Experiment, Row, Settings, table
 from experiments.wire_figures import FAULT_COLUMNS, PART_COLUMNS, summarise
 
-INTERRUPTED = 130  # exit status of who was ended by Ctrl-C
+INTERRUPTED, TERMINATED = 130, 143  # exit status of who was ended by Ctrl-C, or by kill
 
 
 @dataclass(frozen=True)
@@ -137,6 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings = replace(settings, faults=tuple(given.fault))
     if given.repetitions is not None:
         settings = replace(settings, repetitions=given.repetitions)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))  # so that the emulated devices end too
     try:
         return EXPERIMENT.report(settings, given.out)
     except CotargetError as error:

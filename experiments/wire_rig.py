@@ -28,7 +28,7 @@ from cotarget.pantilt import HeadGeometry
 
 READY, CONTROL = "connects to them", "control "  # what the command says when it is up, and where its faults are
 LONGEST_S = 3600  # an emulator whose parent was killed outright ends by itself then [s]
-END_S = 15.0  # for a process to end after Ctrl-C [s]
+END_S = 15.0  # for a process to end when it is asked to [s]
 ANSWER_S = 10.0  # for an answer of the control socket [s]
 STOPS = 17  # focal lengths of the exact calibration; in between its spline is smoother than any lens
 
@@ -124,9 +124,9 @@ class EmulatedRig:
 
 
 def end(process: "subprocess.Popen[str]") -> None:
-    """Ctrl-C, and if that does not help, more."""
+    """Ask it to end, and if that does not help, more. Not by Ctrl-C, which who runs in the background does not hear."""
     if process.poll() is None:
-        process.send_signal(signal.SIGINT)
+        process.terminate()
         try:
             process.wait(END_S)
         except subprocess.TimeoutExpired:
