@@ -24,7 +24,7 @@ STILL_LIMIT_S = 30.0
 CLOSE_LIMIT_S = 3.0
 # The newest frame is the newest for this long, or this many frames; after that the viewfinder is blind. Whoever follows
 # waits for a frame then and lets the head come to rest, which it shall within half a second of the fault.
-FRESH_S, FRESH_FRAMES = 0.25, 2.5
+FRESH_S, FRESH_FRAMES = 0.2, 2.0
 
 
 class GphotoCamera:
