@@ -32,14 +32,22 @@ HEAD = RigConfig().sim.head
 # Pictures of the default rig's size, but fewer, to leave other programs something of the machine.
 RATES = {"fixed": {"rate_hz": 10.0}, "zoom": {"rate_hz": 5.0}}
 ROOM = {"scene": "indoor", "targets": ["book"]} | RATES
+# Where runs are to reach their end, a machine that does other things for a while does not end them.
+PATIENT = {"watchdog_s": 2.0}
 RIGS = {
-    "a book that stands": ({"sim": ROOM | {"paths": {"book": [[0.0, *BOOK_M], [900.0, *BOOK_M]]}}}, []),
+    "a book that stands": (
+        {"sim": ROOM | {"paths": {"book": [[0.0, *BOOK_M], [900.0, *BOOK_M]]}}, "safety": PATIENT},
+        [],
+    ),
     "a book that moves": (
         {"sim": ROOM | {"paths": {"book": TO_AND_FRO}}, "safety": {"stop_file": "stop", "pan_deg": SOFT_PAN_DEG}},
         ["--user", "viewer"],
     ),
     "a short lens": (
-        {"sim": {"scene": "indoor"} | RATES | {"zoom": {"rate_hz": 5.0, "focal_mm": [6.0, 9.0], "lens_steps": 25}}},
+        {
+            "sim": {"scene": "indoor"} | RATES | {"zoom": {"rate_hz": 5.0, "focal_mm": [6.0, 9.0], "lens_steps": 25}},
+            "safety": PATIENT,
+        },
         [],
     ),
 }
