@@ -5,8 +5,11 @@ would stop every thread, the head's included. Opening, settings, previews and st
 is called past Python. Listing the settings' names and looking for cameras do not wait for a camera.
 """
 
+import contextlib
 import ctypes
 import importlib
+import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -102,6 +105,25 @@ class CameraLink(Protocol):
         """The contents of a still."""
 
 
+@contextlib.contextmanager
+def standard_input_kept() -> Iterator[None]:
+    """Keep descriptor 0, which libgphoto2 closes whenever it disconnects from a network camera.
+
+    Whatever opened next would get the number, a socket or a serial port, and be closed by the next disconnection. The
+    mistake is known there (github.com/gphoto/libgphoto2, pull request 1287).
+    """
+    try:
+        kept = os.dup(0)
+    except OSError:  # a program without standard input
+        kept = os.open(os.devnull, os.O_RDONLY)
+    try:
+        yield
+    finally:
+        if kept:
+            os.dup2(kept, 0)
+            os.close(kept)
+
+
 class GphotoLink:
     """A camera by python-gphoto2.
 
@@ -122,16 +144,19 @@ class GphotoLink:
         """Connect; return the camera's name."""
         self._gp = gp = _gphoto2()
         ports, abilities = gp.PortInfoList(), gp.CameraAbilitiesList()
-        try:
-            ports.load()
-            abilities.load()
-            model, port = self._find(ports, abilities)
-            camera = gp.Camera()
-            camera.set_abilities(abilities.get_abilities(abilities.lookup_model(model)))
-            camera.set_port_info(ports.get_info(ports.lookup_path(port)))
-            camera.init()
-        except gp.GPhoto2Error as error:
-            raise LinkError(error.code, error.string, NETWORK_HINT * self._port.startswith("ptpip:")) from error
+        camera: Any = None
+        with standard_input_kept():
+            try:
+                ports.load()
+                abilities.load()
+                model, port = self._find(ports, abilities)
+                camera = gp.Camera()
+                camera.set_abilities(abilities.get_abilities(abilities.lookup_model(model)))
+                camera.set_port_info(ports.get_info(ports.lookup_path(port)))
+                camera.init()
+            except gp.GPhoto2Error as error:
+                camera = None  # disconnected here
+                raise LinkError(error.code, error.string, NETWORK_HINT * self._port.startswith("ptpip:")) from error
         self._camera = camera
         return model
 
@@ -157,7 +182,9 @@ class GphotoLink:
         """Disconnect, without making other threads wait for a camera that does not answer."""
         camera, self._camera = self._camera, None
         if camera is not None:
-            library().gp_camera_exit(ctypes.c_void_p(int(camera.this)), None)
+            with standard_input_kept():
+                library().gp_camera_exit(ctypes.c_void_p(int(camera.this)), None)
+                del camera
 
     def names(self) -> list[str]:
         """The names of the camera's settings."""
