@@ -164,7 +164,13 @@ def _try(folder: Path, emulated: EmulatedRig, fault: str, rng: np.random.Generat
                 watch = Watch(emulated)
                 way = ways.pop(0)
                 if not _follows(watch, follower):
-                    yield {"way": way, "outcome": "did not start", "words": _last(follower.said())}
+                    said = follower.said()
+                    yield {
+                        "way": way,
+                        "outcome": "did not start",
+                        "traceback": int("Traceback" in said),
+                        "words": _last(said),
+                    }
                     break
                 watch.until(time.monotonic() + rng.uniform(*MOMENT_S))
                 try:
