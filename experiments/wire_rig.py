@@ -46,7 +46,6 @@ class EmulatedRig:
 
     def __init__(self, folder: Path, tables: Mapping[str, Any]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        _occupy_descriptor_0()
         self._sim, self._written = folder / "sim.toml", folder / "hardware.toml"
         self._sim.write_text(tomli_w.dumps(dict(tables)), encoding="utf-8")
         self.sim: RigConfig = load_config(self._sim)
@@ -132,17 +131,6 @@ def end(process: "subprocess.Popen[str]") -> None:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-def _occupy_descriptor_0() -> None:
-    """Let nothing that matters have descriptor 0: libgphoto2 closes it whenever it leaves a PTP/IP camera.
-
-    Its ptpip.c closes a third channel that only Fuji's cameras have, and whose number is 0 until it is opened.
-    """
-    try:
-        os.fstat(0)
-    except OSError:
-        os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free
 
 
 def true_calibration(config: RigConfig) -> Calibration:
