@@ -18,6 +18,8 @@ from cotarget.geometry import Array, RigidTransform, Rotation, angle_between, ro
 CLOSED_FORM_ROUNDS = 4
 # Newton's iteration from the closed form converges quadratically; only where the branches meet does it need many.
 NEWTON_STEPS = 40
+# It has converged when it misses by no more than its own rounding, some units in the last place.
+ROUNDING = 4 * np.finfo(float).eps
 # A solution is accepted when it misses by less than this angle [rad], 6e-10 degrees; rounding stays far below.
 ACCEPTED_MISS = 1e-11
 # A Newton step turns an axis by at most this [rad]: where the branches meet, a full step would leave its branch.
@@ -289,7 +291,7 @@ def _newton(
     for _ in range(NEWTON_STEPS):
         residual, J = _residual(unknowns[active], target[active], d[active], t, head)
         error[active] = np.linalg.norm(residual, axis=-1)
-        going_on = error[active] > np.finfo(float).eps * distance[active]
+        going_on = error[active] > ROUNDING * distance[active]
         # A singular J (a target on the pan axis) can go no further and is left to the final check.
         going_on &= np.abs(np.linalg.det(J)) > np.finfo(float).tiny
         active = active[going_on]

@@ -1,6 +1,7 @@
 """Opens the real devices as one Rig; whatever happens, the head is halted and every device released."""
 
 import contextlib
+import sys
 from types import TracebackType
 
 from cotarget.config import RigConfig
@@ -12,6 +13,9 @@ from cotarget.hardware.clock import MonotonicClock
 from cotarget.hardware.head import D46Head
 from cotarget.rig import Board
 
+# How long one of Python's threads may keep the others waiting [s], Python's own 5 ms at most: a driver's thread that waits
+# for its turn makes every command late.
+SWITCH_INTERVAL = 5e-4
 NEEDED = (("head", "port", "/dev/ttyUSB0"), ("fixed", "url", "http://192.168.0.90"), ("zoom", "port", "usb:"))
 
 
@@ -50,6 +54,8 @@ class HardwareRig:
 def open_hardware(config: RigConfig) -> HardwareRig:
     """Open the devices that a configuration names, the head last, so that it does not move where another is missing.
 
+    From then on this process's threads take turns more often (`SWITCH_INTERVAL`).
+
     Raises:
         ConfigError: a device is not named, or is not as configured.
         DeviceError: a device could not be opened.
@@ -60,6 +66,7 @@ def open_hardware(config: RigConfig) -> HardwareRig:
             raise ConfigError(
                 f'hardware.{table}.{key}: is missing; the hardware backend needs it, for example {key} = "{example}"'
             )
+    sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL))
     clock = MonotonicClock()
     with contextlib.ExitStack() as opened:
         board = opened.enter_context(contextlib.closing(make_board(hardware.board)))
