@@ -13,8 +13,8 @@ from cotarget.hardware.clock import MonotonicClock
 from cotarget.hardware.head import D46Head
 from cotarget.rig import Board
 
-# How long one of Python's threads may keep the others waiting [s], Python's own 5 ms at most: a driver's thread that waits
-# for its turn makes every command late.
+# How long one of Python's threads may keep the others waiting [s], where Python's own is 5 ms: a driver's thread that
+# waits for its turn makes every command late.
 SWITCH_INTERVAL = 5e-4
 NEEDED = (("head", "port", "/dev/ttyUSB0"), ("fixed", "url", "http://192.168.0.90"), ("zoom", "port", "usb:"))
 
