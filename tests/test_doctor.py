@@ -36,7 +36,7 @@ def test_a_machine_that_has_everything(tried, capsys):
     findings = doctor.examine()
     assert all(f.ok and not f.fix for f in findings if f.name != "cotarget"), findings
     names = [f.name for f in findings]
-    assert {"python", "rendering", "H.264", "sim_assets", "serial ports", *PACKAGES} == set(names)
+    assert {"python", "rendering", "H.264", "sim_assets", "serial ports", "gphoto2 cameras", *PACKAGES} == set(names)
     assert finding("rendering").text == "without a screen by egl"
     assert finding("sim_assets").text == "scenes indoor, outdoor"
     assert cli.main(["doctor"]) == 0
