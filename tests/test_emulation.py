@@ -149,6 +149,7 @@ def test_the_simulation_opened_directly_aims_as_it_does_over_the_wire(rig, capsy
     np.testing.assert_allclose(end_of(wire), end_of(direct), rtol=0, atol=ALIKE_DEG)
 
 
+@pytest.mark.slow
 @stands
 def test_a_rig_is_calibrated_over_the_wire(rig, capsys):
     check_calibration(rig, capsys, placements=4, stops=1)

@@ -81,6 +81,7 @@ def test_figures_from_rows():
     assert "NO" in wire.describe(SHORT, told)
 
 
+@pytest.mark.slow
 @pytest.mark.wire
 @pytest.mark.render
 def test_a_short_run(tmp_path, capsys):
