@@ -19,6 +19,7 @@ from scipy.optimize import minimize_scalar
 
 from cotarget.calibration import Calibration
 from cotarget.calibration.boards import board_points, find_corners
+from cotarget.calibration.recorder import wait_for_lens
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, StaleFrameError
 from cotarget.geometry import Array, RigidTransform, pose
@@ -31,7 +32,6 @@ WIGGLE = np.radians(1.5)  # of the head to each side: some 18 px of a usual wide
 TURNS_EVERY = (0.53, 0.47, 0.61)
 WIGGLE_SECONDS, SWING_SECONDS = 8.0, 10.0
 LOOK = 0.01  # how long to wait for a frame before looking at the head again [s]
-LENS_TIMEOUT = 15.0  # the slowest zoom lenses take some ten seconds from end to end [s]
 LONGEST_DELAY = 0.6  # that is looked for, either way [s]
 COARSE = 0.01  # steps of the delays tried first [s]
 FEWEST = 20  # samples of a motion
@@ -233,19 +233,6 @@ def _zoom_out(rig: Rig) -> None:
     """Send the lens to its shortest focal length and wait until it stands there."""
     rig.zoom.zoom(rig.zoom.focal_range[0])
     wait_for_lens(rig)
-
-
-def wait_for_lens(rig: Rig) -> None:
-    """Wait until the zoom lens stands.
-
-    Raises:
-        CalibrationError: it goes on moving.
-    """
-    deadline = rig.clock.now() + LENS_TIMEOUT
-    while rig.zoom.state().moving:
-        if rig.clock.now() > deadline:
-            raise CalibrationError(f"the zoom lens still moves after {LENS_TIMEOUT:g} s")
-        rig.clock.sleep_until(rig.clock.now() + LOOK)
 
 
 def _frames(

@@ -5,7 +5,8 @@ from cotarget.hardware.d46unit import connect
 from cotarget.hardware.d46wishes import Halt, Move
 from cotarget.hardware.line import Line
 from cotarget.hwconfig import HardwareHead
-from tests.d46_peer import SimClock, SimPort, Unit
+from tests.d46_peer import SimPort, Unit
+from tests.simulated_clock import SimClock
 
 CONFIG = HardwareHead(port="PORT", pan_deg=(-158.9, 158.9), tilt_deg=(-46.6, 31.1), command_delay_s=0.04)
 

@@ -14,19 +14,6 @@ QUERY = re.compile(r"([PT])([PRNXULAS])")
 WORDS = {"P": "Current {} position is {}", "S": "Target {} speed is {} positions/sec"}
 
 
-class SimClock:
-    """Simulated time."""
-
-    def __init__(self):
-        self.t = 100.0
-
-    def now(self):
-        return self.t
-
-    def sleep_until(self, t):
-        self.t = max(self.t, t)
-
-
 class Unit:
     """The other end of the line: commands in, replies out."""
 

@@ -29,6 +29,7 @@ from cotarget.hardware.gphoto_desk import Desk
 from cotarget.hardware.gphoto_port import full_port
 from cotarget.hardware.gphoto_work import Shooting
 from cotarget.hwconfig import HardwareZoom
+from tests.simulated_clock import SimClock
 
 SIZE, STILL_SIZE = (32, 24), (64, 48)
 CONFIG = HardwareZoom(port="usb:", size=SIZE, still_size=STILL_SIZE, latency_s=0.1)
@@ -45,19 +46,6 @@ def jpeg(size, grey):
 
 
 ROOT = Path(__file__).parents[1]
-
-
-class SimClock:
-    """Time that moves when somebody waits."""
-
-    def __init__(self):
-        self.t = 100.0
-
-    def now(self):
-        return self.t
-
-    def sleep_until(self, t):
-        self.t = max(self.t, t)
 
 
 class Camera:

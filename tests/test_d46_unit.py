@@ -8,7 +8,8 @@ from cotarget.hardware.d46unit import probe, reset
 from cotarget.hardware.line import open_line
 from cotarget.hwconfig import HardwareHead
 from tests.d46_bench import CONFIG, Bench
-from tests.d46_peer import BANNER, VERSION, SimClock
+from tests.d46_peer import BANNER, VERSION
+from tests.simulated_clock import SimClock
 
 # What may be sent while nobody moves the head: nothing that moves it, or wears its memory.
 HARMLESS = {"ED", "FT", "E", "F", "V", "WP", "C", "CI", "I", "H", "PP", "TP"}

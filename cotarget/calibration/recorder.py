@@ -12,7 +12,7 @@ from cotarget.calibration.model import Capture, Rejected, View, unseen
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, DeviceError
 from cotarget.geometry import Array, RigidTransform, Rotation
-from cotarget.rig import Image, Rig
+from cotarget.rig import Image, Rig, ZoomState
 
 # Wishes are rounded to 0.1 mm and 0.1 mrad. Nobody holds a board better; and the fits behind a plan sum in an order
 # that varies with the threads: their last digits would otherwise make two runs with the same seed drift apart.
@@ -47,6 +47,21 @@ def view_of(capture: Capture, corners_px: Array) -> View:
         capture.t,
         capture.source,
     )
+
+
+def wait_for_lens(rig: Rig) -> ZoomState:
+    """Wait until the zoom lens stands; its state then.
+
+    Raises:
+        CalibrationError: it goes on moving.
+    """
+    clock = rig.clock
+    deadline = clock.now() + LENS_TIMEOUT
+    while (state := rig.zoom.state()).moving:
+        if clock.now() > deadline:
+            raise CalibrationError(f"the zoom lens still moves after {LENS_TIMEOUT:g} s")
+        clock.sleep_until(clock.now() + POLL)
+    return state
 
 
 @dataclass(eq=False)
@@ -99,12 +114,8 @@ class Recorder:
         """
         lens, clock = self.rig.zoom, self.rig.clock
         wanted = lens.zoom(nominal_px)
-        deadline = clock.now() + LENS_TIMEOUT
         clock.sleep_until(clock.now() + POLL)
-        while (state := lens.state()).moving:
-            if clock.now() > deadline:
-                raise CalibrationError(f"the zoom lens still moves after {LENS_TIMEOUT:g} s")
-            clock.sleep_until(clock.now() + POLL)
+        state = wait_for_lens(self.rig)
         if abs(np.log(state.focal_px / wanted)) > LENS_TOLERANCE:
             raise CalibrationError(
                 f"the zoom lens stands at {state.focal_px:.0f} px where {wanted:.0f} px was commanded"

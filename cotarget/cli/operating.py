@@ -52,8 +52,8 @@ def latency(options: argparse.Namespace) -> None:
 def point(options: argparse.Namespace) -> None:
     """Cotarget point."""
     from cotarget.calibration.captures import write_image
+    from cotarget.calibration.recorder import wait_for_lens
     from cotarget.config import load_config
-    from cotarget.latency import wait_for_lens
     from cotarget.rig import open_rig
     from cotarget.safety import SafeRig, refuse_if_stopped
 

@@ -116,7 +116,7 @@ class Emulation:
 
         Args:
             tcp: whether the head is reached by TCP in place of its pseudo-terminal.
-            beside: tables of the simulated rig's own file, of which those that hold for any rig are taken over.
+            beside: further tables, such as `copied_tables` of the simulated rig's own file.
         """
         sim = self.config.sim
         late = sim.effects.latency
@@ -153,8 +153,7 @@ class Emulation:
             },
             "board": {"presenter": f"socket://{self._host}:{self.board.port}"},
         }
-        copied = {name: (beside or {})[name] for name in COPIED if name in (beside or {})}
-        return tomli_w.dumps({"backend": "hardware", "hardware": hardware, **copied})
+        return tomli_w.dumps({"backend": "hardware", "hardware": hardware, **(beside or {})})
 
     def close(self) -> None:
         """End all servers, then the world; more than once does no harm."""
