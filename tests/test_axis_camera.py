@@ -112,6 +112,8 @@ class Handler(socketserver.StreamRequestHandler):
             viewer = Viewer(self.connection)
             script.all.append(viewer)
             script.viewers.put(viewer)
+            if script.closing.is_set():  # a client that came back while the server was ending
+                viewer.cut()
             viewer.over.wait()
 
 
