@@ -26,7 +26,7 @@ ZOOMED_OUT = 1.6
 AIM_AHEAD_S = 0.08  # an aim is for about this long after its step: the command's delay and a frame
 SIZE_KNOWN_S = 1.5  # a target that has just come in is still cut by the border, or not yet seen with wings spread
 RECENT_STEPS = 16  # states kept to tell what the lens was when a frame was exposed; more than any latency needs
-# For the close-up, lens (relative) and head (over the image's width) are this near to where they are wanted.
+# For the close-up, focal length (relative) and target (over the image's width) are this near to what is wanted.
 SETTLED = 0.08
 BOX_MARGIN_PX = 4  # a box stands this far outside of what it marks
 
@@ -108,8 +108,8 @@ def side_by_side(step: Step, title: str) -> Image:
 class TargetStages:
     """Picks from a run of Steps what one picture of a target shows: before, centred, and close up.
 
-    It judges by what the loop itself knows: where the devices said that head and lens were, and where the aim wanted
-    them.
+    It judges by what the loop itself knows: where the devices said that head and lens were when a view was exposed,
+    and where the aims wanted them then.
     """
 
     def __init__(self, shortest_px: float) -> None:
@@ -135,10 +135,10 @@ class TargetStages:
         self._since = min(self._since, step.t)
         if step.t - self._since < SIZE_KNOWN_S:
             return
-        off_px = math.hypot(step.head.pan - step.aim.pan, step.head.tilt - step.aim.tilt) * step.lens.focal_px
+        away_px = self._away_in_view() * self._focal_of_view()
         size = float(np.max(step.target.box.size_px))
-        settled = abs(math.log(step.lens.focal_px / step.aim.nominal_px)) < SETTLED
-        if settled and off_px < SETTLED * step.zoom.image.shape[1] and size > self._largest:
+        settled = abs(math.log(self._focal_of_view() / step.aim.nominal_px)) < SETTLED
+        if settled and away_px < SETTLED * step.zoom.image.shape[1] and size > self._largest:
             self._largest, self.close = size, step
 
     def _focal_of_view(self) -> float:

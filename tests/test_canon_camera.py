@@ -371,6 +371,34 @@ def test_broken_frames_are_dropped_and_counted(data, trouble):
     assert bench.desk.trouble == ""
 
 
+def test_frames_that_come_late_cannot_be_dated_and_are_dropped():
+    bench = Bench()
+    bench.run(0.5)
+    newest, dropped = bench.desk.frame, bench.desk.dropped
+    bench.camera.take["preview"] = 1.0
+    bench.run(1.5)
+    assert bench.desk.frame is newest
+    assert bench.desk.dropped > dropped
+    assert bench.desk.trouble == "its frames take 1 s to come"
+    bench.camera.frozen = jpeg(SIZE, 33)
+    bench.run(1.5)
+    bench.camera.take.pop("preview")
+    bench.run(0.5)
+    assert bench.desk.frame is newest  # the late one, shown again in time, is no newer for that
+    bench.camera.frozen = None
+    bench.run(0.3)
+    assert bench.desk.frame is not newest
+    assert bench.desk.trouble == ""
+
+
+def test_a_slow_camera_may_be_slow():
+    bench = Bench(replace(CONFIG, rate_hz=1.0))
+    bench.camera.take["preview"] = 1.0
+    count = len(bench.frames)
+    bench.run(5.0)
+    assert len(bench.frames) >= count + 3
+
+
 def test_zeros_after_a_jpeg_are_padding():
     bench = Bench()
     bench.camera.frozen = jpeg(SIZE, 50) + bytes(30)

@@ -8,6 +8,7 @@ from concurrent.futures import Future
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.hardware.gphoto import CameraLink, GphotoLink
 from cotarget.hardware.gphoto_desk import Desk
+from cotarget.hardware.gphoto_duties import freshness
 from cotarget.hardware.gphoto_setup import ZoomSetting
 from cotarget.hardware.gphoto_work import Shooting
 from cotarget.hwconfig import HardwareZoom
@@ -22,9 +23,6 @@ STILL_LIMIT_S = 30.0
 # Leaving takes two round trips; libgphoto2 waits 2.5 s for each where a camera is silent, and a program that ends
 # because of that shall not hang.
 CLOSE_LIMIT_S = 3.0
-# The newest frame is the newest for this long, or this many frames; after that the viewfinder is blind. Whoever follows
-# waits for a frame then and lets the head come to rest, which it shall within half a second of the fault.
-FRESH_S, FRESH_FRAMES = 0.2, 2.0
 
 
 class GphotoCamera:
@@ -33,7 +31,7 @@ class GphotoCamera:
     A frame's time is when its last byte came, less ``latency_s``: however the camera makes the driver wait, that is
     what a latency measured at bring-up contains. A still's time is the middle of the call that takes it, its transfer
     apart where the camera sends it apart: the shutter opens somewhere within, so the error is at most half that time.
-    While a still is taken the viewfinder is blind, and `read` waits.
+    Frames that took too long to come to be dated so are dropped. While a still is taken the viewfinder is blind, and `read` waits.
 
     The lens's position between commands is the driver's own estimate from ``lens_speed`` and ``command_delay_s``. A
     camera that is lost is looked for again for some seconds, and its lens sent back; then it is gone, and every call
@@ -84,7 +82,7 @@ class GphotoCamera:
 
     @property
     def dropped(self) -> int:
-        """How many frames were broken, or of another size, and therefore not handed out."""
+        """How many frames were broken, late or of another size, and therefore not handed out."""
         with self._desk.changed:
             return self._desk.dropped
 
@@ -96,7 +94,7 @@ class GphotoCamera:
             DeviceError: the camera is gone.
         """
         desk = self._desk
-        fresh = max(FRESH_S, FRESH_FRAMES / self._config.rate_hz)
+        fresh = freshness(self._config)
 
         def there() -> bool:
             if desk.gone:

@@ -26,7 +26,7 @@ class Desk:
         called: whether the camera's thread has something new to do.
         still: who waits for a still.
         trouble: what keeps frames from coming; empty while they come.
-        dropped: frames that were broken or of another size.
+        dropped: frames that were broken, late or of another size.
         gone: why the camera cannot be used any more; empty while it can.
     """
 

@@ -25,6 +25,10 @@ VERIFY_PAUSE_S, VERIFY_S, LENS_TRIES = 0.1, 1.0, 2
 REPEAT_PAUSE_S, REPEAT_LIMIT_S = 0.005, 1.0
 # A lens that comes out when the viewfinder is switched on takes its time until the first frame.
 FIRST_FRAME_S = 10.0
+# A frame is the newest for this long, or this many frames, whichever is longer; after that the viewfinder is blind.
+# Whoever follows waits for a frame then and lets the head come to rest, which it shall within half a second of the
+# fault. A frame that took longer to come is as old as that perhaps, and not handed out at all.
+FRESH_S, FRESH_FRAMES = 0.2, 2.0
 SOI, EOI = b"\xff\xd8", b"\xff\xd9"  # a JPEG's first and last two bytes
 
 
@@ -246,6 +250,7 @@ class ViewDuty:
             self._due = due
             return
         arrived = self._clock.now()
+        took, late = arrived - begin, arrived - begin > freshness(self._config)
         self._patience.reset()
         period = 1 / self._config.rate_hz
         if data == self._data:
@@ -253,13 +258,19 @@ class ViewDuty:
             return
         self._due = max(self._due + period, begin)
         image = decode(data)
-        if image is not None and size_of(image) == self._config.size:
+        if image is not None and size_of(image) == self._config.size and not late:
             self._publish(data, image, arrived)
             return
+        if image is None:
+            trouble = "its frames are broken"
+        elif size_of(image) != self._config.size:
+            trouble = "its frames are {} x {} now".format(*size_of(image))
+        else:
+            trouble = f"its frames take {took:.2g} s to come"
+            self._data = data  # or it would be taken for a new one if it came once more, in time
         with self._desk.changed:
             self._desk.dropped += 1
-            what = "broken" if image is None else "{} x {} now".format(*size_of(image))
-            self._desk.trouble = f"its frames are {what}"
+            self._desk.trouble = trouble
 
     def _publish(self, data: bytes, image: Image, arrived: float) -> None:
         self._data, self._renewed = data, arrived
@@ -267,6 +278,11 @@ class ViewDuty:
             self._desk.frame, self._desk.arrived = Frame(image, arrived - self._config.latency_s), arrived
             self._desk.trouble = ""
             self._desk.changed.notify_all()
+
+
+def freshness(config: HardwareZoom) -> float:
+    """For how long a frame is the newest [s]."""
+    return max(FRESH_S, FRESH_FRAMES / config.rate_hz)
 
 
 def decode(data: bytes) -> Image | None:
