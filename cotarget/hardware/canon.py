@@ -31,7 +31,8 @@ class GphotoCamera:
     A frame's time is when its last byte came, less ``latency_s``: however the camera makes the driver wait, that is
     what a latency measured at bring-up contains. A still's time is the middle of the call that takes it, its transfer
     apart where the camera sends it apart: the shutter opens somewhere within, so the error is at most half that time.
-    Frames that took too long to come to be dated so are dropped. While a still is taken the viewfinder is blind, and `read` waits.
+    Frames that took too long to come to be dated so are dropped. While a still is taken the viewfinder is blind, and
+    `read` waits.
 
     The lens's position between commands is the driver's own estimate from ``lens_speed`` and ``command_delay_s``. A
     camera that is lost is looked for again for some seconds, and its lens sent back; then it is gone, and every call
