@@ -5,7 +5,6 @@ zoom camera streams smaller pictures: the book is wanted smaller there by as muc
 and with it its optical axis.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +63,6 @@ def _one(folder: Path, number: int, at: tuple[float, float, float], seconds: flo
 def _aims(rig: Rig, config: RigConfig, calibration: Calibration, seconds: float) -> np.ndarray:
     """Pan and tilt of the head at the end of following, (n, 2) [rad]."""
     target = config.target(NAME)
-    target = replace(target, wanted_px=target.wanted_px * rig.zoom.size[0] / calibration.zoom.size[0])
     detector = make_detector(target, config.rate_hz)
     settings = FollowSettings(command_delay_s=config.command_delay_s)
     steps = list(follow(rig, calibration, target, detector, seconds=seconds, settings=settings))

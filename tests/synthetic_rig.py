@@ -111,6 +111,7 @@ class SyntheticRig:
     stuck: bool = False
     frozen_camera: bool = False
     short_of: float = 0.0
+    halts: int = 0
     optics: Callable[[float], Stop] | None = None
     limits: PanTiltLimits = field(
         default_factory=lambda: PanTiltLimits(
@@ -224,6 +225,8 @@ class _Head:
         if not rig.stuck:
             rig.arrives = rig.t + 0.3
             rig.pose = (wanted[0] * (1 - rig.short_of), wanted[1])
+            if rig.halts:
+                rig.pose, rig.halts = (wanted[0] / 2, wanted[1] / 2), rig.halts - 1
         if wait:
             rig.t = max(rig.t, rig.arrives)
         return wanted

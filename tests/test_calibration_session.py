@@ -10,6 +10,7 @@ import pytest
 from cotarget.calibration import calibrate_captures, calibrate_photos, calibrate_rig
 from cotarget.calibration.captures import INDEX
 from cotarget.calibration.plan import GRID, Coverage
+from cotarget.calibration.recorder import Recorder
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import pose
@@ -87,6 +88,20 @@ def test_a_broken_rig_is_refused_in_one_line(broken, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         calibrate_rig(SyntheticRig(**broken), BOARD)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("halts", "arrives"), [(1, True), (2, False)])
+def test_a_head_that_was_halted_on_its_way_is_sent_again_once(halts, arrives):
+    rig = SyntheticRig(halts=halts)
+    recorder = Recorder(rig, BOARD)
+    if arrives:
+        recorder.turn(0.5, 0.1)
+        assert rig.pose == pytest.approx((0.5, 0.1), abs=rig.limits.step)
+    else:
+        with pytest.raises(
+            CalibrationError, match=r"the head stands at pan 14\.\d+, tilt 2\.\d+ degrees where pan 28\."
+        ):
+            recorder.turn(0.5, 0.1)
 
 
 def captures(tmp_path, rows, **changes):

@@ -120,6 +120,7 @@ def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
     # Where the book is by the file, not by what anybody saw.
     config, (x, y, z) = load_config(rig.hardware), BOOK_M
     book = config.target("book")
+    assert book.wanted_px == load_config(rig.sim).target("book").wanted_px / 2  # as the viewfinder's pictures are half
     calibration = load_calibration(rig.calibration).for_streams(*config.stream_sizes)
     there = aim(
         calibration,

@@ -12,7 +12,7 @@ from cotarget.calibration.model import Capture, Rejected, View, unseen
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, DeviceError
 from cotarget.geometry import Array, RigidTransform, Rotation
-from cotarget.rig import Image, Rig, ZoomState
+from cotarget.rig import Image, PanTiltState, Rig, ZoomState
 
 # Wishes are rounded to 0.1 mm and 0.1 mrad. Nobody holds a board better; and the fits behind a plan sum in an order
 # that varies with the threads: their last digits would otherwise make two runs with the same seed drift apart.
@@ -26,6 +26,7 @@ HEAD_PATIENCE = 2.0  # beyond what the way takes at the head's own speed and acc
 # A board in somebody's hands counts as held when its corners move less than this between two looks so far apart, and
 # have moved at least so far since the wish (mean over the corners).
 HELD_PX, HELD_FOR, LEFT_PX = 0.3, 0.4, 8.0
+TURN_TRIES = 2  # a watchdog that went off while the machine was busy halts the head on its way
 LENS_TIMEOUT = 15.0  # the slowest zoom lenses take some ten seconds from end to end [s]
 LENS_TOLERANCE = 0.03  # of the focal length; a step of a usual lens is 0.02
 POSE_TOLERANCE = np.radians(0.2)  # between commanded and reached, above the head's own step [rad]
@@ -166,25 +167,31 @@ class Recorder:
         Raises:
             CalibrationError: it does not reach the pose that it said it would.
         """
+        for _ in range(TURN_TRIES):
+            before = self.rig.head.state()
+            wanted = self.rig.head.move(round(pan, WISH_DECIMALS), round(tilt, WISH_DECIMALS), wait=True)
+            way = max(abs(wanted[0] - before.pan), abs(wanted[1] - before.tilt))
+            state, arrived = self._wait_for_head(wanted, way)
+            if arrived:
+                self._still_since = max(self._still_since, state.t + self.settle)
+                return
+        raise CalibrationError(
+            f"the head stands at pan {np.degrees(state.pan):.2f}, tilt {np.degrees(state.tilt):.2f} degrees "
+            f"where pan {np.degrees(wanted[0]):.2f}, tilt {np.degrees(wanted[1]):.2f} was commanded"
+        )
+
+    def _wait_for_head(self, wanted: tuple[float, float], way: float) -> tuple[PanTiltState, bool]:
+        """Wait until the head stands where it is wanted, or should have for long; its state, and whether it does."""
         head, clock = self.rig.head, self.rig.clock
-        before = head.state()
-        wanted = head.move(round(pan, WISH_DECIMALS), round(tilt, WISH_DECIMALS), wait=True)
-        way = max(abs(wanted[0] - before.pan), abs(wanted[1] - before.tilt))
         limits = head.limits
         deadline = clock.now() + way / limits.speed + limits.speed / limits.acceleration + HEAD_PATIENCE
-        tolerance = limits.step + POSE_TOLERANCE
         while True:
             state = head.state()
             off = max(abs(state.pan - wanted[0]), abs(state.tilt - wanted[1]))
-            if not state.moving and off <= tolerance:
-                break
-            if clock.now() > deadline:
-                raise CalibrationError(
-                    f"the head stands at pan {np.degrees(state.pan):.2f}, tilt {np.degrees(state.tilt):.2f} degrees "
-                    f"where pan {np.degrees(wanted[0]):.2f}, tilt {np.degrees(wanted[1]):.2f} was commanded"
-                )
+            arrived = not state.moving and off <= limits.step + POSE_TOLERANCE
+            if arrived or clock.now() > deadline:
+                return state, arrived
             clock.sleep_until(clock.now() + POLL)
-        self._still_since = max(self._still_since, state.t + self.settle)
 
     def see_fixed(self, *, expected: bool = True) -> View | None:
         """Take an image with the fixed camera and find the board in it."""

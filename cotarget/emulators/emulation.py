@@ -9,7 +9,7 @@ from typing import Any
 
 import tomli_w
 
-from cotarget.config import RigConfig
+from cotarget.config import DEFAULT_TARGETS, RigConfig
 from cotarget.emulators.axis import AXIS_FAULTS, AxisServer
 from cotarget.emulators.d46 import D46_FAULTS, UnitProfile
 from cotarget.emulators.d46_twins import make_twins
@@ -153,7 +153,16 @@ class Emulation:
             },
             "board": {"presenter": f"socket://{self._host}:{self.board.port}"},
         }
-        return tomli_w.dumps({"backend": "hardware", "hardware": hardware, **(beside or {})})
+        tables = {"backend": "hardware", "hardware": hardware, **(beside or {})}
+        return tomli_w.dumps({**tables, "targets": self._targets(tables.get("targets", {}))})
+
+    def _targets(self, copied: Mapping[str, Any]) -> dict[str, Any]:
+        """Targets as they are wanted in the viewfinder's smaller pictures."""
+        return {
+            name: {**copied.get(name, {}), "wanted_px": target.wanted_px / PREVIEW_SHARE}
+            for name, target in self.config.targets.items()
+            if name in copied or name in DEFAULT_TARGETS
+        }
 
     def close(self) -> None:
         """End all servers, then the world; more than once does no harm."""
