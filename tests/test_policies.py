@@ -99,7 +99,7 @@ def served_by_best_order(candidates, head):
             now, at = 0.0, head
             for each in order:
                 arrival = now
-                for _ in range(50):  # until the head and the target meet
+                for _ in range(10):  # until the head and the target meet
                     arrival = now + travel_s(each.at + each.rate * arrival - at, LIMITS)
                 now = arrival + SETTLE_S + LOOK_S
                 at = each.at + each.rate * now
@@ -113,7 +113,7 @@ def served_by_best_order(candidates, head):
 def test_the_plan_is_the_best_of_all_orders():
     rng = np.random.default_rng(3)
     sharp = 0
-    for _ in range(60):
+    for _ in range(25):
         five = [
             candidate(i, rng.uniform(-1.5, 1.5), rate=rng.uniform(-0.1, 0.1), leaves=rng.uniform(2, 9))
             for i in range(5)
@@ -124,7 +124,7 @@ def test_the_plan_is_the_best_of_all_orders():
         assert abs(max(plans) - best) <= 1  # the way to a moving target is only nearly right
         sharp += max(plans) == best
         assert plans[policy.select(five, STILL, LIMITS)] == max(plans)
-    assert sharp >= 57
+    assert sharp >= 23
 
 
 def simulated(policy, rng, seconds=20.0, targets=5, dt=0.04):
