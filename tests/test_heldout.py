@@ -138,3 +138,11 @@ def test_too_few_placements_tell_nothing():
     half = fitted(start, [v for v in views if v.camera == "zoom" or v.board > 0])
     assert cross_validate(half, POINTS, None, folds=4) is None
     assert cross_validate(half, POINTS, None, folds=3).views == sum(v.camera == "zoom" for v in views if v.board > 0)
+
+
+def test_placements_that_do_not_determine_the_rig_without_another_tell_nothing():
+    start = model_of(calibrate_views(drawn(Truth(), 99), BOARD, SIZES, options=QUICK))
+    once = fitted(start, drawn(Truth(), 0, boards=6, looks=1))
+    assert cross_validate(once, POINTS, None, folds=5) is None
+    twice = fitted(start, drawn(Truth(), 0, boards=6, looks=2))
+    assert cross_validate(twice, POINTS, None, folds=5).predicted_px < 10.0

@@ -23,6 +23,8 @@ from cotarget.geometry import Array
 # Measured and predicted agree when the mean squared, whitened miss is below 1 + this many standard deviations of it.
 # The misses of a fold share the error of its fit: a placement counts as half an independent miss of two coordinates.
 CHANCE_SIGMAS, SHARE = 2.0, 0.5
+# Where the others predict a board no better than this, they do not determine the rig, and the miss tells nothing [px].
+DETERMINED_PX = 50.0
 FEWEST_VIEWS = 3  # of a zoom stop that must remain for a fold's views at it to be predicted
 
 
@@ -37,7 +39,7 @@ def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -
 
     Returns:
         What came out; None where there are fewer placements seen by both cameras than folds, or too few views to do
-        without any.
+        without any: then the others do not determine the rig.
     """
     both = {v.board for v in found.views if v.camera == "fixed"} & {v.board for v in found.views if v.camera == "zoom"}
     numbers = sorted(both)
@@ -70,13 +72,16 @@ def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -
         expected.append(more_expected)
         left.append(fit(started.model, kept, points, ()).residuals)
     miss, covariances = np.concatenate(misses), np.concatenate(expected)
+    predicted_px = float(np.sqrt(np.mean(np.trace(covariances, axis1=1, axis2=2))))
+    if predicted_px > DETERMINED_PX:
+        return None
     whitened = np.einsum("vi,vij,vj->v", miss, np.linalg.inv(covariances), miss) / 2
     ratio2 = float(np.mean(whitened))
     by_chance = 1 + CHANCE_SIGMAS / np.sqrt(SHARE * len(numbers))
     return HeldOut(
         views=len(miss),
         measured_px=float(np.sqrt(np.mean(np.sum(miss**2, axis=-1)))),
-        predicted_px=float(np.sqrt(np.mean(np.trace(covariances, axis1=1, axis2=2)))),
+        predicted_px=predicted_px,
         corners_rms_px=rms(np.concatenate(left)),
         ratio=float(np.sqrt(ratio2)),
         widened=float(np.sqrt(ratio2)) if ratio2 > by_chance else 1.0,
