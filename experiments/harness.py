@@ -67,6 +67,7 @@ class Experiment(Generic[S]):
         summarise: gives the figures, from the rows alone; nan where nothing was measured.
         describe: gives settings and figures as a text to print.
         plot: draws the rows.
+        missed: names the figures that are not what is wanted; the command fails where there is one.
     """
 
     name: str
@@ -77,6 +78,7 @@ class Experiment(Generic[S]):
     summarise: Callable[[Sequence[Row]], Mapping[str, Any]]
     describe: Callable[[S, Mapping[str, Any]], str]
     plot: Callable[[Sequence[Row], Figure], None] | None = None
+    missed: Callable[[Mapping[str, Any]], Sequence[str]] | None = None
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
         """The command: run, print the figures, and write the files where asked to."""
@@ -94,13 +96,17 @@ class Experiment(Generic[S]):
         return self.report(settings, given.out)
 
     def report(self, settings: S, out: Path | None) -> int:
-        """Run with these settings, print the figures, and write the files where there is a folder for them."""
+        """Run with these settings, print the figures, and write the files where there is a folder for them.
+
+        Returns:
+            The exit status: 1 where a figure is missed.
+        """
         rows = self.run(settings)
         summary = self.summarise(rows)
         print(self.describe(settings, summary))
         if out is not None:
             self.write(out, settings, rows, summary)
-        return 0
+        return 1 if self.missed is not None and self.missed(summary) else 0
 
     def write(self, out: Path, settings: S, rows: Sequence[Row], summary: Mapping[str, Any]) -> None:
         """Write result.json, rows.csv and, where there is a plot, figure.png."""

@@ -26,7 +26,7 @@ from tqdm import tqdm
 from cotarget.errors import CotargetError
 from experiments import wire_age, wire_command, wire_faults, wire_latency, wire_parity, wire_polls
 from experiments.harness import Experiment, Row, Settings, table
-from experiments.wire_figures import FAULT_COLUMNS, PART_COLUMNS, summarise
+from experiments.wire_figures import FAULT_COLUMNS, PART_COLUMNS, missed, summarise
 
 INTERRUPTED, TERMINATED = 130, 143  # exit status of who was ended by Ctrl-C, or by kill
 
@@ -120,6 +120,7 @@ EXPERIMENT = Experiment(
     run,
     summarise,
     describe,
+    missed=missed,
 )
 
 

@@ -3,10 +3,12 @@
 A book goes round and round, so that a head that follows never stands. At a random moment a fault is switched on. Once
 it passes: it is off again after a while, and the head should follow again. Once it is held: the head should stand, or
 go on following where the fault can be lived with. Everything is judged from outside: by where the head truly is, as the
-emulator tells it, and by how the command ends. Where the line to the head is unplugged no halt can reach the unit: it
-ends at the goal of its last command, and how long that takes and how far it goes is what is told.
+emulator tells it, beside where the book truly is, and by how the command ends. Where the line to the head is unplugged
+no halt can reach the unit: it ends at the goal of its last command, and how long that takes and how far it goes is what
+is told.
 """
 
+import functools
 import math
 import subprocess
 import sys
@@ -19,10 +21,13 @@ from typing import IO, Any
 import numpy as np
 
 from cotarget.calibration import save_calibration
+from cotarget.config import parse_config
 from cotarget.emulators.emulation import FAULTS
 from cotarget.geometry import Array
+from cotarget.sim.targets import waypoint_path
+from cotarget.targeting import Reach, aim
 from experiments.harness import Row
-from experiments.wire_rig import EmulatedRig, end, load, true_calibration
+from experiments.wire_rig import MOUNT, EmulatedRig, end, load, true_calibration
 
 # The book's round: x and z about the fixed camera's axis, at a distance [m], and how long one takes [s].
 ROUND, DISTANCE, HEIGHT, PERIOD_S, KNOTS = (1.2, 0.6), 6.0, 1.6, 6.0, 8
@@ -30,7 +35,9 @@ ROUNDS = 150  # as long as one emulator is used
 PAN_DEG, TILT_DEG = (-25.0, 25.0), (-20.0, 20.0)  # soft limits, some way beyond the round as the head sees it
 PASSES_S = 0.3  # that a fault which passes is on [s]
 ONCE = ("head.power-cycle", "head.limit-hit")  # pass by themselves, but the unit has lost its position
+TABLE_S = 0.05  # between the book's directions in a table [s]
 EVERY_S = 0.01  # between looks at the truth [s]
+OFF_DEG = 6.0  # a head that follows trails the book's 13 degrees/s by at most 4
 STILL_DEG, REST_S = 0.03, 0.25  # a head that moves by less for longer stands
 FOLLOWS_S, START_S = 1.0, 30.0  # a head that has moved for so long follows; it must begin to within the latter [s]
 MOMENT_S = (0.3, 2.0)  # from then to the fault [s]
@@ -43,11 +50,12 @@ AFTER_S = 0.5  # that the head is watched after the command has ended [s]
 
 @dataclass
 class Watch:
-    """Where the head truly was: times [s], pan and tilt [degrees]."""
+    """Where the head truly was: times [s], pan and tilt [degrees], and how far from the book [degrees]."""
 
     emulated: EmulatedRig
     times: list[float] = field(default_factory=list)
     angles: list[tuple[float, float]] = field(default_factory=list)
+    off: list[float] = field(default_factory=list)
 
     def until(self, end_s: float, process: "subprocess.Popen[str] | None" = None) -> None:
         """Look until a time on the machine's monotonic clock, or until a process has ended."""
@@ -55,6 +63,7 @@ class Watch:
             told = self.emulated.truth()
             self.times.append(told["t"])
             self.angles.append((told["pan_deg"], told["tilt_deg"]))
+            self.off.append(float(np.hypot(*(directions(told["world"]) - self.angles[-1]))))
             time.sleep(EVERY_S)
 
     def rests(self, since: float) -> list[tuple[float, float]]:
@@ -73,6 +82,11 @@ class Watch:
         """Since when the head has stood until now [s]; None if it does not."""
         rests = self.rests(since)
         return rests[-1][0] if rests and rests[-1][1] == self.times[-1] else None
+
+    def strayed(self, since: float) -> float:
+        """When it was last away from the book [s]; the given time, if it never was."""
+        away = [t for t, off in zip(self.times, self.off, strict=True) if t >= since and off > OFF_DEG]
+        return away[-1] if away else since
 
     def moved(self, since: float) -> float:
         """How far it went from where it was then, at most [degrees]."""
@@ -144,6 +158,27 @@ def all_faults() -> tuple[str, ...]:
     return tuple(sorted(names, key=lambda name: name in ONCE))
 
 
+def directions(world_s: float) -> Array:
+    """Pan and tilt that point at the book at a time of the world, (2,) [degrees]."""
+    phase = np.arange(PERIOD_S / TABLE_S + 1) * TABLE_S
+    return np.array([np.interp(world_s % PERIOD_S, phase, angles) for angles in _directions()])
+
+
+@functools.cache
+def _directions() -> Array:
+    """The same over one round, (2, n); from the path and the true calibration alone."""
+    config = parse_config(_tables())
+    calibration = true_calibration(config)
+    path = waypoint_path(config.sim.paths["book"])
+    reach = Reach(*config.head_limits, config.focal_range_px)
+    found = []
+    for t in np.arange(PERIOD_S / TABLE_S + 1) * TABLE_S:
+        x, y, z = path.position(PERIOD_S + t)  # the first round begins from rest
+        there = aim(calibration, np.array([x, MOUNT - z, y]), reach)
+        found.append((there.pan, there.tilt))
+    return np.degrees(found).T
+
+
 def _tables() -> dict[str, Any]:
     turns = np.arange(ROUNDS * KNOTS + 1)
     phase = 2 * np.pi * turns / KNOTS
@@ -187,7 +222,7 @@ def _follows(watch: Watch, follower: Follower) -> bool:
         if not watch.times:
             continue
         since = watch.times[-1] - FOLLOWS_S
-        if watch.moved(since) > 1.0 and not watch.rests(since):
+        if watch.moved(since) > 1.0 and not watch.rests(since) and watch.strayed(since) == since:
             return True
     return False
 
@@ -221,7 +256,9 @@ def _one(watch: Watch, follower: Follower, fault: str, way: str) -> Row:
     if stands is not None:
         outcome, halted = "ended" if ended is not None else "stands", stands - began
     else:
-        outcome, recovered = "follows", max([*(until - over for _, until in rests), 0.0])
+        outcome, recovered = "follows", max([*(until - over for _, until in rests), watch.strayed(over) - over])
+        if watch.off[-1] > OFF_DEG:
+            outcome, recovered = "strays", math.inf
         halted = rests[0][0] - began if rests else math.nan
     said = follower.said()
     return {
@@ -230,6 +267,7 @@ def _one(watch: Watch, follower: Follower, fault: str, way: str) -> Row:
         "halted_s": halted,
         "recovered_s": recovered,
         "settled_s": float(np.nanmin([halted, recovered])),
+        "off_deg": max(watch.off),
         "moved_deg": watch.moved(began),
         "beyond_deg": watch.beyond(),
         "ended_s": ended_s,

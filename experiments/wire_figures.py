@@ -1,7 +1,7 @@
 """What the rows of `experiments.wire` come to: each figure beside what is wanted, and what lies behind it."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,11 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "faults": faults,
         "load": [min(loads, default=math.nan), max(loads, default=math.nan)],
     }
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The figures that are not what is wanted."""
+    return [name for name, figure in summary["figures"].items() if not figure["reached"]]
 
 
 def at_most(measured: float, wanted: float, unit: str) -> Figure:

@@ -18,12 +18,11 @@ from cotarget.rig import Rig, open_rig
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
 from experiments.harness import Row
-from experiments.wire_rig import LONGEST_S, EmulatedRig, load, true_calibration
+from experiments.wire_rig import LONGEST_S, MOUNT, EmulatedRig, load, true_calibration
 
 NAME = "book"
 DISTANCE = (5.0, 9.0)  # of the book [m]
 SIDE, HEIGHT = 0.3, 0.12  # of its distance, to each side of the fixed camera's axis
-MOUNT = 1.6  # height of the fixed camera in every scene [m]
 SETTLED_S = 1.0  # at the end, over which the head's angles count [s]
 
 

@@ -31,6 +31,7 @@ LONGEST_S = 3600  # an emulator whose parent was killed outright ends by itself 
 END_S = 15.0  # for a process to end when it is asked to [s]
 ANSWER_S = 10.0  # for an answer of the control socket [s]
 STOPS = 17  # focal lengths of the exact calibration; in between its spline is smoother than any lens
+MOUNT = 1.6  # height of the fixed camera in every scene [m]
 
 
 class EmulatedRig:
