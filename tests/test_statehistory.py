@@ -1,0 +1,66 @@
+"""Head and lens in between the states that their devices told, against the head's own profile."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cotarget.rig import PanTiltState, ZoomState
+from cotarget.sim.motion import trapezoid
+from cotarget.statehistory import REMEMBERED_S, StateHistory
+
+RATE_S = 0.04
+OFF_DEG = 0.024  # where the acceleration changes between two states
+
+
+def filled(pan, until=1.2, lens=lambda t: 1000.0, phase=0.0):
+    history = StateHistory()
+    for t in np.arange(-0.2 + phase, until, RATE_S):
+        history.add(PanTiltState(pan(t), -pan(t), True, t), ZoomState(lens(t), True, t))
+    return history
+
+
+def profile(goal_deg):
+    segments = trapezoid(0.1, 0.0, 0.0, goal_deg, 149.0, 206.0)
+
+    def pan(t):
+        begun = [s for s in segments if s[0] <= t]
+        if not begun:
+            return 0.0
+        start, x, v, a = begun[-1]
+        return math.radians(x + v * (t - start) + a * (t - start) ** 2 / 2)
+
+    return pan
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.013, 0.031])
+def test_a_move_of_the_head_is_followed_between_its_states(phase):
+    pan = profile(20.0)
+    history = filled(pan, phase=phase)
+    for t in np.arange(0.0, 0.95, 0.005):
+        found = history.at(t)
+        assert math.degrees(abs(found.pan - pan(t))) < OFF_DEG
+        assert found.tilt == -found.pan
+    # Half way, after sqrt(20 / 206) s, it is as fast as it gets: 206 times that, on both axes.
+    fastest = history.at(0.1 + math.sqrt(20 / 206))
+    assert math.degrees(fastest.speed) == pytest.approx(math.sqrt(2) * 206 * math.sqrt(20 / 206), rel=0.1)
+    assert history.at(0.99).speed == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_lens_moves_evenly_in_the_logarithm():
+    history = filled(lambda t: 0.0, lens=lambda t: 1000.0 * math.exp(t))
+    assert history.at(0.513).nominal_px == pytest.approx(1000.0 * math.exp(0.513))
+
+
+def test_what_was_not_told_is_not_known():
+    history = StateHistory()
+    assert history.at(0.0) is None
+    history.add(PanTiltState(0.1, 0.2, False, 5.0), ZoomState(700.0, False, 5.0))
+    assert (history.at(5.0).pan, history.at(5.0).speed) == (0.1, 0.0)
+    assert history.at(5.01) is None
+    history.add(PanTiltState(0.2, 0.2, False, 5.1), ZoomState(700.0, False, 5.1))
+    assert history.at(5.05).pan == pytest.approx(0.15)
+    history.add(PanTiltState(0.9, 0.9, False, 5.1), ZoomState(900.0, False, 5.1))  # the same state once more
+    assert history.at(5.05).pan == pytest.approx(0.15)
+    history.add(PanTiltState(0.2, 0.2, False, 5.1 + REMEMBERED_S), ZoomState(700.0, False, 5.1 + REMEMBERED_S))
+    assert history.at(5.05) is None
