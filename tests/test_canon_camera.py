@@ -45,6 +45,13 @@ def jpeg(size, grey):
     return cv2.imencode(".jpg", np.full((size[1], size[0], 3), grey, np.uint8))[1].tobytes()
 
 
+def zeroed(data):
+    """The second quarter of a JPEG's compressed data is lost, the rest is there."""
+    start = data.index(b"\xff\xda") + 14
+    long = (len(data) - 2 - start) // 4
+    return data[: start + long] + bytes(long) + data[start + 2 * long :]
+
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -353,6 +360,7 @@ def test_a_frozen_viewfinder_gives_no_new_frames_and_is_not_hammered():
         (jpeg(SIZE, 50)[2:], "its frames are broken"),
         (b"", "its frames are broken"),
         (b"\xff\xd8 nothing \xff\xd9", "its frames are broken"),
+        (zeroed(jpeg(SIZE, 50)), "its frames are broken"),
         (jpeg((40, 30), 50), "its frames are 40 x 30 now"),
     ],
 )
@@ -753,9 +761,7 @@ def test_stills_of_another_size_say_what_to_write():
 def test_stills_that_cannot_be_read_or_taken():
     with opened() as rig:
         rig.link.still = b"raw"
-        with pytest.raises(
-            DeviceError, match=r"still 'capt0000\.jpg' is no JPEG that can be read; set it to take JPEG"
-        ):
+        with pytest.raises(DeviceError, match=r"still 'capt0000\.jpg' is damaged, or no JPEG; set it to take JPEG"):
             rig.camera.capture()
         rig.link.still = None
         rig.link.fail["shoot"] = [BUSY, BAD, None]

@@ -162,7 +162,7 @@ class AxisCamera:
         with self._decoding:
             if self._decoded is not None and self._decoded[0] is picture:
                 return self._decoded[1]
-            image = self._decoder.decode(picture.jpeg, picture.size)
+            image = self._decoder.decode(picture.jpeg)
             if image is not None:
                 self._decoded = (picture, image)
                 return image

@@ -7,13 +7,11 @@ LinkError; being busy is waited for.
 import math
 from concurrent.futures import Future
 
-import cv2
-import numpy as np
-
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.hardware.gphoto import LOST, CameraLink, LinkError
 from cotarget.hardware.gphoto_desk import Desk
 from cotarget.hardware.gphoto_setup import BUSY_PATIENCE_S, BUSY_PAUSE_S, ZoomSetting, patiently, position_in
+from cotarget.hardware.jpeg import JpegDecoder
 from cotarget.hardware.lens import LensMotion
 from cotarget.hwconfig import HardwareZoom
 from cotarget.rig import Clock, Frame, Image
@@ -29,7 +27,6 @@ FIRST_FRAME_S = 10.0
 # Whoever follows waits for a frame then and lets the head come to rest, which it shall within half a second of the
 # fault. A frame that took longer to come is as old as that perhaps, and not handed out at all.
 FRESH_S, FRESH_FRAMES = 0.2, 2.0
-SOI, EOI = b"\xff\xd8", b"\xff\xd9"  # a JPEG's first and last two bytes
 
 
 class Patience:
@@ -138,6 +135,7 @@ class StillDuty:
         self._future: Future[Frame] | None = None
         self._due = -math.inf
         self._patience = Patience(clock)
+        self._decoder = JpegDecoder()
 
     def due(self) -> float:
         """When there is something to do [s]."""
@@ -176,9 +174,9 @@ class StillDuty:
         begin = self._clock.now()
         still = self._link.shoot()
         end = self._clock.now()
-        image = decode(self._link.fetch(still))
+        image = self._decoder.decode(self._link.fetch(still))
         if image is None:
-            raise DeviceError(f"the zoom camera's still '{still[1]}' is no JPEG that can be read; set it to take JPEGs")
+            raise DeviceError(f"the zoom camera's still '{still[1]}' is damaged, or no JPEG; set it to take JPEGs")
         size, wanted = size_of(image), self._config.still_size
         if size != wanted:
             raise ConfigError(
@@ -205,6 +203,7 @@ class ViewDuty:
         self._due = -math.inf
         self._data, self._renewed = b"", -math.inf
         self._patience = Patience(clock)
+        self._decoder = JpegDecoder()
 
     def begin(self) -> None:
         """Wait for the first frame of a camera that was just opened.
@@ -217,7 +216,7 @@ class ViewDuty:
         while True:
             data = patiently(self._clock, self._link.preview)
             arrived = self._clock.now()
-            image = decode(data)
+            image = self._decoder.decode(data)
             if image is not None:
                 break
             if arrived > deadline:
@@ -257,7 +256,7 @@ class ViewDuty:
             self._due = arrived + (REPEAT_PAUSE_S if arrived < self._renewed + REPEAT_LIMIT_S else period)
             return
         self._due = max(self._due + period, begin)
-        image = decode(data)
+        image = self._decoder.decode(data)
         if image is not None and size_of(image) == self._config.size and not late:
             self._publish(data, image, arrived)
             return
@@ -283,18 +282,6 @@ class ViewDuty:
 def freshness(config: HardwareZoom) -> float:
     """For how long a frame is the newest [s]."""
     return max(FRESH_S, FRESH_FRAMES / config.rate_hz)
-
-
-def decode(data: bytes) -> Image | None:
-    """A JPEG's pixels as the sensor has them, (H, W, 3) BGR, read-only; None if it is broken or cut short."""
-    if not data.startswith(SOI) or not data.rstrip(b"\0").endswith(EOI):
-        return None
-    # A camera that feels itself tilted says so in its files; the images must not be turned for that.
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        return None
-    image.flags.writeable = False
-    return image
 
 
 def size_of(image: Image) -> tuple[int, int]:
