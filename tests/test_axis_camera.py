@@ -612,6 +612,24 @@ def test_closing_frees_a_reader_at_once_and_ends_the_thread(server):
         camera.read()
 
 
+@pytest.mark.parametrize("at_once", [True, False])
+def test_a_driver_that_fails_says_so_to_whoever_reads(server, monkeypatch, capfd, at_once):
+    def feed(*_):
+        raise RuntimeError("a mistake")
+
+    if at_once:
+        monkeypatch.setattr(axis.MultipartReader, "feed", feed)
+        assert refused(server) == "the driver of the fixed camera failed: RuntimeError('a mistake')"
+    else:
+        with opened(server) as camera:
+            t = camera.read().t
+            monkeypatch.setattr(axis.MultipartReader, "feed", feed)
+            server.viewer().send(part(jpeg(1)))
+            with pytest.raises(DeviceError, match=r"the driver of the fixed camera failed: RuntimeError"):
+                camera.read(t, PATIENCE_S)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_closing_while_the_server_hangs(server, monkeypatch):
     monkeypatch.setattr(vapix, "SILENCE_S", SHORT_SILENCE_S)
     with opened(server) as camera:

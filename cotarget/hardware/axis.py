@@ -4,6 +4,7 @@ A consumer that read the stream itself would fall behind it: what it has not rea
 """
 
 import contextlib
+import logging
 import threading
 from dataclasses import dataclass, replace
 
@@ -13,6 +14,8 @@ from cotarget.hardware.multipart import MultipartReader, Picture
 from cotarget.hardware.vapix import BusyError, RefusedError, Stream, VideoServer
 from cotarget.hwconfig import HardwareFixed
 from cotarget.rig import Clock, Frame, Image
+
+log = logging.getLogger(__name__)
 
 # How long the first picture may take; a server that is busy is asked again until then [s].
 OPEN_S = 5.0
@@ -76,6 +79,7 @@ class AxisCamera:
         self._spoilt = self._frozen = False  # what came since the newest: broken ones, or the same
         self._trouble = ""  # why there is no stream; empty while there is one
         self._refused: DeviceError | None = None  # why there never was one
+        self._failed = ""  # why there will be none any more
         self._asked = False  # whether the server was asked why there are no new ones
         self._video: bool | None = None  # what it said: whether the input has a signal
         self._thread = threading.Thread(target=self._run, name="axis", daemon=True)
@@ -103,7 +107,7 @@ class AxisCamera:
 
         Raises:
             StaleFrameError: no such frame arrived within ``timeout`` [s], and why.
-            DeviceError: the pictures have another size than at the start, or the camera is closed.
+            DeviceError: the pictures have another size than at the start, the camera is closed, or its driver failed.
         """
         deadline = self._clock.now() + timeout
         # What came before a stall is no answer to somebody who wants to see what is.
@@ -114,6 +118,8 @@ class AxisCamera:
                 self._new.wait_for(lambda: self._ready(after), max(deadline - self._clock.now(), 0.0))
                 if self._closing.is_set():
                     raise DeviceError("the fixed camera is closed")
+                if self._failed:
+                    raise DeviceError(self._failed)
                 picture = self._picture
                 if picture is not None and picture.size != self.size:
                     raise DeviceError(self._other_size(picture.size))
@@ -155,7 +161,7 @@ class AxisCamera:
         """Whether there is something to tell: a picture from after then, one of another size, or the end."""
         picture = self._picture
         told = picture is not None and (self._time(picture) > after or picture.size != self.size)
-        return told or self._closing.is_set()
+        return told or bool(self._failed) or self._closing.is_set()
 
     def _decode(self, picture: Picture) -> Image | None:
         """The picture's image, read-only; None, and counted, if it has none."""
@@ -193,7 +199,18 @@ class AxisCamera:
         return f"no new picture for {now - self._fresh:.1f} s: {reason}{video}"
 
     def _run(self) -> None:
-        """Keep a stream open: what the thread does."""
+        """What the thread does."""
+        try:
+            self._keep_open()
+        except Exception as error:  # a thread must not die in silence
+            log.debug("the driver of the fixed camera failed", exc_info=True)
+            with self._new:
+                self._failed = f"the driver of the fixed camera failed: {error!r}"
+                self._refused = DeviceError(self._failed)
+                self._new.notify_all()
+
+    def _keep_open(self) -> None:
+        """Keep a stream open until the end."""
         pause = 0.0
         while not self._closing.wait(pause):
             frames = self._counters.frames

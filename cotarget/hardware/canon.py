@@ -1,5 +1,6 @@
 """A zoom camera by gphoto2, such as Canon's PowerShots that can be shot from a computer."""
 
+import contextlib
 import logging
 import math
 import threading
@@ -191,10 +192,11 @@ class GphotoCamera:
             while not self._desk.gone:
                 self._rest_until(work.work())
         except Exception as error:  # a thread must not die in silence
-            log.exception("the driver of the zoom camera failed")
+            log.debug("the driver of the zoom camera failed", exc_info=True)
             self._desk.dismiss(f"the driver of the zoom camera failed: {error!r}")
         finally:
-            work.close()
+            with contextlib.suppress(Exception):
+                work.close()
 
     def _rest_until(self, due: float) -> None:
         """Wait until something is due, or somebody wants something."""

@@ -54,7 +54,8 @@ class Setting:
     """One of a camera's settings.
 
     Attributes:
-        kind: "range" has a number for value, "switch" 0 or 1, "choice" one of its choices, "text" anything.
+        kind: "range" has a number for value, "switch" 0 or 1, "choice" one of its choices, "date" seconds since 1970,
+            "text" anything.
         value: what it is now.
         low: a range's least value.
         high: a range's greatest value.
@@ -63,7 +64,7 @@ class Setting:
         readonly: whether it can only be read.
     """
 
-    kind: Literal["range", "switch", "choice", "text"]
+    kind: Literal["range", "switch", "choice", "date", "text"]
     value: str | float
     low: float = 0.0
     high: float = 0.0
@@ -202,6 +203,8 @@ class GphotoLink:
             return Setting("choice", str(value), choices=choices, readonly=readonly)
         if kind == gp.GP_WIDGET_TOGGLE:
             return Setting("switch", float(value), 0.0, 1.0, readonly=readonly)
+        if kind == gp.GP_WIDGET_DATE:
+            return Setting("date", float(value), readonly=readonly)
         return Setting("text", str(value), readonly=readonly)
 
     def put(self, name: str, value: str | float) -> None:

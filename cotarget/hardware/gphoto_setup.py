@@ -20,6 +20,7 @@ SHOOTING, TARGET, MEMORY = "capture", "capturetarget", "Internal RAM"
 # A busy camera is told apart from a wrong value by its ranges, which are checked before: both come back as -2.
 BUSY = frozenset({BAD_PARAMETERS, CAMERA_BUSY})
 BUSY_PAUSE_S, BUSY_PATIENCE_S = 0.1, 3.0
+LATEST = 2**31  # date that libgphoto2 can tell [s since 1970]
 
 T = TypeVar("T")
 
@@ -84,6 +85,8 @@ def _apply(link: CameraLink, clock: Clock, camera: str, names: Collection[str], 
     _check(setting, f"hardware.zoom.settings.{name}", value)
     patiently(clock, lambda: link.put(name, value))
     got = patiently(clock, lambda: link.get(name)).value
+    if setting.kind == "date":  # it goes on
+        return
     if got != value and not (isinstance(got, float) and got == float(value)):
         log.warning("the %s took '%s' for its setting '%s' as '%s'", camera, value, name, got)
 
@@ -100,6 +103,8 @@ def _check(setting: Setting, where: str, value: str) -> None:
         number = _number(value)
         if number is None or not setting.low <= number <= setting.high:
             raise ConfigError(f"{where}: '{value}' is not within {setting.low:g} to {setting.high:g}")
+    if setting.kind == "date" and not (value.isascii() and value.isdigit() and int(value) < LATEST):
+        raise ConfigError(f"{where}: '{value}' is no time in whole seconds since 1970")
 
 
 def _zoom_setting(

@@ -57,6 +57,11 @@ class Shooting:
                 if not left or error.code not in LOST:
                     raise DeviceError(f"the camera at '{self._config.port}' cannot be used: {error}") from error
                 self._clock.sleep_until(self._clock.now() + FIRST_PAUSE_S)
+            except CotargetError:
+                raise
+            except Exception as error:  # a user can do nothing with a traceback
+                log.debug("opening the zoom camera failed", exc_info=True)
+                raise DeviceError(f"the camera at '{self._config.port}' cannot be used: {error!r}") from error
         raise AssertionError("the last attempt succeeds or fails")
 
     def close(self) -> None:
