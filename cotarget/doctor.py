@@ -5,6 +5,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -54,10 +55,14 @@ def examine(config: "RigConfig | None" = None) -> list[Finding]:
         _assets(),
         _rendering(),
         _codec(),
-        *_serial_ports(),
-        _gphoto_cameras(),
+        _serial_ports(),
+        _gphoto_cameras(needed=_is_real(config)),
     ]
-    return found if config is None or config.backend != "hardware" else [*found, *_devices(config.hardware)]
+    return found if config is None or not _is_real(config) else [*found, *_devices(config.hardware)]
+
+
+def _is_real(config: "RigConfig | None") -> bool:
+    return config is not None and config.backend == "hardware"
 
 
 def _python() -> Finding:
@@ -113,42 +118,40 @@ def _codec() -> Finding:
     )
 
 
-def _serial_ports() -> list[Finding]:
+def _serial_ports() -> Finding:
+    from cotarget.hardware.serialport import ports
+
     try:
-        from serial.tools import list_ports
-    except ImportError as error:
-        fix = "pip install --force-reinstall pyserial"
-        return [Finding("serial ports", False, f"pyserial cannot be imported: {error}", fix)]
-    found = [f"{port.device} ({port.description})" for port in list_ports.comports()]
-    return [Finding("serial ports", True, ", ".join(found) or "none (none is needed for the simulation)")]
+        found = [f"{device} ({description})" for device, description in ports()]
+    except CotargetError as error:
+        return Finding("serial ports", False, str(error), "pip install --force-reinstall pyserial")
+    return Finding("serial ports", True, ", ".join(found) or "none (none is needed for the simulation)")
 
 
-def _gphoto_cameras() -> Finding:
+def _gphoto_cameras(needed: bool) -> Finding:
+    from cotarget.hardware.gphoto import cameras
+
+    note = "" if needed else " (none is needed for the simulation)"
     try:
-        from cotarget.hardware.gphoto import probe
-
-        text = ", ".join(probe()) or "none on USB"
-    except (ImportError, CotargetError) as error:
-        text = str(error)
-    return Finding("gphoto2 cameras", True, f"{text} (none is needed for the simulation)")
+        return Finding("gphoto2 cameras", True, (", ".join(cameras()) or "none on USB") + note)
+    except CotargetError as error:
+        return Finding("gphoto2 cameras", not needed, f"{error}{note}", "pip install 'cotarget[hardware]'" * needed)
 
 
 def _devices(hardware: "HardwareConfig") -> list[Finding]:
     """Ask the devices who they are."""
-    from cotarget.hardware.axis import probe as probe_fixed
-    from cotarget.hardware.d46unit import probe as probe_head
+    from cotarget.hardware import axis, board, d46unit, gphoto
 
-    def head() -> str:
-        return probe_head(hardware.head.port, hardware.head.baud)
-
-    def fixed() -> str:
-        return probe_fixed(hardware.fixed)
-
+    head, zoom = hardware.head, hardware.zoom
+    questions: tuple[tuple[str, str, Callable[[], str]], ...] = (
+        ("head", head.port, lambda: d46unit.probe(head.port, head.baud)),
+        ("fixed", hardware.fixed.url, lambda: axis.probe(hardware.fixed)),
+        ("zoom", zoom.port, lambda: gphoto.probe(zoom.port, zoom.model)),
+        ("board", hardware.board.presenter, lambda: board.probe(hardware.board)),
+    )
     found = []
-    for name, there, ask in (
-        ("hardware.head", hardware.head.port, head),
-        ("hardware.fixed", hardware.fixed.url, fixed),
-    ):
+    for table, there, ask in questions:
+        name = f"hardware.{table}"
         try:
             if not there:
                 raise ConfigError("is not configured")

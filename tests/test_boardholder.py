@@ -95,19 +95,30 @@ def test_nobody_there_and_nobody_any_more_are_errors():
 
 
 @pytest.mark.wire
+def test_brackets_without_end_are_no_answer():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        board = SocketBoard("127.0.0.1", server.getsockname()[1])
+        client, _ = server.accept()
+        client.sendall(b"[" * 60000 + b"\n")
+        with pytest.raises(DeviceError, match=r"the board's holder said b'\[\[\["):
+            board.present(None)
+        board.close()
+        client.close()
+
+
+@pytest.mark.wire
 def test_what_is_no_json_is_answered_and_the_server_goes_on():
     with (
         JsonLines(lambda said: {"twice": 2 * said["n"]}) as server,
         socket.create_connection(("127.0.0.1", server.port)) as client,
         client.makefile("rwb") as lines,
     ):
-        for said in (b"nonsense\n", b'{"m": 1}\n', b'{"n": 2}\n'):
+        for said in (b"nonsense\n", b"[" * 60000 + b"\n", b'{"m": 1}\n', b'{"n": 2}\n'):
             lines.write(said)
             lines.flush()
-        replies = [json.loads(lines.readline()) for _ in range(3)]
-    assert "error" in replies[0]
-    assert "error" in replies[1]
-    assert replies[2] == {"twice": 4}
+        *refused, well = (json.loads(lines.readline()) for _ in range(4))
+    assert all("not understood" in reply["error"] for reply in refused)
+    assert well == {"twice": 4}
 
 
 class SlowHands(_Board):

@@ -24,7 +24,7 @@ import pytest
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError
 from cotarget.hardware.canon import GphotoCamera
 from cotarget.hardware.clock import MonotonicClock
-from cotarget.hardware.gphoto import GphotoLink, LinkError, Setting, probe
+from cotarget.hardware.gphoto import GphotoLink, LinkError, Setting, cameras, probe
 from cotarget.hardware.gphoto_desk import Desk
 from cotarget.hardware.gphoto_port import full_port
 from cotarget.hardware.gphoto_work import Shooting
@@ -935,7 +935,7 @@ def test_ports_that_cannot_be():
 
 def test_without_gphoto2_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "gphoto2", None)
-    for call in (probe, GphotoLink("usb:", "").open):
+    for call in (cameras, lambda: probe("usb:", ""), GphotoLink("usb:", "").open):
         with pytest.raises(ConfigError, match=r"gphoto2 is not installed; pip install 'cotarget\[hardware\]'"):
             call()
 
@@ -992,7 +992,7 @@ def test_the_only_camera_is_found(gphoto2):
     module = gphoto2(("Canon S5", "usb:001,005"), ("Mass Storage Camera", "disk:/media/card"))
     assert GphotoLink("usb:", "").open() == "Canon S5"
     assert module.opened == ["Canon S5", "usb:001,005"]
-    assert probe() == ["Canon S5 at usb:001,005", "Mass Storage Camera at disk:/media/card"]
+    assert cameras() == ["Canon S5 at usb:001,005", "Mass Storage Camera at disk:/media/card"]
 
 
 def test_one_of_two_cameras_is_chosen_by_its_port(gphoto2):
@@ -1025,9 +1025,10 @@ def test_one_of_two_cameras_is_chosen_by_its_port(gphoto2):
 )
 def test_cameras_that_are_not_found(gphoto2, port, model, found, message):
     gphoto2(*found)
-    with pytest.raises((ConfigError, DeviceError)) as error:
-        GphotoLink(port, model).open()
-    assert str(error.value) == message
+    for call in (GphotoLink(port, model).open, lambda: probe(port, model)):
+        with pytest.raises((ConfigError, DeviceError)) as error:
+            call()
+        assert str(error.value) == message
 
 
 def test_a_camera_of_another_user_and_one_of_another_program(gphoto2, monkeypatch):
@@ -1039,8 +1040,9 @@ def test_a_camera_of_another_user_and_one_of_another_program(gphoto2, monkeypatc
         GphotoLink("usb:", "").open()
     monkeypatch.setattr(Path, "is_char_device", lambda path: path == Path("/dev/bus/usb/001/005"))
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    with pytest.raises(DeviceError, match=r"no permission to use /dev/bus/usb/001/005; add yourself to its group"):
-        GphotoLink("usb:", "").open()
+    for call in (GphotoLink("usb:", "").open, lambda: probe("usb:", "")):
+        with pytest.raises(DeviceError, match=r"no permission to use /dev/bus/usb/001/005; add yourself to its group"):
+            call()
 
 
 # libgphoto2 has a camera of its own on a USB port of its own, if that is asked for before it is loaded.
@@ -1048,10 +1050,11 @@ VIRTUAL = """
 from cotarget.errors import ConfigError
 from cotarget.hardware.canon import GphotoCamera
 from cotarget.hardware.clock import MonotonicClock
-from cotarget.hardware.gphoto import probe
+from cotarget.hardware.gphoto import cameras, probe
 from cotarget.hwconfig import HardwareZoom
 
-print(probe())
+print(cameras())
+print(probe("usb:", ""))
 try:
     GphotoCamera(HardwareZoom(port="usb:"), MonotonicClock())
 except ConfigError as error:
@@ -1081,8 +1084,8 @@ def test_libgphoto2s_own_virtual_camera_cannot_be_zoomed(tmp_path):
     home, card = home_in(tmp_path), tmp_path / "card"
     card.mkdir()
     with python(VIRTUAL, HOME=str(home), XDG_CONFIG_HOME="", VCAMERADIR=str(card)) as process:
-        found, error = process.communicate(timeout=DEADLINE_S)[0].splitlines()
-    assert found == "['Nikon DSC D750 at usb:001,001']"
+        found, probed, error = process.communicate(timeout=DEADLINE_S)[0].splitlines()
+    assert (found, probed) == ("['Nikon DSC D750 at usb:001,001']", "Nikon DSC D750 at usb:001,001")
     assert error.startswith(
         "hardware.zoom: the Nikon DSC D750 has no setting 'zoom'; it cannot be zoomed; its settings"
     )
@@ -1262,6 +1265,16 @@ def test_another_device_on_the_port():
 
 
 @pytest.mark.wire
+def test_where_somebody_listens(process):
+    port = f"ptpip:localhost:{process.port}"
+    assert probe(port, "") == f"something listens at ptpip:127.0.0.1:{process.port}:{process.port}"
+    with pytest.raises(ConfigError, match=r"hardware\.zoom\.model: gphoto2 knows no 'S5'; it knows "):
+        probe(port, "S5")
+
+
+@pytest.mark.wire
 def test_where_nobody_listens():
+    with pytest.raises(DeviceError, match=r"hardware\.zoom\.port: no camera listens at 'ptpip:127\.0\.0\.1:1:1'"):
+        probe("ptpip:127.0.0.1:1", "")
     with pytest.raises(DeviceError, match=r"hardware\.zoom\.port: no camera listens at 'ptpip:127\.0\.0\.1:1:1'"):
         GphotoCamera(replace(CONFIG, port="ptpip:127.0.0.1:1"), MonotonicClock())

@@ -1,5 +1,6 @@
 """The doctor: what is missing is said with the command that mends it, whatever else is broken."""
 
+import socket
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -7,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from cotarget import cli, doctor
+from cotarget.config import parse_config
 from cotarget.doctor import PACKAGES, Finding
 
 
@@ -66,6 +68,45 @@ def test_a_package_that_cannot_be_imported_does_not_stop_the_doctor(tried, monke
     broken = [f for f in doctor.examine() if not f.ok]
     assert [f.name for f in broken] == ["H.264" if module == "av" else "serial ports"]
     assert broken[0].fix.startswith("pip install")
+
+
+def rig(port, presenter="person"):
+    hardware = {"zoom": {"port": port}, "board": {"presenter": presenter}}
+    return parse_config({"backend": "hardware", "hardware": hardware})
+
+
+def findings(config):
+    return {f.name: f for f in doctor.examine(config)}
+
+
+def test_a_simulated_rig_does_without_gphoto2_and_a_real_one_does_not(tried, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gphoto2", None)
+    assert finding("gphoto2 cameras").ok
+    found = findings(rig("usb:"))
+    missing = found["gphoto2 cameras"]
+    assert (missing.ok, missing.fix) == (False, "pip install 'cotarget[hardware]'")
+    assert found["hardware.zoom"].text == "gphoto2 is not installed; pip install 'cotarget[hardware]'"
+
+
+def test_the_zoom_camera_and_who_holds_the_board_are_looked_for(tried):
+    """Port 1 of this machine is nobody's; a person is always there."""
+    pytest.importorskip("gphoto2")
+    found = findings(rig("ptpip:127.0.0.1:1"))
+    assert not found["hardware.zoom"].ok
+    assert found["hardware.zoom"].text.startswith("hardware.zoom.port: no camera listens at 'ptpip:127.0.0.1:1:1'")
+    assert found["hardware.board"] == Finding("hardware.board", True, "a person")
+    found = findings(rig("", "socket://127.0.0.1:1"))
+    assert found["hardware.zoom"].text == "is not configured"
+    assert not found["hardware.board"].ok
+    assert found["hardware.board"].text.startswith("hardware.board.presenter: nobody holds a board at socket://127")
+    assert "[hardware.board]" in found["hardware.board"].fix
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        found = findings(rig(f"ptpip:localhost:{port}", f"socket://127.0.0.1:{port}"))
+    assert found["hardware.zoom"] == Finding(
+        "hardware.zoom", True, f"something listens at ptpip:127.0.0.1:{port}:{port}"
+    )
+    assert found["hardware.board"] == Finding("hardware.board", True, f"a program at socket://127.0.0.1:{port}")
 
 
 @pytest.mark.parametrize(("change", "backend", "text", "fix"), [

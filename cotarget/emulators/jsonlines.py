@@ -16,7 +16,7 @@ class JsonLines:
     """Serves any number of clients, each on a thread of its own. A context manager.
 
     Args:
-        answer: what to say to an object; a `CotargetError` or a `ValueError` of a wrong object becomes {"error": ...}.
+        answer: what to say to an object; a `CotargetError`, and what a wrong object raises, becomes {"error": ...}.
         host: to listen at.
         port: to listen at; 0 for any that is free.
 
@@ -90,5 +90,5 @@ def _answered(answer: Callable[[Any], Any], line: bytes) -> Any:
         return answer(json.loads(line))
     except CotargetError as error:
         return {"error": str(error)}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         return {"error": f"not understood: {type(error).__name__}: {error}"}

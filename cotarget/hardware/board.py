@@ -41,6 +41,16 @@ def make_board(config: HardwareBoard) -> ClosingBoard:
     return PersonBoard(sys.stderr) if address is None else SocketBoard(*address)
 
 
+def probe(config: HardwareBoard) -> str:
+    """Look whether somebody is there to hold the board, without asking for it; who.
+
+    Raises:
+        DeviceError: nobody is there.
+    """
+    make_board(config).close()
+    return "a person" if socket_address(config.presenter) is None else f"a program at {config.presenter}"
+
+
 class PersonBoard:
     """A person, who reads where to hold the board."""
 
@@ -114,7 +124,7 @@ class SocketBoard:
             raise DeviceError(f"{self._name}: the board's holder does not answer: {error}") from None
         try:
             answer = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):  # the latter of brackets without end
             said = f"said {line[:40]!r}" if line else "is gone"
             raise DeviceError(f"{self._name}: the board's holder {said}") from None
         if not (isinstance(answer, dict) and answer.get("ok") is True):

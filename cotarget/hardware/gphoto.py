@@ -161,6 +161,23 @@ class GphotoLink:
         self._camera = camera
         return model
 
+    def look(self) -> str:
+        """Look for the camera, and whether it may be opened, without opening it; what is there.
+
+        Raises:
+            ConfigError: there can be no such model, or gphoto2 is not installed.
+            DeviceError: it is not there, or not ours to open.
+        """
+        gp = _gphoto2()
+        ports, abilities = gp.PortInfoList(), gp.CameraAbilitiesList()
+        try:
+            ports.load()
+            abilities.load()
+            model, port = self._find(ports, abilities)
+        except gp.GPhoto2Error as error:
+            raise DeviceError(f"gphoto2 says [{error.code}] {error.string}") from error
+        return f"{model} at {port}" if port.startswith("usb:") else f"something listens at {port}"
+
     def _find(self, ports: Any, abilities: Any) -> tuple[str, str]:
         """The model's name and the port in full."""
         port = self._port
@@ -242,13 +259,28 @@ class GphotoLink:
             raise LinkError(error.code, error.string) from error
 
 
-def probe() -> list[str]:
+def cameras() -> list[str]:
     """The cameras that gphoto2 sees on this machine's USB, "model at port" each; none of them is opened.
 
     Raises:
         ConfigError: gphoto2 is not installed.
+        DeviceError: it cannot look.
     """
-    return [f"{model} at {port}" for model, port in _gphoto2().Camera.autodetect().items()]
+    gp = _gphoto2()
+    try:
+        return [f"{model} at {port}" for model, port in gp.Camera.autodetect().items()]
+    except gp.GPhoto2Error as error:
+        raise DeviceError(f"gphoto2 says [{error.code}] {error.string}") from error
+
+
+def probe(port: str, model: str) -> str:
+    """Look for a configured camera without opening it; what is there.
+
+    Raises:
+        ConfigError: there can be no such port or model, or gphoto2 is not installed.
+        DeviceError: it is not there, or not ours to open.
+    """
+    return GphotoLink(port, model).look()
 
 
 def _check_model(model: str, abilities: Any) -> None:

@@ -26,6 +26,19 @@ class Port(Protocol):
         """Release the port."""
 
 
+def ports() -> list[tuple[str, str]]:
+    """The serial ports of this machine: each one's name and what it is.
+
+    Raises:
+        DeviceError: pyserial is missing.
+    """
+    try:
+        from serial.tools import list_ports
+    except ImportError as error:
+        raise _no_pyserial(error) from error
+    return [(port.device, port.description) for port in list_ports.comports()]
+
+
 def open_port(name: str, baud: int) -> Port:
     """Open a port by the name or URL that pyserial knows it by.
 
@@ -38,7 +51,7 @@ def open_port(name: str, baud: int) -> Port:
     try:
         import serial
     except ImportError as error:
-        raise DeviceError(f"pyserial cannot be imported ({error}); pip install pyserial") from error
+        raise _no_pyserial(error) from error
     url = "://" in name
     try:
         # Two programs on one port would take each other's answers.
@@ -49,13 +62,15 @@ def open_port(name: str, baud: int) -> Port:
         raise DeviceError(_why_not(name, error)) from error
 
 
+def _no_pyserial(error: ImportError) -> DeviceError:
+    return DeviceError(f"pyserial cannot be imported ({error}); pip install --force-reinstall pyserial")
+
+
 def _why_not(name: str, error: Exception) -> str:
     """Say in one line why a port cannot be opened and what would help."""
-    from serial.tools import list_ports
-
     match getattr(error, "errno", None):
         case errno.ENOENT | errno.ENXIO | errno.ENODEV:
-            there = ", ".join(sorted(port.device for port in list_ports.comports())) or "none"
+            there = ", ".join(sorted(device for device, _ in ports())) or "none"
             return f"there is no port {name} for the pan-tilt unit; serial ports here: {there}"
         case errno.EACCES | errno.EPERM:
             return (
