@@ -13,10 +13,11 @@ from cotarget.emulators.d46 import D46_FAULTS, D46_STOCK
 from cotarget.emulators.d46_twins import make_twins
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.jsonlines import JsonLines
-from cotarget.emulators.world import FIXED_HZ, ZOOM_HZ, EmulatedAxis, EmulatedLens, LiveWorld, paced
+from cotarget.emulators.mechanics import REMEMBERED, EmulatedAxis, EmulatedLens
+from cotarget.emulators.world import FIXED_HZ, ZOOM_HZ, LiveWorld, paced
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.geometry import pose
-from cotarget.sim.motion import Axis, LensDrive
+from cotarget.sim.motion import Axis, HeadDrive, LensDrive
 
 STEP = math.radians(0.05)  # [rad]
 DELAY = 0.04  # from a command to motion [s]
@@ -267,6 +268,89 @@ def test_a_world_that_cannot_be_made_says_why():
     with pytest.raises(ConfigError, match="unknown scene 'nowhere'"):
         LiveWorld(RigConfig(sim=SimConfig(scene="nowhere")))
     assert threading.active_count() == threads
+
+
+class FakeWorld:
+    """In the place of the simulated one: it shows black, and does to an exposure what the test says."""
+
+    def __init__(self, config, clock):
+        self.head_drive = HeadDrive(Axis(1.0, 1.0), Axis(1.0, 1.0))
+        self.lens_drive = LensDrive(667.0, 8000.0, 128, True, Axis(129.0, math.inf))
+        self.closed = 0
+
+    def expose(self, name, index, t):
+        FakeWorld.act(t)
+        self.head_drive.angles_at(t)
+        return np.zeros((4, 4, 3), np.uint8)
+
+    def close(self):
+        self.closed += 1
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    monkeypatch.setattr("cotarget.emulators.world.SimWorld", FakeWorld)
+    monkeypatch.setattr(FakeWorld, "act", lambda t: None, raising=False)
+    return FakeWorld
+
+
+def no_memory(*_):
+    raise MemoryError("no more")
+
+
+@pytest.mark.wire
+def test_a_world_that_fails_at_its_first_picture_says_why_at_once(fake):
+    fake.act = no_memory
+    threads = threading.active_count()
+    begun = time.monotonic()
+    with pytest.raises(DeviceError, match=r"the simulated world failed: MemoryError\('no more'\)"):
+        LiveWorld(RigConfig())
+    assert time.monotonic() - begun < DEADLINE_S
+    assert threading.active_count() == threads
+
+
+@pytest.mark.wire
+def test_a_world_that_fails_later_says_so_to_who_asks(fake):
+    with LiveWorld(RigConfig()) as world:
+        world.check()
+        assert world.still().shape == (4, 4, 3)
+        fake.act = no_memory
+        deadline = time.monotonic() + DEADLINE_S
+        while not world._failure:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        for call in (world.check, world.still):
+            with pytest.raises(DeviceError, match=r"the simulated world failed: MemoryError\('no more'\)"):
+                call()
+        assert world._world.closed == 1
+
+
+@pytest.mark.wire
+def test_a_world_goes_on_after_the_machine_stood_still(fake):
+    """An exposure is under way, the machine sleeps, and the head's next command forgets how it stood then."""
+    exposing, awake, moments = threading.Event(), threading.Event(), []
+
+    def act(t):
+        moments.append(t)
+        exposing.set()
+        assert awake.wait(DEADLINE_S)
+
+    with LiveWorld(RigConfig()) as world:
+        world.pan.command(10, 1000, 1000)
+        fake.act = act
+        assert exposing.wait(DEADLINE_S)
+        world.clock._start -= 4 * REMEMBERED
+        world.pan.command(0, 1000, 1000)
+        awake.set()
+        after = world.clock.now()
+        newest = world.feeds["fixed"].newest()
+        deadline = time.monotonic() + DEADLINE_S
+        while newest is None or newest.t < world.clock.monotonic(after):
+            assert time.monotonic() < deadline
+            newest = world.feeds["fixed"].newest(after=-1 if newest is None else newest.index, timeout=DEADLINE_S)
+        world.check()
+    assert moments[0] < after - REMEMBERED
+    assert not [t for t in moments[1:] if t < after - REMEMBERED]
 
 
 @pytest.mark.wire

@@ -4,127 +4,33 @@ Pictures leave through `Feed`s when their latency is over, by a thread that does
 does not make the other camera late. Axes and lens are commanded from the servers' threads.
 """
 
+import contextlib
 import heapq
 import itertools
 import logging
 import math
 import queue
 import threading
-import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from cotarget.config import RigConfig, SimCamera
+from cotarget.emulators.mechanics import REMEMBERED, EmulatedAxis, EmulatedLens, WallClock
 from cotarget.emulators.plant import Feed, Picture
-from cotarget.errors import DeviceError
+from cotarget.errors import CotargetError, DeviceError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Image
-from cotarget.sim.motion import Axis, LensDrive
 from cotarget.sim.truth import CameraName
 from cotarget.sim.world import SimWorld
 
 log = logging.getLogger(__name__)
 
 FIXED_HZ, ZOOM_HZ = 15.0, 10.0  # what one core renders beside a client on another
-REMEMBERED = 5.0  # how far back the axes are asked for exposures [s]
+OLDEST = REMEMBERED - 1.0  # exposures are left out where the machine, or this program, stood still for longer [s]
 STILL_TIMEOUT = 5.0  # [s]
 START_TIMEOUT = 60.0  # to compile the world and open OpenGL on a slow machine [s]
 STILL_INDEX = 1_000_000_000  # stills draw their noise from numbers that no stream reaches
 UNTIL_NEXT_LOOK = 0.25  # at most, so that an end is noticed [s]
-
-
-class WallClock:
-    """The machine's monotonic clock from a start."""
-
-    def __init__(self) -> None:
-        self._start = time.monotonic()
-
-    def now(self) -> float:
-        """Seconds since it was made."""
-        return time.monotonic() - self._start
-
-    def sleep_until(self, t: float) -> None:
-        """Return when the clock shows ``t`` [s]."""
-        time.sleep(max(t - self.now(), 0.0))
-
-    def monotonic(self, t: float) -> float:
-        """The machine's monotonic time when this clock shows ``t`` [s]."""
-        return self._start + t
-
-
-class EmulatedAxis:
-    """One axis of the simulated head in the steps of a pan-tilt unit; an `AxisPlant`.
-
-    Args:
-        axis: of the simulation, in radians.
-        clock: the world's.
-        step: of the unit, negative where it counts the other way [rad].
-        delay: from a command to motion [s].
-    """
-
-    def __init__(self, axis: Axis, clock: WallClock, step: float, delay: float) -> None:
-        self._axis, self._clock, self._step, self._delay = axis, clock, step, delay
-        self._rests = 0.0
-        self._lock = threading.Lock()
-
-    def command(self, goal: int, speed: float, acceleration: float) -> None:
-        """Go there from now on: steps, steps/s, steps/s^2."""
-        with self._lock:
-            t = self._begin(acceleration)
-            self._rests = self._axis.command(t, goal * self._step, speed * abs(self._step))
-
-    def halt(self, acceleration: float) -> None:
-        """Brake from now on."""
-        with self._lock:
-            self._rests = self._axis.halt(self._begin(acceleration))
-
-    def position(self) -> int:
-        """Where it is now [steps]."""
-        return round(self._axis.motor(self._clock.now())[0] / self._step)
-
-    def speed(self) -> float:
-        """How fast it turns now [steps/s]."""
-        return self._axis.motor(self._clock.now())[1] / self._step
-
-    def moving(self) -> bool:
-        """Whether it turns, or is about to."""
-        return self._clock.now() < self._rests
-
-    def _begin(self, acceleration: float) -> float:
-        """When a command given now takes effect; what nobody asks for any more is forgotten."""
-        now = self._clock.now()
-        self._axis.forget(now - REMEMBERED)
-        if math.isfinite(self._axis.acceleration):
-            self._axis.acceleration = acceleration * abs(self._step)
-        return now + self._delay
-
-
-class EmulatedLens:
-    """The simulated zoom lens; a `LensPlant`."""
-
-    def __init__(self, drive: LensDrive, clock: WallClock, delay: float) -> None:
-        self._drive, self._clock, self._delay = drive, clock, delay
-        self._rests = 0.0
-        self._lock = threading.Lock()
-
-    @property
-    def last(self) -> int:
-        """The number of its last position."""
-        return self._drive.last
-
-    def command(self, position: int) -> None:
-        """Go there from now on."""
-        with self._lock:
-            now = self._clock.now()
-            self._drive.axis.forget(now - REMEMBERED)
-            self._rests = self._drive.axis.command(now + self._delay, float(min(max(position, 0), self.last)))
-
-    def position(self) -> int:
-        """Where it is now."""
-        return round(self._drive.axis.motor(self._clock.now())[0])
-
-    def moving(self) -> bool:
-        """Whether it moves, or is about to."""
-        return self._clock.now() < self._rests
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +59,7 @@ class LiveWorld:
 
     Raises:
         ConfigError: an unknown scene or target.
-        DeviceError: the machine cannot render.
+        DeviceError: the machine cannot render, or the world failed at its first pictures.
     """
 
     def __init__(self, config: RigConfig, *, pan_sign: int = 1) -> None:
@@ -163,9 +69,10 @@ class LiveWorld:
         self._stills: queue.SimpleQueue[_Still] = queue.SimpleQueue()
         self._due: queue.SimpleQueue[tuple[float, CameraName, Picture] | None] = queue.SimpleQueue()
         self._ended = threading.Event()
-        self._started: queue.SimpleQueue[SimWorld | BaseException] = queue.SimpleQueue()
+        self._failure = ""
+        self._started: queue.SimpleQueue[SimWorld | CotargetError] = queue.SimpleQueue()
         self._threads = [
-            threading.Thread(target=run, name=f"world {name}", daemon=True)
+            threading.Thread(target=self._guarded, args=(run,), name=f"world {name}", daemon=True)
             for name, run in (("render", self._render), ("publish", self._publish))
         ]
         for thread in self._threads:
@@ -174,7 +81,7 @@ class LiveWorld:
             world = self._started.get(timeout=START_TIMEOUT)
         except queue.Empty:
             world = DeviceError(f"the simulated world did not start within {START_TIMEOUT:g} s")
-        if isinstance(world, BaseException):
+        if isinstance(world, CotargetError):
             self.close()
             raise world
         self._world = world
@@ -185,12 +92,22 @@ class LiveWorld:
         self.tilt = EmulatedAxis(world.head_drive.tilt, self.clock, step, delay)
         self.lens = EmulatedLens(world.lens_drive, self.clock, delay)
 
+    def check(self) -> None:
+        """Look whether the world lives; one that has failed shows nothing any more.
+
+        Raises:
+            DeviceError: it has failed, and why.
+        """
+        if self._failure:
+            raise DeviceError(self._failure)
+
     def still(self) -> Image:
         """Take a picture with the zoom camera now, (H, W, 3) BGR.
 
         Raises:
-            DeviceError: the world has ended, or is far too slow.
+            DeviceError: the world has ended or failed, or is far too slow.
         """
+        self.check()
         answer: queue.SimpleQueue[Image] = queue.SimpleQueue()
         self._stills.put(_Still(self.clock.now(), answer))
         try:
@@ -226,20 +143,30 @@ class LiveWorld:
         """Close."""
         self.close()
 
-    def _render(self) -> None:
-        """Expose both cameras at their rates, and stills on demand."""
+    def _guarded(self, run: Callable[[], None]) -> None:
+        """Do what a thread does; what fails is told to who waits for the world, and to who asks for it later."""
         try:
-            world = SimWorld(self.config, self.clock)
-        except BaseException as error:
-            self._started.put(error)
-            return
-        sim = self.config.sim
-        cameras: dict[CameraName, SimCamera] = {"fixed": sim.fixed, "zoom": sim.zoom}
-        late = {n: c.latency_s if sim.effects.latency else 0.0 for n, c in cameras.items()}
-        for name in cameras:
-            world.expose(name, 0, 0.0)  # the first render of each takes seconds where shaders are compiled
+            run()
+        except Exception as error:
+            log.debug("the simulated world failed", exc_info=True)
+            known = isinstance(error, CotargetError)
+            self._failure = str(error) if known else f"the simulated world failed: {error!r}"
+            self._started.put(error if isinstance(error, CotargetError) else DeviceError(self._failure))
+
+    def _render(self) -> None:
+        """Make the world and show it until the end."""
+        with contextlib.closing(SimWorld(self.config, self.clock)) as world:
+            sim = self.config.sim
+            cameras: dict[CameraName, SimCamera] = {"fixed": sim.fixed, "zoom": sim.zoom}
+            for name in cameras:
+                world.expose(name, 0, 0.0)  # the first render of each takes seconds where shaders are compiled
+            self._started.put(world)
+            self._show(world, cameras)
+
+    def _show(self, world: SimWorld, cameras: Mapping[CameraName, SimCamera]) -> None:
+        """Expose both cameras at their rates, and stills on demand."""
+        latency = self.config.sim.effects.latency
         next_index = {name: math.ceil(self.clock.now() * camera.rate_hz) for name, camera in cameras.items()}
-        self._started.put(world)
         numbers = itertools.count(STILL_INDEX)
         while not self._ended.is_set():
             try:
@@ -247,19 +174,35 @@ class LiveWorld:
             except queue.Empty:
                 pass
             else:
-                still.answer.put(world.expose("zoom", next(numbers), still.t))
+                image = self._expose(world, "zoom", next(numbers), still.t)
+                if image is not None:
+                    still.answer.put(image)
                 continue
             name = min(next_index, key=lambda n: next_index[n] / cameras[n].rate_hz)
-            t = next_index[name] / cameras[name].rate_hz
+            index, rate = next_index[name], cameras[name].rate_hz
+            t = index / rate
             wait = t - self.clock.now()
             if wait > 0:
                 self._ended.wait(min(wait, UNTIL_NEXT_LOOK))
                 continue
-            image = world.expose(name, next_index[name], t)
-            self._due.put((t + late[name], name, Picture(image, next_index[name], self.clock.monotonic(t))))
+            image = self._expose(world, name, index, t)
+            if image is not None:
+                due = t + (cameras[name].latency_s if latency else 0.0)
+                self._due.put((due, name, Picture(image, index, self.clock.monotonic(t))))
             # A world that cannot keep up leaves frames out, but tells the truth of those it shows.
-            next_index[name] = max(next_index[name] + 1, math.ceil(self.clock.now() * cameras[name].rate_hz - 1))
-        world.close()
+            next_index[name] = max(index + 1, math.ceil(self.clock.now() * rate - 1))
+
+    def _expose(self, world: SimWorld, name: CameraName, index: int, t: float) -> Image | None:
+        """A camera's picture of then; None where nobody remembers any more how everything stood."""
+        try:
+            return None if self._is_forgotten(t) else world.expose(name, index, t)
+        except Exception:
+            if self._is_forgotten(t):  # meanwhile
+                return None
+            raise
+
+    def _is_forgotten(self, t: float) -> bool:
+        return self.clock.now() - t > OLDEST
 
     def _publish(self) -> None:
         """Let pictures out when they are due."""
