@@ -7,12 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
+from cotarget import __version__
 from cotarget.calibration import calibrate_captures, calibrate_photos, calibrate_rig
-from cotarget.calibration.captures import INDEX
+from cotarget.calibration.captures import INDEX, read_index
 from cotarget.calibration.plan import GRID, Coverage
 from cotarget.calibration.recorder import Recorder
-from cotarget.config import BoardConfig
-from cotarget.errors import CalibrationError
+from cotarget.config import BoardConfig, parse_config
+from cotarget.errors import CalibrationError, DeviceError
 from cotarget.geometry import pose
 from cotarget.rig import PanTiltLimits
 from experiments.synthetic import SIZE, Truth, pointing_errors
@@ -74,6 +75,40 @@ def test_captures_give_the_same_calibration(session):
         calibrate_rig(SyntheticRig(), BOARD, captures_dir=directory)
 
 
+def test_a_session_that_is_killed_leaves_every_image_in_the_index(tmp_path):
+    """Also those of the placement that is under way: in the zoom stage one of them holds many."""
+    recorder = Recorder(SyntheticRig(), BOARD, tmp_path)
+    recorder.start()
+    recorder.present(pose([-0.4, -0.25, 3.0], [0, 0, 0]))
+    for count in range(1, 4):
+        recorder.see_fixed()
+        assert [capture.source for capture in read_index(tmp_path).captures] == sorted(
+            path.name for path in tmp_path.glob("*.png")
+        )
+        assert len(read_index(tmp_path).captures) == count
+
+
+def test_a_session_leaves_what_rig_it_was_and_what_it_was_told_to_do(tmp_path):
+    config = parse_config({"hardware": {"fixed": {"password": "secret", "url": "http://me:secret@server"}}})
+    recorder = Recorder(SyntheticRig(), BOARD, tmp_path, config=config)
+    recorder.start()
+    recorder.present(pose([-0.4, -0.25, 3.0], [0, 20, 0]))
+    recorder.turn(0.25, -0.1)
+    session = json.loads((tmp_path / "session.json").read_text())
+    assert session["versions"]["cotarget"] == __version__
+    assert parse_config(session["config"]).hardware.zoom == config.hardware.zoom
+    assert "secret" not in (tmp_path / "session.json").read_text()
+    commands = [json.loads(line) for line in (tmp_path / "commands.jsonl").read_text().splitlines()]
+    assert [each["do"] for each in commands] == ["zoom", "turn", "present", "turn"]
+    assert commands[2]["asked"] == {
+        "translation": [-0.4, -0.25, 3.0],
+        "rotvec_deg": pytest.approx([0, 20, 0], abs=0.01),
+    }
+    assert commands[3]["asked"] == [0.25, -0.1]
+    assert commands[3]["got"] == pytest.approx([0.25, -0.1], abs=1e-3)
+    assert all(a["t"] <= b["t"] for a, b in itertools.pairwise(commands))
+
+
 NARROW = PanTiltLimits((-0.4, 0.4), (-0.4, 0.4), 2.6, 3.6, 0.0009)
 
 
@@ -102,6 +137,49 @@ def test_a_head_that_was_halted_on_its_way_is_sent_again_once(halts, arrives):
             CalibrationError, match=r"the head stands at pan 14\.\d+, tilt 2\.\d+ degrees where pan 28\."
         ):
             recorder.turn(0.5, 0.1)
+
+
+class Interrupted:
+    """A rig whose user presses Ctrl-C at its n-th frame, and whose board's holder is gone by then."""
+
+    def __init__(self, frames):
+        self.rig, self.log = SyntheticRig(), []
+        read, present = self.rig.fixed.read, self.rig.board.present
+
+        def interrupted(*args, **options):
+            if self.rig.frames >= frames:
+                raise KeyboardInterrupt
+            return read(*args, **options)
+
+        def gone(wish):
+            if wish is None:
+                self.log.append("board")
+                raise DeviceError("whoever holds the board is gone")
+            present(wish)
+
+        self.rig.fixed.read, self.rig.board.present = interrupted, gone
+        self.rig.head.halt = lambda: self.log.append("halt")
+
+
+def test_an_interrupted_session_halts_the_head_before_anything_else_and_keeps_what_it_has(tmp_path, caplog):
+    made = Interrupted(frames=6)
+    with pytest.raises(KeyboardInterrupt):
+        calibrate_rig(made.rig, BOARD, captures_dir=tmp_path)
+    assert made.log == ["halt", "board"]
+    assert (tmp_path / INDEX).exists()
+    assert "while the session was broken off: whoever holds the board is gone" in caplog.text
+
+
+def test_a_head_that_cannot_be_halted_hides_no_error(tmp_path):
+    made = Interrupted(frames=6)
+
+    def halt():
+        raise DeviceError("the line is lost")
+
+    made.rig.head.halt = halt
+    with pytest.raises(KeyboardInterrupt):
+        calibrate_rig(made.rig, BOARD, captures_dir=tmp_path)
+    assert made.log == ["board"]
 
 
 def captures(tmp_path, rows, **changes):

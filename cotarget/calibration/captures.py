@@ -2,7 +2,7 @@
 
 index.json: schema; board; pitch_mm (or null); captures, one object an image with file, camera, board (the number of
 the placement), pan and tilt [rad], focal_px (null for the fixed camera), t [s]. The index is replaced in one step
-after every placement, so that a session that is cut short can still be used up to there.
+after every image, so that a session that is cut short, however, can still be used up to there.
 """
 
 import json

@@ -9,9 +9,10 @@ import numpy as np
 from cotarget.calibration.boards import find_corners
 from cotarget.calibration.captures import INDEX, NO_IMAGE, CaptureIndex, file_name, write_image, write_index
 from cotarget.calibration.model import Capture, Rejected, View, unseen
-from cotarget.config import BoardConfig
+from cotarget.calibration.sessionlog import write_command, write_session
+from cotarget.config import BoardConfig, RigConfig
 from cotarget.errors import CalibrationError, DeviceError
-from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.geometry import Array, RigidTransform, Rotation, pose_dict
 from cotarget.rig import Image, PanTiltState, Rig, ZoomState
 
 # Wishes are rounded to 0.1 mm and 0.1 mrad. Nobody holds a board better; and the fits behind a plan sum in an order
@@ -75,6 +76,7 @@ class Recorder:
         directory: where captures go; None to keep the corners only.
         pitch_mm: size of a pixel of the zoom camera [mm], for the index.
         settle: how long after a stop an image is still taken for one of before [s].
+        config: of the rig, to be kept beside the captures; None where a program made the rig otherwise.
         views: found so far.
         rejected: images in which a board was expected and not found.
         number: of the board's placement now.
@@ -85,6 +87,7 @@ class Recorder:
     directory: Path | None = None
     pitch_mm: float | None = None
     settle: float = SETTLE
+    config: RigConfig | None = None
     views: list[View] = field(default_factory=list)
     rejected: list[Rejected] = field(default_factory=list)
     number: int = -1
@@ -104,6 +107,7 @@ class Recorder:
                 raise CalibrationError(f"{self.directory}: cannot be made: {error.strerror}") from None
             if (self.directory / INDEX).exists():
                 raise CalibrationError(f"{self.directory}: already holds captures; give another folder")
+            write_session(self.directory, self.config)
         self.zoom(self.rig.zoom.focal_range[0])
         self.turn(0.0, 0.0)
 
@@ -114,7 +118,8 @@ class Recorder:
             CalibrationError: the lens goes on moving, or does not reach what it said it would.
         """
         lens, clock = self.rig.zoom, self.rig.clock
-        wanted = lens.zoom(nominal_px)
+        begin, wanted = clock.now(), lens.zoom(nominal_px)
+        self._note(begin, "zoom", nominal_px, wanted)
         clock.sleep_until(clock.now() + POLL)
         state = wait_for_lens(self.rig)
         if abs(np.log(state.focal_px / wanted)) > LENS_TOLERANCE:
@@ -126,12 +131,12 @@ class Recorder:
 
     def present(self, T_fixed_board: RigidTransform) -> int:
         """Ask for the board at a pose, as a new placement; its number."""
-        self.save_index()
         wish = RigidTransform.from_components(
             np.round(T_fixed_board.translation, WISH_DECIMALS),
             Rotation.from_rotvec(np.round(T_fixed_board.rotation.as_rotvec(), WISH_DECIMALS)),
         )
         before = self._fixed_corners() if self.rig.board.patience else None
+        self._note(self.rig.clock.now(), "present", pose_dict(wish))
         self.rig.board.present(wish)
         if self.rig.board.patience:
             self._wait_until_held(before)
@@ -169,7 +174,9 @@ class Recorder:
         """
         for _ in range(TURN_TRIES):
             before = self.rig.head.state()
-            wanted = self.rig.head.move(round(pan, WISH_DECIMALS), round(tilt, WISH_DECIMALS), wait=True)
+            begin, wish = self.rig.clock.now(), (round(pan, WISH_DECIMALS), round(tilt, WISH_DECIMALS))
+            wanted = self.rig.head.move(*wish, wait=True)
+            self._note(begin, "turn", wish, wanted)
             way = max(abs(wanted[0] - before.pan), abs(wanted[1] - before.tilt))
             state, arrived = self._wait_for_head(wanted, way)
             if arrived:
@@ -221,6 +228,11 @@ class Recorder:
         if self.directory is not None and self._captures:
             write_index(self.directory, CaptureIndex(self.board, self.pitch_mm, tuple(self._captures)))
 
+    def _note(self, t: float, do: str, asked: object, got: object = None) -> None:
+        """Note a command, where captures are kept."""
+        if self.directory is not None:
+            write_command(self.directory, t, do, asked, got)
+
     def _keep(self, capture: Capture, expected: bool, find: Finder | None = None) -> View | None:
         """Find the board; keep the image where it was found, or should have been."""
         if find is None:
@@ -235,6 +247,7 @@ class Recorder:
             write_image(self.directory / capture.source, capture.image)
         capture = replace(capture, image=NO_IMAGE)
         self._captures.append(capture)
+        self.save_index()
         if corners is None:
             self.rejected.append(Rejected(str(capture.source), "the board was expected but not found"))
             return None
