@@ -30,7 +30,7 @@ class HardwareHead:
         step_deg: resolution that the unit is expected to report [degrees].
         pan_deg: lowest and highest pan that it is expected to report, in this file's sense of pan [degrees].
         tilt_deg: the same of tilt [degrees].
-        pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left.
+        pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left, as the D46's manual has it.
         tilt_sign: 1 where the unit's positive tilt goes up, -1 where it goes down.
         speed_deg_s: speed of moves, as far as the unit allows [degrees/s].
         command_delay_s: from a command to the start of motion, as measured [s].
@@ -41,7 +41,7 @@ class HardwareHead:
     step_deg: float = 0.0514286
     pan_deg: Pair = (-158.9, 158.9)
     tilt_deg: Pair = (-46.6, 31.1)
-    pan_sign: Literal[1, -1] = 1
+    pan_sign: Literal[1, -1] = -1
     tilt_sign: Literal[1, -1] = 1
     speed_deg_s: float = 149.0
     command_delay_s: float = 0.04

@@ -8,7 +8,8 @@ from cotarget.hwconfig import HardwareHead
 from tests.d46_peer import SimPort, Unit
 from tests.simulated_clock import SimClock
 
-CONFIG = HardwareHead(port="PORT", pan_deg=(-158.9, 158.9), tilt_deg=(-46.6, 31.1), command_delay_s=0.04)
+# With pan in the unit's own sense, so that what is sent is what the tests say.
+CONFIG = HardwareHead(port="PORT", pan_deg=(-158.9, 158.9), tilt_deg=(-46.6, 31.1), pan_sign=1, command_delay_s=0.04)
 
 
 class Bench:
@@ -54,7 +55,6 @@ class Bench:
         return heard
 
     def halt(self):
-        wish = Halt()
-        self.loop.halted = next(self.numbers)
+        wish = Halt(next(self.numbers))
         self.loop.halts.append(wish)
         return wish

@@ -30,6 +30,7 @@ class Unit:
         self.velocity = False
         self.scripted = {}  # command -> replies to give instead, in order; None is silence
         self.says_first = b""  # before the next reply
+        self.noise = b""  # in front of the next byte that it hears
         self._input = b""
 
     def position(self, axis):
@@ -47,8 +48,8 @@ class Unit:
 
     def receive(self, data):
         """Take bytes; return the reply to each command that they complete."""
-        self._input += data
-        reply = b""
+        self._input += self.noise + data
+        self.noise, reply = b"", b""
         while b" " in self._input:
             order, self._input = self._input.split(b" ", 1)
             reply += (order + b" " if self.echo else b"") + (self.answer(order.decode()) if order else b"")

@@ -8,12 +8,16 @@ import time
 import pytest
 import serial
 
+from cotarget.config import SafetyConfig
 from cotarget.errors import ConfigError, DeviceError
+from cotarget.hardware.d46lost import LostPosition
+from cotarget.hardware.d46wishes import Move
 from cotarget.hardware.head import D46Head
 from cotarget.hwconfig import HardwareHead
 from tests.d46_bench import CONFIG, Bench
 
 STEP = math.radians(185.1428 / 3600)
+CARELESS = SafetyConfig()
 LIMITS_DEG = ((-158.91, 158.91), (-46.65, 31.06))  # 3090 and -907..604 steps of 185.1428 seconds of arc
 
 
@@ -30,13 +34,15 @@ def bench():
 
 
 @pytest.fixture
-def opened(bench, monkeypatch):
-    """Open heads on the bench through pyserial's own function."""
+def opened(bench, monkeypatch, tmp_path):
+    """Open heads on the bench through pyserial's own function; what is remembered is forgotten after the test."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     monkeypatch.setattr(serial, "serial_for_url", lambda *_, **__: bench.port)
     heads = []
 
-    def open_head(config=CONFIG):
-        heads.append(D46Head(config, bench.clock))
+    def open_head(config=CONFIG, safety=CARELESS):
+        bench.port.closed = False
+        heads.append(D46Head(config, bench.clock, safety))
         return heads[-1]
 
     yield open_head
@@ -52,6 +58,13 @@ def test_limits_are_the_units_in_the_sense_of_the_file(opened, bench):
     assert limits.step == pytest.approx(STEP)
     assert math.degrees(limits.speed) == pytest.approx(149.0)
     assert limits.acceleration == pytest.approx(2000 * STEP)
+
+
+def test_as_the_manual_has_it_a_unit_counts_to_the_left(opened, bench):
+    """Positive pan of a PTU-D46 turns left, says its manual; that of a rig turns right. Tilt goes up for both."""
+    head = opened(HardwareHead(port="PORT"))
+    head.move(10 * STEP, 20 * STEP, wait=True)
+    assert bench.unit.goals() == (-10, 20)
 
 
 def test_signs_turn_axes_round(opened, bench):
@@ -74,11 +87,32 @@ def test_what_is_really_commanded_is_returned(opened, bench):
     assert (state.pan, state.tilt) == (pytest.approx(STEP), pytest.approx(-2 * STEP))
 
 
-@pytest.mark.parametrize(("asked", "set_to"), [(None, 2897), (0.1, 111), (1e-9, 31), (1e9, 2897)])
+@pytest.mark.parametrize(
+    ("asked", "set_to"),
+    [(None, 2897), (0.1, 111), (111.6 * STEP, 111), (112 * STEP, 112), (1e-9, 31), (1e9, 2897)],
+)
 def test_speeds_are_within_the_units_and_the_files_bounds(opened, bench, asked, set_to):
     # 149 degrees a second are 2897 steps; 0.1 rad/s is 111.
     opened().move(STEP, STEP, speed=asked, wait=True)
     assert bench.unit.speed == {"P": set_to, "T": set_to}
+
+
+SLOW = "0.5 degrees/s is slower than the unit at PORT can turn; it takes 1.6 at least"  # 31 steps/s
+
+
+@pytest.mark.parametrize(
+    ("config", "safety", "key"),
+    [
+        (HardwareHead(**{**vars(CONFIG), "speed_deg_s": 0.5}), SafetyConfig(), "hardware.head"),
+        (CONFIG, SafetyConfig(speed_deg_s=0.5), "safety"),
+    ],
+)
+def test_a_speed_cap_that_the_unit_cannot_keep_is_refused(opened, bench, config, safety, key):
+    with pytest.raises(ConfigError) as caught:
+        opened(config, safety)
+    assert str(caught.value) == f"{key}.speed_deg_s: {SLOW}"
+    assert bench.port.closed
+    opened(CONFIG, SafetyConfig(speed_deg_s=1.6))
 
 
 @pytest.mark.parametrize("values", [(math.nan, 0.0, None), (0.0, math.inf, None), (0.0, 0.0, 0.0), (0, 0, math.nan)])
@@ -119,6 +153,26 @@ def test_halts_from_many_threads(opened, bench):
         thread.join()
     head.halt()
     assert not bench.unit.turning()
+
+
+def test_halts_at_once_let_no_older_move_through(opened, bench):
+    """One thread has taken its halt's number; before it goes on, another takes a move's and halts too."""
+    head = opened()
+    numbers, stale = head._numbers, []
+
+    class Interrupted:
+        def __next__(self):
+            head._numbers, number = numbers, next(numbers)
+            stale.append(Move(next(numbers), (3000, 0), (1000, 1000)))
+            head.halt()
+            return number
+
+    head._numbers = Interrupted()
+    head.halt()
+    head._loop.moves.append(stale[0])
+    assert stale[0].done.wait(20.0)
+    assert str(stale[0].error) == "the move was halted"
+    assert bench.unit.goals() == (0, 0)
 
 
 def test_a_signal_handler_may_halt_whatever_it_interrupts(opened, bench):
@@ -175,6 +229,62 @@ def test_after_a_limit_hit_every_call_but_halt_fails(opened, bench):
             for_ever(head.state)
     head.halt()
     assert bench.unit.heard[-1] == "H"
+
+
+def limit_hit(bench):
+    bench.unit.says_first = b"!P"
+
+
+def stall(bench):
+    bench.unit.stuck = True
+
+
+def power_cycle(bench):
+    bench.unit.echo = bench.unit.verbose = True
+
+
+@pytest.mark.parametrize("event", [limit_hit, stall, power_cycle])
+@pytest.mark.parametrize("stop_file", [False, True])
+def test_a_lost_position_is_remembered_until_the_unit_was_reset(opened, bench, tmp_path, event, stop_file):
+    """By every later program, which does not even open the port; beside the stop file, if there is one."""
+    safety = SafetyConfig(stop_file=tmp_path / "run" / "stop" if stop_file else None)
+    head = opened(CONFIG, safety)
+    head.move(1000 * STEP, 0.0)
+    event(bench)
+    with pytest.raises(DeviceError) as caught:
+        for_ever(head.state)
+    head.close()
+    bench.unit.stuck = bench.unit.echo = bench.unit.verbose = False
+    file = tmp_path / ("run/stop.PORT.position-lost" if stop_file else "cotarget/head.PORT.position-lost")
+    assert file.read_text() == f"{caught.value}\n"
+    bench.unit.heard.clear()
+    for port in ("PORT", "ANOTHER"):  # as an adapter that was replugged may have
+        with pytest.raises(DeviceError) as again:
+            opened(HardwareHead(**{**vars(CONFIG), "port": port}), safety)
+        assert str(again.value) == f"{caught.value} (or, where no unit is at that port any more, remove {file})"
+    assert bench.unit.heard == []
+    LostPosition("PORT", safety.stop_file).forget()
+    opened(CONFIG, safety).state()
+
+
+@pytest.mark.parametrize("when", ["PU", "TP"])
+def test_a_position_that_is_lost_while_it_is_opened_is_remembered_too(opened, bench, when):
+    bench.unit.scripted = {when: [b"!P* 2902\r\n" if when == "PU" else b"!P* 0\r\n"]}
+    with pytest.raises(DeviceError, match="pan hit its limit"):
+        opened()
+    bench.unit.scripted = {}
+    with pytest.raises(DeviceError, match=r"pan hit its limit .* remove"):
+        opened()
+
+
+def test_what_leaves_the_position_known_is_not_remembered(opened, bench):
+    head = opened()
+    bench.port.broken = OSError(5, "Input/output error")
+    with pytest.raises(DeviceError, match="is lost"):
+        for_ever(head.state)
+    head.close()
+    bench.port.broken = None
+    opened().move(STEP, 0.0, wait=True)
 
 
 def test_who_waits_is_told_of_the_end(opened, bench):

@@ -4,7 +4,7 @@ import pytest
 import serial
 
 from cotarget.errors import ConfigError, DeviceError
-from cotarget.hardware.d46unit import probe, reset
+from cotarget.hardware.d46unit import probe
 from cotarget.hardware.line import open_line
 from cotarget.hwconfig import HardwareHead
 from tests.d46_bench import CONFIG, Bench
@@ -144,28 +144,33 @@ def test_a_look_at_a_unit_changes_nothing(opened, monkeypatch):
         probe("PORT", 9600)
 
 
-def test_a_reset_reads_its_answer_to_the_end(opened):
-    opened.unit.facts |= {"PN": 0, "PX": 0}
-
-    def calibrate():
-        opened.unit.facts |= {"PN": -3090, "PX": 3090}
-        opened.port.inject(b"!T!T!P!P", after=20.0)
-        opened.port.inject(b"*\r\n", after=25.0)
-
-    opened.unit.scripted = {"R": [calibrate]}
-    assert reset(CONFIG, opened.clock).pan.highest == 3090
-    assert opened.unit.heard.count("R") == 1
-    assert opened.port.closed
+EVENTS = {"P": "pan hit its limit", "T": "tilt hit its limit", "D": "its cable came off"}
 
 
-def test_a_reset_that_does_not_end_is_halted(opened):
-    opened.unit.scripted = {"R": [None]}
-    with pytest.raises(DeviceError, match="did not answer in time"):
-        reset(CONFIG, opened.clock)
-    assert opened.unit.heard[-1] == "H"
-    opened.unit.facts |= {"PN": 0, "PX": 0}
-    with pytest.raises(DeviceError, match="is not calibrated"):
-        reset(CONFIG, opened.clock)
+@pytest.mark.parametrize("axis", EVENTS)
+@pytest.mark.parametrize("order", ["V", "PU", "H", "C"])
+def test_what_happens_while_it_is_opened_is_not_overheard(bench, axis, order):
+    """Inside an answer after the greeting; only what was said before that may be left from long ago."""
+    bench.unit.scripted = {order: [f"!{axis}*{' 2902' if order == 'PU' else ''}\r\n".encode()]}
+    with pytest.raises(DeviceError, match=rf"reports that {EVENTS[axis]} \(!{axis}\): it was halted, and its position"):
+        bench.connect()
+    assert bench.unit.heard[-1] in ("H", "I", "C", "CI")
+
+
+def test_a_byte_of_noise_at_the_unit_does_not_keep_it_from_being_halted(bench):
+    """It hears "xH", or with a delimiter in front of the halt "x" and "H"."""
+    bench.unit.way["P"] = (bench.clock.now(), 0, 3000)
+    bench.unit.scripted = {noise: [b"! Illegal argument\r\n"] for noise in ("x", "xH")}
+    last = bench.unit.obey
+
+    def obey(order):
+        if order == "TA":  # the last question before the halt
+            bench.unit.noise = b"x"
+        return last(order)
+
+    bench.unit.obey = obey
+    bench.connect()
+    assert not bench.unit.turning()
 
 
 def test_no_port_is_named():

@@ -1,11 +1,14 @@
 """The driver of the PTU-D46 against the emulated unit, in real time over a paced pseudo-terminal and TCP."""
 
 import math
+import os
+import signal
 import subprocess
 import sys
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -14,7 +17,9 @@ from cotarget.emulators.faults import Faults
 from cotarget.emulators.lines import SerialLine, TcpLine
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.hardware.clock import MonotonicClock
-from cotarget.hardware.d46unit import probe, reset
+from cotarget.hardware.d46lost import LostPosition
+from cotarget.hardware.d46reset import reset
+from cotarget.hardware.d46unit import probe
 from cotarget.hardware.head import D46Head
 from cotarget.hwconfig import HardwareHead
 from cotarget.sim.motion import Axis
@@ -72,6 +77,7 @@ class Bench:
             step_deg=step,
             pan_deg=tuple(step * end for end in profile.pan),
             tilt_deg=tuple(step * end for end in profile.tilt),
+            pan_sign=1,
         )
         self.heads = []
 
@@ -107,6 +113,13 @@ def fails(call):
             return str(error)
         time.sleep(0.001)
     raise AssertionError("it goes on and on")
+
+
+@pytest.fixture(autouse=True)
+def state_home(monkeypatch, tmp_path):
+    """What is remembered of units is forgotten after the test."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    return tmp_path
 
 
 @pytest.fixture(params=["pty", "tcp", "e-series"])
@@ -251,6 +264,9 @@ def test_a_limit_hit_ends_it(stock):
     assert not stock.turning()
     with pytest.raises(DeviceError, match="hit its limit"):
         head.move(0.0, 0.0)
+    head.close()
+    with pytest.raises(DeviceError, match=r"hit its limit .* run cotarget reset-head"):  # as the next program would
+        stock.open()
 
 
 def test_a_power_cycle_ends_it_and_a_reset_mends_it(hasty):
@@ -260,10 +276,59 @@ def test_a_power_cycle_ends_it_and_a_reset_mends_it(hasty):
     said = fails(head.state)
     assert "was switched off and on" in said or "does not answer any more" in said
     head.close()
+    lost = LostPosition(hasty.config.port, None)
+    if "was switched off and on" in said:
+        assert fails(hasty.open).startswith(said)
+    lost.forget()
     until(lambda: "is not calibrated" in fails(hasty.open))  # once it has started up
-    unit = reset(hasty.config, MonotonicClock())
+    lost.note(said)
+    unit = reset(hasty.config, MonotonicClock(), lost, lambda: None)
     assert (unit.pan.lowest, unit.pan.highest) == D46_STOCK.pan
     assert hasty.open().move(50 * STEP, 0.0, wait=True)[0] == pytest.approx(50 * STEP)
+
+
+slow = pytest.mark.slow
+NOT_HALTED = (
+    "does not acknowledge the halt and may go on turning until its reset ends: to stop it at once, switch it off"
+)
+
+
+@pytest.mark.parametrize(
+    ("how", "status"),
+    [
+        ("stop", 1),
+        (signal.SIGINT, 130),
+        (signal.SIGQUIT, 128 + signal.SIGQUIT),
+        *(pytest.param(n, 128 + n, marks=slow) for n in (signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)),
+    ],
+)
+def test_a_reset_is_broken_off_by_whatever_ends_it(stock, state_home, how, status):
+    """The emulated unit hears nothing while it resets itself: the operator is told at once."""
+    rig = state_home / "rig.toml"
+    rig.write_text(
+        f"backend = 'hardware'\n[hardware.head]\nport = '{stock.config.port}'\n[safety]\nstop_file = 'stop'\n"
+    )
+    path = {"PYTHONPATH": str(Path(__file__).parents[1])}
+    command = [sys.executable, "-m", "cotarget.cli", "reset-head", "--rig", rig, "--yes"]
+    process = subprocess.Popen(command, env=os.environ | path, stderr=subprocess.PIPE, text=True)
+    try:
+        until(stock.turning)
+        if how == "stop":
+            (state_home / "stop").touch()
+        else:
+            process.send_signal(how)
+        _, said = process.communicate(timeout=DEADLINE_S)
+    finally:
+        process.kill()
+        process.communicate()
+    assert process.returncode == status
+    assert NOT_HALTED in said
+    assert "Traceback" not in said
+    assert len(said.splitlines()) == 1 + (how == signal.SIGINT)
+    assert ("emergency stop: no reason given" in said) == (how == "stop")
+    lost = LostPosition(stock.config.port, state_home / "stop")
+    with pytest.raises(DeviceError, match="has begun a reset that did not come to its end"):
+        lost.refuse()
 
 
 @pytest.mark.parametrize("tcp", [False, True])

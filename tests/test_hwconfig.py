@@ -53,6 +53,12 @@ def test_socket_addresses(url, address):
     assert socket_address(url) == address
 
 
+def test_a_head_of_which_nothing_is_said_counts_as_the_makers_manual_has_it():
+    """Positive pan of a PTU-D46 turns left, where a rig's turns right; positive tilt goes up for both."""
+    head = parse_config({}).hardware.head
+    assert (head.pan_sign, head.tilt_sign) == (-1, 1)
+
+
 def test_the_backend_decides_which_device_speaks():
     """Half the S5 IS's viewfinder width is 160 px of 17.94 um: at 6 mm its focal length is 334.4 px."""
     config = parse_config(tomllib.loads('backend = "hardware"\nhardware.head.pan_deg = [-90, 90]'))

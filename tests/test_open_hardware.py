@@ -77,7 +77,7 @@ def test_the_head_comes_last_and_is_let_go_first(devices):
     with open_rig(CONFIG) as rig:
         assert log == [f"open {name}" for name in ORDER]
         assert rig.real_time
-        assert rig.head.arguments == (CONFIG.hardware.head, rig.clock)
+        assert rig.head.arguments == (CONFIG.hardware.head, rig.clock, CONFIG.safety)
         assert rig.fixed.arguments == (CONFIG.hardware.fixed, rig.clock)
         assert rig.zoom.arguments == (CONFIG.hardware.zoom, rig.clock)
         assert rig.board.arguments == (CONFIG.hardware.board,)

@@ -1,6 +1,7 @@
 """What an operator does with a rig, and how it can be told wrong: one line, and the head is left alone."""
 
 import io
+import json
 import socket
 import sys
 from pathlib import Path
@@ -8,14 +9,16 @@ from types import SimpleNamespace
 
 import pytest
 
-from cotarget import doctor
+from cotarget import cli, doctor
 from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
 from cotarget.doctor import Finding
 from cotarget.emulators.emulation import copied_tables
 from cotarget.errors import EmergencyStopError
-from cotarget.hardware import d46unit
+from cotarget.hardware import d46reset
+from cotarget.latency import Delay, HeadLatency
 from cotarget.safety import refuse_if_stopped
+from tests.safety_rigs import SimulatedRig
 from tests.test_cli import call, true_calibration
 
 NOBODY = "/dev/nobody-is-here"
@@ -150,6 +153,56 @@ def test_a_stopped_rig_is_not_even_opened(folder, capsys, command):
     assert "emergency stop" not in call(capsys, *command)[2]
 
 
+BROKEN = {
+    "an unknown key": "[hardware.head]\nbuad = 9600\n",
+    "an impossible value": "[hardware.head]\nbaud = 9601\n[board]\nsquare = -1\n",
+    "an unknown table": "[hardwear]\n",
+    "another mistake beside it": "",
+}
+
+
+@pytest.mark.parametrize("mistake", BROKEN)
+def test_a_rig_is_stopped_whatever_else_is_wrong_with_its_file(folder, capsys, mistake):
+    more = "" if BROKEN[mistake] else "watchdog_s = 0\npan_deg = 5\n"
+    (folder / "broken.toml").write_text(BROKEN[mistake] + STOP_FILE + more)
+    assert call(capsys, "point", "--rig", "broken.toml")[0] == 1
+    assert call(capsys, "stop", "--rig", "broken.toml")[0] == 0
+    assert (folder / "run" / "stop").exists()
+    assert call(capsys, "clear", "--rig", "broken.toml")[0] == 0
+
+
+def test_a_file_that_names_no_stop_file_any_more_is_told(folder, capsys):
+    (folder / "broken.toml").write_text('[safety]\nstop_file = "run/stop\n')
+    status, out, err = call(capsys, "stop", "--rig", "broken.toml")
+    assert (status, out) == (1, "")
+    assert err.startswith("cotarget stop: broken.toml: is not TOML: ")
+    assert err.endswith("the rig's stop file itself can be made and removed by hand\n")
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("delay", "configured"), [(0.02, 0.08), (-0.06, 0.0), (-0.065, 0.0), (-0.2, None)])
+def test_a_latency_that_cannot_be_is_refused(folder, capsys, monkeypatch, delay, configured):
+    """Frames of the default simulation are dated by 60 ms; less than zero by what is measured inaccurately is zero."""
+    found = HeadLatency(Delay(delay, 0.99), command=0.04, frames=100)
+    monkeypatch.setattr("cotarget.latency.measure_head", lambda rig: found)
+    monkeypatch.setattr("cotarget.rig.open_rig", lambda config: SimulatedRig())
+    status, out, err = call(capsys, "latency", "--rig", "sim.toml")
+    if configured is None:
+        assert (status, out) == (1, "")
+        assert err.splitlines()[-1].startswith("cotarget latency: sim.zoom.latency_s: -140 ms was measured, which is")
+    else:
+        assert status == 0
+        assert json.loads(out)["measured"] == {"sim.zoom.latency_s": configured, "sim.head.command_delay_s": 0.04}
+
+
+def test_every_fault_is_told_of(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["emulate", "--help"])
+    said = capsys.readouterr().out.split()
+    for fault in ("head.silence", "head.limit-hit", "fixed.stall", "zoom.gone"):
+        assert any(word.strip(",") == fault for word in said)
+
+
 def test_a_stop_that_cannot_be_made_is_shouted(folder, capsys):
     (folder / "run").write_text("in the way")
     status, out, err = call(capsys, "stop", "--rig", "stops.toml")
@@ -169,11 +222,12 @@ def resets(monkeypatch):
     axis = SimpleNamespace(lowest=-3090, highest=3090)
     asked = []
 
-    def reset(config, clock):
+    def reset(config, clock, lost, stopped):
+        assert stopped() is None
         asked.append(config.port)
         return SimpleNamespace(version="v2.12.1d1", pan=axis, tilt=axis)
 
-    monkeypatch.setattr(d46unit, "reset", reset)
+    monkeypatch.setattr(d46reset, "reset", reset)
     return asked
 
 

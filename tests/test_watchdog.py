@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 import threading
 import time
 from types import SimpleNamespace
@@ -9,10 +10,10 @@ from types import SimpleNamespace
 import pytest
 
 from cotarget.config import SafetyConfig, SimHead
-from cotarget.errors import DeviceError, StaleFrameError
+from cotarget.errors import DeviceError, EmergencyStopError, StaleFrameError
 from cotarget.rig import Frame
-from cotarget.safety import SafeRig
-from tests.safety_rigs import IMAGE, RealRig, SimulatedRig
+from cotarget.safety import SafeRig, guard, stopfile, stoplook
+from tests.safety_rigs import DEADLINE_S, IMAGE, RealRig, SimulatedRig
 
 WATCHDOG_S = 0.35  # the default
 FAR = math.radians(100)
@@ -274,6 +275,82 @@ def test_a_clock_that_fails_stops_the_head():
         rig.head.wait_for_halt()
         broken.clear()
         with pytest.raises(DeviceError, match="emergency stop: the watchdog failed: no such clock"):
+            safe.head.move(1.0, 0.0)
+
+
+class Hung:
+    """A file system that does not answer, as a network's may."""
+
+    def __init__(self, monkeypatch):
+        self._answers = threading.Event()
+        self._answers.set()
+        look = stopfile.stop_reason
+
+        def stop_reason(path):
+            assert self._answers.wait(DEADLINE_S)
+            return look(path)
+
+        for module in (guard, stoplook, stopfile):
+            monkeypatch.setattr(module, "stop_reason", stop_reason)
+
+    def hang(self):
+        self._answers.clear()
+
+    def answer(self):
+        self._answers.set()
+
+
+@pytest.fixture
+def hung(monkeypatch):
+    made = Hung(monkeypatch)
+    yield made
+    made.answer()
+
+
+@pytest.mark.wire
+def test_a_stop_file_that_cannot_be_looked_at_does_not_keep_the_watchdog_from_halting(hung, tmp_path, caplog):
+    rig = RealRig()
+    with SafeRig(rig, SafetyConfig(watchdog_s=SHORT_S, stop_file=tmp_path / "stop")) as safe:
+        safe.head.move(1.0, 0.0)
+        hung.hang()
+        assert rig.head.halted.wait(SHORT_S + TIMELY_S)
+        assert warnings(caplog)[0].startswith("halting the head: neither")
+        hung.answer()
+
+
+@pytest.mark.wire
+def test_it_counts_as_a_stop_until_it_answers(hung, tmp_path):
+    rig = RealRig()
+    with SafeRig(rig, SafetyConfig(watchdog_s=1000.0, stop_file=tmp_path / "stop")) as safe:
+        safe.head.move(1.0, 0.0)
+        hung.hang()
+        assert rig.head.halted.wait(TIMELY_S)
+        begun = time.monotonic()
+        with pytest.raises(EmergencyStopError, match=r"cannot be looked at: no answer within 0\.3 s"):
+            safe.head.move(1.0, 0.0)
+        assert time.monotonic() - begun < TIMELY_S
+        hung.answer()
+        deadline = time.monotonic() + DEADLINE_S
+        while safe.stopped:
+            assert time.monotonic() < deadline
+        safe.head.move(1.0, 0.0)
+        hung.hang()
+        begun = time.monotonic()
+        with pytest.raises(EmergencyStopError, match="cannot be looked at"):
+            safe.head.move(1.0, 0.0)
+        assert time.monotonic() - begun < TIMELY_S
+        hung.answer()
+    assert "cotarget-stop-file" not in {thread.name for thread in threading.enumerate()}
+
+
+@pytest.mark.wire
+def test_a_pipe_in_the_stop_files_place_stops(tmp_path):
+    rig = RealRig()
+    with SafeRig(rig, SafetyConfig(watchdog_s=1000.0, stop_file=tmp_path / "stop")) as safe:
+        safe.head.move(1.0, 0.0)
+        os.mkfifo(tmp_path / "stop")
+        rig.head.wait_for_halt()
+        with pytest.raises(EmergencyStopError, match="emergency stop: no reason given"):
             safe.head.move(1.0, 0.0)
 
 

@@ -92,6 +92,19 @@ class Child:
     def signal(self, number):
         self.process.send_signal(number)
 
+    def answer(self):
+        """Let the head be halted once."""
+        self.process.stdin.write(b"\n")
+
+    def is_suspended(self):
+        return Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
+
+    def wait_until_suspended(self):
+        deadline = time.monotonic() + DEADLINE_S
+        while not self.is_suspended():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
     def finish(self, answers=8):
         """Answer every halt from now on; its exit status, all of its lines and what it said on stderr."""
         out, err = self.process.communicate(b"\n" * answers, timeout=3 * DEADLINE_S)
@@ -121,6 +134,7 @@ def start(tmp_path):
     (signal.SIGINT, -signal.SIGINT, 4),
     (signal.SIGTERM, 128 + signal.SIGTERM, 1),
     (signal.SIGHUP, 128 + signal.SIGHUP, 1),  # a terminal that was closed, a connection that broke
+    (signal.SIGQUIT, 128 + signal.SIGQUIT, 1),  # Ctrl-\
 ])  # fmt: skip
 def test_a_signal_halts_the_head_and_further_ones_do_not_keep_it_from_that(start, number, status, again):
     child = start(PROGRAM + WORK)
@@ -132,6 +146,39 @@ def test_a_signal_halts_the_head_and_further_ones_do_not_keep_it_from_that(start
     returned, lines, _ = child.finish()
     assert lines == ["working", "halting", "halted", "closed"]
     assert returned == status
+
+
+@pytest.mark.parametrize("number", [signal.SIGTSTP, signal.SIGTTOU])
+def test_ctrl_z_halts_the_head_before_it_suspends_the_program(start, number):
+    child = start(PROGRAM + WORK)
+    child.wait_for("working")
+    child.signal(number)
+    child.wait_for("halting")
+    assert not child.is_suspended()
+    child.answer()
+    child.wait_until_suspended()
+    child.signal(signal.SIGCONT)
+    child.signal(signal.SIGTERM)
+    returned, lines, _ = child.finish()
+    assert lines == ["working", "halting", "halted", "halting", "halted", "closed"]
+    assert returned == 128 + signal.SIGTERM
+
+
+def test_a_program_whose_head_cannot_be_halted_is_not_suspended(start):
+    """Its watchdog goes on trying."""
+    broken = (
+        "tries = []\ndef halt():\n    tries.append(1)\n    say('tried')\n    if len(tries) < 3: raise OSError('dead')\n"
+    )
+    child = start(PROGRAM + broken + "rig.head.halt = halt\n" + WORK)
+    child.wait_for("working")
+    child.signal(signal.SIGTSTP)
+    for _ in range(3):
+        child.wait_for("tried")
+    child.signal(signal.SIGTERM)
+    returned, lines, err = child.finish()
+    assert lines == ["working", *["tried"] * 4, "closed"]
+    assert "not suspended, because the head could not be halted: dead" in err
+    assert returned == 128 + signal.SIGTERM
 
 
 def test_a_signal_while_a_good_end_halts_the_head_acts_afterwards(start):

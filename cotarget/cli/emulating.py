@@ -5,6 +5,7 @@ import os
 import sys
 import time
 import tomllib
+from typing import Any
 
 from cotarget.cli.arguments import check_outputs
 from cotarget.errors import ConfigError
@@ -15,6 +16,14 @@ LOOK = 0.2  # between looks at the time [s]
 # How long a thread that works in Python keeps others waiting [s]; with Python's own 5 ms, a line that is paced by a
 # thread of its own loses half of its rate beside the world's rendering.
 SWITCH_S = 5e-4
+STOP_FILE = "stop"  # beside the rig.toml that is written, where the simulated rig's names none
+
+
+def fault_names() -> str:
+    """The faults that can be switched on, as --help tells them."""
+    from cotarget.emulators.emulation import FAULTS
+
+    return "faults: " + ", ".join(f"{device}.{name}" for device, names in FAULTS.items() for name in names)
 
 
 def emulate(options: argparse.Namespace) -> None:
@@ -29,9 +38,10 @@ def emulate(options: argparse.Namespace) -> None:
     config = RigConfig() if options.rig is None else load_config(options.rig)
     if config.backend != "sim":
         raise ConfigError(f"{options.rig}: backend is '{config.backend}'; what is emulated is a simulated rig")
-    beside = {}
+    beside: dict[str, Any] = {}
     if options.rig is not None:
         beside = copied_tables(tomllib.loads(options.rig.read_text(encoding="utf-8")), options.rig.parent)
+    beside["safety"] = {"stop_file": STOP_FILE} | beside.get("safety", {})
     check_outputs([options.write], [options.rig])
     for fault in options.fault:
         parse_fault(fault)

@@ -49,7 +49,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose mistakes, too, end in one line."""
+    """A parser whose mistakes, too, end in one line.
+
+    Attributes:
+        more: what --help says last, found only then.
+    """
+
+    more: Callable[[], str] | None = None
+
+    def format_help(self) -> str:
+        """Say what there is to say."""
+        if self.more is not None:
+            self.epilog = self.more()
+        return super().format_help()
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong, without the usage in front of it."""
@@ -61,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"cotarget {cotarget.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name: str, run: Callable[[argparse.Namespace], int | None], summary: str) -> argparse.ArgumentParser:
+    def command(name: str, run: Callable[[argparse.Namespace], int | None], summary: str) -> _Parser:
         made = commands.add_parser(name, help=summary, description=summary)
         made.add_argument("-v", "--verbose", action="store_true", help="say more about what is done")
         made.set_defaults(run=run)
@@ -185,7 +197,14 @@ def _parser() -> argparse.ArgumentParser:
         "--tcp", action="store_true", help="let the rig.toml reach the head by TCP, not by a serial port"
     )
     emulate.add_argument("--user", default="", metavar="NAME", help="who alone may look through the fixed camera")
-    emulate.add_argument("--fault", action="append", default=[], metavar="DEVICE.FAULT", help="to be on from the start")
+    emulate.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="DEVICE.FAULT",
+        help="to be on from the start, of those below; while it runs, the control socket switches them",
+    )
+    emulate.more = emulating.fault_names
     emulate.add_argument("--seconds", type=positive, metavar="S", help="for how long (until Ctrl-C)")
 
     detect = command("detect", running.detect, "run the fixed camera's detector and tracker on any film")

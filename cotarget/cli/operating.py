@@ -4,13 +4,16 @@ import argparse
 import json
 import math
 import sys
+import tomllib
 from pathlib import Path
 
 from cotarget.cli.arguments import check_outputs
-from cotarget.errors import ConfigError
+from cotarget.errors import CalibrationError, ConfigError
 
 CONSENT = "yes"
 ENOUGH_DIGITS = 4  # of a latency in seconds
+# What is found is within so much of the truth; less than zero by more is no latency [s].
+ACCURACY_S = 0.01
 
 
 def latency(options: argparse.Namespace) -> None:
@@ -45,8 +48,22 @@ def latency(options: argparse.Namespace) -> None:
             agreement["fixed"] = fixed.agreement
     if calibration is None:
         print("the fixed camera's latency needs --calibration, to look at a board with both cameras", file=sys.stderr)
-    rounded = {name: None if math.isnan(value) else round(value, ENOUGH_DIGITS) for name, value in found.items()}
+    rounded = {name: None if math.isnan(value) else _plausible(name, value) for name, value in found.items()}
     print(json.dumps({"measured": rounded, "agreement": agreement}, indent=2))
+
+
+def _plausible(name: str, seconds: float) -> float:
+    """A latency as it is written into rig.toml.
+
+    Raises:
+        CalibrationError: nothing comes before its cause.
+    """
+    if seconds < -ACCURACY_S:
+        raise CalibrationError(
+            f"{name}: {1000 * seconds:.0f} ms was measured, which is implausible: see that the picture has structure "
+            "and that nothing else moves in it, and measure again"
+        )
+    return max(round(seconds, ENOUGH_DIGITS), 0.0)
 
 
 def point(options: argparse.Namespace) -> None:
@@ -115,8 +132,9 @@ def reset_head(options: argparse.Namespace) -> None:
     """Cotarget reset-head."""
     from cotarget.config import load_config
     from cotarget.hardware.clock import MonotonicClock
-    from cotarget.hardware.d46unit import reset
-    from cotarget.safety import refuse_if_stopped
+    from cotarget.hardware.d46lost import LostPosition
+    from cotarget.hardware.d46reset import reset
+    from cotarget.safety import StopLook, end_politely, refuse_if_stopped
 
     config = load_config(options.rig)
     head = config.hardware.head
@@ -127,7 +145,13 @@ def reset_head(options: argparse.Namespace) -> None:
         print("The head will turn through its whole range. Are camera and cables clear of it? [yes/no]", flush=True)
         if _answer().strip().lower() != CONSENT:
             raise ConfigError("not reset; it needs the answer yes, or --yes")
-    unit = reset(head, MonotonicClock())
+    look, undo = StopLook(config.safety.stop_file), end_politely()
+    try:
+        lost = LostPosition(head.port, config.safety.stop_file)
+        unit = reset(head, MonotonicClock(), lost, stopped=look.reason)
+    finally:
+        undo()
+        look.close()
     pan, tilt = (f"{axis.lowest} to {axis.highest}" for axis in (unit.pan, unit.tilt))
     print(f"reset: {unit.version}: pan {pan}, tilt {tilt} steps")
 
@@ -141,9 +165,17 @@ def _answer() -> str:
 
 
 def _stop_file(rig: Path) -> Path:
-    from cotarget.config import load_config
+    """The stop file that a rig.toml names; nothing else that is wrong with it may keep anybody from stopping.
 
-    path = load_config(rig).safety.stop_file
-    if path is None:
+    Raises:
+        ConfigError: it names none.
+    """
+    try:
+        safety = tomllib.loads(rig.read_text(encoding="utf-8")).get("safety")
+    except (OSError, ValueError) as error:  # no text and no TOML are of the latter kind
+        said = error.strerror if isinstance(error, OSError) else f"is not TOML: {error}"
+        raise ConfigError(f"{rig}: {said}; the rig's stop file itself can be made and removed by hand") from None
+    path = safety.get("stop_file") if isinstance(safety, dict) else None
+    if not isinstance(path, str) or not path:
         raise ConfigError(f'{rig}: has no stop file; give one: [safety] stop_file = "stop"')
-    return path
+    return rig.parent / path

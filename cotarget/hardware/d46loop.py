@@ -11,11 +11,12 @@ from typing import TypeVar
 
 from cotarget.errors import DeviceError
 from cotarget.hardware import d46
-from cotarget.hardware.d46 import HALT, RefusedError, ReplyError, command
+from cotarget.hardware.d46 import RefusedError, ReplyError, command
+from cotarget.hardware.d46lost import PositionLostError
 from cotarget.hardware.d46track import Snapshot, Track
-from cotarget.hardware.d46unit import Unit
+from cotarget.hardware.d46unit import HALT_NOW, HALT_TRIES, Unit, halt_outright, refuse_events, restarted
 from cotarget.hardware.d46wishes import CutError, DroppedError, Halt, Move, drained
-from cotarget.hardware.line import QUICK_S, Line, LostError, SilentError
+from cotarget.hardware.line import QUICK_S, Line, LostError, RestartedError, SilentError
 from cotarget.rig import Clock
 
 log = logging.getLogger(__name__)
@@ -38,7 +39,7 @@ class Loop:
     Attributes:
         moves: wishes to go somewhere; the newest wins.
         halts: wishes to stop; they come first.
-        halted: the number of the newest wish to stop.
+        halted: the number of the newest wish to stop that was taken out of the queue.
         closing: set when no more wishes will come.
         braking_s: the time that a halt can take [s].
         rests: whether the unit has acknowledged the last halt, after which nothing is sent any more.
@@ -68,6 +69,7 @@ class Loop:
         """Do the next thing.
 
         Raises:
+            PositionLostError: nobody knows where the head is.
             DeviceError: the head cannot be used any more.
         """
         try:
@@ -81,13 +83,9 @@ class Loop:
             self._abandon(dropped)
         except CutError as cut:
             self._take_up_again(cut)
-        if self._line.events:
-            # The motor has lost steps against its stop, or nobody knows what the cable did.
-            what = " and ".join(dict.fromkeys(d46.EVENT_WORDS[event] for event in self._line.events))
-            raise DeviceError(
-                f"the pan-tilt unit at {self._line.name} reports that {what}: it was halted, and its position may be "
-                "lost; see that it is free, then run cotarget reset-head"
-            )
+        except RestartedError as error:
+            raise restarted(self._line) from error
+        refuse_events(self._line)
 
     def stop_for_good(self, reason: DeviceError) -> None:
         """Halt a last time, as well as can be, and tell everybody who waits."""
@@ -101,15 +99,16 @@ class Loop:
 
     def _halt_at_last(self, patience: float) -> None:
         # A unit that was switched off and on echoes again, and stale answers may come first.
-        self._line.hurry, self._line.strict = (lambda: False), False
         try:
-            self._line.ask(HALT, patience, skipping=True)
+            halt_outright(self._line, patience)
             self.rests = True
         except DeviceError as error:
             log.warning("%s: the pan-tilt unit did not acknowledge the last halt: %s", self._line.name, error)
 
     def _halt(self) -> None:
         wishes = drained(self.halts)
+        # Threads that halt at once may get here in another order than they were numbered in.
+        self.halted = max([self.halted, *(wish.number for wish in wishes)])
         try:
             self._abandon(DroppedError("the move was halted"))
             self._stop()
@@ -123,7 +122,13 @@ class Loop:
         """Order the halt and wait for the answer."""
         for track in self._tracks:
             track.goal = None
-        self._exchange(HALT, d46.done, patience=HALT_S + self.braking_s)
+        for left in reversed(range(HALT_TRIES)):
+            try:
+                self._exchange(HALT_NOW, d46.done, patience=HALT_S + self.braking_s)
+                break
+            except RefusedError:
+                if not left:
+                    raise
         self._expect_motion()
 
     def _move(self) -> None:
@@ -186,8 +191,8 @@ class Loop:
                 self._active = None
                 self.snapshot = self._look()
                 move.finish()
-            elif self._clock.now() > move.deadline:
-                self._give_up(move, self._late(move))
+            elif self._late(move, move.deadline):
+                raise self._stalled(move)
         self.snapshot = self._look()
 
     def _poll_position(self) -> None:
@@ -252,12 +257,19 @@ class Loop:
         move.deadline = None
         self.moves.appendleft(move)  # behind it may be a newer one, which takes its place, or a halt before it
 
-    def _late(self, move: Move) -> DeviceError:
+    def _late(self, move: Move, deadline: float) -> bool:
+        """Whether an axis was seen elsewhere than at its goal after the deadline; this thread may be late itself."""
+        tracks = zip(self._tracks, move.goals, strict=True)
+        seen = min(track.polls[-1][0] for track in self._tracks)
+        return seen > deadline and any(track.position != goal for track, goal in tracks)
+
+    def _stalled(self, move: Move) -> PositionLostError:
         stands = ", ".join(f"{d46.AXIS_WORDS[axis.name]} {axis.position}" for axis in self._tracks)
         wanted = ", ".join(map(str, move.goals))
-        return DeviceError(
-            f"the pan-tilt unit at {self._line.name} did not arrive in time: {stands} steps, where {wanted} were "
-            "commanded; it was halted; is something in its way, or its motor supply weak?"
+        return PositionLostError(
+            self._line.name,
+            f"did not arrive in time: {stands} steps, where {wanted} were commanded; it was halted, and its position "
+            "may be lost by something in its way or a weak motor supply",
         )
 
     def _stand(self) -> bool:

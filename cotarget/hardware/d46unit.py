@@ -1,6 +1,6 @@
 """Gets to know the PTU-D46 at a port: learns its manner of speaking, reads what it is, compares that with rig.toml.
 
-Also what is done with a unit outside of a rig: a harmless look at it, and the reset that an operator consented to.
+Also a harmless look at a unit outside of a rig; for its reset see `cotarget.hardware.d46reset`.
 """
 
 import logging
@@ -11,9 +11,9 @@ from cotarget.errors import ConfigError, DeviceError
 from cotarget.hardware import d46
 from cotarget.hardware.clock import MonotonicClock
 from cotarget.hardware.d46 import DELIMITER, HALT, AxisName, RefusedError, ReplyError, command
-from cotarget.hardware.line import PATIENCE_S, Line, LostError, SilentError, open_line
+from cotarget.hardware.d46lost import PositionLostError
+from cotarget.hardware.line import PATIENCE_S, Line, RestartedError, SilentError, open_line
 from cotarget.hwconfig import HardwareHead
-from cotarget.rig import Clock
 
 log = logging.getLogger(__name__)
 
@@ -22,7 +22,8 @@ GREETING_QUIET_S, GREETING_MOST_S = 0.25, 1.5  # at open nobody knows what it wa
 # Limits differ by a few steps from unit to unit and from reset to reset; more than this is another unit.
 LIMITS_DEG = 3.0
 STEP_SHARE = 2e-3  # of the resolution; the unit and people round it
-RESET_S = 120.0  # no manual says how long a reset takes; published drivers wait up to a minute
+# A halt is sent behind a delimiter: what noise has left at the unit ends there, and is refused in the halt's place.
+HALT_NOW, HALT_TRIES = DELIMITER + HALT, 2
 
 
 @dataclass(frozen=True)
@@ -76,17 +77,53 @@ def connect(line: Line, config: HardwareHead) -> Unit:
 
     Raises:
         ConfigError: rig.toml describes another unit.
+        PositionLostError: nobody knows where it is.
         DeviceError: there is no unit, or none that can be used as it is.
     """
     greet(line)
-    unit = identify(line)
-    refuse_uncalibrated(line.name, unit)
-    compare(line.name, unit, config)
-    for order in (HALT, command("I")):
-        line.query(order, d46.done, PATIENCE_S + unit.braking_s)
-    _make_independent(line)
-    line.events.clear()
+    try:
+        unit = identify(line)
+        refuse_uncalibrated(line.name, unit)
+        compare(line.name, unit, config)
+        _halt(line, PATIENCE_S + unit.braking_s)
+        line.query(command("I"), d46.done, PATIENCE_S)
+        _make_independent(line)
+    except RestartedError as error:
+        raise restarted(line) from error
+    refuse_events(line)
     return unit
+
+
+def refuse_events(line: Line) -> None:
+    """Raise where the unit has told of a limit or a cable: its motor lost steps, or nobody knows what it did.
+
+    Raises:
+        PositionLostError: with what it told.
+    """
+    if line.events:
+        what = " and ".join(dict.fromkeys(d46.EVENT_WORDS[event] for event in line.events))
+        raise PositionLostError(line.name, f"reports that {what}: it was halted, and its position may be lost")
+
+
+def restarted(line: Line) -> PositionLostError:
+    """What to say of a unit that was switched off and on."""
+    return PositionLostError(line.name, "was switched off and on, so that its position may be lost")
+
+
+def halt_outright(line: Line, patience: float) -> None:
+    """Halt a unit that may echo again or have answers left to send; nothing else can be asked of the line afterwards.
+
+    Raises:
+        DeviceError: it did not acknowledge that in time.
+    """
+    line.hurry, line.strict = (lambda: False), False
+    for left in reversed(range(HALT_TRIES)):
+        try:
+            line.ask(HALT_NOW, patience, skipping=True)
+            return
+        except (RefusedError, ReplyError):
+            if not left:
+                raise
 
 
 def greet(line: Line) -> None:
@@ -98,6 +135,7 @@ def greet(line: Line) -> None:
     for _ in range(TRIES):
         line.write(DELIMITER)
         line.drain(GREETING_QUIET_S, GREETING_MOST_S)
+        line.events.clear()  # from before anybody listened, as after a reset or a start
         try:
             for order in ("ED", "FT"):
                 line.ask(command(order), PATIENCE_S)
@@ -179,32 +217,6 @@ def probe(port: str, baud: int) -> str:
         line.close()
 
 
-def reset(config: HardwareHead, clock: Clock) -> Unit:
-    """Let the unit find its limits anew: it turns through its whole range. Only with an operator's consent.
-
-    Returns:
-        The unit, with the limits that it found.
-
-    Raises:
-        DeviceError: it failed; the unit was halted.
-    """
-    line = open_line(config.port, config.baud, clock)
-    try:
-        greet(line)
-        try:
-            said = line.ask(command("R"), RESET_S, skipping=True).text
-            log.info("%s: reset: %s", line.name, said)
-        except BaseException as error:
-            if not isinstance(error, LostError):
-                line.write(DELIMITER + HALT)
-            raise
-        unit = identify(line)
-        refuse_uncalibrated(line.name, unit)
-        return unit
-    finally:
-        line.close()
-
-
 def _axis(line: Line, axis: AxisName) -> AxisFacts:
     def number(what: str) -> int:
         return line.query(command(axis + what), d46.integer, PATIENCE_S)[0]
@@ -217,6 +229,17 @@ def _axis(line: Line, axis: AxisName) -> AxisFacts:
             f"{facts.fastest} and an acceleration of {facts.acceleration}; restore its factory settings"
         )
     return facts
+
+
+def _halt(line: Line, patience: float) -> None:
+    """Halt a unit that is in step."""
+    for left in reversed(range(HALT_TRIES)):
+        try:
+            line.query(HALT_NOW, d46.done, patience)
+            return
+        except RefusedError:
+            if not left:
+                raise
 
 
 def _told(line: Line, question: str) -> str:

@@ -50,8 +50,15 @@ class Move:
 
 @dataclass(eq=False)
 class Halt:
-    """A wish to stop; ``answered`` when the unit has said that it does."""
+    """A wish to stop.
 
+    Attributes:
+        number: counts wishes, as a move's does.
+        answered: whether the unit has said that it stops.
+        done: set when it has, or will not.
+    """
+
+    number: int
     answered: bool = False
     done: threading.Event = field(default_factory=threading.Event)
 

@@ -7,10 +7,11 @@ import logging
 import math
 import threading
 
-from cotarget.errors import DeviceError
-from cotarget.hardware.d46 import DELIMITER, HALT
+from cotarget.config import SafetyConfig
+from cotarget.errors import ConfigError, DeviceError
 from cotarget.hardware.d46loop import Loop
-from cotarget.hardware.d46unit import AxisFacts, Unit, connect
+from cotarget.hardware.d46lost import LostPosition, PositionLostError
+from cotarget.hardware.d46unit import HALT_NOW, AxisFacts, Unit, connect
 from cotarget.hardware.d46wishes import DroppedError, Halt, Move
 from cotarget.hardware.line import LostError, open_line
 from cotarget.hwconfig import HardwareHead
@@ -22,25 +23,31 @@ STANDS_S = 5.0  # for a head that turned when it was opened to stand after the h
 HALT_S = 1.0  # for a halt to be acknowledged, beyond braking, with a line that has to be got back in step first
 CLOSE_S = 5.0  # for the thread to end
 LOOK_S = 0.2  # how often somebody who waits for a move looks whether the thread still lives
+NOTHING_SAID = SafetyConfig()
+ROUNDING = 1e-9  # of a speed that is a whole number of steps but for the conversion from degrees
 
 
 class D46Head:
     """A PTU-D46, opened, compared with the configuration, and standing.
 
     A thread of its own owns the line: it polls the positions all the time and sends commands as they come. What goes
-    wrong there is raised by the next call of any method, and for good if the position may be lost: then the head has
-    to be opened again by a program that knows why. Nothing here resets the unit.
+    wrong there is raised by the next call of any method, and for good if the position may be lost: then no program
+    opens the head any more until it was reset. Nothing here resets the unit.
 
     Args:
         config: where the unit is, and what it is expected to say.
         clock: the rig's.
+        safety: a speed cap that the unit must be able to keep, and a stop file, beside which is remembered that the
+            position is lost.
 
     Raises:
         ConfigError: the unit is another than the configuration says.
         DeviceError: there is no unit, or none that can be used as it is.
     """
 
-    def __init__(self, config: HardwareHead, clock: Clock) -> None:
+    def __init__(self, config: HardwareHead, clock: Clock, safety: SafetyConfig = NOTHING_SAID) -> None:
+        self._lost = LostPosition(config.port, safety.stop_file)
+        self._lost.refuse()
         self._line = open_line(config.port, config.baud, clock)
         self._signs = (config.pan_sign, config.tilt_sign)
         self._numbers = itertools.count(1)
@@ -48,10 +55,16 @@ class D46Head:
         self._closed = False
         try:
             self.unit: Unit = connect(self._line, config)
+            for key, cap in (
+                ("hardware.head.speed_deg_s", config.speed_deg_s),
+                ("safety.speed_deg_s", safety.speed_deg_s),
+            ):
+                _refuse_too_slow(key, cap, self.unit, config.port)
             self._limits = _limits(self.unit, config)
             self._loop = Loop(self._line, self.unit, clock, config.command_delay_s)
             self._wait_until_it_stands(clock)
-        except BaseException:
+        except BaseException as error:
+            self._remember(error)
             self._line.close()
             raise
         self._thread = threading.Thread(target=self._run, name=f"PTU-D46 at {config.port}", daemon=True)
@@ -82,7 +95,8 @@ class D46Head:
         Args:
             pan: angle [rad].
             tilt: angle [rad].
-            speed: of either axis [rad/s]; the configured one unless given, and never above that.
+            speed: of either axis [rad/s]; the configured one unless given, and never above that. The unit takes it in
+                whole steps a second, rounded down, and turns no slower than it can.
             wait: return only when the head stands there.
 
         Returns:
@@ -120,15 +134,14 @@ class D46Head:
         """
         if self._closed:
             return
-        wish = Halt()
-        self._loop.halted = next(self._numbers)
+        wish = Halt(next(self._numbers))
         self._loop.halts.append(wish)
         wish.done.wait(HALT_S + self._loop.braking_s if self._thread.is_alive() else 0.0)
         if wish.answered or self._loop.rests:
             return
         if not self._thread.is_alive() and not isinstance(self._dead, LostError):
             with contextlib.suppress(DeviceError):
-                self._line.write(DELIMITER + HALT)
+                self._line.write(HALT_NOW)
         why = self._dead or "it does not answer"
         raise DeviceError(f"the pan-tilt unit at {self._line.name} did not acknowledge the halt: {why}")
 
@@ -155,6 +168,12 @@ class D46Head:
             reason = DeviceError(f"the driver of the pan-tilt unit failed: {error!r}")
         self._dead = reason
         self._loop.stop_for_good(reason)
+        self._remember(reason)  # after the halt: a disk that hangs must not keep the head from that
+
+    def _remember(self, error: BaseException) -> None:
+        """Let no program move the head before it was reset, if its position may be lost."""
+        if isinstance(error, PositionLostError):
+            self._lost.note(str(error))
 
     def _angles(self, pan: float, tilt: float) -> tuple[float, float]:
         """The unit's steps as angles [rad]."""
@@ -200,5 +219,19 @@ def _radians(degrees: tuple[float, float]) -> tuple[float, float]:
 
 
 def _steps(speed: float, axis: AxisFacts) -> int:
-    """A speed [rad/s] as the unit's own number [steps/s], within its bounds."""
-    return min(max(round(speed / axis.step), axis.slowest, 1), axis.fastest)
+    """A speed [rad/s] as the unit's own number [steps/s], rounded down, within its bounds."""
+    return min(max(math.floor(speed / axis.step * (1 + ROUNDING)), axis.slowest, 1), axis.fastest)
+
+
+def _refuse_too_slow(key: str, cap_deg_s: float | None, unit: Unit, port: str) -> None:
+    """Refuse a cap that the unit cannot keep.
+
+    Raises:
+        ConfigError: with what it can.
+    """
+    slowest = max(max(axis.slowest, 1) * math.degrees(axis.step) for axis in (unit.pan, unit.tilt))
+    if cap_deg_s is not None and cap_deg_s * (1 + ROUNDING) < slowest:
+        least = math.ceil(100 * slowest) / 100
+        raise ConfigError(
+            f"{key}: {cap_deg_s:g} degrees/s is slower than the unit at {port} can turn; it takes {least:g} at least"
+        )

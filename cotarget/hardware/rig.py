@@ -72,5 +72,5 @@ def open_hardware(config: RigConfig) -> HardwareRig:
         board = opened.enter_context(contextlib.closing(make_board(hardware.board)))
         fixed = opened.enter_context(contextlib.closing(AxisCamera(hardware.fixed, clock)))
         zoom = opened.enter_context(contextlib.closing(GphotoCamera(hardware.zoom, clock)))
-        head = opened.enter_context(contextlib.closing(D46Head(hardware.head, clock)))
+        head = opened.enter_context(contextlib.closing(D46Head(hardware.head, clock, config.safety)))
         return HardwareRig(fixed, zoom, head, clock, board, opened.pop_all())

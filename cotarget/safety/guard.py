@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 from cotarget.config import SafetyConfig
 from cotarget.errors import DeviceError, EmergencyStopError
 from cotarget.rig import Clock, PanTilt, PanTiltState
-from cotarget.safety.stopfile import refuse_if_stopped, stop_reason, stopped_by_file
+from cotarget.safety.stopfile import stop_reason, stopped_by_file
+from cotarget.safety.stoplook import StopLook
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +56,7 @@ class Guard:
         self.threaded = threaded
         self._head, self._clock = head, clock
         self._timeout_s, self._stop_file = config.watchdog_s, config.stop_file
+        self._look = StopLook(config.stop_file)  # idle where no thread watches: time does not pass by itself then
         self._lock = threading.RLock()  # reentrant: a signal's handler may call stop() anywhere
         self._motion: Motion | None = None
         self._alive_at = -math.inf
@@ -71,10 +73,10 @@ class Guard:
             EmergencyStopError: the head is stopped.
             DeviceError: the rig is closed, or the head has still to be halted and cannot be.
         """
-        if self.threaded:
-            self._catch_up()
-        else:
+        if not self.threaded:
             self.watch()
+        elif not self._heed_stop_file():
+            self._halt_if_owed()
         with self._lock:
             halts = self._halts  # before anything is asked: a signal's handler may stop the head in between
             self.refuse_if_stopped()
@@ -135,20 +137,27 @@ class Guard:
 
     def watch(self) -> None:
         """Halt the head if that is due: no sign of life, a stop file, or a halt that failed before."""
-        self._catch_up()
+        # First what needs no file system; then its answer is waited for no longer than until that is due again.
+        tried = self._halt_if_overdue()
+        if not (self._heed_stop_file(self.pause(math.inf)) or tried):
+            self._halt_if_owed()
+
+    def _halt_if_overdue(self) -> bool:
+        """Halt the head if there was no sign of life in time; whether that was so."""
         # In this order, a clock that goes forward shows no less than when the last sign of life was noted.
         alive_at, deadline = self._alive_at, self.deadline()
         if deadline is None or self._owed is not None:
-            return
+            return False
         now = self._clock.now()
         if alive_at <= now < deadline:
-            return
+            return False
         if now < alive_at:
             reason = f"the rig's clock ran backwards by {alive_at - now:.3g} s"
         else:
             reason = f"neither a fresh frame nor a command for {now - alive_at:.2g} s"
         log.warning("halting the head: %s", reason)
         self._halt(reason)
+        return True
 
     def halt(self) -> None:
         """Halt the head because the program says so; where the device fails, the watchdog tries again.
@@ -179,7 +188,8 @@ class Guard:
         Raises:
             EmergencyStopError: there still is a stop file.
         """
-        refuse_if_stopped(self._stop_file)
+        if (there := self._stop_file_says()) is not None:
+            raise stopped_by_file(self._stop_file, there)
         with self._lock:
             reason, self._stopped, self._stopped_by_file = self._stopped, None, None
         return reason
@@ -187,7 +197,7 @@ class Guard:
     @property
     def reason(self) -> str | None:
         """Why the head is stopped; None if it is not."""
-        return self._stopped if self._stopped is not None else stop_reason(self._stop_file)
+        return self._stopped if self._stopped is not None else self._stop_file_says()
 
     def refuse_if_stopped(self) -> None:
         """Raise while the head is stopped, by what was last seen of the stop file.
@@ -219,6 +229,10 @@ class Guard:
         with self._lock:
             self._motion = self._owed = None
 
+    def close(self) -> None:
+        """End the look-out for a stop file."""
+        self._look.close()
+
     def _halt(self, reason: str) -> None:
         """Halt the head; where the device fails, say so and owe it."""
         with self._lock:
@@ -242,14 +256,22 @@ class Guard:
         if late:
             log.warning("the head is halted now")
 
-    def _catch_up(self) -> None:
-        """Look for a stop file, and try again to halt a head that could not be halted."""
-        reason = stop_reason(self._stop_file)
+    def _stop_file_says(self, longest: float | None = None) -> str | None:
+        """Why the stop file stops the head; None if it does not. See `StopLook.reason`."""
+        return self._look.reason(longest) if self.threaded else stop_reason(self._stop_file)
+
+    def _heed_stop_file(self, longest: float | None = None) -> bool:
+        """Look for a stop file, and halt the head for a new one; whether there is a new one."""
+        reason = self._stop_file_says(longest)
         with self._lock:
             new = reason is not None and self._stopped_by_file is None
             self._stopped_by_file = reason
         if new:
             log.warning("emergency stop: %s", reason)
             self._halt(f"emergency stop: {reason}")
-        elif self._owed is not None:
+        return new
+
+    def _halt_if_owed(self) -> None:
+        """Try again to halt a head that could not be halted."""
+        if self._owed is not None:
             self._halt(self._owed)

@@ -50,7 +50,7 @@ class SafeRig:
             self.board: Board = rig.board
             atexit.register(self.close)  # for a rig that nobody closes
             if real_time:
-                self._undo_signals = end_politely()
+                self._undo_signals = end_politely(self._guard.halt)
                 self._watcher = Watcher(self._guard)
         except BaseException:
             self._leave()
@@ -131,5 +131,6 @@ class SafeRig:
         """End what this layer has going in the process."""
         if self._watcher is not None:
             self._watcher.close()
+            self._guard.close()
         self._undo_signals()
         atexit.unregister(self.close)

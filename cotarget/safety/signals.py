@@ -1,5 +1,7 @@
 """Signals: none may keep the head from being halted, and none may end a program with a moving head behind it."""
 
+import logging
+import os
 import signal
 import sys
 import threading
@@ -7,8 +9,12 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-# Signals that would end the process on the spot: a polite request, and a terminal or connection that has gone.
-ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+log = logging.getLogger(__name__)
+
+# Signals that would end the process on the spot: a polite request, a terminal or connection that has gone, Ctrl-\.
+ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name))
+# And those that would freeze it, watchdog and all: Ctrl-Z, and use of a terminal that another program has.
+FREEZING = tuple(getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTTOU") if hasattr(signal, name))
 HELD = (signal.SIGINT, *ENDING)
 SHELL_STATUS = 128  # a shell's exit status for a signal is this and its number
 # So many signals, while the devices are released after the halt, end the wait for devices that do not answer.
@@ -58,10 +64,16 @@ class HeldSignals:
             raise KeyboardInterrupt
 
 
-def end_politely() -> Callable[[], None]:
-    """Let signals that would end the process on the spot raise SystemExit, so that ``with`` blocks are left.
+def end_politely(halt: Callable[[], None] | None = None) -> Callable[[], None]:
+    """Let no signal end or freeze the process with a head that turns.
 
+    One that would end it on the spot raises SystemExit, so that ``with`` blocks are left. One that would freeze it does
+    so once the head is halted, and not at all where that fails; afterwards the program goes on as after any halt.
     Handlers that the program itself has set stay.
+
+    Args:
+        halt: halts the head, and may be called from a signal's handler; without it the signals that would freeze the
+            process end it too.
 
     Returns:
         What undoes it.
@@ -72,14 +84,24 @@ def end_politely() -> Callable[[], None]:
     def leave(number: int, frame: FrameType | None) -> None:
         sys.exit(SHELL_STATUS + number)
 
-    ours = [number for number in ENDING if signal.getsignal(number) is signal.SIG_DFL]
-    for number in ours:
-        signal.signal(number, leave)
+    def freeze(number: int, frame: FrameType | None) -> None:
+        assert halt is not None
+        try:
+            halt()
+        except Exception as error:
+            log.error("not suspended, because the head could not be halted: %s", error)
+            return
+        os.kill(os.getpid(), signal.SIGSTOP)
+
+    handlers = dict.fromkeys(ENDING, leave) | dict.fromkeys(FREEZING, leave if halt is None else freeze)
+    ours = {number: handler for number, handler in handlers.items() if signal.getsignal(number) is signal.SIG_DFL}
+    for number, handler in ours.items():
+        signal.signal(number, handler)
 
     def undo() -> None:
         if threading.current_thread() is threading.main_thread():
-            for number in ours:
-                if signal.getsignal(number) is leave:
+            for number, handler in ours.items():
+                if signal.getsignal(number) is handler:
                     signal.signal(number, signal.SIG_DFL)
 
     return undo

@@ -12,13 +12,14 @@ LONGEST_REASON = 200  # characters of the file's first line that are shown
 def stop_reason(path: Path | None) -> str | None:
     """Why the head must not move; None if it may.
 
-    A file that cannot be looked at stops too: nobody knows then whether somebody has called for a stop.
+    A file that cannot be looked at stops too: nobody knows then whether somebody has called for a stop. One that is a
+    pipe is not waited for; one on a file system that hangs is (see `cotarget.safety.stoplook`).
     """
     if path is None:
         return None
     try:
-        with path.open("rb") as file:
-            content = file.read(4 * LONGEST_REASON)  # a character takes at most 4 bytes
+        with open(path, "rb", buffering=0, opener=_without_waiting) as file:
+            content = file.read(4 * LONGEST_REASON) or b""  # a character takes at most 4 bytes
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
@@ -26,6 +27,10 @@ def stop_reason(path: Path | None) -> str | None:
     lines = content.decode("utf-8", "replace").strip().splitlines()
     said = "".join(c if c.isprintable() else " " for c in lines[0])[:LONGEST_REASON].strip() if lines else ""
     return said or NO_REASON
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def refuse_if_stopped(path: Path | None) -> None:
