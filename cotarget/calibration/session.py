@@ -6,6 +6,8 @@ focal length; a scan with the head finds it in the zoom camera; two small turns 
 from then on a rough model plans every placement and every head pose, and each refines the model.
 """
 
+import contextlib
+import logging
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -20,8 +22,10 @@ from cotarget.calibration.plan import Coverage, plan_placements, plan_poses, pre
 from cotarget.calibration.recorder import Recorder
 from cotarget.calibration.stops import spread_stops
 from cotarget.calibration.zooming import see_stops
-from cotarget.errors import CalibrationError
+from cotarget.errors import CalibrationError, CotargetError
 from cotarget.geometry import RigidTransform
+
+log = logging.getLogger(__name__)
 
 FINE_MARGIN = 0.008  # of the image's width, that plans keep clear once the model is fine
 MARGIN_GROWTH, WIDEST_MARGIN = 3.0, 0.15  # at every miss, and at most
@@ -73,11 +77,24 @@ def capture_session(
             see_stops(recorder, model, nominal, far_placements, rng, tell)
             recorder.rejected += _stops_without_views(recorder, nominal)
         recorder.turn(0.0, 0.0)
-    finally:
-        recorder.save_index()
-        recorder.rig.board.present(None)
+    except BaseException:
+        _break_off(recorder)
+        raise
+    recorder.save_index()
+    recorder.rig.board.present(None)
     if progress is not None:
         progress(total, total, "fitting")
+
+
+def _break_off(recorder: Recorder) -> None:
+    """End a session that failed or was interrupted: the head first of all; what fails now hides no earlier error."""
+    with contextlib.suppress(CotargetError):  # whoever closes the rig halts it again, and tells where that fails
+        recorder.rig.head.halt()
+    for act in (recorder.save_index, lambda: recorder.rig.board.present(None)):
+        try:
+            act()
+        except (CotargetError, OSError) as error:
+            log.warning("while the session was broken off: %s", error)
 
 
 def _stops_without_views(recorder: Recorder, stops: Sequence[float]) -> list[Rejected]:
