@@ -4,6 +4,7 @@ It is driven by white acceleration, so that frames may come at any times. To the
 ``Track``; the filter's own state stays here.
 """
 
+import functools
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -15,8 +16,6 @@ from cotarget.geometry import Array
 
 # The larger side over a wing beat is this percentile: the maximum, but deaf to one frame in ten that is wrong.
 BEAT_PERCENTILE = 90.0
-
-Box = tuple[Array, Array]  # centre and size [px], (2,) each
 
 
 class Measurement(Protocol):
@@ -51,8 +50,12 @@ class TrackerSettings:
         speed_px: standard deviation of the speed that a new target may have [px/s].
         confirm_hits: detections before a track is believed ...
         confirm_s: ... and how long it must have been followed [s] ...
-        confirm_travel: ... and how far it must have come, in larger sides of its box (0: it may stand still).
-        lose_s: a confirmed track dies after this long without a detection [s].
+        confirm_travel: ... and how far it must have come, in larger sides of its box (0: it may stand still) ...
+        confirm_score: ... and what its detections' scores must average, the last ones most (0: any will do).
+        score_s: over this time they are averaged [s]; a new track begins at 0.
+        doubt_score: a confirmed track ends when its average falls below this.
+        lose_s: a confirmed track dies after this long without a detection [s], or after as long as it had been seen,
+            where that is less.
         drop_s: one that was never confirmed, after this long [s].
         size_s: window of the size's median [s].
         beat_s: window of the largest size; some two wing beats [s].
@@ -66,6 +69,9 @@ class TrackerSettings:
     confirm_hits: int = 4
     confirm_s: float = 0.15
     confirm_travel: float = 0.0
+    confirm_score: float = 0.0
+    score_s: float = 0.3
+    doubt_score: float = 0.0
     lose_s: float = 0.8
     drop_s: float = 0.13
     size_s: float = 0.6
@@ -78,8 +84,11 @@ def settings_for(target: TargetConfig) -> TrackerSettings:
     A colour is found to a fraction of a pixel. What is found by its motion jitters with limbs and wings, and
     must have moved before it is believed.
     """
-    if target.detector == "colour":
+    detector: str = target.detector
+    if detector == "colour":
         return TrackerSettings(noise_px=0.2, noise_of_size=0.01)
+    if detector == "speck":  # it may hover: what tells it from a thing that stands is its score
+        return TrackerSettings(acceleration_px=250.0, noise_of_size=0.2, confirm_score=0.5, doubt_score=0.2)
     if target.dimension == "wingspan":
         return TrackerSettings(acceleration_px=250.0, noise_of_size=0.2, confirm_travel=0.5)
     return TrackerSettings(confirm_travel=0.1, noise_of_size=0.04)
@@ -142,12 +151,9 @@ class TargetFilter:
         self.hits = 1
         self.missed = 0
         self.confirmed = False
+        self.mean_score = 0.0
         self.sizes: deque[tuple[float, Array, bool]] = deque([(t, detection.size_px, detection.clipped)])
-
-    @property
-    def box(self) -> Box:
-        """Predicted centre and filtered size [px]."""
-        return self.x[:2], self.size()
+        self.size, self.larger_side = self._median_size(), self._beat_side()
 
     def predict(self, t: float) -> None:
         """Move the filter to time ``t`` [s]."""
@@ -158,6 +164,8 @@ class TargetFilter:
 
     def correct(self, detection: Measurement) -> None:
         """Take a detection of this target alone into account."""
+        weight = 1 - np.exp(-(self.t - self.seen) / self.settings.score_s)
+        self.mean_score += float(weight) * (detection.score - self.mean_score)
         self._measure(detection.center_px, self.variance(detection))
         self.sizes.append((self.t, detection.size_px, detection.clipped))
         self.detection = detection
@@ -165,19 +173,21 @@ class TargetFilter:
         window = max(self.settings.size_s, self.settings.beat_s)
         while self.sizes[0][0] < self.t - window:
             self.sizes.popleft()
+        self.size, self.larger_side = self._median_size(), self._beat_side()
         if not self.confirmed:
-            travel = np.linalg.norm(self.x[:2] - self.start) / max(1.0, float(np.max(self.size())))
+            travel = np.linalg.norm(self.x[:2] - self.start) / max(1.0, float(np.max(self.size)))
             self.confirmed = bool(
                 self.hits >= self.settings.confirm_hits
                 and self.t - self.born >= self.settings.confirm_s
                 and travel >= self.settings.confirm_travel
+                and self.mean_score >= self.settings.confirm_score
             )
 
     def share(self, detection: Measurement) -> None:
         """Take a detection into account that covers other targets too: all it tells is that this one is inside."""
-        center, size = self.box
+        size = self.size
         room = np.maximum(0.0, (detection.size_px - size) / 2)
-        inside = np.clip(center, detection.center_px - room, detection.center_px + room)
+        inside = np.clip(self.x[:2], detection.center_px - room, detection.center_px + room)
         self._measure(inside, (size / 4) ** 2 + room**2)
 
     def is_over(self, image_size: tuple[int, int] | None) -> bool:
@@ -186,17 +196,21 @@ class TargetFilter:
             return True
         if self.missed and image_size is not None and not (-0.5 <= self.x[1] <= image_size[1] - 0.5):
             return True
-        return self.t - self.seen > (self.settings.lose_s if self.confirmed else self.settings.drop_s)
+        if not self.confirmed:
+            return self.t - self.seen > self.settings.drop_s
+        if self.mean_score < self.settings.doubt_score:
+            return True
+        return self.t - self.seen > min(self.settings.lose_s, self.seen - self.born)
 
-    def size(self) -> Array:
+    def _median_size(self) -> Array:
         """Median width and height of the boxes that the border did not cut, or the largest of those it did."""
         recent = [(s, clipped) for t, s, clipped in self.sizes if t >= self.sizes[-1][0] - self.settings.size_s]
         whole = [s for s, clipped in recent if not clipped]
         if whole:
-            return np.median(whole, axis=0)
-        return np.max([s for s, _ in recent], axis=0)
+            return np.asarray(np.median(whole, axis=0))
+        return np.asarray(np.max([s for s, _ in recent], axis=0))
 
-    def larger_side(self) -> float:
+    def _beat_side(self) -> float:
         """The larger side over the last wing beats [px]."""
         recent = [(s.max(), clipped) for t, s, clipped in self.sizes if t >= self.sizes[-1][0] - self.settings.beat_s]
         whole = [s for s, clipped in recent if not clipped] or [s for s, _ in recent]
@@ -211,8 +225,8 @@ class TargetFilter:
             missed=self.missed,
             center_px=self.x[:2].copy(),
             velocity_px=self.x[2:].copy(),
-            size_px=self.size(),
-            larger_side_px=self.larger_side(),
+            size_px=self.size.copy(),
+            larger_side_px=self.larger_side,
             covariance=self.P.copy(),
             score=self.detection.score,
             box=self.detection,
@@ -236,6 +250,7 @@ class TargetFilter:
         self.missed = 0
 
 
+@functools.lru_cache(maxsize=8)  # every track of a frame asks for the same
 def _motion(dt: float, noise: float) -> tuple[Array, Array]:
     """Transition and process noise over ``dt`` [s], forward or back, for white acceleration [px^2/s^3]."""
     eye = np.eye(2)

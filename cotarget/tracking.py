@@ -10,7 +10,8 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from cotarget.motionfilter import Box, Measurement, TargetFilter, Track, TrackerSettings, settings_for
+from cotarget.geometry import Array
+from cotarget.motionfilter import Measurement, TargetFilter, Track, TrackerSettings, settings_for
 
 __all__ = ["FirstCome", "Measurement", "Track", "Tracker", "TrackerSettings", "settings_for", "size_for"]
 
@@ -86,8 +87,9 @@ class Tracker:
         self._t = t
         for state in self._tracks:
             state.predict(t)
-        matches = _assign(self._tracks, detections)
-        crowds = _crowds(self._tracks, detections, matches)
+        pairs = _Pairs(self._tracks, detections)
+        matches = _assign(pairs)
+        crowds = _crowds(pairs, matches)
         taken = set(matches.values())
         for i, state in enumerate(self._tracks):
             if i in crowds:
@@ -97,61 +99,72 @@ class Tracker:
             else:
                 state.missed += 1
         self._tracks = [s for s in self._tracks if not s.is_over(self._image_size)]
-        for j, detection in enumerate(detections):
-            if j not in taken and not any(_covered(s.box, detection) > COVERED for s in self._tracks):
-                self._tracks.append(TargetFilter(self._next_id, detection, t, self._settings))
-                self._next_id += 1
+        self._bear([detection for j, detection in enumerate(detections) if j not in taken], t)
         return self.tracks
 
+    def _bear(self, detections: Sequence[Measurement], t: float) -> None:
+        """Begin a track at each detection that does not cover one."""
+        explained = (_Pairs(self._tracks, detections).covered > COVERED).any(axis=0)
+        born: list[TargetFilter] = []
+        for detection in (detections[int(j)] for j in np.flatnonzero(~explained)):
+            if not (_Pairs(born, [detection]).covered > COVERED).any():
+                born.append(TargetFilter(self._next_id, detection, t, self._settings))
+                self._next_id += 1
+        self._tracks += born
 
-def _assign(states: Sequence[TargetFilter], detections: Sequence[Measurement]) -> dict[int, int]:
+
+class _Pairs:
+    """Every track beside every detection, (tracks, detections): a hundred of each are ten thousand pairs.
+
+    Attributes:
+        distance: Mahalanobis distance squared.
+        log_volume: logarithm of the determinant of the innovation's covariance.
+        covered: the part of the track's box that the detection covers, 0 to 1.
+        overlap: intersection over union of the boxes, 0 to 1.
+        confirmed: which tracks are, (tracks,).
+    """
+
+    def __init__(self, states: Sequence[TargetFilter], detections: Sequence[Measurement]) -> None:
+        """Compare tracks and detections."""
+        n, m = len(states), len(detections)
+        self.confirmed = np.array([state.confirmed for state in states], dtype=bool)
+        at = np.array([state.x[:2] for state in states]).reshape(n, 1, 2)
+        size = np.array([state.size for state in states]).reshape(n, 1, 2)
+        P = np.array([state.P[:2, :2] for state in states]).reshape(n, 1, 2, 2)
+        center = np.array([detection.center_px for detection in detections]).reshape(1, m, 2)
+        extent = np.array([detection.size_px for detection in detections]).reshape(1, m, 2)
+        variance = np.array([states[0].variance(each) if states else (0.0, 0.0) for each in detections])
+        # S = [[a, c], [c, b]], inverted by hand.
+        a, b = (P[..., k, k] + variance.reshape(1, m, 2)[..., k] for k in (0, 1))
+        c = np.broadcast_to(P[..., 0, 1], (n, m))
+        du, dv = np.moveaxis(center - at, -1, 0)
+        volume = a * b - c * c
+        self.distance: Array = (b * du * du - 2 * c * du * dv + a * dv * dv) / volume
+        self.log_volume: Array = np.log(volume)
+        low = np.maximum(at - size / 2, center - extent / 2)
+        high = np.minimum(at + size / 2, center + extent / 2)
+        shared = np.prod(np.maximum(0.0, high - low), axis=-1)
+        own, other = np.prod(size, axis=-1), np.prod(extent, axis=-1)
+        self.covered: Array = shared / own
+        self.overlap: Array = shared / (own + other - shared)
+
+
+def _assign(pairs: _Pairs) -> dict[int, int]:
     """Match tracks to detections one to one: {index of the track: index of the detection}."""
-    if not states or not detections:
-        return {}
-    cost = np.full((len(states), len(detections)), IMPOSSIBLE)
-    for i, state in enumerate(states):
-        for j, detection in enumerate(detections):
-            S = state.P[:2, :2] + np.diag(state.variance(detection))
-            error = detection.center_px - state.x[:2]
-            distance = float(error @ np.linalg.solve(S, error))
-            overlap = _overlap(state.box, detection)
-            # A track that was confirmed goes first, and a box that grew into another still overlaps its track.
-            if distance <= GATE_CHI2 or overlap > OVERLAP_ENOUGH:
-                cost[i, j] = distance + np.log(np.linalg.det(S)) - OVERLAP_BONUS * overlap
-                cost[i, j] += 0.0 if state.confirmed else OVERLAP_BONUS
+    # A track that was confirmed goes first, and a box that grew into another still overlaps its track.
+    possible = (pairs.distance <= GATE_CHI2) | (pairs.overlap > OVERLAP_ENOUGH)
+    cost = pairs.distance + pairs.log_volume - OVERLAP_BONUS * pairs.overlap
+    cost = np.where(possible, cost + np.where(pairs.confirmed, 0.0, OVERLAP_BONUS)[:, None], IMPOSSIBLE)
     rows, columns = linear_sum_assignment(cost)
-    return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if cost[i, j] < IMPOSSIBLE}
+    return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if possible[i, j]}
 
 
-def _crowds(
-    states: Sequence[TargetFilter], detections: Sequence[Measurement], matches: dict[int, int]
-) -> dict[int, int]:
+def _crowds(pairs: _Pairs, matches: dict[int, int]) -> dict[int, int]:
     """Find detections that cover two or more confirmed tracks: {index of such a track: the detection}."""
     crowds: dict[int, int] = {}
-    for j, detection in enumerate(detections):
-        covered = [
-            i
-            for i, state in enumerate(states)
-            if state.confirmed and matches.get(i, j) == j and _covered(state.box, detection) > COVERED
-        ]
+    inside = (pairs.covered > COVERED) & pairs.confirmed[:, None]
+    for j in np.flatnonzero(np.count_nonzero(inside, axis=0) > 1):
+        covered = [int(i) for i in np.flatnonzero(inside[:, j]) if matches.get(int(i), j) == j]
         if len(covered) > 1:
-            crowds |= dict.fromkeys(covered, j)
+            crowds |= dict.fromkeys(covered, int(j))
     return crowds
-
-
-def _intersection(box: Box, detection: Measurement) -> float:
-    """Area that two boxes share [px^2]."""
-    low = np.maximum(box[0] - box[1] / 2, detection.center_px - detection.size_px / 2)
-    high = np.minimum(box[0] + box[1] / 2, detection.center_px + detection.size_px / 2)
-    return float(np.prod(np.maximum(0.0, high - low)))
-
-
-def _covered(box: Box, detection: Measurement) -> float:
-    """The part of a box that a detection covers, 0 to 1."""
-    return _intersection(box, detection) / float(np.prod(box[1]))
-
-
-def _overlap(box: Box, detection: Measurement) -> float:
-    """Intersection over union of two boxes, 0 to 1."""
-    both = _intersection(box, detection)
-    return both / (float(np.prod(box[1])) + float(np.prod(detection.size_px)) - both)

@@ -1,4 +1,9 @@
-"""Finding a target in a single frame of the wide view: by its colour (the book) or by its motion (person, bird)."""
+"""Finding targets in the wide view: by colour (the book), by motion (a person), as a speck that changes (a bird).
+
+`make_detector` knows four by name: "colour"; "mog2", the paper's adaptive Gaussian mixture and nothing beside it;
+"motion", that mixture with what foliage needs; and "speck", for small targets that may hover, seen by a camera that may
+shake. `ExternalDetector` makes a fifth of any function from a picture to boxes.
+"""
 
 import cv2
 import numpy as np
@@ -6,7 +11,9 @@ import numpy as np
 from cotarget.config import TargetConfig
 from cotarget.detection.base import Detection, Detector
 from cotarget.detection.colour import ColourDetector
-from cotarget.detection.motion import BIRD, PERSON, MotionDetector, MotionSettings
+from cotarget.detection.external import ExternalDetector
+from cotarget.detection.motion import BIRD, PERSON, MotionDetector, MotionSettings, plain
+from cotarget.detection.speck import SpeckDetector
 from cotarget.errors import ConfigError
 from cotarget.rig import Image
 
@@ -16,9 +23,12 @@ __all__ = [
     "ColourDetector",
     "Detection",
     "Detector",
+    "ExternalDetector",
     "MotionDetector",
     "MotionSettings",
+    "SpeckDetector",
     "make_detector",
+    "plain",
 ]
 
 
@@ -34,8 +44,12 @@ def make_detector(target: TargetConfig, rate_hz: float, template: Image | None =
     Raises:
         ConfigError: a colour target without a usable template.
     """
-    if target.detector == "motion":
-        return MotionDetector(BIRD if target.dimension == "wingspan" else PERSON, rate_hz)
+    kind: str = target.detector
+    if kind == "speck":
+        return SpeckDetector()
+    if kind in ("motion", "mog2"):
+        settings = BIRD if target.dimension == "wingspan" else PERSON
+        return MotionDetector(plain(settings) if kind == "mog2" else settings, rate_hz)
     if template is None:
         if target.template is None:
             raise ConfigError('a target with detector = "colour" needs a template, a picture of the target')

@@ -1,6 +1,6 @@
 """What moves: an adaptive Gaussian mixture of the background, morphology and connected pieces (person, bird)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -54,6 +54,8 @@ SWAY_UPDATE_S = 0.25
 # Levels by which a pixel must leave that range: five standard deviations of the sensor's noise of 2, and coding.
 SWAY_MARGIN = 15
 
+# The plain mixture remembers 120 frames at 30 a second [s].
+PLAIN_HISTORY_S = 4.0
 # A bird may be as small as four pixels, so that nothing is opened away; it casts no shadow on the sky.
 BIRD = MotionSettings(
     history_s=8.0,
@@ -85,6 +87,11 @@ PERSON = MotionSettings(
     widest=1.3,
     largest=0.9,
 )
+
+
+def plain(settings: MotionSettings) -> MotionSettings:
+    """The paper's detector: the mixture alone, with OpenCV's part of the background and nothing against sway."""
+    return replace(settings, history_s=PLAIN_HISTORY_S, background_part=0.9, threshold=25.0, sway_px=0)
 
 
 class MotionDetector:

@@ -1,0 +1,267 @@
+"""Small targets on drawn pictures: what stands out and changes is found, what only does one of the two is not."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.config import DEFAULT_TARGETS
+from cotarget.detection import MotionDetector, SpeckDetector, make_detector
+from cotarget.detection.cameramotion import CameraMotion
+from cotarget.detection.change import History, change
+from cotarget.detection.contrast import find_specks
+from cotarget.detection.speck import CLEAR_SIGNAL, EVEN, speck_score
+from cotarget.errors import CotargetError
+from cotarget.rig import Frame
+from cotarget.tracking import Tracker, settings_for
+
+RATE = 25.0
+NOISE = 2.0  # grey levels, as the simulated sensor's
+HEIGHT, WIDTH = 240, 320
+SPECK = dataclasses.replace(DEFAULT_TARGETS["bird"], detector="speck")
+
+
+def landscape(rng):
+    """A sky with a gradient above a rough ground that corners are found in."""
+    rows = np.linspace(210, 150, HEIGHT)[:, None, None] * np.array([1.0, 0.85, 0.7])
+    picture = np.broadcast_to(rows, (HEIGHT, WIDTH, 3)).copy()
+    ground = cv2.GaussianBlur(rng.normal(0, 1, (70, WIDTH)), (0, 0), 2.0)
+    picture[170:] = 80 + 40 * (ground / ground.std())[..., None]
+    return picture
+
+
+def draw(picture, u, v, width, height, grey=60.0):
+    """A dark ellipse with soft edges at a sub-pixel place."""
+    scale = 16
+    x, y = (round(float(n) * scale) for n in (u, v))
+    axes = (round(width / 2 * scale), round(height / 2 * scale))
+    there = np.zeros(picture.shape[:2], np.uint8)
+    cv2.ellipse(there, (x, y), axes, 0, 0, 360, 255, -1, cv2.LINE_AA, 4)
+    part = cv2.GaussianBlur(there, (0, 0), 0.5)[..., None] / 255
+    picture[:] = picture * (1 - part) + grey * part
+
+
+def photograph(picture, rng):
+    return np.clip(np.rint(picture + rng.normal(0, NOISE, picture.shape)), 0, 255).astype(np.uint8)
+
+
+def watch(pictures, detector=None):
+    detector = detector or SpeckDetector()
+    return [detector.detect(Frame(picture, i / RATE)) for i, picture in enumerate(pictures)]
+
+
+def follow(pictures):
+    """Confirmed tracks of each frame."""
+    tracker = Tracker(settings_for(SPECK), (WIDTH, HEIGHT))
+    found = watch(pictures)
+    return [[t for t in tracker.update(boxes, i / RATE) if t.confirmed] for i, boxes in enumerate(found)]
+
+
+def film(frames, paint, seed=0):
+    rng = np.random.default_rng(seed)
+    ground = landscape(rng)
+    pictures = []
+    for i in range(frames):
+        picture = ground.copy()
+        paint(picture, i)
+        pictures.append(photograph(picture, rng))
+    return pictures
+
+
+def test_a_bird_that_hovers_on_the_spot_is_followed_and_what_stands_is_not():
+    """Wings beat at 4 Hz on a body that stays where it is; beside it a dark thing of the same size only stands."""
+
+    def paint(picture, i):
+        beat = np.sin(2 * np.pi * 4 * i / RATE)
+        draw(picture, 100, 80, 4, 4)
+        draw(picture, 100, 80 - 2 * beat, 10, 2)
+        draw(picture, 220, 80, 8, 5)
+
+    tracks = follow(film(60, paint))
+    for confirmed in tracks[20:]:
+        (track,) = confirmed
+        assert track.id == tracks[20][0].id
+        assert np.linalg.norm(track.center_px - (100, 80)) < 3.0
+
+
+@pytest.mark.parametrize("size", [4, 8, 16, 32, 56])
+def test_small_targets_of_all_sizes_are_found_where_they_are(size):
+    speed = max(1.7, 0.1 * size)  # a tenth of itself a frame; px
+
+    def paint(picture, i):
+        draw(picture, 40.3 + speed * i, 80.6, size, 0.6 * size)
+
+    found = watch(film(40, paint))
+    for i, boxes in list(enumerate(found))[15:]:
+        (box,) = [box for box in boxes if box.score > 0.5]
+        # The outline at a third of the contrast lies half a pixel outside the true one on each side, at most one.
+        np.testing.assert_allclose(box.center_px, (40.3 + speed * i, 80.6), atol=1.0)
+        assert -0.1 * size - 1 <= box.size_px[0] - size <= 2.5
+
+
+def test_faint_targets_in_much_noise_are_found():
+    """15 grey levels darker than the sky: seven standard deviations of the noise."""
+
+    def paint(picture, i):
+        v, u = 80, 60 + 2 * i
+        picture[v - 2 : v + 3, u - 3 : u + 4] -= 15
+
+    tracks = follow(film(60, paint))
+    assert (
+        np.mean([any(np.abs(t.center_px - (60 + 2 * i, 80)).max() < 4 for t in tracks[i]) for i in range(20, 60)]) > 0.9
+    )
+    assert all(len(confirmed) <= 1 for confirmed in tracks)
+
+
+def test_poles_wires_and_edges_are_no_specks():
+    rng = np.random.default_rng(1)
+    picture = landscape(rng)
+    picture[:, 100:103] = 60  # a pole
+    picture[50:52] = 60  # a wire
+    picture[:60, 200:] += 25  # a cloud's edge
+    grey = cv2.cvtColor(photograph(picture, rng), cv2.COLOR_BGR2GRAY)
+    assert [speck for speck in find_specks(grey, 5.0, 40) if speck.low[1] < 150] == []
+
+
+def test_a_camera_that_shakes_makes_nothing_move():
+    """Everything shifts by a pixel or two every frame: a sign in the sky and the rough ground stay what they are."""
+    rng = np.random.default_rng(2)
+    ground = landscape(rng)
+    draw(ground, 220, 80, 6, 5)
+    pictures = []
+    for _ in range(60):
+        M = np.column_stack([np.eye(2), rng.normal(0, 1.5, 2)])
+        pictures.append(photograph(cv2.warpAffine(ground, M, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT), rng))
+    assert not any(follow(pictures))
+
+
+def test_light_that_flickers_makes_nothing_move():
+    rng = np.random.default_rng(3)
+    ground = landscape(rng)
+    draw(ground, 220, 80, 6, 5)
+    pictures = [photograph(ground * (0.9 + 0.1 * np.sin(2 * np.pi * 3 * i / RATE)), rng) for i in range(60)]
+    assert not any(follow(pictures))
+
+
+def test_the_cameras_shift_is_measured():
+    rng = np.random.default_rng(4)
+    ground = landscape(rng)
+    camera, total = CameraMotion(), np.zeros(2)
+    for i in range(40):
+        total = total + rng.uniform(-3, 3, 2) * (i > 0)
+        M = np.column_stack([np.eye(2), total])
+        image = photograph(cv2.warpAffine(ground, M, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT), rng)
+        shift = camera.update(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+        assert not camera.jumped
+    # A tenth of a pixel a frame, in 40 frames as a random walk.
+    assert np.linalg.norm(shift - total) < 0.1 * np.sqrt(40)
+
+
+def test_a_cut_is_noticed_and_a_sky_without_corners_stands():
+    rng = np.random.default_rng(5)
+    camera = CameraMotion()
+    for seed in (6, 6, 6, 7):
+        picture = photograph(landscape(np.random.default_rng(seed)), rng)
+        camera.update(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+    assert camera.jumped
+    camera = CameraMotion()
+    for _ in range(5):
+        shift = camera.update(np.full((HEIGHT, WIDTH), 180, np.uint8))
+    assert shift.tolist() == [0, 0]
+    assert not camera.jumped
+
+
+def test_a_cut_finds_nothing_until_the_new_scene_has_been_seen_for_a_while():
+    def paint(picture, i):
+        draw(picture, 220, 80, 8, 5)
+
+    found = watch(film(30, paint, seed=8) + film(30, paint, seed=9))
+    assert not any(box.score > 0.5 for boxes in found[30:] for box in boxes)
+
+
+def test_change_is_a_part_of_the_targets_own_contrast():
+    """By hand: a dark square that is gone has changed wholly, one that stands not at all, whatever the contrast."""
+    for grey in (40, 140):
+        before = np.full((60, 80), 160, np.uint8)
+        after = before.copy()
+        after[20:26, 30:36] = grey
+        low, size, still = (30, 20), (6, 6), np.zeros(2)
+        assert change(after, low, size, 160.0, still, 0.0, (before, still)) == pytest.approx(1.0)
+        assert change(after, low, size, 160.0, still, 0.0, (after, still)) == 0.0
+        shifted = np.roll(after, 5, axis=1)
+        assert change(shifted, (35, 20), size, 160.0, np.array([5.0, 0.0]), 0.0, (after, still)) == 0.0
+    assert change(after, low, size, 160.0, np.array([60.0, 0.0]), 0.0, (before, still)) == 0.0  # was not in view
+
+
+def test_the_pictures_noise_is_measured():
+    rng = np.random.default_rng(10)
+    history = History()
+    for i in range(3):
+        history.add(i / RATE, np.clip(rng.normal(128, 4.0, (240, 320)), 0, 255).astype(np.uint8), np.zeros(2))
+    assert history.noise == pytest.approx(4.0, rel=0.3)
+
+
+def test_score_rises_with_contrast_and_change_and_neither_alone_will_do():
+    """Half at the stated balance; a clear contrast does not make up for a lack of change."""
+    usual = [0.05, 0.08, 0.15, 0.20]
+    assert speck_score(EVEN, usual) == pytest.approx(0.5)
+    assert speck_score(6.0, [0.9] * 4) > 0.8
+    assert speck_score(100.0, [0.0] * 4) < 0.05
+    assert speck_score(100.0, usual) == speck_score(CLEAR_SIGNAL, usual)
+    appeared = [0.0, 0.0, 1.0, 1.0]  # what has come and stands
+    assert speck_score(CLEAR_SIGNAL, appeared) < 0.5 < speck_score(CLEAR_SIGNAL, [0.1, 0.3, 1.0, 1.0])
+    assert speck_score(CLEAR_SIGNAL, [float("nan")] * 4) == 0.0
+
+
+def test_frames_that_repeat_and_times_that_jump():
+    """The same picture again tells nothing; a clock that jumps makes the detector learn anew; neither ends it."""
+
+    def paint(picture, i):
+        draw(picture, 60 + 3 * i, 80, 8, 5)
+
+    pictures = film(24, paint)
+    detector = SpeckDetector()
+    for i, picture in enumerate(pictures):
+        found = detector.detect(Frame(picture, i / RATE))
+    assert found
+    assert detector.detect(Frame(pictures[-1], 24 / RATE)) == []
+    for t in (100.0, 1.0, 1.0, 1.04):
+        assert (
+            detector.detect(Frame(photograph(landscape(np.random.default_rng(0)), np.random.default_rng(1)), t)) == []
+        )
+    with pytest.raises(CotargetError, match="320x240 to 200x100"):
+        detector.detect(Frame(np.zeros((100, 200, 3), np.uint8), 2.0))
+
+
+def test_pictures_too_small_dark_or_bright_are_no_error():
+    for value in (0, 255):
+        for shape in ((8, 8, 3), (50, 60, 3), (HEIGHT, WIDTH, 3)):
+            pictures = [np.full(shape, value, np.uint8) for _ in range(3)]
+            pictures[1][0, 0] = 128
+            assert watch(pictures) == [[], [], []]
+
+
+def test_a_hundred_moving_things_keep_their_numbers():
+    rng = np.random.default_rng(11)
+    start = np.stack(np.meshgrid(np.linspace(20, 280, 10), np.linspace(20, 200, 10)), axis=-1).reshape(-1, 2)
+    tracker = Tracker(settings_for(dataclasses.replace(SPECK, detector="mog2")))
+
+    @dataclasses.dataclass
+    class Seen:
+        center_px: np.ndarray
+        size_px: np.ndarray
+        score: float = 1.0
+        clipped: bool = False
+
+    for i in range(30):
+        places = start + i * np.array([1.0, 0.3]) + rng.normal(0, 0.2, start.shape)
+        tracks = tracker.update([Seen(p, np.array([5.0, 4.0])) for p in places], i / RATE)
+    assert [t.id for t in tracks] == list(range(1, 101))
+    assert all(t.confirmed for t in tracks)
+
+
+def test_names_of_detectors():
+    assert isinstance(make_detector(SPECK, RATE), SpeckDetector)
+    for name in ("motion", "mog2"):
+        assert isinstance(make_detector(dataclasses.replace(SPECK, detector=name), RATE), MotionDetector)
