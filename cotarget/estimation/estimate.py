@@ -1,0 +1,144 @@
+"""What is known of a target at one time: position and velocity in 3D, size, and where the zoom camera would see it."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from cotarget.calibration import Calibration
+from cotarget.config import TargetConfig
+from cotarget.estimation.motion import PAN, SEEN, TILT, G, K, L, W
+from cotarget.estimation.sight import Sights
+from cotarget.geometry import Array
+from cotarget.targeting import Closeup
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """Where a target will be in the zoom image.
+
+    Attributes:
+        offset_px: from the image's centre, right and down, (2,).
+        covariance: of it [px^2], (2, 2).
+        size_px: the target's known dimension as it will appear.
+        size_sigma: its standard deviation, relative.
+    """
+
+    offset_px: Array
+    covariance: Array
+    size_px: float
+    size_sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """One target at one time.
+
+    Attributes:
+        t: the time that it is for [s].
+        measured_t: when the newest measurement before that was made [s].
+        state: see `cotarget.estimation.motion`, (13,).
+        state_covariance: (13, 13).
+        surprise: squared innovation over its expectation, averaged over the last measurements; 1 is as expected,
+            several says that the target moves harder than it should or that the calibration is wrong.
+        size_prior: standard deviation of the true size over the told one, as it was assumed.
+        bias_prior: likewise of the head's bias [rad].
+        target: what was told of it.
+        calibration: of the rig.
+        sights: likewise, prepared.
+    """
+
+    t: float
+    measured_t: float
+    state: Array
+    state_covariance: Array
+    surprise: float
+    size_prior: float
+    bias_prior: float
+    target: TargetConfig
+    calibration: Calibration
+    sights: Sights
+
+    @property
+    def x_fixed(self) -> Array:
+        """Position in the fixed camera's frame [m], (3,)."""
+        a, b, log_depth = self.state[:3]
+        return math.exp(log_depth) * np.array([a, b, 1.0])
+
+    @property
+    def velocity(self) -> Array:
+        """Velocity in the fixed camera's frame [m/s], (3,)."""
+        return math.exp(self.state[L]) * self.state[W]
+
+    @property
+    def covariance(self) -> Array:
+        """Of position and velocity in the fixed camera's frame [m, m/s], (6, 6), to first order."""
+        J = np.eye(6) * self.depth
+        J[:3, L] = self.x_fixed
+        J[3:, L] = self.velocity
+        return J @ self.state_covariance[:6, :6] @ J.T
+
+    @property
+    def depth(self) -> float:
+        """Along the fixed camera's axis [m]."""
+        return math.exp(self.state[L])
+
+    @property
+    def depth_sigma(self) -> float:
+        """Standard deviation of the depth, relative."""
+        return math.sqrt(self.state_covariance[L, L])
+
+    @property
+    def bias(self) -> tuple[float, float]:
+        """What to take from the pan and tilt that are solved for, because the head points that much too far [rad]."""
+        return float(self.state[PAN]), float(self.state[TILT])
+
+    @property
+    def size(self) -> float:
+        """The target's true size [m], as far as both views tell."""
+        return self.target.size * math.exp(self.state[K])
+
+    @property
+    def size_surprise(self) -> float:
+        """How far the true size is from the told one, in the standard deviations that were assumed; 0 is as told."""
+        return float(self.state[K]) / self.size_prior
+
+    @property
+    def bias_surprise(self) -> float:
+        """How far the head's bias is, in the standard deviations that were assumed; above 4, calibrate again."""
+        return math.hypot(*self.bias) / self.bias_prior
+
+    @property
+    def closeup(self) -> Closeup:
+        """How large the target shall be, for `aim`: its size as it shows itself now, foreshortened or not."""
+        apparent = self.target.size * math.exp(self.state[K] + self.state[G])
+        return Closeup(apparent, self.target.wanted_px, self.target.dimension == "height")
+
+    def appearance(self, pan: float, tilt: float, nominal_px: float) -> Appearance | None:
+        """Where the target appears in the zoom image, the head's bias included.
+
+        Args:
+            pan: what the head reports then [rad].
+            tilt: likewise.
+            nominal_px: what the lens reports then [px].
+
+        Returns:
+            None where the target is behind the camera.
+        """
+        tangent, J, d = self.sights.at(pan, tilt, nominal_px).seen(self.state)
+        if d[2] <= 0:
+            return None
+        lens = self.calibration.zoom.at(nominal_px)
+        focal = np.array(lens.focal_px)
+        J = focal[:, None] * J
+        P = self.state_covariance
+        size = math.exp(self.state[K] + self.state[G] - self.state[L]) * self.target.size / d[2]
+        h = np.array([-1.0, 1.0, 1.0])
+        spread = h @ P[np.ix_([L, K, G], [L, K, G])] @ h
+        return Appearance(
+            # Straight lines from the principal point: near the centre, where it matters, distortion does not.
+            offset_px=focal * tangent + np.array(lens.center_px) - lens.image_center_px,
+            covariance=J @ P[np.ix_(SEEN, SEEN)] @ J.T,
+            size_px=size * float(focal[1 if self.target.dimension == "height" else 0]),
+            size_sigma=math.sqrt(max(float(spread), 0.0)),
+        )

@@ -1,0 +1,184 @@
+"""One target's filter in 3D: time-stamped measurements of both cameras, in any order, to an Estimate at any time."""
+
+import bisect
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from cotarget.calibration import Calibration
+from cotarget.config import TargetConfig
+from cotarget.estimation.correct import SizeSeen, WideSeen, ZoomSeen, begin, correct_wide, correct_zoom
+from cotarget.estimation.estimate import Estimate
+from cotarget.estimation.motion import propagate
+from cotarget.estimation.node import Node
+from cotarget.estimation.settings import EstimationSettings, estimation_settings_for
+from cotarget.estimation.sight import Sights, tangents
+from cotarget.geometry import Array
+from cotarget.tracking import Measurement
+
+
+class SpatialFilter:
+    """Where one target is in 3D and how fast it moves, how large it is, and by how much the head points wrongly.
+
+    Measurements may come in any order, because each says when its light fell. Those of the last second or so are kept,
+    and a late one is taken into account by going over all that came after it once more: the result is the same as if
+    all had come in order.
+    """
+
+    def __init__(
+        self, calibration: Calibration, target: TargetConfig, settings: EstimationSettings | None = None
+    ) -> None:
+        """Begin without a measurement.
+
+        Args:
+            calibration: of the rig, for the streams in use.
+            target: its told size, and which dimension that is.
+            settings: how it moves and is measured; by default those of its kind.
+
+        Raises:
+            CalibrationError: the calibration has no T.
+        """
+        self._calibration = calibration
+        self._target = target
+        self._settings = settings or estimation_settings_for(target, calibration)
+        self._sights = Sights(calibration)
+        self._base: Node | None = None  # the state before the first measurement kept
+        self._seen: list[WideSeen | ZoomSeen] = []
+        self._nodes: list[Node | None] = []  # the state after each of them, as far as gone over
+
+    def see_wide(
+        self, detection: Measurement, t: float, *, sigma_px: float | None = None, size_px: float | None = None
+    ) -> bool:
+        """Take a detection in the wide view into account.
+
+        Args:
+            detection: its box; one that the image's border cuts tells its size no more, and its middle badly.
+            t: when the frame's light fell [s].
+            sigma_px: standard deviation of the box's middle [px]; by default from the settings and the box's size.
+            size_px: the known dimension in the image [px], where it is better known than from this box alone, as
+                the largest over a wing beat.
+
+        Returns:
+            Whether it could be taken: not when it is older than all that is kept, or no ray leads to its pixel.
+        """
+        found = tangents(self._calibration.fixed, detection.center_px)
+        if found is None:
+            return False
+        z, J = found
+        settings = self._settings
+        width, height = (float(side) for side in detection.size_px)
+        sigma_u = sigma_v = sigma_px or 0.0
+        if sigma_px is None:
+            sigma_u = math.hypot(settings.noise_px, settings.noise_of_size * width)
+            sigma_v = math.hypot(settings.noise_px, settings.noise_of_size * height)
+        if detection.clipped:  # the hidden part may be as large again
+            sigma_u, sigma_v = math.hypot(sigma_u, width / 2), math.hypot(sigma_v, height / 2)
+        vertical = self._vertical(width, height)
+        side = size_px if size_px is not None else (height if vertical else width)
+        size = None if detection.clipped else self._size(side, J[int(vertical), int(vertical)])
+        return self._insert(WideSeen(t, z, (J * np.array([sigma_u**2, sigma_v**2])) @ J.T, size))
+
+    def see_zoom(
+        self,
+        pixel: Array,
+        sigma_px: float,
+        pan: float,
+        tilt: float,
+        nominal_px: float,
+        t: float,
+        *,
+        size_px: float | None = None,
+        head_sigma: float | None = None,
+    ) -> bool:
+        """Take what the zoom camera sees of the target into account.
+
+        Args:
+            pixel: middle of the target in the zoom image, (2,) [px].
+            sigma_px: its standard deviation [px].
+            pan: what the head reported for the time of this frame [rad].
+            tilt: likewise.
+            nominal_px: what the lens reported for that time [px].
+            t: when the frame's light fell [s].
+            size_px: the known dimension in the zoom image [px], where it is wholly seen.
+            head_sigma: standard deviation of what the head reports [rad]; larger while it moves and its time is
+                known badly. By default from the settings.
+
+        Returns:
+            Whether it could be taken, see `see_wide`.
+        """
+        lens = self._calibration.zoom.at(nominal_px)
+        found = tangents(lens, pixel)
+        if found is None:
+            return False
+        z, J = found
+        sigma = self._settings.head_sigma if head_sigma is None else head_sigma
+        R = J @ J.T * sigma_px**2 + np.eye(2) * sigma**2
+        vertical = self._target.dimension == "height"
+        size = None if size_px is None else self._size(size_px, J[int(vertical), int(vertical)])
+        return self._insert(ZoomSeen(t, z, R, self._sights.at(pan, tilt, nominal_px), size))
+
+    def at(self, t: float) -> Estimate | None:
+        """The estimate for a time [s], later than the newest measurement or up to a second or so before it.
+
+        Returns:
+            None before the first detection in the wide view, or longer ago than measurements are kept.
+        """
+        self._run()
+        node = next((node for node in reversed(self._nodes) if node is not None and node.t <= t), self._base)
+        if node is None or node.t > t:
+            return None
+        x, P = propagate(node.x, node.P, t - node.t, self._settings.motion, node.boost)
+        return Estimate(
+            t=t,
+            measured_t=node.t,
+            state=x,
+            state_covariance=P,
+            surprise=node.surprise,
+            size_prior=self._settings.motion.size_sigma,
+            bias_prior=self._settings.motion.bias_sigma,
+            target=self._target,
+            calibration=self._calibration,
+            sights=self._sights,
+        )
+
+    def _vertical(self, width: float, height: float) -> bool:
+        """Whether the known dimension is the box's height."""
+        dimension = self._target.dimension
+        return dimension == "height" or (dimension == "wingspan" and height > width)
+
+    def _size(self, size_px: float, tangent_per_px: float) -> SizeSeen | None:
+        """What a size in the image [px] tells."""
+        if not size_px > 0:
+            return None
+        settings = self._settings
+        sigma = math.hypot(settings.size_noise, settings.size_noise_px / size_px)
+        return SizeSeen(math.log(self._target.size / (size_px * abs(tangent_per_px))), sigma)
+
+    def _insert(self, seen: WideSeen | ZoomSeen) -> bool:
+        """Put a measurement where its time belongs; what came after it will be gone over again."""
+        if not math.isfinite(seen.t) or (self._base is not None and seen.t < self._base.t):
+            return False
+        at = bisect.bisect_right([s.key for s in self._seen], seen.key)
+        self._seen.insert(at, seen)
+        del self._nodes[at:]
+        return True
+
+    def _run(self) -> None:
+        """Go over the measurements not gone over yet, and forget the oldest."""
+        for seen in self._seen[len(self._nodes) :]:
+            before = self._nodes[-1] if self._nodes else self._base
+            self._nodes.append(self._step(before, seen))
+        while len(self._seen) > 1 and self._seen[0].t < self._seen[-1].t - self._settings.history_s:
+            self._base = self._nodes.pop(0)
+            self._seen.pop(0)
+
+    def _step(self, node: Node | None, seen: WideSeen | ZoomSeen) -> Node | None:
+        """The state after one more measurement."""
+        if node is None:
+            return begin(seen, self._settings) if isinstance(seen, WideSeen) else None
+        x, P = propagate(node.x, node.P, seen.t - node.t, self._settings.motion, node.boost)
+        node = replace(node, t=seen.t, x=x, P=P)
+        if isinstance(seen, WideSeen):
+            return correct_wide(node, seen, self._settings)
+        return correct_zoom(node, seen, self._settings)

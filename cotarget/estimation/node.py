@@ -1,0 +1,37 @@
+"""The filter's whole memory after a measurement: state, covariance, and how surprising the last ones were."""
+
+import math
+from dataclasses import dataclass
+
+from cotarget.geometry import Array
+
+
+@dataclass(frozen=True)
+class Node:
+    """One point in time of a filter.
+
+    Attributes:
+        t: [s].
+        x: state, see `cotarget.estimation.motion`, (13,).
+        P: its covariance, (13, 13).
+        surprise: squared innovation over what was expected, averaged over the last measurements of the middle.
+        boost: by what the acceleration's variance is larger than usual.
+        missed_wide: how many measurements in the wide view were turned away on end.
+        missed_zoom: likewise in the zoom view.
+        missed_size: likewise of the size.
+        size_t: when the size was last measured [s].
+        lean: innovation in the zoom view over its standard deviation, averaged over the last second or so, (2,).
+        wide_t: when the middle was last measured in the wide view [s].
+    """
+
+    t: float
+    x: Array
+    P: Array
+    surprise: float = 1.0
+    boost: float = 1.0
+    missed_wide: int = 0
+    missed_zoom: int = 0
+    missed_size: int = 0
+    size_t: float = -math.inf
+    wide_t: float = -math.inf
+    lean: tuple[float, float] = (0.0, 0.0)
