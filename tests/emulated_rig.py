@@ -18,6 +18,7 @@ from cotarget.config import load_config
 from tests.test_cli import true_calibration
 
 DEADLINE_S = 60.0  # for whatever must happen at all, on a machine that is busy with other things
+START_S = 120.0  # for an emulator to say where it listens
 LOOK_S = 0.02  # between looks at the truth
 STILL_S = 0.4  # a head that has not moved for so long rests
 ON_ITS_WAY_DEG = 2.0  # a head that has gone so far is turning
@@ -102,14 +103,22 @@ def emulated(folder, table, *options):
     files = ["--rig", folder / "sim.toml", "--write", folder / "hw.toml"]
     with (folder / "stderr").open("w+") as stderr:
         process = program("emulate", *files, "--seconds", "900", *options, stderr=stderr)
+        late = threading.Timer(START_S, process.kill)  # then its lines end
+        late.start()
         try:
             said = dict(process.stdout.readline().split(maxsplit=1) for _ in range(LINES - 1))
             process.stdout.readline()
+            late.cancel()
             with contextlib.closing(EmulatedRig(folder, said)) as rig:
                 yield rig
         finally:
+            late.cancel()
+            late.join()
             process.terminate()
-            process.communicate(timeout=DEADLINE_S)
+            try:
+                process.communicate(timeout=DEADLINE_S)
+            finally:
+                process.kill()
         assert (folder / "stderr").read_text() == ""
 
 
@@ -128,7 +137,8 @@ class Watch:
 
     def __exit__(self, *_):
         self._ended.set()
-        self._thread.join()
+        self._thread.join(DEADLINE_S)
+        assert not self._thread.is_alive()
 
     def _run(self):
         while not self._ended.wait(LOOK_S):

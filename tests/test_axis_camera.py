@@ -32,6 +32,7 @@ PARAM, STATUS, VIDEO = "/axis-cgi/param.cgi", "/axis-cgi/videostatus.cgi", "/axi
 SIZE = (64, 48)
 PASSWORD = "hunter2 & co"
 PATIENCE_S = 10.0  # for what should come at once, on a machine that has much else to do
+HANG_S = 120.0  # longer than any test takes; then a mistake is no hang, but a failure
 SHORT_SILENCE_S = 0.4  # instead of the driver's two seconds
 LATENCY_S = 0.06
 # The figure is 60 ms; a loaded machine may be slow to run a thread.
@@ -93,10 +94,13 @@ class Viewer:
 
 
 class Handler(socketserver.StreamRequestHandler):
+    timeout = HANG_S  # a client that says nothing, or takes nothing
+
     def handle(self):
         lines = []
-        while line := self.rfile.readline().decode("latin-1").strip():
-            lines.append(line)
+        with contextlib.suppress(TimeoutError):
+            while line := self.rfile.readline().decode("latin-1").strip():
+                lines.append(line)
         if not lines:
             return
         request, script = Request(lines), self.server.script
@@ -104,7 +108,7 @@ class Handler(socketserver.StreamRequestHandler):
         answer = script.pages.get(request.path, reply("404 Not Found"))
         answer = answer(request) if callable(answer) else answer
         if answer is None:  # hangs
-            script.closing.wait()
+            script.closing.wait(HANG_S)
             return
         with contextlib.suppress(OSError):
             self.connection.sendall(answer)
@@ -114,7 +118,7 @@ class Handler(socketserver.StreamRequestHandler):
             script.viewers.put(viewer)
             if script.closing.is_set():  # a client that came back while the server was ending
                 viewer.cut()
-            viewer.over.wait()
+            viewer.over.wait(HANG_S)
 
 
 class Script:
@@ -142,6 +146,12 @@ class Server(socketserver.ThreadingTCPServer):
     allow_reuse_address = True
 
 
+def ended(thread):
+    """Wait until a thread has ended, as it should at once."""
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+
+
 @pytest.fixture
 def server():
     script = Script()
@@ -153,7 +163,7 @@ def server():
         yield script
         script.end()
         tcp.shutdown()
-        thread.join()
+        ended(thread)
 
 
 @pytest.fixture(autouse=True)
@@ -494,11 +504,11 @@ def test_bytes_without_pictures_do_not_go_on_for_ever(server, monkeypatch):
                 while not end.wait(0.05):
                     viewer.send(bytes(100))
 
-        thread = threading.Thread(target=babble)
+        thread = threading.Thread(target=babble, daemon=True)
         thread.start()
         server.viewer().send(part(jpeg(1)))
         end.set()
-        thread.join()
+        ended(thread)
         camera.read(t, PATIENCE_S)
 
 
@@ -599,13 +609,13 @@ def test_closing_frees_a_reader_at_once_and_ends_the_thread(server):
         except DeviceError as error:
             said.put(str(error))
 
-    reader = threading.Thread(target=wait)
+    reader = threading.Thread(target=wait, daemon=True)
     reader.start()
     begun = time.monotonic()
     camera.close()
     assert said.get(timeout=PATIENCE_S) == "the fixed camera is closed"
     assert time.monotonic() - begun < vapix.SILENCE_S  # it did not wait for the socket
-    reader.join()
+    ended(reader)
     camera.close()
     assert server.viewer().gone()
     with pytest.raises(DeviceError, match="closed"):
@@ -668,7 +678,7 @@ def test_a_slow_consumer_sees_fresh_pictures(server):
             frame = camera.read()
             ages.append(clock.now() - frame.t)
         end.set()
-        sender.join()
+        ended(sender)
     assert float(np.median(ages)) < LOOSE_AGE_S
 
 
@@ -691,13 +701,13 @@ def emulated():
             if end.wait(0.04):
                 return
 
-    publisher = threading.Thread(target=publish)
+    publisher = threading.Thread(target=publish, daemon=True)
     publisher.start()
     with AxisServer({1: feed}, user="root", password=PASSWORD, sent=sent.__setitem__) as unit:
         unit.sent = sent
         yield unit
     end.set()
-    publisher.join()
+    ended(publisher)
 
 
 def watching(unit, **changes):

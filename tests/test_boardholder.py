@@ -17,6 +17,8 @@ from cotarget.hardware.board import PersonBoard, SocketBoard, in_words, make_boa
 from cotarget.hwconfig import HardwareBoard
 from tests.synthetic_rig import SyntheticRig, _Board
 
+DEADLINE_S = 30.0  # for what should come at once
+
 
 @pytest.mark.parametrize(
     ("wish", "words"),
@@ -85,8 +87,9 @@ def test_nobody_there_and_nobody_any_more_are_errors():
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         board = SocketBoard("127.0.0.1", port)
+        server.settimeout(DEADLINE_S)
         client, _ = server.accept()
-        threading.Thread(target=lambda: (client.recv(1000), client.close())).start()
+        threading.Thread(target=lambda: (client.recv(1000), client.close()), daemon=True).start()
         with pytest.raises(DeviceError, match="is gone"):
             board.present(None)
         board.close()
@@ -98,6 +101,7 @@ def test_nobody_there_and_nobody_any_more_are_errors():
 def test_brackets_without_end_are_no_answer():
     with socket.create_server(("127.0.0.1", 0)) as server:
         board = SocketBoard("127.0.0.1", server.getsockname()[1])
+        server.settimeout(DEADLINE_S)
         client, _ = server.accept()
         client.sendall(b"[" * 60000 + b"\n")
         with pytest.raises(DeviceError, match=r"the board's holder said b'\[\[\["):
@@ -110,7 +114,7 @@ def test_brackets_without_end_are_no_answer():
 def test_what_is_no_json_is_answered_and_the_server_goes_on():
     with (
         JsonLines(lambda said: {"twice": 2 * said["n"]}) as server,
-        socket.create_connection(("127.0.0.1", server.port)) as client,
+        socket.create_connection(("127.0.0.1", server.port), DEADLINE_S) as client,
         client.makefile("rwb") as lines,
     ):
         for said in (b"nonsense\n", b"[" * 60000 + b"\n", b'{"m": 1}\n', b'{"n": 2}\n'):

@@ -1134,20 +1134,33 @@ class Emulated:
 
     def __init__(self, process):
         self.process = process
-        self.port = int(process.stdout.readline())
+        self.port = int(self._said())
 
     def fault(self, name, on="on"):
         """Switch a fault on or off; where the lens is."""
         print(name, on, file=self.process.stdin, flush=True)
-        return int(self.process.stdout.readline())
+        return int(self._said())
+
+    def _said(self):
+        """Its next line; it is killed if none comes, and its lines end."""
+        late = threading.Timer(DEADLINE_S, self.process.kill)
+        late.start()
+        try:
+            return self.process.stdout.readline()
+        finally:
+            late.cancel()
+            late.join()
 
 
 @pytest.fixture(scope="module")
 def process():
     with python(EMULATOR) as process:
-        yield Emulated(process)
-        process.stdin.close()
-        process.wait(DEADLINE_S)
+        try:
+            yield Emulated(process)
+            process.stdin.close()
+            process.wait(DEADLINE_S)
+        finally:
+            process.kill()
 
 
 @pytest.fixture

@@ -356,7 +356,7 @@ def test_a_world_goes_on_after_the_machine_stood_still(fake):
 @pytest.mark.wire
 def test_a_server_of_lines_hangs_up_and_gives_its_port_back():
     with JsonLines(lambda said: said) as server:
-        client = socket.create_connection(("127.0.0.1", server.port))
+        client = socket.create_connection(("127.0.0.1", server.port), DEADLINE_S)
         with pytest.raises(DeviceError, match=f"cannot listen at 127.0.0.1:{server.port}: Address already in use"):
             JsonLines(lambda said: said, port=server.port)
         with client, client.makefile("rwb") as lines:

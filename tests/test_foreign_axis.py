@@ -57,7 +57,7 @@ class Filming:
 
     def __exit__(self, *_):
         self._stop.set()
-        self._thread.join()
+        self._thread.join(DEADLINE_S)
 
     def _run(self):
         index = 0

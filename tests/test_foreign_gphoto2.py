@@ -105,7 +105,7 @@ def camera():
         server.lens, server.faults = lens, faults
         yield server
     stop.set()
-    thread.join()
+    thread.join(TIMEOUT_S)
 
 
 @pytest.fixture

@@ -58,7 +58,7 @@ class Program:
         self.killer.cancel()
         self.killer.join()
         self.process.kill()
-        self.process.communicate()
+        self.process.communicate(timeout=LONGEST_S)
 
     def result(self, name):
         """The numbers of the next result, which must be that one."""

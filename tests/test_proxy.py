@@ -28,6 +28,7 @@ BEHIND_DEG = 0.3
 # A deadband of the lens of 4 %, steps of 2 %, the depth's error and the book's scatter in size of a few %.
 SIZE_RATIO = (0.85, 1.15)
 CENTRED = 0.06  # of the image's width
+DEADLINE_S = 60.0  # for an answer, the first of which takes a world that is made
 
 
 def serve(table, pipe):
@@ -55,6 +56,7 @@ class Line:
     def ask(self, device, name, *arguments):
         self.spoken.append((device, name))
         self.pipe.send((device, name, arguments))
+        assert self.pipe.poll(DEADLINE_S), "the world does not answer"
         ok, answer = self.pipe.recv()
         if not ok:
             raise answer
@@ -162,7 +164,7 @@ def line():
         assert process.exitcode == 0
     finally:
         process.kill()
-        process.join()
+        process.join(DEADLINE_S)
         process.close()
         ours.close()
 

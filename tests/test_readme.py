@@ -10,6 +10,7 @@ import pytest
 
 from cotarget.config import parse_config
 
+DEADLINE_S = 60.0  # for a command to say how it is used
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 # `cotarget NAME ... --option ...` up to where a line of code or of a shell ends.
 COMMANDS = re.findall(r"cotarget ([a-z-]+)((?: [^`\n]*)?)", README)
@@ -25,14 +26,16 @@ def test_configurations_are_read(block):
     assert parse_config(tomllib.loads(block)) is not None
 
 
+def asked(*arguments):
+    """What a command's --help says."""
+    command = [sys.executable, "-m", "cotarget.cli", *arguments, "--help"]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=DEADLINE_S).stdout
+
+
 @pytest.fixture(scope="module")
 def helps():
-    def ask(*arguments):
-        command = [sys.executable, "-m", "cotarget.cli", *arguments, "--help"]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
-
-    existing = known(ask())
-    return {name: ask(name) for name in sorted({name for name, _ in COMMANDS} & existing)}
+    existing = known(asked())
+    return {name: asked(name) for name in sorted({name for name, _ in COMMANDS} & existing)}
 
 
 def known(text):
@@ -49,5 +52,4 @@ def test_commands_and_their_options_exist(helps):
 
 
 def test_every_command_is_told_of(helps):
-    text = subprocess.run([sys.executable, "-m", "cotarget.cli", "--help"], capture_output=True, text=True, check=True)
-    assert known(text.stdout) <= set(helps)
+    assert known(asked()) <= set(helps)

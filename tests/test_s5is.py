@@ -472,9 +472,11 @@ def pictures(size, greys=lambda index: index % 200):
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
-    yield feed
-    stop.set()
-    thread.join()
+    try:
+        yield feed
+    finally:
+        stop.set()
+        thread.join(DEADLINE_S)
 
 
 @pytest.fixture
@@ -760,7 +762,7 @@ def test_closing_waits_for_a_still():
         letting.start()
         server.close()
         assert set(threading.enumerate()) - before <= {letting}
-        letting.join()
+        letting.join(DEADLINE_S)
 
 
 @pytest.mark.wire
