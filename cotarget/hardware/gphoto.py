@@ -5,16 +5,13 @@ would stop every thread, the head's included. Opening, settings, previews and st
 is called past Python. Listing the settings' names and looking for cameras do not wait for a camera.
 """
 
-import contextlib
 import ctypes
 import importlib
-import os
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 from cotarget.errors import ConfigError, DeviceError
-from cotarget.hardware.gphoto_memory import keep_settings_in_memory, library
+from cotarget.hardware.gphoto_memory import keep_settings_in_memory, library, standard_input_kept
 from cotarget.hardware.gphoto_port import check_listening, check_permission, full_port, shortened
 
 # libgphoto2's result codes, gphoto2/gphoto2-port-result.h and gphoto2-result.h.
@@ -104,25 +101,6 @@ class CameraLink(Protocol):
 
     def fetch(self, still: tuple[str, str]) -> bytes:
         """The contents of a still."""
-
-
-@contextlib.contextmanager
-def standard_input_kept() -> Iterator[None]:
-    """Keep descriptor 0, which libgphoto2 closes whenever it disconnects from a network camera.
-
-    Whatever opened next would get the number, a socket or a serial port, and be closed by the next disconnection. The
-    mistake is known there (github.com/gphoto/libgphoto2, pull request 1287).
-    """
-    try:
-        kept = os.dup(0)
-    except OSError:  # a program without standard input
-        kept = os.open(os.devnull, os.O_RDONLY)
-    try:
-        yield
-    finally:
-        if kept:
-            os.dup2(kept, 0)
-            os.close(kept)
 
 
 class GphotoLink:

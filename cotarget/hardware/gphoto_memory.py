@@ -1,14 +1,17 @@
-"""Lets libgphoto2 remember its own settings in memory, instead of in a file of the user's.
+"""Keeps libgphoto2 from doing to the user, and to this process, what nobody expects.
 
-It would write where stills go, and who we are to network cameras, to ~/.gphoto/settings or ~/.config/gphoto/settings,
-and the gphoto2 command would behave otherwise from then on. Another HOME would keep it from that, but that is the whole
-process's; since 2.5.32 libgphoto2 lets a program answer in place of the file.
+It remembers its own settings in memory, instead of in a file of the user's. It would write where stills go, and who we
+are to network cameras, to ~/.gphoto/settings or ~/.config/gphoto/settings, and the gphoto2 command would behave
+otherwise from then on. Another HOME would keep it from that, but that is the whole process's; since 2.5.32 libgphoto2
+lets a program answer in place of the file.
 """
 
+import contextlib
 import ctypes
 import functools
 import importlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 # Who we are to cameras that pair: always the same, so that nothing needs remembering. "cotarget" twice, in hex.
@@ -50,6 +53,25 @@ def keep_settings_in_memory() -> tuple[object, object]:
             each.gp_setting_set_get_func(functions[0], None)
             each.gp_setting_set_set_func(functions[1], None)
     return functions
+
+
+@contextlib.contextmanager
+def standard_input_kept() -> Iterator[None]:
+    """Keep descriptor 0, which libgphoto2 closes whenever it disconnects from a network camera.
+
+    Whatever opened next would get the number, a socket or a serial port, and be closed by the next disconnection. The
+    mistake is known there (github.com/gphoto/libgphoto2, pull request 1287).
+    """
+    try:
+        kept = os.dup(0)
+    except OSError:  # a program without standard input
+        kept = os.open(os.devnull, os.O_RDONLY)
+    try:
+        yield
+    finally:
+        if kept:
+            os.dup2(kept, 0)
+            os.close(kept)
 
 
 def _drivers() -> list[ctypes.CDLL]:
