@@ -87,9 +87,12 @@ class Tracker:
         self._t = t
         for state in self._tracks:
             state.predict(t)
-        pairs = _Pairs(self._tracks, detections)
-        matches = _assign(pairs)
-        crowds = _crowds(pairs, matches)
+        matches: dict[int, int] = {}
+        crowds: dict[int, int] = {}
+        if self._tracks and detections:
+            pairs = _Pairs(self._tracks, detections)
+            matches = _assign(pairs)
+            crowds = _crowds(pairs, matches)
         taken = set(matches.values())
         for i, state in enumerate(self._tracks):
             if i in crowds:
@@ -104,6 +107,8 @@ class Tracker:
 
     def _bear(self, detections: Sequence[Measurement], t: float) -> None:
         """Begin a track at each detection that does not cover one."""
+        if not detections:
+            return
         explained = (_Pairs(self._tracks, detections).covered > COVERED).any(axis=0)
         born: list[TargetFilter] = []
         for detection in (detections[int(j)] for j in np.flatnonzero(~explained)):

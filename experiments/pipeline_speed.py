@@ -1,0 +1,181 @@
+"""How long the pipeline takes for a frame, beside the background subtraction that it is built from.
+
+A film of a real bird (V_BIRD_036 of Svanstroem et al., doi 10.5281/zenodo.5500576, CC0-1.0, looked for in
+../shared/data/birds beside the project). On each of its frames, in turns because a machine's pace drifts:
+`cv2.createBackgroundSubtractorMOG2().apply` alone on BGR, and detector, tracker and the exact aim at where the target
+will be, each timed. On as many threads as OpenCV takes.
+
+    python -m experiments.pipeline_speed [--seeds 2: times through the film] [--quick] [--out DIR]
+"""
+
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration
+from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetConfig
+from cotarget.detection import Detector, make_detector
+from cotarget.errors import CotargetError
+from cotarget.pantilt import HeadGeometry
+from cotarget.rig import Frame
+from cotarget.targeting import Closeup, Reach, aim, depth_of, point_at
+from cotarget.tracking import FirstCome, Tracker, settings_for, size_for
+from cotarget.video import Film
+from experiments.harness import Experiment, Row, Settings, over_seeds, table
+
+FILM = Path(__file__).resolve().parents[2] / "shared" / "data" / "birds" / "V_BIRD_036.mp4"
+ALONE = "MOG2 alone"
+# The aim leads the target by this [s].
+LEAD_S = 0.1
+STAGES = ("detect_ms", "track_ms", "aim_ms")
+
+
+@dataclass(frozen=True)
+class PipelineSpeedSettings(Settings):
+    """Times through the film as seeds; its first frames are not timed, for a model that learns costs more or less."""
+
+    seeds: int = 2
+    frames: int = 300
+    untimed: int = 60
+
+
+class Pipeline:
+    """Detect, track and aim, as the loop does with a frame."""
+
+    def __init__(self, kind: str, film: Film) -> None:
+        """Begin anew.
+
+        Args:
+            kind: of detector.
+            film: gives size and rate.
+        """
+        self.target: TargetConfig = replace(DEFAULT_TARGETS["bird"], detector=kind)  # type: ignore[arg-type]
+        self.detector: Detector = make_detector(self.target, film.rate_hz)
+        self.tracker, self.policy = Tracker(settings_for(self.target), film.size), FirstCome()
+        self.calibration = calibration_of(film.size)
+        config = RigConfig()
+        pan, tilt = config.head_limits
+        self.reach = Reach(pan, tilt, config.focal_range_px)
+
+    def __call__(self, frame: Frame) -> Row:
+        """Do a frame; the milliseconds of each stage, and whether there was a target to aim at."""
+        began = time.perf_counter()
+        detections = self.detector.detect(frame)
+        detected = time.perf_counter()
+        track = self.policy.select(self.tracker.update(detections, frame.t))
+        tracked = time.perf_counter()
+        if track is not None:
+            closeup = Closeup(self.target.size, self.target.wanted_px)
+            size = size_for(track, self.target.dimension)
+            depth = depth_of(self.calibration, self.target, size, track.center_px)
+            x_fixed = point_at(self.calibration, track.predict(frame.t + LEAD_S), depth)
+            aim(self.calibration, x_fixed, self.reach, closeup=closeup)
+        ended = time.perf_counter()
+        times = (began, detected, tracked, ended)
+        stages = {name: 1e3 * (b - a) for name, a, b in zip(STAGES, times[:-1], times[1:], strict=True)}
+        return {"ms": 1e3 * (ended - began), "aimed": track is not None, **stages}
+
+
+def calibration_of(size: tuple[int, int]) -> Calibration:
+    """The default rig's calibration with a wide view of that size."""
+    sim = RigConfig().sim
+    middle = ((size[0] - 1) / 2, (size[1] - 1) / 2)
+    zoom = Intrinsics(sim.zoom.size, sim.zoom.focal_px, sim.zoom.center_px, sim.zoom.distortion)
+    return Calibration(
+        fixed=Intrinsics(size, sim.fixed.focal_px, middle, sim.fixed.distortion),
+        zoom=ZoomLens((RigConfig().focal_range_px[0],), (zoom,)),
+        T_zoom0_fixed=sim.T_zoom0_fixed,
+        T_head_zoom=sim.T_head_zoom,
+        head=HeadGeometry(sim.head.axis_offset_mm / 1000, float(np.radians(sim.head.squareness_deg))),
+    )
+
+
+def run(settings: PipelineSpeedSettings) -> list[Row]:
+    """One row for each frame and way; in one process, whatever the settings say.
+
+    Raises:
+        CotargetError: the film is not there.
+    """
+    if not FILM.is_file():
+        raise CotargetError(f"needs {FILM}, which is not part of the project")
+    return over_seeds(one, replace(settings, processes=1))
+
+
+def one(settings: PipelineSpeedSettings, seed: int) -> list[Row]:
+    """Go through the film once."""
+    rows: list[Row] = []
+    with Film(FILM) as film:
+        subtractor = cv2.createBackgroundSubtractorMOG2()
+
+        def alone(frame: Frame) -> Row:
+            began = time.perf_counter()
+            subtractor.apply(frame.image)
+            return {"ms": 1e3 * (time.perf_counter() - began), "aimed": True}
+
+        ways: list[tuple[str, Callable[[Frame], Row]]] = [(ALONE, alone)]
+        ways += [(kind, Pipeline(kind, film)) for kind in ("mog2", "motion", "speck")]
+        for index, frame in enumerate(film):
+            if index >= settings.frames:
+                break
+            for k in range(len(ways)):  # the first to touch a frame pays for fetching it: each is first in turn
+                way, work = ways[(k + index) % len(ways)]
+                done = work(frame)
+                if index >= settings.untimed:
+                    rows.append({"seed": seed, "frame": index, "way": way, **done})
+    return rows
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Median milliseconds of the frames with something to aim at, and how many times as long as the subtraction."""
+    found = {}
+    alone = float(np.median([row["ms"] for row in rows if row["way"] == ALONE]))
+    for way in dict.fromkeys(sorted((row["way"] for row in rows), key=lambda way: way != ALONE)):
+        mine = [row for row in rows if row["way"] == way]
+        aimed = [row for row in mine if row["aimed"]]
+        found[way] = {"frames_aimed": len(aimed) / len(mine)}
+        for name in ("ms", *STAGES):
+            found[way][name] = float(np.median([row.get(name, np.nan) for row in aimed] or [np.nan]))
+        found[way]["ratio"] = found[way]["ms"] / alone
+    return found
+
+
+def describe(settings: PipelineSpeedSettings, summary: Mapping[str, Any]) -> str:
+    """The table."""
+    return f"{FILM.name}, {settings.frames - settings.untimed} frames, {settings.seeds} times; medians\n" + table(
+        ("way", "frames aimed", "ms a frame", "detect", "track", "aim", "of MOG2 alone"),
+        ([way, *found.values()] for way, found in summary.items()),
+    )
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Milliseconds of each frame."""
+    ax = figure.subplots()
+    for way in dict.fromkeys(row["way"] for row in rows):
+        ms = np.sort([row["ms"] for row in rows if row["way"] == way])
+        ax.plot(ms, np.linspace(0, 1, len(ms)), label=way)
+    ax.set(xlabel="milliseconds a frame", ylabel="part of the frames that take less", xscale="log")
+    ax.legend(frameon=False)
+
+
+SETTINGS = PipelineSpeedSettings()
+EXPERIMENT = Experiment(
+    "pipeline_speed",
+    "Milliseconds of detect, track and aim for a frame, beside MOG2 alone.",
+    SETTINGS,
+    replace(SETTINGS, seeds=1, frames=120),
+    run,
+    summarise,
+    describe,
+    plot,
+)
+
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())
