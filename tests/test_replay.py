@@ -41,6 +41,7 @@ from tests.recorded_run import (
 from tests.test_cli import true_calibration
 
 SECONDS = 2.0
+DEADLINE_S = 60.0  # for what should come at once
 
 
 def assert_same(then, now, where="step"):
@@ -315,7 +316,7 @@ def test_a_watchdogs_halt_is_noted_and_leaves_the_replay_alone(tmp_path):
             steps.append(step)
             watchdog = threading.Thread(target=lambda: rig.clock.now() and rig.head.halt())
             watchdog.start()
-            watchdog.join()
+            watchdog.join(DEADLINE_S)
     rows = [json.loads(line) for line in lines(tmp_path / "run")]
     assert [row["call"] for row in rows if "aside" in row] == ["head.halt"] * len(steps)
     again, differences = replay(tmp_path / "run")
@@ -327,7 +328,7 @@ def asked_aside(rig):
     answers = []
     thread = threading.Thread(target=lambda: answers.extend([rig.clock.now(), rig.head.state(), rig.head.halt()]))
     thread.start()
-    thread.join()
+    thread.join(DEADLINE_S)
     return answers
 
 
@@ -501,10 +502,14 @@ def test_a_run_that_is_killed_replays_up_to_shortly_before(tmp_path, steps):
     """SIGKILL while it records: what it said it had done is there, but for what was still on its way to the disk."""
     command = [sys.executable, "-m", "tests.recorded_run", str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        late = threading.Timer(DEADLINE_S, process.kill)  # then its lines end
+        late.start()
         try:
             for _ in range(steps):
                 assert process.stdout.readline()
         finally:
+            late.cancel()
+            late.join()
             process.kill()
     recording = open_recording(tmp_path / "recording")
     assert recording.truncated
