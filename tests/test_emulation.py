@@ -18,7 +18,7 @@ from cotarget.calibration import load_calibration
 from cotarget.config import RigConfig, load_config
 from cotarget.emulators.emulation import FAULTS
 from cotarget.targeting import Closeup, Reach, aim, point_at
-from tests.emulated_rig import DEADLINE_S, PASSWORD, Watch, emulated, meanwhile, program
+from tests.emulated_rig import DEADLINE_S, PASSWORD, Watch, emulated, meanwhile, program, way
 from tests.test_cli import call
 
 pytestmark = [pytest.mark.wire, pytest.mark.render]
@@ -141,6 +141,15 @@ def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
 
 
 @stands
+def test_the_rig_that_is_written_can_be_stopped(rig, capsys):
+    """Though the simulated one's file names no stop file."""
+    assert run(capsys, "stop", "--rig", rig.hardware)[0] == 0
+    assert (rig.folder / "stop").exists()
+    assert "emergency stop" in run(capsys, *rig.follow("--seconds", "1"))[2]
+    assert run(capsys, "clear", "--rig", rig.hardware)[0] == 0
+
+
+@stands
 def test_the_simulation_opened_directly_aims_as_it_does_over_the_wire(rig, capsys):
     wire, direct = rig.folder / "wire.csv", rig.folder / "direct.csv"
     if not wire.exists():
@@ -225,12 +234,27 @@ NEED_A_RESET = ("head.power-cycle", "head.limit-hit")
 EVERY_FAULT = [f"{device}.{fault}" for device, faults in FAULTS.items() for fault in faults]
 
 
+def refused(rig, capsys):
+    """What the next program says, which does not move the head; a unit that was switched off may still start up."""
+    before = rig.truth()
+    deadline = time.monotonic() + DEADLINE_S
+    while True:
+        status, out, err = run(capsys, "point", "--rig", rig.hardware, "--pan-deg", "5")
+        assert (status, out) == (1, "")
+        if "starting up" not in err or time.monotonic() > deadline:
+            break
+    assert len(err.splitlines()) == 1
+    assert way(before, rig.truth()) == (0.0, 0.0)
+    return err
+
+
 @pytest.mark.slow
 @moves
 @pytest.mark.parametrize("fault", EVERY_FAULT)
 def test_every_fault_is_survived_or_ends_in_one_line(rig, capsys, fault):
     status, err, watch, at = follow_until_it_breaks(rig, capsys, fault, ["--seconds", "6"])
     if fault in NEED_A_RESET:
+        assert "cotarget reset-head" in refused(rig, capsys)
         assert run(capsys, "reset-head", "--rig", rig.hardware, "--yes")[0] == 0
     if fault == "head.unplugged":  # it comes back, maybe under another name
         deadline = time.monotonic() + DEADLINE_S
