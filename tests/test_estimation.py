@@ -414,8 +414,30 @@ def test_nothing_is_told_before_anything_is_seen():
     assert estimator.at(1.0) is None  # a direction of the zoom camera alone begins nothing
     assert not estimator.see_wide(flight.wide(0.0), math.nan)
     assert not estimator.see_wide(Detection(np.array([np.nan, 1.0]), np.array([5.0, 5.0]), 1.0), 0.0)
-    estimator.see_wide(flight.wide(0.0), 0.0)
+    assert estimator.see_wide(flight.wide(0.0), 0.0)
     assert np.isfinite(estimator.at(0.5).state).all()
+    assert not estimator.see_wide(flight.wide(0.0), 0.0)  # the same frame again
+
+
+def test_a_long_gap_and_a_target_that_flies_at_the_camera_leave_a_covariance():
+    flight = Flight("bird", 7, 3.0)
+    estimator = SpatialFilter(flight.calibration, flight.target)
+    for _, give in measurements(flight):
+        give(estimator)
+    for ahead in (0.0, 1.0, 10.0, 60.0):
+        found = estimator.at(3.0 + ahead)
+        assert np.isfinite(found.state).all()
+        assert np.linalg.eigvalsh(found.state_covariance).min() > 0
+    assert estimator.see_wide(flight.wide(0.2), 20.0)
+    again = estimator.at(20.0)
+    there = flight.path(0.2)
+    assert np.abs(again.state[:2] - there[:2] / there[2]).max() < 0.02
+    near = flight.calibration.fixed.image_center_px
+    charging = SpatialFilter(flight.calibration, flight.target)
+    for i in range(30):  # from 30 m to 1 m in 1.2 s
+        charging.see_wide(Detection(near, np.array([550.0, 100.0]) / (30.0 - i), 1.0), i / RATE)
+    assert 0.1 < charging.at(1.2).depth < 5.0
+    assert charging.at(3.0).depth > 0
 
 
 def test_a_box_that_the_border_cuts_tells_no_size():

@@ -60,7 +60,8 @@ class SpatialFilter:
                 the largest over a wing beat.
 
         Returns:
-            Whether it could be taken: not when it is older than all that is kept, or no ray leads to its pixel.
+            Whether it could be taken: not when it is older than all that is kept, or has been taken already, or no ray
+            leads to its pixel.
         """
         found = tangents(self._calibration.fixed, detection.center_px)
         if found is None:
@@ -159,7 +160,10 @@ class SpatialFilter:
         """Put a measurement where its time belongs; what came after it will be gone over again."""
         if not math.isfinite(seen.t) or (self._base is not None and seen.t < self._base.t):
             return False
-        at = bisect.bisect_right([s.key for s in self._seen], seen.key)
+        keys = [s.key for s in self._seen]
+        at = bisect.bisect_left(keys, seen.key)
+        if at < len(keys) and keys[at] == seen.key:  # a frame that is repeated tells nothing new
+            return False
         self._seen.insert(at, seen)
         del self._nodes[at:]
         return True

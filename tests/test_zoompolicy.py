@@ -1,0 +1,136 @@
+"""How far to zoom in: chances against drawn samples, and the lens's path from one frame to the next."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cotarget.estimation import SpatialFilter
+from cotarget.rig import PanTiltLimits
+from cotarget.sim.motion import Axis
+from cotarget.zoompolicy import Expected, ZoomPolicy, ZoomSettings, chance_inside, expect, longest_focal, way_left
+from tests.moving_targets import APART, Flight, show
+
+SIZE = (640, 480)
+RANGE = (690.0, 8000.0)
+LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians(206), 0.0)
+FRAME = 0.04
+# 20000 samples give a chance of 0.9 to 0.2 %; errors along both axes are counted as if they had nothing in common.
+CHANCE = 0.01
+FOUND = 3e-3  # the focal length is found to a part of two thousand; chances are steep
+
+
+def expected(sigma, offset=(0.0, 0.0), half=(0.01, 0.015), size_sigma=0.0):
+    return Expected(np.array(offset), np.eye(2) * sigma**2, np.array(half), size_sigma)
+
+
+@pytest.mark.parametrize(("sigma", "offset"), [(0.002, (0.0, 0.0)), (0.01, (0.02, -0.01)), (0.03, (0.0, 0.03))])
+def test_the_chance_is_that_of_samples(sigma, offset):
+    focal = 3000.0
+    seen = expected(sigma, offset)
+    at = np.random.default_rng(0).normal(offset, sigma, (20000, 2))
+    inside = (np.abs(at) + seen.half <= np.array(SIZE) / 2 / focal).all(axis=1)
+    assert chance_inside(seen, focal, SIZE) == pytest.approx(inside.mean(), abs=CHANCE)
+
+
+def test_what_is_larger_than_the_image_is_never_inside():
+    assert chance_inside(expected(0.0, half=(0.2, 0.1)), 2000.0, SIZE) == 0.0
+    assert chance_inside(expected(0.0), 2000.0, SIZE) == 1.0
+    assert chance_inside(expected(0.0, offset=(0.2, 0.0)), 2000.0, SIZE) == 0.0
+
+
+def test_the_longest_focal_length_has_the_chance_asked_for():
+    seen = expected(0.01, (0.005, 0.0))
+    found = longest_focal(seen, 0.95, SIZE, RANGE)
+    assert chance_inside(seen, found, SIZE) >= 0.95
+    assert chance_inside(seen, found * (1 + FOUND), SIZE) < 0.95
+    # By hand: certain and at rest in the middle, half the height over half the target's height and rim.
+    sure = expected(1e-9, half=(0.01, 0.05))
+    assert longest_focal(sure, 0.95, SIZE, RANGE, rim_px=4.0) == pytest.approx(236.0 / 0.05, rel=FOUND)
+    assert longest_focal(expected(1.0), 0.95, SIZE, RANGE) == pytest.approx(RANGE[0], rel=FOUND)
+    assert longest_focal(expected(1e-9, half=(1e-4, 1e-4)), 0.95, SIZE, RANGE) == RANGE[1]
+
+
+def test_wide_while_unsure_close_when_sure_and_out_before_it_is_lost():
+    policy = ZoomPolicy(RANGE, SIZE)
+    commanded, t, way = RANGE[0], 0.0, []
+    for sigma in [0.3] * 10 + list(np.geomspace(0.3, 0.001, 40)) + [0.001] * 20 + list(np.geomspace(0.001, 0.2, 20)):
+        choice = policy.choose(expected(sigma), 4000.0, commanded, t)
+        commanded, t = choice.focal_px, t + FRAME
+        way.append((sigma, commanded, choice))
+    assert way[9][1] == RANGE[0]
+    assert way[69][1] == pytest.approx(4000.0, rel=0.06)
+    assert way[69][2].reason == "wanted"
+    assert way[-1][1] < 1.1 * RANGE[0]
+    # Never closer than the lower chance allows, at any step.
+    assert all(c == RANGE[0] or chance_inside(expected(s), c, SIZE) >= 0.79 for s, c, _ in way)
+    assert policy.choose(None, 4000.0, commanded, t).reason == "lost"
+    assert policy.choose(None, 4000.0, 4000.0, t).focal_px == RANGE[0]
+
+
+def test_the_lens_does_not_hunt():
+    """An uncertainty that goes up and down by a fifth from frame to frame, about where it begins to matter."""
+    rng = np.random.default_rng(0)
+
+    def moves(settings):
+        policy, commanded, count = ZoomPolicy(RANGE, SIZE, settings), RANGE[0], 0
+        for i in range(500):
+            seen = expected(0.02 * math.exp(rng.normal(0, 0.2)))
+            choice = policy.choose(seen, 4000.0 * math.exp(rng.normal(0, 0.02)), commanded, i * FRAME)
+            count += choice.focal_px != commanded
+            commanded = choice.focal_px
+        return count
+
+    nervous = moves(ZoomSettings(unsure=0.95, deadband=0.0, settle_s=0.0))
+    assert moves(ZoomSettings()) < 0.15 * nervous
+
+
+def test_a_target_that_comes_near_is_followed_by_zooming_out():
+    policy, commanded = ZoomPolicy(RANGE, SIZE), 4000.0
+    for i, wanted in enumerate(np.geomspace(4000.0, 1500.0, 50)):
+        commanded = policy.choose(expected(0.002), float(wanted), commanded, i * FRAME).focal_px
+        assert abs(math.log(commanded / wanted)) < 0.1
+
+
+def test_the_lens_zooms_in_anew_only_when_things_have_settled():
+    policy = ZoomPolicy(RANGE, SIZE, ZoomSettings(settle_s=0.3))
+    out = policy.choose(expected(0.05), 4000.0, 4000.0, 0.0)
+    assert out.reason == "about to be lost"
+    assert policy.choose(expected(0.001), 4000.0, out.focal_px, 0.1).reason == "settling"
+    assert policy.choose(expected(0.001), 4000.0, out.focal_px, 0.4).focal_px == 4000.0
+
+
+@pytest.mark.parametrize(("way", "closing"), [(0.5, 0.0), (-0.5, 0.3), (0.05, 1.0), (2.0, -1.0), (0.0, 0.5)])
+def test_the_way_left_is_that_of_the_simulated_unit(way, closing):
+    axis = Axis(LIMITS.speed, LIMITS.acceleration)
+    # Bring the axis to the wanted speed at the place 0, then send it the whole way.
+    axis._segments = [(-math.inf, -closing * 100, 0.0, 0.0), (-100.0, -closing * 100, closing, 0.0)]
+    axis.command(0.0, way)
+    for seconds in (0.0, 0.05, 0.2, 0.5, 1.0, 5.0):
+        left = way - axis.motor(seconds)[0]
+        assert way_left(way, closing, seconds, LIMITS) == pytest.approx(left, abs=1e-9)
+
+
+def test_an_estimate_says_what_to_expect():
+    flight = Flight("person", 0, 2.0)
+    estimator = SpatialFilter(flight.calibration, flight.target)
+    for t in flight.times:
+        estimator.see_wide(flight.wide(t), t)
+        show(estimator, flight.zoom(t + APART))
+    t = flight.times[-1] + 0.2
+    pan, tilt = flight.aimed(t)
+    seen = expect(estimator.at(t), pan, tilt, 1700.0, width_over_height=0.26)
+    assert np.hypot(*seen.offset) < 4 * math.sqrt(np.trace(seen.covariance)) + 0.01
+    distance = np.linalg.norm(flight.path(t) - flight.truth.gamma.inv().translation)
+    np.testing.assert_allclose(seen.half, np.array([0.26, 1.0]) * flight.size / 2 / distance, rtol=0.1)
+    # Where the head is 2 degrees short of it in pan, it stands that much to the right.
+    short = expect(estimator.at(t), pan - math.radians(2), tilt, 1700.0)
+    assert short.offset[0] - seen.offset[0] == pytest.approx(math.tan(math.radians(2)), rel=0.05)
+    # The farther ahead, the wider.
+    focals = [
+        longest_focal(expect(estimator.at(t), *flight.aimed(t), 1700.0, width_over_height=0.26), 0.95, SIZE, RANGE)
+        for t in flight.times[-1] + np.array([0.1, 0.5, 1.0])
+        if flight.path.x[-1] > t
+    ]
+    assert (np.diff(focals) < 0).all()
+    assert expect(estimator.at(t), pan + math.pi, tilt, 1700.0) is None
