@@ -161,6 +161,8 @@ class SimEffects:
         scatter: true sizes differ from what the pipeline is told.
         shadows: cast shadows (costs two to four times the rendering).
         multisampling: antialiasing with 4 samples.
+        clutter: outdoors foliage sways, clouds drift, shadows cross the ground and the light changes. Off by default:
+            the figures of calibration and of the demo are for a world at rest.
     """
 
     noise: bool = True
@@ -178,6 +180,7 @@ class SimEffects:
     scatter: bool = True
     shadows: bool = False
     multisampling: bool = True
+    clutter: bool = False
 
 
 # Offsets of the kind the paper's rig had: 0.4 m beside each other, a few degrees apart, the camera bolted to the

@@ -20,6 +20,7 @@ Color = tuple[int, int, int]  # (red, green, blue); reversed where OpenCV wants 
 
 BOOK_MARKER, PERSON_MARKER, BIRD_MARKER = 1, 2, 3  # ids in DICT_4X4_50
 MARKER_CELLS = 6  # of a 4x4 marker with its black border
+FURTHER_MARKERS = (10, 20, 30, 40)  # added to the ids for the second to the fifth person or bird
 
 
 # ---------------------------------------------------------------- textures
@@ -67,8 +68,10 @@ def marker_image(marker: int, cell: int, quiet: float) -> npt.NDArray[np.uint8]:
 def draw_markers() -> None:
     """Markers of the person and the bird; off-white, so that lit paper does not saturate."""
     for name, marker, quiet in (("person", PERSON_MARKER, 1.0), ("bird", BIRD_MARKER, 0.5)):
-        image = marker_image(marker, 40, quiet).astype(float)
-        save(f"{name}_marker", np.repeat((18 + image * (222 / 255))[..., None], 3, axis=2))
+        for more in (0, *FURTHER_MARKERS):
+            image = marker_image(marker + more, 40, quiet).astype(float)
+            file = f"{name}_marker_{marker + more}" if more else f"{name}_marker"
+            save(file, np.repeat((18 + image * (222 / 255))[..., None], 3, axis=2))
 
 
 BOOK_RED: Color = (196, 22, 34)

@@ -15,8 +15,7 @@ from cotarget.rig import Image
 # The map is computed at every fourth pixel and interpolated: a distortion of k1 = -0.2 curves by less than
 # 6 |k1| r / f a pixel, so this costs at most 0.005 px, in the corners.
 MAP_STRIDE = 4
-# The fold is looked for up to this tangent (87 degrees off the axis), in steps far finer than it matters.
-FOLD_SEARCHED, FOLD_SAMPLES = 20.0, 20001
+REAL_ROOT = 1e-9  # imaginary over absolute value of a root that is real but for rounding
 # Fields and maps are kept for the lens positions in use: the fixed camera's one and the zoom camera's latest.
 KEPT_MAPS = 8
 # A fixed point: every round shrinks the error by about 3 |k1| r^2, less than 0.3.
@@ -78,17 +77,21 @@ class TrueLens:
 def _fold(distortion: tuple[float, float, float, float, float]) -> float:
     """Tangent of the angle off the axis where the radial distortion begins to shrink; infinite if it never does."""
     k1, k2, _, _, k3 = distortion
-    r = np.linspace(0.0, FOLD_SEARCHED, FOLD_SAMPLES)
-    shrinking = np.flatnonzero(np.diff(r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)) <= 0)
-    return float(r[shrinking[0]]) if len(shrinking) else np.inf
+    # Where the slope of r (1 + k1 r^2 + k2 r^4 + k3 r^6) is zero, in r^2.
+    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    turns = roots.real[(np.abs(roots.imag) < REAL_ROOT * np.abs(roots)) & (roots.real > 0)]
+    return float(np.sqrt(turns.min())) if len(turns) else np.inf
 
 
 @lru_cache(maxsize=KEPT_MAPS)
 def covering_half_field(lens: TrueLens) -> tuple[float, float]:
     """Tangents of the half field (horizontal, vertical) of a centred pinhole view that covers the whole image."""
     w, h = lens.size
-    u, v = np.meshgrid(np.linspace(-1, w, 41), np.linspace(-1, h, 31))
-    reach = np.abs(lens.directions(np.stack([u, v], axis=-1))).reshape(-1, 2).max(axis=0)
+    u, v = np.linspace(-1, w, 41), np.linspace(-1, h, 31)
+    # The image's rim: a lens that does not fold sees farthest aside there.
+    sides = [np.column_stack([u, np.full_like(u, y)]) for y in (-1, h)]
+    sides += [np.column_stack([np.full_like(v, x), v]) for x in (-1, w)]
+    reach = np.abs(lens.directions(np.concatenate(sides))).max(axis=0)
     return float(reach[0]), float(reach[1])
 
 

@@ -9,8 +9,9 @@ from cotarget.config import BoardConfig, RigConfig, SimConfig
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pattern import tiles
+from cotarget.sim.clutter import INDOORS, add_clutter
 from cotarget.sim.opengl import mujoco
-from cotarget.sim.targets import Target, scale_spec
+from cotarget.sim.targets import Target, change_marker, scale_spec
 
 # The only place where MuJoCo's camera axes (x right, y up, z back) become OpenCV's (x right, y down, z forward).
 T_OPENCV_MUJOCO = RigidTransform.from_rotation(Rotation.from_rotvec([np.pi, 0.0, 0.0]))
@@ -25,6 +26,7 @@ ARM_RADIUS = 0.012  # [m], the bracket between the head and the zoom camera
 CAMERA_FOOT = (0.0, 0.038, -0.086)  # where the zoom camera's housing stands on it, in the camera's frame [m]
 # Sensor pixels are given this size [m]; only ratios to the focal length matter to the renderer.
 RENDER_PITCH = 1e-5
+PORTRAIT_SIZE = (640, 560)  # of the pictures of the rig itself [px]
 
 
 def scene_path(scene: str) -> Path:
@@ -71,16 +73,25 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
     for target in targets:
         asset = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / target.asset))
         scale_spec(asset, target.size)
+        change_marker(asset, target.name)
         _attach(spec, asset, f"{target.name}/")
     _add_board(spec, config.board)
+    if has_clutter(config.sim):
+        add_clutter(spec, config.sim.seed)
     spec.visual.quality.offsamples = 4 if config.sim.effects.multisampling else 0
     visual = spec.visual.global_
-    visual.offwidth = max(visual.offwidth, render_size[0])
-    visual.offheight = max(visual.offheight, render_size[1])
+    # No larger than what is drawn: OpenGL clears and resolves all of it for every picture.
+    visual.offwidth = max(PORTRAIT_SIZE[0], render_size[0])
+    visual.offheight = max(PORTRAIT_SIZE[1], render_size[1])
     try:
         return spec.compile()
     except ValueError as error:
         raise ConfigError(f"{path}: does not compile with the rig: {' '.join(str(error).split())}") from None
+
+
+def has_clutter(sim: SimConfig) -> bool:
+    """Whether anything but the targets moves."""
+    return sim.effects.clutter and sim.scene not in INDOORS
 
 
 def mount_pose(model: "mujoco.MjModel") -> RigidTransform:

@@ -1,6 +1,7 @@
 """Motion in time: trapezoidal speed profiles that can be replaced on the fly, backlash, and the lens's positions."""
 
 import math
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 
 # A segment of constant acceleration: it starts at `t` with position `x`, speed `v` and acceleration `a`.
@@ -73,7 +74,7 @@ class Axis:
     def command(self, t: float, goal: float, speed: float | None = None) -> float:
         """Replace the motion from time t on; return when it will rest [s]."""
         x, v = self.motor(t)
-        kept = [s for s in self._segments if s[0] < t]
+        kept = self._segments[: bisect_left(self._segments, (t,))]
         highest = self.speed if speed is None else min(speed, self.speed)
         self._segments = kept + trapezoid(t, x, v, goal, highest, self.acceleration)
         return self._segments[-1][0]
@@ -117,7 +118,7 @@ class Axis:
 
 def _at(segments: list[Segment], t: float) -> tuple[float, float]:
     """Position and speed at time t."""
-    start, x, v, a = next(s for s in reversed(segments) if s[0] <= t)
+    start, x, v, a = segments[bisect_right(segments, (t, math.inf)) - 1]
     if v == 0.0 and a == 0.0:
         return x, 0.0
     dt = t - start

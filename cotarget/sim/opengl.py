@@ -3,10 +3,15 @@
 import ctypes.util
 import os
 import sys
+from typing import Any
+
+import numpy as np
 
 from cotarget.errors import DeviceError
+from cotarget.geometry import Array
+from cotarget.rig import Image
 
-__all__ = ["BACKEND", "make_renderer", "mujoco"]
+__all__ = ["BACKEND", "Canvas", "make_renderer", "mujoco"]
 
 INSTALL = {
     "egl": "install it: apt-get install -y libegl1 libgl1-mesa-dri libgl1",
@@ -52,3 +57,68 @@ def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.R
         raise DeviceError(
             f"OpenGL ({BACKEND}) cannot render without a screen: {reason}; {INSTALL.get(BACKEND, OTHERWISE)}"
         ) from None
+
+
+class Canvas:
+    """An offscreen renderer that draws any pinhole view, or a part of one, of a size up to its own."""
+
+    def __init__(self, model: "mujoco.MjModel", size: tuple[int, int], shadows: bool) -> None:
+        """Open OpenGL on this thread.
+
+        Args:
+            model: what is drawn.
+            size: (width, height) of the largest picture [px].
+            shadows: whether lights cast them.
+
+        Raises:
+            DeviceError: the machine has no OpenGL that can do it.
+        """
+        self._model, self._size, self._shadows = model, size, shadows
+        self._renderer: Any = make_renderer(model, *size)
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        self._others: list[Canvas] = []
+
+    def without_multisampling(self) -> "Canvas":
+        """Another one that does not antialias, closed with this one."""
+        quality = self._model.vis.quality
+        before, quality.offsamples = quality.offsamples, 0
+        try:
+            self._others.append(Canvas(self._model, self._size, self._shadows))
+        finally:
+            quality.offsamples = before
+        return self._others[-1]
+
+    def look(self, data: "mujoco.MjData", camera_id: int, option: "mujoco.MjvOption") -> None:
+        """Take the scene as a camera of the model has it."""
+        self._renderer.update_scene(data, camera_id, option)
+
+    def draw(
+        self, eye: Array, axes: Array, tangents: tuple[float, float, float, float], size: tuple[int, int]
+    ) -> Image:
+        """Draw the scene, RGB.
+
+        Args:
+            eye: optical centre in the world [m], (3,).
+            axes: the world's coordinates of right, down and forward, as columns, (3, 3).
+            tangents: of the picture's borders: left, right, bottom, top; right and up are positive.
+            size: (width, height) [px].
+        """
+        renderer, (left, right, bottom, top) = self._renderer, tangents
+        for camera in renderer.scene.camera:  # two for stereo; their mean is the view
+            near = camera.frustum_near
+            camera.pos, camera.forward, camera.up = eye, axes[:, 2], -axes[:, 1]
+            camera.frustum_center, camera.frustum_width = near * (left + right) / 2, near * (right - left) / 2
+            camera.frustum_bottom, camera.frustum_top = near * bottom, near * top
+        rect = mujoco.MjrRect(0, 0, *size)
+        image = np.empty((size[1], size[0], 3), dtype=np.uint8)
+        # mujoco.Renderer draws whole pictures of its own size only.
+        if renderer._gl_context:
+            renderer._gl_context.make_current()
+        mujoco.mjr_render(rect, renderer.scene, renderer._mjr_context)
+        mujoco.mjr_readPixels(image, None, rect, renderer._mjr_context)
+        return image[::-1]  # OpenGL's rows begin at the bottom
+
+    def close(self) -> None:
+        """Release OpenGL; more than once does no harm."""
+        for canvas in (*self._others, self):
+            canvas._renderer.close()

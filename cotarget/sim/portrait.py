@@ -6,10 +6,9 @@ import numpy as np
 
 from cotarget.geometry import Array
 from cotarget.rig import Image
-from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, RIG, RIG_GROUP
+from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, PORTRAIT_SIZE, RIG, RIG_GROUP
 from cotarget.sim.opengl import make_renderer, mujoco
 
-SIZE = (640, 560)
 FIELD_DEG = 40.0
 ELEVATION_DEG = -18.0
 CLOSEST = 1.25  # [m]
@@ -45,7 +44,7 @@ def portrait(model: "mujoco.MjModel", data: "mujoco.MjData", azimuth_deg: float,
     option.geomgroup[RIG_GROUP], option.geomgroup[FRAME_GROUP], option.geomgroup[BOARD_GROUP] = 1, axes, 0
     option.sitegroup[:] = 0
     before = float(model.vis.global_.fovy)
-    renderer = make_renderer(model, *SIZE)
+    renderer = make_renderer(model, *PORTRAIT_SIZE)
     try:
         model.vis.global_.fovy = FIELD_DEG
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
@@ -63,6 +62,6 @@ def _project(scene: "mujoco.MjvScene", x_world: Array) -> Array:
     left, right = scene.camera[0], scene.camera[1]  # MuJoCo keeps two for stereo; their middle is the view
     forward, up = np.array(left.forward), np.array(left.up)
     offset = x_world - (np.array(left.pos) + np.array(right.pos)) / 2
-    focal = SIZE[1] / 2 / np.tan(np.radians(FIELD_DEG) / 2)
+    focal = PORTRAIT_SIZE[1] / 2 / np.tan(np.radians(FIELD_DEG) / 2)
     across = np.array([offset @ np.cross(forward, up), -(offset @ up)])
-    return (np.array(SIZE) - 1) / 2 + focal * across / (offset @ forward)
+    return (np.array(PORTRAIT_SIZE) - 1) / 2 + focal * across / (offset @ forward)

@@ -10,6 +10,8 @@ from typing import Literal
 
 import cv2
 import numpy as np
+import numpy.typing as npt
+from scipy.spatial import ConvexHull
 
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.sim.lens import TrueLens
@@ -49,6 +51,23 @@ class Silhouette:
 
 
 @dataclass(frozen=True)
+class Surface:
+    """Points on a target's geoms: the outline is the union of what they span.
+
+    Attributes:
+        geoms: numbers of the target's geoms, (g,).
+        owner: for each point the index of its geom among those, (n,).
+        starts: for each geom the index of its first point, (g,).
+        points: in their geom's own frame [m], (n, 3).
+    """
+
+    geoms: npt.NDArray[np.intp]
+    owner: npt.NDArray[np.intp]
+    starts: npt.NDArray[np.intp]
+    points: Array
+
+
+@dataclass(frozen=True)
 class Truth:
     """True poses, pixels and silhouettes at any time up to now.
 
@@ -75,7 +94,9 @@ class Truth:
     head_at: Callable[[float], tuple[float, float]]
     focal_range: tuple[float, float]
     targets: Mapping[str, Target]
-    _surfaces: dict[str, list[tuple[int, Array]]] = field(default_factory=dict)
+    _surfaces: dict[str, "Surface"] = field(default_factory=dict)
+    _bodies: dict[str, int] = field(default_factory=dict)
+    _scratch: list["mujoco.MjData"] = field(default_factory=list)
 
     def lens(self, camera: CameraName, t: float) -> TrueLens:
         """A camera's optics at time t."""
@@ -104,7 +125,7 @@ class Truth:
             nominal_px: what the device calls the focal length [px].
             x_world: the point [m], (3,).
         """
-        data = self.set_state(0.0)
+        data = self._copy(self.set_state(0.0))
         data.joint(RIG + "pan").qpos[0], data.joint(RIG + "tilt").qpos[0] = pan, tilt
         mujoco.mj_kinematics(self.model, data)
         lens = self.zoom_lens_for(nominal_px)
@@ -117,54 +138,76 @@ class Truth:
         """A target's outline in a camera at time t; None if any of it is behind the camera, or beyond its lens."""
         data, lens = self.set_state(t), self.lens(camera, t)
         T_world_camera = self._camera_pose(data, camera, lens)
-        outlines = self._outlines(name, data, T_world_camera.inv(), lens)
-        everything = np.concatenate(outlines)
-        if not np.isfinite(everything).all():
+        pixels = self._outline(name, data, T_world_camera.inv(), lens)
+        if not np.isfinite(pixels).all():
             return None
-        low, high = everything.min(axis=0), everything.max(axis=0)
-        inside = _fraction_inside(outlines, low, high, lens.size)
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        inside = 1.0
+        if (low < -0.5).any() or (high > np.array(lens.size) - 0.5).any():
+            parts = np.split(pixels, self._surface(name).starts[1:])
+            inside = _fraction_inside(parts, low, high, lens.size)
         return Silhouette(low, high, inside * self._unhidden(name, data, T_world_camera.translation))
+
+    def box(self, name: str, camera: CameraName, t: float) -> tuple[Array, Array] | None:
+        """Top-left and bottom-right corner of a target's outline, (2,) [px] each, whatever hides it.
+
+        Quicker than its silhouette, whose corners they are; None if any of it is behind the camera.
+        """
+        data, lens = self.set_state(t), self.lens(camera, t)
+        pixels = self._outline(name, data, self._camera_pose(data, camera, lens).inv(), lens)
+        return (pixels.min(axis=0), pixels.max(axis=0)) if np.isfinite(pixels).all() else None
 
     def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
         """The larger side of the box, the maximum over one wing beat at the pose of time t [px]; nan behind."""
         target = self.targets[name]
         phases = np.arange(BEAT_PHASES) / BEAT_PHASES * target.beat_s if target.beat_s else [0.0]
-        data = self.set_state(t)
+        data = self._copy(self.set_state(t))
         lens = self.lens(camera, t)
         T_camera_world = self._camera_pose(data, camera, lens).inv()
+        joints = [int(self.model.joint(f"{name}/{joint}").qposadr[0]) for joint in target.pose(t).joints]
         sides = []
         for phase in phases:
-            for joint, angle in target.pose(t + phase).joints.items():
-                data.joint(f"{name}/{joint}").qpos[0] = angle
-            mujoco.mj_kinematics(self.model, data)
-            pixels = np.concatenate(self._outlines(name, data, T_camera_world, lens))
+            if joints:
+                data.qpos[joints] = list(target.pose(t + phase).joints.values())
+                mujoco.mj_kinematics(self.model, data)
+            pixels = self._outline(name, data, T_camera_world, lens)
             sides.append(np.max(pixels.max(axis=0) - pixels.min(axis=0)))
         return float(np.max(sides))
 
-    def _outlines(
-        self, name: str, data: "mujoco.MjData", T_camera_world: RigidTransform, lens: TrueLens
-    ) -> list[Array]:
-        """Pixels of the points on each of a target's geoms, (n, 2) each; nan behind the camera or beyond its lens."""
-        return [
-            lens.project(T_camera_world.apply(points @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]))
-            for geom, points in self._surface(name)
-        ]
+    def _copy(self, data: "mujoco.MjData") -> "mujoco.MjData":
+        """A state that may be changed: the world's own is kept while nobody asks for another time."""
+        if not self._scratch:
+            self._scratch.append(mujoco.MjData(self.model))
+        copy = self._scratch[0]
+        copy.qpos[:], copy.mocap_pos[:], copy.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
+        mujoco.mj_kinematics(self.model, copy)
+        return copy
+
+    def _outline(self, name: str, data: "mujoco.MjData", T_camera_world: RigidTransform, lens: TrueLens) -> Array:
+        """Pixels of the points on a target's geoms, one after the other, (n, 2); nan where the camera has none."""
+        surface = self._surface(name)
+        axes = data.geom_xmat[surface.geoms].reshape(-1, 3, 3)
+        x_world = np.einsum("nij,nj->ni", axes[surface.owner], surface.points)
+        return lens.project(T_camera_world.apply(x_world + data.geom_xpos[surface.geoms][surface.owner]))
 
     def _camera_pose(self, data: "mujoco.MjData", camera: CameraName, lens: TrueLens) -> RigidTransform:
         """The pose of a camera's body, moved along its axis to the lens's pupil."""
-        body = data.body(RIG + camera)
-        axes = body.xmat.reshape(3, 3)
-        return RigidTransform.from_components(body.xpos + axes[:, 2] * lens.pupil, Rotation.from_matrix(axes))
+        if camera not in self._bodies:
+            self._bodies[camera] = self.model.body(RIG + camera).id
+        body = self._bodies[camera]
+        axes = data.xmat[body].reshape(3, 3)
+        return RigidTransform.from_components(data.xpos[body] + axes[:, 2] * lens.pupil, Rotation.from_matrix(axes))
 
-    def _surface(self, name: str) -> list[tuple[int, Array]]:
-        """The target's geoms, each with points on its surface in its own frame."""
+    def _surface(self, name: str) -> "Surface":
+        """What a target's outline is made of."""
         if name not in self._surfaces:
-            root = self.model.body(f"{name}/{name}").id
-            self._surfaces[name] = [
-                (geom, _surface_points(self.model, geom))
-                for geom in range(self.model.ngeom)
-                if self.model.body_rootid[self.model.geom_bodyid[geom]] == root
-            ]
+            root = self.model.body(self.targets[name].body).id
+            geoms = np.flatnonzero(self.model.body_rootid[self.model.geom_bodyid] == root)
+            points = [_surface_points(self.model, int(geom)) for geom in geoms]
+            counts = [len(each) for each in points]
+            self._surfaces[name] = Surface(
+                geoms, np.repeat(np.arange(len(geoms)), counts), np.cumsum([0, *counts[:-1]]), np.concatenate(points)
+            )
         return self._surfaces[name]
 
     def _unhidden(self, name: str, data: "mujoco.MjData", eye: Array) -> float:
@@ -172,15 +215,15 @@ class Truth:
 
         Parts inside or outside the image count alike. A mesh's middle is its centre of mass.
         """
-        own = [geom for geom, _ in self._surface(name)]
+        own = self._surface(name).geoms
         groups = np.ones(mujoco.mjNGROUP, dtype=np.uint8)
         groups[[BOARD_GROUP, RIG_GROUP, FRAME_GROUP]] = 0
-        hit = np.zeros(1, dtype=np.int32)
-        reached = 0
-        for geom in own:
-            mujoco.mj_ray(self.model, data, eye, data.geom_xpos[geom] - eye, groups, 1, -1, hit)
-            reached += hit[0] in own
-        return reached / len(own)
+        hit, distance = np.zeros(len(own), dtype=np.int32), np.zeros(len(own))
+        ways = (data.geom_xpos[own] - eye).ravel()
+        mujoco.mj_multiRay(
+            self.model, data, eye, ways, groups, True, -1, hit, distance, None, len(own), float(mujoco.mjMAXVAL)
+        )
+        return float(np.isin(hit, own).mean())
 
 
 def _fraction_inside(outlines: list[Array], low: Array, high: Array, size: tuple[int, int]) -> float:
@@ -205,7 +248,8 @@ def _surface_points(model: "mujoco.MjModel", geom: int) -> Array:
     if kind == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
         start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        return np.asarray(model.mesh_vert[start : start + count], dtype=float)
+        vertices = np.asarray(model.mesh_vert[start : start + count], dtype=float)
+        return vertices[np.unique(ConvexHull(vertices).simplices)]  # the others cannot be on an outline
     ball = _sphere_points(SURFACE_POINTS)
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         return ball * size[0]

@@ -1,0 +1,96 @@
+"""Brings a compiled world to a time: head, targets, board and clutter; everything is a function of time alone."""
+
+import math
+from collections.abc import Mapping
+
+from cotarget.geometry import RigidTransform
+from cotarget.sim.clutter import Clutter
+from cotarget.sim.model import RIG, quaternion
+from cotarget.sim.motion import HeadDrive
+from cotarget.sim.opengl import mujoco
+from cotarget.sim.targets import Target
+
+SWING, SWING_PERIOD = 0.15, 1.7  # of a board that swings, to each side [m], and there and back [s]
+
+
+class WorldState:
+    """The world's poses at any time up to now."""
+
+    def __init__(
+        self,
+        model: "mujoco.MjModel",
+        targets: Mapping[str, Target],
+        head: HeadDrive,
+        T_world_fixed: RigidTransform,
+        clutter: Clutter | None,
+    ) -> None:
+        """Look up where in the model everything stands.
+
+        Args:
+            model: the compiled world.
+            targets: by name.
+            head: the axes of the pan-tilt unit.
+            T_world_fixed: the fixed camera.
+            clutter: what else moves; None for nothing.
+        """
+        self._model, self._data = model, mujoco.MjData(model)
+        self._head, self._T_world_fixed, self._clutter = head, T_world_fixed, clutter
+        self._axes = [self._address(RIG + "pan"), self._address(RIG + "tilt")]
+        self._targets = [
+            (target, self._mocap(target.body), [self._address(f"{name}/{joint}") for joint in target.pose(0.0).joints])
+            for name, target in targets.items()
+        ]
+        self._board = self._mocap("board")
+        self._boards: list[tuple[float, RigidTransform | None, bool]] = [(-math.inf, None, False)]
+        self._shown: tuple[float, float, float, int] | None = None
+
+    def at(self, t: float) -> "mujoco.MjData":
+        """Everything's pose at time t [s]; the data is the world's own and changes with the next call."""
+        pan, tilt = self._head.angles_at(t)
+        wanted = (t, pan, tilt, len(self._boards))
+        if wanted == self._shown:
+            return self._data
+        data = self._data
+        data.qpos[self._axes] = pan, tilt
+        for target, index, joints in self._targets:
+            pose = target.pose(t)
+            self._place(index, pose.T_world_target)
+            if joints:
+                data.qpos[joints] = list(pose.joints.values())
+        if (T_fixed_board := self.board_at(t)) is not None:
+            self._place(self._board, self._T_world_fixed * T_fixed_board)
+        mujoco.mj_kinematics(self._model, data)
+        if self._clutter is not None:
+            self._clutter.move(data, t)
+        self._shown = wanted
+        return data
+
+    def lit(self, t: float) -> "mujoco.MjData":
+        """The same, with the cameras and lights that a picture needs."""
+        data = self.at(t)
+        mujoco.mj_comPos(self._model, data)
+        mujoco.mj_camlight(self._model, data)
+        if self._clutter is not None:
+            self._clutter.light(self._model, t)
+        return data
+
+    def place_board(self, since: float, T_fixed_board: RigidTransform | None, swings: bool) -> None:
+        """Put the board there from a time on; None takes it away."""
+        self._boards.append((since, T_fixed_board, swings))
+
+    def board_at(self, t: float) -> RigidTransform | None:
+        """T_fixed_board at a time; None while there is no board."""
+        since, T, swings = next(placed for placed in reversed(self._boards) if placed[0] <= t)
+        if T is None or not swings:
+            return T
+        return T * RigidTransform.from_translation([SWING * math.sin(2 * math.pi * (t - since) / SWING_PERIOD), 0, 0])
+
+    def _address(self, joint: str) -> int:
+        return int(self._model.joint(joint).qposadr[0])
+
+    def _mocap(self, body: str) -> int:
+        return int(self._model.body(body).mocapid[0])
+
+    def _place(self, index: int, T_world_body: RigidTransform) -> None:
+        self._data.mocap_pos[index] = T_world_body.translation
+        self._data.mocap_quat[index] = quaternion(T_world_body)

@@ -1,0 +1,276 @@
+"""What the simulated lenses see: renders of the world, bent into the lens's image, with the blur of an exposure.
+
+An exposure is the mean of four renders spread over it, but only where something moves by more than a fraction of a
+pixel meanwhile. If the camera turns or zooms that is the whole picture: four renders without multisampling, shifted by
+parts of a pixel against each other, so that their mean is antialiased as well. If only a target moves it is a window
+around it. At rest it is a single render.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from cotarget.geometry import Array
+from cotarget.rig import Image
+from cotarget.sim.lens import TrueLens, bend, covering_half_field
+from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, RIG, RIG_GROUP
+from cotarget.sim.opengl import Canvas, mujoco
+from cotarget.sim.state import WorldState
+
+# A blurred image is the mean of this many renders spread over the exposure.
+BLUR_RENDERS = 4
+# What moves less than this during an exposure is as sharp as at rest [px].
+SHARP_PX = 0.3
+# Where those renders look beside the middle of a pixel [px]: the rotated grid that multisampling uses too.
+JITTER = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
+WINDOW_MARGIN_PX = 4  # around what moves
+LARGEST_WINDOWS = 0.3  # of the picture; where more of it moves, all of it is rendered four times
+NEAREST = 3.0  # nothing is nearer to a camera than this, for what its own shifts do to the picture [m]
+PROBES = 3  # directions on each side of the picture that tell how the camera turned
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A view without distortion: size (width, height), focal length and centre [px]."""
+
+    size: tuple[int, int]
+    focal_px: tuple[float, float]
+    center_px: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of a picture: its top-left pixel, and its size."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Where the camera and every geom is at one time.
+
+    Attributes:
+        eye: the camera's optical centre in the world [m], (3,).
+        axes: the world's coordinates of the camera's x (right), y (down) and z (forward), as columns, (3, 3).
+        positions: of the geoms [m], (n, 3).
+        turns: their axes, (n, 3, 3).
+        view: the camera's.
+    """
+
+    eye: Array
+    axes: Array
+    positions: Array
+    turns: Array
+    view: Pinhole
+
+    def pixels(self, x_world: Array) -> Array:
+        """Where points (..., 3) are in the view, (..., 2) [px]; nan behind the camera."""
+        return self.toward(x_world - self.eye)
+
+    def toward(self, way_world: Array) -> Array:
+        """Where directions (..., 3) are in the view, (..., 2) [px]; nan behind the camera."""
+        way = way_world @ self.axes
+        depth = np.where(way[..., 2:] > 0, way[..., 2:], np.nan)
+        return way[..., :2] / depth * self.view.focal_px + self.view.center_px
+
+
+class Views:
+    """Renders both cameras of a world."""
+
+    def __init__(
+        self, model: "mujoco.MjModel", state: WorldState, size: tuple[int, int], shadows: bool, multisampling: bool
+    ) -> None:
+        """Open OpenGL.
+
+        Args:
+            model: the compiled world.
+            state: brings it to a time.
+            size: (width, height) of the largest render [px].
+            shadows: whether lights cast them.
+            multisampling: whether a single render is antialiased.
+
+        Raises:
+            DeviceError: the machine cannot render.
+        """
+        self._model, self._state, self._size = model, state, size
+        self._canvas = Canvas(model, size, shadows)
+        self._plain = self._canvas  # without multisampling; made when first needed
+        self._multisampling = multisampling
+        corners = np.stack(np.meshgrid(*([-1, 1],) * 3), axis=-1).reshape(-1, 3)
+        self._corners = model.geom_aabb[:, None, :3] + corners * model.geom_aabb[:, None, 3:]
+        self._endless = model.geom_rbound == 0  # planes
+        groups = np.ones(mujoco.mjNGROUP, dtype=bool)
+        groups[[BOARD_GROUP, RIG_GROUP, FRAME_GROUP]] = False
+        self._drawn = groups[model.geom_group]
+
+    def close(self) -> None:
+        """Release OpenGL; more than once does no harm."""
+        self._canvas.close()
+
+    def sharp(self, camera: str, lens: TrueLens, t: float) -> Image:
+        """What a lens sees in an instant, BGR."""
+        view = self._view(lens)
+        return self._through(lens, view, self._render(camera, lens, view, t))
+
+    def exposed(self, camera: str, lens_at: Callable[[float], TrueLens], t: float, exposure: float) -> Image:
+        """What a lens gathers during an exposure around time t, BGR.
+
+        Args:
+            camera: its name.
+            lens_at: its optics at a time.
+            t: middle of the exposure [s].
+            exposure: how long it is [s].
+        """
+        lens = lens_at(t)
+        if exposure == 0.0:
+            return self.sharp(camera, lens, t)
+        view = self._view(lens)
+        times = (t - exposure / 2, t + exposure / 2)
+        ends = [self._moment(camera, now, when, _as_if(view, lens, now)) for when in times for now in [lens_at(when)]]
+        moments = (t + exposure * ((np.arange(BLUR_RENDERS) + 0.5) / BLUR_RENDERS - 0.5)).tolist()
+        windows = self._moving(ends, t) if _camera_moved(*ends) < SHARP_PX else None
+        if windows is None:
+            jitters = JITTER if self._multisampling else ((0.0, 0.0),) * BLUR_RENDERS
+            total = np.zeros((*view.size[::-1], 3), dtype=np.float32)
+            for moment, jitter in zip(moments, jitters, strict=True):
+                now = lens_at(moment)
+                aside = _shifted(_as_if(view, lens, now), jitter)
+                cv2.accumulate(self._render(camera, now, aside, moment, plain=self._multisampling), total)
+            return self._through(lens, view, cv2.convertScaleAbs(total, alpha=1 / BLUR_RENDERS))
+        image = np.ascontiguousarray(self._render(camera, lens, view, t))
+        for window in windows:
+            part = np.zeros((window.height, window.width, 3), dtype=np.float32)
+            for moment in moments:
+                cv2.accumulate(self._render(camera, lens, view, moment, window), part)
+            rows, columns = window.top + np.arange(2) * window.height, window.left + np.arange(2) * window.width
+            image[slice(*rows), slice(*columns)] = cv2.convertScaleAbs(part, alpha=1 / BLUR_RENDERS)
+        return self._through(lens, view, image)
+
+    def _view(self, lens: TrueLens) -> Pinhole:
+        """The render that a lens's image is made from: centred, and wide enough."""
+        half_width, half_height = covering_half_field(lens)
+        width, height = self._size
+        focal = min((width / 2 - 1) / half_width, (height / 2 - 1) / half_height)
+        return Pinhole(self._size, (focal, focal), ((width - 1) / 2, (height - 1) / 2))
+
+    def _through(self, lens: TrueLens, view: Pinhole, image: Image) -> Image:
+        """Bend a render, RGB, into a lens's image, BGR."""
+        bent = bend(np.ascontiguousarray(image), view.focal_px[0], lens)
+        return np.asarray(cv2.cvtColor(bent, cv2.COLOR_RGB2BGR), dtype=np.uint8)
+
+    def _render(
+        self, camera: str, lens: TrueLens, view: Pinhole, t: float, window: Window | None = None, plain: bool = False
+    ) -> Image:
+        """Render a view, or a window of it, RGB."""
+        moment = self._moment(camera, lens, t, view)
+        data = self._state.lit(t)
+        if plain and self._plain is self._canvas:
+            self._plain = self._canvas.without_multisampling()
+        canvas = self._plain if plain else self._canvas
+        shown = window or Window(0, 0, *view.size)
+        option = mujoco.MjvOption()
+        option.geomgroup[RIG_GROUP] = option.geomgroup[FRAME_GROUP] = 0
+        option.geomgroup[BOARD_GROUP] = self._state.board_at(t) is not None
+        option.sitegroup[:] = 0
+        groups = np.array(self._model.geom_group)
+        self._model.geom_group[self._outside(moment, shown)] = RIG_GROUP
+        try:
+            canvas.look(data, self._model.camera(RIG + camera).id, option)
+        finally:
+            self._model.geom_group[:] = groups
+        (fx, fy), (cx, cy) = view.focal_px, view.center_px
+        left, top = shown.left - 0.5 - cx, shown.top - 0.5 - cy
+        tangents = (left / fx, (left + shown.width) / fx, -(top + shown.height) / fy, -top / fy)
+        return canvas.draw(moment.eye, moment.axes, tangents, (shown.width, shown.height))
+
+    def _moment(self, camera: str, lens: TrueLens, t: float, view: Pinhole) -> Moment:
+        data = self._state.at(t)
+        body = self._model.body(RIG + camera).id
+        axes = np.array(data.xmat[body].reshape(3, 3))
+        eye = data.xpos[body] + axes[:, 2] * lens.pupil
+        turns = np.array(data.geom_xmat.reshape(-1, 3, 3))
+        return Moment(eye, axes, np.array(data.geom_xpos), turns, view)
+
+    def _outside(self, moment: Moment, window: Window) -> Array:
+        """Which geoms a window cannot show, by their bounding spheres; (n,) bool."""
+        (fx, fy), (cx, cy) = moment.view.focal_px, moment.view.center_px
+        x, y, z = ((moment.positions - moment.eye) @ moment.axes).T
+        radius = self._model.geom_rbound
+        out = z < -radius
+        # Signed distance to each side of the frustum, whose planes go through the eye.
+        for along, tangent, sign in (
+            (x, (window.left - 0.5 - cx) / fx, -1),
+            (x, (window.left + window.width - 0.5 - cx) / fx, 1),
+            (y, (window.top - 0.5 - cy) / fy, -1),
+            (y, (window.top + window.height - 0.5 - cy) / fy, 1),
+        ):
+            out |= sign * (along - tangent * z) > radius * np.hypot(1.0, tangent)
+        return out & ~self._endless
+
+    def _moving(self, ends: list[Moment], t: float) -> list[Window] | None:
+        """Windows around what moves during an exposure while the camera does not; None if they are too large."""
+        before, after = ends
+        moved = (before.positions != after.positions).any(axis=1) | (before.turns != after.turns).any(axis=(1, 2))
+        moved &= self._drawn | ((self._model.geom_group == BOARD_GROUP) & (self._state.board_at(t) is not None))
+        if not moved.any():
+            return []
+        seen = [
+            end.pixels(end.positions[moved, None] + np.einsum("gij,gkj->gki", end.turns[moved], self._corners[moved]))
+            for end in ends
+        ]
+        far = np.linalg.norm(seen[1] - seen[0], axis=-1).max(axis=1)
+        if not np.isfinite(far).all():
+            return None
+        both = np.concatenate(seen, axis=1)[far >= SHARP_PX]
+        size = np.array(before.view.size)
+        low = np.floor(both.min(axis=1) - WINDOW_MARGIN_PX).clip(0, size)
+        high = np.ceil(both.max(axis=1) + WINDOW_MARGIN_PX + 1).clip(0, size)
+        boxes = _merged([(a, b) for a, b in zip(low, high, strict=True) if (b > a).all()])
+        if sum(float(np.prod(b - a)) for a, b in boxes) > LARGEST_WINDOWS * float(np.prod(size)):
+            return None
+        return [Window(*map(int, (*a, *(b - a)))) for a, b in boxes]
+
+
+def _camera_moved(before: Moment, after: Moment) -> float:
+    """How far the picture of what stands still moves between two moments [px]."""
+    u, v = (np.linspace(-0.5, n - 0.5, PROBES) for n in before.view.size)
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    rays = np.append((pixels - before.view.center_px) / before.view.focal_px, np.ones((len(pixels), 1)), axis=1)
+    turned = float(np.linalg.norm(after.toward(rays @ before.axes.T) - pixels, axis=1).max())
+    shifted = float(np.linalg.norm(after.eye - before.eye)) / NEAREST * max(before.view.focal_px)
+    return turned + shifted if np.isfinite(turned) else np.inf
+
+
+def _merged(boxes: list[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
+    """Boxes that cover the same, none of which overlap."""
+    found: list[tuple[Array, Array]] = []
+    for low, high in boxes:
+        while hit := next((b for b in found if (b[0] < high).all() and (low < b[1]).all()), None):
+            found = [b for b in found if b is not hit]
+            low, high = np.minimum(low, hit[0]), np.maximum(high, hit[1])
+        found.append((low, high))
+    return found
+
+
+def _as_if(view: Pinhole, lens: TrueLens, now: TrueLens) -> Pinhole:
+    """The view that, bent as if by ``lens``, gives what the lens ``now`` sees.
+
+    While a zoom lens travels, its focal length and centre change during an exposure. The change of its distortion alone
+    is neglected: at most 0.3 px in the corners, at 129 positions a second and 1/100 s, where zooming moves them by 5.
+    """
+    if now is lens or now == lens:
+        return view
+    gain = np.divide(now.focal_px, lens.focal_px)
+    aside = np.subtract(now.center_px, lens.center_px) * np.divide(view.focal_px, lens.focal_px)
+    (fx, fy), (cx, cy) = (gain * view.focal_px).tolist(), (aside + view.center_px).tolist()
+    return replace(view, focal_px=(fx, fy), center_px=(cx, cy))
+
+
+def _shifted(view: Pinhole, by_px: tuple[float, float]) -> Pinhole:
+    """A view whose pixels look a little aside."""
+    return replace(view, center_px=(view.center_px[0] - by_px[0], view.center_px[1] - by_px[1]))

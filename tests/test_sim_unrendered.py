@@ -1,0 +1,70 @@
+"""A world whose frames are not rendered is in all else the same world."""
+
+import numpy as np
+import pytest
+
+from cotarget.config import parse_config
+from cotarget.sim.world import SimWorld
+
+
+def drive(w):
+    """Commands and reads as a loop gives them; everything that the rig tells."""
+    told = []
+    with w.rig as rig:
+        for k in range(8):
+            fixed, zoom = rig.fixed.read(newer_than=k * 0.04 - 0.01), rig.zoom.read()
+            told.append((fixed.t, zoom.t, rig.clock.now(), rig.head.state(), rig.zoom.state()))
+            told.append(rig.head.move(0.02 * k, -0.01 * k))
+            told.append(rig.zoom.zoom(700 + 100 * k))
+        truth = w.truth()
+        outline = truth.silhouette("person", "fixed", 0.3)
+        told.append((truth.center("person", 0.3).tolist(), outline.visible, outline.low_px.tolist()))
+        told.append(truth.head_at(0.3))
+    return told, fixed, zoom
+
+
+def config(**sim):
+    return parse_config({"sim": {"scene": "outdoor", "targets": ["person"], "effects": {"clutter": True}, **sim}})
+
+
+@pytest.mark.render
+def test_times_head_lens_and_truth_are_as_ever():
+    (seen, *_), (blind, fixed, zoom) = drive(SimWorld(config())), drive(SimWorld(config(), rendered=()))
+    assert seen == blind
+    for frame in (fixed, zoom):
+        assert frame.image.shape == (480, 640, 3)
+        assert not frame.image.any()
+        assert not frame.image.flags.writeable
+
+
+@pytest.mark.render
+def test_one_camera_alone():
+    _, fixed, zoom = drive(SimWorld(config(), rendered=("fixed",)))
+    assert fixed.image.std() > 10
+    assert not zoom.image.any()
+
+
+def test_no_opengl_is_opened_for_no_picture(monkeypatch):
+    def refuse(*_):
+        raise AssertionError("nothing is to be rendered")
+
+    monkeypatch.setattr("cotarget.sim.opengl.make_renderer", refuse)
+    drive(SimWorld(config(), rendered=()))
+
+
+def test_a_box_is_that_of_the_silhouette():
+    with (w := SimWorld(config(), rendered=())).rig:
+        truth = w.truth()
+        for t in np.arange(3.0, 6.0, 0.5):
+            low, high = truth.box("person", "fixed", t)
+            outline = truth.silhouette("person", "fixed", t)
+            np.testing.assert_array_equal((low, high), (outline.low_px, outline.high_px))
+
+
+def test_asking_for_a_pointing_miss_leaves_the_world_where_it_was():
+    with (w := SimWorld(config(), rendered=())).rig as rig:
+        truth = w.truth()
+        before = truth.T_world_camera("zoom", 0.0).as_matrix()
+        truth.line_of_sight_miss(0.5, 0.2, rig.zoom.focal_range[0], np.array([0.0, 10.0, 2.0]))
+        truth.largest_side_px("person", "zoom", 0.0)
+        np.testing.assert_array_equal(truth.T_world_camera("zoom", 0.0).as_matrix(), before)
