@@ -2,7 +2,9 @@
 
 import io
 import json
+import os
 import socket
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -295,3 +297,13 @@ def test_what_an_emulated_rig_takes_over_holds_in_any_folder(tmp_path):
         "safety": {"stop_file": str(tmp_path / "run/stop"), "pan_deg": [-5, 5]},
         "targets": {"book": {"template": str(tmp_path / "covers/mine.png")}, "bird": {"size": 0.9}},
     }
+
+
+def test_a_stop_waits_for_no_heavy_import(folder):
+    """On a machine that is busy with following, numpy and scipy alone take seconds."""
+    path = {"PYTHONPATH": str(Path(__file__).parents[1])}
+    program = "import sys; from cotarget import cli; cli.main(['stop', '--rig', 'stops.toml']); print(*sys.modules)"
+    command = [sys.executable, "-c", program]
+    said = subprocess.run(command, env=os.environ | path, capture_output=True, text=True, check=True).stdout
+    assert (folder / "run" / "stop").exists()
+    assert not {"numpy", "scipy", "cv2", "mujoco"} & set(said.split())

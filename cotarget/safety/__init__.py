@@ -6,10 +6,14 @@ keeps Python's lock, nothing runs here; the head then ends at the goal of its la
 limits.
 """
 
-from cotarget.safety.saferig import SafeRig
+from typing import TYPE_CHECKING, Any
+
 from cotarget.safety.signals import end_politely
 from cotarget.safety.stopfile import clear_stop_file, refuse_if_stopped, stop_reason, write_stop_file
 from cotarget.safety.stoplook import StopLook
+
+if TYPE_CHECKING:
+    from cotarget.safety.saferig import SafeRig
 
 __all__ = [
     "SafeRig",
@@ -20,3 +24,12 @@ __all__ = [
     "stop_reason",
     "write_stop_file",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # What SafeRig needs takes a second to import, by which `cotarget stop` would come later.
+    if name == "SafeRig":
+        from cotarget.safety.saferig import SafeRig
+
+        return SafeRig
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
