@@ -58,7 +58,7 @@ def examine(config: "RigConfig | None" = None) -> list[Finding]:
         _serial_ports(),
         _gphoto_cameras(needed=_is_real(config)),
     ]
-    return found if config is None or not _is_real(config) else [*found, *_devices(config.hardware)]
+    return found if config is None or not _is_real(config) else [*found, _position(config), *_devices(config.hardware)]
 
 
 def _is_real(config: "RigConfig | None") -> bool:
@@ -136,6 +136,17 @@ def _gphoto_cameras(needed: bool) -> Finding:
         return Finding("gphoto2 cameras", True, (", ".join(cameras()) or "none on USB") + note)
     except CotargetError as error:
         return Finding("gphoto2 cameras", not needed, f"{error}{note}", "pip install 'cotarget[hardware]'" * needed)
+
+
+def _position(config: "RigConfig") -> Finding:
+    """Whether anybody has noted that the head is not where it says."""
+    from cotarget.hardware.d46lost import LostPosition
+
+    try:
+        LostPosition(config.hardware.head.port, config.safety.stop_file).refuse()
+    except CotargetError as error:
+        return Finding("head's position", False, str(error), "cotarget reset-head --rig rig.toml")
+    return Finding("head's position", True, "nothing says that it is lost")
 
 
 def _devices(hardware: "HardwareConfig") -> list[Finding]:

@@ -20,6 +20,8 @@ STEP = math.radians(185.1428 / 3600)
 CARELESS = SafetyConfig()
 LIMITS_DEG = ((-158.91, 158.91), (-46.65, 31.06))  # 3090 and -907..604 steps of 185.1428 seconds of arc
 
+DEADLINE_S = 10.0  # for a thread that should end at once; a machine may be busy
+
 
 def for_ever(call):
     """Call until it fails."""
@@ -150,7 +152,8 @@ def test_halts_from_many_threads(opened, bench):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join()
+        thread.join(DEADLINE_S)
+        assert not thread.is_alive()
     head.halt()
     assert not bench.unit.turning()
 

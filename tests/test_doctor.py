@@ -129,3 +129,14 @@ def test_rendering_that_fails(tried, monkeypatch, change, backend, text, fix):
 @pytest.mark.render
 def test_rendering_is_really_tried():
     assert doctor._rendering().ok
+
+
+def test_a_lost_position_is_told(tmp_path):
+    table = {"head": {"port": "/dev/nobody"}, "fixed": {"url": "http://127.0.0.1:1"}, "zoom": {"port": "usb:"}}
+    config = parse_config({"backend": "hardware", "hardware": table, "safety": {"stop_file": str(tmp_path / "stop")}})
+    assert findings(config)["head's position"].ok
+    (tmp_path / "stop.dev-nobody.position-lost").write_text("it hit a limit\n")
+    lost = findings(config)["head's position"]
+    assert not lost.ok
+    assert lost.text.startswith("it hit a limit")
+    assert "reset-head" in lost.fix

@@ -15,6 +15,8 @@ from tests.safety_rigs import RealRig, SimulatedRig
 
 FAR = math.radians(100)
 
+DEADLINE_S = 10.0  # for a thread that should end at once; a machine may be busy
+
 
 @pytest.fixture
 def rig():
@@ -151,7 +153,7 @@ def test_stops_from_many_threads_leave_no_command_behind_them():
             ready = threading.Barrier(3)
 
             def command(safe=safe, ready=ready):
-                ready.wait()
+                ready.wait(DEADLINE_S)
                 for _ in range(20):
                     try:
                         safe.head.move(0.5, 0.0)
@@ -159,14 +161,15 @@ def test_stops_from_many_threads_leave_no_command_behind_them():
                         return
 
             def stop(safe=safe, ready=ready):
-                ready.wait()
+                ready.wait(DEADLINE_S)
                 safe.stop("smoke")
 
             threads = [threading.Thread(target=target) for target in (command, command, stop)]
             for thread in threads:
                 thread.start()
             for thread in threads:
-                thread.join()
+                thread.join(DEADLINE_S)
+                assert not thread.is_alive()
             log = list(rig.head.log)
             with pytest.raises(EmergencyStopError):
                 safe.head.move(0.5, 0.0)

@@ -22,7 +22,7 @@ from cotarget.calibration.recorder import SETTLE, Recorder
 from cotarget.calibration.sequential import sequential
 from cotarget.calibration.session import capture_session
 from cotarget.calibration.stops import SAME_FOCAL, stops_of
-from cotarget.config import BoardConfig
+from cotarget.config import BoardConfig, RigConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.geometry import Array
 from cotarget.rig import Rig
@@ -245,6 +245,7 @@ def calibrate_rig(
     seed: int = 0,
     pitch_mm: float | None = None,
     settle: float = SETTLE,
+    config: RigConfig | None = None,
     options: Options = DEFAULT_OPTIONS,
 ) -> Calibration:
     """Drive a rig through a capture session, then calibrate it.
@@ -260,13 +261,14 @@ def calibrate_rig(
         seed: of the choice among possible placements.
         pitch_mm: size of a pixel of the zoom camera [mm], where it is known.
         settle: how long after a stop of head or board an image is still taken for one of before [s].
+        config: of the rig, to be kept beside the captures.
         options: how to calibrate.
 
     Raises:
         CalibrationError: a camera never sees the board, there is no common view, or the head fails.
         ConfigError: the board looks the same upside down.
     """
-    recorder = Recorder(rig, board, captures_dir, pitch_mm, settle)
+    recorder = Recorder(rig, board, captures_dir, pitch_mm, settle, config)
     rng = np.random.default_rng(seed)
     capture_session(recorder, placements, rng, progress, stops=stops, far_placements=far_placements)
     provenance = {

@@ -52,6 +52,7 @@ def calibrate(options: argparse.Namespace) -> None:
                     pitch_mm=config.pitch_mm / finer,
                     settle=SETTLE if config.backend == "sim" else SETTLE_LONG,
                     seed=config.sim.seed,
+                    config=config,
                     options=how,
                     **{name: getattr(options, name) for name in _given(options, SESSION)},
                 )

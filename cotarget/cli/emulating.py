@@ -66,5 +66,6 @@ def emulate(options: argparse.Namespace) -> None:
         try:
             while end is None or time.monotonic() < end:
                 time.sleep(LOOK)
+                emulation.world.check()
         except KeyboardInterrupt:
             print("", file=sys.stderr)
