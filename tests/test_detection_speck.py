@@ -172,6 +172,21 @@ def test_a_cut_is_noticed_and_a_sky_without_corners_stands():
     assert not camera.jumped
 
 
+def test_a_bird_alone_in_the_sky_is_not_taken_for_the_cameras_motion():
+    """Nothing but sky: the strongest corners are the bird's own and the codec's."""
+    rng = np.random.default_rng(12)
+    pictures = []
+    for i in range(50):
+        picture = np.full((HEIGHT, WIDTH, 3), 170.0)
+        draw(picture, 60 + 3 * i, 80 + 2 * np.sin(i), 8, 5)
+        coded = cv2.imencode(".jpg", photograph(picture, rng), [cv2.IMWRITE_JPEG_QUALITY, 60])[1]
+        pictures.append(cv2.imdecode(coded, cv2.IMREAD_COLOR))
+    tracks = follow(pictures)
+    for i in range(15, 50):
+        (track,) = tracks[i]
+        assert np.abs(track.center_px - (60 + 3 * i, 80)).max() < 5
+
+
 def test_a_cut_finds_nothing_until_the_new_scene_has_been_seen_for_a_while():
     def paint(picture, i):
         draw(picture, 220, 80, 8, 5)

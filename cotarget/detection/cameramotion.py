@@ -8,8 +8,13 @@ from cotarget.rig import Image
 
 # Corners are sought and followed in a picture of half the size; a whole one gives no better shift at twice the cost.
 SCALE = 2
-# How many corners are followed, how far apart they lie [px of the half picture], and how strong the weakest is.
+# How many corners are followed, how far apart they lie [px of the half picture], and how strong the weakest is beside
+# the strongest.
 CORNERS, APART_PX, WEAKEST = 60, 6, 0.02
+# Least eigenvalue of a corner, as cv2.cornerMinEigenVal has it: noise of 5 grey levels makes as much. In a picture of
+# nothing but sky the strongest corners are the target and what the codec leaves.
+LEAST_CORNER = 3e-4
+CORNER_BLOCK = 3
 # With fewer corners than this the median is no measurement, and the camera is taken to stand.
 FEWEST = 8
 # When fewer than this part of many corners is found again, the film was cut or the camera was put elsewhere.
@@ -61,7 +66,7 @@ class CameraMotion:
         self.jumped = False
         self._age += 1
         if self._corners is None or self._age >= RENEW_FRAMES or len(self._corners) < FEWEST:
-            self._corners = cv2.goodFeaturesToTrack(before, CORNERS, WEAKEST, APART_PX)
+            self._corners = _corners(before)
             self._age = 0
         if self._corners is None or len(self._corners) < FEWEST:
             return np.zeros(2)
@@ -77,3 +82,12 @@ class CameraMotion:
             return np.zeros(2)
         self._corners = moved[kept]
         return np.asarray(shift, dtype=float)
+
+
+def _corners(picture: Image) -> Image | None:
+    """Corners that are no noise, (n, 1, 2); None where there is none."""
+    corners = cv2.goodFeaturesToTrack(picture, CORNERS, WEAKEST, APART_PX, blockSize=CORNER_BLOCK)
+    if corners is None:
+        return None
+    u, v = corners.reshape(-1, 2).astype(int).T
+    return np.asarray(corners[cv2.cornerMinEigenVal(picture, CORNER_BLOCK)[v, u] >= LEAST_CORNER])

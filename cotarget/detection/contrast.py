@@ -5,6 +5,7 @@ and roofs have a ring as rough as themselves; a pole or the edge of a cloud runs
 false alarm rate detector of radar, Rohling 1983, in two dimensions).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -19,6 +20,8 @@ INNER_PX = 3
 GUARD_HALF_PX, OUTER_HALF_PX = 7, 11
 # Scales, from specks of up to 12 px to those of up to 100: those of 60 need the surroundings of the last one.
 SCALES = 4
+# From this scale on a ring is so large that the gradient of a sky counts: 90 px.
+SLOPING_SCALE = 2
 # A ring counts as at least this rough [grey levels]: a codec smooths a sky's noise away, not its steps.
 LEAST_ROUGHNESS = 1.5
 # The speck's outline is where its contrast has fallen to this part.
@@ -58,7 +61,7 @@ def find_specks(grey: Image, threshold: float, most: int) -> list[Speck]:
         if min(level.shape) < 2 * OUTER_HALF_PX:
             break
         half = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        for u, v, signal, around in _peaks(level, half, threshold, most):
+        for u, v, signal, around in _peaks(level, half, scale >= SLOPING_SCALE, threshold, most):
             speck = _outline(grey, (u, v), scale, signal, around)
             if speck is not None:
                 found.append(speck)
@@ -71,9 +74,11 @@ def find_specks(grey: Image, threshold: float, most: int) -> list[Speck]:
     return kept[:most]
 
 
-def _peaks(level: Image, half: Image, threshold: float, most: int) -> list[tuple[int, int, float, float]]:
+def _peaks(
+    level: Image, half: Image, sloping: bool, threshold: float, most: int
+) -> list[tuple[int, int, float, float]]:
     """Where one scale's picture stands out: (u, v) there, contrast in deviations, and the ring's mean; best first."""
-    mean, deviation = _ring(half)
+    mean, deviation = _ring(half, sloping)
     margin = deviation * np.float32(threshold)
     size = (level.shape[1], level.shape[0])
     # In bytes: three times as quick, and half a grey level is little beside `threshold` deviations.
@@ -97,17 +102,45 @@ def _peaks(level: Image, half: Image, threshold: float, most: int) -> list[tuple
     return peaks[:most]
 
 
-def _ring(half: Image) -> tuple[Array, Array]:
-    """Mean and standard deviation over the ring around each pixel."""
-    guard, outer = (GUARD_HALF_PX,) * 2, (OUTER_HALF_PX,) * 2
-    count = OUTER_HALF_PX**2 - GUARD_HALF_PX**2
-    total = cv2.boxFilter(half, cv2.CV_32F, outer, normalize=False)
-    cv2.subtract(total, cv2.boxFilter(half, cv2.CV_32F, guard, normalize=False), total)
-    squares = cv2.sqrBoxFilter(half, cv2.CV_32F, outer, normalize=False)
-    cv2.subtract(squares, cv2.sqrBoxFilter(half, cv2.CV_32F, guard, normalize=False), squares)
-    mean = total / np.float32(count)
-    variance = squares / np.float32(count) - mean * mean
+def _ring(half: Image, sloping: bool) -> tuple[Array, Array]:
+    """Mean over the ring around each pixel, and the standard deviation from it or from a plane.
+
+    Args:
+        half: the picture.
+        sloping: whether a plane, because the ring is so large that a sky's gradient matters.
+    """
+    total = _box_sum(half, cv2.boxFilter)
+    squares = _box_sum(half, cv2.sqrBoxFilter)
+    count = np.float32(OUTER_HALF_PX**2 - GUARD_HALF_PX**2)
+    mean = total / count
+    variance = squares / count - mean * mean
+    if not sloping:
+        return mean, cv2.sqrt(np.maximum(variance, np.float32(LEAST_ROUGHNESS**2)))
+    # The slope along each axis is the ring's first moment over that of the axis itself.
+    moment = np.float32((_axis_moment(OUTER_HALF_PX) - _axis_moment(GUARD_HALF_PX)) * count)
+    for k in (0, 1):
+        first = _first_moment(half, OUTER_HALF_PX, k)
+        cv2.subtract(first, _first_moment(half, GUARD_HALF_PX, k), first)
+        variance -= first * first / moment
     return mean, cv2.sqrt(np.maximum(variance, np.float32(LEAST_ROUGHNESS**2)))
+
+
+def _box_sum(half: Image, box: Callable[..., Array]) -> Array:
+    """Sum over the ring, of the picture or of its squares."""
+    total = box(half, cv2.CV_32F, (OUTER_HALF_PX,) * 2, normalize=False)
+    return cv2.subtract(total, box(half, cv2.CV_32F, (GUARD_HALF_PX,) * 2, normalize=False), total)
+
+
+def _axis_moment(side: int) -> float:
+    """Sum of the squared distances from the middle column, over a square."""
+    return side * float(np.sum(np.square(np.arange(side) - side // 2)))
+
+
+def _first_moment(half: Image, side: int, axis: int) -> Array:
+    """Sum of the picture times the distance from the middle along an axis (0: columns), over a square."""
+    kernels = [np.ones(side, np.float32)] * 2
+    kernels[axis] = np.arange(side, dtype=np.float32) - side // 2
+    return np.asarray(cv2.sepFilter2D(half, cv2.CV_32F, kernels[0], kernels[1]))
 
 
 def _outline(grey: Image, peak: tuple[int, int], scale: int, signal: float, around: float) -> Speck | None:
