@@ -231,6 +231,18 @@ def test_after_good_finds_a_bad_likeness_elsewhere_is_not_believed():
     assert spoilt.find(Frame(leaf, 0.04), scene.expected()) is None
 
 
+def test_a_box_that_the_wide_view_s_border_cuts_says_little_of_the_body():
+    scene = Scene([(1.5, -1.0, 20.0)])
+    frame, detection, mask = scene.wide()
+    sigmas = []
+    for clipped in (False, True):
+        finder = CloseupFinder(scene.calibration, BIRD)
+        finder.see_wide(frame, dataclasses.replace(detection, clipped=clipped), mask)
+        sigmas.append(finder.find(scene.zoom(), scene.expected()).body_sigma_px)
+    assert (sigmas[1] > 0.45 * detection.size_px * scene.nominal / FOCAL).all()
+    assert (sigmas[1] > 2 * sigmas[0]).all()
+
+
 def test_a_doubtful_find_is_believed_where_it_goes_on_from_a_sure_one():
     scene = Scene([(1.5, -1.0, 20.0)])
     frame, detection, mask = scene.wide()

@@ -120,6 +120,8 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetC
         upright = target.dimension == "height"
         body = np.array([middle[0], center[1]]) if upright else middle
         sigma = (UPRIGHT_SIGMA if upright else FLYING_SIGMA) * size
+    if detection.clipped:  # the hidden part may be as large again
+        sigma = np.hypot(sigma, size / 2)
     patch = frame.image[low[1] : high[1], low[0] : high[0]].copy()
     whitening = _whitening(patch[grown == 0])
     return Sight(frame.t, body, sigma, size, patch, weight, low.astype(float), whitening)
