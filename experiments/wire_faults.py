@@ -9,6 +9,7 @@ is told.
 """
 
 import functools
+import itertools
 import math
 import subprocess
 import sys
@@ -140,12 +141,16 @@ def run(folder: Path, faults: tuple[str, ...], repetitions: int, seed: int) -> l
     rng = np.random.default_rng(seed)
     jobs = [(fault, number) for number in range(repetitions) for fault in faults]
     rows: list[Row] = []
-    while jobs:
-        with EmulatedRig(folder / "faults", _tables()) as emulated:
+    for rig in itertools.count():
+        if not jobs:
+            break
+        # A folder each: that a head's position may be lost is remembered beside the rig's files.
+        files = folder / f"faults{rig}"
+        with EmulatedRig(files, _tables()) as emulated:
             begun = time.monotonic()
             while jobs and time.monotonic() < begun + (ROUNDS - 20) * PERIOD_S:
                 fault, number = jobs.pop(0)
-                for row in _try(folder / "faults", emulated, fault, rng):
+                for row in _try(files, emulated, fault, rng):
                     rows.append({"figure": "faults", "fault": fault, "repetition": number, **row, "load": load()})
                 if fault in ONCE:
                     break
