@@ -82,7 +82,7 @@ def correct_wide(node: Node, seen: WideSeen, settings: EstimationSettings) -> No
     surprise = float(innovation @ S_inv @ innovation)
     if surprise > settings.gate:
         if node.missed_wide + 1 < settings.misses:
-            return replace(node, missed_wide=node.missed_wide + 1)
+            return replace(node, missed_wide=node.missed_wide + 1, missed_zoom=0, lean=(0.0, 0.0))
         return _size(_elsewhere(node, seen, settings), seen.size, settings)
     gain = PHt @ S_inv
     P = node.P - gain @ PHt.T
@@ -152,13 +152,13 @@ def _size(node: Node, size: SizeSeen | None, settings: EstimationSettings) -> No
 def _told(node: Node, surprise: float, settings: EstimationSettings) -> Node:
     """Keep count of how surprising measurements are; a target that surprises manoeuvres harder than usual."""
     mean = node.surprise + settings.surprise_gain * (surprise / 2 - node.surprise)
-    return replace(node, surprise=mean, boost=min(max(mean, 1.0), settings.most_boost))
+    return replace(node, surprise=mean, boost=min(max(mean, 1.0) ** settings.boost_power, settings.most_boost))
 
 
 def _leaning(node: Node, S: Array, innovation: Array, settings: EstimationSettings) -> tuple[float, float]:
     """Average the zoom view's innovations: what always lies to one side is no noise, however small it is."""
     if node.surprise >= settings.calm:  # the target moves otherwise than thought, which says nothing of the head
-        return node.lean
+        return 0.0, 0.0
     g = settings.lean_gain
     u, v = node.lean
     return (
@@ -180,7 +180,7 @@ def _elsewhere(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node
     P[:2, :2] = seen.R
     P[range(3, 9), range(3, 9)] = [(motion.speed * nearness) ** 2] * 3 + [(motion.acceleration * nearness) ** 2] * 3
     P[L, L] += settings.depth_doubt**2
-    return replace(node, x=x, P=P, missed_wide=0, surprise=1.0, boost=1.0)
+    return replace(node, x=x, P=P, missed_wide=0, missed_zoom=0, lean=(0.0, 0.0), surprise=1.0, boost=1.0)
 
 
 def _doubted(P: Array, settings: EstimationSettings) -> Array:

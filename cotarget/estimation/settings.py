@@ -77,7 +77,8 @@ class EstimationSettings:
         size_doubt: what is added to the sigma of size and depth together, where the zoom view contradicts them.
         bias_doubt: what is then added to the sigma of the head's bias [rad].
         surprise_gain: weight of the newest measurement in the mean surprise.
-        most_boost: most by which surprise multiplies the acceleration's variance.
+        boost_power: the acceleration's variance is multiplied by the mean surprise, where above 1, to this power ...
+        most_boost: ... but by no more than this.
         history_s: how late a measurement may come after the newest one [s].
     """
 
@@ -93,7 +94,7 @@ class EstimationSettings:
     size_gate: float = 9.0
     misses: int = 3
     zoom_misses: int = 8
-    calm: float = 3.0
+    calm: float = 2.0
     lean_gain: float = 0.1
     most_lean: float = 1.0
     depth_sigma: float = 1.0
@@ -101,6 +102,7 @@ class EstimationSettings:
     size_doubt: float = 0.3
     bias_doubt: float = 5e-3
     surprise_gain: float = 0.2
+    boost_power: float = 1.0
     most_boost: float = 30.0
     history_s: float = 1.5
 
@@ -119,6 +121,7 @@ BIRD = EstimationSettings(
     MotionSettings(6.5, 2.5, 7.0, 0.075, attitude_mean=-0.35, attitude_sigma=0.3, attitude_s=1.0),
     noise_of_size=0.06,
     size_noise=0.1,
+    size_s=0.06,  # a quarter of a wing beat
 )
 
 
