@@ -93,13 +93,13 @@ def _add_mesh(spec: "mujoco.MjSpec", name: str, mesh: str, pos: list[float] | Ar
 
 
 def _add_saplings(spec: "mujoco.MjSpec", rng: np.random.Generator) -> None:
-    """Young trees, where the scene has the outdoor scene's leaves."""
-    if spec.material("outdoor_leaves") is None:
+    """Young firs, where the scene has the outdoor scene's needles."""
+    if spec.material("outdoor_needles") is None or spec.material("outdoor_bark") is None:
         return
     for i, (x, y) in enumerate(SAPLINGS):
         height = float(rng.uniform(*SAPLING_HEIGHT))
-        mesh = spec.add_mesh(name=f"clutter/crown_{i}", file="tree_crown_c.obj")
-        mesh.scale = [0.45 * height, 0.45 * height, 0.75 * height]
+        mesh = spec.add_mesh(name=f"clutter/crown_{i}", file="tree_conifer.obj")
+        mesh.scale = [0.6 * height, 0.6 * height, 0.85 * height]
         spec.worldbody.add_geom(
             name=f"clutter/trunk_{i}",
             type=mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -110,7 +110,7 @@ def _add_saplings(spec: "mujoco.MjSpec", rng: np.random.Generator) -> None:
             conaffinity=0,
         )
         name = f"clutter/crown_{i}"
-        _add_mesh(spec, name, name, [x, y, 0.25 * height], material="outdoor_leaves")
+        _add_mesh(spec, name, name, [x, y, 0.15 * height], material="outdoor_needles")
 
 
 def _add_twigs(spec: "mujoco.MjSpec", rng: np.random.Generator) -> None:
@@ -126,7 +126,7 @@ def _add_twigs(spec: "mujoco.MjSpec", rng: np.random.Generator) -> None:
         leaves = model.mesh_vert[start : start + count] @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
         middle, half = _extent(model, data, geom)
         shown = leaves[(leaves[:, 2] > middle[2] - 0.4 * half[2]) & (leaves[:, 1] < middle[1])]
-        for j in range(TWIGS_A_TREE):
+        for j in range(TWIGS_A_TREE if len(shown) else 0):
             at = rng.choice(shown)
             name = f"{TWIG}{number}_{j}"
             points = rng.normal(size=(12, 3)) * [1.0, 1.0, 0.7]
@@ -190,7 +190,7 @@ class Clutter:
         self._sun = int(np.argmax(model.light_diffuse.sum(axis=1))) if model.nlight else -1
         self._sunlight = np.array(model.light_diffuse[self._sun]) if model.nlight else np.zeros(3)
         self._light_phase, self._drop_phase, self._gust_phase = rng.uniform(0, 2 * np.pi, 3)
-        self.geoms = np.concatenate([self._crowns, self._twigs, self._drifting])
+        self.faint = self._drifting  # without an edge that an exposure could blur
 
     def move(self, data: "mujoco.MjData", t: float) -> None:
         """Put everything where it is at time t [s]; after the kinematics, which know nothing of it."""

@@ -77,6 +77,8 @@ class TrueLens:
 def _fold(distortion: tuple[float, float, float, float, float]) -> float:
     """Tangent of the angle off the axis where the radial distortion begins to shrink; infinite if it never does."""
     k1, k2, _, _, k3 = distortion
+    if k2 == k3 == 0.0:
+        return float((-3 * k1) ** -0.5) if k1 < 0 else np.inf
     # Where the slope of r (1 + k1 r^2 + k2 r^4 + k3 r^6) is zero, in r^2.
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     turns = roots.real[(np.abs(roots.imag) < REAL_ROOT * np.abs(roots)) & (roots.real > 0)]
@@ -104,12 +106,12 @@ def bend(pinhole: Image, pinhole_focal_px: float, lens: TrueLens) -> Image:
         lens: the lens wanted.
     """
     where = _map(lens, pinhole_focal_px, (pinhole.shape[1], pinhole.shape[0]))
-    return cv2.remap(pinhole, where, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.remap(pinhole, *where, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 @lru_cache(maxsize=KEPT_MAPS)
-def _map(lens: TrueLens, pinhole_focal_px: float, pinhole_size: tuple[int, int]) -> Array:
-    """For every pixel of the lens's image where to look in the pinhole render, (H, W, 2) float32."""
+def _map(lens: TrueLens, pinhole_focal_px: float, pinhole_size: tuple[int, int]) -> tuple[Array, Array]:
+    """For every pixel of the lens's image where to look in the pinhole render, as cv2.remap likes it best."""
     w, h = lens.size
     u, v = np.arange(0, w + MAP_STRIDE, MAP_STRIDE), np.arange(0, h + MAP_STRIDE, MAP_STRIDE)
     coarse = lens.directions(np.stack(np.meshgrid(u, v), axis=-1).astype(float)) * pinhole_focal_px
@@ -118,4 +120,6 @@ def _map(lens: TrueLens, pinhole_focal_px: float, pinhole_size: tuple[int, int])
     # because a resize would shift by half a sample.
     scale = np.array([[1 / MAP_STRIDE, 0, 0], [0, 1 / MAP_STRIDE, 0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(coarse.astype(np.float32), scale, (w, h), flags=flags)
+    fine = cv2.warpAffine(coarse.astype(np.float32), scale, (w, h), flags=flags)
+    whole, part = cv2.convertMaps(fine, None, cv2.CV_16SC2)  # as fine as cv2.remap's own interpolation
+    return whole, part

@@ -3,6 +3,9 @@
 import math
 from collections.abc import Mapping
 
+import numpy as np
+import numpy.typing as npt
+
 from cotarget.geometry import RigidTransform
 from cotarget.sim.clutter import Clutter
 from cotarget.sim.model import RIG, quaternion
@@ -44,6 +47,11 @@ class WorldState:
         self._boards: list[tuple[float, RigidTransform | None, bool]] = [(-math.inf, None, False)]
         self._shown: tuple[float, float, float, int] | None = None
 
+    @property
+    def faint(self) -> npt.NDArray[np.intp]:
+        """Numbers of the geoms without an edge that an exposure could blur."""
+        return np.zeros(0, dtype=np.intp) if self._clutter is None else self._clutter.faint
+
     def at(self, t: float) -> "mujoco.MjData":
         """Everything's pose at time t [s]; the data is the world's own and changes with the next call."""
         pan, tilt = self._head.angles_at(t)
@@ -54,11 +62,16 @@ class WorldState:
         data.qpos[self._axes] = pan, tilt
         for target, index, joints in self._targets:
             pose = target.pose(t)
-            self._place(index, pose.T_world_target)
+            self._data.mocap_pos[index] = pose.position
+            self._data.mocap_quat[index] = pose.rotation.as_quat(scalar_first=True)
             if joints:
                 data.qpos[joints] = list(pose.joints.values())
         if (T_fixed_board := self.board_at(t)) is not None:
-            self._place(self._board, self._T_world_fixed * T_fixed_board)
+            T_world_board = self._T_world_fixed * T_fixed_board
+            data.mocap_pos[self._board], data.mocap_quat[self._board] = (
+                T_world_board.translation,
+                quaternion(T_world_board),
+            )
         mujoco.mj_kinematics(self._model, data)
         if self._clutter is not None:
             self._clutter.move(data, t)
@@ -90,7 +103,3 @@ class WorldState:
 
     def _mocap(self, body: str) -> int:
         return int(self._model.body(body).mocapid[0])
-
-    def _place(self, index: int, T_world_body: RigidTransform) -> None:
-        self._data.mocap_pos[index] = T_world_body.translation
-        self._data.mocap_quat[index] = quaternion(T_world_body)

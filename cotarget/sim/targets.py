@@ -4,6 +4,7 @@ There may be several of a kind: ``bird2`` is a second bird. The ways that they t
 models in sim_assets/targets.
 """
 
+import math
 import re
 import zlib
 from collections.abc import Mapping, Sequence
@@ -46,6 +47,8 @@ PERSON_HEIGHT = 1.75  # of the model [m]
 SCATTER = {"book": 0.0, "person": 0.04, "bird": 0.15}  # of the true sizes, relative; all within twice this
 SCATTER_SIGMA = 0.5  # the range above is two standard deviations
 GRAVITY = 9.81  # [m/s^2]
+STANDING = 1e-9  # [m/s]
+FLAT = np.array([1.0, 1.0, 0.0])  # of the way of whoever walks upright, the part along the ground
 
 STRIDE = 1.44  # length of two steps of a walking person 1.75 m tall [m]
 WALK_SPEED = 1.5  # [m/s]
@@ -56,10 +59,16 @@ OUTER_SWING, OUTER_LAG = np.radians(24.0), np.radians(70.0)  # of the outer wing
 
 @dataclass(frozen=True)
 class TargetPose:
-    """Where a target is: its body's pose in the world, and each joint's angle [rad] by name."""
+    """Where a target is in the world: its body's position [m], its rotation, and each joint's angle [rad] by name."""
 
-    T_world_target: RigidTransform
+    position: Array
+    rotation: Rotation
     joints: Mapping[str, float]
+
+    @property
+    def T_world_target(self) -> RigidTransform:
+        """The body's pose."""
+        return RigidTransform.from_components(self.position, self.rotation)
 
 
 @dataclass(frozen=True)
@@ -97,19 +106,19 @@ class Target:
     def pose(self, t: float) -> TargetPose:
         """Tell pose and joints at time ``t`` [s]."""
         if self.kind == "book":
-            return TargetPose(self._place(t, _face_mount(self.path.position(t), t, self.phase)), {})
+            position = self.path.position(t)
+            return TargetPose(position, _face_mount(position, t, self.phase), {})
         if self.kind == "person":
             step = self.phase + 2 * np.pi * self.path.travelled(t) / (STRIDE * self.size)
-            pace = float(np.linalg.norm(self.path.velocity(t))) / WALK_SPEED
-            joints, bob = _walk(step, min(pace, 1.0))
-            return TargetPose(self._place(t, _heading(self.path, t, flat=True), bob * self.size), joints)
-        return TargetPose(self._place(t, _bank(self.path, t)), _flap(self.phase + 2 * np.pi * WING_BEAT_HZ * t))
-
-    def _place(self, t: float, rotation: Rotation, lift: float = 0.0) -> RigidTransform:
-        position = self.path.position(t) + np.array([0.0, 0.0, lift])
-        if self.grounded:
-            position[2] += 0.5 * PERSON_HEIGHT * self.size
-        return RigidTransform.from_components(position, rotation)
+            velocity = self.path.velocity(t)
+            joints, bob = _walk(step, min(math.hypot(*velocity.tolist()) / WALK_SPEED, 1.0))
+            position = self.path.position(t)
+            rotation = Rotation.from_matrix(_heading(position, velocity * FLAT))
+            position[2] += bob * self.size + (0.5 * PERSON_HEIGHT * self.size if self.grounded else 0.0)
+            return TargetPose(position, rotation, joints)
+        position = self.path.position(t)
+        axes = _bank(_heading(position, self.path.velocity(t)), self.path.acceleration(t))
+        return TargetPose(position, Rotation.from_matrix(axes), _flap(self.phase + 2 * np.pi * WING_BEAT_HZ * t))
 
 
 def make_target(
@@ -203,19 +212,18 @@ def scale_spec(spec: "mujoco.MjSpec", factor: float) -> None:
 # ---------------------------------------------------------------- attitude and gait
 
 
-def _heading(path: Path, t: float, flat: bool) -> Rotation:
-    """Turn x along the way, z as far up as that allows; whoever stands still faces the camera."""
-    to_mount = MOUNT - path.position(t)
-    forward = path.velocity(t)
-    forward = forward / max(float(np.linalg.norm(forward)), 1e-9) if np.linalg.norm(forward) > 1e-9 else to_mount
-    if flat:
-        forward = forward * np.array([1.0, 1.0, 0.0])
-    if np.hypot(forward[0], forward[1]) < 1e-9:
-        forward = forward + np.array([0.0, -1e-6, 0.0])
-    forward = forward / np.linalg.norm(forward)
-    left = np.cross([0.0, 0.0, 1.0], forward)
-    left = left / np.linalg.norm(left)
-    return Rotation.from_matrix(np.stack([forward, left, np.cross(forward, left)], axis=1))
+def _heading(position: Array, velocity: Array) -> Array:
+    """Turn x along the way, z as far up as that allows; whoever stands still faces the camera. Columns, (3, 3)."""
+    x, y, z = velocity.tolist()
+    if math.hypot(x, y, z) < STANDING:
+        x, y, z = (MOUNT - position).tolist()
+        z = 0.0
+    if math.hypot(x, y) < STANDING * math.hypot(x, y, z):
+        y -= 1e-6 * math.hypot(x, y, z)  # straight up or down: towards the camera, if anywhere
+    ahead, whole = math.hypot(x, y), math.hypot(x, y, z)
+    forward, left = (x / whole, y / whole, z / whole), (-y / ahead, x / ahead, 0.0)
+    up = (-forward[2] * left[1], forward[2] * left[0], forward[0] * left[1] - forward[1] * left[0])
+    return np.array([forward, left, up]).T
 
 
 def _face_mount(position: Array, t: float, phase: float) -> Rotation:
@@ -227,11 +235,13 @@ def _face_mount(position: Array, t: float, phase: float) -> Rotation:
     return Rotation.from_euler("ZYX", [yaw, pitch, roll])
 
 
-def _bank(path: Path, t: float) -> Rotation:
-    """Lean the bird into its turn, as far as the turn's acceleration asks for."""
-    upright = _heading(path, t, flat=False)
-    lateral = float(upright.inv().apply(path.acceleration(t))[1])
-    return upright * Rotation.from_euler("x", -np.arctan2(lateral, GRAVITY))
+def _bank(upright: Array, acceleration: Array) -> Array:
+    """Lean the bird into its turn, as far as the turn's acceleration asks for; columns, (3, 3)."""
+    lateral = float(acceleration @ upright[:, 1])
+    whole = math.hypot(lateral, GRAVITY)
+    c, s = GRAVITY / whole, lateral / whole
+    forward, left, up = upright.T
+    return np.array([forward, c * left - s * up, s * left + c * up]).T
 
 
 def _walk(step: float, pace: float) -> tuple[dict[str, float], float]:

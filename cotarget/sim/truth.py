@@ -104,17 +104,18 @@ class Truth:
 
     def T_world_camera(self, camera: CameraName, t: float) -> RigidTransform:
         """Pose of a camera's optical centre at time t, in OpenCV's axes."""
-        return self._camera_pose(self.set_state(t), camera, self.lens(camera, t))
+        eye, axes = self._camera(self.set_state(t), camera, self.lens(camera, t))
+        return RigidTransform.from_components(eye, Rotation.from_matrix(axes))
 
     def center(self, name: str, t: float) -> Array:
         """A target's body centre in the world [m], (3,)."""
-        return np.asarray(self.targets[name].pose(t).T_world_target.translation)
+        return self.targets[name].pose(t).position
 
     def pixel(self, camera: CameraName, x_world: Array, t: float) -> Array:
         """Where a point of the world appears, (..., 2) [px]; nan behind the camera."""
-        x_world = np.asarray(x_world, dtype=float)
-        x_camera = self.T_world_camera(camera, t).inv().apply(x_world.reshape(-1, 3))
-        return self.lens(camera, t).project(x_camera).reshape(*x_world.shape[:-1], 2)
+        lens = self.lens(camera, t)
+        eye, axes = self._camera(self.set_state(t), camera, lens)
+        return lens.project((np.asarray(x_world, dtype=float) - eye) @ axes)
 
     def line_of_sight_miss(self, pan: float, tilt: float, nominal_px: float, x_world: Array) -> float:
         """Angle between the ray through the middle of the zoom image and a point, with the head at pan, tilt [rad].
@@ -129,7 +130,8 @@ class Truth:
         data.joint(RIG + "pan").qpos[0], data.joint(RIG + "tilt").qpos[0] = pan, tilt
         mujoco.mj_kinematics(self.model, data)
         lens = self.zoom_lens_for(nominal_px)
-        x_zoom = self._camera_pose(data, "zoom", lens).inv().apply(x_world)
+        eye, axes = self._camera(data, "zoom", lens)
+        x_zoom = (np.asarray(x_world) - eye) @ axes
         xy = lens.directions((np.array(lens.size) - 1) / 2)
         ray = np.append(xy, 1.0)
         return float(np.arctan2(np.linalg.norm(np.cross(ray, x_zoom)), ray @ x_zoom))
@@ -137,8 +139,8 @@ class Truth:
     def silhouette(self, name: str, camera: CameraName, t: float) -> Silhouette | None:
         """A target's outline in a camera at time t; None if any of it is behind the camera, or beyond its lens."""
         data, lens = self.set_state(t), self.lens(camera, t)
-        T_world_camera = self._camera_pose(data, camera, lens)
-        pixels = self._outline(name, data, T_world_camera.inv(), lens)
+        view = self._camera(data, camera, lens)
+        pixels = self._outline(name, data, view, lens)
         if not np.isfinite(pixels).all():
             return None
         low, high = pixels.min(axis=0), pixels.max(axis=0)
@@ -146,7 +148,7 @@ class Truth:
         if (low < -0.5).any() or (high > np.array(lens.size) - 0.5).any():
             parts = np.split(pixels, self._surface(name).starts[1:])
             inside = _fraction_inside(parts, low, high, lens.size)
-        return Silhouette(low, high, inside * self._unhidden(name, data, T_world_camera.translation))
+        return Silhouette(low, high, inside * self._unhidden(name, data, view[0]))
 
     def box(self, name: str, camera: CameraName, t: float) -> tuple[Array, Array] | None:
         """Top-left and bottom-right corner of a target's outline, (2,) [px] each, whatever hides it.
@@ -154,7 +156,7 @@ class Truth:
         Quicker than its silhouette, whose corners they are; None if any of it is behind the camera.
         """
         data, lens = self.set_state(t), self.lens(camera, t)
-        pixels = self._outline(name, data, self._camera_pose(data, camera, lens).inv(), lens)
+        pixels = self._outline(name, data, self._camera(data, camera, lens), lens)
         return (pixels.min(axis=0), pixels.max(axis=0)) if np.isfinite(pixels).all() else None
 
     def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
@@ -163,14 +165,14 @@ class Truth:
         phases = np.arange(BEAT_PHASES) / BEAT_PHASES * target.beat_s if target.beat_s else [0.0]
         data = self._copy(self.set_state(t))
         lens = self.lens(camera, t)
-        T_camera_world = self._camera_pose(data, camera, lens).inv()
+        view = self._camera(data, camera, lens)
         joints = [int(self.model.joint(f"{name}/{joint}").qposadr[0]) for joint in target.pose(t).joints]
         sides = []
         for phase in phases:
             if joints:
                 data.qpos[joints] = list(target.pose(t + phase).joints.values())
                 mujoco.mj_kinematics(self.model, data)
-            pixels = self._outline(name, data, T_camera_world, lens)
+            pixels = self._outline(name, data, view, lens)
             sides.append(np.max(pixels.max(axis=0) - pixels.min(axis=0)))
         return float(np.max(sides))
 
@@ -183,20 +185,21 @@ class Truth:
         mujoco.mj_kinematics(self.model, copy)
         return copy
 
-    def _outline(self, name: str, data: "mujoco.MjData", T_camera_world: RigidTransform, lens: TrueLens) -> Array:
+    def _outline(self, name: str, data: "mujoco.MjData", view: tuple[Array, Array], lens: TrueLens) -> Array:
         """Pixels of the points on a target's geoms, one after the other, (n, 2); nan where the camera has none."""
         surface = self._surface(name)
         axes = data.geom_xmat[surface.geoms].reshape(-1, 3, 3)
         x_world = np.einsum("nij,nj->ni", axes[surface.owner], surface.points)
-        return lens.project(T_camera_world.apply(x_world + data.geom_xpos[surface.geoms][surface.owner]))
+        eye, camera_axes = view
+        return lens.project((x_world + (data.geom_xpos[surface.geoms] - eye)[surface.owner]) @ camera_axes)
 
-    def _camera_pose(self, data: "mujoco.MjData", camera: CameraName, lens: TrueLens) -> RigidTransform:
-        """The pose of a camera's body, moved along its axis to the lens's pupil."""
+    def _camera(self, data: "mujoco.MjData", camera: CameraName, lens: TrueLens) -> tuple[Array, Array]:
+        """A camera's pupil in the world [m], (3,), and its axes as columns, (3, 3)."""
         if camera not in self._bodies:
             self._bodies[camera] = self.model.body(RIG + camera).id
         body = self._bodies[camera]
-        axes = data.xmat[body].reshape(3, 3)
-        return RigidTransform.from_components(data.xpos[body] + axes[:, 2] * lens.pupil, Rotation.from_matrix(axes))
+        axes = np.array(data.xmat[body].reshape(3, 3))
+        return data.xpos[body] + axes[:, 2] * lens.pupil, axes
 
     def _surface(self, name: str) -> "Surface":
         """What a target's outline is made of."""

@@ -6,6 +6,7 @@ parts of a pixel against each other, so that their mean is antialiased as well. 
 around it. At rest it is a single render.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -106,7 +107,8 @@ class Views:
         self._endless = model.geom_rbound == 0  # planes
         groups = np.ones(mujoco.mjNGROUP, dtype=bool)
         groups[[BOARD_GROUP, RIG_GROUP, FRAME_GROUP]] = False
-        self._drawn = groups[model.geom_group]
+        self._blurs = groups[model.geom_group]
+        self._blurs[state.faint] = False
 
     def close(self) -> None:
         """Release OpenGL; more than once does no harm."""
@@ -155,8 +157,12 @@ class Views:
         """The render that a lens's image is made from: centred, and wide enough."""
         half_width, half_height = covering_half_field(lens)
         width, height = self._size
+        if not any(lens.distortion):  # nothing is stretched, so that more than a pixel for a pixel gains nothing
+            (fx, fy), (most_width, most_height) = lens.focal_px, self._size
+            width = min(math.ceil(2 * half_width * max(fx, fy)) + 2, most_width)
+            height = min(math.ceil(2 * half_height * max(fx, fy)) + 2, most_height)
         focal = min((width / 2 - 1) / half_width, (height / 2 - 1) / half_height)
-        return Pinhole(self._size, (focal, focal), ((width - 1) / 2, (height - 1) / 2))
+        return Pinhole((width, height), (focal, focal), ((width - 1) / 2, (height - 1) / 2))
 
     def _through(self, lens: TrueLens, view: Pinhole, image: Image) -> Image:
         """Bend a render, RGB, into a lens's image, BGR."""
@@ -216,7 +222,7 @@ class Views:
         """Windows around what moves during an exposure while the camera does not; None if they are too large."""
         before, after = ends
         moved = (before.positions != after.positions).any(axis=1) | (before.turns != after.turns).any(axis=(1, 2))
-        moved &= self._drawn | ((self._model.geom_group == BOARD_GROUP) & (self._state.board_at(t) is not None))
+        moved &= self._blurs | ((self._model.geom_group == BOARD_GROUP) & (self._state.board_at(t) is not None))
         if not moved.any():
             return []
         seen = [

@@ -1,0 +1,266 @@
+"""How fast the simulated rig is: beside mujoco.Renderer on the same frames, effect by effect, and against real time.
+
+A step is what the loop does to the rig at 25 Hz without detecting anything: a frame of each camera, the states of head
+and lens, a command to each. What is compared takes turns within one run, because a machine's pace drifts, and medians
+over the steps are given.
+
+1. Image effects off: a step, and mujoco.Renderer drawing the same two frames of the same world, as large, with the same
+   antialiasing, focal length and pose, the poses being ready.
+2. Each image effect alone, and all of them, beside none. Blur is that of 1/100 s under a turning head.
+3. Seconds of simulated time a second of the whole pipeline following a bird: both cameras rendered, all effects on; and
+   nothing rendered, detections from the truth. Of the latter also what the simulation alone takes.
+
+    python -m experiments.sim_speed [--seeds 2] [--seed-base 0] [--quick] [--out DIR]
+"""
+
+import math
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.config import RigConfig
+from cotarget.detection import make_detector
+from cotarget.loop import FollowSettings, follow
+from cotarget.sim.model import RENDER_PITCH, RIG, build_model
+from cotarget.sim.opengl import make_renderer, mujoco
+from cotarget.sim.state import WorldState
+from cotarget.sim.truth import Truth
+from cotarget.sim.world import CAMERAS, SimWorld
+from experiments.harness import Experiment, Row, Settings, over_seeds, seeds_of, table
+from experiments.hold_scenes import TruthDetector, hold_config, true_calibration
+
+IMAGE_EFFECTS = ("noise", "jpeg", "distortion", "blur", "clutter")
+TARGET = "bird"
+TURN, TURN_S = 0.15, 1.5  # the head swings so far [rad], and takes so long there and back [s]
+ZOOMED = 3.0  # times the shortest focal length
+SETTLED_S = 1.0  # before anything is timed; the lens is there then
+RENDERER, LOOP, ALL = "mujoco.Renderer", "loop", "all of them"
+
+
+@dataclass(frozen=True)
+class SimSpeedSettings(Settings):
+    """How many seeds; steps timed of each world; seconds followed with and without pictures."""
+
+    seeds: int = 2
+    steps: int = 60
+    seconds_rendered: float = 6.0
+    seconds_unrendered: float = 20.0
+
+
+def run(settings: SimSpeedSettings) -> list[Row]:
+    """All rows; in one process, whatever the settings say."""
+    return over_seeds(one, replace(settings, processes=1))
+
+
+def one(settings: SimSpeedSettings, seed: int) -> list[Row]:
+    """Time everything once."""
+    rows = _beside_renderer(settings, seed)
+    for effects in (*((name,) for name in IMAGE_EFFECTS), IMAGE_EFFECTS):
+        rows += _beside_none(settings, seed, effects)
+    rows.append({"seed": seed, "what": "rendered", "factor": _followed(settings.seconds_rendered, seed, rendered=True)})
+    factor = _followed(settings.seconds_unrendered, seed, rendered=False)
+    rows.append({"seed": seed, "what": "unrendered", "factor": factor})
+    rows.append({"seed": seed, "what": "simulation alone", "ms": _alone(settings, seed)})
+    return rows
+
+
+def config_with(seed: int, on: Sequence[str]) -> RigConfig:
+    """The bird to hold, with these image effects only; all others are as ever."""
+    config = hold_config(TARGET, seed)
+    effects = replace(config.sim.effects, **{name: name in on for name in IMAGE_EFFECTS})
+    return replace(config, sim=replace(config.sim, effects=effects))
+
+
+class Stepper:
+    """Does to a rig what the loop does, without detecting anything."""
+
+    def __init__(self, config: RigConfig) -> None:
+        self.world = SimWorld(config)
+        rig = self.world.rig
+        rig.zoom.zoom(ZOOMED * rig.zoom.focal_range[0])
+        rig.clock.sleep_until(SETTLED_S)
+        self.t = SETTLED_S - config.sim.fixed.latency_s
+
+    def step(self) -> float:
+        """One step; how long it took [s]."""
+        rig = self.world.rig
+        began = time.perf_counter()
+        self.t = rig.fixed.read(newer_than=self.t).t
+        rig.zoom.read()
+        rig.head.state()
+        rig.zoom.state()
+        swing = TURN * math.sin(2 * math.pi * rig.clock.now() / TURN_S)
+        rig.head.move(swing, 0.3 * swing)
+        rig.zoom.zoom(ZOOMED * rig.zoom.focal_range[0])
+        return time.perf_counter() - began
+
+
+class PlainRenderer:
+    """mujoco.Renderer on the frames of a world whose image effects are off."""
+
+    def __init__(self, world: SimWorld) -> None:
+        sim, self._truth = world.config.sim, world.truth()
+        self._sizes = {"fixed": sim.fixed.size, "zoom": sim.zoom.size}
+        size = sim.fixed.size
+        self._model = build_model(world.config, tuple(world.targets.values()), size)
+        self._state = WorldState(self._model, world.targets, world.head_drive, self._truth.T_world_fixed, None)
+        self._renderer = make_renderer(self._model, *size)
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = sim.effects.shadows
+
+    def draw(self, t: float) -> float:
+        """Draw both cameras' frames of time t; how long that took, but for bringing the world to its pose [s]."""
+        data, option, took = self._state.lit(t), mujoco.MjvOption(), 0.0
+        option.geomgroup[3:] = 0  # neither the board nor the rig itself
+        for camera in CAMERAS:
+            number, focal = self._model.camera(RIG + camera).id, self._truth.lens(camera, t).focal_px
+            self._model.cam_intrinsic[number] = (focal[0] * RENDER_PITCH, focal[1] * RENDER_PITCH, 0.0, 0.0)
+            began = time.perf_counter()
+            self._renderer.update_scene(data, number, option)
+            self._renderer.render()
+            took += time.perf_counter() - began
+        return took
+
+    def close(self) -> None:
+        """Release OpenGL."""
+        self._renderer.close()
+
+
+def _beside_renderer(settings: SimSpeedSettings, seed: int) -> list[Row]:
+    """Steps without image effects, and mujoco.Renderer on their frames, by turns."""
+    stepper = Stepper(config_with(seed, ()))
+    plain = PlainRenderer(stepper.world)
+    rows = []
+    with stepper.world.rig:
+        for i in range(settings.steps + 1):
+            loop = stepper.step()
+            renderer = plain.draw(stepper.t)
+            if i:  # the first one fills caches
+                rows += [
+                    {"seed": seed, "what": LOOP, "step": i, "ms": 1e3 * loop},
+                    {"seed": seed, "what": RENDERER, "step": i, "ms": 1e3 * renderer},
+                ]
+    plain.close()
+    return rows
+
+
+def _beside_none(settings: SimSpeedSettings, seed: int, effects: Sequence[str]) -> list[Row]:
+    """Steps with these image effects and with none, by turns."""
+    with_them, without = Stepper(config_with(seed, effects)), Stepper(config_with(seed, ()))
+    what = effects[0] if len(effects) == 1 else ALL
+    rows = []
+    with with_them.world.rig, without.world.rig:
+        for i in range(settings.steps + 1):
+            took, bare = with_them.step(), without.step()
+            if i:
+                rows.append({"seed": seed, "what": what, "step": i, "ms": 1e3 * took, "without_ms": 1e3 * bare})
+    return rows
+
+
+def _followed(seconds: float, seed: int, rendered: bool) -> float:
+    """Simulated over real time of the whole pipeline."""
+    config = hold_config(TARGET, seed)
+    world = SimWorld(config, rendered=CAMERAS if rendered else ())
+    target, calibration = config.target(TARGET), true_calibration(world)
+    detector = make_detector(target, config.rate_hz) if rendered else TruthDetector(world.truth(), seed)
+    settings = FollowSettings(command_delay_s=config.command_delay_s)
+    with world.rig as rig:
+        for _ in follow(rig, calibration, target, detector, seconds=SETTLED_S, settings=settings):
+            pass
+        start, began = rig.clock.now(), time.perf_counter()
+        for _ in follow(rig, calibration, target, detector, seconds=seconds, settings=settings):
+            pass
+        return (rig.clock.now() - start) / (time.perf_counter() - began)
+
+
+def _alone(settings: SimSpeedSettings, seed: int) -> float:
+    """What the simulation itself takes of a step when nothing is rendered: rig calls, poses, one box of truth [ms]."""
+    config = hold_config(TARGET, seed)
+    world = SimWorld(config, rendered=())
+    truth: Truth = world.truth()
+    took = []
+    with world.rig as rig:
+        t = 0.0
+        for i in range(10 * settings.steps):
+            began = time.perf_counter()
+            t = rig.fixed.read(newer_than=t).t
+            truth.box(TARGET, "fixed", t)
+            rig.head.state()
+            rig.zoom.read()
+            rig.zoom.state()
+            rig.head.move(0.1 * math.sin(i), 0.0)
+            took.append(time.perf_counter() - began)
+    return 1e3 * float(np.median(took))
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Medians over the steps of all seeds."""
+
+    def of(what: str, key: str = "ms") -> Any:
+        return np.array([row[key] for row in rows if row["what"] == what], dtype=float)
+
+    shares = {
+        name: {
+            "ms": float(np.median(of(name))),
+            "without_ms": float(np.median(of(name, "without_ms"))),
+            "more_ms": float(np.median(of(name) - of(name, "without_ms"))),
+        }
+        for name in (*IMAGE_EFFECTS, ALL)
+    }
+    return {
+        "loop_ms": float(np.median(of(LOOP))),
+        "renderer_ms": float(np.median(of(RENDERER))),
+        "loop_over_renderer": float(np.median(of(LOOP) / of(RENDERER))),
+        "effects": shares,
+        "real_time_rendered": float(np.median(of("rendered", "factor"))),
+        "real_time_unrendered": float(np.median(of("unrendered", "factor"))),
+        "simulation_alone_ms": float(np.median(of("simulation alone"))),
+    }
+
+
+def describe(settings: SimSpeedSettings, summary: Mapping[str, Any]) -> str:
+    """The tables."""
+    lines = [
+        f"a step: a frame of each camera, states and commands; medians of {settings.steps} steps, {seeds_of(settings)}",
+        f"image effects off: {summary['loop_ms']:.1f} ms, mujoco.Renderer {summary['renderer_ms']:.1f} ms, ratio "
+        f"{summary['loop_over_renderer']:.2f}",
+        table(
+            ("image effect", "ms", "without", "its share [ms]"),
+            ([n, *v.values()] for n, v in summary["effects"].items()),
+        ),
+        f"real-time factor of the pipeline: both cameras rendered, all effects {summary['real_time_rendered']:.2f}; "
+        f"nothing rendered {summary['real_time_unrendered']:.1f}, of which the simulation itself takes "
+        f"{summary['simulation_alone_ms']:.2f} ms a step",
+    ]
+    return "\n".join(lines)
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Milliseconds of each effect."""
+    found = summarise(rows)
+    ax = figure.subplots()
+    names = [RENDERER, LOOP, *found["effects"]]
+    values = [found["renderer_ms"], found["loop_ms"], *(v["ms"] for v in found["effects"].values())]
+    ax.bar(names, values)
+    ax.set(ylabel="ms a step, two frames")
+    ax.tick_params(axis="x", rotation=20)
+
+
+SETTINGS = SimSpeedSettings()
+EXPERIMENT = Experiment(
+    "sim_speed",
+    "The simulation's speed, beside mujoco.Renderer, effect by effect and against real time.",
+    SETTINGS,
+    replace(SETTINGS, seeds=1, steps=3, seconds_rendered=0.4, seconds_unrendered=2.0),
+    run,
+    summarise,
+    describe,
+    plot,
+)
+
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())
