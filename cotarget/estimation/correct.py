@@ -152,7 +152,7 @@ def _size(node: Node, size: SizeSeen | None, settings: EstimationSettings) -> No
 def _told(node: Node, surprise: float, settings: EstimationSettings) -> Node:
     """Keep count of how surprising measurements are; a target that surprises manoeuvres harder than usual."""
     mean = node.surprise + settings.surprise_gain * (surprise / 2 - node.surprise)
-    return replace(node, surprise=mean, boost=min(max(mean, 1.0) ** settings.boost_power, settings.most_boost))
+    return replace(node, surprise=mean, boost=min(max(mean, 1.0), settings.most_boost))
 
 
 def _leaning(node: Node, S: Array, innovation: Array, settings: EstimationSettings) -> tuple[float, float]:

@@ -77,8 +77,7 @@ class EstimationSettings:
         size_doubt: what is added to the sigma of size and depth together, where the zoom view contradicts them.
         bias_doubt: what is then added to the sigma of the head's bias [rad].
         surprise_gain: weight of the newest measurement in the mean surprise.
-        boost_power: the acceleration's variance is multiplied by the mean surprise, where above 1, to this power ...
-        most_boost: ... but by no more than this.
+        most_boost: most by which surprise multiplies the acceleration's variance.
         history_s: how late a measurement may come after the newest one [s].
     """
 
@@ -102,7 +101,6 @@ class EstimationSettings:
     size_doubt: float = 0.3
     bias_doubt: float = 5e-3
     surprise_gain: float = 0.2
-    boost_power: float = 1.0
     most_boost: float = 30.0
     history_s: float = 1.5
 
