@@ -30,8 +30,8 @@ class SimCamera:
         noise: standard deviation of the sensor's noise [grey levels].
         rate_hz: frames a second.
         latency_s: from light to frame [s].
-        exposure_s: how long light is gathered [s]; what moves meanwhile is blurred, and rendering takes four times
-            as long. 0 for an instant.
+        exposure_s: how long light is gathered [s]; what moves meanwhile is blurred, and rendering takes twice as
+            long while the camera turns. 0 for an instant.
         jpeg_quality: 1 to 100.
     """
 

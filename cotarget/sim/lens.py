@@ -97,29 +97,36 @@ def covering_half_field(lens: TrueLens) -> tuple[float, float]:
     return float(reach[0]), float(reach[1])
 
 
-def bend(pinhole: Image, pinhole_focal_px: float, lens: TrueLens) -> Image:
-    """Resample a centred pinhole render into the lens's image.
+@dataclass(frozen=True)
+class Pinhole:
+    """A view without distortion: size (width, height), focal length and centre [px]."""
+
+    size: tuple[int, int]
+    focal_px: tuple[float, float]
+    center_px: tuple[float, float]
+
+
+def bend(render: Image, view: Pinhole, lens: TrueLens) -> Image:
+    """Resample a pinhole render into the lens's image.
 
     Args:
-        pinhole: render whose optical axis is the middle of the image.
-        pinhole_focal_px: its focal length [px].
+        render: of the view.
+        view: that covers all that the lens sees.
         lens: the lens wanted.
     """
-    where = _map(lens, pinhole_focal_px, (pinhole.shape[1], pinhole.shape[0]))
-    return cv2.remap(pinhole, *where, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.remap(render, _map(lens, view), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 @lru_cache(maxsize=KEPT_MAPS)
-def _map(lens: TrueLens, pinhole_focal_px: float, pinhole_size: tuple[int, int]) -> tuple[Array, Array]:
-    """For every pixel of the lens's image where to look in the pinhole render, as cv2.remap likes it best."""
+def _map(lens: TrueLens, view: Pinhole) -> Array:
+    """For every pixel of the lens's image where to look in the pinhole render, (H, W, 2) float32."""
     w, h = lens.size
     u, v = np.arange(0, w + MAP_STRIDE, MAP_STRIDE), np.arange(0, h + MAP_STRIDE, MAP_STRIDE)
-    coarse = lens.directions(np.stack(np.meshgrid(u, v), axis=-1).astype(float)) * pinhole_focal_px
-    coarse += (np.array(pinhole_size) - 1) / 2
+    coarse = lens.directions(np.stack(np.meshgrid(u, v), axis=-1).astype(float)) * view.focal_px
+    coarse += view.center_px
     # Interpolate between the coarse samples exactly at multiples of the stride: an affine warp, not a resize,
     # because a resize would shift by half a sample.
     scale = np.array([[1 / MAP_STRIDE, 0, 0], [0, 1 / MAP_STRIDE, 0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     fine = cv2.warpAffine(coarse.astype(np.float32), scale, (w, h), flags=flags)
-    whole, part = cv2.convertMaps(fine, None, cv2.CV_16SC2)  # as fine as cv2.remap's own interpolation
-    return whole, part
+    return fine

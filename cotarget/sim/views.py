@@ -6,7 +6,6 @@ parts of a pixel against each other, so that their mean is antialiased as well. 
 around it. At rest it is a single render.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from cotarget.geometry import Array
 from cotarget.rig import Image
-from cotarget.sim.lens import TrueLens, bend, covering_half_field
+from cotarget.sim.lens import Pinhole, TrueLens, bend, covering_half_field
 from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, RIG, RIG_GROUP
 from cotarget.sim.opengl import Canvas, mujoco
 from cotarget.sim.state import WorldState
@@ -30,15 +29,6 @@ WINDOW_MARGIN_PX = 4  # around what moves
 LARGEST_WINDOWS = 0.3  # of the picture; where more of it moves, all of it is rendered four times
 NEAREST = 3.0  # nothing is nearer to a camera than this, for what its own shifts do to the picture [m]
 PROBES = 3  # directions on each side of the picture that tell how the camera turned
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """A view without distortion: size (width, height), focal length and centre [px]."""
-
-    size: tuple[int, int]
-    focal_px: tuple[float, float]
-    center_px: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -154,19 +144,18 @@ class Views:
         return self._through(lens, view, image)
 
     def _view(self, lens: TrueLens) -> Pinhole:
-        """The render that a lens's image is made from: centred, and wide enough."""
+        """The render that a lens's image is made from; resampled as softly whether the lens distorts or not."""
+        if not any(lens.distortion):
+            (w, h), (cx, cy) = lens.size, lens.center_px
+            return Pinhole((w + 3, h + 3), lens.focal_px, (cx + 1.5, cy + 1.5))
         half_width, half_height = covering_half_field(lens)
         width, height = self._size
-        if not any(lens.distortion):  # nothing is stretched, so that more than a pixel for a pixel gains nothing
-            (fx, fy), (most_width, most_height) = lens.focal_px, self._size
-            width = min(math.ceil(2 * half_width * max(fx, fy)) + 2, most_width)
-            height = min(math.ceil(2 * half_height * max(fx, fy)) + 2, most_height)
         focal = min((width / 2 - 1) / half_width, (height / 2 - 1) / half_height)
-        return Pinhole((width, height), (focal, focal), ((width - 1) / 2, (height - 1) / 2))
+        return Pinhole(self._size, (focal, focal), ((width - 1) / 2, (height - 1) / 2))
 
     def _through(self, lens: TrueLens, view: Pinhole, image: Image) -> Image:
         """Bend a render, RGB, into a lens's image, BGR."""
-        bent = bend(np.ascontiguousarray(image), view.focal_px[0], lens)
+        bent = bend(np.ascontiguousarray(image), view, lens)
         return np.asarray(cv2.cvtColor(bent, cv2.COLOR_RGB2BGR), dtype=np.uint8)
 
     def _render(

@@ -159,7 +159,11 @@ class SimWorld:
             tuple(2 * half * focal + 2 for half, focal in zip(covering_half_field(lens), lens.focal_px, strict=True))
             for lens in (self._fixed_lens, *zooms)
         ]
-        return math.ceil(max(s[0] for s in sizes)), math.ceil(max(s[1] for s in sizes))
+        least_width, least_height = np.max(
+            [camera.size for camera in (self.config.sim.fixed, self.config.sim.zoom)], axis=0
+        )
+        width, height = max(s[0] for s in sizes), max(s[1] for s in sizes)
+        return max(math.ceil(width), int(least_width) + 3), max(math.ceil(height), int(least_height) + 3)
 
     def expose(self, name: CameraName, index: int, t: float) -> Image:
         """Gather light around time t, up to now, then add the sensor's effects to frame number ``index``."""
