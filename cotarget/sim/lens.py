@@ -128,5 +128,4 @@ def _map(lens: TrueLens, view: Pinhole) -> Array:
     # because a resize would shift by half a sample.
     scale = np.array([[1 / MAP_STRIDE, 0, 0], [0, 1 / MAP_STRIDE, 0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    fine = cv2.warpAffine(coarse.astype(np.float32), scale, (w, h), flags=flags)
-    return fine
+    return cv2.warpAffine(coarse.astype(np.float32), scale, (w, h), flags=flags)
