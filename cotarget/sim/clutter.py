@@ -29,8 +29,8 @@ LEAF = (0.20, 0.28, 0.11, 1.0)
 SAPLINGS = ((-8.6, 21.0), (-5.6, 25.0), (6.4, 23.0), (9.4, 20.0))  # x, y; beside and behind where targets go
 SAPLING_HEIGHT = (2.4, 3.2)
 HAZE_SIZE = 128  # of the textures of clouds and shadows [px]
-CLOUDS, CLOUD_ALPHA, CLOUD_SPEED = 6, 0.85, (3.0, 7.0)  # [m/s]
-SHADES, SHADE_ALPHA, SHADE_SPEED, SHADE_RANGE = 6, 0.35, (1.5, 5.0), (11.0, 45.0)  # [m/s], [m]
+CLOUDS, CLOUD_ALPHA, CLOUD_SPEED = 6, 0.5, (0.6, 1.8)  # [m/s]; 3 to 9 px/s in the wide view
+SHADES, SHADE_ALPHA, SHADE_SPEED, SHADE_RANGE = 6, 0.30, (1.0, 3.0), (11.0, 45.0)  # [m/s], [m]
 SHADE_LIFT = 0.03  # over the ground, so that the ground does not show through
 VIEW_WIDTH = 0.62  # half the width that drifting things cross, at unit distance: beyond the wide view's edge
 
