@@ -75,6 +75,7 @@ def honesty(truth, seeds, outliers=0.0):
 POINTING_TOLERANCE = 0.25
 
 
+@pytest.mark.slow
 def test_the_covariance_is_honest():
     half = SEEDS // 2
     rigs = [honesty(truth, half, outliers) for truth, outliers in ((Truth(), 0.0), (other_rig(), 0.05))]

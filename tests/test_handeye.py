@@ -148,6 +148,7 @@ def from_motions(starts, ends):
     return lambda rng: solve_hand_eye(A, [noisy(b, rng) for b in B])
 
 
+@pytest.mark.slow
 def test_poses_give_an_honest_covariance():
     rng = np.random.default_rng(0)
     check_honest(from_poses(arm(rng, 20)), from_poses(pan_tilt(rng, 20)))

@@ -183,6 +183,7 @@ def test_numbers_in_the_page_are_those_of_the_calibration(plain, tmp_path):
     assert len(read(page).images) == 2
 
 
+@pytest.mark.slow
 def test_the_verdict_is_as_true_as_it_says(plain, stops):
     for calibration in (plain, stops):
         said = float(re.match(r"Points to ([\d.]+) degrees", judge(calibration, between=()).text).group(1))
