@@ -62,7 +62,7 @@ class TargetConfig:
     size: float
     dimension: Literal["width", "height", "wingspan"]
     wanted_px: float
-    detector: Literal["colour", "motion"]
+    detector: Literal["colour", "motion", "speck", "mog2"]
     template: Path | None = None
 
 

@@ -28,11 +28,12 @@ from cotarget.drawing import (
 )
 from cotarget.errors import ConfigError
 from cotarget.judging import add_row, pointing_errors
-from cotarget.loop import FollowSettings, follow, reach_of
+from cotarget.loop import FollowSettings, follow
 from cotarget.metrics import Row, Score, score, write_rows
 from cotarget.parallel import Report, run_side_by_side
 from cotarget.plots import plot_aim_error
 from cotarget.safety import SafeRig
+from cotarget.servo import reach_of
 from cotarget.sim.world import SimWorld
 from cotarget.video import FilmWriter, join_films
 

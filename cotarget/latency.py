@@ -23,8 +23,8 @@ from cotarget.calibration.recorder import wait_for_lens
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, StaleFrameError
 from cotarget.geometry import Array, RigidTransform, pose
-from cotarget.loop import reach_of
 from cotarget.rig import Camera, Frame, Image, PanTiltState, Rig
+from cotarget.servo import reach_of
 from cotarget.targeting import aim
 
 WIGGLE = np.radians(1.5)  # of the head to each side: some 18 px of a usual wide lens [rad]

@@ -3,22 +3,29 @@
 Everything that records, draws, scores or prints consumes Steps.
 """
 
-import dataclasses
 import enum
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from cotarget.calibration import Calibration
+from cotarget.closeup import Found
 from cotarget.config import TargetConfig
 from cotarget.detection import Detection, Detector
 from cotarget.errors import UnreachableError
-from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, Rig, ZoomState
-from cotarget.targeting import Aim, Closeup, Reach, aim, depth_of, point_at
-from cotarget.tracking import FirstCome, Track, Tracker, settings_for, size_for
+from cotarget.estimation import Estimate
+from cotarget.policies import FirstCome, Policy
+from cotarget.pursuit import Pursuit
+from cotarget.rig import Frame, Image, PanTiltState, Rig, ZoomState
+from cotarget.servo import Drive, Servo, ServoSettings
+from cotarget.targeting import Aim
+from cotarget.tracking import Track, Tracker, settings_for
 
 # Longest interval between frames that is taken for the rhythm of commands [s]; a longer one was a gap.
 LONGEST_INTERVAL_S = 0.2
+SEEN_WELL = 0.8  # a chance of being wholly in the close-up that counts as being there
 
 
 class State(enum.StrEnum):
@@ -32,23 +39,18 @@ class State(enum.StrEnum):
 
 
 @dataclass(frozen=True)
-class FollowSettings:
-    """How the loop follows.
+class FollowSettings(ServoSettings):
+    """How the loop follows, and how it drives head and lens.
 
     Attributes:
-        command_delay_s: from a command to the start of motion [s]; the aim leads the target by it.
         zoom_out_after_s: how long a target may be out of sight before the lens zooms out [s].
-        focal_deadband: the lens is not moved for a smaller relative change of focal length.
-        centred_deg: the lens begins to zoom in when the head is this near to the target [degrees] ...
-        margin: ... and goes on only as far as the way that the head has still to go fits into this part of the
-            image's half height, so that the target is centred first.
+        closed_loop: whether the target is looked for in the zoom view too.
+        policy: which of several targets is followed; the first by default.
     """
 
-    command_delay_s: float = 0.0
     zoom_out_after_s: float = 0.4
-    focal_deadband: float = 0.04
-    centred_deg: float = 1.5
-    margin: float = 0.3
+    closed_loop: bool = True
+    policy: Policy = field(default_factory=FirstCome)
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,8 @@ class Step:
         commanded: pan, tilt [rad] and nominal focal length [px] as really commanded last.
         head: the head's state.
         lens: the lens's state.
+        estimate: of the target in 3D, for the time of the fixed frame.
+        found: the target in the zoom frame, where this Step's is a new one and it was found there.
     """
 
     index: int
@@ -86,6 +90,8 @@ class Step:
     commanded: tuple[float, float, float]
     head: PanTiltState
     lens: ZoomState
+    estimate: Estimate | None = None
+    found: Found | None = None
 
 
 def follow(
@@ -113,146 +119,97 @@ def follow(
         StaleFrameError: frames stopped coming, or came too late to act on.
     """
     calibration.hand_eye()  # refused now, and not when the first target is seen
-    calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
-    tracker, policy = Tracker(settings_for(target), rig.fixed.size), FirstCome()
-    state = rig.head.state()
-    commanded = (state.pan, state.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
-    frame_t: float | None = None
-    last_seen = -math.inf
-    end, index = rig.clock.now() + seconds, 0
+    loop = _Loop(rig, calibration.for_streams(rig.fixed.size, rig.zoom.size), target, detector, settings)
+    end = rig.clock.now() + seconds
     while rig.clock.now() < end:
-        frame = rig.fixed.read(newer_than=frame_t)
-        interval = min(frame.t - frame_t, LONGEST_INTERVAL_S) if frame_t is not None else LONGEST_INTERVAL_S
-        frame_t = frame.t
-        detections = detector.detect(frame)
-        tracks = tracker.update(detections, frame.t)
-        chosen = policy.select(tracks)
-        led: Lead | None = None
-        mode, reason = State.SEARCHING, ""
-        if chosen is not None:
-            last_seen = frame.t if chosen.missed == 0 else last_seen
-            mode = State.FOLLOWING if chosen.missed == 0 else State.COASTING
-            if frame.t - last_seen > settings.zoom_out_after_s:
-                mode, reason = State.LOST, f"out of sight for {frame.t - last_seen:.1f} s"
-            else:
-                try:
-                    led = lead(rig, calibration, target, chosen, settings.command_delay_s, interval)
-                except UnreachableError as error:
-                    mode, reason = State.UNREACHABLE, str(error)
-        if mode is not State.UNREACHABLE:
-            commanded = _command(rig, led, commanded, settings)
-        yield Step(
-            index=index,
+        yield loop.turn()
+
+
+class _Loop:
+    """One run of `follow`."""
+
+    def __init__(
+        self, rig: Rig, calibration: Calibration, target: TargetConfig, detector: Detector, settings: FollowSettings
+    ) -> None:
+        self._rig, self._detector, self._settings = rig, detector, settings
+        self._tracker = Tracker(settings_for(target), rig.fixed.size)
+        self._pursuit = Pursuit(calibration, target, rig.fixed.size, closed_loop=settings.closed_loop)
+        self._servo = Servo(rig, calibration, settings)
+        self._zoom_frame: Frame | None = None
+        self._fixed_t: float | None = None
+        self._last_seen = -math.inf
+        self._index = 0
+
+    def turn(self) -> Step:
+        """One frame of the fixed camera."""
+        rig, pursuit = self._rig, self._pursuit
+        frame = rig.fixed.read(newer_than=self._fixed_t)
+        interval = LONGEST_INTERVAL_S if self._fixed_t is None else min(frame.t - self._fixed_t, LONGEST_INTERVAL_S)
+        self._fixed_t = frame.t
+        detections = self._detector.detect(frame)
+        tracks = self._tracker.update(detections, frame.t)
+        pursuit.see_wide(frame, tracks, self._detector.mask)
+        self._hear()
+        found = self._look_through_zoom()
+        chosen = self._choose(tracks)
+        mode, reason, drive = self._drive(chosen, frame, interval)
+        if drive is not None and chosen is not None and drive.chance >= SEEN_WELL and drive.zoom_reason == "wanted":
+            pursuit.seen_well(chosen.id, interval)
+        self._hear()
+        assert self._zoom_frame is not None, "it was just read"
+        step = Step(
+            index=self._index,
             t=rig.clock.now(),
             state=mode,
             reason=reason,
             fixed=frame,
-            zoom=rig.zoom.read(),
-            mask=detector.mask,
+            zoom=self._zoom_frame,
+            mask=self._detector.mask,
             detections=tuple(detections),
             tracks=tuple(tracks),
             target=chosen,
-            aim=None if led is None else led.aim,
-            commanded=commanded,
-            head=rig.head.state(),
-            lens=rig.zoom.state(),
+            aim=None if drive is None else drive.aim,
+            commanded=self._servo.commanded,
+            head=self._head,
+            lens=self._lens,
+            estimate=None if chosen is None else pursuit.estimate(chosen.id, frame.t),
+            found=found,
         )
-        index += 1
+        self._index += 1
+        return step
 
+    def _hear(self) -> None:
+        """Ask the devices where they are."""
+        self._head, self._lens = self._rig.head.state(), self._rig.zoom.state()
+        self._pursuit.states.add(self._head, self._lens)
 
-@dataclass(frozen=True)
-class Lead:
-    """Where to send the head, and how far it is now from where the target is now [rad]."""
+    def _look_through_zoom(self) -> Found | None:
+        """Take the newest zoom frame; what was found in it, where it is a new one."""
+        before, self._zoom_frame = self._zoom_frame, self._rig.zoom.read()
+        if before is not None and self._zoom_frame.t <= before.t:
+            return None
+        return self._pursuit.see_zoom(self._zoom_frame)
 
-    aim: Aim
-    way: float
+    def _choose(self, tracks: list[Track]) -> Track | None:
+        """Whom to follow."""
+        candidates = self._pursuit.candidates(tracks, self._rig.clock.now())
+        head = np.array([self._head.pan, self._head.tilt])
+        number = self._settings.policy.select(candidates, head, self._rig.head.limits)
+        self._pursuit.follow(number)
+        return next((track for track in tracks if track.id == number), None)
 
-
-def _command(
-    rig: Rig, led: Lead | None, commanded: tuple[float, float, float], settings: FollowSettings
-) -> tuple[float, float, float]:
-    """Send head and lens after the target, or zoom out where there is none; return what is commanded now."""
-    shortest = rig.zoom.focal_range[0]
-    pan, tilt, focal = commanded
-    if led is None:
-        return pan, tilt, rig.zoom.zoom(shortest) if focal > shortest else focal
-    pan, tilt = rig.head.move(led.aim.pan, led.aim.tilt)
-    zoomed_out = focal <= shortest * (1 + settings.focal_deadband)
-    if zoomed_out and led.way > math.radians(settings.centred_deg):
-        nominal = shortest
-    else:
-        nominal = min(led.aim.nominal_px, _focal_while_turning(rig, led.way, settings.margin))
-    return pan, tilt, _command_lens(rig, nominal, focal, settings.focal_deadband)
-
-
-def lead(
-    rig: Rig, calibration: Calibration, target: TargetConfig, track: Track, command_delay_s: float, interval_s: float
-) -> Lead:
-    """Aim so that the head keeps up with a track: the unit brakes to rest at every goal, so the goal lies ahead.
-
-    At the next command's effect the head shall be where the target then is, and as fast; from there it needs
-    its stopping distance, rate^2 / (2 acceleration), so that much further lies the goal.
-
-    Args:
-        rig: gives the time, the limits and where the head is.
-        calibration: of that rig.
-        target: the target's known size and the size wanted.
-        track: in the fixed view.
-        command_delay_s: from command to motion [s].
-        interval_s: from one command to the next [s].
-
-    Raises:
-        UnreachableError: no pan and tilt within the limits do it.
-    """
-    limits, reach = rig.head.limits, reach_of(rig)
-    closeup = Closeup(target.size, target.wanted_px, target.dimension == "height")
-    upright = bool(track.size_px[1] > track.size_px[0])
-    depth = depth_of(calibration, target, size_for(track, target.dimension), track.center_px, upright=upright)
-    effect = rig.clock.now() + command_delay_s
-    at_effect, after = (
-        aim(calibration, point_at(calibration, track.predict(t), depth), reach, closeup=closeup)
-        for t in (effect, effect + interval_s)
-    )
-    rates = [(after.pan - at_effect.pan) / interval_s, (after.tilt - at_effect.tilt) / interval_s]
-    pan, tilt = (
-        goal + stopping_distance(rate, limits) for goal, rate in zip((after.pan, after.tilt), rates, strict=True)
-    )
-    # Where the target is now lies one delay back from where it will be when the command takes effect.
-    pan_now, tilt_now = reach.now
-    way = math.hypot(
-        at_effect.pan - rates[0] * command_delay_s - pan_now, at_effect.tilt - rates[1] * command_delay_s - tilt_now
-    )
-    return Lead(dataclasses.replace(after, pan=pan, tilt=tilt), way)
-
-
-def reach_of(rig: Rig) -> Reach:
-    """What a rig's head and lens can do, and where the head is."""
-    limits, head = rig.head.limits, rig.head.state()
-    return Reach(limits.pan, limits.tilt, rig.zoom.focal_range, (head.pan, head.tilt), limits.step)
-
-
-def stopping_distance(rate: float, limits: PanTiltLimits) -> float:
-    """How far an axis at that rate [rad/s] goes on while it brakes [rad], with the rate's sign."""
-    rate = min(max(rate, -limits.speed), limits.speed)
-    return rate * abs(rate) / (2 * limits.acceleration)
-
-
-def _focal_while_turning(rig: Rig, way: float, margin: float) -> float:
-    """The longest nominal focal length [px] that keeps the target well inside while the head has still to turn.
-
-    Args:
-        rig: gives the image's size and the lens's range.
-        way: how far the head is from the target [rad].
-        margin: part of the image's half height that the way may take.
-    """
-    shortest, longest = rig.zoom.focal_range
-    half = margin * min(rig.zoom.size) / 2
-    slope = math.tan(min(way, 1.5))  # [rad], short of a right angle
-    return longest if slope * longest <= half else max(half / slope, shortest)
-
-
-def _command_lens(rig: Rig, nominal_px: float, commanded_px: float, deadband: float) -> float:
-    """Move the lens unless the change is too small to matter; return what it is commanded to."""
-    if abs(math.log(nominal_px / commanded_px)) < deadband:
-        return commanded_px
-    return rig.zoom.zoom(nominal_px)
+    def _drive(self, chosen: Track | None, frame: Frame, interval: float) -> tuple[State, str, Drive | None]:
+        """Command head and lens; what the loop is doing then, and why."""
+        if chosen is None:
+            self._servo.zoom_out()
+            return State.SEARCHING, "", None
+        if chosen.missed == 0:
+            self._last_seen = frame.t
+        if frame.t - self._last_seen > self._settings.zoom_out_after_s:
+            self._servo.zoom_out()
+            return State.LOST, f"out of sight for {frame.t - self._last_seen:.1f} s", None
+        try:
+            drive = self._servo.drive(lambda t: self._pursuit.estimate(chosen.id, t), self._last_seen, interval)
+        except UnreachableError as error:
+            return State.UNREACHABLE, str(error), None
+        return State.FOLLOWING if chosen.missed == 0 else State.COASTING, "", drive

@@ -22,8 +22,8 @@ from cotarget.calibration import Calibration, calibrate_rig
 from cotarget.config import RigConfig, SimConfig
 from cotarget.geometry import RigidTransform, pose
 from cotarget.judging import pointing_errors
-from cotarget.loop import reach_of
 from cotarget.safety import SafeRig
+from cotarget.servo import reach_of
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Method
 from experiments import harness

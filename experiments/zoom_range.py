@@ -23,9 +23,9 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import RigConfig, SimConfig, SimEffects
 from cotarget.geometry import RigidTransform, angle_between
 from cotarget.judging import pointing_errors
-from cotarget.loop import reach_of
 from cotarget.pantilt import HeadGeometry
 from cotarget.safety import SafeRig
+from cotarget.servo import reach_of
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments import harness

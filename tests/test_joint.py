@@ -140,6 +140,7 @@ CALIBRATION_TOLERANCE, AIM_TOLERANCE = 0.5, 0.18
 AIM_SEEDS = 3
 
 
+@pytest.mark.slow
 def test_a_jittery_head_is_noticed_and_its_pointing_predicted():
     truth = replace(Truth(), jitter=JITTER)
     jitters, with_head, without = [], [], []

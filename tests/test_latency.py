@@ -101,6 +101,7 @@ def test_a_picture_that_stands_still_is_no_measurement(world):
         measure_head(Wrapped(world.rig, zoom=Frozen(world.rig.zoom, 0.0)), seconds=4.0)
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_the_fixed_camera_against_the_zoom_camera(world):
     sim = world.config.sim

@@ -104,6 +104,7 @@ def rms(errors):
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
+@pytest.mark.slow
 def test_captures_in_any_order_give_the_same_calibration(session):
     calibration, directory = session
     table = json.loads((directory / INDEX).read_text())

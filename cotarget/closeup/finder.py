@@ -97,17 +97,21 @@ class CloseupFinder:
         self._last_t = -math.inf
         self._last_offset: Array = np.zeros(2)  # beside the expected place, in wide pixels
 
-    def see_wide(self, frame: Frame, detection: Detection, mask: Image | None = None) -> None:
+    def see_wide(self, frame: Frame, detection: Detection, mask: Image | None = None) -> Sight | None:
         """Remember the target as a wide frame shows it.
 
         Args:
             frame: of the wide view.
             detection: of the target in that very frame.
             mask: the detector's foreground there, (H, W); without it an ellipse in the box.
+
+        Returns:
+            What was seen, the middle of the body in particular; None where the box holds no pixel of the frame.
         """
         sight = look(frame, detection, mask, self._target)
         if sight is not None:
             self._sights.append(sight)
+        return sight
 
     def find(self, frame: Frame, expected: Expected) -> Found | None:
         """Find the target in a zoom frame.

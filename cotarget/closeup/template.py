@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from cotarget.closeup.matching import Samples, resample
 from cotarget.config import TargetConfig
@@ -17,8 +18,10 @@ MARGIN, LEAST_MARGIN_PX = 0.2, 2.0
 MARGIN_WEIGHT = 0.1
 # The pixels at the outline are partly the target's, and missing from the foreground as often as not.
 RIM_WEIGHT = 0.3
-# A foreground that fills less of the box than this is none; an ellipse in the box stands in for it.
-LEAST_FOREGROUND = 0.15
+# A foreground that fills less of the box than this is none, and one that fills all of it tells where the target is but
+# not its outline; then what is not coloured as its surroundings is taken for it, and, failing that, an ellipse.
+LEAST_FOREGROUND, MOST_FOREGROUND = 0.15, 0.9
+STANDS_OUT = 3.0  # standard deviations of the surroundings' colours
 # The background's colours are taken for spread by no less than this, one standard deviation [grey levels]; and from
 # fewer of its pixels than these nothing is learnt.
 LEAST_SPREAD, LEAST_BACKGROUND = 10.0, 12
@@ -31,6 +34,9 @@ BOX_SIGMA = np.array([0.08, 0.18])
 UPRIGHT_SIGMA = np.array([0.03, 0.006])
 FLYING_SIGMA = np.array([0.05, 0.12])
 COLOUR_SIGMA = np.array([0.01, 0.01])
+
+
+Pixels = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -102,10 +108,13 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetC
     v, u = np.mgrid[low[1] : high[1], low[0] : high[0]].astype(np.float32)
     du, dv = np.abs(u - center[0]), np.abs(v - center[1])
     in_box = (du <= size[0] / 2) & (dv <= size[1] / 2)
+    patch = frame.image[low[1] : high[1], low[0] : high[0]].copy()
     foreground = np.zeros_like(in_box)
     if mask is not None:
         foreground = (mask[low[1] : high[1], low[0] : high[0]] > 0) & in_box
-    masked = np.count_nonzero(foreground) > LEAST_FOREGROUND * np.count_nonzero(in_box)
+    if not _is_outline(foreground, in_box):
+        foreground = _stands_out(patch, in_box)
+    masked = _is_outline(foreground, in_box)
     if not masked:
         foreground = (2 * du / size[0]) ** 2 + (2 * dv / size[1]) ** 2 <= 1
     outside = np.maximum(du - size[0] / 2, dv - size[1] / 2)
@@ -122,9 +131,23 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetC
         sigma = (UPRIGHT_SIGMA if upright else FLYING_SIGMA) * size
     if detection.clipped:  # the hidden part may be as large again
         sigma = np.hypot(sigma, size / 2)
-    patch = frame.image[low[1] : high[1], low[0] : high[0]].copy()
     whitening = _whitening(patch[grown == 0])
     return Sight(frame.t, body, sigma, size, patch, weight, low.astype(float), whitening)
+
+
+def _is_outline(foreground: Pixels, in_box: Pixels) -> bool:
+    """Whether a foreground is the target's outline: neither next to nothing nor all of its box."""
+    part = np.count_nonzero(foreground) / max(int(np.count_nonzero(in_box)), 1)
+    return bool(LEAST_FOREGROUND < part < MOST_FOREGROUND)
+
+
+def _stands_out(patch: Image, in_box: Pixels) -> Pixels:
+    """Where the colours in the box are none that are around it."""
+    background = patch[~in_box]
+    if len(background) < LEAST_BACKGROUND:
+        return np.zeros_like(in_box)
+    away = (patch - np.median(background, axis=0)) @ _whitening(background)
+    return np.asarray((np.sum(away**2, axis=2) > STANDS_OUT**2) & in_box)
 
 
 def _whitening(background: Image) -> Array:

@@ -48,14 +48,14 @@ class SpatialFilter:
         self._nodes: list[Node | None] = []  # the state after each of them, as far as gone over
 
     def see_wide(
-        self, detection: Measurement, t: float, *, sigma_px: float | None = None, size_px: float | None = None
+        self, detection: Measurement, t: float, *, sigma_px: Array | None = None, size_px: float | None = None
     ) -> bool:
         """Take a detection in the wide view into account.
 
         Args:
             detection: its box; one that the image's border cuts tells its size no more, and its middle badly.
             t: when the frame's light fell [s].
-            sigma_px: standard deviation of the box's middle [px]; by default from the settings and the box's size.
+            sigma_px: standard deviation of the middle, (2,) [px]; by default from the settings and the box's size.
             size_px: the known dimension in the image [px], where it is better known than from this box alone, as
                 the largest over a wing beat.
 
@@ -69,8 +69,9 @@ class SpatialFilter:
         z, J = found
         settings = self._settings
         width, height = (float(side) for side in detection.size_px)
-        sigma_u = sigma_v = sigma_px or 0.0
-        if sigma_px is None:
+        if sigma_px is not None:
+            sigma_u, sigma_v = (float(sigma) for sigma in sigma_px)
+        else:
             sigma_u = math.hypot(settings.noise_px, settings.noise_of_size * width)
             sigma_v = math.hypot(settings.noise_px, settings.noise_of_size * height)
         if detection.clipped:  # the hidden part may be as large again

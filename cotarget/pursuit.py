@@ -1,0 +1,135 @@
+"""What is known of every track in 3D, and what both cameras show of the one that is followed.
+
+Each track of the wide view has a filter of its own; the one followed is besides looked for in the zoom view, which
+triangulates its depth and shows any error of head or calibration.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cotarget.calibration import Calibration
+from cotarget.closeup import CloseupFinder, Expected, Found
+from cotarget.config import TargetConfig
+from cotarget.detection import Detection
+from cotarget.estimation import Estimate, SpatialFilter, estimation_settings_for
+from cotarget.geometry import Array
+from cotarget.policies import Candidate, leaves_in
+from cotarget.rig import Frame, Image
+from cotarget.statehistory import StateHistory
+from cotarget.tracking import Track
+
+# Of more tracks than these only the first have a filter; there is no telling a hundred moving things apart.
+MOST_FILTERS = 12
+# The time of a frame, of the head's state and of the lens's are known to each other this well [s].
+TIME_SIGMA_S = 2e-3
+HEAD_SIGMA = 3e-4  # of the angles of a head that stands: rounding of 0.05 degrees [rad]
+# For whom to look at next, how fast a target goes round the head is taken over this time [s].
+RATE_S = 0.1
+
+
+class Pursuit:
+    """The filters of all tracks, from one frame to the next.
+
+    Args:
+        calibration: of the rig, for the streams in use.
+        target: what is followed.
+        size: (width, height) of the wide view [px].
+        closed_loop: whether the target is looked for in the zoom view too.
+    """
+
+    def __init__(
+        self, calibration: Calibration, target: TargetConfig, size: tuple[int, int], *, closed_loop: bool = True
+    ) -> None:
+        self._calibration, self._target, self._size = calibration, target, size
+        self._closed_loop = closed_loop
+        self._assumed = estimation_settings_for(target, calibration)
+        self._filters: dict[int, SpatialFilter] = {}
+        self._seen_s: dict[int, float] = {}
+        self._followed: int | None = None
+        self._finder = CloseupFinder(calibration, target)
+        self._to_base = calibration.hand_eye() * calibration.T_zoom0_fixed
+        self.states = StateHistory()
+
+    def see_wide(self, frame: Frame, tracks: Sequence[Track], mask: Image | None) -> None:
+        """Take a frame of the wide view into account.
+
+        Args:
+            frame: the frame.
+            tracks: after it, confirmed ones first.
+            mask: the detector's foreground, (H, W).
+        """
+        known = {track.id for track in tracks}
+        self._filters = {number: each for number, each in self._filters.items() if number in known}
+        self._seen_s = {number: seconds for number, seconds in self._seen_s.items() if number in known}
+        for track in tracks[:MOST_FILTERS]:
+            if track.missed:
+                continue
+            if track.id not in self._filters:
+                self._filters[track.id] = SpatialFilter(self._calibration, self._target, self._assumed)
+            found = self._filters[track.id]
+            box, sigma_px = track.box, None
+            if track.id == self._followed and isinstance(box, Detection):
+                sight = self._finder.see_wide(frame, box, mask)
+                if sight is not None:  # the very point that both views show
+                    box, sigma_px = replace(box, center_px=sight.body_px), sight.body_sigma_px
+            size_px = track.larger_side_px if self._target.dimension == "wingspan" else None
+            found.see_wide(box, frame.t, sigma_px=sigma_px, size_px=size_px)
+
+    def see_zoom(self, frame: Frame) -> Found | None:
+        """Look for the followed target in a frame of the zoom view, and take it into account where it is found."""
+        pose = self.states.at(frame.t)
+        estimate = None if self._followed is None else self.estimate(self._followed, frame.t)
+        if not self._closed_loop or pose is None or estimate is None or self._followed is None:
+            return None
+        seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
+        if seen is None:
+            return None
+        pan, tilt = pose.pan + estimate.bias[0], pose.tilt + estimate.bias[1]
+        expected = Expected(estimate.x_fixed, seen.covariance, pan, tilt, pose.nominal_px)
+        found = self._finder.find(frame, expected)
+        if found is not None:
+            self._filters[self._followed].see_zoom(
+                found.center_px,
+                found.sigma_px,
+                pose.pan,
+                pose.tilt,
+                pose.nominal_px,
+                frame.t,
+                head_sigma=math.hypot(HEAD_SIGMA, pose.speed * TIME_SIGMA_S),
+            )
+        return found
+
+    def follow(self, number: int | None) -> None:
+        """Look for another track in the zoom view from now on."""
+        if number != self._followed:
+            self._followed = number
+            self._finder = CloseupFinder(self._calibration, self._target)
+
+    def seen_well(self, number: int, seconds: float) -> None:
+        """Note that a track was well in the close-up for some time [s]."""
+        self._seen_s[number] = self._seen_s.get(number, 0.0) + seconds
+
+    def estimate(self, number: int, t: float) -> Estimate | None:
+        """A track at a time [s]; None where it is not known."""
+        found = self._filters.get(number)
+        return None if found is None else found.at(t)
+
+    def candidates(self, tracks: Sequence[Track], t: float) -> list[Candidate]:
+        """What a policy chooses from, at a time [s]: the confirmed tracks."""
+        found = []
+        for track in tracks:
+            now, soon = (self.estimate(track.id, t + later) for later in (0.0, RATE_S))
+            if not track.confirmed or now is None or soon is None:
+                continue
+            at, then = self._direction(now.x_fixed), self._direction(soon.x_fixed)
+            seen_s = self._seen_s.get(track.id, 0.0)
+            found.append(Candidate(track, at, (then - at) / RATE_S, leaves_in(track, self._size), seen_s))
+        return found
+
+    def _direction(self, x_fixed: Array) -> Array:
+        """Pan and tilt of a point as seen from the head, (2,) [rad], the zoom camera's place on it aside."""
+        x, y, z = self._to_base.apply(x_fixed)
+        return np.array([math.atan2(x, z), math.atan2(-y, math.hypot(x, z))])

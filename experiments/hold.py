@@ -1,0 +1,204 @@
+"""How long and how well a target is held in the close-up: a book, a person and a bird in the field, by the truth.
+
+The rig is the default one, calibrated from rendered boards, under the field's conditions (`experiments.hold_scenes`):
+exposure blur, clutter, 120 ms from light to frame, 80 ms from command to motion, true sizes that nobody knows. Each
+seed is another path, another size and other noise. Figures are medians over the seeds of the field's terms, which
+`cotarget.metrics` defines; everything is judged by the simulation's truth, which the pipeline cannot see.
+
+    python -m experiments.hold [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import functools
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration, calibrate_rig
+from cotarget.config import RigConfig, SimConfig
+from cotarget.detection import make_detector
+from cotarget.judging import add_row
+from cotarget.loop import FollowSettings, follow
+from cotarget.metrics import Row as Judged
+from cotarget.metrics import score
+from cotarget.safety import SafeRig
+from cotarget.sim.world import SimWorld
+from experiments import harness
+from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
+from experiments.hold_scenes import SECONDS, hold_config
+
+# What is wanted of each figure's median: at least, or at most.
+WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
+    "book": {
+        "closeup_yield": (0.88, 1.0),
+        "in_frame_ratio": (0.99, 1.0),
+        "tpo_width_median": (0.0, 0.02),
+        "size_ratio_median": (0.9, 1.1),
+        "fragmentation_per_min": (0.0, 0.0),
+        "time_to_acquire_s": (0.0, 2.0),
+        "identification": (0.90, 1.0),
+        "identification_wide": (0.0, 0.01),
+    },
+    "person": {
+        "closeup_yield": (0.85, 1.0),
+        "in_frame_ratio": (0.99, 1.0),
+        "tpo_width_median": (0.0, 0.04),
+        "size_ratio_median": (0.85, 1.15),
+        "fragmentation_per_min": (0.0, 0.2),
+        "time_to_acquire_s": (0.0, 2.0),
+        "identification": (0.80, 1.0),
+        "identification_wide": (0.0, 0.01),
+    },
+    "bird": {
+        "closeup_yield": (0.62, 1.0),
+        "in_frame_ratio": (0.90, 1.0),
+        "tpo_width_median": (0.0, 0.10),
+        "size_ratio_median": (0.75, 1.25),
+        "fragmentation_per_min": (0.0, 2.0),
+        "time_to_acquire_s": (0.0, 2.5),
+        "identification": (0.40, 1.0),
+        "identification_wide": (0.0, 0.01),
+    },
+}
+
+
+@dataclass(frozen=True)
+class HoldSettings(harness.Settings):
+    """How many seeds, which targets, and for how long.
+
+    Attributes:
+        targets: book, person, bird.
+        seconds: of each run [s].
+    """
+
+    seeds: int = 20
+    targets: tuple[str, ...] = tuple(WANTED)
+    seconds: float = SECONDS
+
+
+def run(settings: HoldSettings) -> list[Row]:
+    """Calibrate the rig once, then hold each target once a seed; one row each."""
+    return over_seeds(functools.partial(one, calibrated(settings.seed_base)), settings)
+
+
+def calibrated(seed: int) -> Calibration:
+    """The default rig's calibration from rendered boards."""
+    config = RigConfig(sim=SimConfig(scene="indoor", seed=seed))
+    world = SimWorld(config)
+    with SafeRig(world.rig, config.safety) as rig:
+        return calibrate_rig(rig, config.board, pitch_mm=config.pitch_mm, seed=seed)
+
+
+def one(calibration: Calibration, settings: HoldSettings, seed: int) -> list[Row]:
+    """Hold each target once."""
+    return [
+        {
+            "seed": seed,
+            "target": name,
+            **dataclasses.asdict(score(held(calibration, hold_config(name, seed), name, settings.seconds))),
+        }
+        for name in settings.targets
+    ]
+
+
+def held(
+    calibration: Calibration,
+    config: RigConfig,
+    name: str,
+    seconds: float,
+    settings: FollowSettings | None = None,
+) -> list[Judged]:
+    """Hold a target of a simulated rig, and judge every frame.
+
+    Args:
+        calibration: what is known of the rig.
+        config: the rig and its world.
+        name: of the target.
+        seconds: for how long [s].
+        settings: how it is followed; as always, by default.
+    """
+    world = SimWorld(config)
+    truth, target = world.truth(), config.target(name)
+    if target.dimension == "wingspan":  # clutter that moves by itself drowns a bird for the motion detector
+        target = dataclasses.replace(target, detector="speck")
+    rows: list[Judged] = []
+    settings = settings or FollowSettings(command_delay_s=config.command_delay_s)
+    with SafeRig(world.rig, config.safety) as rig:
+        detector = make_detector(target, config.rate_hz)
+        for step in follow(rig, calibration, target, detector, seconds=seconds, settings=settings):
+            add_row(rows, step, truth, name, target)
+    return rows
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Medians over the seeds of each target's figures; one that was never measured counts as missed."""
+    return {
+        name: {key: _median(row[key] for row in rows if row["target"] == name) for key in wanted}
+        for name, wanted in WANTED.items()
+        if any(row["target"] == name for row in rows)
+    }
+
+
+def _median(values: Any) -> float:
+    """The median, where a run without the figure counts as the worst there is: as infinite."""
+    found = [np.inf if value is None else float(value) for value in values]
+    return float(np.median(found))
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The figures that are not what is wanted."""
+    return [
+        f"{name}: {key}"
+        for name, figures in summary.items()
+        for key, value in figures.items()
+        if not WANTED[name][key][0] <= value <= WANTED[name][key][1]
+    ]
+
+
+def describe(settings: HoldSettings, summary: Mapping[str, Any]) -> str:
+    """A line a figure, a column a target, what is wanted beside it."""
+    lines = []
+    for key in WANTED["book"]:
+        cells: list[Any] = [key]
+        for name, figures in summary.items():
+            low, high = WANTED[name][key]
+            mark = "" if low <= figures[key] <= high else " NO"
+            cells += [f"{figures[key]:.3g}{mark}", f"{low:g}-{high:g}"]
+        lines.append(cells)
+    head = ["median", *(column for name in summary for column in (name, "wanted"))]
+    return f"holding a target, {seeds_of(settings)}\n" + table(head, lines)
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Close-up yield and offset of each seed, by target."""
+    names = [name for name in WANTED if any(row["target"] == name for row in rows)]
+    for ax, (key, label) in zip(
+        figure.subplots(1, 2),
+        (("closeup_yield", "close-up yield"), ("tpo_width_median", "median offset / width")),
+        strict=True,
+    ):
+        for i, name in enumerate(names):
+            values = [row[key] for row in rows if row["target"] == name and row[key] is not None]
+            ax.plot([i] * len(values), values, "o", alpha=0.5)
+        ax.set(ylabel=label, xticks=range(len(names)), xticklabels=names)
+
+
+SETTINGS = HoldSettings()
+EXPERIMENT = Experiment(
+    "hold",
+    "How long and how well a target is held in the close-up.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, seconds=6.0),
+    run,
+    summarise,
+    describe,
+    plot,
+    missed,
+)
+
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())
