@@ -1,6 +1,7 @@
-"""How many processes the tests run in."""
+"""How many processes the tests run in, and which signals reach the programs that they start."""
 
 import os
+import signal
 
 # Tests of the wire wait in real time more than they work, so that two cores have room for a third process.
 FEWEST = 3
@@ -8,3 +9,13 @@ FEWEST = 3
 
 def pytest_xdist_auto_num_workers(config):
     return max(FEWEST, os.cpu_count() or FEWEST)
+
+
+def pytest_configure(config):
+    """Let programs that tests start hear signals that whoever started the tests had ignored, as nohup does.
+
+    Ignored signals are inherited by every program started from here, signals with a handler are not.
+    """
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, lambda *_: None)

@@ -81,7 +81,11 @@ def address(server):
 def ask(server, target, method="GET", headers=""):
     """A connection on which a request has been sent."""
     connection = socket.create_connection(address(server), DEADLINE_S)
-    connection.sendall(f"{method} {target} HTTP/1.0\r\n{headers}\r\n".encode())
+    try:
+        connection.sendall(f"{method} {target} HTTP/1.0\r\n{headers}\r\n".encode())
+    except OSError:
+        connection.close()
+        raise
     return connection
 
 
@@ -105,7 +109,11 @@ class Viewer:
     def __init__(self, server, target=STREAM, head=STREAM_HEAD):
         self.connection = ask(server, target)
         self.stream = self.connection.makefile("rb")
-        assert self.stream.read(len(head)) == head
+        try:
+            assert self.stream.read(len(head)) == head
+        except BaseException:
+            self.close()
+            raise
 
     def part(self):
         """The JPEG of the next part."""

@@ -67,12 +67,6 @@ sys.exit(cli.main(["follow", "--rig", "rig.toml", "--calibration", "good.json", 
 ROOT = Path(__file__).parents[1]
 
 
-def _hear_every_signal():
-    """Whoever started the tests may have had some ignored, as nohup does, and a child inherits that."""
-    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):
-        signal.signal(number, signal.SIG_DFL)
-
-
 class Child:
     """A program whose lines are waited for with a deadline."""
 
@@ -80,7 +74,6 @@ class Child:
         self.process = subprocess.Popen(
             [sys.executable, "-c", program], cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)},
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0,
-            preexec_fn=_hear_every_signal,
         )  # fmt: skip
         self.lines, self.rest = [], b""
 
