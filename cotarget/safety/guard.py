@@ -75,7 +75,7 @@ class Guard:
         """
         if not self.threaded:
             self.watch()
-        elif not self._heed_stop_file():
+        elif (self._stopped_by_file is None and self._look.is_clear()) or not self._heed_stop_file():
             self._halt_if_owed()
         with self._lock:
             halts = self._halts  # before anything is asked: a signal's handler may stop the head in between

@@ -1,7 +1,9 @@
 """Looks at the stop file on a thread of its own: a file system that hangs must keep nobody from halting the head."""
 
+import math
 import threading
 from pathlib import Path
+from time import monotonic
 
 from cotarget.safety.stopfile import stop_reason
 
@@ -9,6 +11,9 @@ POLL_S = 0.05  # a look takes well below a millisecond; it is waited for in slic
 # So many slices without an answer, and nobody knows whether somebody has called for a stop. They are counted rather
 # than timed, so that a machine that stood still does not count as a file that cannot be looked at.
 MOST_MISSED = 6
+# A look that began this lately is good enough for a command, which then waits for none: who watches halts the head for
+# a file that came meanwhile [s].
+RECENT_S = 2 * POLL_S
 JOIN_S = 0.2  # for the thread to end, if it is not held by the file [s]
 
 
@@ -24,6 +29,7 @@ class StopLook:
         self._changed = threading.Condition()
         self._asked = self._answered = self._missed = 0
         self._reason: str | None = None
+        self._looked_at = -math.inf
         self._thread: threading.Thread | None = None
         self._closed = False
 
@@ -52,6 +58,11 @@ class StopLook:
                 if longest is not None:
                     return self._reason
 
+    def is_clear(self) -> bool:
+        """Whether a recent look found no stop; at once."""
+        with self._changed:
+            return self._path is None or (self._reason is None and monotonic() - self._looked_at <= RECENT_S)
+
     def close(self) -> None:
         """End the thread; one that the file holds ends when the file lets it go."""
         with self._changed:
@@ -67,10 +78,11 @@ class StopLook:
                 if self._closed:
                     return
                 question = self._asked
+            begun = monotonic()
             try:
                 reason = stop_reason(self._path)
             except Exception as error:  # who cannot look lets nothing move
                 reason = f"the file cannot be read: {error}"
             with self._changed:
-                self._answered, self._reason, self._missed = question, reason, 0
+                self._answered, self._reason, self._missed, self._looked_at = question, reason, 0, begun
                 self._changed.notify_all()
