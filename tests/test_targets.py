@@ -103,11 +103,12 @@ def test_bird_turns_at_20_to_25_metres_where_it_can_be_seen():
         assert points[:, 2].max() < 10.5
 
 
+@pytest.mark.parametrize("where", ["the beginning", "where the lap begins anew"])
 @pytest.mark.parametrize(("name", "scene"), CASES)
-def test_motion_is_smooth(name, scene):
+def test_motion_is_smooth(name, scene, where):
     target = make(name, scene)
     step = 0.01
-    times = np.arange(0.0, 12.0, step)
+    times = np.arange(0.0, 12.0, step) + (target.path.lap[1] - 6.0 if where != "the beginning" else 0.0)
     poses = [target.pose(t) for t in times]
     acceleration = np.diff([p.T_world_target.translation for p in poses], 2, axis=0) / step**2
     assert np.abs(acceleration).max() < 12.0  # 5 m/s round 2.5 m takes 10 m/s^2
@@ -116,6 +117,19 @@ def test_motion_is_smooth(name, scene):
     for joint in poses[0].joints:
         swing = np.diff([p.joints[joint] for p in poses], 2) / step**2
         assert np.abs(swing).max() < 600.0  # 35 degrees at 4 Hz take 386 rad/s^2
+
+
+@pytest.mark.parametrize(("name", "scene"), CASES)
+def test_goes_round_for_as_long_as_anybody_looks(name, scene):
+    path = make(name, scene).path
+    begin, end = path.lap
+    for t in (begin + 1.0, begin + 0.7 * (end - begin)):
+        days_later = t + 5000 * (end - begin)
+        np.testing.assert_allclose(path.position(days_later), path.position(t), atol=1e-6)
+        np.testing.assert_allclose(path.velocity(days_later), path.velocity(t), atol=1e-6)
+        laps = (path.travelled(days_later) - path.travelled(t)) / (path.travelled(end) - path.travelled(begin))
+        assert laps == pytest.approx(5000)
+        assert np.linalg.norm(path.velocity(days_later)) > 0.1  # [m/s]; the book is the slowest
 
 
 @pytest.mark.parametrize(("name", "scene"), CASES)

@@ -19,7 +19,7 @@ from cotarget.simconfig import Waypoint
 
 MOUNT = np.array([0.0, 0.0, 1.6])  # where the fixed camera is in every scene of sim_assets [m]
 VIEW_EDGE = np.tan(np.radians(25.0))  # half the wide view's width at unit distance
-PATH_SECONDS = 600.0  # paths loop for this long, then the target stands still
+PATH_SECONDS = 600.0  # a loop is laid out for this long; from then on one of its last laps is gone again and again
 
 
 @dataclass(frozen=True)
@@ -29,30 +29,35 @@ class Path:
     Attributes:
         spline: position [m] as a function of time [s].
         length: distance travelled [m] as a function of time [s].
+        lap: begin and end [s] of a lap that is gone again and again after its end; None for a way that ends.
     """
 
     spline: CubicSpline
     length: CubicSpline
+    lap: tuple[float, float] | None = None
 
-    def clip(self, t: float) -> float:
-        """Hold the first and the last position outside the path's time."""
+    def within(self, t: float) -> float:
+        """The time within the path's at which all is as at ``t``: in the lap, or else held at both ends."""
+        if self.lap is not None and t > self.lap[1]:
+            begin, end = self.lap
+            return begin + (t - begin) % (end - begin)
         return min(max(t, self._knots[0]), self._knots[-1])
 
     def position(self, t: float) -> Array:
         """Position [m], (3,)."""
-        (a, b, c, d), s = self._piece(self.clip(t))
+        (a, b, c, d), s = self._piece(self.within(t))
         return ((a * s + b) * s + c) * s + d
 
     def velocity(self, t: float) -> Array:
         """Direction and speed of travel [m/s], (3,); while the target is held, a trace of how it moves just inside."""
         first, last = self._knots[0], self._knots[-1]
         inside = 1e-3 * (last - first)
-        (a, b, c, _), s = self._piece(min(max(t, first + inside), last - inside))
+        (a, b, c, _), s = self._piece(min(max(self.within(t), first + inside), last - inside))
         return (3 * a * s + 2 * b) * s + c
 
     def acceleration(self, t: float) -> Array:
         """Acceleration [m/s^2], (3,)."""
-        (a, b, _, _), s = self._piece(self.clip(t))
+        (a, b, _, _), s = self._piece(self.within(t))
         return 6 * a * s + 2 * b
 
     @cached_property
@@ -71,7 +76,11 @@ class Path:
 
     def travelled(self, t: float) -> float:
         """Distance since the path's start [m]."""
-        return float(self.length(self.clip(t)))
+        here = float(self.length(self.within(t)))
+        if self.lap is None or t <= self.lap[1]:
+            return here
+        begin, end = self.lap
+        return here + (t - begin) // (end - begin) * float(self.length(end) - self.length(begin))
 
 
 def waypoint_path(waypoints: Sequence[Waypoint], where: str = "waypoints") -> Path:
@@ -90,12 +99,12 @@ def waypoint_path(waypoints: Sequence[Waypoint], where: str = "waypoints") -> Pa
     return _measured(CubicSpline(table[:, 0], table[:, 1:], bc_type="clamped"))
 
 
-def _measured(spline: CubicSpline) -> Path:
+def _measured(spline: CubicSpline, lap: tuple[float, float] | None = None) -> Path:
     """Add the distance travelled to a path."""
     first, last = spline.x[0], spline.x[-1]
     t = np.linspace(first, last, max(int((last - first) / 0.05), 50))
     speed = np.linalg.norm(spline(t, 1), axis=1)
-    return Path(spline, CubicSpline(t, speed).antiderivative())
+    return Path(spline, CubicSpline(t, speed).antiderivative(), lap)
 
 
 def _loop_path(
@@ -130,7 +139,9 @@ def _loop_path(
         way_in = points[: len(straight) + 1, 0]
         inward = np.sign(way_in[-1] - way_in[0])
         t = t + time - np.interp(inward * x, inward * way_in, t[: len(straight) + 1])
-    return _measured(CubicSpline(t, points))
+    # The last lap but one: what the end of the line does to smoothing and spline does not reach so far back.
+    begin, end = t[-2 * len(line) - 1], t[-len(line) - 1]
+    return _measured(CubicSpline(t, points), (float(begin), float(end)))
 
 
 def _even(points: Array, spacing: float) -> Array:
