@@ -6,6 +6,7 @@ Defaults are the rig that the project's figures are stated for.
 
 import dataclasses
 import math
+import re
 import tomllib
 import types
 from collections.abc import Mapping
@@ -168,15 +169,15 @@ class RigConfig:
         return self.sim.head.command_delay_s if self.sim.effects.command_delay else 0.0
 
     def target(self, name: str) -> TargetConfig:
-        """Look a target up by name.
+        """Look a target up by name; a further one of a kind, as ``bird2``, is like the first unless it has its own.
 
         Raises:
             ConfigError: no such target.
         """
-        try:
-            return self.targets[name]
-        except KeyError:
-            raise ConfigError(f"unknown target '{name}'; the targets are: {choices(self.targets)}") from None
+        found = _of_kind(self.targets, name)
+        if found is None:
+            raise ConfigError(f"unknown target '{name}'; the targets are: {choices(self.targets)}")
+        return found
 
 
 def load_config(path: Path) -> RigConfig:
@@ -223,7 +224,7 @@ def parse_config(table: Mapping[str, Any]) -> RigConfig:
     given = table.pop("targets", {})
     expect_table(given, "targets")
     for name, values in given.items():
-        targets[name] = build(TargetConfig, values, f"targets.{name}", base=targets.get(name))
+        targets[name] = build(TargetConfig, values, f"targets.{name}", base=_of_kind(targets, name))
     sim_table = table.get("sim")
     if isinstance(sim_table, Mapping) and isinstance(sim_table.get("effects"), Mapping):
         table["sim"] = {**sim_table, "effects": _expand_all(dict(sim_table["effects"]))}
@@ -244,6 +245,11 @@ def _expand_all(effects: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(every, bool):
         raise ConfigError(f"sim.effects.all: {every!r} is not true or false")
     return {f.name: every for f in dataclasses.fields(SimEffects) if f.name not in QUALITY} | effects
+
+
+def _of_kind(targets: Mapping[str, TargetConfig], name: str) -> TargetConfig | None:
+    """The target of that name, or of the name without the number from 2 on at its end."""
+    return targets.get(name) or targets.get(re.sub(r"(?<=[^\d])([2-9]|[1-9]\d+)$", "", name))
 
 
 def _overlap(own: Pair, soft: Pair | None, where: str) -> Pair:
@@ -282,5 +288,5 @@ def _check(config: RigConfig) -> None:
     for name in config.sim.targets:
         config.target(name)
     for name in config.sim.paths:
-        if name not in config.targets:
+        if _of_kind(config.targets, name) is None:
             raise ConfigError(f"sim.paths.{name}: is no target; the targets are: {choices(config.targets)}")

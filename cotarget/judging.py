@@ -13,14 +13,14 @@ from cotarget.geometry import Array
 from cotarget.loop import Step
 from cotarget.metrics import WHOLLY_VISIBLE, Row
 from cotarget.rig import Frame
+from cotarget.sim.targets import marker_of
 from cotarget.sim.truth import Silhouette, Truth
 from cotarget.targeting import Method, Reach, aim
 from cotarget.tracking import Track
 
 # Pointing error is stated for targets at these depths, all over the wide view [m].
 POINTING_DEPTHS = (4.0, 30.0)
-# The markers that the simulated targets carry, of MARKERS; sim_assets/make_assets.py draws them.
-MARKER_IDS = {"book": 1, "person": 2, "bird": 3}
+# Whence the markers are that the simulated targets carry; sim_assets/make_assets.py draws them.
 MARKERS = cv2.aruco.DICT_4X4_50
 # A marker is sought in its target's true box, widened on each side by this part of the larger side ...
 SEARCH_MARGIN = 0.25
@@ -87,8 +87,8 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
         v_wide_px=float(wide_px[1]),
         u_detected_px=float(detected[0]),
         v_detected_px=float(detected[1]),
-        decoded=decodes(step.zoom, outline, MARKER_IDS[name]),
-        decoded_wide=decodes(step.fixed, wide_outline, MARKER_IDS[name]),
+        decoded=decodes(step.zoom, outline, marker_of(name)),
+        decoded_wide=decodes(step.fixed, wide_outline, marker_of(name)),
         off_target=" ".join(str(i) for i in off_target(step.tracks, wide_outlines.values())),
         range_m=float(np.linalg.norm(center - truth.T_world_camera("zoom", t).translation)),
         depth_m=math.nan if step.aim is None else step.aim.depth,

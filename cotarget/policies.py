@@ -7,8 +7,9 @@ whoever leaves first, the other plans the order that serves most.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -78,74 +79,87 @@ class FirstCome:
         return self._id
 
 
-@dataclass
-class NearestDeadline:
-    """Look for a while at whoever leaves first of those that can still be seen, then at the next.
+@dataclass(frozen=True)
+class Outlook:
+    """What an order is made from.
 
     Attributes:
+        waiting: those not seen for long enough yet; who leaves first comes first.
+        current: the number of the track followed before.
+        head: pan and tilt now, (2,) [rad].
+        limits: the head's.
         look_s: how long each is looked at [s].
     """
 
+    waiting: Sequence[Candidate]
+    current: int | None
+    head: Array
+    limits: PanTiltLimits
+    look_s: float
+
+
+@dataclass
+class Rounds:
+    """Look at every target for a while and go on to the next; once all were seen, at whoever was seen least.
+
+    Attributes:
+        next_of: gives the number of the next one; asked at every frame, and never without anybody waiting.
+        look_s: how long each is looked at [s].
+    """
+
+    next_of: Callable[[Outlook], int]
     look_s: float = LOOK_S
     _id: int | None = None
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
-        """The one followed before until it was seen for long enough; then the next."""
-        known = {candidate.id: candidate for candidate in candidates}
-        if self._id in known and known[self._id].seen_s < self.look_s:
-            return self._id
-        waiting = [c for c in candidates if c.seen_s < self.look_s]
-        in_time = [c for c in waiting if _end(c, head, 0.0, limits, self.look_s) <= c.leaves_in]
-        self._id = min(in_time or waiting, key=lambda c: (c.leaves_in, c.id)).id if waiting else _least_seen(candidates)
-        return self._id
-
-
-@dataclass
-class MostServed:
-    """Plan the order in which most targets are seen for long enough before they leave.
-
-    Attributes:
-        look_s: how long each is looked at [s].
-    """
-
-    look_s: float = LOOK_S
-    _id: int | None = None
-
-    def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
-        """The first of the best order; the one followed before unless another order serves more."""
+        """The next one, as long as somebody waits."""
         waiting = sorted((c for c in candidates if c.seen_s < self.look_s), key=lambda c: (c.leaves_in, c.id))
-        waiting = waiting[:MOST_PLANNED]
-        if not waiting:
-            self._id = _least_seen(candidates)
-            return self._id
-        plans = {c.id: self._plan(c, [o for o in waiting if o is not c], head, limits) for c in waiting}
-        best = max(plans, key=lambda number: (plans[number], -number))
-        if self._id not in plans or plans[best][0] > plans[self._id][0]:
-            self._id = best
+        if waiting:
+            self._id = self.next_of(Outlook(waiting, self._id, head, limits, self.look_s))
+        else:
+            least = min(candidates, key=lambda c: (c.seen_s, c.id), default=None)
+            self._id = None if least is None else least.id
         return self._id
 
-    def _plan(self, first: Candidate, others: list[Candidate], head: Array, limits: PanTiltLimits) -> tuple[int, float]:
-        """How many targets the best order that begins with one serves, and minus when it is over [s]."""
-        end = _end(first, head, 0.0, limits, self.look_s, here=first.id == self._id)
-        served = int(end <= first.leaves_in)
-        if not served:  # nobody waits for what cannot be had
-            return 0, -end
-        at = first.at + first.rate * end
-        return self._best(others, at, end, limits, (served, -end))
 
-    def _best(
-        self, left: list[Candidate], at: Array, now: float, limits: PanTiltLimits, so_far: tuple[int, float]
-    ) -> tuple[int, float]:
-        """The best that can be made of those left, from where the head is then."""
-        best = so_far
-        for candidate in left:
-            end = _end(candidate, at, now, limits, self.look_s)
-            if end > candidate.leaves_in:
-                continue
-            rest = [other for other in left if other is not candidate]
-            there = candidate.at + candidate.rate * end
-            best = max(best, self._best(rest, there, end, limits, (so_far[0] + 1, -end)))
-        return best
+def nearest_deadline(outlook: Outlook) -> int:
+    """The one followed before to its end; then whoever leaves first of those that can still be seen."""
+    if outlook.current in {c.id for c in outlook.waiting}:
+        return outlook.current
+    in_time = [c for c in outlook.waiting if _end(c, outlook, outlook.head, 0.0) <= c.leaves_in]
+    return (in_time or outlook.waiting)[0].id
+
+
+def most_served(outlook: Outlook) -> int:
+    """The first of the order that serves most before they leave; the one followed before unless another serves more."""
+    planned = outlook.waiting[:MOST_PLANNED]
+    plans = {c.id: plan(c, [o for o in planned if o is not c], outlook) for c in planned}
+    best = max(plans, key=lambda number: (plans[number], -number))
+    current = outlook.current
+    return best if current not in plans or plans[best][0] > plans[current][0] else current
+
+
+def plan(first: Candidate, others: Sequence[Candidate], outlook: Outlook) -> tuple[int, float]:
+    """How many targets the best order that begins with one serves, and minus when it is over [s].
+
+    Args:
+        first: who comes first.
+        others: who may come after.
+        outlook: gives the head, and who is looked at now.
+    """
+    return _order(first, others, outlook, outlook.head, (0, 0.0)) or (0, -_end(first, outlook, outlook.head, 0.0))
+
+
+def _order(
+    first: Candidate, others: Sequence[Candidate], outlook: Outlook, head: Array, so_far: tuple[int, float]
+) -> tuple[int, float] | None:
+    """The best order from where the head is then, after what was served so far; None where the first leaves before."""
+    end = _end(first, outlook, head, -so_far[1])
+    if end > first.leaves_in:  # nobody waits for what cannot be had
+        return None
+    served, there = (so_far[0] + 1, -end), first.at + first.rate * end
+    rest = (_order(c, [o for o in others if o is not c], outlook, there, served) for c in others)
+    return max([served, *(order for order in rest if order is not None)])
 
 
 @dataclass
@@ -195,28 +209,26 @@ def travel_s(way: Array, limits: PanTiltLimits) -> float:
     return longest / limits.speed + limits.speed / limits.acceleration
 
 
-def _end(
-    candidate: Candidate, head: Array, now: float, limits: PanTiltLimits, look_s: float, *, here: bool = False
-) -> float:
+def _end(candidate: Candidate, outlook: Outlook, head: Array, now: float) -> float:
     """When a target will have been seen for long enough if it comes next; it moves on meanwhile [s from now].
 
     Args:
         candidate: the target.
+        outlook: gives the head's limits, and who is looked at already.
         head: where the head is then, (2,) [rad].
         now: when it sets out [s from now].
-        limits: the head's.
-        look_s: how long the target is to be seen.
-        here: whether the head is at the target already.
     """
     arrival = now
-    if not here:
+    if now > 0 or candidate.id != outlook.current:  # the head is not there already
         for _ in range(2):  # the way depends on when the head arrives; the second time is right to a few hundredths
-            arrival = now + travel_s(candidate.at + candidate.rate * arrival - head, limits)
+            arrival = now + travel_s(candidate.at + candidate.rate * arrival - head, outlook.limits)
         arrival += SETTLE_S
-    return arrival + max(look_s - candidate.seen_s, 0.0)
+    return arrival + max(outlook.look_s - candidate.seen_s, 0.0)
 
 
-def _least_seen(candidates: Iterable[Candidate]) -> int | None:
-    """Who was seen for the shortest time."""
-    least = min(candidates, key=lambda c: (c.seen_s, c.id), default=None)
-    return None if least is None else least.id
+# By the names that users call them.
+POLICIES: Mapping[str, Callable[[], Policy]] = {
+    "first-come": FirstCome,
+    "nearest-deadline": partial(Rounds, nearest_deadline),
+    "most-served": partial(Rounds, most_served),
+}

@@ -16,13 +16,13 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.config import DEFAULT_TARGETS, RigConfig, SimConfig, TargetConfig
+from cotarget.config import RigConfig, SimConfig
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import Array
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig import Frame, Image
-from cotarget.sim.targets import MOUNT, PERSON_HEIGHT, draw_size, kind_of, target_rng
+from cotarget.sim.targets import MOUNT, PERSON_HEIGHT, draw_size, target_rng
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from cotarget.simconfig import Waypoint
@@ -99,7 +99,6 @@ def _config(paths: dict[str, list[Waypoint]], seed: int, scene: str) -> RigConfi
     """The default rig under the field's conditions, with targets on these paths."""
     sim = SimConfig()
     slow = {"latency_s": LATENCY_S, "exposure_s": EXPOSURE_S}
-    targets: dict[str, TargetConfig] = dict(DEFAULT_TARGETS) | {n: DEFAULT_TARGETS[kind_of(n)] for n in paths}
     sim = replace(
         sim,
         scene=scene,
@@ -111,7 +110,7 @@ def _config(paths: dict[str, list[Waypoint]], seed: int, scene: str) -> RigConfi
         head=replace(sim.head, command_delay_s=COMMAND_DELAY_S),
         effects=replace(sim.effects, clutter=True),
     )
-    return RigConfig(sim=sim, targets=targets)
+    return RigConfig(sim=sim)
 
 
 def _rng(seed: int, what: str) -> np.random.Generator:

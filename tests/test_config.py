@@ -162,3 +162,18 @@ def test_the_curves_of_the_zoom_lens_are_taken_and_checked_only_where_they_are_u
 def test_all_false_is_the_textbook():
     effects = parse_config({"sim": {"effects": {"all": False}}}).sim.effects
     assert effects == SimEffects(**dict.fromkeys(SimEffects.__dataclass_fields__, False) | {"multisampling": True})
+
+
+def test_a_further_one_of_a_kind_is_as_the_first_unless_it_has_its_own():
+    config = parse_config(
+        {
+            "sim": {"targets": ["bird", "bird2", "bird3"], "paths": {"bird3": [[0, 0, 10, 1.6], [9, 0, 10, 1.6]]}},
+            "targets": {"bird": {"wanted_px": 99.0}, "bird3": {"size": 0.5}},
+        }
+    )
+    assert config.target("bird2") == config.target("bird")
+    assert (config.target("bird3").wanted_px, config.target("bird3").size) == (99.0, 0.5)
+    assert config.target("bird12").wanted_px == 99.0
+    for name in ("bird1", "bird02", "bird2x", "2", "cow2"):
+        with pytest.raises(ConfigError, match=f"unknown target '{name}'; the targets are: bird, bird3, book, person"):
+            config.target(name)

@@ -9,19 +9,21 @@ import pytest
 from cotarget.motionfilter import Track
 from cotarget.policies import (
     LOOK_S,
+    POLICIES,
     SETTLE_S,
     Candidate,
     Chosen,
     FirstCome,
-    MostServed,
-    NearestDeadline,
+    Outlook,
     leaves_in,
+    plan,
     travel_s,
 )
 from cotarget.rig import PanTiltLimits
 
 LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians(206), math.radians(0.0514286))
 STILL = np.zeros(2)
+nearest_deadline, most_served = POLICIES["nearest-deadline"], POLICIES["most-served"]
 
 
 def track(number, center=(320.0, 240.0), velocity=(0.0, 0.0), size=(20.0, 20.0)):
@@ -57,7 +59,7 @@ def test_first_come_stays_until_its_target_is_gone():
 
 
 def test_the_nearest_deadline_comes_first_and_is_seen_to_its_end():
-    policy = NearestDeadline()
+    policy = nearest_deadline()
     there = [candidate(1, 0.2, leaves=9.0), candidate(2, -0.2, leaves=4.0), candidate(3, 0.1, leaves=6.0)]
     assert policy.select(there, STILL, LIMITS) == 2
     sooner = [*there, candidate(4, leaves=3.0)]
@@ -68,12 +70,12 @@ def test_the_nearest_deadline_comes_first_and_is_seen_to_its_end():
 
 def test_the_nearest_deadline_does_not_run_after_what_it_cannot_have():
     lost, kept = candidate(1, 0.5, leaves=1.0), candidate(2, -0.5, leaves=9.0)
-    assert NearestDeadline().select([lost, kept], STILL, LIMITS) == 2
-    assert NearestDeadline().select([lost], STILL, LIMITS) == 1
+    assert nearest_deadline().select([lost, kept], STILL, LIMITS) == 2
+    assert nearest_deadline().select([lost], STILL, LIMITS) == 1
 
 
 def test_when_all_have_been_seen_whoever_was_seen_least_is_next():
-    for policy in (NearestDeadline(), MostServed()):
+    for policy in (nearest_deadline(), most_served()):
         seen = [candidate(1, seen=5.0), candidate(2, seen=2.0), candidate(3, seen=3.0)]
         assert policy.select(seen, STILL, LIMITS) == 2
         assert policy.select([], STILL, LIMITS) is None
@@ -87,8 +89,8 @@ def test_the_plan_gives_up_one_to_have_two():
     one = travel_s(far.at, LIMITS) + SETTLE_S + LOOK_S
     assert one < 3.5
     assert one + travel_s(right[0].at - far.at, LIMITS) + SETTLE_S + LOOK_S > 5.0
-    assert NearestDeadline().select([far, *right], STILL, LIMITS) == 1
-    assert MostServed().select([far, *right], STILL, LIMITS) in (2, 3)
+    assert nearest_deadline().select([far, *right], STILL, LIMITS) == 1
+    assert most_served().select([far, *right], STILL, LIMITS) in (2, 3)
 
 
 def served_by_best_order(candidates, head):
@@ -118,12 +120,12 @@ def test_the_plan_is_the_best_of_all_orders():
             candidate(i, rng.uniform(-1.5, 1.5), rate=rng.uniform(-0.1, 0.1), leaves=rng.uniform(2, 9))
             for i in range(5)
         ]
-        policy = MostServed()
-        plans = [policy._plan(c, [o for o in five if o is not c], STILL, LIMITS)[0] for c in five]
+        outlook = Outlook(five, None, STILL, LIMITS, LOOK_S)
+        plans = [plan(c, [o for o in five if o is not c], outlook)[0] for c in five]
         best = served_by_best_order(five, STILL)
         assert abs(max(plans) - best) <= 1  # the way to a moving target is only nearly right
         sharp += max(plans) == best
-        assert plans[policy.select(five, STILL, LIMITS)] == max(plans)
+        assert plans[most_served().select(five, STILL, LIMITS)] == max(plans)
     assert sharp >= 23
 
 
@@ -160,12 +162,12 @@ def simulated(policy, rng, seconds=20.0, targets=5, dt=0.04):
 
 def test_planning_serves_most_of_targets_that_come_and_go():
     served = {
-        kind.__name__: sum(simulated(kind(), np.random.default_rng(seed)) for seed in range(15))
-        for kind in (FirstCome, NearestDeadline, MostServed)
+        name: sum(simulated(policy(), np.random.default_rng(seed)) for seed in range(15))
+        for name, policy in POLICIES.items()
     }
     print(served)
-    assert served["MostServed"] >= served["NearestDeadline"]
-    assert served["MostServed"] >= 1.5 * served["FirstCome"]
+    assert served["most-served"] >= served["nearest-deadline"]
+    assert served["most-served"] >= 1.5 * served["first-come"]
 
 
 def test_a_number_is_followed_and_nothing_else():
