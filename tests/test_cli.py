@@ -374,6 +374,7 @@ def test_photos_are_calibrated(folder, capsys):
 def test_photos_of_a_board_with_markers_are_calibrated(folder, capsys):
     """8x6 corners, which no plain chessboard may have, seen by two cameras without any distortion."""
     (folder / "photos").mkdir()
+    (folder / "out.json").unlink()
     truth, rng, square_px = Truth(), np.random.default_rng(0), 40
     picture = draw_board(BoardConfig("charuco", (8, 6), 0.1), square_px)
     first = 2 * square_px - 0.5  # where the first inner corner is drawn
@@ -426,6 +427,7 @@ def zooming(tmp_path_factory):
 def test_who_insists_is_heard_at_every_focal_length(folder, capsys, zooming):
     """With pan alone the first fit, of the shortest focal length, is refused already."""
     directory, rows = zooming
+    (folder / "out.json").unlink()
     write_index(directory, [row for row in rows if row["tilt"] == 0])
     status, out, err = call(capsys, *FROM, directory)
     assert (status, out) == (1, "")
@@ -441,6 +443,7 @@ def test_the_sequential_method_leaves_other_focal_lengths_alone(folder, capsys, 
 
     monkeypatch.setattr("cotarget.calibration.finding.joint", never)
     directory, rows = zooming
+    (folder / "out.json").unlink()
     write_index(directory, rows)
     status, out, err = call(capsys, *FROM, directory, "--method", "sequential")
     assert status == 0, err

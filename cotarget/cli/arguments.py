@@ -1,31 +1,74 @@
-"""What the commands share: arguments and outputs that are checked before the work, and the progress bar."""
+"""What the commands share: arguments and outputs that are checked before the work, progress, and results in JSON."""
 
 import argparse
+import contextlib
+import itertools
+import json
 import math
-from collections.abc import Iterator, Sequence
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from cotarget.errors import ConfigError
 
+REMARK_S = 30.0  # between lines of progress where stderr is no terminal [s]
+
 
 @contextmanager
-def progress_bar() -> Iterator[Any]:
-    """A progress bar on stderr when that is a terminal: call it with (what, done, of how much)."""
+def progress_bar(now: Callable[[], float] = time.monotonic) -> Iterator[Any]:
+    """A progress bar on stderr, or a line now and then where that is no terminal.
+
+    Args:
+        now: tells the time [s].
+
+    Yields:
+        What is to be called with (what, done, of how much).
+    """
+    if not sys.stderr.isatty():
+        yield _remarks(now)
+        return
     from tqdm import tqdm
 
-    with tqdm(
-        total=None, disable=None, leave=False, bar_format="{desc} |{bar:30}| {percentage:3.0f}% {elapsed}"
-    ) as bar:
+    with tqdm(total=None, leave=False, bar_format="{desc} |{bar:30}| {percentage:3.0f}% {elapsed}") as bar:
 
         def show(text: str, done: int, total: int) -> None:
-            if bar.disable:
-                return
             bar.total, bar.n = total, done
             bar.set_description_str(text)
 
         yield show
+
+
+def _remarks(now: Callable[[], float]) -> Callable[[str, int, int], None]:
+    """Progress for a file: a line at most every half a minute, so that short work says nothing."""
+    begin = last = now()
+
+    def remark(text: str, done: int, total: int) -> None:
+        nonlocal last
+        if (t := now()) - last < REMARK_S:
+            return
+        last = t
+        with contextlib.suppress(OSError):  # whoever read along may have gone; the work goes on
+            print(f"{text} ({100 * done / max(total, 1):.0f} %, {t - begin:.0f} s)", file=sys.stderr, flush=True)
+
+    return remark
+
+
+def print_json(table: Any) -> None:
+    """Print a result on stdout."""
+    print(json.dumps(_positive_zeros(table), indent=2))
+
+
+def _positive_zeros(value: Any) -> Any:
+    """The same values, but for zeros, which have no sign to people."""
+    if isinstance(value, dict):
+        return {key: _positive_zeros(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_positive_zeros(item) for item in value]
+    return value + 0.0 if isinstance(value, float) else value  # -0.0 + 0.0 is 0.0
 
 
 @contextmanager
@@ -49,6 +92,56 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None])
         if path.resolve() in taken:
             raise ConfigError(f"{path}: is read or written for something else too; give another name for the result")
         taken.add(path.resolve())
+
+
+@contextmanager
+def previous_kept(path: Path) -> Iterator[None]:
+    """Keep what an earlier run wrote under a name that says so, while the block writes another; and say where it is.
+
+    Both are whole at every moment. Where the block fails, everything is as it was before.
+
+    Raises:
+        CalibrationError: the earlier one cannot be kept.
+    """
+    kept = _second_name(path)
+    try:
+        yield
+    except BaseException:
+        if kept is not None:
+            kept.unlink(missing_ok=True)
+        raise
+    if kept is not None:
+        print(f"{path}: the one of before is kept as {kept}", file=sys.stderr)
+
+
+def _second_name(path: Path) -> Path | None:
+    """Give a file another name beside its own; None where there is no such file."""
+    from cotarget.calibration.atomic import write_atomically
+
+    if not path.exists():
+        return None
+    numbered = (path.with_name(f"{path.stem}.previous-{n}{path.suffix}") for n in itertools.count(1))
+    kept = next(name for name in numbered if not os.path.lexists(name))
+    try:
+        os.link(path, kept)
+    except OSError:  # not every file system has second names
+        write_atomically(kept, path.read_bytes())
+    return kept
+
+
+def check_within(option: str, value: float, bounds: tuple[float, float], of: str, slack: float = 0.0) -> None:
+    """Refuse a value beyond what a device can do, but for some slack, in the same words for every option.
+
+    Args:
+        option: as it is typed.
+        value: as it was typed.
+        bounds: lowest and highest, in the option's unit.
+        of: what the bounds are of, and their unit, with `{}` where they stand.
+        slack: by which a value may be beyond, as bounds are printed rounded.
+    """
+    low, high = bounds
+    if not low - slack <= value <= high + slack:
+        raise ConfigError(f"{option}: {value:g} is beyond {of.format(f'{low:g} to {high:g}')}")
 
 
 def number(text: str) -> float:

@@ -1,16 +1,15 @@
 """The commands that make, judge and prepare calibrations: calibrate, report, board."""
 
 import argparse
+import contextlib
 import dataclasses
-import json
 import math
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cotarget.cli.arguments import check_outputs, progress_bar
+from cotarget.cli.arguments import check_outputs, previous_kept, print_json, progress_bar
 from cotarget.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ def calibrate(options: argparse.Namespace) -> None:
     check_outputs([options.out], [options.rig, options.source and options.source / "index.json"])
     _check_together(options)
     how = cal.Options(options.method, encoders=options.encoders, insist=options.insist)
-    with progress_bar() as progress:
+    with _captures_kept(options.captures), progress_bar() as progress:
 
         def tell(done: int, total: int, text: str) -> None:
             progress(f"calibrating: {text}", done, total)
@@ -42,7 +41,7 @@ def calibrate(options: argparse.Namespace) -> None:
         if options.rig is not None:
             config = load_config(options.rig)
             refuse_if_stopped(config.safety.stop_file)
-            with _captures_kept(options.captures), SafeRig(open_rig(config), config.safety) as rig:
+            with SafeRig(open_rig(config), config.safety) as rig:
                 finer = rig.zoom.still_size[0] / rig.zoom.size[0]
                 found = cal.calibrate_rig(
                     with_stills(rig),
@@ -61,21 +60,28 @@ def calibrate(options: argparse.Namespace) -> None:
             found = cal.calibrate_photos(options.source, options.fixed, options.zoom, board, options=how, progress=tell)
         else:
             found = cal.calibrate_captures(options.source, options=how, progress=tell)
-        cal.save_calibration(options.out, found)
+        with previous_kept(options.out):
+            cal.save_calibration(options.out, found)
     assert found.residuals is not None
     for rejected in found.residuals.rejected:
         print(f"not used: {rejected.name}: {rejected.reason}", file=sys.stderr)
-    print(json.dumps(summary(found, options.out), indent=2))
+    print_json(summary(found, options.out))
 
 
-@contextmanager
+@contextlib.contextmanager
 def _captures_kept(directory: Path | None) -> Iterator[None]:
-    """Say, when a session is interrupted, that what it has taken so far can be used."""
+    """Say, when a session fails or is interrupted, that what it has taken so far can be used."""
+    index = None if directory is None else directory / "index.json"
+    others = index is not None and index.exists()  # of an earlier session, which this one does not touch
     try:
         yield
-    except KeyboardInterrupt:
-        if directory is not None and (directory / "index.json").exists():
-            print(f"the captures so far are in {directory}; calibrate --from {directory} reads them", file=sys.stderr)
+    except BaseException:
+        if index is not None and index.exists() and not others:
+            with contextlib.suppress(OSError):  # a terminal that has gone hides no error
+                print(
+                    f"the captures so far are in {directory}: cotarget calibrate --from {directory} goes on with them",
+                    file=sys.stderr,
+                )
         raise
 
 

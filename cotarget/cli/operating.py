@@ -1,13 +1,12 @@
 """What an operator does with a rig: point it, measure its latencies, stop it and clear the stop, reset the head."""
 
 import argparse
-import json
 import math
 import sys
 import tomllib
 from pathlib import Path
 
-from cotarget.cli.arguments import check_outputs
+from cotarget.cli.arguments import check_outputs, check_within, previous_kept, print_json
 from cotarget.errors import CalibrationError, ConfigError
 
 CONSENT = "yes"
@@ -49,7 +48,7 @@ def latency(options: argparse.Namespace) -> None:
     if calibration is None:
         print("the fixed camera's latency needs --calibration, to look at a board with both cameras", file=sys.stderr)
     rounded = {name: None if math.isnan(value) else _plausible(name, value) for name, value in found.items()}
-    print(json.dumps({"measured": rounded, "agreement": agreement}, indent=2))
+    print_json({"measured": rounded, "agreement": agreement})
 
 
 def _plausible(name: str, seconds: float) -> float:
@@ -79,12 +78,17 @@ def point(options: argparse.Namespace) -> None:
     shots = {} if options.pictures is None else {name: options.pictures / f"{name}.png" for name in ("fixed", "zoom")}
     check_outputs(list(shots.values()), [options.rig])
     with SafeRig(open_rig(config), config.safety) as rig:
+        limits = rig.head.limits
+        for option, angle, bounds in (
+            ("--pan-deg", options.pan_deg, limits.pan),
+            ("--tilt-deg", options.tilt_deg, limits.tilt),
+        ):
+            if angle is not None:
+                low, high = map(math.degrees, bounds)
+                check_within(option, angle, (low, high), "the head's {} degrees", math.degrees(limits.step))
         if options.focal_mm is not None:
             shortest, longest = (focal * config.pitch_mm for focal in rig.zoom.focal_range)
-            if not shortest <= options.focal_mm <= longest:
-                raise ConfigError(
-                    f"--focal-mm: {options.focal_mm:g} is beyond the lens's {shortest:g} to {longest:g} mm"
-                )
+            check_within("--focal-mm", options.focal_mm, (shortest, longest), "the lens's {} mm")
             rig.zoom.zoom(options.focal_mm / config.pitch_mm)
         now = rig.head.state()
         pan, tilt = (
@@ -96,17 +100,15 @@ def point(options: argparse.Namespace) -> None:
         head, lens = rig.head.state(), rig.zoom.state()
         for name, path in shots.items():
             frame = rig.fixed.read(newer_than=head.t) if name == "fixed" else rig.zoom.capture()
-            write_image(path, frame.image)
-    print(
-        json.dumps(
-            {
-                "pan_deg": math.degrees(head.pan),
-                "tilt_deg": math.degrees(head.tilt),
-                "focal_mm": lens.focal_px * config.pitch_mm,
-                "pictures": {name: str(path) for name, path in shots.items()},
-            },
-            indent=2,
-        )
+            with previous_kept(path):
+                write_image(path, frame.image)
+    print_json(
+        {
+            "pan_deg": math.degrees(head.pan),
+            "tilt_deg": math.degrees(head.tilt),
+            "focal_mm": lens.focal_px * config.pitch_mm,
+            "pictures": {name: str(path) for name, path in shots.items()},
+        }
     )
 
 

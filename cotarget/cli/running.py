@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cotarget.cli.arguments import check_outputs, nothing, progress_bar
+from cotarget.cli.arguments import check_outputs, check_within, nothing, print_json, progress_bar
+from cotarget.cli.choosing import Choice
 from cotarget.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -61,9 +62,9 @@ def aim(options: argparse.Namespace) -> None:
         else None
     )
     nominal = None if options.focal_mm is None else options.focal_mm / pitch_mm
-    if nominal is not None and not reach.focal_px[0] <= nominal <= reach.focal_px[1]:
+    if nominal is not None:
         shortest, longest = (f * pitch_mm for f in reach.focal_px)
-        raise ConfigError(f"--focal-mm: {options.focal_mm:g} is beyond the lens's {shortest:g} to {longest:g} mm")
+        check_within("--focal-mm", options.focal_mm, (shortest, longest), "the lens's {} mm")
     pixel = np.array(options.pixel)
     size = calibration.fixed.size
     if not (np.all(pixel >= -0.5) and np.all(pixel <= np.array(size) - 0.5)):
@@ -83,22 +84,19 @@ def aim(options: argparse.Namespace) -> None:
             f"{calibrated[0] * pitch_mm:.1f} to {calibrated[-1] * pitch_mm:.1f} mm: the prediction only guesses there",
             file=sys.stderr,
         )
-    print(
-        json.dumps(
-            {
-                "pan_deg": math.degrees(found.pan),
-                "tilt_deg": math.degrees(found.tilt),
-                "focal_px": found.focal_px,
-                "focal_mm": found.nominal_px * pitch_mm,
-                "focal_limited": found.limited,
-                "focal_calibrated": within,
-                "depth_m": found.depth,
-                "range_m": found.range,
-                "predicted_error_deg": budget and {name: math.degrees(part) for name, part in budget.items()},
-                "predicted_error_px": budget and math.tan(budget["total"]) * found.focal_px,
-            },
-            indent=2,
-        )
+    print_json(
+        {
+            "pan_deg": math.degrees(found.pan),
+            "tilt_deg": math.degrees(found.tilt),
+            "focal_px": found.focal_px,
+            "focal_mm": found.nominal_px * pitch_mm,
+            "focal_limited": found.limited,
+            "focal_calibrated": within,
+            "depth_m": found.depth,
+            "range_m": found.range,
+            "predicted_error_deg": budget and {name: math.degrees(part) for name, part in budget.items()},
+            "predicted_error_px": budget and math.tan(budget["total"]) * found.focal_px,
+        }
     )
 
 
@@ -120,14 +118,15 @@ def follow(options: argparse.Namespace) -> None:
             f"{json.dumps([*config.sim.targets, options.target])}"
         )
     check_outputs([options.csv, options.video], [options.rig, options.calibration, target.template])
+    choice = Choice(options, config.stream_sizes[0])
     with (
         Recorder(options.record, config, options.calibration, options.target)
         if options.record
         else nothing() as recorder,
         SafeRig(recorder.wrap(open_rig(config)) if recorder else open_rig(config), config.safety) as rig,
     ):
-        states = _follow(rig, calibration, config, options.target, options.seconds, options.csv, options.video)
-    print(json.dumps(states, indent=2))
+        states = _follow(rig, calibration, config, options.target, choice, options.seconds, options.csv, options.video)
+    print_json(states)
 
 
 def replay(options: argparse.Namespace) -> None:
@@ -142,11 +141,11 @@ def replay(options: argparse.Namespace) -> None:
     calibration = load_calibration(recording.calibration)
     check_outputs([options.csv, options.video], [recording.calibration])
     played = ReplayRig(recording)
+    choice = Choice(options, played.fixed.size)
     with SafeRig(played, recording.config.safety) as rig:
-        states = _follow(
-            rig, calibration, recording.config, recording.target, math.inf, options.csv, options.video, recording.steps
-        )
-    print(json.dumps(states | {"differences": dataclasses.asdict(played.differences)}, indent=2))
+        config, name, steps = recording.config, recording.target, recording.steps
+        states = _follow(rig, calibration, config, name, choice, math.inf, options.csv, options.video, steps)
+    print_json(states | {"differences": dataclasses.asdict(played.differences)})
 
 
 def _follow(
@@ -154,6 +153,7 @@ def _follow(
     calibration: "Calibration",
     config: "RigConfig",
     name: str,
+    choice: Choice,
     seconds: float,
     csv: Path | None,
     video: Path | None,
@@ -169,7 +169,7 @@ def _follow(
 
     target = config.target(name)
     detector = make_detector(target, config.rate_hz)
-    settings = FollowSettings(command_delay_s=config.command_delay_s)
+    settings = FollowSettings(command_delay_s=config.command_delay_s, policy=choice.policy)
     states: dict[str, int] = dict.fromkeys(State, 0)
     expected = math.ceil(seconds * config.rate_hz) if frames is None else frames
     with (
@@ -179,10 +179,13 @@ def _follow(
     ):
         for step in until_end(follow(rig, calibration, target, detector, seconds=seconds, settings=settings)):
             table.write(step)
+            choice.see(step)
             states[step.state] += 1
             if film is not None:
                 film.write(side_by_side(step, name))
             progress(f"following: {name}: {step.state}", min(step.index + 1, expected), expected)
+    if choice.unmet:
+        print(choice.unmet, file=sys.stderr)
     return {"steps": sum(states.values()), "states": states}
 
 
@@ -202,7 +205,7 @@ def detect(options: argparse.Namespace) -> None:
             options.video,
             lambda done, total: progress(f"detecting: {options.target}", done, total or done),
         )
-    print(json.dumps(dataclasses.asdict(found), indent=2))
+    print_json(dataclasses.asdict(found))
 
 
 def doctor(options: argparse.Namespace) -> int:
