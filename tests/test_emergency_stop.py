@@ -9,7 +9,7 @@ import time
 import pytest
 
 from cotarget.config import SafetyConfig
-from cotarget.errors import DeviceError, EmergencyStopError
+from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
 from cotarget.safety import SafeRig, clear_stop_file, refuse_if_stopped, stop_reason, write_stop_file
 from tests.safety_rigs import RealRig, SimulatedRig
 
@@ -215,7 +215,8 @@ def test_what_cannot_be_looked_at_stops(file):
 
 
 def test_a_stop_is_written_whole_and_the_newest_holds(tmp_path):
-    file = tmp_path / "made" / "when needed" / "stop"
+    (tmp_path / "run").mkdir()
+    file = tmp_path / "run" / "stop"
     write_stop_file(file, "smoke")
     write_stop_file(file, "fire")
     assert stop_reason(file) == "fire"
@@ -236,10 +237,23 @@ def test_a_full_disk_stops_without_a_reason(file, monkeypatch):
 
 
 def test_a_stop_that_cannot_be_written_is_told(tmp_path):
-    (tmp_path / "file").write_text("")
+    name = "x" * 300  # longer than file systems take
     with pytest.raises(DeviceError, match="NOT stopped: the file cannot be written") as caught:
-        write_stop_file(tmp_path / "file" / "stop", "smoke")
+        write_stop_file(tmp_path / name, "smoke")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("folder", ["mistyped", "mistyped/twice", "a file"])
+def test_a_stop_file_whose_folder_is_not_there_is_told_and_no_folder_made(rig, tmp_path, folder):
+    (tmp_path / "a file").touch()
+    file = tmp_path / folder / "stop"
+    with pytest.raises(DeviceError, match="NOT stopped: there is no folder") as caught:
+        write_stop_file(file, "smoke")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ConfigError, match="nobody could stop the head by this file: there is no folder"):
+        SafeRig(rig, SafetyConfig(stop_file=file))
+    assert rig.closed
+    assert names(tmp_path) == ["a file"]
 
 
 def test_a_stop_is_logged_once(rig, file, caplog):

@@ -49,6 +49,7 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "nameless.toml").write_text('backend = "hardware"\n')
     (tmp_path / "replayed.toml").write_text('backend = "replay"\nrecording = "empty"\n')
     (tmp_path / "empty").mkdir()
+    (tmp_path / "run").mkdir()
     (tmp_path / "file").write_text("no recording")
     save_calibration(tmp_path / "good.json", true_calibration(RigConfig()))
     save_calibration(tmp_path / "headless.json", true_calibration(RigConfig(), with_head=False))
@@ -122,7 +123,7 @@ def test_a_port_that_is_taken_is_told(folder, capsys):
 
 
 def test_a_stop_lasts_until_it_is_cleared(folder, capsys):
-    """By the file of any rig.toml that names it; its folder need not be there before."""
+    """By the file of any rig.toml that names it."""
     path = folder / "run" / "stop"
     assert call(capsys, "clear", "--rig", "stops.toml") == (0, f"{Path('run/stop')}: there was no stop\n", "")
     status, out, err = call(capsys, "stop", "--rig", "stops.toml", "--reason", "a bird in the gears")
@@ -206,11 +207,13 @@ def test_every_fault_is_told_of(capsys):
 
 
 def test_a_stop_that_cannot_be_made_is_shouted(folder, capsys):
-    (folder / "run").write_text("in the way")
-    status, out, err = call(capsys, "stop", "--rig", "stops.toml")
-    assert (status, out) == (1, "")
-    assert err.startswith("cotarget stop: run/stop: NOT stopped: the file cannot be written")
-    assert len(err.splitlines()) == 1
+    """And nothing is opened that could not be stopped."""
+    (folder / "run").rmdir()
+    wrong = "there is no folder run; make it, or correct stop_file in [safety] of rig.toml\n"
+    assert call(capsys, "stop", "--rig", "stops.toml") == (1, "", f"cotarget stop: run/stop: NOT stopped: {wrong}")
+    told = f"cotarget point: run/stop: nobody could stop the head by this file: {wrong}"
+    assert call(capsys, "point", "--rig", "stops.toml") == (1, "", told)
+    assert not (folder / "run").exists()
 
 
 def test_a_stop_without_a_reason_has_one(folder, capsys):

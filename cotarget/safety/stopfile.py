@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from cotarget.errors import DeviceError, EmergencyStopError
+from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
 
 NO_REASON = "no reason given"
 LONGEST_REASON = 200  # characters of the file's first line that are shown
@@ -34,11 +34,14 @@ def _without_waiting(path: str, flags: int) -> int:
 
 
 def refuse_if_stopped(path: Path | None) -> None:
-    """Raise while the file exists.
+    """Raise while the file exists, and where nobody could make it.
 
     Raises:
         EmergencyStopError: with the reason, and how to clear it.
+        ConfigError: its folder does not exist.
     """
+    if path is not None and not path.parent.is_dir():
+        raise ConfigError(f"{path}: nobody could stop the head by this file: {_no_folder(path)}")
     if (reason := stop_reason(path)) is not None:
         raise stopped_by_file(path, reason)
 
@@ -50,15 +53,20 @@ def stopped_by_file(path: Path | None, reason: str) -> EmergencyStopError:
     )
 
 
+def _no_folder(path: Path) -> str:
+    return f"there is no folder {path.parent}; make it, or correct stop_file in [safety] of rig.toml"
+
+
 def write_stop_file(path: Path, reason: str) -> None:
     """Stop every rig that watches this file; a reader finds the whole reason or no file.
 
     Raises:
         DeviceError: the file cannot be made, so nothing is stopped by it.
     """
+    if not path.parent.is_dir():  # made now it would stop nobody: a rig whose stop file has no folder is not opened
+        raise DeviceError(f"{path}: NOT stopped: {_no_folder(path)}")
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         try:
             with temporary.open("w", encoding="utf-8") as file:
                 file.write(f"{reason}\n")
