@@ -11,6 +11,7 @@ from typing import NoReturn
 import cotarget
 from cotarget.cli import calibrating, emulating, operating, running
 from cotarget.cli.arguments import corners, count, not_negative, number, port, positive
+from cotarget.cli.choosing import add_choice
 from cotarget.errors import CotargetError
 
 # Heavy modules (MuJoCo, OpenCV, matplotlib) are imported by the command that needs them, so that --help and
@@ -147,6 +148,7 @@ def _parser() -> argparse.ArgumentParser:
     follow.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
     follow.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
     follow.add_argument("--target", required=True, metavar="NAME", help="a target of rig.toml")
+    add_choice(follow)
     follow.add_argument("--seconds", type=positive, default=20.0, metavar="S", help="for how long (20)")
     follow.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
     follow.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
@@ -154,6 +156,7 @@ def _parser() -> argparse.ArgumentParser:
 
     replay = command("replay", running.replay, "run the pipeline again on a recording of follow --record")
     replay.add_argument("recording", type=Path, metavar="DIR")
+    add_choice(replay)
     replay.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
     replay.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
 

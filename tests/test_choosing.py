@@ -1,0 +1,115 @@
+"""Whom of several targets a command follows, as its options say."""
+
+import argparse
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import cotarget.cli as cli
+from cotarget import policies
+from cotarget.calibration import save_calibration
+from cotarget.cli.choosing import POLICIES, Choice, add_choice
+from cotarget.config import RigConfig
+from cotarget.motionfilter import Track
+from cotarget.policies import Candidate
+from cotarget.rig import PanTiltLimits
+from cotarget.sim.world import SimWorld
+from experiments.hold_scenes import true_calibration
+
+SIZE = (640, 480)
+LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), 2.6, 3.6, 0.0)
+
+
+def chosen(*arguments):
+    parser = argparse.ArgumentParser(exit_on_error=False)
+    add_choice(parser)
+    return Choice(parser.parse_args(arguments), SIZE)
+
+
+def track(number, center, confirmed=True):
+    center, size = np.array(center, float), np.array([20.0, 30.0])
+    return Track(number, 0.0, confirmed, 0, center, np.zeros(2), size, 30.0, np.eye(4), 1.0, None, 1.0)
+
+
+def pick(choice, seen=(0.0, 0.0, 0.0)):
+    """Of three: one to the left that stays, one in the middle that leaves in 9 s, one to the right, in 5 s."""
+    places = {2: (100, 200), 3: (320, 200), 5: (600, 200)}
+    leaves = (np.inf, 9.0, 5.0)
+    candidates = [
+        Candidate(track(number, at), np.array([(at[0] - 320) / 686, 0.0]), np.zeros(2), end, done)
+        for (number, at), end, done in zip(places.items(), leaves, seen, strict=True)
+    ]
+    return choice.policy.select(candidates, np.zeros(2), LIMITS)
+
+
+def test_the_names_are_those_of_the_policies():
+    assert set(POLICIES) == set(policies.POLICIES)
+    assert POLICIES[0] == "first-come"
+
+
+def test_whom_the_options_mean():
+    assert pick(chosen()) == 2
+    assert pick(chosen("--policy", "first-come")) == 2
+    assert pick(chosen("--policy", "nearest-deadline")) == 5
+    assert pick(chosen("--policy", "most-served"), seen=(0.0, 2.0, 2.0)) == 2
+    assert pick(chosen("--click", "325", "210")) == 3
+    assert pick(chosen("--click", "325", "400")) is None
+    assert pick(chosen("--track", "5")) == 5
+    assert pick(chosen("--track", "4")) is None
+
+
+def test_what_was_never_there_is_told():
+    choice = chosen("--track", "4")
+    choice.see(SimpleNamespace(target=None, tracks=[track(2, (1, 1)), track(3, (9, 9), confirmed=False)]))
+    assert choice.unmet == "--track: there was no track 4; the tracks were: 2"
+    choice.see(SimpleNamespace(target=track(4, (1, 1)), tracks=[]))
+    assert choice.unmet == ""
+    assert chosen("--click", "3", "4").unmet == "--click: no track came near (3, 4); the tracks were: none"
+    assert chosen().unmet == ""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text('[sim]\nscene = "indoor"\ntargets = ["book"]\n')
+    save_calibration(tmp_path / "good.json", true_calibration(SimWorld(RigConfig(), rendered=())))
+    return tmp_path
+
+
+def follow(capsys, *arguments):
+    command = ["follow", "--rig", "rig.toml", "--calibration", "good.json", "--target", "book", "--seconds", "0.3"]
+    try:
+        status = cli.main([*command, *arguments])
+    except SystemExit as left:
+        status = left.code
+    said = capsys.readouterr()
+    return status, said.out, said.err
+
+
+@pytest.mark.parametrize(("arguments", "part"), [
+    (("--policy", "best"), "invalid choice: 'best'"),
+    (("--click", "640", "3"), "--click: (640, 3) is not in the wide view's 640x480 image"),
+    (("--click", "-1", "3"), "--click: (-1, 3) is not in the wide view's 640x480 image"),
+    (("--click", "3", "nan"), "nan is not a finite number"),
+    (("--click", "3"), "expected 2 arguments"),
+    (("--track", "0"), "'0' is not a whole number from 1"),
+    (("--track", "1", "--policy", "first-come"), "not allowed with argument"),
+])  # fmt: skip
+def test_a_mistake_ends_in_one_line(folder, capsys, arguments, part):
+    status, out, err = follow(capsys, *arguments)
+    assert status != 0
+    assert out == ""
+    assert part in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.render
+def test_follow_follows_what_was_chosen(folder, capsys):
+    for arguments, state in ((("--track", "1"), "following"), (("--track", "9"), "searching")):
+        status, out, err = follow(capsys, *arguments)
+        told = json.loads(out)
+        assert status == 0
+        assert told["states"][state] >= told["steps"] - 4  # a track needs four detections
+        assert err == ("" if state == "following" else "--track: there was no track 9; the tracks were: 1\n")
