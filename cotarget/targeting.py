@@ -136,13 +136,19 @@ def aim(
         CalibrationError: the calibration has no T.
         UnreachableError: no pan and tilt within the limits do it.
     """
-    x_base = (calibration.hand_eye() * calibration.T_zoom0_fixed).apply(x_fixed)  # (6)
+    x_base = calibration.T_base_fixed.apply(x_fixed)  # (6)
     wanted = calibration.zoom.stops[0].image_center_px if pixel is None else np.asarray(pixel, dtype=float)
+    if closeup:  # begin near: with the range from the base
+        nominal_px = calibration.zoom.nominal_for(
+            focal_for_size(closeup.size, closeup.wanted_px, float(np.linalg.norm(x_base)))
+        )
     nominal, limited = _limit(reach.focal_px[0] if nominal_px is None else nominal_px, reach)
     for _ in range(FOCAL_ROUNDS if closeup else 1):
-        ray = calibration.zoom.at(nominal).ray(wanted)
+        lens = calibration.zoom.at(nominal)
+        ray = lens.ray(wanted)
         if method == "exact":
-            ways = solve(x_base, calibration.hand_eye(nominal), calibration.head, ray)
+            pupil = calibration.zoom.pupil_at(nominal)
+            ways = solve(x_base, calibration.hand_eye(), calibration.head, ray, pupil=pupil)
             pointing = nearest(ways, reach.pan, reach.tilt, reach.now, calibration.head)
         else:
             pointing = _paper(calibration, x_fixed, method, reach)
@@ -150,7 +156,7 @@ def aim(
             z = float(pointing.range * ray[2] / np.linalg.norm(ray))
             focal = focal_for_size(closeup.size, closeup.wanted_px, z)  # (17)
             if closeup.vertical:  # that is fy; the lens is told by fx
-                fx, fy = calibration.zoom.at(nominal).focal_px
+                fx, fy = lens.focal_px
                 focal *= fx / fy
             previous = nominal
             nominal, limited = _limit(calibration.zoom.nominal_for(focal), reach)

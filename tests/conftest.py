@@ -1,8 +1,10 @@
-"""How many processes the tests run in, and which signals reach the programs that they start."""
+"""How many processes and threads the tests run in, and which signals reach the programs that they start."""
 
 import os
 import signal
 
+# Tests run side by side: threads of their own in each would only get into each other's way.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Tests of the wire wait in real time more than they work, so that two cores have room for a third process.
 FEWEST = 3
 

@@ -1,5 +1,7 @@
 """Intrinsics against cv2.projectPoints and the numbers of the paper's Section 4.2."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ FIXED = Intrinsics(size=(640, 480), focal_px=(686.0, 684.0), center_px=(325.0, 2
 ZOOM = Intrinsics(size=(640, 480), focal_px=(692.0, 693.0), center_px=(326.0, 235.0))
 DISTORTED = Intrinsics((640, 480), (690.0, 700.0), (325.0, 231.0), (-0.25, 0.07, 0.002, -0.001, -0.004))
 PROJECTION_PX = 1e-9  # both are double precision
+TANGENT = 1e-12
 ROUND_TRIP_PX = 1e-8
 MIDDLE = np.array(FIXED.center_px)
 BOX_TILT = 5e-3  # distortion bends the stick a little out of the box's middle line
@@ -38,6 +41,32 @@ def test_points_behind_or_beyond_the_fold_are_nan():
     folded = Intrinsics((640, 480), (690.0, 690.0), (320.0, 240.0), (-0.3, 0, 0, 0, 0))
     assert np.isnan(folded.project(np.array([1.5, 0.0, 1.0]))).all()  # folds at r = 1 / sqrt(0.9)
     assert np.isnan(folded.ray(np.array([5000.0, 240.0]))).all()
+
+
+def test_one_ray_is_that_of_many_and_its_slope_what_differences_say():
+    pixels = np.random.default_rng(1).uniform((0, 0), (639, 479), (50, 2))
+    for pixel, ray in zip(pixels, DISTORTED.ray(pixels), strict=True):
+        tangent, slope = DISTORTED.tangents(pixel)
+        np.testing.assert_allclose(tangent, ray[:2], atol=TANGENT)
+        np.testing.assert_allclose(DISTORTED.ray(pixel), ray, atol=TANGENT)
+        apart = DISTORTED.ray(pixel + 0.1 * np.vstack([np.eye(2), -np.eye(2)]))[:, :2]
+        np.testing.assert_allclose(slope, (apart[:2] - apart[2:]).T / 0.2, atol=1e-8)
+    assert DISTORTED.tangents(np.array([5e4, 240.0])) is None
+
+
+@pytest.mark.parametrize(
+    ("k1", "k2", "k3"), [(-0.3, 0, 0), (-0.3, 0.05, 0), (-0.9, 0.6, -0.12), (0.2, -0.4, 0.1), (-0.3, 0.2, 0)]
+)
+def test_the_fold_is_where_the_polynomial_turns(k1, k2, k3):
+    """Where r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing, by stepping outwards."""
+    camera = Intrinsics((640, 480), (500.0, 500.0), (320.0, 240.0), (k1, k2, 0, 0, k3))
+    r = np.linspace(1e-4, 3, 30001)
+    grown = r * (1 + k1 * r**2 + k2 * r**4 + k3 * r**6)
+    falls = np.flatnonzero(np.diff(grown) <= 0)
+    first = falls[0] if len(falls) else len(r)
+    seen = np.isfinite(camera.project(np.column_stack([r, 0 * r, 0 * r + 1]))[:, 0])
+    assert seen[: first - 1].all()
+    assert not seen[first + 2 :].any()
 
 
 def test_the_papers_worked_example():
@@ -125,6 +154,15 @@ def test_a_spline_through_eight_stops_follows_a_smooth_lens():
         assert zoom.pupil_at(n) == pytest.approx(pupil, abs=0.05 * 0.02)
         corner = np.array([600.0, 400.0])
         assert found.project(lens.ray(corner)) == pytest.approx(corner, abs=1.0)
+
+
+def test_the_nominal_focal_length_is_the_inverse_of_the_true_one_within_the_stops_and_beyond():
+    lens = ZoomLens(
+        (700.0, 1500.0, 3000.0, 8000.0),
+        tuple(replace(ZOOM, focal_px=(f, f)) for f in (730.0, 1450.0, 3200.0, 7900.0)),
+    )
+    for nominal in (300.0, 700.0, 705.0, 1500.0, 2222.0, 7999.0, 8000.0, 12000.0):
+        assert lens.nominal_for(lens.at(nominal).focal_px[0]) == pytest.approx(nominal, rel=1e-13)
 
 
 def test_zoom_lens_refuses_stops_out_of_order():

@@ -12,6 +12,7 @@ RIGS, TARGETS = 500, 200  # 100,000 targets
 MISS_DEG = 1e-9  # the figure to reach
 ROUNDING = 1e-12
 SAME_ANGLES = 1e-7  # [rad]; near the pan axis the angles are ill-conditioned though the aim is not
+RAY = (0.1, -0.05, 1.0)
 MADE_FROM_FOUND = 0.9998  # the rest lie where both branches meet, and either may be given
 
 
@@ -89,6 +90,24 @@ def test_inverse_hits_random_targets_in_both_branches():
     )
     assert worst < MISS_DEG
     assert found >= MADE_FROM_FOUND * RIGS * TARGETS
+
+
+def test_one_target_is_solved_as_many_are():
+    """Targets too near to be reached, on the pan axis and anywhere else, with a pupil that has moved."""
+    rng = np.random.default_rng(3)
+    for _ in range(100):
+        T, head = random_rig(rng)
+        pupil = rng.uniform(0.0, 0.1)
+        targets = np.vstack([rng.uniform(-5, 5, (5, 3)), rng.uniform(-0.2, 0.2, (3, 3)), [0.0, 2.0, 0.0]])
+        moved = T * RigidTransform.from_translation([0.0, 0.0, pupil])
+        many = solve(targets, moved, head, RAY)
+        for i, target in enumerate(targets[:-1]):
+            one = solve(target, T, head, RAY, pupil=pupil)
+            for name in ("pan", "tilt", "range"):
+                np.testing.assert_allclose(getattr(one, name), getattr(many, name)[i], rtol=1e-6, atol=SAME_ANGLES)
+        on_axis = solve(targets[-1], T, head, RAY, pupil=pupil)
+        reached = np.isfinite(on_axis.pan)
+        assert np.all(miss(on_axis.pan[reached], on_axis.tilt[reached], targets[-1], moved, head, RAY) < SAME_ANGLES)
 
 
 def test_home_is_its_own_solution():

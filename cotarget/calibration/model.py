@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -246,6 +247,15 @@ class Calibration:
         if nominal_px is None:
             return self.T_head_zoom
         return self.T_head_zoom * self.zoom.to_pupil(nominal_px)
+
+    @cached_property
+    def T_base_fixed(self) -> RigidTransform:
+        """Where the fixed camera is seen from the base (6).
+
+        Raises:
+            CalibrationError: there was no head to calibrate.
+        """
+        return self.hand_eye() * self.T_zoom0_fixed
 
     def for_streams(self, fixed_size: tuple[int, int], zoom_size: tuple[int, int]) -> "Calibration":
         """The same calibration for streams (width, height) [px] that are scaled.

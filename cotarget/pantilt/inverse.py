@@ -1,0 +1,273 @@
+"""The exact inverse: pan, tilt and range that bring a target onto a ray of the zoom camera, for one or for many.
+
+The formulas are written once, by coordinates, for floats and for arrays: a target that is followed comes alone, and an
+array of one costs twenty times as much as floats.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from cotarget.errors import UnreachableError
+from cotarget.geometry import Array, RigidTransform
+from cotarget.pantilt.head import IDEAL_HEAD, HeadGeometry
+
+# Rounds by which the closed form meets an axis offset; a real one shrinks the error a thousandfold each round.
+CLOSED_FORM_ROUNDS = 4
+# Newton's iteration from the closed form converges quadratically; only where the branches meet does it need many.
+NEWTON_STEPS = 40
+# It has converged when it misses by no more than its own rounding, some units in the last place.
+ROUNDING = 4 * np.finfo(float).eps
+# A solution is accepted when it misses by less than this angle [rad], 6e-10 degrees; rounding stays far below.
+ACCEPTED_MISS = 1e-11
+# A Newton step turns an axis by at most this [rad]: where the branches meet, a full step would leave its branch.
+LONGEST_STEP = 0.2
+# A derivative with a smaller determinant has no inverse.
+SINGULAR = np.finfo(float).tiny
+TURN = 2.0 * np.pi
+NOWHERE = (math.nan, math.nan, math.nan)
+
+V = TypeVar("V")
+Triple = tuple[V, V, V]
+
+
+@dataclass(frozen=True)
+class Pointing:
+    """Ways to bring a target onto a ray of the zoom camera.
+
+    Attributes:
+        pan: [rad], a float or (..., 2), one for each branch.
+        tilt: [rad], likewise.
+        range: distance from the zoom camera to the target along that ray [m], likewise.
+    """
+
+    pan: Array
+    tilt: Array
+    range: Array
+
+
+def solve(
+    x_base: Array,
+    T_head_zoom: RigidTransform,
+    head: HeadGeometry = IDEAL_HEAD,
+    ray: Array | tuple[float, float, float] = (0.0, 0.0, 1.0),
+    *,
+    pupil: float = 0.0,
+) -> Pointing:
+    """Solve pan, tilt and range exactly, in both branches (Eqs. 6, 13, 16 and the norm's quadratic for the range).
+
+    The closed form holds for an ideal head; Newton's steps carry it to a head with an axis offset and axes that
+    are not square, and take the closed form's own rounding away.
+
+    Args:
+        x_base: targets in the base's frame [m], (..., 3).
+        T_head_zoom: the zoom camera's place on the head.
+        head: the unit's own geometry.
+        ray: the zoom camera's ray that shall meet the target, of any length, (3,) or (..., 3).
+        pupil: how far the camera's entrance pupil has moved forward from there [m].
+
+    Returns:
+        Pan and tilt as the head reports them, their true angles within -pi..pi, and range, each (..., 2); the first
+        branch is the one that faces forward. All three are nan in a branch that does not exist, as for a target
+        nearer than the lever arm. Within half a degree of the pan axis, where the branches meet, both may be the same
+        solution.
+    """
+    x_base, ray = np.broadcast_arrays(np.asarray(x_base, float), np.asarray(ray, float))
+    T = T_head_zoom.as_matrix()
+    R, t = T[:3, :3], T[:3, 3] + T[:3, 2] * pupil - (0.0, 0.0, head.axis_offset)
+    d = ray / np.linalg.norm(ray, axis=-1, keepdims=True) @ R.T
+    if x_base.ndim == 1:
+        ways = _solve_one(_floats(x_base), _floats(d), _floats(t), head)
+        pan, tilt, reach = (np.array(values) for values in zip(*ways, strict=True))
+    else:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            pan, tilt, reach = _solve_many(x_base, d, t, head)
+    wrapped = head.reported_angles(*((angle + np.pi) % TURN - np.pi for angle in (pan, tilt)))
+    return Pointing(*(np.where(reach > 0, value, np.nan) for value in (*wrapped, reach)))
+
+
+def nearest(
+    pointing: Pointing,
+    pan_limits: tuple[float, float],
+    tilt_limits: tuple[float, float],
+    now: tuple[float, float] = (0.0, 0.0),
+    head: HeadGeometry = IDEAL_HEAD,
+) -> Pointing:
+    """Choose from both branches, whole turns included, the solution within the limits that is nearest to now.
+
+    Args:
+        pointing: one target's two branches, as `solve` gives them.
+        pan_limits: lowest and highest pan [rad].
+        tilt_limits: lowest and highest tilt [rad].
+        now: where the head is, (pan, tilt) [rad]. Near is what the slower axis has to travel.
+        head: the unit's own geometry, for what it reports after a whole turn.
+
+    Raises:
+        UnreachableError: there is no solution, or none within the limits.
+    """
+    candidates = []
+    for pan, tilt, reach in zip(pointing.pan.tolist(), pointing.tilt.tolist(), pointing.range.tolist(), strict=True):
+        if not math.isfinite(pan + tilt + reach):
+            continue
+        pans = [pan + turns * TURN / head.pan_scale for turns in range(-2, 3)]
+        tilts = [tilt + turns * TURN / head.tilt_scale for turns in range(-1, 2)]
+        candidates += [
+            (max(abs(p - now[0]), abs(q - now[1])), p, q, reach)
+            for p in pans
+            if pan_limits[0] <= p <= pan_limits[1]
+            for q in tilts
+            if tilt_limits[0] <= q <= tilt_limits[1]
+        ]
+    if candidates:
+        return Pointing(*np.array(min(candidates)[1:]))
+    if not np.isfinite(pointing.pan).any():
+        raise UnreachableError("no pan and tilt bring this point to the wanted pixel: it is too close to the head")
+    wanted = " or ".join(
+        f"pan {np.degrees(p):.2f}, tilt {np.degrees(q):.2f}"
+        for p, q in zip(pointing.pan, pointing.tilt, strict=True)
+        if np.isfinite(p)
+    )
+    lo_hi = np.degrees([*pan_limits, *tilt_limits])
+    raise UnreachableError(
+        f"the point needs {wanted} degrees, beyond the limits "
+        f"pan {lo_hi[0]:g} to {lo_hi[1]:g}, tilt {lo_hi[2]:g} to {lo_hi[3]:g} degrees"
+    )
+
+
+def _floats(v: Array) -> Triple[float]:
+    x, y, z = v.tolist()
+    return x, y, z
+
+
+def _solve_one(target: Triple[float], d: Triple[float], t: Triple[float], head: HeadGeometry) -> list[Triple[float]]:
+    """True pan, true tilt and range of one target in both branches, nan where there is none."""
+    distance = math.hypot(*target)
+    found = []
+    for sign in (1.0, -1.0):
+        try:
+            pan, tilt, reach = _closed_form(target, d, t, sign, head, math)
+        except ValueError:  # the root of a negative number
+            found.append(NOWHERE)
+            continue
+        error = math.inf
+        for _ in range(NEWTON_STEPS):
+            turns = math.cos(pan), math.sin(pan), math.cos(tilt), math.sin(tilt)
+            residual, det, steps = _newton_step(*turns, reach, target, d, t, head)
+            error = math.hypot(*residual)
+            if error <= ROUNDING * distance or abs(det) <= SINGULAR:
+                break
+            pan_step, tilt_step, reach_step = (step / det for step in steps)
+            part = min(1.0, LONGEST_STEP / max(abs(pan_step), abs(tilt_step), LONGEST_STEP))
+            pan, tilt, reach = pan - part * pan_step, tilt - part * tilt_step, reach - part * reach_step
+        found.append((pan, tilt, reach) if error <= ACCEPTED_MISS * distance else NOWHERE)
+    return found
+
+
+def _solve_many(x_base: Array, d: Array, t: Array, head: HeadGeometry) -> Triple[Array]:
+    """As `_solve_one`, for targets (..., 3) and rays d (..., 3); true pan, true tilt and range, each (..., 2)."""
+    target, d = (
+        np.array(np.broadcast_to(v[..., None, :], (*v.shape[:-1], 2, 3))).reshape(-1, 3).T for v in (x_base, d)
+    )
+    distance = np.linalg.norm(target, axis=0)
+    sign = np.tile([1.0, -1.0], len(distance) // 2)
+    (x, y, z), (d_x, d_y, d_z), (t_x, t_y, t_z) = target, d, t
+    unknowns = np.array(_closed_form((x, y, z), (d_x, d_y, d_z), (t_x, t_y, t_z), sign, head, np))
+    error = np.full(len(distance), np.inf)
+    active = np.arange(len(distance))
+    for _ in range(NEWTON_STEPS):
+        pan, tilt, reach = unknowns[:, active]
+        turns = np.cos(pan), np.sin(pan), np.cos(tilt), np.sin(tilt)
+        residual, det, steps = _newton_step(*turns, reach, tuple(target[:, active]), tuple(d[:, active]), t, head)
+        error[active] = np.linalg.norm(residual, axis=0)
+        # A singular J (a target on the pan axis) can go no further and is left to the final check.
+        going_on = (error[active] > ROUNDING * distance[active]) & (np.abs(det) > SINGULAR)
+        active = active[going_on]
+        if not len(active):
+            break
+        step = np.array(steps)[:, going_on] / det[going_on]
+        longest = np.max(np.abs(step[:2]), axis=0)
+        unknowns[:, active] -= step * np.minimum(1.0, LONGEST_STEP / np.maximum(longest, LONGEST_STEP))
+    unknowns[:, ~(error <= ACCEPTED_MISS * distance)] = np.nan
+    pan, tilt, reach = unknowns.reshape(3, *x_base.shape[:-1], 2)
+    return pan, tilt, reach
+
+
+def _closed_form(target: Triple[Any], d: Triple[Any], t: Triple[Any], sign: Any, head: HeadGeometry, lib: Any) -> Any:
+    """Pan, tilt and range in the atan2 forms of (13) and (16), of floats or arrays alike.
+
+    Exact for dz = 0. With an axis offset the range depends on the tilt, and a few rounds bring both together; each
+    takes off a factor of dz / range.
+
+    Args:
+        target: x, y and z of the target in the base's frame [m].
+        d: of the ray in the head's frame, of length 1.
+        t: of the zoom camera in the head's frame, from the tilt axis [m].
+        sign: 1 for the branch that faces forward, -1 for the other.
+        head: the unit's own geometry.
+        lib: `math` or `numpy`, for its functions.
+    """
+    (a, b, c), dz = target, head.axis_offset
+    sin_eps, cos_eps = math.sin(head.squareness), math.cos(head.squareness)
+    along = d[0] * t[0] + d[1] * t[1] + d[2] * t[2]
+    free = a * a + b * b + c * c - dz * dz - (t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
+    ahead = 0.0  # the z of q after tilting
+    for _ in range(1 if dz == 0 else CLOSED_FORM_ROUNDS):
+        # |x_base|^2 = dz^2 + 2 dz z_tilted + |q|^2 with q = r d + t: a quadratic in the range r
+        reach = lib.sqrt(along * along + free - 2 * dz * ahead) - along
+        qx, qy, qz = (reach * along_d + from_t for along_d, from_t in zip(d, t, strict=True))
+        on_axis = cos_eps * qx + sin_eps * qy
+        y, z, height = qy - on_axis * sin_eps, cos_eps * qz, b - on_axis * sin_eps
+        left = y * y + z * z - height * height
+        tilt = lib.atan2(y, z) - lib.atan2(height, sign * lib.sqrt((left + abs(left)) / 2))  # (13)
+        x, _, ahead = _tilt((qx, qy, qz), lib.cos(tilt), lib.sin(tilt), head)  # (14)
+    z2 = ahead + dz
+    return lib.atan2(a * z2 - c * x, a * x + c * z2), tilt, reach  # (16)
+
+
+def _newton_step(
+    cos_pan: Any, sin_pan: Any, cos_tilt: Any, sin_tilt: Any, reach: Any,
+    target: Triple[Any], d: Triple[Any], t: Triple[Any] | Array, head: HeadGeometry,
+) -> tuple[Triple[Any], Any, Triple[Any]]:  # fmt: skip
+    """What base_head(pan, tilt) (range d + t) misses the target by, and Newton's step by Cramer's rule.
+
+    Returns:
+        The residual [m]; the determinant of its derivative by (pan, tilt, range); and the step times that.
+    """
+    q = _tilt((reach * d[0] + t[0], reach * d[1] + t[1], reach * d[2] + t[2]), cos_tilt, sin_tilt, head)
+    reached = _pan((q[0], q[1], q[2] + head.axis_offset), cos_pan, sin_pan)
+    residual = (reached[0] - target[0], reached[1] - target[1], reached[2] - target[2])
+    by_pan = (reached[2], 0.0, -reached[0])
+    by_tilt = _pan(_about_tilt_axis(q, head), cos_pan, sin_pan)
+    by_reach = _pan(_tilt(d, cos_tilt, sin_tilt, head), cos_pan, sin_pan)
+    normal = _cross(by_tilt, by_reach)
+    steps = _dot(residual, normal), _dot(by_pan, _cross(residual, by_reach)), _dot(by_pan, _cross(by_tilt, residual))
+    return residual, _dot(by_pan, normal), steps
+
+
+def _pan(v: Triple[Any], cos: Any, sin: Any) -> Triple[Any]:
+    """Rotation about Y."""
+    return cos * v[0] + sin * v[2], v[1], cos * v[2] - sin * v[0]
+
+
+def _tilt(v: Triple[Any], cos: Any, sin: Any, head: HeadGeometry) -> Triple[Any]:
+    """Rodrigues' rotation about the tilt axis."""
+    x_axis, y_axis = math.cos(head.squareness), math.sin(head.squareness)
+    x, y, z = _about_tilt_axis(v, head)
+    along = (1 - cos) * (v[0] * x_axis + v[1] * y_axis)
+    return cos * v[0] + sin * x + along * x_axis, cos * v[1] + sin * y + along * y_axis, cos * v[2] + sin * z
+
+
+def _about_tilt_axis(v: Triple[Any], head: HeadGeometry) -> Triple[Any]:
+    """Cross product of the tilt axis with a vector."""
+    x_axis, y_axis = math.cos(head.squareness), math.sin(head.squareness)
+    return y_axis * v[2], -x_axis * v[2], x_axis * v[1] - y_axis * v[0]
+
+
+def _cross(a: Triple[Any], b: Triple[Any]) -> Triple[Any]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _dot(a: Triple[Any], b: Triple[Any]) -> Any:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
