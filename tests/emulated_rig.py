@@ -22,7 +22,7 @@ START_S = 120.0  # for an emulator to say where it listens
 LOOK_S = 0.02  # between looks at the truth
 STILL_S = 0.4  # a head that has not moved for so long rests
 ON_ITS_WAY_DEG = 2.0  # a head that has gone so far is turning
-LINES = 6  # that the emulator says when all of it is there
+LINES = 7  # that the emulator says when all of it is there
 PASSWORD = "open sesame"
 
 

@@ -16,6 +16,8 @@ LOOK = 0.2  # between looks at the time [s]
 # How long a thread that works in Python keeps others waiting [s]; with Python's own 5 ms, a line that is paced by a
 # thread of its own loses half of its rate beside the world's rendering.
 SWITCH_S = 5e-4
+WHO_IS_THERE = ("person",)  # to be followed, where no rig.toml says who
+NOBODY = 'none; [sim] targets = ["person"] has one to follow'
 STOP_FILE = "stop"  # beside the rig.toml that is written, where the simulated rig's names none
 
 
@@ -34,8 +36,9 @@ def emulate(options: argparse.Namespace) -> None:
     from cotarget.config import RigConfig, load_config
     from cotarget.emulators.emulation import Emulation, Ports, copied_tables, parse_fault
     from cotarget.emulators.world import paced
+    from cotarget.simconfig import SimConfig
 
-    config = RigConfig() if options.rig is None else load_config(options.rig)
+    config = RigConfig(sim=SimConfig(targets=WHO_IS_THERE)) if options.rig is None else load_config(options.rig)
     if config.backend != "sim":
         raise ConfigError(f"{options.rig}: backend is '{config.backend}'; what is emulated is a simulated rig")
     beside: dict[str, Any] = {}
@@ -59,6 +62,7 @@ def emulate(options: argparse.Namespace) -> None:
             f"zoom     ptpip:{options.host}:{emulation.zoom.port}:{emulation.zoom.port}\n"
             f"board    socket://{options.host}:{emulation.board.port}\n"
             f"control  socket://{options.host}:{emulation.control.port}\n"
+            f"targets  {', '.join(config.sim.targets) or NOBODY}\n"
             f"{options.write} connects to them; Ctrl-C ends them",
             flush=True,
         )
