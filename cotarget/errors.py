@@ -23,6 +23,10 @@ class StaleFrameError(DeviceError):
     """A frame came too late or is too old to act on."""
 
 
+class HaltedError(DeviceError):
+    """A move did not come to its end because the head was halted, or sent elsewhere; it may be commanded again."""
+
+
 class EmergencyStopError(DeviceError):
     """The head is stopped until an operator clears it."""
 

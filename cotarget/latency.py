@@ -19,7 +19,7 @@ from scipy.optimize import minimize_scalar
 
 from cotarget.calibration import Calibration
 from cotarget.calibration.boards import board_points, find_corners
-from cotarget.calibration.recorder import wait_for_lens
+from cotarget.calibration.standing import wait_for_lens
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, StaleFrameError
 from cotarget.geometry import Array, RigidTransform, pose

@@ -13,7 +13,7 @@ from cotarget.calibration.captures import INDEX, read_index
 from cotarget.calibration.plan import GRID, Coverage
 from cotarget.calibration.recorder import Recorder
 from cotarget.config import BoardConfig, parse_config
-from cotarget.errors import CalibrationError, DeviceError
+from cotarget.errors import CalibrationError, DeviceError, EmergencyStopError, HaltedError, StaleFrameError
 from cotarget.geometry import pose
 from cotarget.rig import PanTiltLimits
 from experiments.synthetic import SIZE, Truth, pointing_errors
@@ -125,8 +125,9 @@ def test_a_broken_rig_is_refused_in_one_line(broken, message):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("halts", "arrives"), [(1, True), (2, False)])
-def test_a_head_that_was_halted_on_its_way_is_sent_again_once(halts, arrives):
+@pytest.mark.parametrize(("halts", "arrives"), [(1, True), (2, True), (3, False)])
+def test_a_head_that_was_halted_on_its_way_is_sent_again(halts, arrives):
+    """One that tells nobody, and is seen to stand elsewhere."""
     rig = SyntheticRig(halts=halts)
     recorder = Recorder(rig, BOARD)
     if arrives:
@@ -137,6 +138,87 @@ def test_a_head_that_was_halted_on_its_way_is_sent_again_once(halts, arrives):
             CalibrationError, match=r"the head stands at pan 14\.\d+, tilt 2\.\d+ degrees where pan 28\."
         ):
             recorder.turn(0.5, 0.1)
+
+
+class Failing:
+    """A rig whose moves or frames fail the first times, as one in real time does on a busy machine."""
+
+    def __init__(self, *, moves=(), frames=()):
+        self.rig = SyntheticRig()
+        self.sent, self.seen = [], []
+        self.rig.head.move = self._failing(self.rig.head.move, list(moves), self.sent)
+        for camera in (self.rig.fixed, self.rig.zoom):
+            camera.read = self._failing(camera.read, list(frames), self.seen)
+
+    def _failing(self, act, errors, log):
+        def acts(*args, **options):
+            log.append(args or options)
+            if errors:
+                raise errors.pop(0)
+            return act(*args, **options)
+
+        return acts
+
+
+HALTED, LATE = HaltedError("the move was halted"), StaleFrameError("the newest frame is 0.70 s old")
+
+
+@pytest.mark.parametrize("times", [1, 2, 3])
+def test_a_move_that_the_watchdog_halted_is_commanded_again(tmp_path, times, caplog):
+    made = Failing(moves=[HALTED] * times)
+    recorder = Recorder(made.rig, BOARD, tmp_path)
+    if times < 3:
+        recorder.turn(0.5, 0.1)
+        assert made.rig.pose == pytest.approx((0.5, 0.1), abs=made.rig.limits.step)
+    else:
+        with pytest.raises(HaltedError, match="the move was halted"):
+            recorder.turn(0.5, 0.1)
+    assert made.sent == [(0.5, 0.1)] * min(times + 1, 3)
+    assert caplog.messages == ["the move was halted; the head is sent again"] * min(times, 2)
+    told = [json.loads(line)["got"] for line in (tmp_path / "commands.jsonl").read_text().splitlines()]
+    assert [got is None for got in told] == [True] * times + [False] * (times < 3)
+
+
+@pytest.mark.parametrize("error", [EmergencyStopError("emergency stop: a bird"), DeviceError("pan hit its limit")])
+def test_a_head_that_was_stopped_is_not_sent_again(error):
+    """Nor where the operator stops it while a frame is late."""
+    made = Failing(moves=[error])
+    with pytest.raises(type(error), match=str(error)):
+        Recorder(made.rig, BOARD).turn(0.5, 0.1)
+    assert made.sent == [(0.5, 0.1)]
+    made = Failing(frames=[LATE, LATE])
+    recorder = Recorder(made.rig, BOARD)
+    recorder.turn(0.5, 0.1)
+    made.sent.clear()
+
+    def stopped(*wish, wait):
+        made.sent.append(wish)
+        raise error
+
+    made.rig.head.move = stopped
+    with pytest.raises(type(error), match=str(error)):
+        recorder.see_zoom()
+    assert (len(made.sent), len(made.seen)) == (1, 1)
+
+
+@pytest.mark.parametrize("camera", ["fixed", "zoom"])
+@pytest.mark.parametrize("times", [1, 2, 3])
+def test_a_late_frame_is_waited_for_again_with_the_head_where_it_should_be(camera, times):
+    made = Failing(frames=[LATE] * times)
+    recorder = Recorder(made.rig, BOARD)
+    recorder.turn(0.5, 0.1)
+    pushed = made.rig.pose
+    look = {"fixed": recorder.see_fixed, "zoom": recorder.see_zoom}[camera]
+    made.rig.pose = (0.4, 0.1)  # as after a halt
+    if times < 3:
+        assert look(expected=False) is None
+        assert made.rig.pose == pushed
+    else:
+        with pytest.raises(StaleFrameError, match="the newest frame is"):
+            look(expected=False)
+    assert len(made.seen) == min(times + 1, 3)
+    after = [each["newer_than"] for each in made.seen]
+    assert all(a < b for a, b in itertools.pairwise(after))  # not the same old frame once more
 
 
 class Interrupted:

@@ -9,7 +9,7 @@ import pytest
 import serial
 
 from cotarget.config import SafetyConfig
-from cotarget.errors import ConfigError, DeviceError
+from cotarget.errors import ConfigError, DeviceError, HaltedError
 from cotarget.hardware.d46lost import LostPosition
 from cotarget.hardware.d46wishes import Move
 from cotarget.hardware.head import D46Head
@@ -200,6 +200,25 @@ def test_a_signal_handler_may_halt_whatever_it_interrupts(opened, bench):
         signal.signal(signal.SIGUSR1, before)
     assert all(halted)
     assert len(halted) >= 51
+
+
+def test_who_waits_for_a_move_that_is_halted_may_command_it_again(opened, bench):
+    head = opened()
+    halts = threading.Thread(target=head.halt)
+
+    def halted_meanwhile():
+        halts.start()
+        deadline = time.monotonic() + DEADLINE_S
+        while not head._loop.halts and time.monotonic() < deadline:
+            time.sleep(0)
+        return b"*\r\n"
+
+    bench.unit.scripted = {"PP2000": [halted_meanwhile]}
+    with pytest.raises(HaltedError, match="the move was halted"):
+        head.move(2000 * STEP, 0.0, wait=True)
+    halts.join(DEADLINE_S)
+    head.move(2000 * STEP, 0.0, wait=True)
+    assert head.state().pan == pytest.approx(2000 * STEP)
 
 
 def test_a_closed_head_is_halted_and_says_so(opened, bench):

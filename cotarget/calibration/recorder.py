@@ -1,8 +1,10 @@
 """Taking captures from a rig: everything stands still first, and every image goes to disk with how it was taken."""
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -10,10 +12,13 @@ from cotarget.calibration.boards import find_corners
 from cotarget.calibration.captures import INDEX, NO_IMAGE, CaptureIndex, file_name, write_image, write_index
 from cotarget.calibration.model import Capture, Rejected, View, unseen
 from cotarget.calibration.sessionlog import write_command, write_session
+from cotarget.calibration.standing import POLL, wait_for_head, wait_for_lens
 from cotarget.config import BoardConfig, RigConfig
-from cotarget.errors import CalibrationError, DeviceError
+from cotarget.errors import CalibrationError, HaltedError, StaleFrameError
 from cotarget.geometry import Array, RigidTransform, Rotation, pose_dict
-from cotarget.rig import Image, PanTiltState, Rig, ZoomState
+from cotarget.rig import Frame, Image, PanTiltState, Rig, ZoomState
+
+log = logging.getLogger(__name__)
 
 # Wishes are rounded to 0.1 mm and 0.1 mrad. Nobody holds a board better; and the fits behind a plan sum in an order
 # that varies with the threads: their last digits would otherwise make two runs with the same seed drift apart.
@@ -21,20 +26,19 @@ WISH_DECIMALS = 4
 # After a stop, for vibrations and for an exposure that had begun before [s]; and where nobody has measured yet by how
 # much frames are dated too late.
 SETTLE, SETTLE_LONG = 0.05, 0.5
-POLL = 0.02  # between looks at a state [s]
 FRAME_TIMEOUT = 5.0  # a slow network camera's latency, several times [s]
-HEAD_PATIENCE = 2.0  # beyond what the way takes at the head's own speed and acceleration [s]
 # A board in somebody's hands counts as held when its corners move less than this between two looks so far apart, and
 # have moved at least so far since the wish (mean over the corners).
 HELD_PX, HELD_FOR, LEFT_PX = 0.3, 0.4, 8.0
-TURN_TRIES = 2  # a watchdog that went off while the machine was busy halts the head on its way
-LENS_TIMEOUT = 15.0  # the slowest zoom lenses take some ten seconds from end to end [s]
+# Of a turn, and of an image: on a machine that is busy for a while the watchdog halts the head on its way, and frames
+# are too old when they are read.
+TRIES = 3
 LENS_TOLERANCE = 0.03  # of the focal length; a step of a usual lens is 0.02
-POSE_TOLERANCE = np.radians(0.2)  # between commanded and reached, above the head's own step [rad]
 
 
 # Finds a board's corners in an image, given the view that it will be but for its corners.
 Finder = Callable[[Image, View], Array | None]
+Seen = TypeVar("Seen")
 
 
 def view_of(capture: Capture, corners_px: Array) -> View:
@@ -49,21 +53,6 @@ def view_of(capture: Capture, corners_px: Array) -> View:
         capture.t,
         capture.source,
     )
-
-
-def wait_for_lens(rig: Rig) -> ZoomState:
-    """Wait until the zoom lens stands; its state then.
-
-    Raises:
-        CalibrationError: it goes on moving.
-    """
-    clock = rig.clock
-    deadline = clock.now() + LENS_TIMEOUT
-    while (state := rig.zoom.state()).moving:
-        if clock.now() > deadline:
-            raise CalibrationError(f"the zoom lens still moves after {LENS_TIMEOUT:g} s")
-        clock.sleep_until(clock.now() + POLL)
-    return state
 
 
 @dataclass(eq=False)
@@ -93,6 +82,7 @@ class Recorder:
     number: int = -1
     _captures: list[Capture] = field(default_factory=list)
     _still_since: float = 0.0
+    _wish: tuple[float, float] | None = None
 
     def start(self) -> None:
         """Make the captures' folder, send the lens to its shortest focal length and the head home.
@@ -146,7 +136,8 @@ class Recorder:
 
     def _fixed_corners(self) -> Array | None:
         """Where the fixed camera sees the board now, in a frame that was exposed after now."""
-        frame = self.rig.fixed.read(newer_than=self.rig.clock.now(), timeout=FRAME_TIMEOUT)
+        self._still_since = max(self._still_since, self.rig.clock.now())
+        frame = self._look(self._read_fixed)
         return find_corners(frame.image, self.board, thorough=False)
 
     def _wait_until_held(self, before: Array | None) -> None:
@@ -169,40 +160,38 @@ class Recorder:
     def turn(self, pan: float, tilt: float) -> None:
         """Turn the head and wait until it stands.
 
+        One that was halted on its way is sent again, a few times; after an emergency stop the head refuses that.
+
         Raises:
             CalibrationError: it does not reach the pose that it said it would.
+            HaltedError: it was halted each time.
         """
-        for _ in range(TURN_TRIES):
+        wish = self._wish = round(pan, WISH_DECIMALS), round(tilt, WISH_DECIMALS)
+        for left in reversed(range(TRIES)):
             before = self.rig.head.state()
-            begin, wish = self.rig.clock.now(), (round(pan, WISH_DECIMALS), round(tilt, WISH_DECIMALS))
-            wanted = self.rig.head.move(*wish, wait=True)
+            begin = self.rig.clock.now()
+            try:
+                wanted = self.rig.head.move(*wish, wait=True)
+            except HaltedError as error:
+                self._note(begin, "turn", wish)
+                if not left:
+                    raise
+                log.warning("%s; the head is sent again", error)
+                continue
             self._note(begin, "turn", wish, wanted)
             way = max(abs(wanted[0] - before.pan), abs(wanted[1] - before.tilt))
-            state, arrived = self._wait_for_head(wanted, way)
+            state, arrived = wait_for_head(self.rig, wanted, way)
             if arrived:
                 self._still_since = max(self._still_since, state.t + self.settle)
                 return
         raise CalibrationError(
-            f"the head stands at pan {np.degrees(state.pan):.2f}, tilt {np.degrees(state.tilt):.2f} degrees "
-            f"where pan {np.degrees(wanted[0]):.2f}, tilt {np.degrees(wanted[1]):.2f} was commanded"
+            f"the head stands at pan {np.degrees(state.pan):z.2f}, tilt {np.degrees(state.tilt):z.2f} degrees "
+            f"where pan {np.degrees(wanted[0]):z.2f}, tilt {np.degrees(wanted[1]):z.2f} was commanded"
         )
-
-    def _wait_for_head(self, wanted: tuple[float, float], way: float) -> tuple[PanTiltState, bool]:
-        """Wait until the head stands where it is wanted, or should have for long; its state, and whether it does."""
-        head, clock = self.rig.head, self.rig.clock
-        limits = head.limits
-        deadline = clock.now() + way / limits.speed + limits.speed / limits.acceleration + HEAD_PATIENCE
-        while True:
-            state = head.state()
-            off = max(abs(state.pan - wanted[0]), abs(state.tilt - wanted[1]))
-            arrived = not state.moving and off <= limits.step + POSE_TOLERANCE
-            if arrived or clock.now() > deadline:
-                return state, arrived
-            clock.sleep_until(clock.now() + POLL)
 
     def see_fixed(self, *, expected: bool = True) -> View | None:
         """Take an image with the fixed camera and find the board in it."""
-        frame = self.rig.fixed.read(newer_than=self._still_since, timeout=FRAME_TIMEOUT)
+        frame = self._look(self._read_fixed)
         return self._keep(Capture(frame.image, "fixed", self.number, t=frame.t), expected)
 
     def see_zoom(self, *, expected: bool = True, find: Finder | None = None) -> View | None:
@@ -212,12 +201,43 @@ class Recorder:
             expected: whether the board should be there, so that it is worth looking thoroughly.
             find: how to look for it: given the image, and the view that it will be but for its corners.
         """
-        frame = self.rig.zoom.read(newer_than=self._still_since, timeout=FRAME_TIMEOUT)
-        pose, lens = self.rig.head.state(), self.rig.zoom.state()
-        if pose.moving or lens.moving:
-            raise DeviceError("head or lens moved while the zoom camera took a calibration image")
+        frame, pose, lens = self._look(self._read_zoom)
         capture = Capture(frame.image, "zoom", self.number, pose.pan, pose.tilt, lens.focal_px, frame.t)
         return self._keep(capture, expected, find)
+
+    def _look(self, look: Callable[[float], Seen]) -> Seen:
+        """Look, and look again, a few times, where what is seen comes too late.
+
+        Each time the head is sent again to where it should stand; it stays there if nothing happened, and refuses after
+        an emergency stop.
+
+        Args:
+            look: given the time [s] after which a frame must have been exposed.
+
+        Raises:
+            StaleFrameError: it came too late each time.
+            EmergencyStopError: the head was stopped meanwhile.
+        """
+        for _ in range(TRIES - 1):
+            try:
+                return look(self._still_since)
+            except StaleFrameError as error:
+                log.warning("%s; looking again", error)
+            if self._wish is not None:
+                self.turn(*self._wish)
+            self._still_since = max(self._still_since, self.rig.clock.now())
+        return look(self._still_since)
+
+    def _read_fixed(self, newer_than: float) -> Frame:
+        return self.rig.fixed.read(newer_than=newer_than, timeout=FRAME_TIMEOUT)
+
+    def _read_zoom(self, newer_than: float) -> tuple[Frame, PanTiltState, ZoomState]:
+        """A frame of the zoom camera, and how head and lens stand."""
+        frame = self.rig.zoom.read(newer_than=newer_than, timeout=FRAME_TIMEOUT)
+        pose, lens = self.rig.head.state(), self.rig.zoom.state()
+        if pose.moving or lens.moving:
+            raise StaleFrameError("head or lens moved while the zoom camera took a calibration image")
+        return frame, pose, lens
 
     def of_placement(self, number: int) -> Sequence[View]:
         """The views of one placement."""

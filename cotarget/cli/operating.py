@@ -68,7 +68,7 @@ def _plausible(name: str, seconds: float) -> float:
 def point(options: argparse.Namespace) -> None:
     """Cotarget point."""
     from cotarget.calibration.captures import write_image
-    from cotarget.calibration.recorder import wait_for_lens
+    from cotarget.calibration.standing import wait_for_lens
     from cotarget.config import load_config
     from cotarget.rig import open_rig
     from cotarget.safety import SafeRig, refuse_if_stopped

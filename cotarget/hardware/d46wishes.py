@@ -5,12 +5,12 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from cotarget.errors import DeviceError
+from cotarget.errors import DeviceError, HaltedError
 
 Wish = TypeVar("Wish")
 
 
-class DroppedError(DeviceError):
+class DroppedError(HaltedError):
     """A move did not come to its end because of another wish."""
 
 

@@ -8,7 +8,7 @@ import math
 import threading
 
 from cotarget.config import SafetyConfig
-from cotarget.errors import ConfigError, DeviceError
+from cotarget.errors import ConfigError, DeviceError, HaltedError
 from cotarget.hardware.d46loop import Loop
 from cotarget.hardware.d46lost import LostPosition, PositionLostError
 from cotarget.hardware.d46unit import HALT_NOW, AxisFacts, Unit, connect
@@ -192,7 +192,8 @@ class D46Head:
             if not self._thread.is_alive():
                 self._raise_what_happened()
         if move.error is not None:
-            raise DeviceError(str(move.error)) from move.error
+            kind = HaltedError if isinstance(move.error, HaltedError) else DeviceError
+            raise kind(str(move.error)) from move.error
 
     def _wait_until_it_stands(self, clock: Clock) -> None:
         deadline = clock.now() + STANDS_S
