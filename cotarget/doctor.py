@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from cotarget.assets import assets_dir
-from cotarget.errors import ConfigError, CotargetError
+from cotarget.errors import ConfigError, CotargetError, EmergencyStopError
 
 if TYPE_CHECKING:
     from cotarget.config import HardwareConfig, RigConfig
@@ -58,6 +58,8 @@ def examine(config: "RigConfig | None" = None) -> list[Finding]:
         _serial_ports(),
         _gphoto_cameras(needed=_is_real(config)),
     ]
+    if config is not None:
+        found.append(_emergency_stop(config))
     return found if config is None or not _is_real(config) else [*found, _position(config), *_devices(config.hardware)]
 
 
@@ -138,6 +140,22 @@ def _gphoto_cameras(needed: bool) -> Finding:
         return Finding("gphoto2 cameras", not needed, f"{error}{note}", "pip install 'cotarget[hardware]'" * needed)
 
 
+def _emergency_stop(config: "RigConfig") -> Finding:
+    """Whether an operator has stopped the head."""
+    from cotarget.safety import refuse_if_stopped
+
+    name, path = "emergency stop", config.safety.stop_file
+    if path is None:
+        return Finding(name, True, "no stop file is configured: no other shell can stop the head")
+    try:
+        refuse_if_stopped(path)
+    except EmergencyStopError as error:
+        return Finding(name, False, str(error), "cotarget clear --rig rig.toml")
+    except ConfigError as error:
+        return Finding(name, False, str(error), f"mkdir -p {path.parent}")
+    return Finding(name, True, "nobody has called for one")
+
+
 def _position(config: "RigConfig") -> Finding:
     """Whether anybody has noted that the head is not where it says."""
     from cotarget.hardware.d46lost import LostPosition
@@ -168,5 +186,20 @@ def _devices(hardware: "HardwareConfig") -> list[Finding]:
                 raise ConfigError("is not configured")
             found.append(Finding(name, True, ask()))
         except CotargetError as error:
-            found.append(Finding(name, False, str(error), f"look at the device, its cable, and [{name}] in rig.toml"))
+            found.append(Finding(name, False, str(error), _fix(error, name, there)))
     return found
+
+
+def _fix(error: CotargetError, name: str, there: str) -> str:
+    """What helps with a device that does not answer as it should."""
+    from cotarget.hardware.serialport import InUseError, NoPermissionError
+    from cotarget.hardware.vapix import LoginError
+
+    match error:
+        case InUseError():
+            return f"end the program that has it, which 'fuser -v {there}' names"
+        case NoPermissionError():
+            return "sudo usermod -a -G dialout $USER, then log in anew"
+        case LoginError():
+            return f"give the right user in [{name}] in rig.toml, and export COTARGET_PASSWORD=..."
+    return f"look at the device, its cable, and [{name}] in rig.toml"

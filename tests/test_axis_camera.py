@@ -653,8 +653,12 @@ def test_probe_tells_who_it_is(server):
     server.pages[STATUS] = reply(body=b"Video 2 = no video\n")
     assert probe(config(server, camera=2)) == "AXIS 241Q, firmware 4.48, input 2 has no video"
     assert not [request for request in server.requests if request.path == VIDEO]
+    video = server.pages[VIDEO]
     server.pages.clear()
-    with pytest.raises(DeviceError, match=r"tells nothing of itself: check hardware\.fixed\.url, user and password"):
+    server.pages[VIDEO] = video
+    assert probe(config(server)) == "tells nothing of itself, but sends pictures"
+    server.pages.clear()
+    with pytest.raises(DeviceError, match=r"\(404\): check hardware\.fixed\.url and hardware\.fixed\.camera"):
         probe(config(server))
 
 

@@ -1,15 +1,19 @@
 """The doctor: what is missing is said with the command that mends it, whatever else is broken."""
 
+import os
 import socket
 import subprocess
 import sys
 from types import SimpleNamespace
 
 import pytest
+import serial
 
 from cotarget import cli, doctor
 from cotarget.config import parse_config
 from cotarget.doctor import PACKAGES, Finding
+from cotarget.emulators.axis import AxisServer
+from cotarget.emulators.plant import Feed
 
 
 @pytest.fixture
@@ -140,3 +144,58 @@ def test_a_lost_position_is_told(tmp_path):
     assert not lost.ok
     assert lost.text.startswith("it hit a limit")
     assert "reset-head" in lost.fix
+
+
+@pytest.mark.parametrize("backend", ["sim", "hardware"])
+def test_an_emergency_stop_is_told(tried, tmp_path, backend):
+    stop = tmp_path / "run" / "stop"
+    config = parse_config({"backend": backend, "safety": {"stop_file": str(stop)}})
+    found = findings(config)["emergency stop"]
+    assert (found.ok, found.fix) == (False, f"mkdir -p {tmp_path / 'run'}")
+    stop.parent.mkdir()
+    assert findings(config)["emergency stop"] == Finding("emergency stop", True, "nobody has called for one")
+    stop.write_text("a bird in the gears\n")
+    found = findings(config)["emergency stop"]
+    assert not found.ok
+    assert found.text.startswith("emergency stop: a bird in the gears; when it is safe to move, run 'cotarget clear")
+    assert found.fix == "cotarget clear --rig rig.toml"
+    assert findings(parse_config({"backend": backend}))["emergency stop"].ok
+
+
+def test_a_port_that_another_program_has_is_told_with_what_names_it(tried):
+    ends = os.openpty()
+    port = os.ttyname(ends[1])
+    try:
+        with serial.Serial(port, exclusive=True):
+            found = findings(parse_config({"backend": "hardware", "hardware": {"head": {"port": port}}}))
+    finally:
+        for end in ends:
+            os.close(end)
+    head = found["hardware.head"]
+    assert head == Finding(
+        "hardware.head",
+        False,
+        f"{port} is in use by another program",
+        f"end the program that has it, which 'fuser -v {port}' names",
+    )
+
+
+def test_a_port_that_is_not_for_this_user_is_told_with_the_group(tried, monkeypatch):
+    def denied(*_, **__):
+        raise serial.SerialException(13, "could not open port")
+
+    monkeypatch.setattr(serial, "serial_for_url", denied)
+    head = findings(parse_config({"backend": "hardware", "hardware": {"head": {"port": "/dev/x"}}}))["hardware.head"]
+    assert head.text.startswith("no permission to use /dev/x")
+    assert "dialout" in head.fix
+
+
+@pytest.mark.wire
+def test_a_wrong_password_is_told_with_where_it_belongs(tried, monkeypatch):
+    monkeypatch.setenv("COTARGET_PASSWORD", "guessed")
+    with AxisServer({1: Feed()}, user="viewer", password="open sesame") as server:
+        table = {"fixed": {"url": server.url, "user": "viewer"}}
+        fixed = findings(parse_config({"backend": "hardware", "hardware": table}))["hardware.fixed"]
+    assert fixed.text.startswith(f"{server.url} refuses the user 'viewer' (401)")
+    assert "export COTARGET_PASSWORD" in fixed.fix
+    assert "cable" not in fixed.fix

@@ -9,6 +9,14 @@ SLICE_S = 0.01  # how long a read waits, so how often one that waits longer look
 WRITE_S = 0.5  # a line that takes no bytes for so long is dead
 
 
+class InUseError(DeviceError):
+    """Another program has it."""
+
+
+class NoPermissionError(DeviceError):
+    """This user may not use it."""
+
+
 class Port(Protocol):
     """What of pyserial's ports is used."""
 
@@ -59,25 +67,25 @@ def open_port(name: str, baud: int) -> Port:
             name, baudrate=baud, timeout=SLICE_S, write_timeout=WRITE_S, exclusive=None if url else True
         )
     except Exception as error:  # the drivers behind odd ports and URLs raise what they like
-        raise DeviceError(_why_not(name, error)) from error
+        raise _why_not(name, error) from error
 
 
 def _no_pyserial(error: ImportError) -> DeviceError:
     return DeviceError(f"pyserial cannot be imported ({error}); pip install --force-reinstall pyserial")
 
 
-def _why_not(name: str, error: Exception) -> str:
+def _why_not(name: str, error: Exception) -> DeviceError:
     """Say in one line why a port cannot be opened and what would help."""
     match getattr(error, "errno", None):
         case errno.ENOENT | errno.ENXIO | errno.ENODEV:
             there = ", ".join(sorted(device for device, _ in ports())) or "none"
-            return f"there is no port {name} for the pan-tilt unit; serial ports here: {there}"
+            return DeviceError(f"there is no port {name} for the pan-tilt unit; serial ports here: {there}")
         case errno.EACCES | errno.EPERM:
-            return (
+            return NoPermissionError(
                 f"no permission to use {name}; add yourself to the group that owns it, often dialout, and log in anew"
             )
         case errno.EBUSY | errno.EAGAIN:
-            return f"{name} is in use by another program"
+            return InUseError(f"{name} is in use by another program")
     if name.startswith("socket://"):
-        return f"cannot connect to the pan-tilt unit at {name}: {error}"
-    return f"cannot open {name} as a serial port: {error}"
+        return DeviceError(f"cannot connect to the pan-tilt unit at {name}: {error}")
+    return DeviceError(f"cannot open {name} as a serial port: {error}")

@@ -37,6 +37,10 @@ class RefusedError(DeviceError):
     """The server has no such stream for us."""
 
 
+class LoginError(RefusedError):
+    """The server wants another user or password."""
+
+
 @dataclass(frozen=True)
 class Identity:
     """What a server says of itself; empty, and None, where it does not say.
@@ -152,11 +156,13 @@ class VideoServer:
         """Who the server is, in a line.
 
         Raises:
-            DeviceError: it cannot be reached, or tells nothing.
+            RefusedError: it tells nothing, and has no stream for us either, which says why.
+            DeviceError: it cannot be reached.
         """
         identity, video = self.identify(), self.has_video()
         if identity is None and video is None:
-            raise DeviceError(f"{self.name} tells nothing of itself: check hardware.fixed.url, user and password")
+            with self.stream():
+                return "tells nothing of itself, but sends pictures"
         told = [] if identity is None else [f"{identity.brand} {identity.product}".strip()]
         if identity is not None and identity.firmware:
             told.append(f"firmware {identity.firmware}")
@@ -205,10 +211,10 @@ class VideoServer:
         if status == 401 and not (self._user and self._password):
             missing = f"the environment variable {PASSWORD_VARIABLE}"
             missing = missing if self._user else f"hardware.fixed.user and {missing}"
-            return RefusedError(f"{name} asks for user and password: set {missing}")
+            return LoginError(f"{name} asks for user and password: set {missing}")
         if status in (401, 403):
             check = f"check hardware.fixed.user and the password, which may be in {PASSWORD_VARIABLE}"
-            return RefusedError(f"{name} refuses the user '{self._user}' ({status}): {check}")
+            return LoginError(f"{name} refuses the user '{self._user}' ({status}): {check}")
         if status == 503:
             return BusyError(f"{name} is busy (503), perhaps with too many viewers: close some")
         if status >= 500:
