@@ -20,16 +20,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
-from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetConfig
 from cotarget.detection import Detector, make_detector
 from cotarget.errors import CotargetError
-from cotarget.pantilt import HeadGeometry
 from cotarget.rig import Frame
+from cotarget.sim.world import SimWorld
 from cotarget.targeting import Closeup, Reach, aim, depth_of, point_at
 from cotarget.tracking import FirstCome, Tracker, settings_for, size_for
 from cotarget.video import Film
 from experiments.harness import Experiment, Row, Settings, over_seeds, table
+from experiments.hold_scenes import true_calibration
 
 FILM = Path(__file__).resolve().parents[2] / "shared" / "data" / "birds" / "V_BIRD_036.mp4"
 ALONE = "MOG2 alone"
@@ -85,17 +85,10 @@ class Pipeline:
 
 
 def calibration_of(size: tuple[int, int]) -> Calibration:
-    """The default rig's calibration with a wide view of that size."""
-    sim = RigConfig().sim
+    """The default rig's calibration, with a wide view of that size."""
+    calibration = true_calibration(SimWorld(RigConfig(), rendered=()))
     middle = ((size[0] - 1) / 2, (size[1] - 1) / 2)
-    zoom = Intrinsics(sim.zoom.size, sim.zoom.focal_px, sim.zoom.center_px, sim.zoom.distortion)
-    return Calibration(
-        fixed=Intrinsics(size, sim.fixed.focal_px, middle, sim.fixed.distortion),
-        zoom=ZoomLens((RigConfig().focal_range_px[0],), (zoom,)),
-        T_zoom0_fixed=sim.T_zoom0_fixed,
-        T_head_zoom=sim.T_head_zoom,
-        head=HeadGeometry(sim.head.axis_offset_mm / 1000, float(np.radians(sim.head.squareness_deg))),
-    )
+    return replace(calibration, fixed=replace(calibration.fixed, size=size, center_px=middle))
 
 
 def run(settings: PipelineSpeedSettings) -> list[Row]:

@@ -167,7 +167,8 @@ def _followed(seconds: float, seed: int, rendered: bool) -> float:
     world = SimWorld(config, rendered=CAMERAS if rendered else ())
     target, calibration = config.target(TARGET), true_calibration(world)
     detector = make_detector(target, config.rate_hz) if rendered else TruthDetector(world.truth(), seed)
-    settings = FollowSettings(command_delay_s=config.command_delay_s)
+    # Without pictures there is nothing to be looked for in the zoom view.
+    settings = FollowSettings(command_delay_s=config.command_delay_s, closed_loop=rendered)
     with world.rig as rig:
         for _ in follow(rig, calibration, target, detector, seconds=SETTLED_S, settings=settings):
             pass
