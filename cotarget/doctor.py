@@ -197,7 +197,7 @@ def _fix(error: CotargetError, name: str, there: str) -> str:
 
     match error:
         case InUseError():
-            return f"end the program that has it, which 'fuser -v {there}' names"
+            return "end the program that has it" + (f", which 'fuser -v {there}' names" if "://" not in there else "")
         case NoPermissionError():
             return "sudo usermod -a -G dialout $USER, then log in anew"
         case LoginError():

@@ -1,13 +1,17 @@
 """Opening the real devices as one rig: in which order, and what is left when one of them is missing."""
 
 import dataclasses
+import os
+import sys
 
 import pytest
 
 from cotarget.config import HardwareConfig, RigConfig, parse_config
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.hardware import rig as hardware_rig
+from cotarget.hardware.d46unit import probe
 from cotarget.hardware.rig import open_hardware
+from cotarget.hwconfig import HardwareHead
 from cotarget.rig import open_rig
 
 ORDER = ("board", "fixed", "zoom", "head")
@@ -95,6 +99,42 @@ def test_where_one_is_missing_the_others_are_let_go_and_the_head_is_not_touched(
         open_hardware(CONFIG)
     there = ORDER[: ORDER.index(missing)]
     assert log == [*(f"open {name}" for name in there), f"no {missing}", *(f"close {name}" for name in reversed(there))]
+
+
+@pytest.fixture
+def port():
+    ends = os.openpty()
+    yield os.ttyname(ends[1])
+    for end in ends:
+        os.close(end)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the devices have to refuse a second program")
+@pytest.mark.parametrize("by", ["its name", "another name", "a URL"])
+def test_a_rig_that_another_program_has_is_said_to_be_before_any_device_is_asked(devices, port, tmp_path, by):
+    """Within one process as well; and the claim ends with the rig."""
+    log, missing, _ = devices
+    (tmp_path / "link").symlink_to(port)
+    address = f"socket://192.0.2.1:{os.getpid()}"  # of no other test's process
+    names = {"its name": (port, port), "another name": (port, str(tmp_path / "link")), "a URL": (address, address)}[by]
+    first, second = (
+        dataclasses.replace(CONFIG, hardware=dataclasses.replace(CONFIG.hardware, head=HardwareHead(port=name)))
+        for name in names
+    )
+    with open_hardware(first):
+        log.clear()
+        with pytest.raises(
+            DeviceError, match=r"another program has the rig with the pan-tilt unit at .*; end it first"
+        ):
+            open_hardware(second)
+        with pytest.raises(DeviceError, match="another program has the rig"):
+            probe(names[1], 9600)
+        assert log == []
+    missing.append("zoom")
+    with pytest.raises(DeviceError, match="zoom: is not there"):
+        open_hardware(second)
+    missing.clear()
+    open_hardware(second).close()
 
 
 @pytest.mark.parametrize("which", ORDER)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from cotarget.errors import DeviceError, EmergencyStopError
 from cotarget.hardware import d46
+from cotarget.hardware.claim import claimed
 from cotarget.hardware.d46 import command
 from cotarget.hardware.d46lost import LostPosition, PositionLostError
 from cotarget.hardware.d46unit import Unit, greet, halt_outright, identify, refuse_events, refuse_uncalibrated
@@ -43,8 +44,7 @@ def reset(config: HardwareHead, clock: Clock, lost: LostPosition, stopped: Calla
         EmergencyStopError: it was stopped.
         DeviceError: it failed.
     """
-    line = open_line(config.port, config.baud, clock)
-    try:
+    with claimed(config.port), contextlib.closing(open_line(config.port, config.baud, clock)) as line:
         greet(line)
         _refuse_if_stopped(stopped)
         lost.note(str(PositionLostError(line.name, "has begun a reset that did not come to its end")))
@@ -56,8 +56,6 @@ def reset(config: HardwareHead, clock: Clock, lost: LostPosition, stopped: Calla
         refuse_events(line)
         lost.forget()
         return unit
-    finally:
-        line.close()
 
 
 def _turn(line: Line, stopped: Callable[[], str | None]) -> None:

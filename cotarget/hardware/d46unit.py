@@ -3,12 +3,14 @@
 Also a harmless look at a unit outside of a rig; for its reset see `cotarget.hardware.d46reset`.
 """
 
+import contextlib
 import logging
 import math
 from dataclasses import dataclass
 
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.hardware import d46
+from cotarget.hardware.claim import claimed
 from cotarget.hardware.clock import MonotonicClock
 from cotarget.hardware.d46 import DELIMITER, HALT, AxisName, RefusedError, ReplyError, command
 from cotarget.hardware.d46lost import PositionLostError
@@ -201,20 +203,18 @@ def probe(port: str, baud: int) -> str:
     """Look who is at a port, by questions that change nothing: version and number on the network.
 
     Raises:
-        DeviceError: no pan-tilt unit.
+        DeviceError: no pan-tilt unit, or another program has it.
     """
-    line = open_line(port, baud, MonotonicClock())
-    try:
-        line.write(DELIMITER)
-        line.drain(GREETING_QUIET_S, GREETING_MOST_S)
-        version = line.ask(command("V"), PATIENCE_S).text
-        if not version:
-            raise ReplyError(f"what answers at {port} tells no version")
-        return f"{version}, unit {d46.integer(line.ask(command('U'), PATIENCE_S).text)}"
-    except (SilentError, ReplyError, RefusedError) as error:
-        raise _stranger(line) from error
-    finally:
-        line.close()
+    with claimed(port), contextlib.closing(open_line(port, baud, MonotonicClock())) as line:
+        try:
+            line.write(DELIMITER)
+            line.drain(GREETING_QUIET_S, GREETING_MOST_S)
+            version = line.ask(command("V"), PATIENCE_S).text
+            if not version:
+                raise ReplyError(f"what answers at {port} tells no version")
+            return f"{version}, unit {d46.integer(line.ask(command('U'), PATIENCE_S).text)}"
+        except (SilentError, ReplyError, RefusedError) as error:
+            raise _stranger(line) from error
 
 
 def _axis(line: Line, axis: AxisName) -> AxisFacts:

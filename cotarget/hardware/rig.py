@@ -9,6 +9,7 @@ from cotarget.errors import ConfigError
 from cotarget.hardware.axis import AxisCamera
 from cotarget.hardware.board import make_board
 from cotarget.hardware.canon import GphotoCamera
+from cotarget.hardware.claim import claimed
 from cotarget.hardware.clock import MonotonicClock
 from cotarget.hardware.head import D46Head
 from cotarget.rig import Board
@@ -58,7 +59,7 @@ def open_hardware(config: RigConfig) -> HardwareRig:
 
     Raises:
         ConfigError: a device is not named, or is not as configured.
-        DeviceError: a device could not be opened.
+        DeviceError: a device could not be opened, or another program has them.
     """
     hardware = config.hardware
     for table, key, example in NEEDED:
@@ -69,6 +70,7 @@ def open_hardware(config: RigConfig) -> HardwareRig:
     sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL))
     clock = MonotonicClock()
     with contextlib.ExitStack() as opened:
+        opened.enter_context(claimed(hardware.head.port))
         board = opened.enter_context(contextlib.closing(make_board(hardware.board)))
         fixed = opened.enter_context(contextlib.closing(AxisCamera(hardware.fixed, clock)))
         zoom = opened.enter_context(contextlib.closing(GphotoCamera(hardware.zoom, clock)))
