@@ -7,6 +7,7 @@ import json
 import math
 import platform
 import shutil
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -66,12 +67,14 @@ class StepTable:
             return
         track, aim, (pan, tilt, focal) = step.target, step.aim, step.commanded
         box = ["", "", "", "", ""] if track is None else [track.id, *track.center_px, *track.size_px]
-        self._writer.writerow(
+        row = (
             [step.index, step.t, step.fixed.t, step.zoom.t, step.state, step.reason, *box]
             + (["", ""] if aim is None else [aim.depth, aim.range])
             + [math.degrees(pan), math.degrees(tilt), focal]
             + [math.degrees(step.head.pan), math.degrees(step.head.tilt), step.lens.focal_px]
         )
+        with self._told(self._path):
+            self._writer.writerow(row)
 
     def __enter__(self) -> "StepTable":
         """Give the table itself."""
@@ -83,11 +86,25 @@ class StepTable:
         """Complete the file and give it its name; after an error, remove what there is."""
         if self._path is None:
             return
-        self._file.close()
-        if kind is None:
-            self._part.replace(self._path)
-        else:
+        try:
+            with self._told(self._path):
+                self._file.close()  # which writes what is left, and may find the disk full
+                if kind is None:
+                    self._part.replace(self._path)
+        except ConfigError:
+            if kind is None:  # otherwise there is an error to be told already
+                raise
+        finally:
             self._part.unlink(missing_ok=True)
+
+    @staticmethod
+    @contextlib.contextmanager
+    def _told(path: Path) -> Iterator[None]:
+        """Say which file it is that cannot be written; a full disk does not."""
+        try:
+            yield
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 class Recorder:

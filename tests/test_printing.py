@@ -9,7 +9,8 @@ import pytest
 from cotarget.calibration.boards import find_corners
 from cotarget.calibration.printing import print_board
 from cotarget.config import BoardConfig
-from cotarget.errors import ConfigError
+from cotarget.errors import CalibrationError, ConfigError
+from tests.full_disk import SAID, full_disk
 
 BOARD = BoardConfig(corners=(7, 4), square=0.02)
 PIXELS_PER_SQUARE = 0.02 / 0.0254 * 300
@@ -48,4 +49,13 @@ def test_a_png_is_read_as_the_board_it_is(tmp_path):
 def test_what_cannot_be_printed_is_said(tmp_path, name, board, said):
     with pytest.raises(ConfigError, match=re.escape(said)):
         print_board(tmp_path / name, board)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", [".pdf", ".svg", ".png"])
+@pytest.mark.parametrize("room", [0, 4096])
+def test_a_full_disk_leaves_nothing(tmp_path, suffix, room):
+    path = tmp_path / f"board{suffix}"
+    with full_disk(room), pytest.raises(CalibrationError, match=re.escape(f"{path}: cannot be written: {SAID}")):
+        print_board(path, BoardConfig(corners=(9, 6), square=0.025))
     assert not list(tmp_path.iterdir())

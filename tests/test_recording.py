@@ -24,6 +24,7 @@ from cotarget.replay import ReplayRig, open_recording
 from cotarget.rig import Frame, PanTiltState, ZoomState
 from cotarget.targeting import Aim
 from cotarget.tracking import Track
+from tests.full_disk import SAID, full_disk
 from tests.recorded_run import CONFIG, SIZE, ToyRig, calibration_file, record, run
 
 PICTURE = np.zeros((4, 4, 3), np.uint8)
@@ -99,6 +100,25 @@ def test_no_path_writes_nothing(tmp_path, monkeypatch):
 def test_a_table_that_cannot_be_written_is_named_at_once(tmp_path):
     with pytest.raises(ConfigError, match=r"steps\.csv: cannot be written: No such file or directory"):
         StepTable(tmp_path / "none" / "steps.csv")
+
+
+def fill(path, steps):
+    with StepTable(path) as table:
+        for index in range(steps):
+            table.write(step(index))
+
+
+@pytest.mark.parametrize("steps", [1, 1000])  # found full at the end, and on the way
+def test_a_table_on_a_full_disk_is_named(tmp_path, steps):
+    path = tmp_path / "steps.csv"
+    path.write_text("old")
+    with full_disk(), pytest.raises(ConfigError, match=rf"steps\.csv: cannot be written: {SAID}"):
+        fill(path, steps)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+    with full_disk(), pytest.raises(KeyboardInterrupt):
+        fill_and_fail(path)
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.fixture

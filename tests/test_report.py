@@ -49,6 +49,7 @@ from experiments.synthetic import (
     views_at_stops,
     zoom_view,
 )
+from tests.full_disk import SAID, full_disk
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)
@@ -438,3 +439,17 @@ def test_mistakes_end_in_one_line_and_leave_the_page(plain, tmp_path, capsys):
     negative = replace(plain.covariance, matrix=-plain.covariance.matrix)
     with pytest.raises(CalibrationError, match="is no variance"):
         write_report(page, bare(plain, covariance=negative))
+
+
+def test_a_full_disk_leaves_nothing_of_a_report(plain, tmp_path):
+    """There is room for some of its pictures, and none for the page."""
+    page = tmp_path / "page.html"
+    with full_disk(60_000), pytest.raises(CalibrationError, match=f"page.html: cannot be written: {SAID}"):
+        write_report(page, plain)
+    assert not list(tmp_path.iterdir())
+    write_report(page, bare(plain, covariance=None))
+    before = page.read_bytes()
+    with full_disk(), pytest.raises(CalibrationError):
+        write_report(page, bare(plain, covariance=None))
+    assert page.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html", "page_pictures"]

@@ -1,5 +1,6 @@
 """Files that are either the old one or the new one, never half of one."""
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -19,6 +20,9 @@ def write_atomically(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise CalibrationError(f"{path}: cannot be written: {error.strerror}") from None
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise CalibrationError(f"{path}: cannot be written: {error.strerror}") from None
+        raise

@@ -1,5 +1,6 @@
 """A board to print, to scale."""
 
+import io
 from pathlib import Path
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -57,12 +58,7 @@ def print_board(path: Path, board: BoardConfig) -> tuple[float, float]:
         "print at 100 %"
     )
     ax.text(columns / 2, rows + MARGIN / 2, told, ha="center", va="center", fontsize=board.square * 300)
-    part = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
-        figure.savefig(part, dpi=DOTS_PER_INCH)
-        write_atomically(path, part.read_bytes())
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
-    finally:
-        part.unlink(missing_ok=True)
+    page = io.BytesIO()  # matplotlib ends a PDF that a full disk cuts short in errors of its own
+    figure.savefig(page, format=path.suffix.lower().removeprefix("."), dpi=DOTS_PER_INCH)
+    write_atomically(path, page.getvalue())
     return width, height

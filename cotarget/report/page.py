@@ -1,11 +1,11 @@
 """The report on a calibration: one HTML page that needs nothing beside it, and its pictures in a folder."""
 
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from cotarget.calibration.atomic import write_atomically
 from cotarget.calibration.file import check_covariance
 from cotarget.calibration.model import Calibration
 from cotarget.errors import CalibrationError
@@ -57,22 +57,27 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
     items = advice(calibration, at, between, parts, evidence)
     body = _body(calibration, source, found, at, parts, evidence, made, items)
     page = markup.document(f"Calibration report: {source}", STYLE.read_text(encoding="utf-8"), body)
-    _write_pictures(path.with_name(f"{path.stem}_pictures"), made)
-    write_atomically(path, page.encode())
+    _write(path, page, made)
     return found
 
 
-def _write_pictures(folder: Path, made: dict[str, Picture]) -> None:
-    """Write the pictures; those of an earlier report that this one does not have go."""
+def _write(path: Path, page: str, made: dict[str, Picture]) -> None:
+    """Write page and pictures, all or nothing; pictures of an earlier report that this one does not have go."""
+    folder = path.with_name(f"{path.stem}_pictures")
+    files = {folder / f"{name}.png": picture.png for name, picture in made.items()} | {path: page.encode()}
     try:
-        folder.mkdir(exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.", ignore_cleanup_errors=True) as parts:
+            for file, data in files.items():
+                (Path(parts) / file.name).write_bytes(data)
+            folder.mkdir(exist_ok=True)
+            for file in files:
+                (Path(parts) / file.name).replace(file)
         for name in pictures.NAMES:
             if name not in made:
                 (folder / f"{name}.png").unlink(missing_ok=True)
     except OSError as error:
-        raise CalibrationError(f"{folder}: cannot be written: {error.strerror}") from None
-    for name, picture in made.items():
-        write_atomically(folder / f"{name}.png", picture.png)
+        where = folder if folder.exists() and not folder.is_dir() else path
+        raise CalibrationError(f"{where}: cannot be written: {error.strerror}") from None
 
 
 def _body(
