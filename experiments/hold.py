@@ -11,7 +11,7 @@ seed is another path, another size and other noise. Figures are medians over the
 import dataclasses
 import functools
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,17 +19,19 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration, calibrate_rig
-from cotarget.config import RigConfig, SimConfig
+from cotarget.config import RigConfig, SimConfig, TargetConfig
 from cotarget.detection import make_detector
 from cotarget.judging import add_row
-from cotarget.loop import FollowSettings, follow
+from cotarget.loop import FollowSettings, Step, follow
 from cotarget.metrics import Row as Judged
 from cotarget.metrics import score
 from cotarget.safety import SafeRig
+from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments import harness
 from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
 from experiments.hold_scenes import SECONDS, hold_config
+from experiments.wide_view import WideView, open_on
 
 # What is wanted of each figure's median: at least, or at most.
 WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
@@ -111,6 +113,7 @@ def held(
     name: str,
     seconds: float,
     settings: FollowSettings | None = None,
+    view: WideView | None = None,
 ) -> list[Judged]:
     """Hold a target of a simulated rig, and judge every frame.
 
@@ -120,18 +123,38 @@ def held(
         name: of the target.
         seconds: for how long [s].
         settings: how it is followed; as always, by default.
+        view: what the wide camera sees, where that was recorded.
     """
-    world = SimWorld(config)
-    truth, target = world.truth(), config.target(name)
-    if target.dimension == "wingspan":  # clutter that moves by itself drowns a bird for the motion detector
-        target = dataclasses.replace(target, detector="speck")
-    rows: list[Judged] = []
-    settings = settings or FollowSettings(command_delay_s=config.command_delay_s)
-    with SafeRig(world.rig, config.safety) as rig:
-        detector = make_detector(target, config.rate_hz)
-        for step in follow(rig, calibration, target, detector, seconds=seconds, settings=settings):
-            add_row(rows, step, truth, name, target)
+    target, rows = target_of(config, name), list[Judged]()
+    for step, truth in watched(calibration, config, target, seconds, settings, view):
+        add_row(rows, step, truth, name, target)
     return rows
+
+
+def watched(
+    calibration: Calibration,
+    config: RigConfig,
+    target: TargetConfig,
+    seconds: float,
+    settings: FollowSettings | None = None,
+    view: WideView | None = None,
+) -> Iterator[tuple[Step, Truth]]:
+    """Follow a target of a simulated rig; each Step, and the truth to judge it by. See `held`."""
+    settings = settings or FollowSettings(command_delay_s=config.command_delay_s)
+    if view is None:
+        world, detector = SimWorld(config), make_detector(target, config.rate_hz)
+    else:
+        world, detector = open_on(view, config, closed_loop=settings.closed_loop)
+    truth = world.truth()
+    with SafeRig(world.rig, config.safety) as rig:
+        for step in follow(rig, calibration, target, detector, seconds=seconds, settings=settings):
+            yield step, truth
+
+
+def target_of(config: RigConfig, name: str) -> TargetConfig:
+    """What is told of a target in the field, where clutter that moves by itself drowns a bird for its own detector."""
+    target = config.target(name)
+    return dataclasses.replace(target, detector="speck") if target.dimension == "wingspan" else target
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:

@@ -1,0 +1,181 @@
+"""What prediction is worth: the offset in the close-up with it and without, over the delay of cameras and head.
+
+A person walks and a bird flies in the field of `experiments.hold_scenes`, and the delay from light to the start of
+motion goes from none to 600 ms, of which three fifths are the cameras' and the rest the head's and the lens's, as in
+the field's 120 + 80 ms. Without prediction the head is sent where the target was seen. At one delay, the field's, both
+are compared once more with the correction from the zoom view; the curve is of the wide view alone, so that nothing is
+rendered but its frames, once a seed. A run in which the target was never acquired counts with half the diagonal.
+
+    python -m experiments.delay [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import functools
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration
+from cotarget.config import RigConfig
+from cotarget.loop import FollowSettings
+from cotarget.metrics import score
+from experiments import harness
+from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
+from experiments.hold import calibrated, held, target_of
+from experiments.hold_scenes import COMMAND_DELAY_S, LATENCY_S, SECONDS, hold_config
+from experiments.wide_view import record
+
+FIELD_S = LATENCY_S + COMMAND_DELAY_S
+LIGHT_PART = LATENCY_S / FIELD_S  # of a delay, that from light to frame
+NEVER = math.hypot(640, 480) / 2 / 640  # offset over the width, of a target that is never acquired
+WANTED = 3.0  # times smaller with prediction than without, at the field's delay
+
+
+@dataclass(frozen=True)
+class DelaySettings(harness.Settings):
+    """How many seeds, which targets, at which delays and for how long.
+
+    Attributes:
+        targets: person, bird.
+        delays: from light to the start of motion, the field's among them [s].
+        seconds: of each run [s].
+        closed_loop: whether both ways are compared with the zoom view's correction too, at the field's delay.
+    """
+
+    seeds: int = 5
+    targets: tuple[str, ...] = ("person", "bird")
+    delays: tuple[float, ...] = (0.0, 0.1, FIELD_S, 0.3, 0.4, 0.5, 0.6)
+    seconds: float = SECONDS
+    closed_loop: bool = True
+
+
+def run(settings: DelaySettings) -> list[Row]:
+    """Calibrate the rig once, then follow each target at each delay, with and without; one row each."""
+    return over_seeds(functools.partial(one, calibrated(settings.seed_base)), settings)
+
+
+def one(calibration: Calibration, settings: DelaySettings, seed: int) -> list[Row]:
+    """All runs of a seed."""
+    cases = [(delay, predict, False) for delay in settings.delays for predict in (True, False)]
+    if settings.closed_loop:
+        cases += [(FIELD_S, predict, True) for predict in (True, False)]
+    rows: list[Row] = []
+    for name in settings.targets:
+        config = hold_config(name, seed)
+        view = record(config, target_of(config, name), settings.seconds, pictures=settings.closed_loop)
+        for delay, predict, closed_loop in cases:
+            late = delayed(config, delay)
+            how = FollowSettings(command_delay_s=late.command_delay_s, predict=predict, closed_loop=closed_loop)
+            found = score(held(calibration, late, name, settings.seconds, how, view))
+            rows.append(
+                {
+                    "seed": seed,
+                    "target": name,
+                    "delay_s": delay,
+                    "predict": predict,
+                    "closed_loop": closed_loop,
+                    "tpo_width": NEVER if found.tpo_width_median is None else found.tpo_width_median,
+                    "tpo_deg": found.tpo_deg_median,
+                    "closeup_yield": found.closeup_yield,
+                    "in_frame_ratio": found.in_frame_ratio or 0.0,
+                }
+            )
+    return rows
+
+
+def delayed(config: RigConfig, delay: float) -> RigConfig:
+    """The same rig with another delay from light to the start of motion [s]."""
+    sim, late = config.sim, {"latency_s": LIGHT_PART * delay}
+    head = dataclasses.replace(sim.head, command_delay_s=(1 - LIGHT_PART) * delay)
+    fixed, zoom = dataclasses.replace(sim.fixed, **late), dataclasses.replace(sim.zoom, **late)
+    return dataclasses.replace(config, sim=dataclasses.replace(sim, fixed=fixed, zoom=zoom, head=head))
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Of each target the curve, medians over the seeds, and how many times prediction makes the offset smaller."""
+    return {name: _of_target([row for row in rows if row["target"] == name]) for name in _targets(rows)}
+
+
+def _targets(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(row["target"] for row in rows))
+
+
+def _of_target(rows: Sequence[Row]) -> dict[str, Any]:
+    def both(delay: float, closed_loop: bool) -> dict[str, float]:
+        ways = [
+            [
+                r["tpo_width"]
+                for r in rows
+                if (r["delay_s"], r["closed_loop"], r["predict"]) == (delay, closed_loop, way)
+            ]
+            for way in (True, False)
+        ]
+        predicted, seen = (float(np.median(way)) if way else math.nan for way in ways)
+        return {"with": predicted, "without": seen, "times": seen / predicted}
+
+    delays = sorted({row["delay_s"] for row in rows})
+    curve = {f"{1e3 * delay:.0f} ms": both(delay, False) for delay in delays}
+    return {"wide view alone": curve, "closed loop": both(FIELD_S, True)}
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The targets for which prediction is not worth what is wanted; of the whole pipeline, where that was measured."""
+    lost = []
+    for name, figures in summary.items():
+        times = figures["closed loop"]["times"]
+        if math.isnan(times):
+            times = figures["wide view alone"][f"{1e3 * FIELD_S:.0f} ms"]["times"]
+        if not times >= WANTED:
+            lost.append(name)
+    return lost
+
+
+def describe(settings: DelaySettings, summary: Mapping[str, Any]) -> str:
+    """A line for each target and delay."""
+    lines = []
+    for name, figures in summary.items():
+        lines += [[f"{name}, {delay}", *found.values()] for delay, found in figures["wide view alone"].items()]
+        if settings.closed_loop:
+            lines.append([f"{name}, {1e3 * FIELD_S:.0f} ms, closed loop", *figures["closed loop"].values()])
+    return (
+        f"median offset over the width, with prediction and without, {seeds_of(settings)}; "
+        f"at least {WANTED:g} times is wanted at {1e3 * FIELD_S:.0f} ms\n"
+        + table(("", "with", "without", "times"), lines)
+    )
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Offset over the delay: each seed a point, medians joined."""
+    names = _targets(rows)
+    for ax, name in zip(np.ravel(figure.subplots(1, len(names), sharey=True)), names, strict=True):
+        for predict, label in ((True, "with prediction"), (False, "without")):
+            mine = [r for r in rows if (r["target"], r["predict"], r["closed_loop"]) == (name, predict, False)]
+            delays = sorted({row["delay_s"] for row in mine})
+            medians = [np.median([row["tpo_width"] for row in mine if row["delay_s"] == delay]) for delay in delays]
+            (line,) = ax.semilogy([1e3 * delay for delay in delays], medians, label=label)
+            at, offsets = [1e3 * row["delay_s"] for row in mine], [row["tpo_width"] for row in mine]
+            ax.semilogy(at, offsets, ".", color=line.get_color(), alpha=0.5)
+        ax.set(title=name, xlabel="delay from light to motion [ms]", ylabel="median offset / width")
+    ax.legend(frameon=False)
+
+
+SETTINGS = DelaySettings()
+EXPERIMENT = Experiment(
+    "delay",
+    "The offset in the close-up with prediction and without, over the delay of cameras and head.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, delays=(0.0, FIELD_S, 0.6), seconds=6.0, closed_loop=False),
+    run,
+    summarise,
+    describe,
+    plot,
+    missed,
+)
+
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

@@ -1,0 +1,130 @@
+"""What the wide camera sees of a scene, rendered and searched once, so that it can be followed many times over.
+
+Its frames and what is found in them depend neither on where the zoom camera looks nor on how late they come. A world
+opened on such a view renders the zoom camera only, and nothing at all where nobody looks through it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from cotarget.config import RigConfig, TargetConfig
+from cotarget.detection import Detection, make_detector
+from cotarget.rig import Camera, Frame, Image
+from cotarget.sim.world import SimWorld
+
+QUICKLY = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # without loss, at a third of the size
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One frame.
+
+    Attributes:
+        detections: in it.
+        picture: as a PNG; None where pictures were not kept.
+        mask: the detector's foreground, likewise.
+    """
+
+    detections: tuple[Detection, ...]
+    picture: bytes | None = None
+    mask: bytes | None = None
+
+
+@dataclass(frozen=True)
+class WideView:
+    """The frames of one run by their times.
+
+    Attributes:
+        frames: by microseconds.
+        pictures: whether they were kept.
+    """
+
+    frames: Mapping[int, Seen] = field(repr=False)
+    pictures: bool
+
+    def at(self, t: float) -> Seen:
+        """The frame of a time [s]."""
+        return self.frames[_key(t)]
+
+
+def record(config: RigConfig, target: TargetConfig, seconds: float, *, pictures: bool = True) -> WideView:
+    """Look through the wide camera alone, and search each frame.
+
+    Args:
+        config: the rig and its world.
+        target: what is looked for.
+        seconds: for how long [s].
+        pictures: whether frames and masks are kept, for who looks for the target in the zoom view too.
+    """
+    frames: dict[int, Seen] = {}
+    detector = make_detector(target, config.rate_hz)
+    with SimWorld(config, rendered=("fixed",)).rig as rig:
+        t: float | None = None
+        while t is None or t < seconds:
+            frame = rig.fixed.read(newer_than=t)
+            t, found = frame.t, tuple(detector.detect(frame))
+            frames[_key(t)] = Seen(found, _png(frame.image), _png(detector.mask)) if pictures else Seen(found)
+    return WideView(frames, pictures)
+
+
+def open_on(view: WideView, config: RigConfig, *, closed_loop: bool) -> tuple[SimWorld, "RecordedDetector"]:
+    """A world whose wide frames are those recorded, and the detector that finds in them what was found.
+
+    Args:
+        view: of the same world, whatever its latencies.
+        config: the rig and its world.
+        closed_loop: whether the zoom camera is rendered.
+    """
+    assert view.pictures or not closed_loop, "the zoom view is searched for what the wide view shows"
+    world = SimWorld(config, rendered=("zoom",) if closed_loop else ())
+    if closed_loop:
+        world.rig.fixed = _RecordedCamera(world.rig.fixed, view)
+    return world, RecordedDetector(view)
+
+
+class RecordedDetector:
+    """Finds in a frame what was found in it before."""
+
+    def __init__(self, view: WideView) -> None:
+        self._view = view
+        self.mask: Image | None = None
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """What was found, best first."""
+        seen = self._view.at(frame.t)
+        self.mask = None if seen.mask is None else _picture(seen.mask, cv2.IMREAD_GRAYSCALE)
+        return list(seen.detections)
+
+
+class _RecordedCamera:
+    """A camera that delivers when the simulated one does, and what was recorded."""
+
+    def __init__(self, camera: Camera, view: WideView) -> None:
+        self._camera, self._view = camera, view
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px]."""
+        return self._camera.size
+
+    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
+        """As the simulated camera."""
+        t = self._camera.read(newer_than, timeout).t
+        picture = self._view.at(t).picture
+        assert picture is not None, "pictures were kept"
+        return Frame(_picture(picture, cv2.IMREAD_COLOR), t)
+
+
+def _key(t: float) -> int:
+    return round(t * 1e6)
+
+
+def _png(image: Image | None) -> bytes | None:
+    return None if image is None else cv2.imencode(".png", image, QUICKLY)[1].tobytes()
+
+
+def _picture(png: bytes, flags: int) -> Image:
+    return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), flags))
