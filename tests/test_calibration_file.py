@@ -141,6 +141,12 @@ def edited(tmp_path, edit):
     (lambda t: t["board"].update(square=0), "board.square: 0 is not greater than zero"),
     (lambda t: t.update(board=None), "board: is null, but there are views"),
     (lambda t: t["views"][1].update(camera="left"), r"views\[1\].camera: 'left' is not one of: fixed, zoom"),
+    (lambda t: t.update(T_zoom_fixed=1), "unknown key 'T_zoom_fixed'; valid here: T_head_zoom, T_zoom0_fixed, board"),
+    (lambda t: t["fixed"].update(k1=0.0), "unknown key 'fixed.k1'; valid here: cx, cy, distortion, fx, fy, size"),
+    (lambda t: t["zoom"]["stops"][1].update(focal=0.0), r"unknown key 'zoom.stops\[1\].focal'; valid here: cx"),
+    (lambda t: t["T_head_zoom"].update(rotvec=[0] * 3),
+     "unknown key 'T_head_zoom.rotvec'; valid here: rotvec_deg, translation"),
+    (lambda t: t["views"][0].update(pan_deg=1), r"unknown key 'views\[0\].pan_deg'; valid here: board"),
     (lambda t: t["views"][0]["corners_px"].pop(), r"views\[0\].corners_px: has 53 values where 54 are wanted"),
 ])  # fmt: skip
 def test_errors_name_the_file_and_the_key_in_one_line(tmp_path, edit, message):
@@ -152,8 +158,16 @@ def test_errors_name_the_file_and_the_key_in_one_line(tmp_path, edit, message):
 
 
 @pytest.mark.parametrize(("content", "message"), [
-    (b"", "is not JSON"), (b"[1]", "holds no JSON object"), (b"\xff\xfe", "not UTF-8"),
-    (b'{"schema": 1e999}', "schema inf"),
+    (b"", "is empty; give a calibration.json, as cotarget calibrate writes it"),
+    (b"[1]", "holds no JSON object; give a"), (b"\xff\xfe", "not UTF-8"),
+    (b'{"schema": 2, "fi', "is not JSON: .*; give a"),
+    (b'backend = "sim"\n[sim]\nseed = 1\n', "is TOML; give a calibration.json"),
+    (b'{"schema": 1e999}', "is no calibration; give a"),
+    (b'{"schema": 1e999, "fixed": 1}', "schema inf"),
+    (b'{"schema": 1, "board": {}, "pitch_mm": null, "captures": []}',
+     "is no calibration, but the index of captures: cotarget calibrate --from its folder makes one of them; give a"),
+    (b'{"schema": 1, "versions": {}, "config": null}',
+     "is no calibration, but what a capture session or a recording says of itself; give a calibration.json"),
 ])  # fmt: skip
 def test_what_is_no_calibration_at_all(tmp_path, content, message):
     path = tmp_path / "c.json"

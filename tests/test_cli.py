@@ -143,7 +143,7 @@ MISTAKES = {
     "no calibration": (changed([*AIM, "--depth", "5"], "--calibration", "none.json"), ["none.json: no such file"]),
     "half a calibration": (changed([*AIM, "--depth", "5"], "--calibration", "broken.json"),
                            ["broken.json: is not JSON"]),
-    "an empty calibration": (changed(FOLLOW, "--calibration", "empty.json"), ["empty.json: missing key"]),
+    "an empty calibration": (changed(FOLLOW, "--calibration", "empty.json"), ["empty.json: is no calibration"]),
     "another aspect ratio": (changed(FOLLOW, "--calibration", "wide.json"), ["640x480", "640x360", "aspect ratio"]),
     "another aspect ratio in aim": ([*AIM, "--depth", "5", "--rig", "other_shape.toml"], ["640x360", "640x480"]),
     "no hand-eye part": (changed([*AIM, "--depth", "5"], "--calibration", "headless.json"),

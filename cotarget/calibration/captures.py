@@ -17,9 +17,10 @@ import numpy as np
 
 from cotarget.calibration import parsing
 from cotarget.calibration.atomic import write_atomically
-from cotarget.calibration.file import parse_board, write_board
+from cotarget.calibration.file import write_board
 from cotarget.calibration.model import CameraName, Capture
 from cotarget.calibration.parsing import Table, get
+from cotarget.calibration.reading import parse_board
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.rig import Image
@@ -98,7 +99,8 @@ def read_index(directory: Path) -> CaptureIndex:
     path = directory / INDEX
     if not directory.is_dir():
         raise CalibrationError(f"{directory}: no such folder; give a folder of captures")
-    table = parsing.read_json(path, SCHEMA)
+    table = parsing.read_json(path, "give a folder of captures, as cotarget calibrate --captures DIR makes one")
+    parsing.check_schema(path, table, SCHEMA)
     try:
         pitch = get(table, "pitch_mm")
         rows = parsing.as_list(get(table, "captures"), "captures")

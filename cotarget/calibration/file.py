@@ -7,29 +7,28 @@ that a refit starts from the very same numbers.
 """
 
 import dataclasses
-import itertools
 import json
 import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from cotarget.calibration import parsing
 from cotarget.calibration.atomic import write_atomically
-from cotarget.calibration.model import Calibration, Covariance, HeldOut, Rejected, Residuals, View
-from cotarget.calibration.parameters import EVERY_BLOCK, parameter_names
-from cotarget.calibration.parsing import Table, get, join
+from cotarget.calibration.model import Calibration, Residuals, View
+from cotarget.calibration.parsing import Table
+from cotarget.calibration.reading import RESIDUAL_KEYS, parse_calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
-from cotarget.errors import CalibrationError
+from cotarget.errors import CalibrationError, choices
 from cotarget.geometry import pose_dict
-from cotarget.pantilt import HeadGeometry
 
 SCHEMA = 2
-# Rounding leaves a covariance, scaled to a unit diagonal, no less symmetric and its smallest eigenvalue no further
-# below zero than this, for every parameter.
-ROUNDING = 1e-9
+OWN_KEYS = {"fixed", "zoom", "T_zoom0_fixed"}  # of which a calibration of any version has one
+WANTED = "give a calibration.json, as cotarget calibrate writes it"
+OTHERS = (
+    ({"captures", "board"}, "the index of captures: cotarget calibrate --from its folder makes one of them"),
+    ({"versions", "config"}, "what a capture session or a recording says of itself"),
+)
 
 
 def save_calibration(path: Path, calibration: Calibration) -> None:
@@ -38,9 +37,36 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
     Raises:
         CalibrationError: the file cannot be written, or the calibration holds a number that is not finite.
     """
+    try:
+        text = _readable(_table(calibration))
+    except ValueError:
+        raise CalibrationError(f"{path}: not written: the calibration holds a number that is not finite") from None
+    write_atomically(path, text.encode())
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Read calibration.json.
+
+    Raises:
+        CalibrationError: the file is missing, malformed or something else; the message names the file and the key.
+    """
+    table = parsing.read_json(path, WANTED)
+    if not (table.keys() & OWN_KEYS):
+        raise CalibrationError(f"{path}: is no calibration{_what(table)}; {WANTED}")
+    parsing.check_schema(path, table, SCHEMA)
+    try:
+        found = parse_calibration(table)
+        _refuse_unknown(table, _table(found))
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+    return found
+
+
+def _table(calibration: Calibration) -> dict[str, Any]:
+    """What the file holds."""
     T_head_zoom = calibration.T_head_zoom
     covariance = calibration.covariance
-    table = {
+    return {
         "schema": SCHEMA,
         "fixed": {"size": list(calibration.fixed.size), **_write_intrinsics(calibration.fixed)},
         "zoom": {
@@ -72,73 +98,37 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
         "provenance": dict(calibration.provenance),
         "views": [_write_view(view) for view in calibration.views],
     }
-    try:
-        text = _readable(table)
-    except ValueError:
-        raise CalibrationError(f"{path}: not written: the calibration holds a number that is not finite") from None
-    write_atomically(path, text.encode())
 
 
-def load_calibration(path: Path) -> Calibration:
-    """Read calibration.json.
-
-    Raises:
-        CalibrationError: the file is missing or malformed; the message names the file and the key.
-    """
-    table = parsing.read_json(path, SCHEMA)
-    try:
-        return _parse(table)
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}: {error}") from None
+def _what(table: Table) -> str:
+    """What a file is that is no calibration, where that can be told."""
+    return next((f", but {what}" for keys, what in OTHERS if table.keys() >= keys), "")
 
 
-def check_covariance(covariance: Covariance, stops: int) -> None:
-    """Refuse a covariance that is none, or of other parameters than a rig has.
+def _refuse_unknown(read: Any, written: Any, where: str = "") -> None:
+    """Refuse a key that nothing is read from, which somebody may have meant to change something by.
 
     Args:
-        covariance: of a calibration.
-        stops: how many its zoom lens has.
+        read: from the file.
+        written: what the same calibration would be written as.
+        where: the key of both.
 
     Raises:
-        CalibrationError: with the key in the file.
+        CalibrationError: with the keys that are known there.
     """
-    names, C = covariance.parameters, covariance.matrix
-    known = parameter_names(EVERY_BLOCK, stops)
-    if unknown := [name for name in names if name not in known]:
-        raise CalibrationError(f"covariance.parameters: '{unknown[0]}' is no parameter; they are: {', '.join(known)}")
-    if not names:
-        raise CalibrationError("covariance.parameters: is empty; a method that tells no uncertainty has null instead")
-    if twice := [name for i, name in enumerate(names) if name in names[:i]]:
-        raise CalibrationError(f"covariance.parameters: '{twice[0]}' is there twice")
-    variances = np.diagonal(C)
-    for i in np.flatnonzero((variances < 0) | ((variances == 0) & C.any(axis=1))):
-        raise CalibrationError(
-            f"covariance.matrix[{i}][{i}]: {variances[i]:g} is no variance of {names[i]}; that is greater than zero"
-        )
-    scale = np.where(variances > 0, np.sqrt(variances), 1.0)
-    with np.errstate(over="ignore"):
-        R = C / scale / scale[:, None]
-    rounding = ROUNDING * len(C)
-    if not np.isfinite(R).all() or np.abs(R - R.T).max() > rounding or np.linalg.eigvalsh(R)[0] < -rounding:
-        raise CalibrationError("covariance.matrix: is no covariance: not symmetric, or with a variance below zero")
+    if isinstance(read, dict) and isinstance(written, dict):
+        for key, value in read.items():
+            if key not in written:
+                raise CalibrationError(f"unknown key '{parsing.join(where, key)}'; valid here: {choices(written)}")
+            _refuse_unknown(value, written[key], parsing.join(where, key))
+    elif isinstance(read, list) and isinstance(written, list):
+        for i, (a, b) in enumerate(zip(read, written, strict=False)):
+            _refuse_unknown(a, b, f"{where}[{i}]")
 
 
 def write_board(board: BoardConfig) -> dict[str, Any]:
     """Write the board as a JSON object."""
     return {"kind": board.kind, "corners": list(board.corners), "square": board.square}
-
-
-def parse_board(value: Any, where: str) -> BoardConfig:
-    """Read a board from a JSON object."""
-    table = parsing.as_table(value, where)
-    kind = get(table, "kind", where)
-    if kind not in ("chessboard", "charuco"):
-        raise CalibrationError(f"{join(where, 'kind')}: {parsing.short(kind)} is not one of: chessboard, charuco")
-    return BoardConfig(
-        kind=kind,
-        corners=parsing.as_size(get(table, "corners", where), join(where, "corners")),
-        square=parsing.as_number(get(table, "square", where), join(where, "square"), positive=True),
-    )
 
 
 def _readable(table: dict[str, Any]) -> str:
@@ -173,18 +163,6 @@ def _write_residuals(residuals: Residuals) -> dict[str, Any]:
     }
 
 
-RESIDUAL_KEYS = (
-    "fixed_rms_px",
-    "zoom_rms_px",
-    "stereo_rms_px",
-    "handeye_rms_px",
-    "fixed_views",
-    "zoom_views",
-    "pairs",
-    "outliers",
-)
-
-
 def _write_view(view: View) -> dict[str, Any]:
     return {
         "camera": view.camera,
@@ -198,154 +176,3 @@ def _write_view(view: View) -> dict[str, Any]:
             corner if seen else None for corner, seen in zip(view.corners_px.tolist(), view.seen, strict=True)
         ],
     }
-
-
-def _parse(table: Table) -> Calibration:
-    T_head_zoom = get(table, "T_head_zoom")
-    head = parsing.as_table(get(table, "head"), "head")
-    pitch = get(table, "pitch_mm")
-    board = None if get(table, "board") is None else parse_board(table["board"], "board")
-    views = parsing.as_list(get(table, "views"), "views")
-    if views and board is None:
-        raise CalibrationError("board: is null, but there are views of one")
-    fixed = parsing.as_table(get(table, "fixed"), "fixed")
-    warp = parsing.as_numbers(get(table, "board_warp"), "board_warp", 2)
-
-    def angle(name: str) -> float:
-        return math.radians(parsing.as_number(get(head, f"{name}_deg", "head"), f"head.{name}_deg"))
-
-    zoom = _parse_lens(parsing.as_table(get(table, "zoom"), "zoom"))
-    return Calibration(
-        fixed=_parse_intrinsics(fixed, parsing.as_size(get(fixed, "size", "fixed"), "fixed.size"), "fixed"),
-        zoom=zoom,
-        T_zoom0_fixed=parsing.as_pose(get(table, "T_zoom0_fixed"), "T_zoom0_fixed"),
-        T_head_zoom=None if T_head_zoom is None else parsing.as_pose(T_head_zoom, "T_head_zoom"),
-        head=HeadGeometry(
-            axis_offset=parsing.as_number(get(head, "axis_offset", "head"), "head.axis_offset"),
-            squareness=angle("squareness"),
-            pan_scale=parsing.as_number(get(head, "pan_scale", "head"), "head.pan_scale", positive=True),
-            tilt_scale=parsing.as_number(get(head, "tilt_scale", "head"), "head.tilt_scale", positive=True),
-            pan_zero=angle("pan_zero"),
-            tilt_zero=angle("tilt_zero"),
-        ),
-        jitter=math.radians(_at_least(0, get(head, "jitter_deg", "head"), "head.jitter_deg")),
-        pitch_mm=None if pitch is None else parsing.as_number(pitch, "pitch_mm", positive=True),
-        residuals=_parse_residuals(get(table, "residuals")),
-        covariance=_parse_covariance(get(table, "covariance"), len(zoom.stops)),
-        held_out=_parse_held_out(get(table, "held_out")),
-        board_warp=(warp[0], warp[1]),
-        board=board,
-        views=tuple(_parse_view(view, f"views[{i}]", board) for i, view in enumerate(views) if board is not None),
-        provenance=parsing.as_table(get(table, "provenance"), "provenance"),
-    )
-
-
-def _parse_intrinsics(table: Table, size: tuple[int, int], where: str) -> Intrinsics:
-    fx, fy = (parsing.as_number(get(table, k, where), join(where, k), positive=True) for k in ("fx", "fy"))
-    cx, cy = (parsing.as_number(get(table, k, where), join(where, k)) for k in ("cx", "cy"))
-    k1, k2, p1, p2, k3 = parsing.as_numbers(get(table, "distortion", where), join(where, "distortion"), 5)
-    return Intrinsics(size=size, focal_px=(fx, fy), center_px=(cx, cy), distortion=(k1, k2, p1, p2, k3))
-
-
-def _parse_lens(table: Table) -> ZoomLens:
-    size = parsing.as_size(get(table, "size", "zoom"), "zoom.size")
-    stops = parsing.as_list(get(table, "stops", "zoom"), "zoom.stops")
-    if not stops:
-        raise CalibrationError("zoom.stops: is empty; at least one calibrated focal length is needed")
-    nominal, intrinsics, pupil = [], [], []
-    for i, value in enumerate(stops):
-        where = f"zoom.stops[{i}]"
-        stop = parsing.as_table(value, where)
-        nominal.append(parsing.as_number(get(stop, "nominal_px", where), join(where, "nominal_px"), positive=True))
-        intrinsics.append(_parse_intrinsics(stop, size, where))
-        pupil.append(parsing.as_number(get(stop, "pupil", where), join(where, "pupil")))
-    if any(b <= a for a, b in itertools.pairwise(nominal)):
-        raise CalibrationError("zoom.stops: the values of nominal_px do not increase")
-    if pupil[0] != 0:
-        raise CalibrationError("zoom.stops[0].pupil: is not 0, from which the others are counted")
-    return ZoomLens(tuple(nominal), tuple(intrinsics), tuple(pupil))
-
-
-def _parse_residuals(value: Any) -> Residuals | None:
-    if value is None:
-        return None
-    where = "residuals"
-    table = parsing.as_table(value, where)
-    numbers: dict[str, Any] = {}
-    for key in RESIDUAL_KEYS:
-        item = get(table, key, where)
-        if key.endswith("_px"):
-            missing = item is None and key in ("handeye_rms_px", "stereo_rms_px")
-            numbers[key] = None if missing else _at_least(0, item, join(where, key))
-        else:
-            numbers[key] = parsing.as_whole(item, join(where, key))
-    rejected = []
-    for i, item in enumerate(parsing.as_list(get(table, "rejected", where), "residuals.rejected")):
-        entry = parsing.as_table(item, f"residuals.rejected[{i}]")
-        name, reason = (
-            parsing.as_text(get(entry, k, f"residuals.rejected[{i}]"), f"residuals.rejected[{i}].{k}")
-            for k in ("name", "reason")
-        )
-        rejected.append(Rejected(name, reason))
-    return Residuals(**numbers, rejected=tuple(rejected))
-
-
-def _parse_held_out(value: Any) -> HeldOut | None:
-    if value is None:
-        return None
-    table = parsing.as_table(value, "held_out")
-    lowest = {"measured_px": 0, "predicted_px": 0, "corners_rms_px": 0, "ratio": 0, "widened": 1}
-    numbers = {
-        name: _at_least(least, get(table, name, "held_out"), f"held_out.{name}") for name, least in lowest.items()
-    }
-    return HeldOut(views=parsing.as_whole(get(table, "views", "held_out"), "held_out.views"), **numbers)
-
-
-def _at_least(lowest: int, value: Any, where: str) -> float:
-    """Expect a number that is not below some lowest one."""
-    number = parsing.as_number(value, where)
-    if number < lowest:
-        raise CalibrationError(f"{where}: {number:g} is less than {lowest}")
-    return number
-
-
-def _parse_covariance(value: Any, stops: int) -> Covariance | None:
-    if value is None:
-        return None
-    table = parsing.as_table(value, "covariance")
-    names = parsing.as_list(get(table, "parameters", "covariance"), "covariance.parameters")
-    rows = parsing.as_list(get(table, "matrix", "covariance"), "covariance.matrix", len(names))
-    matrix = [parsing.as_numbers(r, f"covariance.matrix[{i}]", len(names)) for i, r in enumerate(rows)]
-    covariance = Covariance(
-        parameters=tuple(parsing.as_text(n, f"covariance.parameters[{i}]") for i, n in enumerate(names)),
-        matrix=np.array(matrix).reshape(len(names), len(names)),
-    )
-    check_covariance(covariance, stops)
-    return covariance
-
-
-def _parse_view(value: Any, where: str, board: BoardConfig) -> View:
-    table = parsing.as_table(value, where)
-    camera = get(table, "camera", where)
-    if camera not in ("fixed", "zoom"):
-        raise CalibrationError(f"{where}.camera: {parsing.short(camera)} is not one of: fixed, zoom")
-    focal = get(table, "focal_px", where)
-    source = get(table, "source", where)
-    columns, rows = board.corners
-    corners = parsing.as_list(get(table, "corners_px", where), f"{where}.corners_px", columns * rows)
-    pan, tilt, t = (parsing.as_number(get(table, k, where), join(where, k)) for k in ("pan", "tilt", "t"))
-    return View(
-        camera=camera,
-        corners_px=np.array(
-            [
-                (np.nan, np.nan) if c is None else parsing.as_numbers(c, f"{where}.corners_px[{i}]", 2)
-                for i, c in enumerate(corners)
-            ]
-        ),
-        board=parsing.as_whole(get(table, "board", where), join(where, "board")),
-        pan=pan,
-        tilt=tilt,
-        focal_px=None if focal is None else parsing.as_number(focal, join(where, "focal_px"), positive=True),
-        t=t,
-        source=None if source is None else parsing.as_text(source, join(where, "source")),
-    )

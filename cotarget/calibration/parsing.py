@@ -5,6 +5,7 @@ Messages do not name the file; the caller, who knows it, puts it in front.
 
 import json
 import math
+import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,32 +16,53 @@ from cotarget.geometry import RigidTransform, pose
 Table = Mapping[str, Any]
 
 
-def read_json(path: Path, schema: int) -> Table:
-    """Read a JSON file and check its schema number.
+def read_json(path: Path, wanted: str) -> Table:
+    """Read a JSON object from a file.
+
+    Args:
+        path: of the file.
+        wanted: what to give instead, where it holds something else.
 
     Raises:
-        CalibrationError: the file is missing, is not JSON, or has another schema.
+        CalibrationError: the file is missing, or is not JSON; the message says what it is, if that can be told.
     """
 
     def refuse(constant: str) -> None:
         raise CalibrationError(f"{path}: holds the number {constant}, which is not finite")
 
     try:
-        table = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+        text = path.read_text(encoding="utf-8")
+        table = json.loads(text, parse_constant=refuse)
     except FileNotFoundError:
         raise CalibrationError(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise CalibrationError(f"{path}: cannot be read: {reason}") from None
     except (json.JSONDecodeError, RecursionError) as error:
-        raise CalibrationError(f"{path}: is not JSON: {error}") from None
+        what = "is empty" if not text.strip() else "is TOML" if _is_toml(text) else f"is not JSON: {error}"
+        raise CalibrationError(f"{path}: {what}; {wanted}") from None
     if not isinstance(table, dict):
-        raise CalibrationError(f"{path}: holds no JSON object")
+        raise CalibrationError(f"{path}: holds no JSON object; {wanted}")
+    return table
+
+
+def _is_toml(text: str) -> bool:
+    try:
+        return bool(tomllib.loads(text))
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return False
+
+
+def check_schema(path: Path, table: Table, schema: int) -> None:
+    """Refuse a file of another version.
+
+    Raises:
+        CalibrationError: it has another schema number, or none.
+    """
     if "schema" not in table:
         raise CalibrationError(f"{path}: missing key 'schema'; this version reads schema {schema}")
     if table["schema"] != schema or isinstance(table["schema"], bool):
         raise CalibrationError(f"{path}: schema {table['schema']!r} is not {schema}, the one that this version reads")
-    return table
 
 
 def get(table: Table, key: str, where: str = "") -> Any:

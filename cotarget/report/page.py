@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cotarget.calibration.file import check_covariance
 from cotarget.calibration.model import Calibration
+from cotarget.calibration.reading import check_covariance
 from cotarget.errors import CalibrationError
 from cotarget.report import markup, pictures
 from cotarget.report.advice import advice, board_in_words
