@@ -345,7 +345,7 @@ def test_a_unit_that_comes_back_was_halted_and_goes_on(bench, wait):
         assert move.error is None
         assert bench.unit.position("P") == 3000
     else:  # whoever sends without waiting sends again; an old wish is not taken up after a silence
-        assert "the line was silent and the head was halted" in str(move.error)
+        assert "did not answer in time, and the head was halted" in str(move.error)
         assert bench.unit.position("P") < 1000
         bench.until(lambda: not bench.loop.snapshot.moving)
     again = bench.move(100, 0)
@@ -365,7 +365,7 @@ def test_a_move_is_not_taken_up_again_for_ever_nor_after_a_halt(bench):
         )
         bench.run(0.8)
         assert move.done.is_set() == (silence >= 3)
-    assert "the line was silent" in str(move.error)
+    assert "did not answer in time, and the head was halted" in str(move.error)
     move = bench.move(-3000, 0, wait=True)
     bench.run(0.3)
     back = bench.clock.now() + 0.7

@@ -261,6 +261,25 @@ def test_the_thread_halts_until_the_head_obeys(real, caplog):
 
 
 @pytest.mark.wire
+@pytest.mark.parametrize("why", [None, ValueError])
+def test_a_head_that_cannot_be_halted_is_told_of_once(caplog, why):
+    """By the log when it happens, and by whatever ends the program; not by each that tries again."""
+    rig = RealRig()
+    rig.head.failing = 1000
+    ends = pytest.raises(OSError, match="cable") if why is None else pytest.raises(why)
+    with ends, SafeRig(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
+        safe.head.move(1.0, 0.0)
+        deadline = time.monotonic() + DEADLINE_S
+        while not any("will be halted again" in record.getMessage() for record in caplog.records):
+            assert time.monotonic() < deadline
+        if why is not None:
+            raise why
+    told = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+    assert told[0] == "the head could not be halted and will be halted again: the cable is out"
+    assert told[1:] == ([] if why is None else ["the head could not be halted to the end"])
+
+
+@pytest.mark.wire
 def test_a_clock_that_fails_stops_the_head():
     def now():
         if broken:

@@ -16,7 +16,8 @@ from cotarget.hardware.d46lost import PositionLostError
 from cotarget.hardware.d46track import Snapshot, Track
 from cotarget.hardware.d46unit import HALT_NOW, HALT_TRIES, Unit, halt_outright, refuse_events, restarted
 from cotarget.hardware.d46wishes import CutError, DroppedError, Halt, Move, drained
-from cotarget.hardware.line import QUICK_S, Line, LostError, RestartedError, SilentError
+from cotarget.hardware.line import QUICK_S, Line
+from cotarget.hardware.lineerrors import LostError, RestartedError, SilentError
 from cotarget.rig import Clock
 
 log = logging.getLogger(__name__)
@@ -225,7 +226,7 @@ class Loop:
                         track.goal = None
                     self._expect_motion()
                     if self._active is not None:
-                        raise CutError(f"the line was silent and the head was halted: {error}") from error
+                        raise CutError(f"{error}, and the head was halted") from error
                 if reason := unless():
                     raise DroppedError(reason) from error
                 if attempt == TRIES - 1:

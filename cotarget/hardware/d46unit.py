@@ -14,7 +14,8 @@ from cotarget.hardware.claim import claimed
 from cotarget.hardware.clock import MonotonicClock
 from cotarget.hardware.d46 import DELIMITER, HALT, AxisName, RefusedError, ReplyError, command
 from cotarget.hardware.d46lost import PositionLostError
-from cotarget.hardware.line import PATIENCE_S, Line, RestartedError, SilentError, open_line
+from cotarget.hardware.line import PATIENCE_S, Line, open_line
+from cotarget.hardware.lineerrors import RestartedError, SilentError
 from cotarget.hwconfig import HardwareHead
 
 log = logging.getLogger(__name__)

@@ -13,7 +13,8 @@ from cotarget.hardware.d46loop import Loop
 from cotarget.hardware.d46lost import LostPosition, PositionLostError
 from cotarget.hardware.d46unit import HALT_NOW, AxisFacts, Unit, connect
 from cotarget.hardware.d46wishes import DroppedError, Halt, Move
-from cotarget.hardware.line import LostError, open_line
+from cotarget.hardware.line import open_line
+from cotarget.hardware.lineerrors import LostError
 from cotarget.hwconfig import HardwareHead
 from cotarget.rig import Clock, PanTiltLimits, PanTiltState
 
@@ -142,8 +143,9 @@ class D46Head:
         if not self._thread.is_alive() and not isinstance(self._dead, LostError):
             with contextlib.suppress(DeviceError):
                 self._line.write(HALT_NOW)
-        why = self._dead or "it does not answer"
-        raise DeviceError(f"the pan-tilt unit at {self._line.name} did not acknowledge the halt: {why}")
+        if self._dead is not None:
+            raise DeviceError(str(self._dead)) from self._dead
+        raise DeviceError(f"the pan-tilt unit at {self._line.name} did not acknowledge a halt: it does not answer")
 
     def close(self) -> None:
         """Halt, end the thread and release the port; nothing is raised, and a second time does nothing."""

@@ -12,6 +12,7 @@ from typing import TypeVar
 from cotarget.errors import DeviceError
 from cotarget.hardware import d46
 from cotarget.hardware.d46 import DELIMITER, HALT, RefusedError, ReplyError, command, shown
+from cotarget.hardware.lineerrors import LostError, RestartedError, SilentError
 from cotarget.hardware.serialport import Port, open_port
 from cotarget.rig import Clock
 
@@ -31,18 +32,6 @@ WORDY_ANSWER = 100  # the longest of a healthy unit, with its echo [bytes]
 TERSE_ANSWER = 40  # the longest but for its version, once echo and words are off [bytes]
 MOST_LINES = 64  # that are skipped in search of one answer
 HEARD = 200  # so much of what was last heard is kept for error messages [bytes]
-
-
-class SilentError(DeviceError):
-    """No answer came in time."""
-
-
-class LostError(DeviceError):
-    """The port itself failed: unplugged, or closed by the other side."""
-
-
-class RestartedError(DeviceError):
-    """The unit was switched off and on, and has forgotten where it is."""
 
 
 @dataclass(frozen=True)
@@ -145,12 +134,12 @@ class Line:
         self.write(DELIMITER + HALT if self.hurry() else DELIMITER)
         noise += self.drain(QUIET_S, DRAIN_S)
         if d46.BANNER.search(noise):
-            raise self._restarted()
+            raise RestartedError(self.name)
         if self._answers(command("E"), lambda text: not d46.echoing(text), QUICK_S):
             return False
         self.write(DELIMITER + HALT)
         if d46.BANNER.search(self.drain(QUIET_S, DRAIN_S)):
-            raise self._restarted()
+            raise RestartedError(self.name)
         back = any(self._answers(command("F"), d46.terse, QUICK_S) for _ in range(LAST_TRIES))
         if not (back and self._answers(command("E"), lambda text: not d46.echoing(text), LAST_S)):
             self.write(DELIMITER + HALT)
@@ -176,7 +165,7 @@ class Line:
         try:
             self._port.write(data)
         except OSError as error:  # pyserial's exceptions are of this kind too
-            raise self._lost(error) from error
+            raise LostError(self.name, error) from error
 
     def close(self) -> None:
         """Release the port."""
@@ -189,6 +178,8 @@ class Line:
 
     def nonsense(self, error: DeviceError) -> DeviceError:
         """What to say of a unit whose answers were no good for the last time."""
+        if isinstance(error, SilentError):
+            return error
         return DeviceError(f"the pan-tilt unit at {self.name} answers, but not what it was asked: {error}")
 
     def _deadline(self, order: bytes, patience: float) -> float:
@@ -255,7 +246,7 @@ class Line:
                 line, _ = self._next_line(deadline)
                 line = self._without_events(line)
                 if d46.BANNER.search(line):
-                    raise self._restarted()
+                    raise RestartedError(self.name)
                 reply = d46.parse(line)
                 well = reply is not None and not reply.refused and right(reply.text)
             except SilentError:
@@ -265,7 +256,7 @@ class Line:
             if well:
                 return True
             if reply is not None and not reply.refused:
-                raise self._restarted()
+                raise RestartedError(self.name)
         return False
 
     def _without_events(self, data: bytes) -> bytes:
@@ -279,19 +270,9 @@ class Line:
             there = self._port.in_waiting
             data = self._port.read(max(there, 1)) if there or wait else b""
         except OSError as error:  # in_waiting raises the system's own, read and write pyserial's
-            raise self._lost(error) from error
+            raise LostError(self.name, error) from error
         self._heard = (self._heard + data)[-HEARD:]
         return data
-
-    def _lost(self, error: OSError) -> LostError:
-        return LostError(
-            f"the line to the pan-tilt unit at {self.name} is lost ({error}); plug it in and open it again"
-        )
-
-    def _restarted(self) -> RestartedError:
-        return RestartedError(
-            f"the pan-tilt unit at {self.name} was switched off and on, so that its position may be lost; open it again"
-        )
 
 
 def open_line(name: str, baud: int, clock: Clock) -> Line:

@@ -50,10 +50,13 @@ class Guard:
         clock: the rig's.
         config: how long without a sign of life, and the stop file.
         threaded: whether a thread calls `watch`. Where none does, each call on the rig has to.
+
+    Attributes:
+        told: why the head could not be halted, as the log has it already; empty where it has not.
     """
 
     def __init__(self, head: PanTilt, clock: Clock, config: SafetyConfig, *, threaded: bool) -> None:
-        self.threaded = threaded
+        self.threaded, self.told = threaded, ""
         self._head, self._clock = head, clock
         self._timeout_s, self._stop_file = config.watchdog_s, config.stop_file
         self._look = StopLook(config.stop_file)  # idle where no thread watches: time does not pass by itself then
@@ -101,7 +104,7 @@ class Guard:
             if self._motion is motion and not interrupted:
                 self._motion = None if arrived else replace(motion, patience_s=0.0, on_its_way=False)
         if interrupted:
-            self._halt("a command was still on its way when the head was halted")
+            self._halt()  # the command may have come behind the halt
         return interrupted
 
     def alive(self, now: float) -> None:
@@ -156,7 +159,7 @@ class Guard:
         else:
             reason = f"neither a fresh frame nor a command for {now - alive_at:.2g} s"
         log.warning("halting the head: %s", reason)
-        self._halt(reason)
+        self._halt()
         return True
 
     def halt(self) -> None:
@@ -180,7 +183,7 @@ class Guard:
         with self._lock:
             self._stopped = reason  # first of all, so that no command slips in behind the halt
         log.warning("emergency stop: %s", reason)
-        self._halt(reason)
+        self._halt()
 
     def clear(self) -> str | None:
         """End this process's emergency stop; return its reason.
@@ -222,9 +225,8 @@ class Guard:
             try:
                 self._head.halt()
                 break
-            except Exception as error:
+            except Exception:  # told by who closes the rig
                 if not left:
-                    log.error("the head could not be halted: %s", error)
                     raise
         with self._lock:
             self._motion = self._owed = None
@@ -233,7 +235,7 @@ class Guard:
         """End the look-out for a stop file."""
         self._look.close()
 
-    def _halt(self, reason: str) -> None:
+    def _halt(self) -> None:
         """Halt the head; where the device fails, say so and owe it."""
         with self._lock:
             motion, self._halts = self._motion, self._halts + 1
@@ -243,7 +245,8 @@ class Guard:
             with self._lock:
                 first, self._owed = self._owed is None, str(error)
             if first and not self._shut:
-                log.error("the head could not be halted (%s) and will be halted again: %s", reason, error)
+                self.told = str(error)
+                log.error("the head could not be halted and will be halted again: %s", error)
             return
         self._rests(motion)
 
@@ -268,10 +271,10 @@ class Guard:
             self._stopped_by_file = reason
         if new:
             log.warning("emergency stop: %s", reason)
-            self._halt(f"emergency stop: {reason}")
+            self._halt()
         return new
 
     def _halt_if_owed(self) -> None:
         """Try again to halt a head that could not be halted."""
         if self._owed is not None:
-            self._halt(self._owed)
+            self._halt()

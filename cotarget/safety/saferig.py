@@ -97,6 +97,13 @@ class SafeRig:
         try:
             self._close(deliver=isinstance(error, Exception))  # a second Ctrl-C says no more than the first
         except Exception as failure:
+            self._tell(failure)
+
+    def _tell(self, failure: BaseException) -> None:
+        """Say why the rig could not be closed, unless that was said before."""
+        if str(failure) == self._guard.told:
+            log.error("the head could not be halted to the end")
+        else:
             log.error("the rig could not be closed: %s", failure)
 
     def _close(self, deliver: bool) -> None:
@@ -118,8 +125,10 @@ class SafeRig:
             except BaseException as error:
                 errors.append(error)
         held.restore()
-        for failure in errors:
+        for failure in errors[1:]:
             log.info("while the rig was closed: %s", failure)
+        if deliver and errors and (interrupt is not None or held.pending):
+            self._tell(errors[0])  # what ends the program now tells nothing of it
         if deliver and interrupt is not None:
             raise interrupt
         if deliver:
