@@ -313,6 +313,29 @@ def test_aim_tells_json_with_the_documented_keys(folder, capsys):
     assert told["range_m"] == pytest.approx(np.linalg.norm(x_zoom), rel=CLOSE)
 
 
+@pytest.mark.parametrize(
+    ("depth", "more", "doubted"),
+    [
+        ("0.01", [], "book fits into the fixed view only from 0.25 m"),  # 0.234 m at 686 px are 640 px at 0.251 m
+        ("0.24", [], "book fits into the fixed view only from 0.25 m"),
+        ("0.26", [], None),
+        (
+            "2",
+            ["--target", "person"],
+            "person fits into the fixed view only from 2.5 m",
+        ),  # 1.75 m at 684 px are 480 px at 2.49 m
+        ("2.6", ["--target", "person"], None),
+    ],
+)
+def test_a_depth_at_which_no_target_fits_into_the_view_is_doubted(folder, capsys, depth, more, doubted):
+    status, out, err = call(capsys, *AIM, "--depth", depth, *more)
+    assert status == 0
+    assert json.loads(out)["depth_plausible"] is (doubted is None)
+    assert len(err.splitlines()) == (doubted is not None)
+    if doubted is not None:
+        assert err == f"cotarget aim: the {doubted} on: is a depth of {depth} m meant?\n"
+
+
 def test_aim_takes_depth_from_a_size_and_focal_length_from_a_close_up(folder, capsys):
     size = str(686 * 0.234 / 12)
     told = aim_json(capsys, *AIM, "--size-px", size, "--target", "book", "--wanted-px", "100", "--rig", "rig.toml")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import cotarget
-from cotarget.cli import calibrating, emulating, operating, running
+from cotarget.cli import aiming, calibrating, emulating, operating, running
 from cotarget.cli.arguments import corners, count, not_negative, number, port, positive
 from cotarget.cli.choosing import add_choice
 from cotarget.errors import CotargetError
@@ -130,7 +130,7 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     aim = command(
-        "aim", running.aim, "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout"
+        "aim", aiming.aim, "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout"
     )
     aim.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
     aim.add_argument("--pixel", type=float, nargs=2, required=True, metavar=("U", "V"), help="in the fixed view [px]")

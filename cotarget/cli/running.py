@@ -1,4 +1,4 @@
-"""The commands that run what was calibrated, and look around: demo, aim, follow, replay, detect, doctor."""
+"""The commands that run what was calibrated, and look around: demo, follow, replay, detect, doctor."""
 
 import argparse
 import dataclasses
@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cotarget.cli.arguments import check_outputs, check_within, nothing, print_json, progress_bar
+from cotarget.cli.arguments import check_outputs, nothing, print_json, progress_bar
 from cotarget.cli.choosing import Choice
 from cotarget.errors import ConfigError
 
@@ -26,78 +26,6 @@ def demo(options: argparse.Namespace) -> None:
         metrics = run_demo(options.out, options.seed, progress)
     print(summary(metrics))
     print(f"pictures, video and metrics.json are in {options.out} ({metrics['wall_s']:.0f} s)")
-
-
-def aim(options: argparse.Namespace) -> None:
-    """Cotarget aim."""
-    import numpy as np
-
-    from cotarget.calibration import load_calibration
-    from cotarget.calibration.stops import SAME_FOCAL
-    from cotarget.config import RigConfig, load_config
-    from cotarget.targeting import Closeup, Reach, aim, depth_of, error_budget, point_at
-
-    config = RigConfig() if options.rig is None else load_config(options.rig)
-    calibration = load_calibration(options.calibration)
-    if options.rig is not None:
-        calibration = calibration.for_streams(*config.stream_sizes)
-    target = None if options.target is None else config.target(options.target)
-    if options.size_px is not None and target is None:
-        raise ConfigError("--size-px needs --target NAME, whose true size gives the depth")
-    if options.wanted_px is not None and target is None:
-        raise ConfigError("--wanted-px needs --target NAME, whose true size gives the focal length")
-    depth = (
-        options.depth
-        if target is None or options.size_px is None
-        else depth_of(calibration, target, options.size_px, np.array(options.pixel))
-    )
-    pitch_mm = calibration.pitch_mm or config.pitch_mm
-    shortest, longest = config.focal_range_px
-    if options.rig is None:  # the calibration knows its own lens's shortest focal length
-        shortest = calibration.zoom.nominal_px[0]
-    reach = Reach(*config.head_limits, (shortest, max(shortest, longest)), step=config.head_step)
-    closeup = (
-        Closeup(target.size, options.wanted_px, target.dimension == "height")
-        if target and options.wanted_px is not None
-        else None
-    )
-    nominal = None if options.focal_mm is None else options.focal_mm / pitch_mm
-    if nominal is not None:
-        shortest, longest = (f * pitch_mm for f in reach.focal_px)
-        check_within("--focal-mm", options.focal_mm, (shortest, longest), "the lens's {} mm")
-    pixel = np.array(options.pixel)
-    size = calibration.fixed.size
-    if not (np.all(pixel >= -0.5) and np.all(pixel <= np.array(size) - 0.5)):
-        raise ConfigError(
-            f"--pixel: ({pixel[0]:g}, {pixel[1]:g}) is not in the fixed camera's {size[0]}x{size[1]} image"
-        )
-    found = aim(
-        calibration, point_at(calibration, pixel, depth), reach, closeup=closeup, nominal_px=nominal, method=options.ik
-    )
-    # The budget speaks of the exact inverse; what the paper's shortcut loses beside it, nothing here knows.
-    budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px) if options.ik == "exact" else None
-    calibrated = calibration.zoom.nominal_px
-    within = calibrated[0] * (1 - SAME_FOCAL) <= found.nominal_px <= calibrated[-1] * (1 + SAME_FOCAL)
-    if not within:
-        print(
-            f"cotarget aim: {found.nominal_px * pitch_mm:.1f} mm is beyond the focal lengths calibrated, "
-            f"{calibrated[0] * pitch_mm:.1f} to {calibrated[-1] * pitch_mm:.1f} mm: the prediction only guesses there",
-            file=sys.stderr,
-        )
-    print_json(
-        {
-            "pan_deg": math.degrees(found.pan),
-            "tilt_deg": math.degrees(found.tilt),
-            "focal_px": found.focal_px,
-            "focal_mm": found.nominal_px * pitch_mm,
-            "focal_limited": found.limited,
-            "focal_calibrated": within,
-            "depth_m": found.depth,
-            "range_m": found.range,
-            "predicted_error_deg": budget and {name: math.degrees(part) for name, part in budget.items()},
-            "predicted_error_px": budget and math.tan(budget["total"]) * found.focal_px,
-        }
-    )
 
 
 def follow(options: argparse.Namespace) -> None:
