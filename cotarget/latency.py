@@ -36,6 +36,7 @@ LONGEST_DELAY = 0.6  # that is looked for, either way [s]
 COARSE = 0.01  # steps of the delays tried first [s]
 FEWEST = 20  # samples of a motion
 AGREEMENT = 0.9  # of both records, as their correlation; less is no measurement
+ASIDE_DEG = 5.0  # a head that looks farther to the side may see more where it looks straight ahead
 EARLY = 0.4  # of a turn's way, in which the head still accelerates
 BOARD_SHARE, BOARD_TURNED = 0.35, 15.0  # of the wide view's width that a board fills, and how it is turned [degrees]
 
@@ -92,12 +93,19 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
     if len(frames) < FEWEST:
         raise StaleFrameError(f"the zoom camera gave {len(frames)} frames in {seconds:g} s; {FEWEST} are needed")
     shifts = picture_shifts([frame.image for frame in frames])
-    t, pan = np.array([(state.t, state.pan) for state in states]).T
-    zoom = delay_between(np.array([frame.t for frame in frames]), shifts, t, pan)
+    t, pans = np.array([(state.t, state.pan) for state in states]).T
+    zoom = delay_between(np.array([frame.t for frame in frames]), shifts, t, pans)
     if zoom.agreement < AGREEMENT:
+        pan, tilt = np.degrees(home.pan), np.degrees(home.tilt)
+        elsewhere = (
+            ", such as by cotarget point --rig FILE --pan-deg 0 --tilt-deg 0"
+            if max(abs(pan), abs(tilt)) > ASIDE_DEG
+            else ""
+        )
         raise CalibrationError(
-            f"the zoom camera's picture does not move with the head (correlation {zoom.agreement:.2f}); point it at "
-            "something with structure that stands still"
+            f"the zoom camera's picture at pan {pan:z.1f}, tilt {tilt:z.1f} degrees does not move with the head "
+            f"(correlation {zoom.agreement:.2f}); point it at something with structure that stands still, not at the "
+            f"sky{elsewhere}"
         )
     return HeadLatency(zoom, command_delay(starts, states, rig.head.limits.acceleration), len(frames))
 

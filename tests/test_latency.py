@@ -97,8 +97,17 @@ def test_a_picture_that_stands_still_is_no_measurement(world):
         def read(self, newer_than=None, timeout=1.0):
             return Frame(frame.image, super().read(newer_than, timeout).t)
 
-    with pytest.raises(CalibrationError, match="does not move with the head"):
-        measure_head(Wrapped(world.rig, zoom=Frozen(world.rig.zoom, 0.0)), seconds=4.0)
+    frozen = Wrapped(world.rig, zoom=Frozen(world.rig.zoom, 0.0))
+    with pytest.raises(
+        CalibrationError, match=r"at pan 0\.0, tilt 0\.0 degrees does not move with the head .* the sky$"
+    ):
+        measure_head(frozen, seconds=4.0)
+    world.rig.head.move(0.0, np.radians(20), wait=True)
+    with pytest.raises(
+        CalibrationError, match=r"the sky, such as by cotarget point --rig FILE --pan-deg 0 --tilt-deg 0$"
+    ):
+        measure_head(frozen, seconds=4.0)
+    world.rig.head.move(0.0, 0.0, wait=True)
 
 
 @pytest.mark.slow
