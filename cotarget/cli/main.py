@@ -91,7 +91,11 @@ def _parser() -> argparse.ArgumentParser:
     source.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml: drive that rig through a capture plan")
     source.add_argument("--from", type=Path, metavar="DIR", dest="source", help="captures taken earlier, or photos")
     calibrate.add_argument(
-        "--out", type=Path, default=Path("calibration.json"), metavar="FILE", help="what to write (calibration.json)"
+        "--out",
+        type=Path,
+        default=Path("calibration.json"),
+        metavar="FILE",
+        help="what to write (calibration.json); one of before is kept",
     )
     calibrate.add_argument("--captures", type=Path, metavar="DIR", help="with --rig: keep the images there")
     calibrate.add_argument("--fixed", metavar="GLOB", help="photos of the fixed camera, such as 'left*.jpg'")
@@ -165,7 +169,9 @@ def _parser() -> argparse.ArgumentParser:
     point.add_argument("--pan-deg", type=number, metavar="A", help="positive turns right (where it is)")
     point.add_argument("--tilt-deg", type=number, metavar="A", help="positive goes up (where it is)")
     point.add_argument("--focal-mm", type=positive, metavar="F", help="of the zoom lens (where it is)")
-    point.add_argument("--pictures", type=Path, metavar="DIR", help="write fixed.png and zoom.png there")
+    point.add_argument(
+        "--pictures", type=Path, metavar="DIR", help="write fixed.png and zoom.png there; those of before are kept"
+    )
 
     latency = command("latency", operating.latency, "measure how late cameras and head are, by what moves")
     latency.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
