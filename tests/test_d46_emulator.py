@@ -806,3 +806,26 @@ class TestTcpLine:
         unit, _, _ = live()
         with TcpLine(unit) as line, pytest.raises(DeviceError, match=f"cannot listen at 127.0.0.1:{line.port}"):
             TcpLine(live()[0], port=line.port)
+
+    def test_two_lines_to_one_unit_serve_one_program(self):
+        """A port that is locked is locked on the network too, and the other way round."""
+
+        def locks(port):
+            try:
+                serial.Serial(port, exclusive=True).close()
+            except serial.SerialException:
+                return False
+            return True
+
+        with SerialLine(live()[0]) as line, TcpLine(live()[0], beside=line) as tcp:
+            with serial.serial_for_url(tcp.url, timeout=DEADLINE_S) as first:
+                assert ask(first, b"TP ") == b"TP * Current Tilt position is 0\r\n"
+                assert not locks(line.port)
+            until(lambda: locks(line.port))
+            with (
+                serial.Serial(line.port, exclusive=True),
+                socket.create_connection((tcp.host, tcp.port), DEADLINE_S) as late,
+            ):
+                assert late.recv(1) == b""
+            with serial.serial_for_url(tcp.url, timeout=DEADLINE_S) as again:
+                assert ask(again, b"TP ") == b"TP * Current Tilt position is 0\r\n"

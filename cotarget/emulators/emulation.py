@@ -82,7 +82,7 @@ class Emulation:
             world = self.world
             twins = make_twins(world.pan, world.tilt, unit, self.faults["head"], world.clock.now)
             self.tty = opened.enter_context(SerialLine(twins[0]))
-            self.tcp = opened.enter_context(TcpLine(twins[1], ports.host, ports.head, paced=True))
+            self.tcp = opened.enter_context(TcpLine(twins[1], ports.host, ports.head, paced=True, beside=self.tty))
             self.fixed = opened.enter_context(
                 AxisServer(
                     {1: world.feeds["fixed"]},

@@ -4,7 +4,9 @@ Each line serves one firmware from one thread of its own; a unit that is to be o
 the same axes.
 """
 
+import abc
 import contextlib
+import fcntl
 import os
 import select
 import socket
@@ -38,7 +40,58 @@ def _baud(slave: int) -> int | None:
     return SPEEDS.get(termios.tcgetattr(slave)[5]) or None
 
 
-class SerialLine:
+class _Line(abc.ABC):
+    """What both kinds of line have in common: a thread that serves the unit from when it is started to the close."""
+
+    def __init__(self, firmware: Firmware, wire: Wire) -> None:
+        self._firmware, self._wire = firmware, wire
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name=f"d46 {type(self).__name__}", daemon=True)
+
+    def close(self) -> None:
+        """Take the port away."""
+        self._closing.set()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        """Give the line itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Take the port away."""
+        self.close()
+
+    def _serve(self) -> None:
+        while not self._closing.is_set():
+            if "unplugged" in self._firmware.faults:
+                self._unplug()
+                self._firmware.faults.wait_while("unplugged", TICK_S)
+            elif self._is_plugged_in():
+                self._exchange()
+            else:
+                self._plug_in()
+        self._unplug()
+
+    @abc.abstractmethod
+    def _is_plugged_in(self) -> bool:
+        """Whether the port is there."""
+
+    @abc.abstractmethod
+    def _plug_in(self) -> None:
+        """Let the port be there."""
+
+    @abc.abstractmethod
+    def _unplug(self) -> None:
+        """Let it be there no longer; more than once does no harm."""
+
+    @abc.abstractmethod
+    def _exchange(self) -> None:
+        """Pass on what is due, and wait for more."""
+
+
+class SerialLine(_Line):
     """A pseudo-terminal that behaves as a serial port with the firmware's unit at its end; a context manager.
 
     A client that sets another baud than the unit's exchanges noise with it. While the fault unplugged is on, the port
@@ -55,20 +108,17 @@ class SerialLine:
     """
 
     def __init__(self, firmware: Firmware, baud: int | None = None) -> None:
-        self._firmware = firmware
         if baud is not None and baud not in CODES:
             raise ConfigError(f"baud: {baud} is not one of: {', '.join(map(str, sorted(CODES)[1:]))}")
         if baud is not None:
             firmware.set_baud(baud)
-        self._wire = Wire(firmware)
-        self._closing = threading.Event()
+        super().__init__(firmware, Wire(firmware))
         self._ends: tuple[int, int] | None = None  # the emulator's and the client's; ours of the latter stays open,
         self._port = ""  # or the former would fail whenever no client has it open
         try:
             self._plug_in()
         except OSError as error:
             raise DeviceError(f"no pseudo-terminal: {error.strerror}") from None
-        self._thread = threading.Thread(target=self._serve, name="d46 serial line", daemon=True)
         self._thread.start()
 
     @property
@@ -76,20 +126,23 @@ class SerialLine:
         """Name of the port to open; empty while unplugged."""
         return self._port
 
-    def close(self) -> None:
-        """Take the port away."""
-        self._closing.set()
-        self._thread.join()
+    def reserve(self) -> bool:
+        """Keep programs that lock the port from opening it, unless one has; whether none has."""
+        try:
+            if self._ends is not None:
+                fcntl.flock(self._ends[1], fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return False
+        return True
 
-    def __enter__(self) -> Self:
-        """Give the line itself."""
-        return self
+    def release(self) -> None:
+        """Let programs open the port again."""
+        with contextlib.suppress(OSError):  # unplugged just now
+            if self._ends is not None:
+                fcntl.flock(self._ends[1], fcntl.LOCK_UN)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Take the port away."""
-        self.close()
+    def _is_plugged_in(self) -> bool:
+        return self._ends is not None
 
     def _plug_in(self) -> None:
         master, slave = os.openpty()
@@ -109,20 +162,9 @@ class SerialLine:
             self._ends = None
         self._wire.clear()
 
-    def _serve(self) -> None:
-        while not self._closing.is_set():
-            if "unplugged" in self._firmware.faults:
-                self._unplug()
-                self._firmware.faults.wait_while("unplugged", TICK_S)
-                continue
-            if self._ends is None:
-                self._plug_in()
-            assert self._ends is not None
-            self._exchange(*self._ends)
-        self._unplug()
-
-    def _exchange(self, master: int, slave: int) -> None:
-        """Pass on what is due, and wait for more."""
+    def _exchange(self) -> None:
+        assert self._ends is not None
+        master, slave = self._ends
         arrived = self._wire.step(time.monotonic(), _baud(slave))
         if arrived:
             with contextlib.suppress(BlockingIOError):  # nobody reads: a serial port loses bytes then
@@ -133,7 +175,7 @@ class SerialLine:
                 self._wire.feed(os.read(master, room), time.monotonic(), _baud(slave))
 
 
-class TcpLine:
+class TcpLine(_Line):
     """A TCP port with the firmware's unit behind it, as of a serial device server; a context manager.
 
     One client at a time. A second takes the first one's place, because a client that vanished without a word, its cable
@@ -145,15 +187,22 @@ class TcpLine:
         host: address to listen at; this machine only by default.
         port: to listen at; 0 for a free one.
         paced: whether bytes take the time that they would take on the unit's serial line.
+        beside: another line to the same unit, which serves either; None where there is none.
 
     Raises:
         DeviceError: the address cannot be listened at.
     """
 
-    def __init__(self, firmware: Firmware, host: str = "127.0.0.1", port: int = 0, paced: bool = False) -> None:
-        self._firmware = firmware
-        self._wire = Wire(firmware, paced)
-        self._closing = threading.Event()
+    def __init__(
+        self,
+        firmware: Firmware,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        paced: bool = False,
+        beside: SerialLine | None = None,
+    ) -> None:
+        super().__init__(firmware, Wire(firmware, paced))
+        self._beside = beside
         self._client: socket.socket | None = None
         self.host, self.port = host, port
         try:
@@ -161,7 +210,6 @@ class TcpLine:
         except OSError as error:
             raise DeviceError(f"cannot listen at {host}:{port}: {error.strerror}") from None
         self.port = self._listener.getsockname()[1]
-        self._thread = threading.Thread(target=self._serve, name="d46 TCP line", daemon=True)
         self._thread.start()
 
     @property
@@ -169,41 +217,17 @@ class TcpLine:
         """How pyserial and a rig's config name it."""
         return f"socket://{self.host}:{self.port}"
 
-    def close(self) -> None:
-        """Drop the client and listen no more."""
-        self._closing.set()
-        self._thread.join()
+    def _is_plugged_in(self) -> bool:
+        return self._listener is not None
 
-    def __enter__(self) -> Self:
-        """Give the line itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Drop the client and listen no more."""
-        self.close()
-
-    def _serve(self) -> None:
-        while not self._closing.is_set():
-            if "unplugged" in self._firmware.faults:
-                self._stop()
-                self._firmware.faults.wait_while("unplugged", TICK_S)
-                continue
-            if self._listener is None:
-                self._listen_again()
-            else:
-                self._exchange(self._listener)
-        self._stop()
-
-    def _listen_again(self) -> None:
+    def _plug_in(self) -> None:
         """Listen at the same port; if another has taken it meanwhile, wait for it."""
         try:
             self._listener = socket.create_server((self.host, self.port), backlog=1)
         except OSError:
             self._closing.wait(TICK_S)
 
-    def _stop(self) -> None:
+    def _unplug(self) -> None:
         self._drop_client()
         if self._listener is not None:
             self._listener.close()
@@ -213,12 +237,15 @@ class TcpLine:
         if self._client is not None:
             self._client.close()
             self._client = None
+            if self._beside is not None:
+                self._beside.release()
         self._wire.clear()
 
-    def _exchange(self, listener: socket.socket) -> None:
-        """Pass on what is due, and wait for more or for a client."""
+    def _exchange(self) -> None:
+        """Also waits for a client."""
+        assert self._listener is not None
         arrived = self._wire.step(time.monotonic())
-        client, room = self._client, self._wire.room
+        listener, client, room = self._listener, self._client, self._wire.room
         try:
             if client is not None and arrived:
                 client.sendall(arrived)
@@ -234,7 +261,11 @@ class TcpLine:
             return
         if listener.fileno() in ready:
             self._drop_client()
-            self._client = listener.accept()[0]
+            newcomer = listener.accept()[0]
+            if self._beside is not None and not self._beside.reserve():
+                newcomer.close()
+                return
+            self._client = newcomer
             self._client.settimeout(SEND_TIMEOUT_S)
             self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._firmware.connected()
