@@ -126,7 +126,7 @@ def _row(index: int, t: float, track: Track) -> list[str]:
     """A track's line of the table."""
     numbers = (*track.center_px, *track.size_px)
     score = track.score if track.missed == 0 else 0.0
-    return [str(index), f"{t:.4f}", str(track.id), *(f"{x:.2f}" for x in numbers), f"{score:.3f}"]
+    return [str(index), f"{t:.4f}", str(track.id), *(f"{x:z.2f}" for x in numbers), f"{score:.3f}"]
 
 
 class Trails:

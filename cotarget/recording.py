@@ -74,7 +74,7 @@ class StepTable:
             + [math.degrees(step.head.pan), math.degrees(step.head.tilt), step.lens.focal_px]
         )
         with self._told(self._path):
-            self._writer.writerow(row)
+            self._writer.writerow([cell + 0.0 if isinstance(cell, float) else cell for cell in row])  # no -0.0
 
     def __enter__(self) -> "StepTable":
         """Give the table itself."""

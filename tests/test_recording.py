@@ -75,6 +75,15 @@ def test_one_line_a_step(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_zeros_have_no_sign(tmp_path):
+    path = tmp_path / "steps.csv"
+    with StepTable(path) as table:
+        table.write(dataclasses.replace(step(), commanded=(-0.0, np.float64(-0.0), 4800.0), t=-0.0))
+    with path.open(newline="") as file:
+        row = next(csv.DictReader(file))
+    assert [row[name] for name in ("t_s", "pan_commanded_deg", "tilt_commanded_deg")] == ["0.0"] * 3
+
+
 def fill_and_fail(path):
     with StepTable(path) as table:
         table.write(step())
