@@ -8,7 +8,10 @@ import importlib
 import sys
 from pathlib import Path
 
-EXPERIMENTS = ("hand_eye", "chain", "random_rigs", "mismatch", "honesty", "speed", "pointing", "zoom_range", "wire")
+EXPERIMENTS = (
+    *("hand_eye", "chain", "random_rigs", "mismatch", "honesty", "speed", "pointing", "zoom_range", "wire"),
+    *("hold", "first_shot", "delay", "five_targets", "dead_zone"),
+)
 
 
 def main() -> int:

@@ -24,10 +24,9 @@ from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
 from cotarget.loop import FollowSettings
 from cotarget.metrics import score
-from experiments import harness
 from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
-from experiments.hold import calibrated, held, target_of
-from experiments.hold_scenes import COMMAND_DELAY_S, LATENCY_S, SECONDS, hold_config
+from experiments.hold import FieldSettings, calibrated, held, target_of
+from experiments.hold_scenes import COMMAND_DELAY_S, LATENCY_S, hold_config
 from experiments.wide_view import record
 
 FIELD_S = LATENCY_S + COMMAND_DELAY_S
@@ -37,26 +36,24 @@ WANTED = 3.0  # times smaller with prediction than without, at the field's delay
 
 
 @dataclass(frozen=True)
-class DelaySettings(harness.Settings):
-    """How many seeds, which targets, at which delays and for how long.
+class DelaySettings(FieldSettings):
+    """How many seeds, which targets, and at which delays.
 
     Attributes:
         targets: person, bird.
         delays: from light to the start of motion, the field's among them [s].
-        seconds: of each run [s].
         closed_loop: whether both ways are compared with the zoom view's correction too, at the field's delay.
     """
 
     seeds: int = 5
     targets: tuple[str, ...] = ("person", "bird")
     delays: tuple[float, ...] = (0.0, 0.1, FIELD_S, 0.3, 0.4, 0.5, 0.6)
-    seconds: float = SECONDS
     closed_loop: bool = True
 
 
 def run(settings: DelaySettings) -> list[Row]:
     """Calibrate the rig once, then follow each target at each delay, with and without; one row each."""
-    return over_seeds(functools.partial(one, calibrated(settings.seed_base)), settings)
+    return over_seeds(functools.partial(one, calibrated(settings)), settings)
 
 
 def one(calibration: Calibration, settings: DelaySettings, seed: int) -> list[Row]:
@@ -169,7 +166,9 @@ EXPERIMENT = Experiment(
     "delay",
     "The offset in the close-up with prediction and without, over the delay of cameras and head.",
     SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, delays=(0.0, FIELD_S, 0.6), seconds=6.0, closed_loop=False),
+    dataclasses.replace(
+        SETTINGS, seeds=1, delays=(0.0, FIELD_S, 0.6), seconds=6.0, calibrated=False, closed_loop=False
+    ),
     run,
     summarise,
     describe,

@@ -1,0 +1,139 @@
+"""What the dead zone spares the motors: commands and reversals a minute with it and without, and the offset it costs.
+
+A book that is put elsewhere once and a person who walks are held in the field of `experiments.hold_scenes`, by the
+whole pipeline; all that differs is whether the head gets a new command with every frame that asks for one.
+
+    python -m experiments.dead_zone [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import functools
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration
+from cotarget.deadzone import SteeringSettings
+from cotarget.loop import FollowSettings
+from cotarget.metrics import score
+from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
+from experiments.hold import FieldSettings, calibrated, held, target_of
+from experiments.hold_scenes import hold_config
+from experiments.wide_view import record
+
+WAYS = {"with": SteeringSettings(), "without": SteeringSettings(zone=0.0)}
+FIGURES = ("commands_per_min", "reversals_per_min", "tpo_width_median")
+# With the dead zone over without: at most.
+WANTED = {"commands_per_min": 0.5, "reversals_per_min": 0.5, "tpo_width_median": 1.1}
+
+
+@dataclass(frozen=True)
+class DeadZoneSettings(FieldSettings):
+    """How many seeds, and which targets.
+
+    Attributes:
+        targets: book, person.
+        closed_loop: whether the offset is corrected from the zoom view too.
+    """
+
+    seeds: int = 5
+    targets: tuple[str, ...] = ("book", "person")
+    closed_loop: bool = True
+
+
+def run(settings: DeadZoneSettings) -> list[Row]:
+    """Calibrate the rig once, then hold each target with the dead zone and without; one row each."""
+    return over_seeds(functools.partial(one, calibrated(settings)), settings)
+
+
+def one(calibration: Calibration, settings: DeadZoneSettings, seed: int) -> list[Row]:
+    """Hold each target both ways."""
+    rows: list[Row] = []
+    for name in settings.targets:
+        config = hold_config(name, seed)
+        view = record(config, target_of(config, name), settings.seconds, pictures=settings.closed_loop)
+        for way, steering in WAYS.items():
+            how = FollowSettings(
+                command_delay_s=config.command_delay_s, steering=steering, closed_loop=settings.closed_loop
+            )
+            found = score(held(calibration, config, name, settings.seconds, how, view))
+            rows.append({"seed": seed, "target": name, "way": way} | {key: getattr(found, key) for key in FIGURES})
+    return rows
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
+    """Of each target and figure the medians over the seeds, and the one over the other."""
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for name in dict.fromkeys(row["target"] for row in rows):
+        found[name] = {}
+        for key in FIGURES:
+            medians = {way: _median([r[key] for r in rows if (r["target"], r["way"]) == (name, way)]) for way in WAYS}
+            found[name][key] = medians | {"over": _over(medians["with"], medians["without"])}
+    return found
+
+
+def _median(values: Sequence[float | None]) -> float:
+    """The median; nan where a run never acquired its target."""
+    return float(np.median([math.nan if value is None else value for value in values]))
+
+
+def _over(value: float, other: float) -> float:
+    """A ratio, which is 1 of nothing over nothing."""
+    return 1.0 if value == other == 0 else value / other if other else math.inf
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The figures that are not what is wanted."""
+    return [
+        f"{name}: {key}"
+        for name, figures in summary.items()
+        for key, found in figures.items()
+        if not found["over"] <= WANTED[key]
+    ]
+
+
+def describe(settings: DeadZoneSettings, summary: Mapping[str, Any]) -> str:
+    """A line for each target and figure."""
+    lines = [
+        [f"{name}, {key}", found["with"], found["without"], found["over"], f"<= {WANTED[key]:g}"]
+        for name, figures in summary.items()
+        for key, found in figures.items()
+    ]
+    return f"the head with a dead zone and without, medians of {seeds_of(settings)}\n" + table(
+        ("", "with", "without", "with / without", "wanted"), lines
+    )
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Each seed's figures, with against without."""
+    for ax, key in zip(figure.subplots(1, len(FIGURES)), FIGURES, strict=True):
+        highest = 0.0
+        for name in dict.fromkeys(row["target"] for row in rows):
+            of_way = [[r[key] or 0.0 for r in rows if (r["target"], r["way"]) == (name, way)] for way in WAYS]
+            ax.plot(of_way[1], of_way[0], "o", label=name)
+            highest = max([highest, *of_way[0], *of_way[1]])
+        ax.plot([0, highest], [0, WANTED[key] * highest], "k:", label="wanted: below")
+        ax.set(title=key, xlabel="without", ylabel="with")
+    ax.legend(frameon=False)
+
+
+SETTINGS = DeadZoneSettings()
+EXPERIMENT = Experiment(
+    "dead_zone",
+    "Commands and reversals a minute with the dead zone and without, and the offset it costs.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, seconds=8.0, calibrated=False, closed_loop=False),
+    run,
+    summarise,
+    describe,
+    plot,
+    missed,
+)
+
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

@@ -1,0 +1,167 @@
+"""How well a single shot from the wide view alone hits, what one correction adds, and what a miss consists of.
+
+A book, a person and a bird in the field of `experiments.hold_scenes` are shot at again and again (`experiments.shots`):
+each time one command from what the wide view has told, judged in the zoom frame that follows at the focal length
+solved for, then one more after a look through the zoom camera. Beside what was measured stands the sum, in quadrature,
+of what each cause leaves alone while all else is as it truly is: detection, size, calibration, delay, the head's steps
+and the lens's positions. A shot at something else than the target counts as a miss, and not in the budget.
+
+    python -m experiments.first_shot [--seeds 10] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import functools
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration
+from experiments.harness import Experiment, Row, over_seeds, rms, seeds_of, table
+from experiments.hold import FieldSettings, calibrated, target_of
+from experiments.hold_scenes import hold_config
+from experiments.shots import CAUSES, Fired, fire
+
+# What is wanted of each target, at least and at most.
+WANTED: Mapping[str, tuple[float, float]] = {
+    "in_frame": (0.98, 1.0),
+    "tpo_width": (0.0, 0.08),
+    "corrected_width": (0.0, 0.02),
+    "sum over measured": (0.85, 1.15),
+}
+
+
+@dataclass(frozen=True)
+class FirstShotSettings(FieldSettings):
+    """How many seeds, and which targets; a shot every 0.8 s from the third second on.
+
+    Attributes:
+        targets: book, person, bird.
+    """
+
+    seeds: int = 10
+    targets: tuple[str, ...] = ("book", "person", "bird")
+
+
+def run(settings: FirstShotSettings) -> list[Row]:
+    """Calibrate the rig once, then shoot at each target; a row for each shot."""
+    return over_seeds(functools.partial(one, calibrated(settings)), settings)
+
+
+def one(calibration: Calibration, settings: FirstShotSettings, seed: int) -> list[Row]:
+    """All shots of a seed."""
+    rows: list[Row] = []
+    for name in settings.targets:
+        config = hold_config(name, seed)
+        fired = fire(calibration, config, name, target_of(config, name), settings.seconds)
+        rows += [{"seed": seed, "target": name} | _row(each) for each in fired]
+    return rows
+
+
+def _row(fired: Fired) -> Row:
+    """One shot; angles as parts of the image's width."""
+    row = fired.row
+
+    def of_width(angle: float) -> float:
+        return math.tan(min(angle, 1.5)) * row.focal_px / row.width_px  # short of a right angle
+
+    return {
+        "t_s": fired.shot.exposed_t,
+        "on_target": fired.on_target,
+        "in_frame": row.in_frame,
+        "tpo_width": row.tpo_px / row.width_px,
+        "size_ratio": row.size_ratio,
+        "found": fired.found,
+        "corrected_width": None if fired.corrected is None else fired.corrected.tpo_px / row.width_px,
+        "measured": of_width(fired.missed),
+        **{cause: of_width(part) for cause, part in fired.parts.items()},
+    }
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Of each target the figures, and the budget: rms of each cause, their sum, and what was measured."""
+    return {
+        name: _figures([row for row in rows if row["target"] == name])
+        for name in dict.fromkeys(row["target"] for row in rows)
+    }
+
+
+def _figures(rows: Sequence[Row]) -> dict[str, float]:
+    hits = [row for row in rows if row["on_target"]]
+    causes = {cause: rms(row[cause] for row in hits) for cause in CAUSES}
+    total, measured = math.hypot(*causes.values()), rms(row["measured"] for row in hits)
+    corrected = [row["corrected_width"] for row in rows if row["corrected_width"] is not None]
+    return {
+        "shots": len(rows),
+        "in_frame": float(np.mean([row["in_frame"] for row in rows])),
+        "tpo_width": float(np.median([row["tpo_width"] for row in rows])),
+        "found": float(np.mean([row["found"] for row in rows])),
+        "corrected_width": float(np.median(corrected)) if corrected else math.nan,
+        **causes,
+        "sum": total,
+        "measured": measured,
+        "sum over measured": total / measured,
+    }
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The figures that are not what is wanted."""
+    return [
+        f"{name}: {key}"
+        for name, figures in summary.items()
+        for key, (low, high) in WANTED.items()
+        if not low <= figures[key] <= high
+    ]
+
+
+def describe(settings: FirstShotSettings, summary: Mapping[str, Any]) -> str:
+    """A line a figure, a column a target."""
+    keys = list(dict.fromkeys(key for figures in summary.values() for key in figures))
+    lines = [
+        [
+            f"{key}, rms" if key in (*CAUSES, "sum", "measured") else key,
+            *(figures[key] for figures in summary.values()),
+            "{:g}-{:g}".format(*WANTED[key]) if key in WANTED else "",
+        ]
+        for key in keys
+    ]
+    return f"single shots, offsets over the width, {seeds_of(settings)}\n" + table(("", *summary, "wanted"), lines)
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Offsets of first shots and corrected ones, and the budgets."""
+    left, right = figure.subplots(1, 2)
+    for name, figures in summarise(rows).items():
+        mine = [row for row in rows if row["target"] == name]
+        for key, style in (("tpo_width", "-"), ("corrected_width", "--")):
+            offsets = np.sort([row[key] for row in mine if row[key] is not None])
+            label = name if key == "tpo_width" else f"{name}, corrected"
+            left.plot(offsets, (np.arange(len(offsets)) + 1) / len(mine), style, label=label)
+        right.plot(
+            [*CAUSES, "sum", "measured"], [figures[key] for key in (*CAUSES, "sum", "measured")], "o", label=name
+        )
+    left.set(xlabel="offset / width", ylabel="part of the shots", xlim=(0, 0.65))
+    right.set(yscale="log", ylabel="rms / width")
+    right.tick_params(axis="x", labelrotation=60)
+    left.legend(frameon=False)
+
+
+SETTINGS = FirstShotSettings()
+EXPERIMENT = Experiment(
+    "first_shot",
+    "How well a single shot from the wide view alone hits, and what a miss consists of.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, seconds=6.0, calibrated=False),
+    run,
+    summarise,
+    describe,
+    plot,
+    missed,
+)
+
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

@@ -1,0 +1,162 @@
+"""Of five targets at once, how many get a good close-up under each policy.
+
+Five persons, or five birds, cross the wide view in the field of `experiments.hold_scenes`: all at once for a while,
+each gone after a time. A target counts as served when it was well in the close-up, by the metrics' definition, for a
+second in all. What the wide camera sees is rendered and searched once a seed and kind, and followed under each policy.
+
+    python -m experiments.five_targets [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import functools
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration
+from cotarget.config import RigConfig, TargetConfig
+from cotarget.judging import observe
+from cotarget.loop import FollowSettings
+from cotarget.policies import POLICIES
+from cotarget.sim.truth import Truth
+from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
+from experiments.hold import FieldSettings, calibrated, target_of, watched
+from experiments.hold_scenes import five_targets_config
+from experiments.wide_view import WideView, record
+
+FIRST = "first-come"
+SERVED_S = 1.0  # of good close-up
+WANTED = 1.5  # times as many served by the best policy as by first-come
+
+
+@dataclass(frozen=True)
+class FiveSettings(FieldSettings):
+    """How many seeds, and which kinds.
+
+    Attributes:
+        kinds: person, bird.
+        closed_loop: whether the zoom view corrects.
+    """
+
+    seeds: int = 5
+    kinds: tuple[str, ...] = ("person", "bird")
+    closed_loop: bool = True
+
+
+def run(settings: FiveSettings) -> list[Row]:
+    """Calibrate the rig once, then follow five of each kind under each policy; one row each."""
+    return over_seeds(functools.partial(one, calibrated(settings)), settings)
+
+
+def one(calibration: Calibration, settings: FiveSettings, seed: int) -> list[Row]:
+    """All runs of a seed."""
+    rows: list[Row] = []
+    for kind in settings.kinds:
+        config = five_targets_config(seed, kind)
+        target = target_of(config, kind)
+        view = record(config, target, settings.seconds, pictures=settings.closed_loop)
+        for policy, make in POLICIES.items():
+            how = FollowSettings(
+                command_delay_s=config.command_delay_s, policy=make(), closed_loop=settings.closed_loop
+            )
+            seconds = good_seconds(calibration, config, target, settings.seconds, how, view)
+            rows.append(
+                {
+                    "seed": seed,
+                    "kind": kind,
+                    "policy": policy,
+                    "served": sum(value >= SERVED_S for value in seconds.values()),
+                    "good_s": sum(seconds.values()),
+                    **{f"good_{i}_s": value for i, value in enumerate(seconds.values(), 1)},
+                }
+            )
+    return rows
+
+
+def good_seconds(
+    calibration: Calibration,
+    config: RigConfig,
+    target: TargetConfig,
+    seconds: float,
+    how: FollowSettings,
+    view: WideView,
+) -> dict[str, float]:
+    """How long each target of a world was well in the close-up, by the truth [s]."""
+    good = dict.fromkeys(config.sim.targets, 0.0)
+    last: float | None = None
+    for step, truth in watched(calibration, config, target, seconds, how, view):
+        t = step.zoom.t
+        if last is not None and t > last:  # a frame stands for the time since the one before
+            for name in good:
+                if _near(truth, name, t) and observe(step, truth, name, target).good_closeup:
+                    good[name] += t - last
+        last = t
+    return good
+
+
+def _near(truth: Truth, name: str, t: float) -> bool:
+    """Whether a target's middle is in the zoom image; quicker than all that a row says."""
+    width, height = truth.lens("zoom", t).size
+    u, v = truth.pixel("zoom", truth.center(name, t), t)
+    return bool(-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5)
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Targets served under each policy, means over the seeds, and the best over first-come."""
+    found: dict[str, dict[str, float]] = {}
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        served = {
+            policy: float(np.mean([row["served"] for row in rows if (row["kind"], row["policy"]) == (kind, policy)]))
+            for policy in POLICIES
+        }
+        best = max(served.values())
+        found[kind] = served | {"best over first": best / served[FIRST] if served[FIRST] else math.inf * best}
+    return found
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The kinds for which no policy serves enough more than first-come."""
+    return [kind for kind, found in summary.items() if not found["best over first"] >= WANTED]
+
+
+def describe(settings: FiveSettings, summary: Mapping[str, Any]) -> str:
+    """A line for each kind."""
+    head = ("", *POLICIES, "best / first-come", "wanted")
+    lines = [[f"five {kind}s", *found.values(), f">= {WANTED:g}"] for kind, found in summary.items()]
+    return (
+        f"targets of five with {SERVED_S:g} s of good close-up or more, means of {seeds_of(settings)}, "
+        f"{settings.seconds:g} s each\n" + table(head, lines)
+    )
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """How many were served, each seed a bar."""
+    kinds = list(dict.fromkeys(row["kind"] for row in rows))
+    for ax, kind in zip(np.ravel(figure.subplots(1, len(kinds), sharey=True)), kinds, strict=True):
+        for i, policy in enumerate(POLICIES):
+            served = [row["served"] for row in rows if (row["kind"], row["policy"]) == (kind, policy)]
+            ax.bar(np.arange(len(served)) + 0.25 * (i - 1), served, 0.22, label=policy)
+        ax.set(title=f"five {kind}s", xlabel="seed", ylabel="targets served")
+    ax.legend(frameon=False)
+
+
+SETTINGS = FiveSettings()
+EXPERIMENT = Experiment(
+    "five_targets",
+    "Of five targets at once, how many get a good close-up under each policy.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, kinds=("person",), seconds=12.0, calibrated=False, closed_loop=False),
+    run,
+    summarise,
+    describe,
+    plot,
+    missed,
+)
+
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

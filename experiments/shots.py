@@ -1,0 +1,276 @@
+"""Single shots at a target in the simulated field, each followed by one correction, and what each cause adds to a miss.
+
+A shot is one command to head and lens from what the wide view has told so far: direction from the detections, depth
+from the size, motion over the delay from its track. The head and the lens are there as soon as the delay is over: what
+they need for the way is left out, as it is in the delay's definition. The zoom frame that is then exposed is judged by
+the truth, looked at once, and a second shot taken with what it showed.
+"""
+
+import copy
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cotarget.calibration import Calibration
+from cotarget.config import RigConfig, TargetConfig
+from cotarget.detection import make_detector
+from cotarget.errors import UnreachableError
+from cotarget.estimation import Estimate
+from cotarget.geometry import Array
+from cotarget.judging import observe
+from cotarget.loop import State, Step
+from cotarget.metrics import Row as Judged
+from cotarget.pursuit import Pursuit
+from cotarget.rig import Frame, Rig
+from cotarget.safety import SafeRig
+from cotarget.servo import reach_of
+from cotarget.sim.truth import Truth
+from cotarget.sim.world import SimWorld
+from cotarget.targeting import Aim, Reach, aim
+from cotarget.tracking import Track, Tracker, settings_for
+from experiments.hold_scenes import true_calibration
+
+# A head and a lens that are wherever they are sent within a millisecond.
+QUICK_DEG_S, QUICK_DEG_S2, QUICK_STEPS_S = 1e6, 1e9, 1e6
+BEGIN_S = 3.0  # of the first shot, one second after the background was learnt
+EVERY_S = 0.8  # from one shot to the next at least; a shot and its correction take 0.7 s
+ROUNDING = 1e-6  # of frame times over the period
+CAUSES = ("detection", "size", "calibration", "delay", "steps", "lens")
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One command, and what it was made from.
+
+    Attributes:
+        seen_t: of the wide frame [s].
+        exposed_t: of the zoom frame that it was aimed for [s].
+        pixel: the target in the wide frame as it was estimated, (2,).
+        depth: likewise [m].
+        moved: how far it was expected to come until then, fixed frame [m], (3,).
+        wished_px: nominal focal length that was solved for.
+        pan: commanded, rounded to steps [rad].
+        tilt: likewise.
+        nominal_px: the lens's position.
+    """
+
+    seen_t: float
+    exposed_t: float
+    pixel: Array
+    depth: float
+    moved: Array
+    wished_px: float
+    pan: float
+    tilt: float
+    nominal_px: float
+
+
+@dataclass(frozen=True)
+class Fired:
+    """A shot and what came of it.
+
+    Attributes:
+        shot: the first.
+        on_target: whether it was aimed at the target: what it was made from is no farther from it than its larger side.
+        row: its zoom frame, judged.
+        parts: what each cause alone leaves, see `budget` [rad].
+        missed: between the line of sight and the target when the zoom frame was exposed [rad].
+        found: whether the target was found in that frame.
+        corrected: the second shot's zoom frame; None where there was no second.
+    """
+
+    shot: Shot
+    on_target: bool
+    row: Judged
+    parts: dict[str, float]
+    missed: float
+    found: bool
+    corrected: Judged | None
+
+
+def quick(config: RigConfig) -> RigConfig:
+    """The same rig with a head and a lens that need no time for the way."""
+    head = replace(config.sim.head, speed_deg_s=QUICK_DEG_S, accel_deg_s2=QUICK_DEG_S2)
+    zoom = replace(config.sim.zoom, lens_speed=QUICK_STEPS_S)
+    return replace(config, sim=replace(config.sim, head=head, zoom=zoom))
+
+
+def fire(calibration: Calibration, config: RigConfig, name: str, target: TargetConfig, seconds: float) -> list[Fired]:
+    """Shoot at a target again and again, each time from the wide view alone.
+
+    Args:
+        calibration: what is known of the rig.
+        config: the rig and its world.
+        name: of the target.
+        target: what is told of it.
+        seconds: for how long [s].
+    """
+    config = quick(config)
+    world = SimWorld(config)
+    truth, exact = world.truth(), true_calibration(world, stops=config.sim.zoom.lens_steps)
+    fired = []
+    with SafeRig(world.rig, config.safety) as rig:
+        lookout = _Lookout(rig, calibration, config, target)
+        begin = BEGIN_S
+        while rig.clock.now() < seconds:
+            lookout.look()
+            if lookout.frame.t < begin or lookout.track is None or lookout.track.missed:
+                continue
+            begin = lookout.frame.t + EVERY_S
+            if (shot := lookout.shoot()) is None:
+                continue
+            row = observe(lookout.judged(shot), truth, name, target)
+            t = shot.exposed_t
+            miss = truth.line_of_sight_miss(*truth.head_at(t), truth.nominal_at(t), truth.center(name, t))
+            parts = budget(truth, exact, calibration, reach_of(rig), name, shot)
+            found = lookout.see_zoom()
+            second = lookout.shoot()
+            corrected = None if second is None else observe(lookout.judged(second), truth, name, target)
+            lookout.forget()
+            fired.append(Fired(shot, _on_target(truth, name, shot), row, parts, miss, found, corrected))
+    return fired
+
+
+def _on_target(truth: Truth, name: str, shot: Shot) -> bool:
+    box, at = truth.box(name, "fixed", shot.seen_t), truth.pixel("fixed", truth.center(name, shot.seen_t), shot.seen_t)
+    return box is not None and bool(np.linalg.norm(shot.pixel - at) <= np.max(box[1] - box[0]))
+
+
+class _Lookout:
+    """Watches the wide view of a rig, and shoots at the eldest track.
+
+    Attributes:
+        frame: the newest of the wide view.
+        track: the eldest confirmed one, if any.
+    """
+
+    frame: Frame
+
+    def __init__(self, rig: Rig, calibration: Calibration, config: RigConfig, target: TargetConfig) -> None:
+        self._rig, self._config, self._calibration = rig, config, calibration
+        self._detector = make_detector(target, config.rate_hz)
+        self._tracker = Tracker(settings_for(target), rig.fixed.size)
+        self._wide = Pursuit(calibration, target, rig.fixed.size)  # which never sees the zoom view
+        self._both: Pursuit | None = None
+        self._tracks: list[Track] = []
+        self._t: float | None = None
+        self.track: Track | None = None
+
+    def look(self) -> None:
+        """Take the next wide frame into account."""
+        self.frame = self._rig.fixed.read(newer_than=self._t)
+        self._t = self.frame.t
+        self._tracks = self._tracker.update(self._detector.detect(self.frame), self.frame.t)
+        self.track = min((track for track in self._tracks if track.confirmed), key=lambda track: track.id, default=None)
+        for pursuit in self._pursuits():
+            pursuit.see_wide(self.frame, self._tracks, self._detector.mask)
+            pursuit.follow(None if self.track is None else self.track.id)
+            pursuit.states.add(self._rig.head.state(), self._rig.zoom.state())
+
+    def _pursuits(self) -> Iterator[Pursuit]:
+        yield self._wide
+        if self._both is not None:
+            yield self._both
+
+    def shoot(self) -> Shot | None:
+        """Aim at the track for the first zoom frame that can be exposed then, and wait for it; None if it cannot be."""
+        pursuit = self._wide if self._both is None else self._both
+        rate, now = self._config.rate_hz, self._rig.clock.now()
+        still = now + self._config.command_delay_s + self._config.sim.zoom.exposure_s / 2
+        t = (math.floor(still * rate + ROUNDING) + 1) / rate
+        if self.track is None:
+            return None
+        at, then = (pursuit.estimate(self.track.id, each) for each in (self.frame.t, t))
+        if at is None or then is None:
+            return None
+        try:
+            found = aim(self._calibration, then.x_fixed, reach_of(self._rig), closeup=then.closeup)
+        except UnreachableError:
+            return None
+        shot = self._command(at, then, found, t)
+        if self._both is None:
+            self._both = copy.deepcopy(self._wide)
+        while self._rig.clock.now() < t + self._config.sim.zoom.latency_s - ROUNDING:
+            self.look()
+        self._zoom = self._rig.zoom.read()
+        assert abs(self._zoom.t - t) * rate < ROUNDING, "the zoom frame is the one that was aimed for"
+        return shot
+
+    def _command(self, at: Estimate, then: Estimate, found: Aim, t: float) -> Shot:
+        bias = then.bias
+        pan, tilt = self._rig.head.move(found.pan - bias[0], found.tilt - bias[1])
+        nominal = self._rig.zoom.zoom(found.nominal_px)
+        pixel = self._calibration.fixed.project(at.x_fixed)
+        moved = then.x_fixed - at.x_fixed
+        return Shot(self.frame.t, t, pixel, at.depth, moved, found.nominal_px, pan, tilt, nominal)
+
+    def see_zoom(self) -> bool:
+        """Look for the target in the shot's zoom frame, for the next shot; whether it was found."""
+        assert self._both is not None, "a shot was taken"
+        return self._both.see_zoom(self._zoom) is not None
+
+    def forget(self) -> None:
+        """Forget what the zoom view has shown."""
+        self._both = None
+
+    def judged(self, shot: Shot) -> Step:
+        """The shot as a Step, to be put beside the truth."""
+        return Step(
+            index=0,
+            t=self._rig.clock.now(),
+            state=State.FOLLOWING,
+            reason="",
+            fixed=self.frame,
+            zoom=self._zoom,
+            mask=None,
+            detections=(),
+            tracks=tuple(self._tracks),
+            target=self.track,
+            aim=None,
+            commanded=(shot.pan, shot.tilt, shot.nominal_px),
+            head=self._rig.head.state(),
+            lens=self._rig.zoom.state(),
+        )
+
+
+def budget(
+    truth: Truth, exact: Calibration, calibration: Calibration, reach: Reach, name: str, shot: Shot
+) -> dict[str, float]:
+    """What each cause alone leaves between the line of sight and the target, all else as it truly is [rad].
+
+    Args:
+        truth: of the world.
+        exact: its calibration without error.
+        calibration: what is known of it.
+        reach: of head and lens.
+        name: of the target.
+        shot: what was commanded, and from what.
+
+    Returns:
+        "detection": the pixel; "size": the depth; "calibration": everything in it; "delay": what the target did until
+        the exposure beside what was expected; "steps": rounding of the head; "lens": its being at a position beside the
+        focal length solved for.
+    """
+    seen, then = (truth.center(name, t) for t in (shot.seen_t, shot.exposed_t))
+    x_seen, x_then = truth.T_world_fixed.inv().apply(np.array([seen, then]))
+    depth, pixel = float(x_seen[2]), truth.pixel("fixed", seen, shot.seen_t)
+    free = replace(reach, pan=(-np.inf, np.inf), tilt=(-np.inf, np.inf), now=(shot.pan, shot.tilt))
+
+    def miss(
+        model: Calibration, x_fixed: Array, x_world: Array, step: float = 0.0, nominal: float | None = None
+    ) -> float:
+        found = aim(model, x_fixed, free, nominal_px=shot.wished_px)
+        pan, tilt = (round(angle / step) * step if step else angle for angle in (found.pan, found.tilt))
+        return truth.line_of_sight_miss(pan, tilt, found.nominal_px if nominal is None else nominal, x_world)
+
+    return {
+        "detection": miss(exact, exact.fixed.ray(shot.pixel) * depth, seen),
+        "size": miss(exact, exact.fixed.ray(pixel) * shot.depth, seen),
+        "calibration": miss(calibration, calibration.fixed.ray(pixel) * depth, seen),
+        # A depth that is wrong makes the way longer as it makes the distance: in angles it is right.
+        "delay": miss(exact, x_seen + shot.moved * depth / shot.depth, then),
+        "steps": miss(exact, x_then, then, step=reach.step),
+        "lens": miss(exact, x_then, then, nominal=shot.nominal_px),
+    }

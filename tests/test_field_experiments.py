@@ -1,0 +1,314 @@
+"""What is measured in the simulated field: by hand-worked cases, and by what a target seen well must give."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from cotarget.config import parse_config
+from cotarget.geometry import pose
+from cotarget.loop import FollowSettings
+from cotarget.rig import Frame
+from cotarget.sim.world import SimWorld
+from cotarget.targeting import Reach
+from experiments import dead_zone, delay, first_shot, five_targets, hold
+from experiments.__main__ import EXPERIMENTS
+from experiments.harness import EXPECTED
+from experiments.hold_scenes import TruthDetector, TruthNoise, hold_config, true_calibration
+from experiments.shots import CAUSES, Shot, budget
+from experiments.wide_view import Seen, WideView, open_on, record
+
+FIELD = (hold, first_shot, delay, five_targets, dead_zone)
+SMALL = 0.03  # relative: products of angles of a hundredth that are taken for sums
+FRAME_S = 0.04
+
+
+def seen_well(config, target, seconds, *, pictures=False):
+    """What `record` gives, of a detector that finds the targets where they are; nothing is rendered."""
+    with (world := SimWorld(config, rendered=())).rig:
+        detector = TruthDetector(world.truth(), config.sim.seed, TruthNoise(0.2, 0.01, 0.0))
+        image = np.zeros((480, 640, 3), np.uint8)
+        times = [k / config.rate_hz for k in range(round(seconds * config.rate_hz) + 1)]
+        frames = {round(t * 1e6): Seen(tuple(detector.detect(Frame(image, t)))) for t in times}
+    return WideView(frames, pictures=False)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return hold.calibrated(hold.HoldSettings(calibrated=False))
+
+
+def test_every_experiment_can_be_run():
+    for module in FIELD:
+        assert module.__name__ == f"experiments.{module.EXPERIMENT.name}"
+        assert module.EXPERIMENT.name in EXPERIMENTS
+
+
+# ---------------------------------------------------------------- the wide view, once
+
+
+@pytest.mark.render
+def test_what_was_recorded_is_what_is_seen():
+    config = hold_config("book", 2)
+    target = config.target("book")
+    view = record(config, target, 0.04)
+    late = delay.delayed(config, 0.5)
+    with (seen := SimWorld(config)).rig, (world := open_on(view, late, closed_loop=True)[0]).rig:
+        detector, again = hold.make_detector(target, 25.0), open_on(view, late, closed_loop=False)[1]
+        t = None
+        for _ in range(2):
+            frame, recorded = seen.rig.fixed.read(newer_than=t), world.rig.fixed.read(newer_than=t)
+            t = frame.t
+            assert recorded.t == t
+            np.testing.assert_array_equal(recorded.image, frame.image)
+            assert world.rig.clock.now() == pytest.approx(t + 0.3)
+            for old, new in zip(again.detect(recorded), detector.detect(frame), strict=True):
+                np.testing.assert_array_equal(old.center_px, new.center_px)
+            np.testing.assert_array_equal(again.mask, detector.mask)
+        assert len(again.detect(recorded)) == 1
+
+
+# ---------------------------------------------------------------- delay
+
+
+def test_a_delay_is_shared_as_in_the_field():
+    config = delay.delayed(hold_config("person", 0), 0.6)
+    assert config.sim.fixed.latency_s == config.sim.zoom.latency_s == pytest.approx(0.36)
+    assert config.command_delay_s == pytest.approx(0.24)
+    assert delay.delayed(config, 0.2).sim.head.command_delay_s == pytest.approx(0.08)
+
+
+def test_who_does_not_predict_is_behind_by_speed_times_delay(exact, monkeypatch):
+    """1.5 m/s and 0.2 s are 0.3 m, of 1.75 m that are 300 px large: 51 px of 640, and a frame or two more on the way.
+
+    The way across the line of sight is shorter by some cosine.
+    """
+    monkeypatch.setattr(delay, "record", seen_well)
+    settings = delay.DelaySettings(targets=("person",), delays=(delay.FIELD_S,), seconds=5.0, closed_loop=False)
+    rows = delay.one(exact, settings, 1)
+    summary = delay.summarise(rows)
+    found = summary["person"]["wide view alone"]["200 ms"]
+    behind = 1.5 * 0.2 / 1.75 * 300 / 640
+    assert 0.9 * behind < found["without"] < 1.5 * behind
+    assert found["times"] > 3
+    assert delay.missed(summary) == []
+    assert "person, 200 ms" in delay.describe(settings, summary)
+    delay.plot(rows, Figure())
+
+
+def test_how_many_times_is_of_medians_at_one_delay():
+    def row(name, delay_s, predict, closed_loop, offset):
+        return {"target": name, "delay_s": delay_s, "predict": predict, "closed_loop": closed_loop, "tpo_width": offset}
+
+    rows = [row("bird", 0.2, True, False, offset) for offset in (0.01, 0.02, 0.6)]
+    rows += [row("bird", 0.2, False, False, offset) for offset in (0.05, 0.1, 0.6)]
+    summary = delay.summarise(rows)
+    assert summary["bird"]["wide view alone"] == {"200 ms": {"with": 0.02, "without": 0.1, "times": 5.0}}
+    assert delay.missed(summary) == []  # the closed loop was not measured
+    rows += [row("bird", 0.2, True, True, 0.05), row("bird", 0.2, False, True, 0.1)]
+    assert delay.missed(delay.summarise(rows)) == ["bird"]
+
+
+# ---------------------------------------------------------------- five targets
+
+
+def test_good_seconds_are_those_that_rows_tell(exact):
+    config = hold_config("person", 1)
+    target, how = config.target("person"), FollowSettings(command_delay_s=0.08, closed_loop=False)
+    view = seen_well(config, target, 4.0)
+    found = five_targets.good_seconds(exact, config, target, 4.0, how, view)
+    rows = hold.held(exact, config, "person", 4.0, how, view)
+    assert found.keys() == {"person"}
+    assert found["person"] == pytest.approx(FRAME_S * sum(row.good_closeup for row in rows[1:]))
+    assert found["person"] > 0.5
+
+
+def test_of_five_who_had_a_second_is_served(exact, monkeypatch):
+    monkeypatch.setattr(five_targets, "record", seen_well)
+    settings = five_targets.FiveSettings(kinds=("person",), seconds=3.6, closed_loop=False)
+    rows = five_targets.one(exact, settings, 0)
+    assert [row["policy"] for row in rows] == ["first-come", "nearest-deadline", "most-served"]
+    for row in rows:
+        good = [row[f"good_{i}_s"] for i in range(1, 6)]
+        assert row["served"] == sum(value >= 1.0 for value in good)
+        assert row["good_s"] == pytest.approx(sum(good))
+    five_targets.plot(rows, Figure())
+
+
+def test_the_best_policy_is_put_over_the_first():
+    def row(policy, served):
+        return {"kind": "bird", "policy": policy, "served": served}
+
+    rows = [row("first-come", 2), row("first-come", 1), row("nearest-deadline", 3), row("most-served", 4)]
+    summary = five_targets.summarise(rows)
+    assert summary == {
+        "bird": {"first-come": 1.5, "nearest-deadline": 3.0, "most-served": 4.0, "best over first": 4 / 1.5}
+    }
+    assert five_targets.missed(summary) == []
+    assert five_targets.missed(five_targets.summarise([*rows, row("first-come", 6)])) == ["bird"]
+    assert "five birds" in five_targets.describe(five_targets.SETTINGS, summary)
+    none = five_targets.summarise([row(policy, 0) for policy in ("first-come", "nearest-deadline", "most-served")])
+    assert five_targets.missed(none) == ["bird"]
+
+
+# ---------------------------------------------------------------- dead zone
+
+
+def test_a_dead_zone_spares_the_head_that_looks_at_a_book(exact, monkeypatch):
+    monkeypatch.setattr(dead_zone, "record", seen_well)
+    settings = dead_zone.DeadZoneSettings(targets=("book",), seconds=6.0, closed_loop=False)
+    rows = dead_zone.one(exact, settings, 0)
+    summary = dead_zone.summarise(rows)
+    assert summary["book"]["commands_per_min"]["over"] < 0.5
+    assert summary["book"]["commands_per_min"]["without"] > 0
+    dead_zone.plot(rows, Figure())
+    assert "book, commands_per_min" in dead_zone.describe(settings, summary)
+
+
+def test_with_a_dead_zone_over_without():
+    def row(way, commands, reversals, offset):
+        return {
+            "target": "book",
+            "way": way,
+            "commands_per_min": commands,
+            "reversals_per_min": reversals,
+            "tpo_width_median": offset,
+        }
+
+    rows = [row("with", 10.0, 0.0, 0.021), row("without", 40.0, 0.0, 0.02)]
+    summary = dead_zone.summarise(rows)
+    assert {key: found["over"] for key, found in summary["book"].items()} == pytest.approx(
+        {"commands_per_min": 0.25, "reversals_per_min": 1.0, "tpo_width_median": 1.05}
+    )
+    assert dead_zone.missed(summary) == ["book: reversals_per_min"]  # nothing cannot be halved, and is told
+    lost = dead_zone.summarise([row("with", 10.0, 1.0, None), row("without", 40.0, 4.0, 0.02)])
+    assert dead_zone.missed(lost) == ["book: tpo_width_median"]
+
+
+# ---------------------------------------------------------------- first shot
+
+
+@pytest.fixture(scope="module")
+def still():
+    """A book 10 m ahead, the zoom camera 0.4 m to the right, all effects off: a head that turns about its lens."""
+    home = {"translation": [0, 0, 0], "rotvec_deg": [0, 0, 0]}
+    sim = {
+        "scene": "indoor",
+        "targets": ["book"],
+        "effects": {"all": False},
+        "T_zoom0_fixed": home | {"translation": [-0.4, 0, 0]},
+        "T_head_zoom": home,
+        "paths": {"book": [[0, 0, 10, 1.6], [9, 0, 10, 1.6]]},
+    }
+    return SimWorld(parse_config({"sim": sim}), rendered=())
+
+
+def test_each_cause_alone(still):
+    truth, exact = still.truth(), true_calibration(still, stops=2)
+    shortest = still.rig.zoom.focal_range[0]
+    reach = Reach((-2.7, 2.7), (-0.8, 0.5), still.rig.zoom.focal_range)
+    at = truth.pixel("fixed", truth.center("book", 0.0), 0.0)
+    perfect = Shot(0.0, 1.0, at, 10.0, np.zeros(3), 2 * shortest, 0.0, 0.0, 2 * shortest)
+
+    def parts(calibration=exact, step=0.0, **changes):
+        shot = dataclasses.replace(perfect, **changes)
+        return budget(truth, exact, calibration, dataclasses.replace(reach, step=step), "book", shot)
+
+    assert tuple(parts()) == CAUSES
+    assert parts() == pytest.approx(dict.fromkeys(CAUSES, 0.0), abs=1e-7)
+
+    def alone(cause, found):
+        assert {key: value for key, value in found.items() if key != cause} == pytest.approx(
+            {key: 0.0 for key in CAUSES if key != cause}, abs=1e-7
+        )
+        return found[cause]
+
+    away = math.hypot(10, 0.4)
+    off = alone("detection", parts(pixel=at + np.array([3.0, 4.0])))
+    assert off == pytest.approx(math.hypot(30 / 686, 40 / 684) / away, rel=SMALL)
+    assert alone("size", parts(depth=12.0)) == pytest.approx(math.atan(0.4 / 10) - math.atan(0.4 / 12), rel=SMALL)
+    assert alone("delay", parts(moved=np.array([0.0, 0.1, 0.0]))) == pytest.approx(0.1 / away, rel=SMALL)
+    longer = parts(moved=np.array([0.0, 0.1, 0.0]), depth=12.0)["delay"]
+    assert longer == pytest.approx(0.1 * 10 / 12 / away, rel=SMALL)
+    turned = dataclasses.replace(exact, T_zoom0_fixed=pose([0, 0, 0], [0, 0.1, 0]) * exact.T_zoom0_fixed)
+    assert alone("calibration", parts(turned)) == pytest.approx(math.radians(0.1), rel=SMALL)
+    # The middle of the image is 6.5 and 4.5 px beside the principal point, at 1384 and 2768 px.
+    lens = alone("lens", parts(nominal_px=4 * shortest))
+    assert lens == pytest.approx(math.hypot(6.5, 4.5) * (1 / 1384 - 1 / 2768), rel=SMALL)
+    # Pan is -0.04 less 6.5 px of 1384, tilt is 4.5 px; to the nearest 0.03.
+    pan, tilt = -math.atan(0.04) + 6.5 / 1384, 4.5 / 1386
+    steps = alone("steps", parts(step=0.03))
+    assert steps == pytest.approx(math.hypot(pan + 0.03, tilt), rel=0.2)
+
+
+def test_a_budget_is_summed_in_quadrature_over_shots_at_the_target():
+    def row(on_target, offset, **parts):
+        told = dict.fromkeys(CAUSES, 0.0) | parts
+        return {
+            "target": "book",
+            "on_target": on_target,
+            "in_frame": on_target,
+            "tpo_width": min(offset, 0.625),
+            "found": on_target,
+            "corrected_width": 0.01 if on_target else None,
+            "measured": offset,
+            **told,
+        }
+
+    rows = [row(True, 0.05, detection=0.03, size=0.04), row(True, 0.05, detection=0.03, size=0.04)]
+    figures = first_shot.summarise(rows)["book"]
+    assert (figures["sum"], figures["measured"], figures["sum over measured"]) == pytest.approx((0.05, 0.05, 1.0))
+    assert first_shot.missed({"book": figures}) == []
+    rows.append(row(False, 4.0, detection=4.0))
+    figures = first_shot.summarise(rows)["book"]
+    assert (figures["sum"], figures["measured"], figures["in_frame"]) == pytest.approx((0.05, 0.05, 2 / 3))
+    assert first_shot.missed({"book": figures}) == ["book: in_frame"]
+    unexplained = [row(True, 0.1, delay=0.05)]
+    assert first_shot.missed(first_shot.summarise(unexplained)) == ["book: tpo_width", "book: sum over measured"]
+    assert "corrected_width" in first_shot.describe(first_shot.SETTINGS, {"book": figures})
+    first_shot.plot(rows, Figure())
+
+
+# ---------------------------------------------------------------- hold
+
+
+def test_a_target_that_is_never_acquired_is_missed():
+    good = {"closeup_yield": 0.95, "in_frame_ratio": 1.0, "tpo_width_median": 0.01, "size_ratio_median": 1.0}
+    good |= {"fragmentation_per_min": 0.0, "time_to_acquire_s": 0.5, "identification": 1.0, "identification_wide": 0.0}
+    rows = [{"target": "book", **good} for _ in range(3)]
+    summary = hold.summarise(rows)
+    assert summary == {"book": good}
+    assert hold.missed(summary) == []
+    lost = {"target": "book", **good, "closeup_yield": 0.1, "time_to_acquire_s": None, "tpo_width_median": None}
+    assert hold.missed(hold.summarise([*rows, lost, lost])) == []  # medians
+    assert hold.missed(hold.summarise([*rows, *[lost] * 4])) == [
+        "book: closeup_yield",
+        "book: tpo_width_median",
+        "book: time_to_acquire_s",
+    ]
+    assert "closeup_yield" in hold.describe(hold.SETTINGS, summary)
+
+
+# ---------------------------------------------------------------- quick runs, rendered
+
+WORSE = 1.10  # times the bound
+BOUNDED = (hold, first_shot, delay, dead_zone)
+
+
+@pytest.mark.slow
+@pytest.mark.render
+@pytest.mark.parametrize("module", BOUNDED, ids=lambda module: module.EXPERIMENT.name)
+def test_no_figure_gets_worse(module):
+    experiment = module.EXPERIMENT
+    summary = experiment.summarise(experiment.run(experiment.quick))
+    bounds = json.loads((EXPECTED / f"{experiment.name}.json").read_text())
+    assert bounds
+    for target, figures in bounds.items():
+        for path, bound in figures.items():
+            found = summary[target]
+            for key in path.split(" / "):
+                found = found[key]
+            assert found <= WORSE * bound, f"{target}, {path}: {found:.4g}, where {bound:.4g} was reached"
