@@ -72,9 +72,10 @@ class Session:
     """A capture session that takes an image and then fails, or not."""
 
     def __init__(self, error=None):
-        self.error = error
+        self.error, self.told = error, {}
 
-    def __call__(self, rig, board, *, captures_dir, **_):
+    def __call__(self, rig, board, *, captures_dir, **told):
+        self.told = told
         if captures_dir is not None:
             captures_dir.mkdir(exist_ok=True)
             (captures_dir / "index.json").write_text("{}")
@@ -87,7 +88,7 @@ class Session:
 def sessions(monkeypatch):
     """Lets `calibrate --rig` open a rig without a world; its session is what a test says."""
     rig = SimulatedRig()
-    rig.zoom.still_size = rig.zoom.size
+    rig.zoom.still_size, rig.zoom.focal_range = rig.zoom.size, RigConfig().focal_range_px  # 12 x zoom
     monkeypatch.setattr("cotarget.rig.open_rig", lambda config: rig)
     return lambda error=None: monkeypatch.setattr("cotarget.calibration.calibrate_rig", Session(error))
 
@@ -116,6 +117,34 @@ def test_captures_of_another_session_are_not_taken_for_its_own(folder, capsys, s
     sessions(CalibrationError("kept: already holds captures; give another folder"))
     status, _, err = call(capsys, *CALIBRATE)
     assert (status, err) == (1, "cotarget calibrate: kept: already holds captures; give another folder\n")
+
+
+@pytest.mark.parametrize(
+    ("stops", "taken", "said"),
+    [
+        (None, None, None),  # as many as the session has by default
+        (1, 1, None),
+        (2, 4, "2 stops of the zoom lens are 12 times apart"),
+        (3, 4, "3 stops of the zoom lens are 3.5 times apart"),
+        (4, 4, None),
+        (9, 9, None),
+    ],
+)
+def test_stops_that_are_too_far_apart_have_others_between_them(
+    folder, capsys, monkeypatch, sessions, stops, taken, said
+):
+    """Each at most 2.5 times the one before: from 1 to 12 by 2.29 takes three steps."""
+    sessions()
+    session = Session(CalibrationError("enough"))
+    monkeypatch.setattr("cotarget.calibration.calibrate_rig", session)
+    status, _, err = call(capsys, "calibrate", "--rig", "rig.toml", *([] if stops is None else ["--stops", stops]))
+    assert status == 1
+    assert session.told.get("stops") == taken
+    lines = err.splitlines()
+    assert lines[-1] == "cotarget calibrate: enough"
+    assert len(lines) == 1 + (said is not None)
+    assert said is None or lines[0].startswith(said)
+    assert said is None or lines[0].endswith("; 4 are taken")
 
 
 def test_an_earlier_calibration_is_kept(folder, capsys, sessions, monkeypatch):

@@ -6,6 +6,7 @@ can be told apart; and each stop, once seen, makes a good guess of the next.
 """
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -24,12 +25,17 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
+FINE = 1e-9  # rounding of a logarithm
 SAME_FOCAL = 0.008  # relative; a step of a usual lens changes the focal length by 0.02
 # What is known of a lens before it is seen: its pupil moves by some decimetres over the range; and distortion, measured
 # in the image, stays within several times of what lenses have. Boards all over the image know either far better.
 PUPIL_SIGMA = 0.2  # [m]
 BENT_SIGMAS = {"k1": (0.5, 2), "k2": (1.0, 4), "p1": (0.05, 1), "p2": (0.05, 1)}  # and the power of the focal length
 INSIDE_PX = 2.0  # a corner predicted this far inside the image is expected to be seen
+# A stop is found by where the one before lets expect the board's corners. What that one leaves open, a principal point
+# that is taken for a turn of the camera, grows with the focal length: in three sessions of eight placements, rendered
+# without multisampling, a stop 12 times as far was lost in two, 3.5 times as far in one, 2.3 times in none.
+LARGEST_LEAP = 2.5
 FEWEST_CORNERS = 6  # of a board seen in part, that tell how a lens magnifies and where its axis is
 
 
@@ -38,6 +44,11 @@ def spread_stops(shortest_px: float, longest_px: float, count: int) -> list[floa
     if longest_px <= shortest_px * (1 + SAME_FOCAL) or count < 2:
         return [shortest_px]
     return [float(f) for f in np.geomspace(shortest_px, longest_px, count)]
+
+
+def fewest_stops(shortest_px: float, longest_px: float) -> int:
+    """How many stops it takes, evenly spread in their logarithm, to get surely from one to the next."""
+    return 1 + math.ceil(math.log(longest_px / shortest_px) / math.log(LARGEST_LEAP) - FINE)
 
 
 def stops_of(views: Sequence[View]) -> list[float]:

@@ -42,6 +42,9 @@ def calibrate(options: argparse.Namespace) -> None:
             config = load_config(options.rig)
             refuse_if_stopped(config.safety.stop_file)
             with SafeRig(open_rig(config), config.safety) as rig:
+                session = {name: getattr(options, name) for name in _given(options, SESSION)}
+                if options.stops is not None:
+                    session["stops"] = _enough_stops(options.stops, rig.zoom.focal_range)
                 finer = rig.zoom.still_size[0] / rig.zoom.size[0]
                 found = cal.calibrate_rig(
                     with_stills(rig),
@@ -53,7 +56,7 @@ def calibrate(options: argparse.Namespace) -> None:
                     seed=config.sim.seed,
                     config=config,
                     options=how,
-                    **{name: getattr(options, name) for name in _given(options, SESSION)},
+                    **session,
                 )
         elif options.board is not None:
             board = BoardConfig(options.kind or "chessboard", options.board, options.square)
@@ -83,6 +86,22 @@ def _captures_kept(directory: Path | None) -> Iterator[None]:
                     file=sys.stderr,
                 )
         raise
+
+
+def _enough_stops(wanted: int, focal_range_px: tuple[float, float]) -> int:
+    """As many stops as are wanted, or as it takes to get from one to the next; 1 is the shortest focal length alone."""
+    from cotarget.calibration.stops import fewest_stops
+
+    needed = fewest_stops(*focal_range_px)
+    if not 1 < wanted < needed:
+        return wanted
+    leap = (focal_range_px[1] / focal_range_px[0]) ** (1 / (wanted - 1))
+    print(
+        f"{wanted} stops of the zoom lens are {leap:.2g} times apart, too far to know the board again from one to the "
+        f"next; {needed} are taken",
+        file=sys.stderr,
+    )
+    return needed
 
 
 def _given(options: argparse.Namespace, names: Sequence[str]) -> list[str]:

@@ -112,7 +112,7 @@ def _parser() -> argparse.ArgumentParser:
         "--stops",
         type=count,
         metavar="N",
-        help="with --rig: how many stops of the zoom lens; 1 for the shortest alone (8)",
+        help="with --rig: how many stops of the zoom lens, more where they are too far apart; 1: shortest alone (8)",
     )
     calibrate.add_argument(
         "--method",
