@@ -127,7 +127,7 @@ EXPERIMENT = Experiment(
     "dead_zone",
     "Commands and reversals a minute with the dead zone and without, and the offset it costs.",
     SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=8.0, calibrated=False, closed_loop=False),
+    dataclasses.replace(SETTINGS, seeds=1, seconds=10.0, calibrated=False, closed_loop=False),
     run,
     summarise,
     describe,

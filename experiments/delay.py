@@ -167,7 +167,7 @@ EXPERIMENT = Experiment(
     "The offset in the close-up with prediction and without, over the delay of cameras and head.",
     SETTINGS,
     dataclasses.replace(
-        SETTINGS, seeds=1, delays=(0.0, FIELD_S, 0.6), seconds=6.0, calibrated=False, closed_loop=False
+        SETTINGS, seeds=1, delays=(0.0, FIELD_S, 0.6), seconds=10.0, calibrated=False, closed_loop=False
     ),
     run,
     summarise,

@@ -26,7 +26,7 @@ from cotarget.policies import POLICIES
 from cotarget.sim.truth import Truth
 from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, target_of, watched
-from experiments.hold_scenes import five_targets_config
+from experiments.hold_scenes import GROUP, five_targets_config
 from experiments.wide_view import WideView, record
 
 FIRST = "first-come"
@@ -136,12 +136,13 @@ def describe(settings: FiveSettings, summary: Mapping[str, Any]) -> str:
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """How many were served, each seed a bar."""
-    kinds = list(dict.fromkeys(row["kind"] for row in rows))
+    kinds, seeds = (list(dict.fromkeys(row[key] for row in rows)) for key in ("kind", "seed"))
     for ax, kind in zip(np.ravel(figure.subplots(1, len(kinds), sharey=True)), kinds, strict=True):
         for i, policy in enumerate(POLICIES):
             served = [row["served"] for row in rows if (row["kind"], row["policy"]) == (kind, policy)]
             ax.bar(np.arange(len(served)) + 0.25 * (i - 1), served, 0.22, label=policy)
-        ax.set(title=f"five {kind}s", xlabel="seed", ylabel="targets served")
+        ax.set(title=f"five {kind}s", xlabel="seed", ylabel="targets served", ylim=(0, GROUP))
+        ax.set_xticks(range(len(seeds)), seeds)
     ax.legend(frameon=False)
 
 

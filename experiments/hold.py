@@ -228,7 +228,7 @@ EXPERIMENT = Experiment(
     "hold",
     "How long and how well a target is held in the close-up.",
     SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=6.0, calibrated=False),
+    dataclasses.replace(SETTINGS, seeds=1, seconds=10.0, calibrated=False),
     run,
     summarise,
     describe,
