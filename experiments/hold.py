@@ -66,6 +66,8 @@ WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
         "identification_wide": (0.0, 0.01),
     },
 }
+# Told beside them.
+ALSO = ("tpe_px_median", "false_tracks_per_min", "commands_per_min", "reversals_per_min")
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,7 @@ def target_of(config: RigConfig, name: str) -> TargetConfig:
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """Medians over the seeds of each target's figures; one that was never measured counts as missed."""
     return {
-        name: {key: _median(row[key] for row in rows if row["target"] == name) for key in wanted}
+        name: {key: _median(row[key] for row in rows if row["target"] == name) for key in (*wanted, *ALSO)}
         for name, wanted in WANTED.items()
         if any(row["target"] == name for row in rows)
     }
@@ -190,20 +192,20 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     return [
         f"{name}: {key}"
         for name, figures in summary.items()
-        for key, value in figures.items()
-        if not WANTED[name][key][0] <= value <= WANTED[name][key][1]
+        for key, (low, high) in WANTED[name].items()
+        if not low <= figures[key] <= high
     ]
 
 
 def describe(settings: HoldSettings, summary: Mapping[str, Any]) -> str:
     """A line a figure, a column a target, what is wanted beside it."""
     lines = []
-    for key in WANTED["book"]:
+    for key in (*WANTED["book"], *ALSO):
         cells: list[Any] = [key]
         for name, figures in summary.items():
-            low, high = WANTED[name][key]
+            low, high = WANTED[name].get(key, (-np.inf, np.inf))
             mark = "" if low <= figures[key] <= high else " NO"
-            cells += [f"{figures[key]:.3g}{mark}", f"{low:g}-{high:g}"]
+            cells += [f"{figures[key]:.3g}{mark}", f"{low:g}-{high:g}" if key in WANTED[name] else ""]
         lines.append(cells)
     head = ["median", *(column for name in summary for column in (name, "wanted"))]
     return f"holding a target, {seeds_of(settings)}\n" + table(head, lines)
