@@ -131,12 +131,16 @@ def nearest_deadline(outlook: Outlook) -> int:
 
 
 def most_served(outlook: Outlook) -> int:
-    """The first of the order that serves most before they leave; the one followed before unless another serves more."""
+    """The first of the order that serves most before they leave; the one followed before while it can still be had.
+
+    When a target leaves is known badly: whoever made another plan at every frame would look at nobody for long enough.
+    """
+    current = next((c for c in outlook.waiting if c.id == outlook.current), None)
+    if current is not None and _end(current, outlook, outlook.head, 0.0) <= current.leaves_in:
+        return current.id
     planned = outlook.waiting[:MOST_PLANNED]
     plans = {c.id: plan(c, [o for o in planned if o is not c], outlook) for c in planned}
-    best = max(plans, key=lambda number: (plans[number], -number))
-    current = outlook.current
-    return best if current not in plans or plans[best][0] > plans[current][0] else current
+    return max(plans, key=lambda number: (plans[number], -number))
 
 
 def plan(first: Candidate, others: Sequence[Candidate], outlook: Outlook) -> tuple[int, float]:

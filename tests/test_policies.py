@@ -93,6 +93,18 @@ def test_the_plan_gives_up_one_to_have_two():
     assert most_served().select([far, *right], STILL, LIMITS) in (2, 3)
 
 
+def test_a_plan_is_kept_while_the_times_to_leave_waver():
+    policy, rng = most_served(), np.random.default_rng(0)
+    chosen = set()
+    for k in range(25):  # a second
+        leaves = rng.uniform(3.0, 9.0, 3)
+        there = [candidate(i, 0.2 * i, leaves=leaves[i], seen=0.04 * k * (i in chosen)) for i in range(3)]
+        chosen.add(policy.select(there, STILL, LIMITS))
+    assert len(chosen) == 1
+    gone = [candidate(i, 0.2 * i, leaves=0.1 if i in chosen else 9.0) for i in range(3)]
+    assert policy.select(gone, STILL, LIMITS) not in chosen
+
+
 def served_by_best_order(candidates, head):
     """How many the best of all orders serves, by trying every order of every subset."""
     best = 0
