@@ -3,11 +3,11 @@
 from itertools import pairwise
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 
 from cotarget.errors import ConfigError
+from cotarget.sim.opengl import mujoco  # which chooses the OpenGL, whichever test comes first
 from cotarget.sim.targets import MOUNT, TARGETS, make_target, scale_spec, waypoint_path
 
 ASSETS = Path(__file__).parent.parent / "sim_assets"
