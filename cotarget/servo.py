@@ -28,13 +28,13 @@ class ServoSettings:
     Attributes:
         command_delay_s: from a command to the start of motion [s].
         predict: whether the target's motion is allowed for; without it the head is sent where the target was seen.
-        steering: when the head gets a new command; with every frame by default.
+        steering: how the head keeps up, and when it is left alone.
         zoom: when the lens zooms in and out.
     """
 
     command_delay_s: float = 0.0
     predict: bool = True
-    steering: SteeringSettings = field(default_factory=lambda: SteeringSettings(zone=0.0))
+    steering: SteeringSettings = field(default_factory=SteeringSettings)
     zoom: ZoomSettings = field(default_factory=ZoomSettings)
 
 
@@ -92,11 +92,19 @@ class Servo:
         rates = (found.pan - first.pan) / interval, (found.tilt - first.tilt) / interval
         pan, tilt, focal = self.commanded
         view = self._rig.zoom.size[0] / self._true(focal)
-        command = self._steering.decide(effect, interval, reach.now, (first.pan, first.tilt), rates, view)
+        command = self._steering.decide(
+            effect, interval, reach.now, (first.pan, first.tilt), rates, view, effect - at_effect.measured_t
+        )
         if command is not None:
             pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)
         head = self._steering.where(effect + interval, reach.now)
-        choice = self._zoom.choose(expect(then, *head, focal), found.focal_px, self._true(focal), now)
+        choice = self._zoom.choose(
+            expect(then, *head, focal),
+            found.focal_px,
+            self._true(focal),
+            now,
+            self._true(self._rig.zoom.state().focal_px),
+        )
         nominal = self._calibration.zoom.nominal_for(choice.focal_px)
         if abs(math.log(nominal / focal)) > NO_CHANGE:
             focal = self._rig.zoom.zoom(nominal)

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cotarget.deadzone import axis_at
 from cotarget.estimation.estimate import Estimate
 from cotarget.geometry import Array
-from cotarget.rig import PanTiltLimits
 
 # Halvings of the range of focal lengths, tenfold or so, until it is known to a thousandth.
 HALVINGS = 12
@@ -76,7 +74,7 @@ def expect(
 
     Args:
         estimate: of the target, for the time when the next frame is exposed.
-        pan: where the head will be then [rad]: its goal, or short of it by what `way_left` says.
+        pan: where the head will be then [rad].
         tilt: likewise.
         nominal_px: any focal length near the one in question; it only matters for the lens's centre.
         width_over_height: of the target's box.
@@ -163,7 +161,9 @@ class ZoomPolicy:
         self._settings = settings
         self._out_t = -math.inf
 
-    def choose(self, expected: Expected | None, wanted_px: float, commanded_px: float, t: float) -> ZoomChoice:
+    def choose(
+        self, expected: Expected | None, wanted_px: float, commanded_px: float, t: float, now_px: float | None = None
+    ) -> ZoomChoice:
         """Decide where the lens shall be.
 
         Args:
@@ -171,6 +171,7 @@ class ZoomPolicy:
             wanted_px: focal length at which it is as large as wanted [px].
             commanded_px: where the lens was last sent [px].
             t: the time now [s].
+            now_px: where the lens is now [px]; there by default.
         """
         if expected is None:
             self._out_t = t
@@ -190,7 +191,9 @@ class ZoomPolicy:
         change = math.log(goal / commanded_px)
         if change > settings.deadband:
             if t - self._out_t < settings.settle_s:
-                return choice(commanded_px, "settling")
+                # What it had to zoom out for may have passed before it got there: no farther out than is needed now.
+                here = commanded_px if now_px is None else now_px
+                return choice(max(commanded_px, min(goal, here)), "settling")
             return choice(goal, reason)
         if commanded_px > longest(settings.unsure) and change < 0:
             self._out_t = t
@@ -198,22 +201,6 @@ class ZoomPolicy:
         if math.log(wanted / commanded_px) < -settings.deadband:
             return choice(goal, reason)
         return choice(commanded_px, reason)
-
-
-def way_left(way: float, closing: float, seconds: float, limits: PanTiltLimits) -> float:
-    """How far an axis will still have to go, when it moves as fast as it can and comes to rest at its goal.
-
-    Args:
-        way: how far it has to go [rad].
-        closing: how fast that way grows shorter now [rad/s], with the sign of ``way``.
-        seconds: how much later [s].
-        limits: of speed and acceleration.
-
-    Returns:
-        What is left of ``way`` [rad]; of the other sign where the axis is too fast to stop in time.
-    """
-    gone, _ = axis_at(seconds, 0.0, closing, way, limits.speed, limits.acceleration)
-    return way - gone
 
 
 def _below(value: float, sigma: float) -> float:

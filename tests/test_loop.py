@@ -102,8 +102,8 @@ class _Head:
         goal = [
             min(max(round(q / STEP) * STEP, lo), hi) for q, (lo, hi) in ((pan, rig.limits.pan), (tilt, rig.limits.tilt))
         ]
-        rig.pan.command(rig.t + DELAY, goal[0])
-        rig.tilt.command(rig.t + DELAY, goal[1])
+        rig.pan.command(rig.t + DELAY, goal[0], speed)
+        rig.tilt.command(rig.t + DELAY, goal[1], speed)
         rig.moves.append((rig.t, *goal))
         return tuple(goal)
 

@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 
 from cotarget.estimation import SpatialFilter
-from cotarget.rig import PanTiltLimits
-from cotarget.sim.motion import Axis
-from cotarget.zoompolicy import Expected, ZoomPolicy, ZoomSettings, chance_inside, expect, longest_focal, way_left
+from cotarget.zoompolicy import Expected, ZoomPolicy, ZoomSettings, chance_inside, expect, longest_focal
 from tests.moving_targets import APART, Flight, show
 
 SIZE = (640, 480)
 RANGE = (690.0, 8000.0)
-LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians(206), 0.0)
 FRAME = 0.04
 # 20000 samples give a chance of 0.9 to 0.2 %; errors along both axes are counted as if they had nothing in common.
 CHANCE = 0.01
@@ -100,15 +97,14 @@ def test_the_lens_zooms_in_anew_only_when_things_have_settled():
     assert policy.choose(expected(0.001), 4000.0, out.focal_px, 0.4).focal_px == 4000.0
 
 
-@pytest.mark.parametrize(("way", "closing"), [(0.5, 0.0), (-0.5, 0.3), (0.05, 1.0), (2.0, -1.0), (0.0, 0.5)])
-def test_the_way_left_is_that_of_the_simulated_unit(way, closing):
-    axis = Axis(LIMITS.speed, LIMITS.acceleration)
-    # Bring the axis to the wanted speed at the place 0, then send it the whole way.
-    axis._segments = [(-math.inf, -closing * 100, 0.0, 0.0), (-100.0, -closing * 100, closing, 0.0)]
-    axis.command(0.0, way)
-    for seconds in (0.0, 0.05, 0.2, 0.5, 1.0, 5.0):
-        left = way - axis.motor(seconds)[0]
-        assert way_left(way, closing, seconds, LIMITS) == pytest.approx(left, abs=1e-9)
+def test_a_lens_on_its_way_out_stops_where_it_is_once_that_is_sure_enough():
+    policy = ZoomPolicy(RANGE, SIZE, ZoomSettings(settle_s=0.3))
+    out = policy.choose(expected(0.3), 4000.0, 4000.0, 0.0)
+    assert out.focal_px < 1.1 * RANGE[0]
+    stopped = policy.choose(expected(0.001), 4000.0, out.focal_px, 0.1, now_px=3500.0)
+    assert (stopped.focal_px, stopped.reason) == (3500.0, "settling")
+    # Nor does it go in meanwhile, wherever it is said to be.
+    assert policy.choose(expected(0.001), 4000.0, stopped.focal_px, 0.14, now_px=3000.0).focal_px == 3500.0
 
 
 def test_an_estimate_says_what_to_expect():

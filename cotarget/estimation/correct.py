@@ -173,12 +173,15 @@ def _elsewhere(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node
     nearness = math.exp(-node.x[L])
     x, P = node.x.copy(), node.P.copy()
     x[:2] = seen.tangent
-    x[W], x[C] = 0.0, 0.0
+    x[C] = 0.0  # its velocity is the best guess still: one that is carried off is soon farther off
     moved = [A, B, *range(W.start, C.stop)]
     P[moved] = 0.0
     P[:, moved] = 0.0
     P[:2, :2] = seen.R
-    P[range(3, 9), range(3, 9)] = [(motion.speed * nearness) ** 2] * 3 + [(motion.acceleration * nearness) ** 2] * 3
+    # Along the axis only sizes tell, and badly: there it is taken for no faster than usual.
+    speeds = settings.jump_speed, settings.jump_speed, motion.speed
+    accelerations = settings.jump_acceleration, settings.jump_acceleration, motion.acceleration
+    P[range(3, 9), range(3, 9)] = (np.array([*speeds, *accelerations]) * nearness) ** 2
     P[L, L] += settings.depth_doubt**2
     return replace(node, x=x, P=P, missed_wide=0, missed_zoom=0, lean=(0.0, 0.0), surprise=1.0, boost=1.0)
 

@@ -68,6 +68,8 @@ class EstimationSettings:
         gate: largest squared innovation, in variances, of a middle; 99.9 % of a chi-square with two degrees of freedom.
         size_gate: likewise of a size; 99.7 % with one.
         misses: so many measurements outside the gate on end are believed.
+        jump_speed: standard deviation, across the line of sight, of the velocity of a target so found elsewhere [m/s]
+        jump_acceleration: ... and of its acceleration [m/s^2].
         zoom_misses: likewise in the zoom view, while the wide view has no surprise: then size or head is doubted.
         calm: a mean surprise below which the wide view counts as having none.
         lean_gain: weight of the newest innovation in the zoom view in their mean, in standard deviations.
@@ -92,6 +94,8 @@ class EstimationSettings:
     gate: float = 13.8
     size_gate: float = 9.0
     misses: int = 3
+    jump_speed: float = 3.0
+    jump_acceleration: float = 10.0
     zoom_misses: int = 8
     calm: float = 2.0
     lean_gain: float = 0.1
@@ -112,6 +116,7 @@ BOOK = EstimationSettings(
     noise_s=0.0,
     size_noise=0.01,
     size_noise_px=0.3,
+    misses=2,
 )
 PERSON = EstimationSettings(MotionSettings(0.8, 0.7, 1.2, 0.04))
 # The larger side of a bird's box is anything from its body's length to its wingspan.
