@@ -70,7 +70,7 @@ class Choice:
 
     @property
     def unmet(self) -> str:
-        """Says that a click or a number never meant a track; empty where it did, or where none was given."""
-        if self._followed or not self._wish:
+        """Says that a click or a number meant none of the tracks; empty where it did, and where there was no track."""
+        if self._followed or not self._wish or not self._seen:
             return ""
         return f"{self._wish}; the tracks were: {choices(map(str, self._seen))}"

@@ -54,7 +54,7 @@ def follow(options: argparse.Namespace) -> None:
         SafeRig(recorder.wrap(open_rig(config)) if recorder else open_rig(config), config.safety) as rig,
     ):
         states = _follow(rig, calibration, config, options.target, choice, options.seconds, options.csv, options.video)
-    _tell_if_nothing_was_seen("follow", options.target, states["states"])
+    _tell_if_nothing_was_seen("follow", options.target, states["states"], choice)
     print_json(states)
 
 
@@ -74,7 +74,7 @@ def replay(options: argparse.Namespace) -> None:
     with SafeRig(played, recording.config.safety) as rig:
         config, name, steps = recording.config, recording.target, recording.steps
         states = _follow(rig, calibration, config, name, choice, math.inf, options.csv, options.video, steps)
-    _tell_if_nothing_was_seen("replay", recording.target, states["states"])
+    _tell_if_nothing_was_seen("replay", recording.target, states["states"], choice)
     print_json(states | {"differences": dataclasses.asdict(played.differences)})
 
 
@@ -119,12 +119,12 @@ def _follow(
     return {"steps": sum(states.values()), "states": states}
 
 
-def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int]) -> None:
+def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int], choice: Choice) -> None:
     """Say so where there was nothing to follow all the time, and what would be right."""
     from cotarget.loop import State
 
     steps = sum(states.values())
-    if steps and states[State.SEARCHING] == steps:
+    if steps and states[State.SEARCHING] == steps and not choice.unmet:
         print(
             f"cotarget {command}: no {name} was seen in {steps} frames; what --target names has to move in the fixed "
             "camera's view, which --video FILE shows (an emulated rig has who is in its [sim] targets)",
