@@ -91,7 +91,7 @@ def settings_for(target: TargetConfig) -> TrackerSettings:
         return TrackerSettings(acceleration_px=250.0, noise_of_size=0.2, confirm_score=0.5, doubt_score=0.2)
     if target.dimension == "wingspan":
         return TrackerSettings(acceleration_px=250.0, noise_of_size=0.2, confirm_travel=0.5)
-    return TrackerSettings(confirm_travel=0.1, noise_of_size=0.04)
+    return TrackerSettings(confirm_travel=0.5, noise_of_size=0.04)
 
 
 @dataclass(frozen=True)
