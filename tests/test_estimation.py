@@ -305,6 +305,19 @@ def test_a_wild_measurement_does_no_harm(camera):
     assert (np.abs(a.state - b.state) < 0.1 * sigma + EXACT).all()
 
 
+def test_a_detector_that_errs_more_than_it_is_thought_to_makes_nothing_leap():
+    """A book that stands, seen with two and a half times the noise that a book is taken to have."""
+    flight = Flight("book", 4, 3.0)
+    rng = np.random.default_rng(4)
+    estimator = SpatialFilter(flight.calibration, flight.target)
+    still = flight.wide(0.0)
+    fastest = 0.0
+    for t in np.arange(0.0, 20.0, 1 / RATE):
+        estimator.see_wide(replace(still, center_px=still.center_px + rng.normal(0.0, 0.5, 2)), t)
+        fastest = max(fastest, float(np.linalg.norm(estimator.at(t).velocity[:2])) if t > 1 else 0.0)
+    assert fastest < 1.0  # taken for elsewhere each time, it would be several metres a second
+
+
 def test_a_target_that_jumps_is_believed_after_three_frames():
     flight = Flight("book", 3, 2.0)
     estimator = SpatialFilter(flight.calibration, flight.target)

@@ -80,10 +80,13 @@ def correct_wide(node: Node, seen: WideSeen, settings: EstimationSettings) -> No
     R = seen.R * _repeated(node.t - node.wide_t, settings.noise_s)
     S_inv = _inverse(PHt[:2] + R)
     surprise = float(innovation @ S_inv @ innovation)
-    if surprise > settings.gate:
+    if surprise > settings.jump_gate:
         if node.missed_wide + 1 < settings.misses:
             return replace(node, missed_wide=node.missed_wide + 1, missed_zoom=0, lean=(0.0, 0.0))
         return _size(_elsewhere(node, seen, settings), seen.size, settings)
+    if surprise > settings.gate:  # measured worse than thought: it counts as much as one that just passes
+        S_inv = _inverse(PHt[:2] + R * (surprise / settings.gate))
+        surprise = float(innovation @ S_inv @ innovation)
     gain = PHt @ S_inv
     P = node.P - gain @ PHt.T
     node = _told(replace(node, x=node.x + gain @ innovation, P=P, missed_wide=0, wide_t=node.t), surprise, settings)

@@ -66,8 +66,9 @@ class EstimationSettings:
         size_s: how long an error of the side lasts [s]; half a wing beat or step.
         head_sigma: of the angles that the head reports for a frame [rad]; rounding of 0.05 degrees leaves that.
         gate: largest squared innovation, in variances, of a middle; 99.9 % of a chi-square with two degrees of freedom.
+        jump_gate: beyond this it is either wrong or elsewhere: ten standard deviations. Between the two it counts less.
         size_gate: likewise of a size; 99.7 % with one.
-        misses: so many measurements outside the gate on end are believed.
+        misses: so many measurements beyond jump_gate on end are believed.
         jump_speed: standard deviation, across the line of sight, of the velocity of a target so found elsewhere [m/s]
         jump_acceleration: ... and of its acceleration [m/s^2].
         zoom_misses: likewise in the zoom view, while the wide view has no surprise: then size or head is doubted.
@@ -92,6 +93,7 @@ class EstimationSettings:
     size_s: float = 0.2
     head_sigma: float = 3e-4
     gate: float = 13.8
+    jump_gate: float = 100.0
     size_gate: float = 9.0
     misses: int = 3
     jump_speed: float = 3.0
