@@ -114,6 +114,29 @@ def test_faint_targets_in_much_noise_are_found():
     assert all(len(confirmed) <= 1 for confirmed in tracks)
 
 
+def test_a_bird_in_front_of_rough_ground_is_found_by_what_it_does_to_the_picture():
+    """The ground varies by 40 grey levels around 80, the bird stands for 40 everywhere."""
+
+    def paint(picture, i):
+        draw(picture, 30 + 3 * i, 205, 10, 7, grey=40.0)
+
+    tracks = follow(film(80, paint))
+    on = [any(np.linalg.norm(t.center_px - (30 + 3 * i, 205)) < 5 for t in tracks[i]) for i in range(30, 80)]
+    assert np.mean(on) > 0.9
+    assert sum(len(confirmed) > 1 for confirmed in tracks) <= 0.1 * 80  # it may fall in two for a moment
+
+
+def test_a_twig_that_sways_where_it_is_makes_no_track():
+    """Above the ground's rough edge, hither and thither by its own size as the wind takes it."""
+    rng = np.random.default_rng(7)
+    way = 3 * np.cumsum(rng.normal(0, 0.5, 200)) % 8 - 4
+
+    def paint(picture, i):
+        draw(picture, 160 + way[i], 168, 6, 4)
+
+    assert sum(len(confirmed) for confirmed in follow(film(200, paint))) < 0.1 * 200
+
+
 def test_poles_wires_and_edges_are_no_specks():
     rng = np.random.default_rng(1)
     picture = landscape(rng)

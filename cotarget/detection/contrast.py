@@ -69,7 +69,7 @@ def find_specks(grey: Image, threshold: float, most: int) -> list[Speck]:
     found.sort(key=lambda speck: -speck.signal)
     kept: list[Speck] = []
     for speck in found:
-        if not any(_same(speck, other) for other in kept):
+        if not any(share(speck, other) for other in kept):
             kept.append(speck)
     return kept[:most]
 
@@ -171,6 +171,6 @@ def _outline(grey: Image, peak: tuple[int, int], scale: int, signal: float, arou
     return Speck((left + x, top + y), (w, h), contrast, signal, around)
 
 
-def _same(one: Speck, other: Speck) -> bool:
+def share(one: Speck, other: Speck) -> bool:
     """Whether the boxes of two specks share a pixel."""
     return all(a < b + n and b < a + m for a, m, b, n in zip(one.low, one.size, other.low, other.size, strict=True))
