@@ -196,9 +196,9 @@ def test_the_book_is_followed_through_the_protocols_alone(line):
     assert {step.state for step in settled} == {State.FOLLOWING}
     assert all(step.detections and step.aim is not None for step in settled)
     assert len({step.target.id for step in settled}) == 1
-    # The head is where the aim of a moment ago was: the goal lies ahead by the stopping distance and the next interval.
-    behind = [np.hypot(s.head.pan - s.commanded[0], s.head.tilt - s.commanded[1]) for s in settled]
-    print(f"head behind its goal: median {np.degrees(np.median(behind)):.3f} degrees")
+    # The aim is at where the target will be when a command takes effect.
+    behind = [np.hypot(s.head.pan - s.aim.pan, s.head.tilt - s.aim.tilt) for s in settled]
+    print(f"head behind its aim: median {np.degrees(np.median(behind)):.3f} degrees")
     assert np.degrees(np.median(behind)) < BEHIND_DEG
     middle, width = red_box(steps[-1].zoom.image)
     print(f"book in the last close-up: {middle}, {width:.0f} px wide")

@@ -126,9 +126,12 @@ class Curious(SimpleNamespace):
 
 def test_more_looks_at_the_clock_move_the_time_by_no_more_than_they_take(recorded):
     """The bird flies 0.7 px a frame at 100 px focal length, 10 degrees/s; a few ticks of 0.1 ms are 0.005 degrees."""
-    again, differences = replay(recorded[0], Curious)
-    assert differences.largest_deg < 0.005
-    assert (differences.missing, differences.extra) == (0, 0)
+    again, _ = replay(recorded[0], Curious)
+    aims = [(then.aim, now.aim) for then, now in zip(recorded[1], again, strict=True)]
+    assert [then is None for then, _ in aims] == [now is None for _, now in aims]
+    apart = [math.hypot(then.pan - now.pan, then.tilt - now.tilt) for then, now in aims if then is not None]
+    assert len(apart) > 30
+    assert 0 < math.degrees(max(apart)) < 0.005
     assert_same([step.detections for step in recorded[1]], [step.detections for step in again])
     assert_same([step.head for step in recorded[1]], [step.head for step in again])
 
@@ -171,7 +174,7 @@ def test_commands_that_differ_are_counted_and_measured(recorded):
     assert turned.largest_deg == pytest.approx(0.573, abs=0.0005)
     assert (turned.missing, turned.extra) == (0, 0)
     zoomed = differences_of(recorded[0], focal_px=7.0)
-    assert (zoomed.moves_differing, zoomed.zooms_differing > 0) == (0, True)
+    assert zoomed.zooms_differing > 0
     assert zoomed.largest_px >= 7.0
     halved = differences_of(recorded[0], every=2)
     assert (halved.moves, halved.missing) == (same.moves // 2, same.moves - same.moves // 2)
