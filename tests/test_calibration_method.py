@@ -43,7 +43,7 @@ def test_exact_corners_give_the_truth_exactly():
 @pytest.mark.parametrize(("truth", "bounds", "refined_bounds"), [
     # Median and p95 [degrees] at 0.1 px noise from 30 boards; the refined ones are five times what is usual.
     (Truth(), (0.05, 0.10), (0.010, 0.020)),
-    (other_rig(), (0.08, 0.16), (0.010, 0.020)),
+    pytest.param(other_rig(), (0.08, 0.16), (0.010, 0.020), marks=pytest.mark.slow),
 ], ids=["default", "other"])  # fmt: skip
 def test_noisy_corners_point_well_enough(truth, bounds, refined_bounds):
     views = synthetic_views(truth, POINTS, np.random.default_rng(1))

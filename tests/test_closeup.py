@@ -294,7 +294,7 @@ def true_calibration(world):
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("name", ["book", "person", "bird"])
+@pytest.mark.parametrize("name", [pytest.param("book", marks=pytest.mark.slow), "person", "bird"])
 def test_rendered_targets_are_found_from_the_shortest_focal_length_to_the_longest(name):
     config = sim_config(SCENES[name], (name,), 5)
     world, empty = (

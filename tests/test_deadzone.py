@@ -134,6 +134,7 @@ def test_half_the_commands_and_reversals_at_the_same_offset(name):
     assert offset <= SAME_OFFSET * before[2]
 
 
+@pytest.mark.slow
 def test_at_the_speed_of_the_target_the_picture_smears_less():
     """The same as a head that hurries to where the target will be, but for what moves within 1/100 s."""
     *_, offset, smear = over_seeds("person", EVERY_FRAME)

@@ -175,6 +175,7 @@ def test_random_rigs_are_within_what_is_promised():
         assert np.linalg.norm(rig.truth.hand.translation) <= 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"the real stereo photos are not at {PHOTOS}")
 def test_the_real_photos(capsys):
     assert photos.main([str(PHOTOS), "--quick", "--processes", "1"]) == 0

@@ -154,6 +154,7 @@ def test_poses_give_an_honest_covariance():
     check_honest(from_poses(arm(rng, 20)), from_poses(pan_tilt(rng, 20)))
 
 
+@pytest.mark.slow
 def test_independent_motions_give_an_honest_covariance():
     rng = np.random.default_rng(1)
     check_honest(from_motions(arm(rng, 20), arm(rng, 20)), from_motions(pan_tilt(rng, 20), pan_tilt(rng, 20)))

@@ -73,6 +73,7 @@ def test_the_book_is_put_elsewhere_once():
         assert seen_wholly(truth, "book", TIMES[::10]).all()
 
 
+@pytest.mark.slow
 def test_the_person_walks_at_ten_metres():
     for seed in SEEDS:
         x, truth = track("person", seed)
@@ -130,7 +131,7 @@ def test_true_sizes_scatter():
     assert 0.02 < np.std(sizes["bird"]) < 0.15
 
 
-@pytest.mark.parametrize("kind", ["person", "bird"])
+@pytest.mark.parametrize("kind", [pytest.param("person", marks=pytest.mark.slow), "bird"])
 def test_five_at_once_cross_and_are_told_apart(kind):
     for seed in SEEDS[:3]:
         config = five_targets_config(seed, kind)

@@ -82,7 +82,7 @@ def world():
 
 
 @pytest.mark.render
-@pytest.mark.parametrize("late", [0.0, 0.045])
+@pytest.mark.parametrize("late", [pytest.param(0.0, marks=pytest.mark.slow), 0.045])
 def test_the_zoom_camera_against_the_head(world, late):
     found = measure_head(Wrapped(world.rig, zoom=LateCamera(world.rig.zoom, late)), seconds=4.0)
     assert found.zoom.seconds == pytest.approx(late, abs=CLOSE)
