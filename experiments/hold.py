@@ -30,7 +30,8 @@ from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments import harness
 from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
-from experiments.hold_scenes import SECONDS, hold_config, true_calibration
+from experiments.hold_scenes import SECONDS, hold_config
+from experiments.true_rig import true_calibration
 from experiments.wide_view import WideView, open_on
 
 # What is wanted of each figure's median: at least, or at most.

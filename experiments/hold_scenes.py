@@ -14,17 +14,13 @@ from typing import Literal
 
 import numpy as np
 
-from cotarget.calibration import Calibration
-from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import RigConfig, SimConfig
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import Array
-from cotarget.pantilt import HeadGeometry
 from cotarget.rig import Frame, Image
 from cotarget.sim.targets import MOUNT, PERSON_HEIGHT, draw_size, target_rng
 from cotarget.sim.truth import Truth
-from cotarget.sim.world import SimWorld
 from cotarget.simconfig import Waypoint
 
 SECONDS = 20.0  # of a run
@@ -115,25 +111,6 @@ def _config(paths: dict[str, list[Waypoint]], seed: int, scene: str) -> RigConfi
 
 def _rng(seed: int, what: str) -> np.random.Generator:
     return np.random.default_rng((seed, PATHS, *what.encode()))
-
-
-def true_calibration(world: SimWorld, stops: int = 8) -> Calibration:
-    """What a calibration of a world's rig without any error would be, at focal lengths even in the logarithm."""
-    sim, truth = world.config.sim, world.truth()
-    nominal = tuple(float(f) for f in np.geomspace(*truth.focal_range, stops))
-    lenses = [truth.zoom_lens_for(f) for f in nominal]
-    fixed, *zooms = (
-        Intrinsics(lens.size, lens.focal_px, lens.center_px, lens.distortion) for lens in (truth.fixed_lens, *lenses)
-    )
-    real = sim.effects.axes
-    return Calibration(
-        fixed=fixed,
-        zoom=ZoomLens(nominal, tuple(zooms), tuple(lens.pupil for lens in lenses)),
-        T_zoom0_fixed=sim.T_zoom0_fixed,
-        T_head_zoom=sim.T_head_zoom,
-        head=HeadGeometry(sim.head.axis_offset_mm / 1000 * real, np.radians(sim.head.squareness_deg) * real),
-        pitch_mm=sim.zoom.pitch_mm,
-    )
 
 
 # ---------------------------------------------------------------- paths

@@ -29,7 +29,7 @@ from cotarget.targeting import Closeup, Reach, aim, depth_of, point_at
 from cotarget.tracking import FirstCome, Tracker, settings_for, size_for
 from cotarget.video import Film
 from experiments.harness import Experiment, Row, Settings, over_seeds, table
-from experiments.hold_scenes import true_calibration
+from experiments.true_rig import true_calibration
 
 FILM = Path(__file__).resolve().parents[2] / "shared" / "data" / "birds" / "V_BIRD_036.mp4"
 ALONE = "MOG2 alone"

@@ -32,7 +32,8 @@ from cotarget.sim.state import WorldState
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import CAMERAS, SimWorld
 from experiments.harness import Experiment, Row, Settings, over_seeds, seeds_of, table
-from experiments.hold_scenes import TruthDetector, hold_config, true_calibration
+from experiments.hold_scenes import TruthDetector, hold_config
+from experiments.true_rig import true_calibration
 
 IMAGE_EFFECTS = ("noise", "jpeg", "distortion", "blur", "clutter")
 TARGET = "bird"

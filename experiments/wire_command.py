@@ -16,7 +16,7 @@ from cotarget.loop import FollowSettings, follow
 from cotarget.rig import Camera, Clock, Frame, Image, PanTilt, PanTiltLimits, PanTiltState, Rig, open_rig
 from cotarget.safety import SafeRig
 from experiments.harness import Row
-from experiments.wire_rig import EmulatedRig, Tap, load, tapped, true_calibration
+from experiments.wire_rig import EmulatedRig, Tap, exact_calibration, load, tapped
 
 SCENES = {"book": "indoor", "person": "outdoor"}
 ORDER = re.compile(rb"[PT][PS]-?\d+ ")  # the first bytes of a move; questions have no number
@@ -131,7 +131,7 @@ def _follow(emulated: EmulatedRig, name: str, seconds: float) -> list[Row]:
         target = config.target(name)
         detector = TimedDetector(make_detector(target, config.rate_hz), notes)
         settings = FollowSettings(command_delay_s=config.command_delay_s)
-        timed, calibration = TimedRig(rig, notes), true_calibration(emulated.sim)
+        timed, calibration = TimedRig(rig, notes), exact_calibration(emulated.sim)
         for _ in follow(timed, calibration, target, detector, seconds=seconds, settings=settings):
             pass
     return [row | {"load": load()} for row in _parts(notes.turns, taps[0])]

@@ -28,7 +28,7 @@ from cotarget.geometry import Array
 from cotarget.sim.targets import waypoint_path
 from cotarget.targeting import Reach, aim
 from experiments.harness import Row
-from experiments.wire_rig import MOUNT, EmulatedRig, end, load, true_calibration
+from experiments.wire_rig import MOUNT, EmulatedRig, end, exact_calibration, load
 
 # The book's round: x and z about the fixed camera's axis, at a distance [m], and how long one takes [s].
 ROUND, DISTANCE, HEIGHT, PERIOD_S, KNOTS = (1.2, 0.6), 6.0, 1.6, 6.0, 8
@@ -106,7 +106,7 @@ class Follower:
 
     def __init__(self, folder: Path, emulated: EmulatedRig) -> None:
         calibration = folder / "calibration.json"
-        save_calibration(calibration, true_calibration(emulated.sim))
+        save_calibration(calibration, exact_calibration(emulated.sim))
         command = [
             sys.executable,
             "-m",
@@ -173,7 +173,7 @@ def directions(world_s: float) -> Array:
 def _directions() -> Array:
     """The same over one round, (2, n); from the path and the true calibration alone."""
     config = parse_config(_tables())
-    calibration = true_calibration(config)
+    calibration = exact_calibration(config)
     path = waypoint_path(config.sim.paths["book"])
     reach = Reach(*config.head_limits, config.focal_range_px)
     found = []

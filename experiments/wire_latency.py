@@ -20,7 +20,7 @@ from cotarget.safety import SafeRig
 from experiments.harness import Row
 from experiments.wire_command import ORDER, Notes, TimedHead, Turn, open_tapped
 from experiments.wire_polls import BYTES_S
-from experiments.wire_rig import EmulatedRig, Tap, load, true_calibration
+from experiments.wire_rig import EmulatedRig, Tap, exact_calibration, load
 
 LOOK_S = 0.01  # between questions for the newest exposures [s]
 CAMERAS = ("fixed", "zoom")
@@ -118,7 +118,7 @@ def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
             noted = NotedRig(rig, notes)
             found = measure_head(noted, head_seconds)  # type: ignore[arg-type]
             orders = _commands(notes, taps[0], emulated.sim.sim.head.command_delay_s)
-            calibration = true_calibration(emulated.sim)
+            calibration = exact_calibration(emulated.sim)
             swing, _ = measure_fixed(noted, calibration, config.board, board_seconds)  # type: ignore[arg-type]
         truth = {
             "fixed": _truth(noted.fixed, hardware.fixed.latency_s, watcher.exposures["fixed"]),

@@ -18,7 +18,7 @@ from cotarget.rig import Rig, open_rig
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
 from experiments.harness import Row
-from experiments.wire_rig import LONGEST_S, MOUNT, EmulatedRig, load, true_calibration
+from experiments.wire_rig import LONGEST_S, MOUNT, EmulatedRig, exact_calibration, load
 
 NAME = "book"
 DISTANCE = (5.0, 9.0)  # of the book [m]
@@ -41,7 +41,7 @@ def place(rng: np.random.Generator) -> tuple[float, float, float]:
 def _one(folder: Path, number: int, at: tuple[float, float, float], seconds: float) -> Row:
     tables = {"sim": {"scene": "indoor", "targets": [NAME], "paths": {NAME: [[0.0, *at], [float(LONGEST_S), *at]]}}}
     with EmulatedRig(folder, tables) as emulated:
-        calibration = true_calibration(emulated.sim)
+        calibration = exact_calibration(emulated.sim)
         config = emulated.config()
         with SafeRig(open_rig(config), config.safety) as rig:
             before = emulated.truth()

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import math
 import multiprocessing
 import os
 import signal
@@ -16,15 +15,14 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tomli_w
 
 from cotarget.calibration import Calibration
-from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import RigConfig, load_config
 from cotarget.errors import DeviceError
 from cotarget.hardware import line
-from cotarget.pantilt import HeadGeometry
+from cotarget.sim.world import SimWorld
+from experiments.true_rig import true_calibration
 
 READY, CONTROL = "connects to them", "control "  # what the command says when it is up, and where its faults are
 LONGEST_S = 3600  # an emulator whose parent was killed outright ends by itself then [s]
@@ -134,20 +132,9 @@ def end(process: "subprocess.Popen[str]") -> None:
             process.wait()
 
 
-def true_calibration(config: RigConfig) -> Calibration:
+def exact_calibration(config: RigConfig) -> Calibration:
     """The exact calibration of a simulated rig, over the whole range of its lens."""
-    sim, (shortest, longest) = config.sim, config.focal_range_px
-    nominal = np.geomspace(shortest, longest, STOPS if sim.effects.optics else 1)
-    optics = [sim.zoom.optics_at(float(f) / shortest) for f in nominal]
-    stops = [Intrinsics(sim.zoom.size, o.focal_px, o.center_px, o.distortion) for o in optics]
-    return Calibration(
-        fixed=Intrinsics(sim.fixed.size, sim.fixed.focal_px, sim.fixed.center_px, sim.fixed.distortion),
-        zoom=ZoomLens(tuple(map(float, nominal)), tuple(stops), tuple(o.pupil for o in optics)),
-        T_zoom0_fixed=sim.T_zoom0_fixed,
-        T_head_zoom=sim.T_head_zoom,
-        head=HeadGeometry(sim.head.axis_offset_mm / 1000, math.radians(sim.head.squareness_deg)),
-        pitch_mm=sim.zoom.pitch_mm,
-    )
+    return true_calibration(SimWorld(config, rendered=()), STOPS if config.sim.effects.optics else 1)
 
 
 @dataclass

@@ -16,7 +16,7 @@ from cotarget.motionfilter import Track
 from cotarget.policies import Candidate
 from cotarget.rig import PanTiltLimits
 from cotarget.sim.world import SimWorld
-from experiments.hold_scenes import true_calibration
+from experiments.true_rig import true_calibration
 
 SIZE = (640, 480)
 LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), 2.6, 3.6, 0.0)

@@ -16,10 +16,10 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.demo import SCENES, sim_config
 from cotarget.detection import Detection
 from cotarget.geometry import pose
-from cotarget.pantilt import HeadGeometry
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim
+from experiments.true_rig import true_calibration
 
 SIZE = (640, 480)
 FINE = 8  # scenes are drawn with this many bits of sub-pixel, and antialiased
@@ -276,23 +276,6 @@ def test_boxes_at_and_beyond_the_border_do_no_harm(center):
 RENDERED_PX = {"book": 0.3, "person": 1.2, "bird": 0.4}
 
 
-def true_calibration(world):
-    """With a stop of the lens every fifth of the way, in the logarithm."""
-    sim, nominal = world.config.sim, np.geomspace(*world.rig.zoom.focal_range, 16)
-    lenses = [world.zoom_lens_for(float(f)) for f in nominal]
-    return Calibration(
-        fixed=Intrinsics(sim.fixed.size, sim.fixed.focal_px, sim.fixed.center_px, sim.fixed.distortion),
-        zoom=ZoomLens(
-            tuple(nominal.tolist()),
-            tuple(Intrinsics(lens.size, lens.focal_px, lens.center_px, lens.distortion) for lens in lenses),
-            tuple(lens.pupil - lenses[0].pupil for lens in lenses),
-        ),
-        T_zoom0_fixed=sim.T_zoom0_fixed,
-        T_head_zoom=sim.T_head_zoom,
-        head=HeadGeometry(sim.head.axis_offset_mm / 1000, math.radians(sim.head.squareness_deg)),
-    )
-
-
 @pytest.mark.render
 @pytest.mark.parametrize("name", [pytest.param("book", marks=pytest.mark.slow), "person", "bird"])
 def test_rendered_targets_are_found_from_the_shortest_focal_length_to_the_longest(name):
@@ -302,7 +285,7 @@ def test_rendered_targets_are_found_from_the_shortest_focal_length_to_the_longes
         SimWorld(dataclasses.replace(config, sim=dataclasses.replace(config.sim, targets=()))),
     )
     truth, rig, target = world.truth(), world.rig, config.target(name)
-    calibration = true_calibration(world)
+    calibration = true_calibration(world, stops=16)
     finder = CloseupFinder(calibration, target)
     closest = target.wanted_px / target.size
     for k, part in enumerate((0.0, 0.5, 1.0)):

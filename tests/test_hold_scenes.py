@@ -17,8 +17,8 @@ from experiments.hold_scenes import (
     TruthNoise,
     five_targets_config,
     hold_config,
-    true_calibration,
 )
+from experiments.true_rig import true_calibration
 
 SEEDS = (0, 1, 2, 100, 101)
 NAMES = ("book", "person", "bird")

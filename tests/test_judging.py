@@ -6,18 +6,17 @@ import math
 import numpy as np
 import pytest
 
-from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import parse_config
 from cotarget.detection import Detection
 from cotarget.geometry import pose
 from cotarget.judging import add_row, decodes, observe, pointing_errors
 from cotarget.loop import State, Step
-from cotarget.pantilt import HeadGeometry
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
 from cotarget.tracking import Track
+from experiments.true_rig import true_calibration
 
 pytestmark = pytest.mark.render
 
@@ -47,35 +46,22 @@ def book():
     world.close()
 
 
-def true_calibration(world):
-    sim = world.config.sim
-    plain = (0.0,) * 5
-    return Calibration(
-        fixed=Intrinsics(sim.fixed.size, sim.fixed.focal_px, sim.fixed.center_px, plain),
-        zoom=ZoomLens(
-            (world.rig.zoom.focal_range[0],),
-            (Intrinsics(sim.zoom.size, sim.zoom.focal_px, sim.zoom.center_px, plain),),
-        ),
-        T_zoom0_fixed=sim.T_zoom0_fixed,
-        T_head_zoom=sim.T_head_zoom,
-        head=HeadGeometry(sim.head.axis_offset_mm / 1000, math.radians(sim.head.squareness_deg)),
-    )
-
-
 def reach_of(world):
     limits = world.rig.head.limits
     return Reach(limits.pan, limits.tilt, world.rig.zoom.focal_range)
 
 
 def test_the_true_calibration_points_exactly(book):
-    errors = pointing_errors(true_calibration(book), book.truth(), reach_of(book), np.random.default_rng(0), 50)
+    errors = pointing_errors(
+        true_calibration(book, stops=1), book.truth(), reach_of(book), np.random.default_rng(0), 50
+    )
     assert len(errors) == 50
     assert np.degrees(errors).max() < EXACT_DEG
 
 
 def test_a_boresight_that_is_off_by_a_tenth_of_a_degree_points_off_by_as_much(book):
     """Gamma turned about y by 0.1 degree: the line of sight misses by 0.1 degree in the middle, at most that aside."""
-    true = true_calibration(book)
+    true = true_calibration(book, stops=1)
     off = dataclasses.replace(true, T_zoom0_fixed=pose([0, 0, 0], [0, 0.1, 0]) * true.T_zoom0_fixed)
     errors = np.degrees(pointing_errors(off, book.truth(), reach_of(book), np.random.default_rng(0), 50))
     assert errors.max() < 0.1 + EXACT_DEG
@@ -84,7 +70,7 @@ def test_a_boresight_that_is_off_by_a_tenth_of_a_degree_points_off_by_as_much(bo
 
 def test_a_principal_point_that_is_off_matters_less_at_a_longer_focal_length(book):
     """The middle of the image is taken for a ray 20 px aside of the true one, at five times the shortest 692 px."""
-    true = true_calibration(book)
+    true = true_calibration(book, stops=1)
     stop = dataclasses.replace(true.zoom.stops[0], center_px=(346.0, 235.0))
     off = dataclasses.replace(true, zoom=dataclasses.replace(true.zoom, stops=(stop,)))
     reach = reach_of(book)
@@ -101,7 +87,7 @@ def test_the_true_calibration_at_a_focal_length_points_exactly_with_it():
     lens = world.truth().zoom_lens_for(nominal)
     assert abs(lens.pupil) > 0.05
     to_pupil = pose([0, 0, lens.pupil], [0, 0, 0])
-    true, sim = true_calibration(world), world.config.sim
+    true, sim = true_calibration(world, stops=1), world.config.sim
     at_nominal = dataclasses.replace(
         true,
         fixed=dataclasses.replace(true.fixed, distortion=sim.fixed.distortion),
