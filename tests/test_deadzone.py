@@ -181,7 +181,7 @@ def test_a_moving_target_is_followed_at_its_own_speed():
             at = steering.where(t, (0.0, 0.0))[0]
             assert abs(at - 0.5 - rate * t) < 1.5 * ZONE
     late = [(t, command) for t, command in commands if t > 1.0]
-    assert len(late) < 0.25 * 75  # of 75 frames: a new goal each 0.3 s at most, and what the first ones left over
+    assert len(late) < 0.3 * 75  # of 75 frames: a new goal each 0.15 s at most, and what the first ones left over
     for t, command in late:
         assert command.speed == pytest.approx(rate, rel=0.1)
         # The goal is 0.3 s ahead of the target, and the way on which the unit brakes farther.
