@@ -184,8 +184,8 @@ def test_a_moving_target_is_followed_at_its_own_speed():
     assert len(late) < 0.3 * 75  # of 75 frames: a new goal each 0.15 s at most, and what the first ones left over
     for t, command in late:
         assert command.speed == pytest.approx(rate, rel=0.1)
-        # The goal is 0.3 s ahead of the target, and the way on which the unit brakes farther.
-        ahead = 0.5 + rate * (t + 0.3) + rate**2 / (2 * LIMITS.acceleration)
+        # The goal is 0.15 s ahead of the target, and the way on which the unit brakes farther.
+        ahead = 0.5 + rate * (t + 0.15) + rate**2 / (2 * LIMITS.acceleration)
         assert command.pan == pytest.approx(ahead)
 
 
