@@ -93,7 +93,9 @@ class Pursuit:
         if found is not None:
             self._filters[self._followed].see_zoom(
                 found.center_px,
-                found.sigma_px,
+                # Both views show the same point, but wings and limbs move it: with its own error alone, each of their
+                # beats would be the target's.
+                np.hypot(found.sigma_px, found.body_sigma_px),
                 pose.pan,
                 pose.tilt,
                 pose.nominal_px,

@@ -84,7 +84,7 @@ class SpatialFilter:
     def see_zoom(
         self,
         pixel: Array,
-        sigma_px: float,
+        sigma_px: float | Array,
         pan: float,
         tilt: float,
         nominal_px: float,
@@ -97,7 +97,7 @@ class SpatialFilter:
 
         Args:
             pixel: middle of the target in the zoom image, (2,) [px].
-            sigma_px: its standard deviation [px].
+            sigma_px: its standard deviation, one for u and v or one for each, (2,) [px].
             pan: what the head reported for the time of this frame [rad].
             tilt: likewise.
             nominal_px: what the lens reported for that time [px].
@@ -115,7 +115,7 @@ class SpatialFilter:
             return False
         z, J = found
         sigma = self._settings.head_sigma if head_sigma is None else head_sigma
-        R = J @ J.T * sigma_px**2 + np.eye(2) * sigma**2
+        R = (J * np.square(sigma_px)) @ J.T + np.eye(2) * sigma**2
         vertical = self._target.dimension == "height"
         size = None if size_px is None else self._size(size_px, J[int(vertical), int(vertical)])
         return self._insert(ZoomSeen(t, z, R, self._sights.at(pan, tilt, nominal_px), size))

@@ -125,6 +125,7 @@ PERSON = EstimationSettings(MotionSettings(0.8, 0.7, 1.2, 0.04))
 BIRD = EstimationSettings(
     MotionSettings(6.5, 2.5, 7.0, 0.075, attitude_mean=-0.35, attitude_sigma=0.3, attitude_s=1.0),
     noise_of_size=0.06,
+    noise_s=0.1,  # half a wing beat
     size_noise=0.1,
     size_s=0.06,  # a quarter of a wing beat
 )
