@@ -1,0 +1,217 @@
+"""What is known of every track: which have a filter, what a policy is told, what the zoom view adds to one of them.
+
+The wide camera looks along z from the origin and the zoom camera from 0.4 m to the right, where pan and tilt meet.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cotarget.calibration import Calibration
+from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.closeup import Found
+from cotarget.config import DEFAULT_TARGETS
+from cotarget.detection import Detection
+from cotarget.geometry import pose
+from cotarget.motionfilter import Track
+from cotarget.pursuit import MOST_FILTERS, RATE_S, Pursuit
+from cotarget.rig import Frame, PanTiltState, ZoomState
+
+SIZE, CENTER, FOCAL, ZOOMED = (640, 480), (319.5, 239.5), 700.0, 3000.0
+BASELINE = 0.4
+CALIBRATION = Calibration(
+    Intrinsics(SIZE, (FOCAL, FOCAL), CENTER),
+    ZoomLens((FOCAL, ZOOMED), (Intrinsics(SIZE, (FOCAL, FOCAL), CENTER), Intrinsics(SIZE, (ZOOMED, ZOOMED), CENTER))),
+    pose([-BASELINE, 0, 0], [0, 0, 0]),
+    pose([0, 0, 0], [0, 0, 0]),
+)
+BOOK, BIRD = DEFAULT_TARGETS["book"], DEFAULT_TARGETS["bird"]
+PICTURE = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
+FRAME_S = 0.04
+
+
+def box_at(x, y, z, size=BOOK.size, wrong=1.0):
+    """A box as wide as a target of that size looks there, or wrongly so."""
+    side = wrong * FOCAL * size / z
+    return Detection(np.array([CENTER[0] + FOCAL * x / z, CENTER[1] + FOCAL * y / z]), np.array([side, side]), 1.0)
+
+
+def track(number, box, t=0.0, *, missed=0, confirmed=True, larger=None):
+    side = float(box.size_px.max()) if larger is None else larger
+    still = np.zeros(2)
+    return Track(number, t, confirmed, missed, box.center_px, still, box.size_px, side, np.eye(4), 1.0, box, 1.0)
+
+
+def seen(pursuit, tracks_at, frames):
+    """Show a pursuit so many frames; the time of the last one."""
+    for i in range(frames):
+        t = i * FRAME_S
+        pursuit.see_wide(Frame(PICTURE, t), tracks_at(t), None)
+    return t
+
+
+def test_a_track_has_an_estimate_as_long_as_it_lives():
+    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    box = box_at(1.0, 0.5, 10.0)
+    assert pursuit.estimate(1, 0.0) is None
+    t = seen(pursuit, lambda t: [track(1, box, t), track(2, box_at(-1.0, 0.0, 8.0), t)], 10)
+    np.testing.assert_allclose(pursuit.estimate(1, t).x_fixed, (1.0, 0.5, 10.0), rtol=0.02)
+    np.testing.assert_allclose(pursuit.estimate(2, t).x_fixed, (-1.0, 0.0, 8.0), rtol=0.02, atol=1e-6)
+    pursuit.see_wide(Frame(PICTURE, t + FRAME_S), [track(2, box_at(-1.0, 0.0, 8.0), t + FRAME_S)], None)
+    assert pursuit.estimate(1, t) is None
+    assert pursuit.estimate(2, t) is not None
+
+
+def test_a_track_that_was_missed_measures_nothing():
+    """Its box is an old one, and it was elsewhere."""
+    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    t = seen(pursuit, lambda t: [track(1, box_at(1.0, 0.0, 10.0), t)], 5)
+    before = pursuit.estimate(1, t + 1)
+    pursuit.see_wide(Frame(PICTURE, t + 1), [track(1, box_at(3.0, 0.0, 10.0), t + 1, missed=1)], None)
+    after = pursuit.estimate(1, t + 1)
+    assert (after.state == before.state).all()
+    assert after.measured_t == t
+
+
+def test_of_a_hundred_tracks_only_the_first_have_filters():
+    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    tracks = [track(n, box_at(0.05 * n, 0.0, 10.0)) for n in range(1, 101)]
+    pursuit.see_wide(Frame(PICTURE, 0.0), tracks, None)
+    known = [n for n in range(1, 101) if pursuit.estimate(n, 0.0) is not None]
+    assert known == list(range(1, MOST_FILTERS + 1))
+
+
+def test_a_birds_wingspan_is_the_largest_side_over_a_beat():
+    """The same boxes with twice the largest side are of a bird at half the distance."""
+    depths = []
+    for larger in (20.0, 40.0):
+        pursuit = Pursuit(CALIBRATION, BIRD, SIZE)
+        box = Detection(np.array([320.0, 240.0]), np.array([12.0, 8.0]), 1.0)
+        t = seen(pursuit, lambda t, box=box, larger=larger: [track(1, box, t, larger=larger)], 20)
+        depths.append(pursuit.estimate(1, t).depth)
+    assert depths[0] == pytest.approx(2 * depths[1], rel=0.01)
+
+
+def test_a_policy_is_told_directions_and_speeds_as_the_head_sees_them():
+    """At 2 m/s to the right, 10 m away: seen from 0.4 m to the right, the middle of the view is to the left."""
+    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    t = seen(pursuit, lambda t: [track(1, box_at(2.0 * t - 2.0, -1.0, 10.0), t)], 26)
+    (found,) = pursuit.candidates([track(1, box_at(0.0, -1.0, 10.0), t)], t)
+    assert t == pytest.approx(1.0)
+    # The depth is known by the size alone, to some per cent.
+    assert found.at[0] == pytest.approx(math.atan2(-BASELINE, 10.0), abs=2e-3)
+    assert found.at[1] == pytest.approx(math.atan2(1.0, math.hypot(BASELINE, 10.0)), rel=0.02)  # up
+    later = math.atan2(2.0 * RATE_S - BASELINE, 10.0)
+    assert found.rate[0] == pytest.approx((later - math.atan2(-BASELINE, 10.0)) / RATE_S, rel=0.05)
+
+
+def test_a_policy_is_told_of_confirmed_tracks_only_and_of_how_long_each_was_seen_well():
+    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    tracks = [track(n, box_at(float(n), 0.0, 10.0), confirmed=n < 3) for n in (1, 2, 3)]
+    pursuit.see_wide(Frame(PICTURE, 0.0), tracks, None)
+    for _ in range(3):
+        pursuit.seen_well(2, 0.5)
+    unknown = track(4, box_at(0.0, 0.0, 10.0))
+    found = {each.track.id: each.seen_s for each in pursuit.candidates([*tracks, unknown], 0.0)}
+    assert found == {1: 0.0, 2: 1.5}
+    pursuit.see_wide(Frame(PICTURE, FRAME_S), tracks[:1], None)  # it is gone ...
+    pursuit.see_wide(Frame(PICTURE, 2 * FRAME_S), tracks, None)  # ... and whoever has its number is another
+    assert {each.seen_s for each in pursuit.candidates(tracks, 2 * FRAME_S)} == {0.0}
+
+
+class Finder:
+    """Finds a point where the truth says, and notes what it was asked."""
+
+    def __init__(self, x_fixed, body_sigma_px=1.0):
+        self.x, self.body_sigma_px, self.asked = np.array(x_fixed), body_sigma_px, []
+
+    def see_wide(self, frame, detection, mask):
+        return None
+
+    def find(self, frame, expected):
+        self.asked.append(expected)
+        tangent = (self.x[:2] - (BASELINE, 0.0)) / self.x[2]  # the head looks straight ahead
+        body = np.full(2, self.body_sigma_px)
+        return Found(np.array(CENTER) + ZOOMED * tangent, 1.0, body, 1.0, 1.0, np.ones(2), np.zeros(2), frame.t)
+
+
+def followed(x_fixed, wrong, frames, finder, **pursuit):
+    """A pursuit of a book at a place whose size looks wrong, whose zoom view the finder answers for."""
+    pursuit = Pursuit(CALIBRATION, BOOK, SIZE, **pursuit)
+    pursuit.follow(1)
+    pursuit._finder = finder
+    found = []
+    for i in range(frames):
+        t = i * FRAME_S
+        pursuit.see_wide(Frame(PICTURE, t), [track(1, box_at(*x_fixed, wrong=wrong), t)], None)
+        pursuit.states.add(PanTiltState(0.0, 0.0, False, t), ZoomState(ZOOMED, False, t))
+        found.append(pursuit.see_zoom(Frame(PICTURE, t)))
+    return pursuit, found
+
+
+def test_the_zoom_view_triangulates_the_depth():
+    """The size looks 3 % too large, so that the depth seems 3 % too small: what both views see says better."""
+    x = (0.45, 0.1, 10.0)
+    alone, none = followed(x, 1.03, 40, Finder(x), closed_loop=False)
+    both, found = followed(x, 1.03, 40, finder := Finder(x))
+    t = 39 * FRAME_S
+    assert none == [None] * 40
+    assert all(each is not None for each in found)
+    assert alone.estimate(1, t).depth == pytest.approx(10.0 / 1.03, rel=0.01)
+    # A book's size is taken to be known to 1 %, the head's pan to 0.04 degrees, which is 1.7 % of this depth.
+    assert both.estimate(1, t).depth == pytest.approx(10.0, rel=0.02)
+    assert finder.asked[-1].nominal_px == pytest.approx(ZOOMED)
+    assert finder.asked[-1].x_fixed[2] == pytest.approx(10.0, rel=0.02)
+
+
+def test_a_point_that_may_not_be_the_body_moves_the_estimate_less():
+    """Wings and limbs: the point that both views show may be far from the middle, and is the less believed for it."""
+    x, off = (0.45, 0.1, 10.0), (0.47, 0.1, 10.0)
+
+    def pulled(sigma_px):
+        pursuit, _ = followed(x, 1.0, 10, Finder(off, sigma_px))
+        return pursuit.estimate(1, 9 * FRAME_S).x_fixed[0] - x[0]
+
+    assert pulled(30.0) < 0.7 * pulled(1.0)
+
+
+def test_the_zoom_view_is_not_asked_before_it_is_known_where_it_looks_and_for_whom():
+    x = (0.45, 0.1, 10.0)
+    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    pursuit._finder = Finder(x)
+    pursuit.see_wide(Frame(PICTURE, 0.0), [track(1, box_at(*x))], None)
+    assert pursuit.see_zoom(Frame(PICTURE, 0.0)) is None  # nobody is followed, and nothing was heard of the head
+    pursuit.states.add(PanTiltState(0.0, 0.0, False, 0.0), ZoomState(ZOOMED, False, 0.0))
+    assert pursuit.see_zoom(Frame(PICTURE, 0.0)) is None
+    pursuit.follow(1)
+    pursuit._finder = Finder(x)
+    assert pursuit.see_zoom(Frame(PICTURE, 0.0)) is not None
+
+
+def test_another_target_is_looked_for_by_another_finder():
+    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    pursuit.follow(1)
+    finder = pursuit._finder
+    pursuit.follow(1)
+    assert pursuit._finder is finder
+    pursuit.follow(2)
+    assert pursuit._finder is not finder
+
+
+def test_the_middle_of_the_followed_body_is_what_both_views_show():
+    """A track's box may lie beside the body; where a finder has taken it, its middle counts."""
+
+    class Sees(Finder):
+        def see_wide(self, frame, detection, mask):
+            return type("Sight", (), {"body_px": detection.center_px + 5.0, "body_sigma_px": np.full(2, 0.1)})
+
+    box = box_at(0.0, 0.0, 10.0)
+    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    pursuit.follow(1)
+    pursuit._finder = Sees((0, 0, 10))
+    t = seen(pursuit, lambda t: [track(1, box, t), track(2, replace(box), t)], 10)
+    ours, other = (pursuit.estimate(n, t).x_fixed for n in (1, 2))
+    assert ours[0] * FOCAL / ours[2] == pytest.approx(5.0, abs=0.05)
+    assert other[0] == pytest.approx(0.0, abs=1e-6)

@@ -1,0 +1,202 @@
+"""From an estimate to commands, on a rig whose cameras and axes all meet in one point: every angle is an arctangent."""
+
+import math
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cotarget.calibration import Calibration
+from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.config import DEFAULT_TARGETS
+from cotarget.deadzone import SteeringSettings
+from cotarget.errors import UnreachableError
+from cotarget.estimation import Appearance
+from cotarget.geometry import pose
+from cotarget.rig import PanTiltLimits, PanTiltState, ZoomState
+from cotarget.servo import Servo, ServoSettings, reach_of
+from cotarget.targeting import Closeup
+from cotarget.zoompolicy import ZoomSettings
+
+SIZE, CENTER = (640, 480), (319.5, 239.5)
+SHORTEST, LONGEST = 700.0, 7000.0
+TRUE = 1.1  # what the lens magnifies over what its device tells
+BOOK = DEFAULT_TARGETS["book"]
+LIMITS = PanTiltLimits((-1.0, 1.0), (-0.8, 0.5), math.radians(149), math.radians(206), 0.0)
+DELAY, FRAME = 0.1, 0.04
+HERE = pose([0, 0, 0], [0, 0, 0])
+CALIBRATION = Calibration(
+    Intrinsics(SIZE, (700.0, 700.0), CENTER),
+    ZoomLens(
+        (SHORTEST, LONGEST), tuple(Intrinsics(SIZE, (TRUE * f, TRUE * f), CENTER) for f in (SHORTEST, LONGEST)), (0, 0)
+    ),
+    HERE,
+    HERE,
+)
+
+
+@dataclass
+class Rig:
+    """Notes what it is told; nothing moves by itself."""
+
+    t: float = 0.0
+    moves: list = field(default_factory=list)
+    zooms: list = field(default_factory=list)
+
+    def __post_init__(self):
+        self.clock = SimpleNamespace(now=lambda: self.t)
+        self.head = SimpleNamespace(limits=LIMITS, state=self._head, move=self._move)
+        self.zoom = SimpleNamespace(
+            size=SIZE, focal_range=(SHORTEST, LONGEST), state=lambda: ZoomState(self.zooms[-1], False, self.t)
+        )
+        self.zoom.zoom = self._zoom
+
+    def _head(self):
+        return PanTiltState(*(self.moves[-1][:2] if self.moves else (0.0, 0.0)), False, self.t)
+
+    def _move(self, pan, tilt, speed=None):
+        self.moves.append((pan, tilt, speed))
+        return pan, tilt
+
+    def _zoom(self, focal_px):
+        self.zooms.append(focal_px)
+        return focal_px
+
+
+@dataclass
+class Known:
+    """What is known of a book at a time, and how surely [rad]."""
+
+    x_fixed: np.ndarray
+    t: float
+    sigma: float = 1e-4
+    bias: tuple = (0.0, 0.0)
+    target = BOOK
+    calibration = CALIBRATION
+
+    @property
+    def measured_t(self):
+        return self.t
+
+    @property
+    def closeup(self):
+        return Closeup(BOOK.size, BOOK.wanted_px)
+
+    def appearance(self, pan, tilt, nominal_px):
+        x, y, z = self.x_fixed
+        focal = TRUE * nominal_px
+        off = np.tan([math.atan2(x, z) - pan, math.atan2(y, math.hypot(x, z)) + tilt])
+        return Appearance(focal * off, np.eye(2) * (focal * self.sigma) ** 2, focal * BOOK.size / z, 0.0)
+
+
+def moving(speed, **known):
+    """To the right at a speed [m/s], 10 m away and 1 m up, in the middle at time 0."""
+    return lambda t: Known(np.array([speed * t, -1.0, 10.0]), t, **known)
+
+
+def still(x, **known):
+    return lambda t: Known(np.array([x, -1.0, 10.0]), t, **known)
+
+
+def servo(rig, **settings):
+    return Servo(rig, CALIBRATION, ServoSettings(command_delay_s=DELAY, **settings))
+
+
+def test_the_lens_starts_at_its_shortest_and_the_head_where_it_is():
+    rig = Rig()
+    assert servo(rig).commanded == (0.0, 0.0, SHORTEST)
+    assert (rig.moves, rig.zooms) == ([], [SHORTEST])
+
+
+def test_the_aim_is_at_where_the_target_will_be_when_the_command_takes_effect():
+    rig = Rig(t=2.0)
+    found = servo(rig).drive(moving(1.0), 1.9, FRAME).aim
+    assert found.pan == pytest.approx(math.atan(2.1 / 10))
+    assert found.tilt == pytest.approx(math.atan(1 / math.hypot(2.1, 10)))  # up
+    # The head was at rest in the middle: it is sent farther than there, as the target goes on.
+    assert rig.moves[-1][0] > found.pan
+
+
+def test_without_prediction_the_aim_is_at_where_it_was_seen():
+    rig = Rig(t=2.0)
+    found = servo(rig, predict=False).drive(moving(1.0), 1.9, FRAME).aim
+    assert found.pan == pytest.approx(math.atan(1.9 / 10))
+    assert rig.moves == [(found.pan, found.tilt, None)]  # at full speed, for it is taken to stand there
+
+
+def test_the_bias_of_the_head_is_taken_off_within_its_limits():
+    found = servo(Rig()).drive(still(2.0, bias=(0.01, -0.02)), 0.0, FRAME).aim
+    assert found.pan == pytest.approx(math.atan(0.2) - 0.01)
+    assert found.tilt == pytest.approx(math.atan(1 / math.hypot(2, 10)) + 0.02)
+    edge = 10 * math.tan(0.999)
+    assert servo(Rig()).drive(still(edge, bias=(-0.01, 0.0)), 0.0, FRAME).aim.pan == LIMITS.pan[1]
+
+
+@pytest.mark.parametrize(
+    ("predict", "why"), [(lambda t: None, "not seen yet"), (still(30.0), "beyond the limits"), (still(-30.0), "beyond")]
+)
+def test_what_cannot_be_aimed_at_moves_nothing(predict, why):
+    rig = Rig()
+    driver = servo(rig)
+    with pytest.raises(UnreachableError, match=why):
+        driver.drive(predict, 0.0, FRAME)
+    assert (rig.moves, rig.zooms) == ([], [SHORTEST])
+    assert driver.commanded == (0.0, 0.0, SHORTEST)
+
+
+def test_a_target_that_stands_gets_one_command_of_head_and_lens():
+    """Once the head is there, and the lens is told its own number for the true focal length of Eq. 17."""
+    rig = Rig()
+    driver = servo(rig)
+    for i in range(50):
+        rig.t = i * FRAME
+        drive = driver.drive(still(0.5), rig.t, FRAME)
+    assert rig.moves == [(pytest.approx(math.atan(0.05)), pytest.approx(math.atan(1 / math.hypot(0.5, 10))), None)]
+    distance = math.sqrt(0.5**2 + 1 + 10**2)
+    wanted = BOOK.wanted_px * distance / BOOK.size
+    assert drive.aim.focal_px == pytest.approx(wanted)
+    assert rig.zooms[-1] == driver.commanded[2] == pytest.approx(wanted / TRUE, rel=ZoomSettings().deadband)
+    assert drive.zoom_reason == "wanted"
+    assert drive.chance > 0.99
+
+
+def test_the_less_is_known_the_wider_the_lens_stays():
+    """A direction known to 0.05 rad: by the table of the normal distribution, 95 % of both axes is 2.24 sigma each."""
+    rig = Rig(moves=[(0.0, math.atan(0.1), None)])  # it looks there already
+    drive = servo(rig).drive(still(0.0, sigma=0.05), 0.0, FRAME)
+    assert drive.zoom_reason == "unsure"
+    assert drive.chance == pytest.approx(ZoomSettings().sure, abs=0.01)
+    # Of the height alone, the narrower axis, 95 % are within 1.96 sigma; half the book comes on top.
+    half = (SIZE[1] / 2 - ZoomSettings().rim_px) / (TRUE * rig.zooms[-1])
+    assert 1.96 < (half - 0.5 * BOOK.size / 10) / 0.05 < 2.24
+
+
+def test_zooming_out_leaves_the_head_alone_and_is_told_once():
+    rig = Rig()
+    driver = servo(rig)
+    driver.drive(still(0.5), 0.0, FRAME)
+    moves, zooms = len(rig.moves), len(rig.zooms)
+    for _ in range(3):
+        driver.zoom_out()
+    assert len(rig.moves) == moves
+    assert rig.zooms[zooms:] == [SHORTEST]
+    # Whoever moved it meanwhile: what was commanded before does not count.
+    driver.drive(still(0.5), 0.0, FRAME)
+    assert len(rig.moves) == moves + 1
+
+
+def test_every_frame_has_its_command_without_a_dead_zone():
+    rig = Rig()
+    driver = servo(rig, steering=SteeringSettings(zone=0.0))
+    for i in range(10):
+        rig.t = i * FRAME
+        driver.drive(moving(1.0), rig.t, FRAME)
+    assert len(rig.moves) == 10
+
+
+def test_the_reach_of_a_rig_is_that_of_its_devices():
+    rig = Rig(moves=[(0.2, 0.1, None)])
+    reach = reach_of(rig)
+    assert (reach.pan, reach.tilt, reach.focal_px) == (LIMITS.pan, LIMITS.tilt, (SHORTEST, LONGEST))
+    assert (reach.now, reach.step) == ((0.2, 0.1), 0.0)
