@@ -123,8 +123,10 @@ class Pursuit:
         """What a policy chooses from, at a time [s]: the confirmed tracks."""
         found = []
         for track in tracks:
+            if not track.confirmed:
+                continue
             now, soon = (self.estimate(track.id, t + later) for later in (0.0, RATE_S))
-            if not track.confirmed or now is None or soon is None:
+            if now is None or soon is None:
                 continue
             at, then = self._direction(now.x_fixed), self._direction(soon.x_fixed)
             seen_s = self._seen_s.get(track.id, 0.0)
