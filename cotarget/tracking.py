@@ -4,7 +4,7 @@ Every track has its own motion filter; detections are assigned to tracks by the 
 Mahalanobis gate.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from cotarget.geometry import Array
 from cotarget.motionfilter import Measurement, TargetFilter, Track, TrackerSettings, settings_for
 
-__all__ = ["FirstCome", "Measurement", "Track", "Tracker", "TrackerSettings", "settings_for", "size_for"]
+__all__ = ["Measurement", "Track", "Tracker", "TrackerSettings", "settings_for", "size_for"]
 
 # A cost that no assignment inside the gate reaches, so that it marks pairs that must not be matched.
 IMPOSSIBLE = 1e6
@@ -32,20 +32,6 @@ def size_for(track: Track, dimension: Literal["width", "height", "wingspan"]) ->
     if dimension == "wingspan":
         return track.larger_side_px
     return float(track.size_px[0 if dimension == "width" else 1])
-
-
-class FirstCome:
-    """The paper's policy: follow the first confirmed target until it disappears, then the next."""
-
-    def __init__(self) -> None:
-        self._id: int | None = None
-
-    def select(self, tracks: Iterable[Track]) -> Track | None:
-        """Choose the track to follow, or None when none is confirmed."""
-        confirmed = {track.id: track for track in tracks if track.confirmed}
-        if self._id not in confirmed:
-            self._id = min(confirmed, default=None)
-        return None if self._id is None else confirmed[self._id]
 
 
 class Tracker:

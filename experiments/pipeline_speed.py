@@ -2,12 +2,13 @@
 
 A film of a real bird (V_BIRD_036 of Svanstroem et al., doi 10.5281/zenodo.5500576, CC0-1.0, looked for in
 ../shared/data/birds beside the project). On each of its frames, in turns because a machine's pace drifts:
-`cv2.createBackgroundSubtractorMOG2().apply` alone on BGR, and detector, tracker and the exact aim at where the target
-will be, each timed. On as many threads as OpenCV takes.
+`cv2.createBackgroundSubtractorMOG2().apply` alone on BGR, and what the loop does with a wide frame, each timed: detect,
+track in the image and in 3D, and aim exactly at where the target will be. On as many threads as OpenCV takes.
 
     python -m experiments.pipeline_speed [--seeds 2: times through the film] [--quick] [--out DIR]
 """
 
+import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -23,10 +24,12 @@ from cotarget.calibration import Calibration
 from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetConfig
 from cotarget.detection import Detector, make_detector
 from cotarget.errors import CotargetError
-from cotarget.rig import Frame
+from cotarget.policies import FirstCome
+from cotarget.pursuit import Pursuit
+from cotarget.rig import Frame, PanTiltLimits
 from cotarget.sim.world import SimWorld
-from cotarget.targeting import Closeup, Reach, aim, depth_of, point_at
-from cotarget.tracking import FirstCome, Tracker, settings_for, size_for
+from cotarget.targeting import Reach, aim
+from cotarget.tracking import Tracker, settings_for
 from cotarget.video import Film
 from experiments.harness import Experiment, Row, Settings, over_seeds, table
 from experiments.true_rig import true_calibration
@@ -59,29 +62,31 @@ class Pipeline:
         """
         self.target: TargetConfig = replace(DEFAULT_TARGETS["bird"], detector=kind)  # type: ignore[arg-type]
         self.detector: Detector = make_detector(self.target, film.rate_hz)
-        self.tracker, self.policy = Tracker(settings_for(self.target), film.size), FirstCome()
         self.calibration = calibration_of(film.size)
+        self.tracker, self.policy = Tracker(settings_for(self.target), film.size), FirstCome()
+        self.pursuit = Pursuit(self.calibration, self.target, film.size)
         config = RigConfig()
         pan, tilt = config.head_limits
         self.reach = Reach(pan, tilt, config.focal_range_px)
+        self.limits = PanTiltLimits(pan, tilt, math.inf, math.inf, 0.0)
 
     def __call__(self, frame: Frame) -> Row:
         """Do a frame; the milliseconds of each stage, and whether there was a target to aim at."""
         began = time.perf_counter()
         detections = self.detector.detect(frame)
         detected = time.perf_counter()
-        track = self.policy.select(self.tracker.update(detections, frame.t))
+        tracks = self.tracker.update(detections, frame.t)
+        self.pursuit.see_wide(frame, tracks, self.detector.mask)
+        number = self.policy.select(self.pursuit.candidates(tracks, frame.t), np.zeros(2), self.limits)
+        self.pursuit.follow(number)
+        estimate = None if number is None else self.pursuit.estimate(number, frame.t + LEAD_S)
         tracked = time.perf_counter()
-        if track is not None:
-            closeup = Closeup(self.target.size, self.target.wanted_px)
-            size = size_for(track, self.target.dimension)
-            depth = depth_of(self.calibration, self.target, size, track.center_px)
-            x_fixed = point_at(self.calibration, track.predict(frame.t + LEAD_S), depth)
-            aim(self.calibration, x_fixed, self.reach, closeup=closeup)
+        if estimate is not None:
+            aim(self.calibration, estimate.x_fixed, self.reach, closeup=estimate.closeup)
         ended = time.perf_counter()
         times = (began, detected, tracked, ended)
         stages = {name: 1e3 * (b - a) for name, a, b in zip(STAGES, times[:-1], times[1:], strict=True)}
-        return {"ms": 1e3 * (ended - began), "aimed": track is not None, **stages}
+        return {"ms": 1e3 * (ended - began), "aimed": estimate is not None, **stages}
 
 
 def calibration_of(size: tuple[int, int]) -> Calibration:

@@ -52,6 +52,8 @@ def test_one_ray_is_that_of_many_and_its_slope_what_differences_say():
         apart = DISTORTED.ray(pixel + 0.1 * np.vstack([np.eye(2), -np.eye(2)]))[:, :2]
         np.testing.assert_allclose(slope, (apart[:2] - apart[2:]).T / 0.2, atol=1e-8)
     assert DISTORTED.tangents(np.array([5e4, 240.0])) is None
+    assert DISTORTED.tangents(np.array([np.nan, 0.0])) is None
+    assert replace(DISTORTED, distortion=(-0.6, 0, 0, 0, 0)).tangents(np.array([-400.0, -300.0])) is None
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -15,7 +14,7 @@ from cotarget.errors import CalibrationError
 from cotarget.estimation import SpatialFilter, estimation_settings_for
 from cotarget.estimation.motion import STATES, propagate
 from cotarget.estimation.settings import BIRD, PERSON, USUAL_BIAS, MotionSettings
-from cotarget.estimation.sight import Sights, tangents
+from cotarget.estimation.sight import Sights
 from cotarget.motionfilter import TargetFilter, settings_for
 from cotarget.targeting import Reach, aim, depth_of, point_at
 from experiments.synthetic import NOMINAL_PX, SIZE, Truth
@@ -88,26 +87,6 @@ def baselines(flight):
 
 
 # ---------------------------------------------------------------- geometry
-
-
-def test_undistorting_one_pixel_is_opencvs():
-    lens = calibration_of(Truth()).fixed
-    for pixel in ([3.0, 470.0], [325.0, 239.0], [600.0, 20.0]):
-        tangent, J = tangents(lens, np.array(pixel))
-        back, _ = cv2.projectPoints(
-            np.array([[*tangent, 1.0]]), np.zeros(3), np.zeros(3), lens.matrix, np.array(lens.distortion)
-        )
-        np.testing.assert_allclose(back.ravel(), pixel, atol=1e-6)  # the iteration ends at 1e-9 of a tangent
-        for axis in range(2):
-            step = DIFFERENCE * 100 * np.eye(2)[axis]
-            numeric = (tangents(lens, pixel + step)[0] - tangents(lens, pixel - step)[0]) / (2 * DIFFERENCE * 100)
-            np.testing.assert_allclose(J[:, axis], numeric, atol=DERIVATIVE)
-
-
-def test_a_pixel_that_no_ray_leads_to():
-    folded = replace(calibration_of(Truth()).fixed, distortion=(-0.6, 0.0, 0.0, 0.0, 0.0))
-    assert tangents(folded, np.array([-400.0, -300.0])) is None
-    assert tangents(folded, np.array([np.nan, 0.0])) is None
 
 
 def test_the_zoom_cameras_sight_is_that_of_written_out_matrices():

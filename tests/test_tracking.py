@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.tracking import FirstCome, Tracker, TrackerSettings, settings_for, size_for
+from cotarget.tracking import Tracker, TrackerSettings, settings_for, size_for
 
 RATE = 25.0
 SIZE = (640, 480)
@@ -174,15 +174,3 @@ def test_times_that_repeat_or_jump_back():
     assert len(tracker.update([seen(500, 400)], 100.0)) == 1  # a late one: ignored
     tracks = run(tracker, np.arange(20) / RATE, ((100, 100), (100, 0)))[-1]  # the clock starts anew
     assert [t.id for t in tracks] == [2]
-
-
-def test_first_come_follows_until_it_disappears():
-    tracker, policy, chosen = Tracker(PLAIN), FirstCome(), []
-    for i in range(80):
-        t = i / RATE
-        boxes = [seen(50 + 60 * t, 100)] if i < 30 else []
-        boxes += [seen(50 + 60 * t, 300)] if i > 10 else []
-        pick = policy.select(tracker.update(boxes, t))
-        chosen.append(pick and pick.id)
-    assert chosen[0] is None
-    assert [n for i, n in enumerate(chosen) if n and n != chosen[i - 1]] == [1, 2]

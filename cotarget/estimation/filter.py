@@ -13,7 +13,7 @@ from cotarget.estimation.estimate import Estimate
 from cotarget.estimation.motion import propagate
 from cotarget.estimation.node import Node
 from cotarget.estimation.settings import EstimationSettings, estimation_settings_for
-from cotarget.estimation.sight import Sights, tangents
+from cotarget.estimation.sight import Sights
 from cotarget.geometry import Array
 from cotarget.tracking import Measurement
 
@@ -63,7 +63,7 @@ class SpatialFilter:
             Whether it could be taken: not when it is older than all that is kept, or has been taken already, or no ray
             leads to its pixel.
         """
-        found = tangents(self._calibration.fixed, detection.center_px)
+        found = self._calibration.fixed.tangents(detection.center_px)
         if found is None:
             return False
         z, J = found
@@ -110,7 +110,7 @@ class SpatialFilter:
             Whether it could be taken, see `see_wide`.
         """
         lens = self._calibration.zoom.at(nominal_px)
-        found = tangents(lens, pixel)
+        found = lens.tangents(pixel)
         if found is None:
             return False
         z, J = found

@@ -1,7 +1,7 @@
-"""What both cameras see of a direction, with derivatives, for single points: in tangents, without distortion.
+"""What the moved zoom camera sees of a direction, with derivatives: in tangents, without distortion.
 
-The same geometry as `cotarget.camera` and `cotarget.pantilt`, for one point at a time and with floats in place of
-arrays, because it is asked for in every frame: it takes less than a tenth of their time.
+The same geometry as `cotarget.pantilt`, for one point at a time and with floats in place of arrays, because it is asked
+for in every frame: it takes less than a tenth of their time.
 """
 
 import math
@@ -10,47 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.camera import Intrinsics
 from cotarget.geometry import Array
 from cotarget.pantilt import HeadGeometry
-
-# Newton's iteration for the inverse distortion, as in `cotarget.camera`; 1e-9 of a tangent is 1e-5 px at the longest.
-UNDISTORT_STEPS = 20
-UNDISTORT_TOLERANCE = 1e-9
-
-
-def tangents(lens: Intrinsics, pixel: Array) -> tuple[Array, Array] | None:
-    """Undistort one pixel.
-
-    Args:
-        lens: the camera.
-        pixel: (u, v) [px], (2,).
-
-    Returns:
-        Tangents (x / z, y / z), (2,), and their derivative by the pixel [1/px], (2, 2); None where the iteration finds
-        no ray that projects to that pixel.
-    """
-    (fx, fy), (cx, cy) = lens.focal_px, lens.center_px
-    k1, k2, p1, p2, k3 = lens.distortion
-    goal_x, goal_y = (float(pixel[0]) - cx) / fx, (float(pixel[1]) - cy) / fy
-    x, y = goal_x, goal_y
-    for _ in range(UNDISTORT_STEPS):
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
-        off_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) - goal_x
-        off_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y - goal_y
-        xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-        xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
-        yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-        det = xx * yy - xy * xy
-        if not det > 0:  # folded over, or nan
-            return None
-        if abs(off_x) + abs(off_y) < UNDISTORT_TOLERANCE:
-            return np.array([x, y]), np.array([[yy / fx, -xy / fy], [-xy / fx, xx / fy]]) / det
-        x -= (yy * off_x - xy * off_y) / det
-        y -= (xx * off_y - xy * off_x) / det
-    return None
 
 
 @dataclass(frozen=True)
