@@ -38,7 +38,7 @@ CALLS: Mapping[str, tuple[tuple[int, ...], int]] = {
     "zoom.capture": ((0,), 1),
     "zoom.zoom": ((1,), 1),  # focal_px -> focal_px
     "zoom.state": ((0,), 3),  # -> focal_px, moving, t
-    "head.move": ((4,), 2),  # pan, tilt, speed, wait -> pan, tilt
+    "head.move": ((4, 5), 2),  # pan, tilt, speed (of both axes or of each), wait -> pan, tilt
     "head.state": ((0,), 4),  # -> pan, tilt, moving, t
     "head.halt": ((0,), 0),
     "clock.now": ((0,), 1),

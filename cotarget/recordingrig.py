@@ -17,6 +17,7 @@ from cotarget.rig import (
     PanTiltLimits,
     PanTiltState,
     Rig,
+    Speed,
     ZoomCamera,
     ZoomState,
 )
@@ -114,8 +115,8 @@ class _Head:
             "head.state", (), self._head.state, lambda state: (state.pan, state.tilt, state.moving, state.t)
         )
 
-    def move(self, pan: float, tilt: float, speed: float | None = None, wait: bool = False) -> tuple[float, float]:
-        args = (pan, tilt, speed, wait)
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
+        args = (pan, tilt, *(speed if isinstance(speed, tuple) else (speed,)), wait)
         return self._notes.ask("head.move", args, lambda: self._head.move(pan, tilt, speed, wait), lambda both: both)
 
     def halt(self) -> None:

@@ -18,7 +18,19 @@ from cotarget.geometry import RigidTransform
 from cotarget.recordformat import Event, Number
 from cotarget.recordreader import Recording, open_recording
 from cotarget.replaytape import Differences, RecordingEndedError, Tape, time_of
-from cotarget.rig import Board, Camera, Clock, Frame, Image, PanTilt, PanTiltLimits, PanTiltState, ZoomCamera, ZoomState
+from cotarget.rig import (
+    Board,
+    Camera,
+    Clock,
+    Frame,
+    Image,
+    PanTilt,
+    PanTiltLimits,
+    PanTiltState,
+    Speed,
+    ZoomCamera,
+    ZoomState,
+)
 
 __all__ = ["Differences", "Recording", "RecordingEndedError", "ReplayRig", "open_recording", "until_end"]
 
@@ -143,9 +155,9 @@ class _Head:
         then = event.result
         return PanTiltState(float(then[0] or 0.0), float(then[1] or 0.0), bool(then[2]), float(then[3] or 0.0))
 
-    def move(self, pan: float, tilt: float, speed: float | None = None, wait: bool = False) -> tuple[float, float]:
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         recorded = self._tape.take("head.move")
-        args: tuple[Number, ...] = (pan, tilt, speed, wait)
+        args: tuple[Number, ...] = (pan, tilt, *(speed if isinstance(speed, tuple) else (speed,)), wait)
         self._tape.compare("head.move", recorded, args)
         if recorded is not None:
             self._tape.play(recorded)

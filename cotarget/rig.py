@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.errors import ConfigError
+from cotarget.errors import ConfigError, DeviceError
 from cotarget.geometry import RigidTransform
 
 if TYPE_CHECKING:
     from cotarget.config import RigConfig
 
 Image = npt.NDArray[np.uint8]
+Speed = float | tuple[float, float]  # of both axes of a head, or of pan and tilt each [rad/s]
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,19 @@ class PanTiltLimits:
     speed: float
     acceleration: float
     step: float
+
+    def capped(self, speed: Speed | None) -> tuple[float, float]:
+        """The speeds of pan and tilt to ask for [rad/s]: never above the highest, which is meant by None.
+
+        Raises:
+            DeviceError: a speed is not above zero.
+        """
+        both = speed if isinstance(speed, tuple) else (speed, speed)
+        for each in both:
+            if each is not None and not each > 0:
+                raise DeviceError(f"the head cannot move at a speed of {each} rad/s")
+        pan, tilt = (self.speed if each is None else min(each, self.speed) for each in both)
+        return pan, tilt
 
     def allow(self, pan: npt.ArrayLike, tilt: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Whether angles [rad] are within the limits; nan is not."""
@@ -117,8 +131,11 @@ class PanTilt(Protocol):
     def state(self) -> PanTiltState:
         """Tell the head's state now."""
 
-    def move(self, pan: float, tilt: float, speed: float | None = None, wait: bool = False) -> tuple[float, float]:
-        """Command both axes [rad]; return what was commanded after clipping and rounding to steps."""
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
+        """Command both axes [rad]; return what was commanded after clipping and rounding to steps.
+
+        Each axis goes on its own way, no faster than its ``speed``, and comes to rest at its goal.
+        """
 
     def halt(self) -> None:
         """Stop at once; safe even if the program dies next."""

@@ -16,7 +16,7 @@ from cotarget.hardware.d46wishes import DroppedError, Halt, Move
 from cotarget.hardware.line import open_line
 from cotarget.hardware.lineerrors import LostError
 from cotarget.hwconfig import HardwareHead
-from cotarget.rig import Clock, PanTiltLimits, PanTiltState
+from cotarget.rig import Clock, PanTiltLimits, PanTiltState, Speed
 
 log = logging.getLogger(__name__)
 
@@ -90,14 +90,14 @@ class D46Head:
         pan, tilt = self._angles(seen.pan, seen.tilt)
         return PanTiltState(pan, tilt, seen.moving or waiting, seen.t)
 
-    def move(self, pan: float, tilt: float, speed: float | None = None, wait: bool = False) -> tuple[float, float]:
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         """Command both axes; the newest command wins.
 
         Args:
             pan: angle [rad].
             tilt: angle [rad].
-            speed: of either axis [rad/s]; the configured one unless given, and never above that. The unit takes it in
-                whole steps a second, rounded down, and turns no slower than it can.
+            speed: of both axes or of each [rad/s]; the configured one unless given, and never above that. The unit
+                takes it in whole steps a second, rounded down, and turns no slower than it can.
             wait: return only when the head stands there.
 
         Returns:
@@ -110,15 +110,13 @@ class D46Head:
         self._raise_what_happened()
         if not (math.isfinite(pan) and math.isfinite(tilt)):
             raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
-        if speed is not None and not speed > 0:
-            raise DeviceError(f"the head cannot move at a speed of {speed} rad/s")
-        fastest = self._limits.speed if speed is None else min(speed, self._limits.speed)
+        fastest = self._limits.capped(speed)
         axes = (self.unit.pan, self.unit.tilt)
         a, b = (
             min(max(round(sign * angle / axis.step), axis.lowest), axis.highest)
             for sign, angle, axis in zip(self._signs, (pan, tilt), axes, strict=True)
         )
-        move = Move(number, (a, b), (_steps(fastest, axes[0]), _steps(fastest, axes[1])), wait)
+        move = Move(number, (a, b), (_steps(fastest[0], axes[0]), _steps(fastest[1], axes[1])), wait)
         self._loop.moves.append(move)
         if wait:
             self._wait_for(move)

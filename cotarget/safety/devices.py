@@ -7,9 +7,9 @@ watchdog is due in between. A rig in real time has a thread for that.
 import math
 
 from cotarget.errors import DeviceError, StaleFrameError
-from cotarget.rig import Camera, Clock, Frame, PanTilt, PanTiltLimits, PanTiltState, ZoomCamera, ZoomState
+from cotarget.rig import Camera, Clock, Frame, PanTilt, PanTiltLimits, PanTiltState, Speed, ZoomCamera, ZoomState
 from cotarget.safety.guard import Guard
-from cotarget.safety.limits import capped, clipped
+from cotarget.safety.limits import clipped
 
 # A frame cannot be from later than now; this much is left for a latency that is compensated too far [s].
 FUTURE_S = 0.05
@@ -36,7 +36,7 @@ class SafeHead:
         self._guard.saw(state, self._limits.step)
         return state
 
-    def move(self, pan: float, tilt: float, speed: float | None = None, wait: bool = False) -> tuple[float, float]:
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         """Command both axes [rad], clipped to the soft limits; return what was really commanded.
 
         Raises:
@@ -44,10 +44,13 @@ class SafeHead:
             DeviceError: an angle is not a number, a speed is not above zero, or the device did not obey.
         """
         pan, tilt = clipped(pan, tilt, self._limits)
-        speed = capped(speed, self._limits)
-        motion = self._guard.begin((pan, tilt), self._patience((pan, tilt), speed) if wait else 0.0)
+        speeds = self._limits.capped(speed)
+        asked: Speed | None = speeds
+        if speeds[0] == speeds[1]:
+            asked = None if math.isinf(speeds[0]) else speeds[0]
+        motion = self._guard.begin((pan, tilt), self._patience((pan, tilt), min(speeds)) if wait else 0.0)
         try:
-            said = self._head.move(pan, tilt, speed, wait)
+            said = self._head.move(pan, tilt, asked, wait)
         except BaseException as error:
             if self._guard.end(motion, arrived=False) and isinstance(error, Exception):
                 self._guard.refuse_if_stopped()  # which is why the device failed
@@ -66,9 +69,9 @@ class SafeHead:
         """Stop at once."""
         self._guard.halt()
 
-    def _patience(self, goal: tuple[float, float], speed: float | None) -> float:
+    def _patience(self, goal: tuple[float, float], speed: float) -> float:
         """How long the device may wait for the head to arrive [s]."""
-        speed, acceleration = self._limits.speed if speed is None else speed, self._limits.acceleration
+        acceleration = self._limits.acceleration
         if math.isinf(speed):
             return 0.0  # only a simulated head is so fast, and nobody watches its waiting
         state = self._head.state()

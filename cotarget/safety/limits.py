@@ -35,18 +35,6 @@ def clipped(pan: float, tilt: float, limits: PanTiltLimits) -> tuple[float, floa
     return _clip(pan, limits.pan, limits.step), _clip(tilt, limits.tilt, limits.step)
 
 
-def capped(speed: float | None, limits: PanTiltLimits) -> float | None:
-    """The speed to ask for [rad/s]: never above the cap; None where neither wish nor cap says a number.
-
-    Raises:
-        DeviceError: the speed is not above zero.
-    """
-    if speed is not None and not speed > 0:
-        raise DeviceError(f"the head cannot move at a speed of {speed} rad/s")
-    slower = limits.speed if speed is None else min(speed, limits.speed)
-    return None if math.isinf(slower) else slower
-
-
 def _within(
     soft_deg: tuple[float, float] | None, device: tuple[float, float], step: float, name: str
 ) -> tuple[float, float]:

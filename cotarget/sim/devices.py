@@ -7,7 +7,7 @@ from types import TracebackType
 from cotarget.config import SimCamera, SimEffects, SimHead, SimZoomCamera
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
-from cotarget.rig import Clock, Frame, Image, PanTiltLimits, PanTiltState, ZoomState
+from cotarget.rig import Clock, Frame, Image, PanTiltLimits, PanTiltState, Speed, ZoomState
 from cotarget.sim.motion import Axis, HeadDrive, LensDrive
 
 # Frame times are multiples of the frame period; this much of a period [1] absorbs their rounding.
@@ -173,15 +173,14 @@ class SimPanTilt:
         pan, tilt = (self._to_step(axis.motor(now)[0]) for axis in (self._drive.pan, self._drive.tilt))
         return PanTiltState(pan, tilt, now < self._rests, now)
 
-    def move(self, pan: float, tilt: float, speed: float | None = None, wait: bool = False) -> tuple[float, float]:
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         """Command both axes [rad]; return what was commanded after clipping and rounding to steps."""
         if not (math.isfinite(pan) and math.isfinite(tilt)):
             raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
-        if speed is not None and not speed > 0:
-            raise DeviceError(f"the head cannot move at a speed of {speed} rad/s")
+        speeds = self._limits.capped(speed)
         pan, tilt = self._clip(pan, self._limits.pan), self._clip(tilt, self._limits.tilt)
         t = self._clock.now() + self._delay
-        self._rests = max(self._drive.pan.command(t, pan, speed), self._drive.tilt.command(t, tilt, speed))
+        self._rests = max(self._drive.pan.command(t, pan, speeds[0]), self._drive.tilt.command(t, tilt, speeds[1]))
         if wait:
             self._clock.sleep_until(self._rests)
         return pan, tilt
