@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from cotarget.deadzone import Steering, SteeringSettings, axis_at, goal_for
+from cotarget.deadzone import Steering, SteeringSettings
 from cotarget.estimation import SpatialFilter
-from cotarget.rig import PanTiltLimits
+from cotarget.rig import PanTiltLimits, PanTiltState
 from cotarget.sim.motion import Axis
 from cotarget.targeting import Reach, aim
 from experiments.synthetic import SIZE
@@ -44,8 +44,8 @@ class Head:
         goal = tuple(round(q / STEP) * STEP for q in (pan, tilt))
         if not self.goals or goal != self.goals[-1]:
             self.goals.append(goal)
-        for axis, q in zip(self.axes, goal, strict=True):
-            axis.command(t + DELAY, q, speed)
+        for axis, q, each in zip(self.axes, goal, LIMITS.capped(speed), strict=True):
+            axis.command(t + DELAY, q, each)
 
     def at(self, t):
         return tuple(axis.motor(t)[0] for axis in self.axes)
@@ -88,9 +88,8 @@ def follow(name, seed, settings):
             goals = [q + r * abs(r) / (2 * LIMITS.acceleration) for q, r in zip(after, rates, strict=True)]
             head.move(t, *goals, None)
         else:
-            command = steering.decide(
-                effect, 1 / RATE, head.at(t), wanted, rates, field_angle, effect - estimates[0].measured_t
-            )
+            steering.head.saw(PanTiltState(*head.at(t), True, t))
+            command = steering.decide(effect, 1 / RATE, wanted, rates, field_angle, effect - estimates[0].measured_t)
             if command is not None:
                 head.move(t, command.pan, command.tilt, command.speed)
         if t > 1.5:
@@ -147,85 +146,73 @@ WIDTH = 0.1  # of the image [rad]; the zone is 2 mrad
 ZONE = SteeringSettings().zone * WIDTH
 
 
-def decide(steering, t, now, wanted, rate=0.0):
-    return steering.decide(t, FRAME, (now, 0.0), (wanted, 0.0), (rate, 0.0), WIDTH)
+def standing(limits=LIMITS, pan=0.0):
+    """A head that stands, and nobody has commanded."""
+    steering = Steering(limits)
+    steering.head.saw(PanTiltState(pan, 0.0, False, -FRAME))
+    return steering
+
+
+def decide(steering, t, wanted, rate=0.0):
+    return steering.decide(t, FRAME, (wanted, 0.0), (rate, 0.0), WIDTH)
 
 
 def test_a_target_that_stands_is_centred_once_and_left_alone():
-    steering = Steering(LIMITS)
-    first = decide(steering, 0.0, 0.0, 0.05)
+    steering = standing()
+    first = decide(steering, 0.0, 0.05)
     assert (first.pan, first.tilt, first.speed) == (0.05, 0.0, None)
     # On its way, and there: the same place, give or take what is less than the zone, needs no further command ...
-    assert all(decide(steering, i * FRAME, 0.05, 0.05 + 0.9 * ZONE * (-1) ** i) is None for i in range(1, 25))
+    assert all(decide(steering, i * FRAME, 0.05 + 0.9 * ZONE * (-1) ** i) is None for i in range(1, 25))
     # ... until it has rested for a second: then it is centred, slowly, if it is off by more than a step.
-    assert decide(steering, 1.04, 0.05, 0.05 + 0.9 * STEP) is None
-    centred = decide(steering, 1.08, 0.05, 0.05 + 1.5 * STEP)
+    assert decide(steering, 1.04, 0.05 + 0.9 * STEP) is None
+    centred = decide(steering, 1.08, 0.05 + 1.5 * STEP)
     assert centred.pan == 0.05 + 1.5 * STEP
-    assert centred.speed == pytest.approx(1.5 * STEP / SteeringSettings().catch_s)
-    assert decide(steering, 1.12, 0.05, 0.05) is None
+    assert centred.speed[0] == pytest.approx(1.5 * STEP / SteeringSettings().catch_s)
+    assert decide(steering, 1.12, 0.05) is None
     # Out of the zone it is gone after at once.
-    assert decide(steering, 1.2, 0.05, 0.05 + 2 * ZONE).pan == 0.05 + 2 * ZONE
-    steering.forget()
-    assert decide(steering, 1.24, 0.05, 0.05) is not None
+    assert decide(steering, 1.2, 0.05 + 2 * ZONE).pan == 0.05 + 2 * ZONE
 
 
 def test_a_moving_target_is_followed_at_its_own_speed():
     """Once it keeps up, the unit told so is left alone for as long as its goal is ahead."""
-    steering = Steering(LIMITS)
+    steering = standing()
     rate, commands = 0.3, []
     for i in range(100):
         t = i * FRAME
-        command = decide(steering, t, 0.0, 0.5 + rate * t, rate)
+        command = decide(steering, t, 0.5 + rate * t, rate)
         commands += [] if command is None else [(t, command)]
         if t > 1.0:
-            at = steering.where(t, (0.0, 0.0))[0]
+            at = steering.head.at(t)[0][0]
             assert abs(at - 0.5 - rate * t) < 1.5 * ZONE
     late = [(t, command) for t, command in commands if t > 1.0]
     assert len(late) < 0.3 * 75  # of 75 frames: a new goal each 0.15 s at most, and what the first ones left over
     for t, command in late:
-        assert command.speed == pytest.approx(rate, rel=0.1)
-        # The goal is 0.15 s ahead of the target, and the way on which the unit brakes farther.
+        assert command.speed[0] == pytest.approx(rate, rel=0.1)
+        # The goal is 0.15 s ahead, and the way on which the unit brakes farther.
         ahead = 0.5 + rate * (t + 0.15) + rate**2 / (2 * LIMITS.acceleration)
-        assert command.pan == pytest.approx(ahead)
+        assert command.pan == pytest.approx(ahead, abs=1.5 * ZONE)
+
+
+def test_each_axis_has_its_targets_speed():
+    """A target that goes aslant is followed aslant, and not along one axis and then the other."""
+    steering, rates = standing(), (0.3, -0.1)
+    for i in range(60):
+        t = i * FRAME
+        wanted = 0.5 + rates[0] * t, 0.1 + rates[1] * t
+        steering.decide(t, FRAME, wanted, rates, WIDTH)
+    for later in (0.25, 0.5, 0.75):
+        assert [speed for _, speed in steering.head.at(t + later * FRAME)] == pytest.approx(rates, abs=0.03)
 
 
 def test_a_goal_is_within_the_limits():
-    command = decide(Steering(LIMITS), 0.0, 2.7, 2.75, 0.5)
+    command = decide(standing(pan=2.7), 0.0, 2.75, 0.5)
     assert command.pan == LIMITS.pan[1]
 
 
 def test_a_head_that_jumps_is_sent_to_the_middle_of_the_way():
     """The textbook's unit, without limits of speed and acceleration."""
     limits = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.inf, math.inf, 0.0)
-    steering = Steering(limits)
-    command = decide(steering, 0.0, 0.0, 0.5, 0.4)
+    steering = standing(limits)
+    command = decide(steering, 0.0, 0.5, 0.4)
     assert (command.pan, command.speed) == (0.5 + 0.4 * FRAME / 2, None)
-    assert steering.where(0.0, (0.0, 0.0)) == (command.pan, 0.0)
-
-
-@pytest.mark.parametrize("v", [0.0, 0.2, 0.5])
-@pytest.mark.parametrize("way", [0.002, 0.008, 0.02, -0.008])
-def test_the_goal_for_a_way_gets_the_simulated_unit_there(v, way):
-    """It is that much farther on after the time, unless it cannot brake or speed up so hard."""
-    a, seconds = LIMITS.acceleration, 0.04
-    axis = Axis(LIMITS.speed, a)
-    axis._segments = [(-math.inf, -v * 100, 0.0, 0.0), (-100.0, -v * 100, v, 0.0)]
-    goal = goal_for(0.0, v, way, seconds, a)
-    axis.command(0.0, goal)
-    least, most = v * seconds - a * seconds**2 / 2, v * seconds + a * seconds**2 / 2
-    if goal != way:  # else it is so slow, or so little is asked, that it comes to rest there
-        assert axis.motor(seconds)[0] == pytest.approx(math.copysign(min(max(abs(way), least), most), way))
-
-
-@pytest.mark.parametrize("goal", [0.4, -0.4, 0.01, 0.0])
-@pytest.mark.parametrize("speed", [math.inf, 1.5, 0.2])
-@pytest.mark.parametrize("v", [0.0, 0.5, -0.8])
-def test_an_axis_moves_as_the_simulated_unit(goal, speed, v):
-    limit = min(speed, LIMITS.speed)
-    axis = Axis(LIMITS.speed, LIMITS.acceleration)
-    axis._segments = [(-math.inf, -v * 100, 0.0, 0.0), (-100.0, -v * 100, v, 0.0)]
-    axis.command(0.0, goal, limit)
-    for seconds in (0.0, 0.03, 0.1, 0.3, 1.0, 4.0):
-        assert axis_at(seconds, 0.0, v, goal, limit, LIMITS.acceleration) == pytest.approx(
-            axis.motor(seconds), abs=1e-9
-        )
+    assert steering.head.at(0.0)[0] == (command.pan, 0.0)
