@@ -25,6 +25,7 @@ MARKERS = cv2.aruco.DICT_4X4_50
 # A marker is sought in its target's true box, widened on each side by this part of the larger side ...
 SEARCH_MARGIN = 0.25
 SEARCH_PX = 8.0  # ... and by this, for what a moving target smears and the finder's windows need [px]
+ENLARGED = 2  # times for the finder, which wants some eight pixels a cell of what can be read at four
 
 
 def add_row(rows: list[Row], step: Step, truth: Truth, name: str, target: TargetConfig) -> None:
@@ -119,6 +120,7 @@ def decodes(frame: Frame, outline: Silhouette | None, marker: int) -> bool:
     left, top = np.clip(np.floor(outline.low_px - margin), 0, size).astype(int)
     right, bottom = np.clip(np.ceil(outline.high_px + margin) + 1, 0, size).astype(int)
     grey = cv2.cvtColor(frame.image[top:bottom, left:right], cv2.COLOR_BGR2GRAY)
+    grey = cv2.resize(grey, None, fx=ENLARGED, fy=ENLARGED, interpolation=cv2.INTER_CUBIC)
     finder = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(MARKERS))
     _, found, _ = finder.detectMarkers(grey)
     return found is not None and marker in found

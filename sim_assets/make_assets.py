@@ -66,12 +66,15 @@ def marker_image(marker: int, cell: int, quiet: float) -> npt.NDArray[np.uint8]:
 
 
 def draw_markers() -> None:
-    """Markers of the person and the bird; off-white, so that lit paper does not saturate."""
-    for name, marker, quiet in (("person", PERSON_MARKER, 1.0), ("bird", BIRD_MARKER, 0.5)):
+    """Markers of the person and the bird.
+
+    Off-white, so that lit paper does not saturate; the bird's are grey, so that it stays as dark as its plumage.
+    """
+    for name, marker, quiet, light in (("person", PERSON_MARKER, 1.0, 222), ("bird", BIRD_MARKER, 0.75, 140)):
         for more in (0, *FURTHER_MARKERS):
             image = marker_image(marker + more, 40, quiet).astype(float)
             file = f"{name}_marker_{marker + more}" if more else f"{name}_marker"
-            save(file, np.repeat((18 + image * (222 / 255))[..., None], 3, axis=2))
+            save(file, np.repeat((18 + image * (light / 255))[..., None], 3, axis=2))
 
 
 BOOK_RED: Color = (196, 22, 34)
