@@ -10,10 +10,13 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from cotarget.config import TargetConfig
 from cotarget.geometry import Array
 
+# A box that is smaller than this part of its target's usual one is a piece of it, which may be any.
+PIECE = 0.7
 # The larger side over a wing beat is this percentile: the maximum, but deaf to one frame in ten that is wrong.
 BEAT_PERCENTILE = 90.0
 
@@ -144,6 +147,7 @@ class TargetFilter:
         self.settings = settings
         self.noise = settings.acceleration_px**2 * settings.manoeuvre_s
         self.x: Array = np.concatenate([detection.center_px, np.zeros(2)])
+        self.size = detection.size_px
         self.P = np.diag([*self.variance(detection), settings.speed_px**2, settings.speed_px**2])
         self.t = self.born = self.seen = t
         self.start = self.x[:2].copy()
@@ -235,9 +239,9 @@ class TargetFilter:
 
     def variance(self, detection: Measurement) -> Array:
         """Variance of a detection's centre [px^2], (2,)."""
-        if detection.clipped:  # the hidden part may be as large again
-            return self.settings.noise_px**2 + (detection.size_px / 2) ** 2
-        return self.settings.noise_px**2 + (self.settings.noise_of_size * detection.size_px) ** 2
+        return center_variance(
+            self.settings, detection.size_px, detection.clipped, missing(self.size, detection.size_px)
+        )
 
     def _measure(self, center: Array, variance: Array) -> None:
         """Kalman's correction by a measured centre [px] with its variance [px^2], both (2,)."""
@@ -248,6 +252,26 @@ class TargetFilter:
         self.P = (self.P + self.P.T) / 2
         self.seen = self.t
         self.missed = 0
+
+
+def missing(usual: Array, size: Array) -> Array:
+    """How much of a target's usual width and height a box lacks [px], (..., 2), if it is a piece of it; else 0."""
+    return np.asarray(np.where(size < PIECE * usual, usual - size, 0.0))
+
+
+def center_variance(
+    settings: TrackerSettings, size: Array, clipped: npt.NDArray[np.bool_] | bool, lacks: Array
+) -> Array:
+    """Variance of a box's middle [px^2], (..., 2).
+
+    Args:
+        settings: how well middles are measured.
+        size: of the box [px], (..., 2).
+        clipped: whether the border cuts it, (..., 1) or one; the hidden part may be as large again.
+        lacks: what `missing` says, (..., 2).
+    """
+    part = np.where(clipped, 0.5, settings.noise_of_size)
+    return np.asarray(settings.noise_px**2 + (part * size) ** 2 + (lacks / 2) ** 2)
 
 
 @functools.lru_cache(maxsize=8)  # every track of a frame asks for the same

@@ -11,14 +11,28 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from cotarget.geometry import Array
-from cotarget.motionfilter import Measurement, TargetFilter, Track, TrackerSettings, settings_for
+from cotarget.motionfilter import (
+    Measurement,
+    TargetFilter,
+    Track,
+    TrackerSettings,
+    center_variance,
+    missing,
+    settings_for,
+)
 
 __all__ = ["Measurement", "Track", "Tracker", "TrackerSettings", "settings_for", "size_for"]
 
 # A cost that no assignment inside the gate reaches, so that it marks pairs that must not be matched.
 IMPOSSIBLE = 1e6
-# 99.9 % of a chi-square with two degrees of freedom: one true detection in a thousand is turned away.
-GATE_CHI2 = 13.8
+# 99.9 % of a chi-square with three degrees of freedom, two of place and one of size: of true detections one in a
+# thousand is turned away.
+GATE_CHI2 = 16.3
+# Wings, limbs and what hides a part make a box half as large or twice as large as before, one standard deviation of the
+# logarithm of its side. A twig that is seen a little later where a bird has gone behind a tree is smaller still.
+SIZE_SIGMA = 0.5
+# What is more likely something else than a target is believed less: that likelihood ratio counts, down to this score.
+LEAST_SCORE = 0.01
 # A box that overlaps a track's by this much may be its target even outside the gate: it grew into something else.
 OVERLAP_ENOUGH = 0.3
 # What perfect overlap of the boxes is worth against the Mahalanobis distance squared.
@@ -108,7 +122,7 @@ class _Pairs:
     """Every track beside every detection, (tracks, detections): a hundred of each are ten thousand pairs.
 
     Attributes:
-        distance: Mahalanobis distance squared.
+        distance: squared, of place (Mahalanobis) and of size, in variances; a low score counts as distance too.
         log_volume: logarithm of the determinant of the innovation's covariance.
         covered: the part of the track's box that the detection covers, 0 to 1.
         overlap: intersection over union of the boxes, 0 to 1.
@@ -124,30 +138,44 @@ class _Pairs:
         P = np.array([state.P[:2, :2] for state in states]).reshape(n, 1, 2, 2)
         center = np.array([detection.center_px for detection in detections]).reshape(1, m, 2)
         extent = np.array([detection.size_px for detection in detections]).reshape(1, m, 2)
-        variance = np.array([states[0].variance(each) if states else (0.0, 0.0) for each in detections])
+        cut = np.array([detection.clipped for detection in detections], dtype=bool)  # its size says nothing
+        variance = np.zeros((n, m, 2))
+        if states:
+            variance = center_variance(states[0].settings, extent, cut[:, None], missing(size, extent))
         # S = [[a, c], [c, b]], inverted by hand.
-        a, b = (P[..., k, k] + variance.reshape(1, m, 2)[..., k] for k in (0, 1))
+        a, b = (P[..., k, k] + variance[..., k] for k in (0, 1))
         c = np.broadcast_to(P[..., 0, 1], (n, m))
         du, dv = np.moveaxis(center - at, -1, 0)
         volume = a * b - c * c
-        self.distance: Array = (b * du * du - 2 * c * du * dv + a * dv * dv) / volume
+        own, other = np.prod(size, axis=-1), np.prod(extent, axis=-1)
+        resized = np.where(cut, 0.0, np.log(other / own) / 2 / SIZE_SIGMA)
+        self.distance: Array = (b * du * du - 2 * c * du * dv + a * dv * dv) / volume + resized**2
+        score = np.array([detection.score for detection in detections]).clip(LEAST_SCORE, 0.5)
+        self.distance += 2 * np.log((1 - score) / score)
         self.log_volume: Array = np.log(volume)
         low = np.maximum(at - size / 2, center - extent / 2)
         high = np.minimum(at + size / 2, center + extent / 2)
         shared = np.prod(np.maximum(0.0, high - low), axis=-1)
-        own, other = np.prod(size, axis=-1), np.prod(extent, axis=-1)
         self.covered: Array = shared / own
         self.overlap: Array = shared / (own + other - shared)
 
 
 def _assign(pairs: _Pairs) -> dict[int, int]:
-    """Match tracks to detections one to one: {index of the track: index of the detection}."""
-    # A track that was confirmed goes first, and a box that grew into another still overlaps its track.
+    """Match tracks to detections one to one: {index of the track: index of the detection}.
+
+    Confirmed tracks choose first: one that coasts knows badly where its target is, and a new track that was begun there
+    meanwhile knows it well, yet it is the old target that was found again.
+    """
+    # A box that grew into another still overlaps its track.
     possible = (pairs.distance <= GATE_CHI2) | (pairs.overlap > OVERLAP_ENOUGH)
-    cost = pairs.distance + pairs.log_volume - OVERLAP_BONUS * pairs.overlap
-    cost = np.where(possible, cost + np.where(pairs.confirmed, 0.0, OVERLAP_BONUS)[:, None], IMPOSSIBLE)
-    rows, columns = linear_sum_assignment(cost)
-    return {int(i): int(j) for i, j in zip(rows, columns, strict=True) if possible[i, j]}
+    cost = np.where(possible, pairs.distance + pairs.log_volume - OVERLAP_BONUS * pairs.overlap, IMPOSSIBLE)
+    matches: dict[int, int] = {}
+    for group in (np.flatnonzero(pairs.confirmed), np.flatnonzero(~pairs.confirmed)):
+        free = np.setdiff1d(np.arange(cost.shape[1]), list(matches.values()))
+        rows, columns = linear_sum_assignment(cost[np.ix_(group, free)])
+        found = ((int(group[i]), int(free[j])) for i, j in zip(rows, columns, strict=True))
+        matches |= {i: j for i, j in found if possible[i, j]}
+    return matches
 
 
 def _crowds(pairs: _Pairs, matches: dict[int, int]) -> dict[int, int]:
