@@ -155,7 +155,10 @@ def _size(node: Node, size: SizeSeen | None, settings: EstimationSettings) -> No
 def _told(node: Node, surprise: float, settings: EstimationSettings) -> Node:
     """Keep count of how surprising measurements are; a target that surprises manoeuvres harder than usual."""
     mean = node.surprise + settings.surprise_gain * (surprise / 2 - node.surprise)
-    return replace(node, surprise=mean, boost=min(max(mean, 1.0), settings.most_boost))
+    boost = min(max(mean, 1.0), settings.most_boost)
+    if node.t < node.moved_t + settings.carried_s:
+        boost = max(boost, settings.carried_boost)
+    return replace(node, surprise=mean, boost=boost)
 
 
 def _leaning(node: Node, S: Array, innovation: Array, settings: EstimationSettings) -> tuple[float, float]:
@@ -186,7 +189,17 @@ def _elsewhere(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node
     accelerations = settings.jump_acceleration, settings.jump_acceleration, motion.acceleration
     P[range(3, 9), range(3, 9)] = (np.array([*speeds, *accelerations]) * nearness) ** 2
     P[L, L] += settings.depth_doubt**2
-    return replace(node, x=x, P=P, missed_wide=0, missed_zoom=0, lean=(0.0, 0.0), surprise=1.0, boost=1.0)
+    return replace(
+        node,
+        x=x,
+        P=P,
+        missed_wide=0,
+        missed_zoom=0,
+        lean=(0.0, 0.0),
+        surprise=1.0,
+        boost=settings.carried_boost,
+        moved_t=node.t,
+    )
 
 
 def _doubted(P: Array, settings: EstimationSettings) -> Array:

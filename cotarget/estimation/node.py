@@ -22,6 +22,7 @@ class Node:
         size_t: when the size was last measured [s].
         lean: innovation in the zoom view over its standard deviation, averaged over the last second or so, (2,).
         wide_t: when the middle was last measured in the wide view [s].
+        moved_t: when it was last found elsewhere than it could be [s].
     """
 
     t: float
@@ -34,4 +35,5 @@ class Node:
     missed_size: int = 0
     size_t: float = -math.inf
     wide_t: float = -math.inf
+    moved_t: float = -math.inf
     lean: tuple[float, float] = (0.0, 0.0)

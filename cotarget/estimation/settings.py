@@ -70,7 +70,8 @@ class EstimationSettings:
         size_gate: likewise of a size; 99.7 % with one.
         misses: so many measurements beyond jump_gate on end are believed.
         jump_speed: standard deviation, across the line of sight, of the velocity of a target so found elsewhere [m/s]
-        jump_acceleration: ... and of its acceleration [m/s^2].
+        jump_acceleration: ... and of its acceleration [m/s^2], then and ...
+        carried_s: ... for so long: whoever carries it speeds up and brakes [s].
         zoom_misses: likewise in the zoom view, while the wide view has no surprise: then size or head is doubted.
         calm: a mean surprise below which the wide view counts as having none.
         lean_gain: weight of the newest innovation in the zoom view in their mean, in standard deviations.
@@ -98,6 +99,7 @@ class EstimationSettings:
     misses: int = 3
     jump_speed: float = 3.0
     jump_acceleration: float = 10.0
+    carried_s: float = 1.5
     zoom_misses: int = 8
     calm: float = 2.0
     lean_gain: float = 0.1
@@ -109,6 +111,11 @@ class EstimationSettings:
     surprise_gain: float = 0.2
     most_boost: float = 30.0
     history_s: float = 1.5
+
+    @property
+    def carried_boost(self) -> float:
+        """By what the acceleration's variance is larger than usual while it is carried."""
+        return max(1.0, (self.jump_acceleration / self.motion.acceleration) ** 2)
 
 
 BOOK = EstimationSettings(
