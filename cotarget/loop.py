@@ -6,7 +6,7 @@ Everything that records, draws, scores or prints consumes Steps.
 import enum
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from cotarget.config import TargetConfig
 from cotarget.detection import Detection, Detector
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
+from cotarget.eyes import Eyes
 from cotarget.policies import FirstCome, Policy
 from cotarget.pursuit import Pursuit
 from cotarget.rig import Frame, Image, PanTiltState, Rig, ZoomState
@@ -61,9 +62,9 @@ class Step:
         index: from 0.
         t: when it was done, on the rig's clock [s].
         state: what the loop was doing, and
-        reason: why, where that needs words.
+        reason: why, where that needs words, and what is wrong with what it acts on.
         fixed: the frame that it acted on.
-        zoom: the newest zoom frame at that time.
+        zoom: the newest zoom frame at that time; an old one while the zoom camera is blind, which `reason` says.
         mask: the detector's foreground, (H, W), or None.
         detections: in the fixed frame.
         tracks: after them.
@@ -116,7 +117,9 @@ def follow(
     Raises:
         CalibrationError: the calibration has no T.
         ConfigError: the calibration is of another aspect ratio than the rig's streams.
-        StaleFrameError: frames stopped coming, or came too late to act on.
+        StaleFrameError: frames of the fixed camera stopped coming, or came too late to act on, or again; or the zoom
+            camera shows nothing new for 10 s. Until then the wide view alone is followed, and every Step says so.
+        DeviceError: a device failed; frames have another size than before among others.
     """
     calibration.hand_eye()  # refused now, and not when the first target is seen
     loop = _Loop(rig, calibration.for_streams(rig.fixed.size, rig.zoom.size), target, detector, settings)
@@ -135,35 +138,38 @@ class _Loop:
         self._tracker = Tracker(settings_for(target), rig.fixed.size)
         self._pursuit = Pursuit(calibration, target, rig.fixed.size, closed_loop=settings.closed_loop)
         self._servo = Servo(rig, calibration, settings)
-        self._zoom_frame: Frame | None = None
-        self._fixed_t: float | None = None
+        self._eyes = Eyes(rig.fixed, rig.zoom, rig.clock)
+        self._beyond: set[int] = set()  # tracks that could not be aimed at
         self._last_seen = -math.inf
         self._index = 0
 
     def turn(self) -> Step:
         """One frame of the fixed camera."""
         rig, pursuit = self._rig, self._pursuit
-        frame = rig.fixed.read(newer_than=self._fixed_t)
-        interval = LONGEST_INTERVAL_S if self._fixed_t is None else min(frame.t - self._fixed_t, LONGEST_INTERVAL_S)
-        self._fixed_t = frame.t
+        frame = self._eyes.look_wide()
+        interval = min(self._eyes.interval, LONGEST_INTERVAL_S)
         detections = self._detector.detect(frame)
         tracks = self._tracker.update(detections, frame.t)
-        pursuit.see_wide(frame, tracks, self._detector.mask)
+        favoured = {track.id for track in tracks if self._settings.policy.favours(track)}
+        pursuit.see_wide(frame, tracks, self._detector.mask, favoured)
         self._hear()
-        found = self._look_through_zoom()
+        zoom = self._eyes.look_close()
+        found = pursuit.see_zoom(zoom) if self._eyes.close_is_new else None
         chosen = self._choose(tracks)
         mode, reason, drive = self._drive(chosen, frame, interval)
+        if chosen is None:
+            reason = self._why_nobody(tracks)
         if drive is not None and chosen is not None and drive.chance >= SEEN_WELL and drive.zoom_reason == "wanted":
             pursuit.seen_well(chosen.id, interval)
         self._hear()
-        assert self._zoom_frame is not None, "it was just read"
+        doubts = [] if chosen is None else pursuit.doubts(chosen.id, frame.t)
         step = Step(
             index=self._index,
             t=rig.clock.now(),
             state=mode,
-            reason=reason,
+            reason="; ".join(filter(None, [reason, *doubts, *self._eyes.troubles()])),
             fixed=frame,
-            zoom=self._zoom_frame,
+            zoom=zoom,
             mask=self._detector.mask,
             detections=tuple(detections),
             tracks=tuple(tracks),
@@ -183,16 +189,22 @@ class _Loop:
         self._head, self._lens = self._rig.head.state(), self._rig.zoom.state()
         self._pursuit.states.add(self._head, self._lens)
 
-    def _look_through_zoom(self) -> Found | None:
-        """Take the newest zoom frame; what was found in it, where it is a new one."""
-        before, self._zoom_frame = self._zoom_frame, self._rig.zoom.read()
-        if before is not None and self._zoom_frame.t <= before.t:
-            return None
-        return self._pursuit.see_zoom(self._zoom_frame)
+    def _why_nobody(self, tracks: list[Track]) -> str:
+        """Why nobody is followed."""
+        if unmet := self._settings.policy.unmet:
+            return unmet
+        if not tracks:
+            return "nothing is detected"
+        return "what is detected is not believed yet"
 
     def _choose(self, tracks: list[Track]) -> Track | None:
         """Whom to follow."""
-        candidates = self._pursuit.candidates(tracks, self._rig.clock.now())
+        now = self._rig.clock.now()
+        candidates = self._pursuit.candidates(tracks, now)
+        if self._beyond:  # whoever could not be aimed at may have come nearer
+            estimates = {number: self._pursuit.estimate(number, now) for number in self._beyond}
+            self._beyond = {n for n, each in estimates.items() if each is not None and not self._servo.can_reach(each)}
+            candidates = [replace(each, reachable=each.id not in self._beyond) for each in candidates]
         head = np.array([self._head.pan, self._head.tilt])
         number = self._settings.policy.select(candidates, head, self._rig.head.limits)
         self._pursuit.follow(number)
@@ -211,5 +223,6 @@ class _Loop:
         try:
             drive = self._servo.drive(lambda t: self._pursuit.estimate(chosen.id, t), self._last_seen, interval)
         except UnreachableError as error:
+            self._beyond.add(chosen.id)
             return State.UNREACHABLE, str(error), None
         return State.FOLLOWING if chosen.missed == 0 else State.COASTING, "", drive

@@ -38,6 +38,7 @@ class Candidate:
         rate: how fast these change, (2,) [rad/s].
         leaves_in: how long until it leaves the wide view [s]; inf for one that does not.
         seen_s: how long it has been well in the close-up so far [s].
+        reachable: whether the head can point at it.
     """
 
     track: Track
@@ -45,6 +46,7 @@ class Candidate:
     rate: Array
     leaves_in: float = math.inf
     seen_s: float = 0.0
+    reachable: bool = True
 
     @property
     def id(self) -> int:
@@ -59,10 +61,22 @@ class Policy(Protocol):
         """The number of the track to follow; None for none.
 
         Args:
-            candidates: all confirmed tracks that the head can point at.
+            candidates: all confirmed tracks.
             head: pan and tilt now, (2,) [rad].
             limits: the head's speed and acceleration.
         """
+
+    def favours(self, track: Track) -> bool:
+        """Whether a track must be among the candidates, even where there are more than can be."""
+
+    @property
+    def unmet(self) -> str:
+        """What was asked for and is not there, in words; empty where it is there, or where anybody will do."""
+
+
+def _reachable(candidates: Sequence[Candidate]) -> Sequence[Candidate]:
+    """Those that the head can point at; where it can point at none, all of them, so that it is said why."""
+    return [candidate for candidate in candidates if candidate.reachable] or candidates
 
 
 @dataclass
@@ -70,10 +84,15 @@ class FirstCome:
     """The paper's policy: follow the first target until it disappears, then the next."""
 
     _id: int | None = None
+    unmet = ""
+
+    def favours(self, track: Track) -> bool:
+        """No: whoever came first has the lowest number, and is a candidate as long as it is there."""
+        return False
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
-        """The one followed before, if it is still there, or the eldest."""
-        ids = [candidate.id for candidate in candidates]
+        """The one followed before, if it is still there and can be reached, or the eldest."""
+        ids = [candidate.id for candidate in _reachable(candidates)]
         if self._id not in ids:
             self._id = min(ids, default=None)
         return self._id
@@ -110,9 +129,15 @@ class Rounds:
     next_of: Callable[[Outlook], int]
     look_s: float = LOOK_S
     _id: int | None = None
+    unmet = ""
+
+    def favours(self, track: Track) -> bool:
+        """No: there is no telling whose turn it would be."""
+        return False
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
         """The next one, as long as somebody waits."""
+        candidates = _reachable(candidates)
         waiting = sorted((c for c in candidates if c.seen_s < self.look_s), key=lambda c: (c.leaves_in, c.id))
         if waiting:
             self._id = self.next_of(Outlook(waiting, self._id, head, limits, self.look_s))
@@ -180,19 +205,55 @@ class Chosen:
     pixel: tuple[float, float] | None = None
     width_px: float = math.inf
     _found: int | None = field(default=None, init=False)
+    _there: bool = field(default=False, init=False)
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
         """The chosen one while it is there."""
         if self._found is None:
-            self._found = self.number if self.pixel is None else self._clicked(candidates, self.pixel)
-        return self._found if self._found in {candidate.id for candidate in candidates} else None
+            self._found = self.number if self.pixel is None else self._clicked(candidates)
+        self._there = self._found in {candidate.id for candidate in candidates}
+        return self._found if self._there else None
 
-    def _clicked(self, candidates: Sequence[Candidate], pixel: tuple[float, float]) -> int | None:
+    def favours(self, track: Track) -> bool:
+        """Whether it is the chosen one, or may be."""
+        return track.id == self._found if self._found is not None else self._means(track)
+
+    @property
+    def unmet(self) -> str:
+        """Which choice means none of the tracks."""
+        if self._there:
+            return ""
+        if self.pixel is None:
+            return f"track {self.number} is not there"
+        at = f"at the click ({self.pixel[0]:g}, {self.pixel[1]:g})"
+        return (
+            f"no track {at}" if self._found is None else f"track {self._found}, which was {at}, is not there any more"
+        )
+
+    def _clicked(self, candidates: Sequence[Candidate]) -> int | None:
         """The track under a click, or the nearest that is near."""
-        off = {c.id: np.abs(c.track.center_px - pixel) for c in candidates}
-        inside = [c.id for c in candidates if np.all(off[c.id] <= c.track.size_px / 2)]
-        near = inside or [number for number, each in off.items() if np.hypot(*each) <= CLICK_PART * self.width_px]
-        return min(near, key=lambda number: float(np.hypot(*off[number])), default=None)
+        near = [c.track for c in candidates if self._means(c.track)]
+        inside = [track for track in near if self._inside(track)]
+        return min(inside or near, key=self._away).id if near else None
+
+    def _means(self, track: Track) -> bool:
+        """Whether a choice may mean a track."""
+        if self.pixel is None:
+            return track.id == self.number
+        return self._inside(track) or self._away(track) <= CLICK_PART * self.width_px
+
+    def _inside(self, track: Track) -> bool:
+        """Whether the click is in a track's box."""
+        return bool(np.all(np.abs(self._off(track)) <= track.size_px / 2))
+
+    def _away(self, track: Track) -> float:
+        """How far a click is from a track's middle [px]."""
+        return float(np.linalg.norm(self._off(track)))
+
+    def _off(self, track: Track) -> Array:
+        """From a click to a track's middle, (2,) [px]."""
+        assert self.pixel is not None, "who asks has looked"
+        return np.asarray(track.center_px - np.array(self.pixel))
 
 
 def leaves_in(track: Track, size: tuple[int, int]) -> float:

@@ -5,7 +5,7 @@ triangulates its depth and shows any error of head or calibration.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +14,10 @@ from cotarget.calibration import Calibration
 from cotarget.closeup import CloseupFinder, Expected, Found
 from cotarget.config import TargetConfig
 from cotarget.detection import Detection
-from cotarget.estimation import Estimate, SpatialFilter, estimation_settings_for
+from cotarget.estimation import Appearance, Estimate, SpatialFilter, estimation_settings_for
+from cotarget.estimation.motion import PAN, TILT, K, L
 from cotarget.geometry import Array
+from cotarget.motionfilter import missing
 from cotarget.policies import Candidate, leaves_in
 from cotarget.rig import Frame, Image
 from cotarget.statehistory import StateHistory
@@ -26,6 +28,18 @@ MOST_FILTERS = 12
 # The time of a frame, of the head's state and of the lens's are known to each other this well [s].
 TIME_SIGMA_S = 2e-3
 HEAD_SIGMA = 3e-4  # of the angles of a head that stands: rounding of 0.05 degrees [rad]
+# A size or a head's bias that is this many times what was assumed is no chance; a right one comes to 1 or 2.
+WRONG = 4.0
+# Whoever is in both views and yet not found in the zoom view for so long is not where he is thought to be [s]. A bird
+# that is where it should be was missed for 0.8 s at most, a person or a book for a frame or two.
+UNFOUND_S = 1.5
+# Then he is looked for as far around as this leaves: standard deviations of size and depth together, and of the head's
+# bias [rad]. A size told twice too large is 0.7.
+DOUBTED_SIZE, DOUBTED_BIAS = 0.4, 5e-3
+# A find so near to where it was expected, in standard deviations, is no surprise.
+NEAR = 3.0
+# So long after the wide view has shown it a target may have gone elsewhere [s].
+JUST_SEEN_S = 0.2
 # For whom to look at next, how fast a target goes round the head is taken over this time [s].
 RATE_S = 0.1
 
@@ -49,28 +63,48 @@ class Pursuit:
         self._filters: dict[int, SpatialFilter] = {}
         self._seen_s: dict[int, float] = {}
         self._followed: int | None = None
+        self._zoom_t = math.inf
+        self._unfound_s = 0.0
         self._finder = CloseupFinder(calibration, target)
         self._to_base = calibration.hand_eye() * calibration.T_zoom0_fixed
         self.states = StateHistory()
 
-    def see_wide(self, frame: Frame, tracks: Sequence[Track], mask: Image | None) -> None:
+    def see_wide(
+        self, frame: Frame, tracks: Sequence[Track], mask: Image | None, favoured: Collection[int] = ()
+    ) -> None:
         """Take a frame of the wide view into account.
 
         Args:
             frame: the frame.
-            tracks: after it, confirmed ones first.
+            tracks: after it, the eldest first.
             mask: the detector's foreground, (H, W).
+            favoured: numbers of tracks that have a filter before others.
         """
-        known = {track.id for track in tracks}
-        self._filters = {number: each for number, each in self._filters.items() if number in known}
-        self._seen_s = {number: seconds for number, seconds in self._seen_s.items() if number in known}
-        for track in tracks[:MOST_FILTERS]:
+
+        def last(track: Track) -> tuple[bool, ...]:
+            return (
+                track.id != self._followed,
+                track.id not in favoured,
+                not track.confirmed,
+                track.id not in self._filters,  # or else who is known would be forgotten for somebody new
+            )
+
+        known = sorted(tracks, key=last)[:MOST_FILTERS]
+        numbers = {track.id for track in known}
+        self._filters = {number: each for number, each in self._filters.items() if number in numbers}
+        numbers = {track.id for track in tracks}
+        self._seen_s = {number: seconds for number, seconds in self._seen_s.items() if number in numbers}
+        for track in known:
             if track.missed:
                 continue
             if track.id not in self._filters:
                 self._filters[track.id] = SpatialFilter(self._calibration, self._target, self._assumed)
             found = self._filters[track.id]
             box, sigma_px = track.box, None
+            lacks = missing(track.size_px, box.size_px)
+            if lacks.any() and isinstance(box, Detection):  # a piece of it, which tells no size and its middle badly
+                found.see_wide(replace(box, clipped=True), frame.t, sigma_px=lacks / 2)
+                continue
             if track.id == self._followed and isinstance(box, Detection):
                 sight = self._finder.see_wide(frame, box, mask)
                 if sight is not None:  # the very point that both views show
@@ -87,9 +121,12 @@ class Pursuit:
         seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
         if seen is None:
             return None
+        # The wrong size, or a wrong calibration, has it looked for beside where it is, and never be found.
+        doubted = _doubted(estimate).appearance(pose.pan, pose.tilt, pose.nominal_px) if self._overdue else None
         pan, tilt = pose.pan + estimate.bias[0], pose.tilt + estimate.bias[1]
-        expected = Expected(estimate.x_fixed, seen.covariance, pan, tilt, pose.nominal_px)
-        found = self._finder.find(frame, expected)
+        covariance = (seen if doubted is None else doubted).covariance
+        found = self._finder.find(frame, Expected(estimate.x_fixed, covariance, pan, tilt, pose.nominal_px))
+        self._count_unfound(frame, found, seen, estimate)
         if found is not None:
             self._filters[self._followed].see_zoom(
                 found.center_px,
@@ -104,10 +141,53 @@ class Pursuit:
             )
         return found
 
+    @property
+    def _overdue(self) -> bool:
+        """Whether the zoom view should have shown the target long since."""
+        return self._unfound_s > UNFOUND_S
+
+    def _count_unfound(self, frame: Frame, found: Found | None, seen: Appearance, estimate: Estimate) -> None:
+        """Note for how long the target was not where the zoom view should show it."""
+        passed, self._zoom_t = min(max(frame.t - self._zoom_t, 0.0), JUST_SEEN_S), frame.t
+        size = np.array(frame.image.shape[1::-1])
+        if found is not None:
+            off = found.center_px - (size - 1) / 2 - seen.offset_px
+            spread = seen.covariance + np.diag(np.square(found.sigma_px) + np.square(found.body_sigma_px))
+            if float(off @ np.linalg.solve(spread, off)) <= NEAR**2:
+                self._unfound_s = 0.0
+                return
+        wholly = np.all(np.abs(seen.offset_px) + seen.size_px / 2 <= size / 2)
+        if wholly and frame.t - estimate.measured_t <= JUST_SEEN_S:
+            self._unfound_s += passed
+
+    def doubts(self, number: int, t: float) -> list[str]:
+        """What speaks against what was told of a target, or against the calibration, in words.
+
+        Args:
+            number: of the track that is followed.
+            t: the time [s].
+        """
+        estimate = self.estimate(number, t)
+        if estimate is None:
+            return []
+        wrong, found = [], []
+        if abs(estimate.size_surprise) > WRONG:
+            wrong.append(f"both views make it {estimate.size:.2g} m and not {self._target.size:.2g} m")
+        if estimate.bias_surprise > WRONG:
+            wrong.append(f"the head points {math.degrees(math.hypot(*estimate.bias)):.2g} degrees beside")
+        if wrong:
+            found.append(f"the told size or the calibration seems wrong: {', '.join(wrong)}")
+        if number == self._followed and self._overdue:
+            found.append(
+                f"for {self._unfound_s:.1f} s not found where the zoom view should show it: it is hidden there, or the "
+                "told size or the calibration is wrong"
+            )
+        return found
+
     def follow(self, number: int | None) -> None:
         """Look for another track in the zoom view from now on."""
         if number != self._followed:
-            self._followed = number
+            self._followed, self._unfound_s = number, 0.0
             self._finder = CloseupFinder(self._calibration, self._target)
 
     def seen_well(self, number: int, seconds: float) -> None:
@@ -137,3 +217,11 @@ class Pursuit:
         """Pan and tilt of a point as seen from the head, (2,) [rad], the zoom camera's place on it aside."""
         x, y, z = self._to_base.apply(x_fixed)
         return np.array([math.atan2(x, z), math.atan2(-y, math.hypot(x, z))])
+
+
+def _doubted(estimate: Estimate) -> Estimate:
+    """The same estimate, as if size and head were hardly known: their ratio to the depth is what the wide view sees."""
+    P = estimate.state_covariance.copy()
+    P[np.ix_([L, K], [L, K])] += DOUBTED_SIZE**2
+    P[[PAN, TILT], [PAN, TILT]] += DOUBTED_BIAS**2
+    return replace(estimate, state_covariance=P)

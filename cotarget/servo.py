@@ -12,7 +12,7 @@ from cotarget.calibration import Calibration
 from cotarget.deadzone import Steering, SteeringSettings
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
-from cotarget.rig import Rig
+from cotarget.rig import PanTiltState, Rig
 from cotarget.targeting import Aim, Reach, aim
 from cotarget.zoompolicy import ZoomPolicy, ZoomSettings, expect
 
@@ -87,19 +87,21 @@ class Servo:
         at_effect, then = (predict(t) for t in times)
         if at_effect is None or then is None:
             raise UnreachableError("where the target is was not seen yet")
-        reach = reach_of(self._rig)
+        state = self._rig.head.state()
+        self._steering.head.saw(state)  # a head that was halted, or is slow, is not where it was sent
+        reach = reach_of(self._rig, state)
         first, found = self._aim(at_effect, reach), self._aim(then, reach)
         rates = (found.pan - first.pan) / interval, (found.tilt - first.tilt) / interval
         pan, tilt, focal = self.commanded
         view = self._rig.zoom.size[0] / self._true(focal)
         command = self._steering.decide(
-            effect, interval, reach.now, (first.pan, first.tilt), rates, view, effect - at_effect.measured_t
+            effect, interval, (first.pan, first.tilt), rates, view, effect - at_effect.measured_t
         )
         if command is not None:
             pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)
-        head = self._steering.where(effect + interval, reach.now)
+        (pan_then, _), (tilt_then, _) = self._steering.head.at(effect + interval)
         choice = self._zoom.choose(
-            expect(then, *head, focal),
+            expect(then, pan_then, tilt_then, focal),
             found.focal_px,
             self._true(focal),
             now,
@@ -113,11 +115,18 @@ class Servo:
 
     def zoom_out(self) -> None:
         """Send the lens to its shortest focal length; the head waits."""
-        self._steering.forget()
         pan, tilt, focal = self.commanded
         shortest = self._rig.zoom.focal_range[0]
         if focal > shortest:
             self.commanded = (pan, tilt, self._rig.zoom.zoom(shortest))
+
+    def can_reach(self, estimate: Estimate) -> bool:
+        """Whether the head can point at where a target is estimated to be."""
+        try:
+            self._aim(estimate, reach_of(self._rig))
+        except UnreachableError:
+            return False
+        return True
 
     def _true(self, nominal_px: float) -> float:
         """The true focal length at a nominal one [px]."""
@@ -132,7 +141,7 @@ class Servo:
         return dataclasses.replace(found, pan=pan, tilt=tilt)
 
 
-def reach_of(rig: Rig) -> Reach:
-    """What a rig's head and lens can do, and where the head is."""
-    limits, head = rig.head.limits, rig.head.state()
+def reach_of(rig: Rig, state: PanTiltState | None = None) -> Reach:
+    """What a rig's head and lens can do, and where the head is; asked by default."""
+    limits, head = rig.head.limits, rig.head.state() if state is None else state
     return Reach(limits.pan, limits.tilt, rig.zoom.focal_range, (head.pan, head.tilt), limits.step)

@@ -33,7 +33,7 @@ CALIBRATION = Calibration(
 )
 WIDE = PanTiltLimits((-2.7, 2.7), (-0.8, 0.5), math.radians(149), math.radians(206), STEP)
 ROUNDED_PX = 0.5  # products of angles that are taken for sums
-PICTURE = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+PICTURES = [np.full((SIZE[1], SIZE[0], 3), level, np.uint8) for level in (0, 1)]  # those of a live camera differ
 
 
 @dataclass
@@ -70,7 +70,7 @@ class _Camera:
                 if index / RATE_HZ - newer_than > timeout:
                     raise StaleFrameError("no new frame")
         rig.t = max(rig.t, index / RATE_HZ + LATENCY)
-        return Frame(PICTURE, index / RATE_HZ)
+        return Frame(PICTURES[index % 2], index / RATE_HZ)
 
 
 @dataclass
@@ -95,15 +95,17 @@ class _Head:
         return self.rig.limits
 
     def state(self):
-        return PanTiltState(*self.rig.pose(self.rig.t), moving=False, t=self.rig.t)
+        moving = any(axis.motor(self.rig.t)[1] != 0 for axis in (self.rig.pan, self.rig.tilt))
+        return PanTiltState(*self.rig.pose(self.rig.t), moving, self.rig.t)
 
     def move(self, pan, tilt, speed=None, wait=False):
         rig = self.rig
         goal = [
             min(max(round(q / STEP) * STEP, lo), hi) for q, (lo, hi) in ((pan, rig.limits.pan), (tilt, rig.limits.tilt))
         ]
-        rig.pan.command(rig.t + DELAY, goal[0], speed)
-        rig.tilt.command(rig.t + DELAY, goal[1], speed)
+        speeds = rig.limits.capped(speed)
+        rig.pan.command(rig.t + DELAY, goal[0], speeds[0])
+        rig.tilt.command(rig.t + DELAY, goal[1], speeds[1])
         rig.moves.append((rig.t, *goal))
         return tuple(goal)
 
@@ -181,9 +183,10 @@ def test_from_searching_to_lost_and_back():
     for step in steps:
         aimed = step.state in (State.FOLLOWING, State.COASTING)
         assert (step.aim is not None) == aimed
-        assert bool(step.reason) == (step.state is State.LOST)
         if step.state is State.LOST:
             assert step.reason.startswith("out of sight for 0.")
+        if step.state is State.SEARCHING:
+            assert step.reason == ("what is detected is not believed yet" if step.tracks else "nothing is detected")
         if not aimed:
             assert step.commanded[2] == 667.0  # zoomed out to see more
         assert step.t >= step.fixed.t + LATENCY - 1e-9
@@ -282,6 +285,7 @@ def test_a_detector_that_never_detects():
     steps = run(rig, Seer(still, lambda t: False), 2.0)
     assert {step.state for step in steps} == {State.SEARCHING}
     assert all(step.aim is None and step.target is None and step.tracks == () for step in steps)
+    assert {step.reason for step in steps} == {"nothing is detected"}
     assert not rig.moves
     assert rig.zooms == [(0.0, 667.0)]
     assert len(steps) == pytest.approx(2.0 * RATE_HZ, abs=2)

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -199,3 +200,40 @@ def test_a_click_means_the_box_it_is_in_or_the_nearest_one_near():
     assert far.select([large, small], STILL, LIMITS) is None
     assert far.select([candidate(7, center=(410, 310))], STILL, LIMITS) == 7
     assert far.select([candidate(7, center=(20, 20)), small], STILL, LIMITS) == 7  # it is known by its number now
+
+
+@pytest.mark.parametrize("name", sorted(POLICIES))
+def test_who_is_out_of_reach_keeps_nobody_waiting(name):
+    policy = POLICIES[name]()
+    assert policy.select([replace(candidate(1), reachable=False)], STILL, LIMITS) == 1  # so that it is said why
+    assert policy.select([replace(candidate(1), reachable=False), candidate(2)], STILL, LIMITS) == 2
+    assert policy.unmet == ""
+    assert not policy.favours(track(1))
+
+
+def test_a_chosen_one_is_followed_in_reach_or_not():
+    policy = Chosen(number=1)
+    assert policy.select([replace(candidate(1), reachable=False), candidate(2)], STILL, LIMITS) == 1
+
+
+def test_a_choice_by_number_says_when_it_is_not_met():
+    policy = Chosen(number=2)
+    assert policy.unmet == "track 2 is not there"
+    assert [policy.favours(track(n)) for n in (1, 2)] == [False, True]
+    policy.select([candidate(1), candidate(2)], STILL, LIMITS)
+    assert policy.unmet == ""
+    policy.select([candidate(1)], STILL, LIMITS)
+    assert policy.unmet == "track 2 is not there"
+
+
+def test_a_choice_by_click_says_when_it_is_not_met():
+    policy = Chosen(pixel=(100.0, 200.0), width_px=500.0)  # 40 px are near
+    near, far = track(1, center=(100, 239)), track(2, center=(100, 241))
+    assert [policy.favours(each) for each in (near, far)] == [True, False]
+    policy.select([candidate(2, center=(100, 241))], STILL, LIMITS)
+    assert policy.unmet == "no track at the click (100, 200)"
+    assert policy.select([candidate(1, center=(100, 239))], STILL, LIMITS) == 1
+    assert policy.unmet == ""
+    assert [policy.favours(track(n, center=(100, 200))) for n in (1, 3)] == [True, False]  # it is that one from now on
+    policy.select([], STILL, LIMITS)
+    assert policy.unmet == "track 1, which was at the click (100, 200), is not there any more"

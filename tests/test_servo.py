@@ -16,6 +16,7 @@ from cotarget.estimation import Appearance
 from cotarget.geometry import pose
 from cotarget.rig import PanTiltLimits, PanTiltState, ZoomState
 from cotarget.servo import Servo, ServoSettings, reach_of
+from cotarget.sim.motion import Axis
 from cotarget.targeting import Closeup
 from cotarget.zoompolicy import ZoomSettings
 
@@ -38,7 +39,7 @@ CALIBRATION = Calibration(
 
 @dataclass
 class Rig:
-    """Notes what it is told; nothing moves by itself."""
+    """Notes what it is told; the head obeys after the delay, the lens at once."""
 
     t: float = 0.0
     moves: list = field(default_factory=list)
@@ -52,11 +53,21 @@ class Rig:
         )
         self.zoom.zoom = self._zoom
 
+        self.axes = [Axis(LIMITS.speed, LIMITS.acceleration) for _ in range(2)]
+        for pan, tilt, _ in self.moves:  # those of before
+            self._go(pan, tilt, -10.0)
+
+    def _go(self, pan, tilt, t, speed=None):
+        for axis, goal, fastest in zip(self.axes, (pan, tilt), LIMITS.capped(speed), strict=True):
+            axis.command(t, goal, fastest)
+
     def _head(self):
-        return PanTiltState(*(self.moves[-1][:2] if self.moves else (0.0, 0.0)), False, self.t)
+        (pan, v), (tilt, w) = (axis.motor(self.t) for axis in self.axes)
+        return PanTiltState(pan, tilt, bool(v or w), self.t)
 
     def _move(self, pan, tilt, speed=None):
         self.moves.append((pan, tilt, speed))
+        self._go(pan, tilt, self.t + DELAY, speed)
         return pan, tilt
 
     def _zoom(self, focal_px):
@@ -182,8 +193,32 @@ def test_zooming_out_leaves_the_head_alone_and_is_told_once():
     assert len(rig.moves) == moves
     assert rig.zooms[zooms:] == [SHORTEST]
     # Whoever moved it meanwhile: what was commanded before does not count.
-    driver.drive(still(0.5), 0.0, FRAME)
+    rig._go(-0.5, 0.0, rig.t + DELAY)
+    rig.t += 2.0
+    driver.drive(still(0.5), rig.t, FRAME)
     assert len(rig.moves) == moves + 1
+    assert rig.moves[-1][:2] == pytest.approx((math.atan(0.05), math.atan(1 / math.hypot(0.5, 10))))
+
+
+def test_a_head_that_was_halted_on_its_way_is_sent_again():
+    """As a watchdog does after a gap in the frames; whoever took it to have arrived would leave it where it stands."""
+    rig = Rig()
+    driver = servo(rig)
+    driver.drive(still(5.0), rig.t, FRAME)
+    rig.t = 0.3
+    halted = [axis.halt(rig.t) for axis in rig.axes]
+    rig.t = max(halted) + 0.5
+    assert abs(rig._head().pan - math.atan(0.5)) > 0.1
+    driver.drive(still(5.0), rig.t, FRAME)
+    rig.t += 2.0
+    assert len(rig.moves) == 2
+    assert rig._head().pan == pytest.approx(math.atan(0.5))
+
+
+def test_what_can_be_reached():
+    driver = servo(Rig())
+    assert driver.can_reach(still(10 * math.tan(0.99))(0.0))
+    assert not driver.can_reach(still(10 * math.tan(1.01))(0.0))
 
 
 def test_every_frame_has_its_command_without_a_dead_zone():
