@@ -174,3 +174,46 @@ def test_times_that_repeat_or_jump_back():
     assert len(tracker.update([seen(500, 400)], 100.0)) == 1  # a late one: ignored
     tracks = run(tracker, np.arange(20) / RATE, ((100, 100), (100, 0)))[-1]  # the clock starts anew
     assert [t.id for t in tracks] == [2]
+
+
+def flown(tracker, seconds=1.0, at=(100.0, 200.0), velocity=(200.0, 0.0)):
+    """A target of 20 px that flew straight until now; its place then, and the time."""
+    times = np.arange(0.0, seconds, 1 / RATE)
+    run(tracker, times, (at, velocity))
+    return np.array(at) + np.array(velocity) * times[-1], times[-1]
+
+
+@pytest.mark.parametrize("twigs", [1, 2])
+def test_a_piece_of_a_target_does_not_bend_its_way(twigs):
+    """Before a tree only a wing's tip is seen: it says that the target is there, and not where its middle is."""
+    tracker = Tracker(PLAIN)
+    place, t = flown(tracker)
+    for i in range(1, twigs + 1):
+        middle = place + np.array([200.0, 0.0]) * i / RATE
+        (track,) = tracker.update([seen(*(middle + [0.0, -8.0]), 5, 4)], t + i / RATE)
+    assert track.missed == 0
+    assert abs(track.velocity_px[1]) < SPEED_TOLERANCE
+    assert abs(track.center_px[1] - 200) < 4
+
+
+@pytest.mark.parametrize(("size", "score", "taken"), [(20, 1.0, True), (3, 1.0, False), (20, 0.02, False)])
+def test_after_a_gap_what_looks_like_the_target_is_taken_for_it(size, score, taken):
+    """A gap leaves much room: for the target, and not for a twig or for what its detector hardly believes."""
+    tracker = Tracker(PLAIN)
+    place, t = flown(tracker)
+    for i in range(1, 8):
+        tracker.update([], t + i / RATE)
+    aside = place + np.array([200.0 * 8 / RATE, 30.0])
+    found = Seen(aside, np.array([size, size], dtype=float), score)
+    tracks = tracker.update([found], t + 8 / RATE)
+    assert (tracks[0].id, tracks[0].missed == 0) == (1, taken)
+
+
+def test_who_is_found_again_is_no_newcomer():
+    """It turned aside and was beyond the gate at first, so that a new track was begun; the old one takes it over."""
+    tracker = Tracker(PLAIN)
+    place, t = flown(tracker)
+    for i in range(1, 20):
+        place = place + np.array([200.0, 15.0]) / RATE + (np.array([0.0, 12.0]) if i == 1 else 0)
+        tracks = tracker.update([seen(*place)], t + i / RATE)
+    assert [(track.id, track.missed) for track in tracks if track.confirmed] == [(1, 0)]
