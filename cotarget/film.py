@@ -37,12 +37,14 @@ class FilmSummary:
         frames_with_target: in how many of them there was a confirmed track.
         tracks: how many tracks were confirmed.
         duration_s: from the first frame to the last [s].
+        rate_hz: frames a second, as the film says.
     """
 
     frames: int
     frames_with_target: int
     tracks: int
     duration_s: float
+    rate_hz: float
 
 
 def run_on_film(
@@ -119,7 +121,7 @@ def _run(
             write_image(trails.draw(frame.image, tracks, frame.t))
         if progress is not None:
             progress(index + 1, film.count)
-    return FilmSummary(len(times), with_target, len(numbers), max(times) - min(times))
+    return FilmSummary(len(times), with_target, len(numbers), max(times) - min(times), film.rate_hz)
 
 
 def _row(index: int, t: float, track: Track) -> list[str]:

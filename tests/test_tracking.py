@@ -190,7 +190,7 @@ def test_a_piece_of_a_target_does_not_bend_its_way(twigs):
     place, t = flown(tracker)
     for i in range(1, twigs + 1):
         middle = place + np.array([200.0, 0.0]) * i / RATE
-        (track,) = tracker.update([seen(*(middle + [0.0, -8.0]), 5, 4)], t + i / RATE)
+        (track,) = tracker.update([seen(*(middle + np.array([0.0, -8.0])), 5, 4)], t + i / RATE)
     assert track.missed == 0
     assert abs(track.velocity_px[1]) < SPEED_TOLERANCE
     assert abs(track.center_px[1] - 200) < 4

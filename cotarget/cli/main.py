@@ -224,6 +224,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     detect.add_argument("--video", type=Path, metavar="OUT", help="write the film with the tracks drawn (.mp4)")
     detect.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml, for targets of your own")
+    detect.add_argument(
+        "--labels",
+        type=Path,
+        metavar="FILE",
+        help="score the tracks by these: a csv with frame,x_px,y_px,width_px,height_px, from 0 and the top-left pixel",
+    )
 
     board = command("board", calibrating.board, "write a calibration board to print, to scale")
     board.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .pdf, .svg or .png")

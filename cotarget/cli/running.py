@@ -136,10 +136,12 @@ def detect(options: argparse.Namespace) -> None:
     """Cotarget detect."""
     from cotarget.config import RigConfig, load_config
     from cotarget.film import run_on_film
+    from cotarget.metrics import read_labels, read_tracks, score_tracks
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
     target = config.target(options.target)
-    check_outputs([options.csv, options.video], [options.film, options.rig, target.template])
+    check_outputs([options.csv, options.video], [options.film, options.rig, options.labels, target.template])
+    labels = None if options.labels is None else read_labels(options.labels)
     with progress_bar() as progress:
         found = run_on_film(
             options.film,
@@ -148,7 +150,10 @@ def detect(options: argparse.Namespace) -> None:
             options.video,
             lambda done, total: progress(f"detecting: {options.target}", done, total or done),
         )
-    print_json(dataclasses.asdict(found))
+    table = dataclasses.asdict(found)
+    if labels is not None:
+        table |= dataclasses.asdict(score_tracks(read_tracks(options.csv), labels, found.rate_hz, found.frames))
+    print_json(table)
 
 
 def doctor(options: argparse.Namespace) -> int:

@@ -1,0 +1,18 @@
+"""The field's figures: of a target that was held, by the truth, and of tracks on a film, by labels."""
+
+from cotarget.metrics.held import WHOLLY_VISIBLE, Row, Score, read_rows, score, write_rows
+from cotarget.metrics.tracked import Label, TrackScore, read_labels, read_tracks, score_tracks
+
+__all__ = [
+    "WHOLLY_VISIBLE",
+    "Label",
+    "Row",
+    "Score",
+    "TrackScore",
+    "read_labels",
+    "read_rows",
+    "read_tracks",
+    "score",
+    "score_tracks",
+    "write_rows",
+]

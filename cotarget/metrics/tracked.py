@@ -1,0 +1,174 @@
+"""How well the wide view's tracks keep to a target that somebody labelled: scores of a table of tracks beside labels.
+
+The table is the one that `cotarget.film.run_on_film` writes, and a label a box around the target in one frame; a frame
+may have several, and frames without any say nothing of what is found in them, but that a track which is never on a
+label is false.
+"""
+
+import csv
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cotarget.errors import ConfigError
+from cotarget.geometry import Array
+from cotarget.metrics.held import BREAK_S, FALSE_S, ROUNDING_S
+
+LABELS = ("frame", "x_px", "y_px", "width_px", "height_px")
+# Frames that no detector is judged by: the background has a second to be learnt.
+LEARNING_FRAMES = 30
+
+
+@dataclass(frozen=True)
+class Label:
+    """A box around a target: its middle (u, v), (2,), and width and height, (2,) [px]."""
+
+    center_px: Array
+    size_px: Array
+
+    @property
+    def larger_side_px(self) -> float:
+        """The larger of its sides."""
+        return float(self.size_px.max())
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A confirmed track in one frame: the frame's number and time, the track's number, and its middle (u, v) [px]."""
+
+    frame: int
+    t: float
+    track: int
+    center_px: Array
+
+
+@dataclass(frozen=True)
+class TrackScore:
+    """How well tracks keep to what is labelled. Each is None where nothing is labelled, or nothing was found.
+
+    A track is on a target when it is no farther from the label's middle than the label's larger side.
+
+    Attributes:
+        labelled_frames: that are judged: those after LEARNING_FRAMES.
+        on_target_ratio: of these, in how many a track is on a label.
+        numbers: how many different tracks were on a label in them.
+        offset_px_median: of the track on it, from the label's middle [px].
+        fragmentation_per_min: how often no track was on a label for longer than 0.2 s, a minute of labelled frames.
+        false_tracks: tracks that lived for 0.5 s and were never on a label.
+        false_tracks_per_min: the same, a minute of the film.
+    """
+
+    labelled_frames: int
+    on_target_ratio: float | None
+    numbers: int
+    offset_px_median: float | None
+    fragmentation_per_min: float | None
+    false_tracks: int
+    false_tracks_per_min: float | None
+
+
+def score_tracks(
+    tracks: Iterable[Tracked],
+    labels: Mapping[int, Sequence[Label]],
+    rate_hz: float,
+    frames: int,
+    learning_frames: int = LEARNING_FRAMES,
+) -> TrackScore:
+    """Score tracks.
+
+    Args:
+        tracks: the confirmed ones of every frame.
+        labels: by the frame's number, from 0.
+        rate_hz: frames a second.
+        frames: how many the film has.
+        learning_frames: so many at its beginning are not judged.
+    """
+    offsets: dict[int, dict[int, float]] = {}  # by frame and track, of those on a label
+    lives: dict[int, list[float]] = {}
+    for each in tracks:
+        lives.setdefault(each.track, []).append(each.t)
+        for label in labels.get(each.frame, ()):
+            offset = float(np.linalg.norm(each.center_px - label.center_px))
+            if offset <= label.larger_side_px:
+                on = offsets.setdefault(each.frame, {})
+                on[each.track] = min(offset, on.get(each.track, math.inf))
+    ever = {track for on in offsets.values() for track in on}
+    false = sum(t[-1] - t[0] >= FALSE_S - ROUNDING_S for track, t in lives.items() if track not in ever)
+    judged = sorted(frame for frame, boxes in labels.items() if boxes and frame >= learning_frames)
+    hits = [offsets[frame] for frame in judged if frame in offsets]
+    minutes, labelled_minutes = frames / rate_hz / 60, len(judged) / rate_hz / 60
+    breaks = _breaks([frame in offsets for frame in judged], judged, rate_hz)
+    return TrackScore(
+        labelled_frames=len(judged),
+        on_target_ratio=len(hits) / len(judged) if judged else None,
+        numbers=len({track for on in hits for track in on}),
+        offset_px_median=float(np.median([min(on.values()) for on in hits])) if hits else None,
+        fragmentation_per_min=breaks / labelled_minutes if judged else None,
+        false_tracks=false,
+        false_tracks_per_min=false / minutes if frames else None,
+    )
+
+
+def _breaks(on: Sequence[bool], frames: Sequence[int], rate_hz: float) -> int:
+    """How often there was no track for longer than 0.2 s, in frames that are labelled one after the other."""
+    breaks, lacking = 0, 0
+    for i, is_on in enumerate(on):
+        if is_on or (i and frames[i] != frames[i - 1] + 1):
+            lacking = 0
+        if not is_on:
+            lacking += 1
+            # Counted once, when it has lasted for long enough.
+            breaks += lacking / rate_hz > BREAK_S + ROUNDING_S >= (lacking - 1) / rate_hz
+    return breaks
+
+
+def read_labels(path: Path) -> dict[int, list[Label]]:
+    """Read labels: a csv with frame (from 0), x_px, y_px (of the top-left pixel, from 0), width_px and height_px.
+
+    Raises:
+        ConfigError: the file is missing, or is no such table.
+    """
+    labels: dict[int, list[Label]] = {}
+    for row in _table(path, LABELS, "labels"):
+        frame, x, y, width, height = (row[name] for name in LABELS)
+        if not (width > 0 and height > 0 and frame == int(frame)):
+            raise ConfigError(f"{path}: a label wants a whole frame and a width and height above 0, not {row}")
+        size = np.array([width, height])
+        # A box of w pixels from column x covers columns x to x + w - 1.
+        labels.setdefault(int(frame), []).append(Label(np.array([x, y]) + (size - 1) / 2, size))
+    return labels
+
+
+def read_tracks(path: Path) -> list[Tracked]:
+    """Read the table that `cotarget.film.run_on_film` writes.
+
+    Raises:
+        ConfigError: the file is missing, or is no such table.
+    """
+    names = ("frame", "t", "track", "u_px", "v_px")
+    return [
+        Tracked(int(row["frame"]), row["t"], int(row["track"]), np.array([row["u_px"], row["v_px"]]))
+        for row in _table(path, names, "tracks")
+    ]
+
+
+def _table(path: Path, names: Sequence[str], what: str) -> list[dict[str, float]]:
+    """The numbers of a csv's columns.
+
+    Raises:
+        ConfigError: the file is missing, lacks a column, or holds something else.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            if missing := [name for name in names if name not in (reader.fieldnames or ())]:
+                raise ValueError(f"it has no column '{missing[0]}'; it wants {', '.join(names)}")
+            rows = [{name: float(row[name] or "nan") for name in names} for row in reader]
+        if any(not math.isfinite(value) for row in rows for value in row.values()):
+            raise ValueError("a number is missing")
+        return rows
+    except (OSError, csv.Error, ValueError, TypeError) as error:
+        raise ConfigError(f"{path}: is no table of {what}: {error}") from None

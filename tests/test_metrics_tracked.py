@@ -1,0 +1,120 @@
+"""Scores of tracks by labels, on cases worked out by hand."""
+
+import json
+
+import numpy as np
+import pytest
+
+from cotarget.cli.main import main
+from cotarget.errors import ConfigError
+from cotarget.metrics import Label, read_labels, read_tracks, score_tracks
+from cotarget.metrics.tracked import Tracked
+from cotarget.video import FilmWriter
+
+RATE = 25.0
+FRAMES = 100
+
+
+def label(u, v, side=10.0):
+    return [Label(np.array([u, v], dtype=float), np.array([side, side / 2]))]
+
+
+def track(number, frames, offset=0.0):
+    """On a target that flies a pixel a frame, or beside it."""
+    return [Tracked(i, i / RATE, number, np.array([i + offset, 50.0])) for i in frames]
+
+
+LABELS = {i: label(i, 50) for i in range(FRAMES)}
+
+
+def test_what_is_near_is_on_target_and_counted_after_the_background_is_learnt():
+    found = score_tracks([*track(1, range(60), 3.0), *track(2, range(60, 93), 10.0)], LABELS, RATE, FRAMES)
+    assert found.labelled_frames == 70
+    assert found.on_target_ratio == pytest.approx(63 / 70)
+    assert found.numbers == 2
+    assert found.offset_px_median == pytest.approx(10.0)  # 33 of 63 have it, and it is just near enough
+    assert (found.false_tracks, found.false_tracks_per_min) == (0, 0.0)
+    # The last seven frames without a track are 0.28 s.
+    assert found.fragmentation_per_min == pytest.approx(1 / (70 / RATE / 60))
+
+
+def test_a_track_beside_the_target_is_false_when_it_lives():
+    beside = track(3, range(40, 53), 10.1)
+    blink = track(4, range(40, 52), 30.0)  # 0.44 s
+    found = score_tracks([*track(1, range(FRAMES)), *beside, *blink], LABELS, RATE, FRAMES)
+    assert found.false_tracks == 0  # 0.48 s
+    found = score_tracks([*track(1, range(FRAMES)), *track(3, range(40, 54), 10.1), *blink], LABELS, RATE, FRAMES)
+    assert found.false_tracks == 1  # 0.52 s
+    assert found.false_tracks_per_min == pytest.approx(60 / (FRAMES / RATE))
+    assert (found.on_target_ratio, found.numbers, found.fragmentation_per_min) == (1.0, 1, 0.0)
+
+
+@pytest.mark.parametrize(("gap", "breaks"), [(5, 0), (6, 1), (20, 1)])
+def test_a_gap_of_more_than_a_fifth_of_a_second_is_a_break(gap, breaks):
+    frames = [i for i in range(FRAMES) if not 50 <= i < 50 + gap]
+    found = score_tracks(track(1, frames), LABELS, RATE, FRAMES)
+    assert found.fragmentation_per_min == pytest.approx(breaks / (70 / RATE / 60))
+
+
+def test_frames_without_a_label_break_nothing():
+    labels = {i: boxes for i, boxes in LABELS.items() if not 50 <= i < 60}
+    frames = [i for i in range(FRAMES) if not 47 <= i < 63]
+    found = score_tracks(track(1, frames), labels, RATE, FRAMES)
+    assert found.fragmentation_per_min == 0.0  # three frames before and three after
+    assert found.on_target_ratio == pytest.approx(54 / 60)
+
+
+def test_nothing_labelled_and_nothing_found():
+    found = score_tracks(track(1, range(FRAMES)), {}, RATE, FRAMES)
+    assert (found.labelled_frames, found.on_target_ratio, found.false_tracks) == (0, None, 1)
+    found = score_tracks([], LABELS, RATE, FRAMES)
+    assert (found.on_target_ratio, found.offset_px_median, found.numbers) == (0.0, None, 0)
+
+
+def write_labels(path, rows, head="frame,x_px,y_px,width_px,height_px"):
+    path.write_text("\n".join([head, *rows]) + "\n")
+    return path
+
+
+def test_labels_are_boxes_by_their_first_pixel(tmp_path):
+    found = read_labels(write_labels(tmp_path / "labels.csv", ["3,10,20,5,2", "3,0,0,1,1"]))
+    assert [each.center_px.tolist() for each in found[3]] == [[12.0, 20.5], [0.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    ("rows", "head", "why"),
+    [
+        (["1,2,3,4"], "frame,x_px,y_px,width_px", "no column 'height_px'"),
+        (["1,2,3,4"], "frame,x_px,y_px,width_px,height_px", "number is missing"),
+        (["1,2,3,x,5"], "frame,x_px,y_px,width_px,height_px", "could not convert"),
+        (["1,2,3,0,5"], "frame,x_px,y_px,width_px,height_px", "above 0"),
+        (["1.5,2,3,4,5"], "frame,x_px,y_px,width_px,height_px", "whole frame"),
+    ],
+)
+def test_other_tables_are_refused_by_name(tmp_path, rows, head, why):
+    with pytest.raises(ConfigError, match=why):
+        read_labels(write_labels(tmp_path / "labels.csv", rows, head))
+    with pytest.raises(ConfigError, match=r"nothing\.csv"):
+        read_labels(tmp_path / "nothing.csv")
+
+
+def test_the_command_scores_a_film(tmp_path, capsys):
+    """A dark square that flies over a grey wall, labelled where it is."""
+    rng, rows = np.random.default_rng(0), []
+    with FilmWriter(tmp_path / "film.mp4", RATE) as film:
+        for i in range(80):
+            image = np.full((120, 320, 3), 170, np.uint8) + rng.integers(-3, 4, (120, 320, 3)).astype(np.uint8)
+            x = 20 + 3 * i
+            image[50:60, x : x + 10] = 20
+            film.write(image)
+            rows.append(f"{i},{x},50,10,10")
+    labels = write_labels(tmp_path / "labels.csv", rows)
+    arguments = ["detect", str(tmp_path / "film.mp4"), "--target", "bird", "--csv", str(tmp_path / "tracks.csv")]
+    assert main([*arguments, "--labels", str(labels)]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["labelled_frames"], found["on_target_ratio"], found["numbers"]) == (50, 1.0, 1)
+    assert found["false_tracks"] == 0
+    assert found["offset_px_median"] < 1.5
+    assert len(read_tracks(tmp_path / "tracks.csv")) >= 50
+    assert main([*arguments, "--labels", str(tmp_path / "none.csv")]) == 1
+    assert "none.csv" in capsys.readouterr().err
