@@ -1,24 +1,28 @@
 """One target's motion filter: a constant-velocity Kalman filter over (u, v, du, dv) with a history of sizes.
 
 It is driven by white acceleration, so that frames may come at any times. To the outside it is told as a frozen
-``Track``; the filter's own state stays here.
+``Track``; the filter's own state stays here. Neither motion nor measurement mixes u and v: each has its own filter.
 """
 
-import functools
+import math
+import statistics
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from cotarget.axisfilter import AxisFilter, Spread, covariance_of
 from cotarget.config import TargetConfig
 from cotarget.geometry import Array
 
 # A box that is smaller than this part of its target's usual one is a piece of it, which may be any.
 PIECE = 0.7
-# The larger side over a wing beat is this percentile: the maximum, but deaf to one frame in ten that is wrong.
-BEAT_PERCENTILE = 90.0
+# The larger side over a wing beat is that of which this part is smaller: the maximum, but deaf to one frame in ten that
+# is wrong.
+BEAT_PART = 0.9
 
 
 class Measurement(Protocol):
@@ -135,52 +139,70 @@ class Track:
 
     def at(self, t: float) -> "Track":
         """The track as expected at time ``t`` [s], with the covariance grown accordingly."""
-        F, Q = _motion(t - self.t, self.noise)
-        return replace(self, t=t, center_px=self.predict(t), covariance=F @ self.covariance @ F.T + Q)
+        P = self.covariance
+        spreads = [Spread(*map(float, (P[i, i], P[i, i + 2], P[i + 2, i + 2]))) for i in range(2)]
+        grown = [spread.after(t - self.t, self.noise) for spread in spreads]
+        return replace(self, t=t, center_px=self.predict(t), covariance=covariance_of(*grown))
+
+
+@dataclass(frozen=True)
+class _Size:
+    """Width and height of a box at a time [s], and whether the image's border cut it."""
+
+    t: float
+    width: float
+    height: float
+    clipped: bool
 
 
 class TargetFilter:
-    """The Kalman filter and the size history of one track."""
+    """The Kalman filters and the size history of one track."""
 
     def __init__(self, number: int, detection: Measurement, t: float, settings: TrackerSettings) -> None:
         self.number = number
         self.settings = settings
         self.noise = settings.acceleration_px**2 * settings.manoeuvre_s
-        self.x: Array = np.concatenate([detection.center_px, np.zeros(2)])
-        self.size = detection.size_px
-        self.P = np.diag([*self.variance(detection), settings.speed_px**2, settings.speed_px**2])
         self.t = self.born = self.seen = t
-        self.start = self.x[:2].copy()
         self.detection = detection
         self.hits = 1
         self.missed = 0
         self.confirmed = False
         self.mean_score = 0.0
-        self.sizes: deque[tuple[float, Array, bool]] = deque([(t, detection.size_px, detection.clipped)])
-        self.size, self.larger_side = self._median_size(), self._beat_side()
+        self.sizes: deque[_Size] = deque()
+        self._note_size(detection)
+        self._u, self._v = (
+            AxisFilter(at, variance, settings.speed_px**2)
+            for at, variance in zip(detection.center_px.tolist(), self.variance(detection).tolist(), strict=True)
+        )
+        self.start = self.center
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """The middle (u, v) [px]."""
+        return self._u.at, self._v.at
+
+    @property
+    def center_variance(self) -> tuple[float, float]:
+        """Of the middle [px^2]; u and v know nothing of each other."""
+        return self._u.spread.at, self._v.spread.at
 
     def predict(self, t: float) -> None:
         """Move the filter to time ``t`` [s]."""
-        F, Q = _motion(t - self.t, self.noise)
-        self.x = F @ self.x
-        self.P = F @ self.P @ F.T + Q
+        for axis in (self._u, self._v):
+            axis.predict(t - self.t, self.noise)
         self.t = t
 
     def correct(self, detection: Measurement) -> None:
         """Take a detection of this target alone into account."""
-        weight = 1 - np.exp(-(self.t - self.seen) / self.settings.score_s)
-        self.mean_score += float(weight) * (detection.score - self.mean_score)
-        self._measure(detection.center_px, self.variance(detection))
-        self.sizes.append((self.t, detection.size_px, detection.clipped))
+        weight = 1 - math.exp(-(self.t - self.seen) / self.settings.score_s)
+        self.mean_score += weight * (detection.score - self.mean_score)
+        self._measure(detection.center_px.tolist(), self.variance(detection).tolist())
+        self._note_size(detection)
         self.detection = detection
         self.hits += 1
-        window = max(self.settings.size_s, self.settings.beat_s)
-        while self.sizes[0][0] < self.t - window:
-            self.sizes.popleft()
-        self.size, self.larger_side = self._median_size(), self._beat_side()
         if not self.confirmed:
-            travel = np.linalg.norm(self.x[:2] - self.start) / max(1.0, float(np.max(self.size)))
-            self.confirmed = bool(
+            travel = math.dist(self.center, self.start) / max(1.0, *self.size.tolist())
+            self.confirmed = (
                 self.hits >= self.settings.confirm_hits
                 and self.t - self.born >= self.settings.confirm_s
                 and travel >= self.settings.confirm_travel
@@ -191,34 +213,20 @@ class TargetFilter:
         """Take a detection into account that covers other targets too: all it tells is that this one is inside."""
         size = self.size
         room = np.maximum(0.0, (detection.size_px - size) / 2)
-        inside = np.clip(self.x[:2], detection.center_px - room, detection.center_px + room)
-        self._measure(inside, (size / 4) ** 2 + room**2)
+        inside = np.clip(self.center, detection.center_px - room, detection.center_px + room)
+        self._measure(inside.tolist(), ((size / 4) ** 2 + room**2).tolist())
 
     def is_over(self, image_size: tuple[int, int] | None) -> bool:
         """Whether the track has been without a detection for too long, or has left the image."""
-        if self.missed and image_size is not None and not (-0.5 <= self.x[0] <= image_size[0] - 0.5):
-            return True
-        if self.missed and image_size is not None and not (-0.5 <= self.x[1] <= image_size[1] - 0.5):
-            return True
+        if self.missed and image_size is not None:
+            width, height = image_size
+            if not (-0.5 <= self._u.at <= width - 0.5 and -0.5 <= self._v.at <= height - 0.5):
+                return True
         if not self.confirmed:
             return self.t - self.seen > self.settings.drop_s
         if self.mean_score < self.settings.doubt_score:
             return True
         return self.t - self.seen > min(self.settings.lose_s, self.seen - self.born)
-
-    def _median_size(self) -> Array:
-        """Median width and height of the boxes that the border did not cut, or the largest of those it did."""
-        recent = [(s, clipped) for t, s, clipped in self.sizes if t >= self.sizes[-1][0] - self.settings.size_s]
-        whole = [s for s, clipped in recent if not clipped]
-        if whole:
-            return np.asarray(np.median(whole, axis=0))
-        return np.asarray(np.max([s for s, _ in recent], axis=0))
-
-    def _beat_side(self) -> float:
-        """The larger side over the last wing beats [px]."""
-        recent = [(s.max(), clipped) for t, s, clipped in self.sizes if t >= self.sizes[-1][0] - self.settings.beat_s]
-        whole = [s for s, clipped in recent if not clipped] or [s for s, _ in recent]
-        return float(np.percentile(whole, BEAT_PERCENTILE))
 
     def track(self) -> Track:
         """What the outside sees."""
@@ -227,11 +235,11 @@ class TargetFilter:
             t=self.t,
             confirmed=self.confirmed,
             missed=self.missed,
-            center_px=self.x[:2].copy(),
-            velocity_px=self.x[2:].copy(),
+            center_px=np.array(self.center),
+            velocity_px=np.array([self._u.speed, self._v.speed]),
             size_px=self.size.copy(),
             larger_side_px=self.larger_side,
-            covariance=self.P.copy(),
+            covariance=covariance_of(self._u.spread, self._v.spread),
             score=self.detection.score,
             box=self.detection,
             noise=self.noise,
@@ -243,15 +251,41 @@ class TargetFilter:
             self.settings, detection.size_px, detection.clipped, missing(self.size, detection.size_px)
         )
 
-    def _measure(self, center: Array, variance: Array) -> None:
-        """Kalman's correction by a measured centre [px] with its variance [px^2], both (2,)."""
-        S = self.P[:2, :2] + np.diag(variance)
-        K = np.linalg.solve(S, self.P[:2]).T
-        self.x = self.x + K @ (center - self.x[:2])
-        self.P = self.P - K @ S @ K.T
-        self.P = (self.P + self.P.T) / 2
+    def _note_size(self, detection: Measurement) -> None:
+        """Remember a box's size, and work out the usual one and the largest anew."""
+        width, height = detection.size_px.tolist()
+        self.sizes.append(_Size(self.t, width, height, detection.clipped))
+        settings, sizes = self.settings, self.sizes
+        while sizes[0].t < self.t - max(settings.size_s, settings.beat_s):
+            sizes.popleft()
+        recent = [size for size in sizes if size.t >= self.t - settings.size_s]
+        # The border makes boxes smaller: those that it did not cut count, or else the largest of those it did.
+        whole = [size for size in recent if not size.clipped]
+        self.size: Array = np.array(
+            [
+                statistics.median(sides) if whole else max(sides)
+                for sides in ([size.width for size in whole or recent], [size.height for size in whole or recent])
+            ]
+        )
+        recent = [size for size in sizes if size.t >= self.t - settings.beat_s]
+        beat = [size for size in recent if not size.clipped] or recent
+        self.larger_side = _quantile([max(size.width, size.height) for size in beat], BEAT_PART)
+
+    def _measure(self, center: Sequence[float], variance: Sequence[float]) -> None:
+        """Take a measured centre [px] with its variance [px^2] into account, both (2,)."""
+        for axis, at, spread in zip((self._u, self._v), center, variance, strict=True):
+            axis.correct(at, spread)
         self.seen = self.t
         self.missed = 0
+
+
+def _quantile(values: Sequence[float], part: float) -> float:
+    """The value of which a part of others is smaller, linearly between two; numpy's takes forty times as long."""
+    ordered = sorted(values)
+    at = part * (len(ordered) - 1)
+    low = int(at)
+    high = min(low + 1, len(ordered) - 1)
+    return ordered[low] + (at - low) * (ordered[high] - ordered[low])
 
 
 def missing(usual: Array, size: Array) -> Array:
@@ -272,13 +306,3 @@ def center_variance(
     """
     part = np.where(clipped, 0.5, settings.noise_of_size)
     return np.asarray(settings.noise_px**2 + (part * size) ** 2 + (lacks / 2) ** 2)
-
-
-@functools.lru_cache(maxsize=8)  # every track of a frame asks for the same
-def _motion(dt: float, noise: float) -> tuple[Array, Array]:
-    """Transition and process noise over ``dt`` [s], forward or back, for white acceleration [px^2/s^3]."""
-    eye = np.eye(2)
-    F = np.block([[eye, dt * eye], [np.zeros((2, 2)), eye]])
-    span = abs(dt)
-    Q = noise * np.block([[span**3 / 3 * eye, dt * span / 2 * eye], [dt * span / 2 * eye, span * eye]])
-    return F, Q

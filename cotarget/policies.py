@@ -9,7 +9,7 @@ whoever leaves first, the other plans the order that serves most.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Protocol
 
 import numpy as np
@@ -28,22 +28,24 @@ MOST_PLANNED = 7
 CLICK_PART = 0.08
 
 
+# How fast a target goes round the head is taken over this time [s].
+RATE_S = 0.1
+
+
 @dataclass(frozen=True)
 class Candidate:
-    """A confirmed track, as a policy sees it.
+    """A confirmed track, as a policy sees it; where it is, is worked out for those policies that ask.
 
     Attributes:
         track: in the wide view.
-        at: pan and tilt that point at it now, (2,) [rad].
-        rate: how fast these change, (2,) [rad/s].
+        where: gives pan and tilt that point at it so many seconds from now, (2,) [rad].
         leaves_in: how long until it leaves the wide view [s]; inf for one that does not.
         seen_s: how long it has been well in the close-up so far [s].
         reachable: whether the head can point at it.
     """
 
     track: Track
-    at: Array
-    rate: Array
+    where: Callable[[float], Array]
     leaves_in: float = math.inf
     seen_s: float = 0.0
     reachable: bool = True
@@ -52,6 +54,16 @@ class Candidate:
     def id(self) -> int:
         """The track's number."""
         return self.track.id
+
+    @cached_property
+    def at(self) -> Array:
+        """Pan and tilt that point at it now, (2,) [rad]."""
+        return self.where(0.0)
+
+    @cached_property
+    def rate(self) -> Array:
+        """How fast these change, (2,) [rad/s]."""
+        return (self.where(RATE_S) - self.at) / RATE_S
 
 
 class Policy(Protocol):

@@ -7,6 +7,7 @@ triangulates its depth and shows any error of head or calibration.
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -40,8 +41,6 @@ DOUBTED_SIZE, DOUBTED_BIAS = 0.4, 5e-3
 NEAR = 3.0
 # So long after the wide view has shown it a target may have gone elsewhere [s].
 JUST_SEEN_S = 0.2
-# For whom to look at next, how fast a target goes round the head is taken over this time [s].
-RATE_S = 0.1
 
 
 class Pursuit:
@@ -114,9 +113,10 @@ class Pursuit:
 
     def see_zoom(self, frame: Frame) -> Found | None:
         """Look for the followed target in a frame of the zoom view, and take it into account where it is found."""
-        pose = self.states.at(frame.t)
-        estimate = None if self._followed is None else self.estimate(self._followed, frame.t)
-        if not self._closed_loop or pose is None or estimate is None or self._followed is None:
+        if not self._closed_loop or self._followed is None:
+            return None
+        pose, estimate = self.states.at(frame.t), self.estimate(self._followed, frame.t)
+        if pose is None or estimate is None:
             return None
         seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
         if seen is None:
@@ -201,21 +201,22 @@ class Pursuit:
 
     def candidates(self, tracks: Sequence[Track], t: float) -> list[Candidate]:
         """What a policy chooses from, at a time [s]: the confirmed tracks."""
-        found = []
-        for track in tracks:
-            if not track.confirmed:
-                continue
-            now, soon = (self.estimate(track.id, t + later) for later in (0.0, RATE_S))
-            if now is None or soon is None:
-                continue
-            at, then = self._direction(now.x_fixed), self._direction(soon.x_fixed)
-            seen_s = self._seen_s.get(track.id, 0.0)
-            found.append(Candidate(track, at, (then - at) / RATE_S, leaves_in(track, self._size), seen_s))
-        return found
+        return [
+            Candidate(
+                track,
+                partial(self._direction, self._filters[track.id], t),
+                leaves_in(track, self._size),
+                self._seen_s.get(track.id, 0.0),
+            )
+            for track in tracks
+            if track.confirmed and track.id in self._filters and self._filters[track.id].knows(t)
+        ]
 
-    def _direction(self, x_fixed: Array) -> Array:
-        """Pan and tilt of a point as seen from the head, (2,) [rad], the zoom camera's place on it aside."""
-        x, y, z = self._to_base.apply(x_fixed)
+    def _direction(self, known: SpatialFilter, t: float, later: float) -> Array:
+        """Pan and tilt of a target as seen from the head, (2,) [rad], the zoom camera's place on it aside."""
+        estimate = known.at(t + later)
+        assert estimate is not None, "what is known at a time is known later"
+        x, y, z = self._to_base.apply(estimate.x_fixed)
         return np.array([math.atan2(x, z), math.atan2(-y, math.hypot(x, z))])
 
 

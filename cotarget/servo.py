@@ -93,7 +93,8 @@ class Servo:
         first, found = self._aim(at_effect, reach), self._aim(then, reach)
         rates = (found.pan - first.pan) / interval, (found.tilt - first.tilt) / interval
         pan, tilt, focal = self.commanded
-        view = self._rig.zoom.size[0] / self._true(focal)
+        focal_now = self._true(focal)
+        view = self._rig.zoom.size[0] / focal_now
         command = self._steering.decide(
             effect, interval, (first.pan, first.tilt), rates, view, effect - at_effect.measured_t
         )
@@ -103,7 +104,7 @@ class Servo:
         choice = self._zoom.choose(
             expect(then, pan_then, tilt_then, focal),
             found.focal_px,
-            self._true(focal),
+            focal_now,
             now,
             self._true(self._rig.zoom.state().focal_px),
         )

@@ -1,5 +1,6 @@
 """From a pixel and a depth, or a track, to an Aim: pan, tilt and focal length. Pure: no device, no clock."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -139,12 +140,10 @@ def aim(
     x_base = calibration.T_base_fixed.apply(x_fixed)  # (6)
     wanted = calibration.zoom.stops[0].image_center_px if pixel is None else np.asarray(pixel, dtype=float)
     if closeup:  # begin near: with the range from the base
-        nominal_px = calibration.zoom.nominal_for(
-            focal_for_size(closeup.size, closeup.wanted_px, float(np.linalg.norm(x_base)))
-        )
+        nominal_px = calibration.zoom.nominal_for(focal_for_size(closeup.size, closeup.wanted_px, math.hypot(*x_base)))
     nominal, limited = _limit(reach.focal_px[0] if nominal_px is None else nominal_px, reach)
+    lens = calibration.zoom.at(nominal)
     for _ in range(FOCAL_ROUNDS if closeup else 1):
-        lens = calibration.zoom.at(nominal)
         ray = lens.ray(wanted)
         if method == "exact":
             pupil = calibration.zoom.pupil_at(nominal)
@@ -153,19 +152,21 @@ def aim(
         else:
             pointing = _paper(calibration, x_fixed, method, reach)
         if closeup:
-            z = float(pointing.range * ray[2] / np.linalg.norm(ray))
+            z = float(pointing.range * ray[2]) / math.hypot(*ray)
             focal = focal_for_size(closeup.size, closeup.wanted_px, z)  # (17)
             if closeup.vertical:  # that is fy; the lens is told by fx
                 fx, fy = lens.focal_px
                 focal *= fx / fy
             previous = nominal
             nominal, limited = _limit(calibration.zoom.nominal_for(focal), reach)
+            if nominal != previous:
+                lens = calibration.zoom.at(nominal)
             if abs(nominal - previous) <= FOCAL_FOUND * nominal:
                 break
     return Aim(
         pan=float(pointing.pan),
         tilt=float(pointing.tilt),
-        focal_px=calibration.zoom.at(nominal).focal_px[0],
+        focal_px=lens.focal_px[0],
         nominal_px=nominal,
         limited=limited,
         x_fixed=np.asarray(x_fixed, dtype=float),

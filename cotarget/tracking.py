@@ -126,38 +126,38 @@ class _Pairs:
         log_volume: logarithm of the determinant of the innovation's covariance.
         covered: the part of the track's box that the detection covers, 0 to 1.
         overlap: intersection over union of the boxes, 0 to 1.
-        confirmed: which tracks are, (tracks,).
+        confirmed: which tracks are.
     """
 
     def __init__(self, states: Sequence[TargetFilter], detections: Sequence[Measurement]) -> None:
         """Compare tracks and detections."""
         n, m = len(states), len(detections)
-        self.confirmed = np.array([state.confirmed for state in states], dtype=bool)
-        at = np.array([state.x[:2] for state in states]).reshape(n, 1, 2)
+        self.confirmed = [state.confirmed for state in states]
+        at = np.array([state.center for state in states]).reshape(n, 1, 2)
         size = np.array([state.size for state in states]).reshape(n, 1, 2)
-        P = np.array([state.P[:2, :2] for state in states]).reshape(n, 1, 2, 2)
+        spread = np.array([state.center_variance for state in states]).reshape(n, 1, 2)
         center = np.array([detection.center_px for detection in detections]).reshape(1, m, 2)
         extent = np.array([detection.size_px for detection in detections]).reshape(1, m, 2)
         cut = np.array([detection.clipped for detection in detections], dtype=bool)  # its size says nothing
-        variance = np.zeros((n, m, 2))
         if states:
-            variance = center_variance(states[0].settings, extent, cut[:, None], missing(size, extent))
-        # S = [[a, c], [c, b]], inverted by hand.
-        a, b = (P[..., k, k] + variance[..., k] for k in (0, 1))
-        c = np.broadcast_to(P[..., 0, 1], (n, m))
-        du, dv = np.moveaxis(center - at, -1, 0)
-        volume = a * b - c * c
-        own, other = np.prod(size, axis=-1), np.prod(extent, axis=-1)
+            spread = spread + center_variance(states[0].settings, extent, cut[:, None], missing(size, extent))
+        own, other = _area(size), _area(extent)
         resized = np.where(cut, 0.0, np.log(other / own) / 2 / SIZE_SIGMA)
-        self.distance: Array = (b * du * du - 2 * c * du * dv + a * dv * dv) / volume + resized**2
-        score = np.array([detection.score for detection in detections]).clip(LEAST_SCORE, 0.5)
+        off = (center - at) ** 2 / spread
+        self.distance: Array = off[..., 0] + off[..., 1] + resized**2
+        score = np.array([min(max(detection.score, LEAST_SCORE), 0.5) for detection in detections])
         self.distance += 2 * np.log((1 - score) / score)
-        self.log_volume: Array = np.log(volume)
+        self.log_volume: Array = np.log(_area(spread))
         low = np.maximum(at - size / 2, center - extent / 2)
         high = np.minimum(at + size / 2, center + extent / 2)
-        shared = np.prod(np.maximum(0.0, high - low), axis=-1)
+        shared = _area(np.maximum(0.0, high - low))
         self.covered: Array = shared / own
         self.overlap: Array = shared / (own + other - shared)
+
+
+def _area(sides: Array) -> Array:
+    """Product of the last axis's two, (..., 2) to (...)."""
+    return np.asarray(sides[..., 0] * sides[..., 1])
 
 
 def _assign(pairs: _Pairs) -> dict[int, int]:
@@ -170,18 +170,23 @@ def _assign(pairs: _Pairs) -> dict[int, int]:
     possible = (pairs.distance <= GATE_CHI2) | (pairs.overlap > OVERLAP_ENOUGH)
     cost = np.where(possible, pairs.distance + pairs.log_volume - OVERLAP_BONUS * pairs.overlap, IMPOSSIBLE)
     matches: dict[int, int] = {}
-    for group in (np.flatnonzero(pairs.confirmed), np.flatnonzero(~pairs.confirmed)):
-        free = np.setdiff1d(np.arange(cost.shape[1]), list(matches.values()))
-        rows, columns = linear_sum_assignment(cost[np.ix_(group, free)])
-        found = ((int(group[i]), int(free[j])) for i, j in zip(rows, columns, strict=True))
-        matches |= {i: j for i, j in found if possible[i, j]}
+    for confirmed in (True, False):
+        group = [i for i, each in enumerate(pairs.confirmed) if each == confirmed]
+        taken = set(matches.values())
+        free = [j for j in range(cost.shape[1]) if j not in taken]
+        if group and free:
+            rows, columns = linear_sum_assignment(cost[group][:, free])
+            found = ((group[i], free[j]) for i, j in zip(rows.tolist(), columns.tolist(), strict=True))
+            matches |= {i: j for i, j in found if possible[i, j]}
     return matches
 
 
 def _crowds(pairs: _Pairs, matches: dict[int, int]) -> dict[int, int]:
     """Find detections that cover two or more confirmed tracks: {index of such a track: the detection}."""
     crowds: dict[int, int] = {}
-    inside = (pairs.covered > COVERED) & pairs.confirmed[:, None]
+    if sum(pairs.confirmed) < 2:
+        return crowds
+    inside = (pairs.covered > COVERED) & np.array(pairs.confirmed)[:, None]
     for j in np.flatnonzero(np.count_nonzero(inside, axis=0) > 1):
         covered = [int(i) for i in np.flatnonzero(inside[:, j]) if matches.get(int(i), j) == j]
         if len(covered) > 1:

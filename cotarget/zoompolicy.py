@@ -85,7 +85,7 @@ def expect(
     seen = estimate.appearance(pan, tilt, nominal_px)
     if seen is None:
         return None
-    focal = np.array(estimate.calibration.zoom.at(nominal_px).focal_px)
+    focal = seen.focal_px
     shape = {
         "height": (width_over_height, 1.0),
         "width": (1.0, 1 / width_over_height),
@@ -93,7 +93,7 @@ def expect(
     }[estimate.target.dimension]
     return Expected(
         seen.offset_px / focal,
-        seen.covariance / np.outer(focal, focal),
+        seen.covariance / (focal[:, None] * focal),
         0.5 * seen.size_px / focal * np.array(shape),
         seen.size_sigma,
     )

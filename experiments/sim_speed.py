@@ -81,7 +81,7 @@ class Stepper:
     """Does to a rig what the loop does, without detecting anything."""
 
     def __init__(self, config: RigConfig) -> None:
-        self.world = SimWorld(config)
+        self.world = SimWorld(config, ahead=False)  # whose thread would render during other worlds' turns
         rig = self.world.rig
         rig.zoom.zoom(ZOOMED * rig.zoom.focal_range[0])
         rig.clock.sleep_until(SETTLED_S)

@@ -38,7 +38,7 @@ def pick(choice, seen=(0.0, 0.0, 0.0)):
     places = {2: (100, 200), 3: (320, 200), 5: (600, 200)}
     leaves = (np.inf, 9.0, 5.0)
     candidates = [
-        Candidate(track(number, at), np.array([(at[0] - 320) / 686, 0.0]), np.zeros(2), end, done)
+        Candidate(track(number, at), lambda _, at=at: np.array([(at[0] - 320) / 686, 0.0]), end, done)
         for (number, at), end, done in zip(places.items(), leaves, seen, strict=True)
     ]
     return choice.policy.select(candidates, np.zeros(2), LIMITS)

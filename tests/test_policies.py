@@ -33,7 +33,7 @@ def track(number, center=(320.0, 240.0), velocity=(0.0, 0.0), size=(20.0, 20.0))
 
 
 def candidate(number, pan=0.0, *, rate=0.0, leaves=math.inf, seen=0.0, **where):
-    return Candidate(track(number, **where), np.array([pan, 0.0]), np.array([rate, 0.0]), leaves, seen)
+    return Candidate(track(number, **where), lambda later: np.array([pan + rate * later, 0.0]), leaves, seen)
 
 
 def test_a_way_takes_as_long_as_the_units_profile_says():

@@ -16,7 +16,8 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.geometry import pose
 from cotarget.motionfilter import Track
-from cotarget.pursuit import MOST_FILTERS, RATE_S, UNFOUND_S, Pursuit
+from cotarget.policies import RATE_S
+from cotarget.pursuit import MOST_FILTERS, UNFOUND_S, Pursuit
 from cotarget.rig import Frame, PanTiltState, ZoomState
 
 SIZE, CENTER, FOCAL, ZOOMED = (640, 480), (319.5, 239.5), 700.0, 3000.0

@@ -98,7 +98,8 @@ class Known:
         x, y, z = self.x_fixed
         focal = TRUE * nominal_px
         off = np.tan([math.atan2(x, z) - pan, math.atan2(y, math.hypot(x, z)) + tilt])
-        return Appearance(focal * off, np.eye(2) * (focal * self.sigma) ** 2, focal * BOOK.size / z, 0.0)
+        covariance = np.eye(2) * (focal * self.sigma) ** 2
+        return Appearance(focal * off, covariance, focal * BOOK.size / z, 0.0, np.full(2, focal))
 
 
 def moving(speed, **known):

@@ -7,10 +7,15 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import TargetConfig
-from cotarget.estimation.motion import PAN, SEEN, TILT, G, K, L, W
+from cotarget.estimation.motion import PAN, SEEN, STATES, TILT, G, K, L, W
 from cotarget.estimation.sight import Sights
 from cotarget.geometry import Array
 from cotarget.targeting import Closeup
+
+_SEEN_TWICE = np.ix_(SEEN, SEEN)
+# Derivative of the logarithm of the apparent size, k + g - l, by the state.
+_BY_SIZE = np.zeros(STATES)
+_BY_SIZE[[L, K, G]] = -1.0, 1.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -22,12 +27,14 @@ class Appearance:
         covariance: of it [px^2], (2, 2).
         size_px: the target's known dimension as it will appear.
         size_sigma: its standard deviation, relative.
+        focal_px: true focal length (fx, fy), (2,).
     """
 
     offset_px: Array
     covariance: Array
     size_px: float
     size_sigma: float
+    focal_px: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,12 +140,11 @@ class Estimate:
         J = focal[:, None] * J
         P = self.state_covariance
         size = math.exp(self.state[K] + self.state[G] - self.state[L]) * self.target.size / d[2]
-        h = np.array([-1.0, 1.0, 1.0])
-        spread = h @ P[np.ix_([L, K, G], [L, K, G])] @ h
         return Appearance(
             # Straight lines from the principal point: near the centre, where it matters, distortion does not.
             offset_px=focal * tangent + np.array(lens.center_px) - lens.image_center_px,
-            covariance=J @ P[np.ix_(SEEN, SEEN)] @ J.T,
+            covariance=J @ P[_SEEN_TWICE] @ J.T,
             size_px=size * float(focal[1 if self.target.dimension == "height" else 0]),
-            size_sigma=math.sqrt(max(float(spread), 0.0)),
+            size_sigma=math.sqrt(max(float(_BY_SIZE @ P @ _BY_SIZE), 0.0)),
+            focal_px=focal,
         )

@@ -126,9 +126,8 @@ class SpatialFilter:
         Returns:
             None before the first detection in the wide view, or longer ago than measurements are kept.
         """
-        self._run()
-        node = next((node for node in reversed(self._nodes) if node is not None and node.t <= t), self._base)
-        if node is None or node.t > t:
+        node = self._before(t)
+        if node is None:
             return None
         x, P = propagate(node.x, node.P, t - node.t, self._settings.motion, node.boost)
         return Estimate(
@@ -143,6 +142,16 @@ class SpatialFilter:
             calibration=self._calibration,
             sights=self._sights,
         )
+
+    def knows(self, t: float) -> bool:
+        """Whether there is an estimate for a time [s]."""
+        return self._before(t) is not None
+
+    def _before(self, t: float) -> Node | None:
+        """The newest state that is no later than a time [s]."""
+        self._run()
+        node = next((node for node in reversed(self._nodes) if node is not None and node.t <= t), self._base)
+        return None if node is None or node.t > t else node
 
     def _vertical(self, width: float, height: float) -> bool:
         """Whether the known dimension is the box's height."""
@@ -161,9 +170,8 @@ class SpatialFilter:
         """Put a measurement where its time belongs; what came after it will be gone over again."""
         if not math.isfinite(seen.t) or (self._base is not None and seen.t < self._base.t):
             return False
-        keys = [s.key for s in self._seen]
-        at = bisect.bisect_left(keys, seen.key)
-        if at < len(keys) and keys[at] == seen.key:  # a frame that is repeated tells nothing new
+        at = bisect.bisect_left(self._seen, seen.key, key=lambda each: each.key)
+        if at < len(self._seen) and self._seen[at].key == seen.key:  # a frame that is repeated tells nothing new
             return False
         self._seen.insert(at, seen)
         del self._nodes[at:]

@@ -30,6 +30,7 @@ NEAREST = 0.2
 # Below this part of the acceleration's time constant, Singer's noise is that of white jerk to better than 2 %, while
 # its closed form loses its digits.
 SHORT = 0.03
+_UNIT = np.eye(MOVING)
 MOST_DOUBT = 0.5  # of the logarithm's variance
 CACHED = 1024  # spans of time; frames come at regular ones
 
@@ -41,7 +42,7 @@ class Span:
     Attributes:
         linear: the motion before it is divided by the new depth, (13, 13).
         noise: of position, velocity and acceleration for a unit variance of the acceleration, (9, 9).
-        drift: variances that size and bias gain, (4,).
+        drift: variances that size and bias gain, (13, 13).
         dt: the span [s].
         reach: what an acceleration adds to the position [s^2].
     """
@@ -68,7 +69,8 @@ def span_of(dt: float, motion: MotionSettings) -> Span:
         linear[i, 3 + i], linear[i, 6 + i], linear[3 + i, 6 + i] = dt, reach, gain
     linear[5, 8] *= fade
     growth = np.array([0.0, motion.attitude_sigma**2, motion.bias_sigma**2, motion.bias_sigma**2])
-    drift = growth * (1 - np.array([1.0, attitude, bias, bias]) ** 2)
+    drift = np.zeros((STATES, STATES))
+    drift[range(MOVING, STATES), range(MOVING, STATES)] = growth * (1 - np.array([1.0, attitude, bias, bias]) ** 2)
     return Span(linear, np.kron(_singer(dt, tau), np.eye(3)).astype(float), drift, dt, reach)
 
 
@@ -119,13 +121,12 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, boost: floa
         shrink[L] = -1 / ratio
         F[:MOVING, 5] -= shrink * dt
         F[:MOVING, 8] -= shrink * span.reach
-    P = F @ P @ F.T
+    P = F @ P @ F.T + span.drift
     # Noise of the position along the axis scales all that is divided by the depth.
-    N = np.eye(MOVING)
+    N = _UNIT.copy()
     N[:, L] -= y[:MOVING]
     N[L, L] = 1.0
     # The mean of 1 / depth^2 over all depths that it may have: an uncertain depth makes the noise larger.
     sigma = motion.acceleration * math.exp(min(P[L, L], MOST_DOUBT) - log_depth)
     P[:MOVING, :MOVING] += N @ span.noise @ N.T * (boost * sigma * sigma)
-    P[[K, G, PAN, TILT], [K, G, PAN, TILT]] += span.drift
     return y, P

@@ -76,6 +76,8 @@ class Canvas:
         self._model, self._size, self._shadows = model, size, shadows
         self._renderer: Any = make_renderer(model, *size)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        self._option, self._untouched = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._option.sitegroup[:] = 0
         self._others: list[Canvas] = []
 
     def without_multisampling(self) -> "Canvas":
@@ -88,9 +90,20 @@ class Canvas:
             quality.offsamples = before
         return self._others[-1]
 
-    def look(self, data: "mujoco.MjData", camera_id: int, option: "mujoco.MjvOption") -> None:
-        """Take the scene as a camera of the model has it."""
-        self._renderer.update_scene(data, camera_id, option)
+    def look(self, data: "mujoco.MjData", camera_id: int, layers: int) -> None:
+        """Take the scene as a camera of the model has it.
+
+        Args:
+            data: with everything's pose.
+            camera_id: the camera's number.
+            layers: geoms of so many groups are drawn, from group 0 on one group after the other.
+        """
+        self._option.geomgroup[:] = np.arange(mujoco.mjNGROUP) == 0
+        self._renderer.update_scene(data, camera_id, self._option)
+        for layer in range(1, layers):
+            self._option.geomgroup[:] = np.arange(mujoco.mjNGROUP) == layer
+            everything = mujoco.mjtCatBit.mjCAT_ALL.value
+            mujoco.mjv_addGeoms(self._model, data, self._option, self._untouched, everything, self._renderer.scene)
 
     def draw(
         self, eye: Array, axes: Array, tangents: tuple[float, float, float, float], size: tuple[int, int]

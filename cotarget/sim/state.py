@@ -1,5 +1,6 @@
 """Brings a compiled world to a time: head, targets, board and clutter; everything is a function of time alone."""
 
+import copy
 import math
 from collections.abc import Mapping
 
@@ -46,6 +47,12 @@ class WorldState:
         self._board = self._mocap("board")
         self._boards: list[tuple[float, RigidTransform | None, bool]] = [(-math.inf, None, False)]
         self._shown: tuple[float, float, float, int] | None = None
+
+    def apart(self, model: "mujoco.MjModel") -> "WorldState":
+        """The same world's poses in a copy of its model, for another thread."""
+        other = copy.copy(self)
+        other._model, other._data, other._shown = model, mujoco.MjData(model), None
+        return other
 
     @property
     def faint(self) -> npt.NDArray[np.intp]:

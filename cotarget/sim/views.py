@@ -6,11 +6,13 @@ parts of a pixel against each other, so that their mean is antialiased as well. 
 around it. At rest it is a single render.
 """
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from cotarget.geometry import Array
 from cotarget.rig import Image
@@ -28,6 +30,7 @@ JITTER = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
 WINDOW_MARGIN_PX = 4  # around what moves
 LARGEST_WINDOWS = 0.3  # of the picture; where more of it moves, all of it is rendered four times
 NEAREST = 3.0  # nothing is nearer to a camera than this, for what its own shifts do to the picture [m]
+LAYERS = mujoco.mjNGROUP - 1  # of geoms, drawn from the nearest to the farthest; the last group is not drawn
 PROBES = 3  # directions on each side of the picture that tell how the camera turned
 
 
@@ -88,17 +91,25 @@ class Views:
         Raises:
             DeviceError: the machine cannot render.
         """
-        self._model, self._state, self._size = model, state, size
+        self._model, self._state, self._size, self._shadows = model, state, size, shadows
         self._canvas = Canvas(model, size, shadows)
         self._plain = self._canvas  # without multisampling; made when first needed
         self._multisampling = multisampling
         corners = np.stack(np.meshgrid(*([-1, 1],) * 3), axis=-1).reshape(-1, 3)
         self._corners = model.geom_aabb[:, None, :3] + corners * model.geom_aabb[:, None, 3:]
         self._endless = model.geom_rbound == 0  # planes
-        groups = np.ones(mujoco.mjNGROUP, dtype=bool)
-        groups[[BOARD_GROUP, RIG_GROUP, FRAME_GROUP]] = False
-        self._blurs = groups[model.geom_group]
+        self._groups = np.array(model.geom_group)
+        self._shown = ~np.isin(self._groups, (BOARD_GROUP, RIG_GROUP, FRAME_GROUP))
+        self._blurs = self._shown.copy()
         self._blurs[state.faint] = False
+
+    def apart(self) -> "Views":
+        """Another one of the same world, which shares nothing that either of them changes: for the calling thread."""
+        model = copy.copy(self._model)
+        other = Views(model, self._state.apart(model), self._size, self._shadows, self._multisampling)
+        if self._multisampling:
+            other._plain = other._canvas.without_multisampling()
+        return other
 
     def close(self) -> None:
         """Release OpenGL; more than once does no harm."""
@@ -144,14 +155,17 @@ class Views:
         return self._through(lens, view, image)
 
     def _view(self, lens: TrueLens) -> Pinhole:
-        """The render that a lens's image is made from; resampled as softly whether the lens distorts or not."""
+        """The render that a lens's image is made from, as fine as it is in the middle and no larger than that needs.
+
+        It is resampled as softly whether the lens distorts or not.
+        """
         if not any(lens.distortion):
             (w, h), (cx, cy) = lens.size, lens.center_px
             return Pinhole((w + 3, h + 3), lens.focal_px, (cx + 1.5, cy + 1.5))
-        half_width, half_height = covering_half_field(lens)
-        width, height = self._size
-        focal = min((width / 2 - 1) / half_width, (height / 2 - 1) / half_height)
-        return Pinhole(self._size, (focal, focal), ((width - 1) / 2, (height - 1) / 2))
+        half = np.array(covering_half_field(lens))
+        width, height = np.minimum(np.ceil(2 * half * lens.focal_px + 2), self._size).astype(int).tolist()
+        focal = float(min((width / 2 - 1) / half[0], (height / 2 - 1) / half[1]))
+        return Pinhole((width, height), (focal, focal), ((width - 1) / 2, (height - 1) / 2))
 
     def _through(self, lens: TrueLens, view: Pinhole, image: Image) -> Image:
         """Bend a render, RGB, into a lens's image, BGR."""
@@ -168,16 +182,11 @@ class Views:
             self._plain = self._canvas.without_multisampling()
         canvas = self._plain if plain else self._canvas
         shown = window or Window(0, 0, *view.size)
-        option = mujoco.MjvOption()
-        option.geomgroup[RIG_GROUP] = option.geomgroup[FRAME_GROUP] = 0
-        option.geomgroup[BOARD_GROUP] = self._state.board_at(t) is not None
-        option.sitegroup[:] = 0
-        groups = np.array(self._model.geom_group)
-        self._model.geom_group[self._outside(moment, shown)] = RIG_GROUP
+        self._model.geom_group[:] = self._layers(moment, shown, self._visible(t))
         try:
-            canvas.look(data, self._model.camera(RIG + camera).id, option)
+            canvas.look(data, self._model.camera(RIG + camera).id, LAYERS)
         finally:
-            self._model.geom_group[:] = groups
+            self._model.geom_group[:] = self._groups
         (fx, fy), (cx, cy) = view.focal_px, view.center_px
         left, top = shown.left - 0.5 - cx, shown.top - 0.5 - cy
         tangents = (left / fx, (left + shown.width) / fx, -(top + shown.height) / fy, -top / fy)
@@ -191,12 +200,19 @@ class Views:
         turns = np.array(data.geom_xmat.reshape(-1, 3, 3))
         return Moment(eye, axes, np.array(data.geom_xpos), turns, view)
 
-    def _outside(self, moment: Moment, window: Window) -> Array:
-        """Which geoms a window cannot show, by their bounding spheres; (n,) bool."""
+    def _visible(self, t: float) -> npt.NDArray[np.bool_]:
+        """Which geoms are there to be seen; (n,) bool."""
+        return self._shown if self._state.board_at(t) is None else self._shown | (self._groups == BOARD_GROUP)
+
+    def _layers(self, moment: Moment, window: Window, visible: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+        """When to draw each geom: the nearest first, so that what they hide need not be painted; (n,) int.
+
+        What a window cannot show, by its bounding sphere, is left out.
+        """
         (fx, fy), (cx, cy) = moment.view.focal_px, moment.view.center_px
         x, y, z = ((moment.positions - moment.eye) @ moment.axes).T
-        radius = self._model.geom_rbound
-        out = z < -radius
+        radius = np.where(self._endless, np.inf, self._model.geom_rbound)
+        inside = visible & (z >= -radius)
         # Signed distance to each side of the frustum, whose planes go through the eye.
         for along, tangent, sign in (
             (x, (window.left - 0.5 - cx) / fx, -1),
@@ -204,14 +220,17 @@ class Views:
             (y, (window.top - 0.5 - cy) / fy, -1),
             (y, (window.top + window.height - 0.5 - cy) / fy, 1),
         ):
-            out |= sign * (along - tangent * z) > radius * np.hypot(1.0, tangent)
-        return out & ~self._endless
+            inside &= sign * (along - tangent * z) <= radius * np.hypot(1.0, tangent)
+        drawn = np.flatnonzero(inside)
+        layers = np.full(len(z), LAYERS)
+        layers[drawn[np.argsort((z + radius)[drawn])]] = np.arange(len(drawn)) * LAYERS // max(len(drawn), 1)
+        return layers
 
     def _moving(self, ends: list[Moment], t: float) -> list[Window] | None:
         """Windows around what moves during an exposure while the camera does not; None if they are too large."""
         before, after = ends
         moved = (before.positions != after.positions).any(axis=1) | (before.turns != after.turns).any(axis=(1, 2))
-        moved &= self._blurs | ((self._model.geom_group == BOARD_GROUP) & (self._state.board_at(t) is not None))
+        moved &= self._blurs | ((self._groups == BOARD_GROUP) & self._visible(t))
         if not moved.any():
             return []
         seen = [

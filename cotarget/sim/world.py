@@ -10,6 +10,7 @@ import numpy as np
 from cotarget.config import RigConfig, SimCamera
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Clock, Image
+from cotarget.sim.ahead import Ahead
 from cotarget.sim.clutter import Clutter
 from cotarget.sim.devices import (
     SimBoard,
@@ -42,7 +43,12 @@ class SimWorld:
     """A world with a rig in it. The pipeline gets `rig`; tests and experiments also get `truth()`."""
 
     def __init__(
-        self, config: RigConfig, clock: Clock | None = None, *, rendered: Collection[CameraName] = CAMERAS
+        self,
+        config: RigConfig,
+        clock: Clock | None = None,
+        *,
+        rendered: Collection[CameraName] = CAMERAS,
+        ahead: bool = True,
     ) -> None:
         """Build and compile the world.
 
@@ -51,6 +57,8 @@ class SimWorld:
             clock: what its time goes by; by default its own, which only moves when somebody waits.
             rendered: the cameras whose frames are rendered; the others' are black. All else is as ever: times,
                 latencies, head, lens and truth. Without any, no OpenGL is needed.
+            ahead: whether the zoom camera's next frame may be rendered, on another thread, before it is asked for;
+                nothing but the speed depends on it.
 
         Raises:
             ConfigError: an unknown scene or target.
@@ -72,6 +80,7 @@ class SimWorld:
         self._opened: Views | None = None
         if self._rendered:
             self._views()
+        self._ahead = Ahead(self._views().apart) if ahead and "zoom" in self._rendered else None
         # The lens obeys as late as the head does.
         delay = sim.head.command_delay_s if effects.command_delay else 0.0
         self._black = {name: _black(self._camera(name)) for name in CAMERAS}
@@ -81,7 +90,7 @@ class SimWorld:
         }
         self.rig = SimRig(
             SimStream(sim.fixed, effects, self._clock, partial(self.expose, "fixed")),
-            SimZoomStream(sim.zoom, effects, self._clock, partial(self.expose, "zoom"), self.lens_drive, delay),
+            SimZoomStream(sim.zoom, effects, self._clock, self._expose_zoom, self.lens_drive, delay),
             SimPanTilt(sim.head, effects, self._clock, self.head_drive),
             self._clock,
             SimBoard(self._place_board),
@@ -126,7 +135,9 @@ class SimWorld:
         return portrait(self._model, self._state.lit(self._clock.now()), azimuth_deg, axes)
 
     def close(self) -> None:
-        """Release the renderer; more than once does no harm."""
+        """Release the renderers; more than once does no harm."""
+        if self._ahead is not None:
+            self._ahead.close()
         if self._opened is not None:
             self._opened.close()
 
@@ -167,11 +178,26 @@ class SimWorld:
 
     def expose(self, name: CameraName, index: int, t: float) -> Image:
         """Gather light around time t, up to now, then add the sensor's effects to frame number ``index``."""
-        if name not in self._rendered:
-            return self._black[name]
-        exposure = self._camera(name).exposure_s if self.config.sim.effects.blur else 0.0
+        return self._exposed(self._views(), name, index, t) if name in self._rendered else self._black[name]
+
+    def _exposed(self, views: Views, name: CameraName, index: int, t: float) -> Image:
         lens_at = self.zoom_lens_at if name == "zoom" else lambda _: self._fixed_lens
-        return self._sensors[name].expose(self._views().exposed(name, lens_at, t, exposure), index)
+        return self._sensors[name].expose(views.exposed(name, lens_at, t, self._exposure(name)), index)
+
+    def _exposure(self, name: CameraName) -> float:
+        return self._camera(name).exposure_s if self.config.sim.effects.blur else 0.0
+
+    def _expose_zoom(self, index: int, t: float) -> Image:
+        """A zoom frame for its stream; then, if what comes next has already happened, the next one is begun."""
+        if self._ahead is None:
+            return self.expose("zoom", index, t)
+        image = self._ahead.take(index)
+        if image is None:
+            image = self.expose("zoom", index, t)
+        after = (index + 1) / self.config.sim.zoom.rate_hz
+        if after + self._exposure("zoom") / 2 < self._clock.now():
+            self._ahead.begin(index + 1, lambda views: self._exposed(views, "zoom", index + 1, after))
+        return image
 
     def _place_board(self, T_fixed_board: RigidTransform | None, swings: bool) -> None:
         self._state.place_board(self._clock.now(), T_fixed_board, swings)
