@@ -94,14 +94,14 @@ class Steering:
         if self._may_rest(effect_t, interval_s, wanted, rates, zone, still):
             return None
         pan, tilt = self.head.at(effect_t)
+        off = _apart(wanted, (pan[0], tilt[0]), wanted[1])
         if math.isinf(self._limits.acceleration):  # it jumps: to the middle of the target's way until the next chance
             half = interval_s / 2
             command = HeadCommand(wanted[0] + half * rates[0], wanted[1] + half * rates[1], None)
-        elif still and _apart(wanted, (pan[0], tilt[0]), wanted[1]) > zone:
+        elif still and off > zone:
             command = HeadCommand(*wanted, None)
         else:
-            far = _apart(wanted, (pan[0], tilt[0]), wanted[1]) > self._settings.far * zone
-            catch_s = self._settings.hurry_s if far else self._settings.catch_s
+            catch_s = self._settings.hurry_s if off > self._settings.far * zone else self._settings.catch_s
             command = self._along((pan, tilt), wanted, rates, interval_s, catch_s)
         command = self._within(command)
         self.head.obeys(effect_t, command)

@@ -10,9 +10,8 @@ import numpy as np
 
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.rig import Camera, Clock, Frame, Image
+from cotarget.safety.devices import FUTURE_S
 
-# A frame cannot be from later than now; this much is left for a latency that is compensated too far [s].
-FUTURE_S = 0.05
 # Longer than this nobody waits for a zoom frame that is not there yet, but for the first [s].
 ZOOM_WAIT_S = 2e-3
 # A zoom camera that gives the same frame for so long shows nothing new [s] ...

@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 from cotarget.config import RigConfig
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform, pose_dict
-from cotarget.rig import PanTiltLimits
+from cotarget.rig import PanTiltLimits, Speed
 
 SCHEMA = 1
 META, LOG, CALIBRATION, TEMPLATE = "recording.json", "log.jsonl", "calibration.json", "template"
@@ -93,6 +93,11 @@ class RigFacts:
     focal_range: tuple[float, float]
     limits: PanTiltLimits
     real_time: bool
+
+
+def move_args(pan: float, tilt: float, speed: Speed | None, wait: bool) -> tuple[Number, ...]:
+    """The arguments of `head.move` as an event has them."""
+    return (pan, tilt, *(speed if isinstance(speed, tuple) else (speed,)), wait)
 
 
 def event_line(event: Event) -> str:

@@ -6,7 +6,7 @@ from types import TracebackType
 from typing import TypeVar
 
 from cotarget.geometry import RigidTransform
-from cotarget.recordformat import FIXED, ZOOM, Event, Number, RigFacts, facts_table
+from cotarget.recordformat import FIXED, ZOOM, Event, Number, RigFacts, facts_table, move_args
 from cotarget.recordwriter import RecordWriter
 from cotarget.rig import (
     Board,
@@ -116,7 +116,7 @@ class _Head:
         )
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
-        args = (pan, tilt, *(speed if isinstance(speed, tuple) else (speed,)), wait)
+        args = move_args(pan, tilt, speed, wait)
         return self._notes.ask("head.move", args, lambda: self._head.move(pan, tilt, speed, wait), lambda both: both)
 
     def halt(self) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
-from cotarget.recordformat import Event, Number
+from cotarget.recordformat import Event, move_args
 from cotarget.recordreader import Recording, open_recording
 from cotarget.replaytape import Differences, RecordingEndedError, Tape, time_of
 from cotarget.rig import (
@@ -157,7 +157,7 @@ class _Head:
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         recorded = self._tape.take("head.move")
-        args: tuple[Number, ...] = (pan, tilt, *(speed if isinstance(speed, tuple) else (speed,)), wait)
+        args = move_args(pan, tilt, speed, wait)
         self._tape.compare("head.move", recorded, args)
         if recorded is not None:
             self._tape.play(recorded)
