@@ -5,8 +5,6 @@ It is driven by white acceleration, so that frames may come at any times. To the
 """
 
 import math
-import statistics
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -15,14 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.axisfilter import AxisFilter, Spread, covariance_of
+from cotarget.boxhistory import SizeHistory, Trail
 from cotarget.config import TargetConfig
 from cotarget.geometry import Array
 
 # A box that is smaller than this part of its target's usual one is a piece of it, which may be any.
 PIECE = 0.7
-# The larger side over a wing beat is that of which this part is smaller: the maximum, but deaf to one frame in ten that
-# is wrong.
-BEAT_PART = 0.9
 
 
 class Measurement(Protocol):
@@ -58,6 +54,7 @@ class TrackerSettings:
         confirm_hits: detections before a track is believed ...
         confirm_s: ... and how long it must have been followed [s] ...
         confirm_travel: ... and how far it must have come, in larger sides of its box (0: it may stand still) ...
+        travel_s: ... within so long [s] ...
         confirm_score: ... and what its detections' scores must average, the last ones most (0: any will do).
         score_s: over this time they are averaged [s]; a new track begins at 0.
         doubt_score: a confirmed track ends when its average falls below this.
@@ -76,6 +73,7 @@ class TrackerSettings:
     confirm_hits: int = 4
     confirm_s: float = 0.15
     confirm_travel: float = 0.0
+    travel_s: float = 2.0
     confirm_score: float = 0.0
     score_s: float = 0.3
     doubt_score: float = 0.0
@@ -145,20 +143,17 @@ class Track:
         return replace(self, t=t, center_px=self.predict(t), covariance=covariance_of(*grown))
 
 
-@dataclass(frozen=True)
-class _Size:
-    """Width and height of a box at a time [s], and whether the image's border cut it."""
-
-    t: float
-    width: float
-    height: float
-    clipped: bool
-
-
 class TargetFilter:
     """The Kalman filters and the size history of one track."""
 
-    def __init__(self, number: int, detection: Measurement, t: float, settings: TrackerSettings) -> None:
+    def __init__(
+        self,
+        number: int,
+        detection: Measurement,
+        t: float,
+        settings: TrackerSettings,
+        image_size: tuple[int, int] | None = None,
+    ) -> None:
         self.number = number
         self.settings = settings
         self.noise = settings.acceleration_px**2 * settings.manoeuvre_s
@@ -168,13 +163,14 @@ class TargetFilter:
         self.missed = 0
         self.confirmed = False
         self.mean_score = 0.0
-        self.sizes: deque[_Size] = deque()
-        self._note_size(detection)
+        self._sizes = SizeHistory(settings.size_s, settings.beat_s)
+        # Of who stands, or is confirmed, nobody asks.
+        self._trail = Trail(settings.travel_s, image_size) if settings.confirm_travel else None
+        self._note(detection)
         self._u, self._v = (
             AxisFilter(at, variance, settings.speed_px**2)
             for at, variance in zip(detection.center_px.tolist(), self.variance(detection).tolist(), strict=True)
         )
-        self.start = self.center
 
     @property
     def center(self) -> tuple[float, float]:
@@ -182,9 +178,14 @@ class TargetFilter:
         return self._u.at, self._v.at
 
     @property
-    def center_variance(self) -> tuple[float, float]:
+    def place_variance(self) -> tuple[float, float]:
         """Of the middle [px^2]; u and v know nothing of each other."""
         return self._u.spread.at, self._v.spread.at
+
+    @property
+    def size(self) -> Array:
+        """Usual width and height [px], (2,)."""
+        return self._sizes.size
 
     def predict(self, t: float) -> None:
         """Move the filter to time ``t`` [s]."""
@@ -197,17 +198,19 @@ class TargetFilter:
         weight = 1 - math.exp(-(self.t - self.seen) / self.settings.score_s)
         self.mean_score += weight * (detection.score - self.mean_score)
         self._measure(detection.center_px.tolist(), self.variance(detection).tolist())
-        self._note_size(detection)
+        self._note(detection)
         self.detection = detection
         self.hits += 1
         if not self.confirmed:
-            travel = math.dist(self.center, self.start) / max(1.0, *self.size.tolist())
+            settings = self.settings
             self.confirmed = (
-                self.hits >= self.settings.confirm_hits
-                and self.t - self.born >= self.settings.confirm_s
-                and travel >= self.settings.confirm_travel
-                and self.mean_score >= self.settings.confirm_score
+                self.hits >= settings.confirm_hits
+                and self.t - self.born >= settings.confirm_s
+                and self.mean_score >= settings.confirm_score
+                and self._has_travelled()
             )
+            if self.confirmed:
+                self._trail = None
 
     def share(self, detection: Measurement) -> None:
         """Take a detection into account that covers other targets too: all it tells is that this one is inside."""
@@ -238,7 +241,7 @@ class TargetFilter:
             center_px=np.array(self.center),
             velocity_px=np.array([self._u.speed, self._v.speed]),
             size_px=self.size.copy(),
-            larger_side_px=self.larger_side,
+            larger_side_px=self._sizes.larger_side,
             covariance=covariance_of(self._u.spread, self._v.spread),
             score=self.detection.score,
             box=self.detection,
@@ -251,25 +254,18 @@ class TargetFilter:
             self.settings, detection.size_px, detection.clipped, missing(self.size, detection.size_px)
         )
 
-    def _note_size(self, detection: Measurement) -> None:
-        """Remember a box's size, and work out the usual one and the largest anew."""
-        width, height = detection.size_px.tolist()
-        self.sizes.append(_Size(self.t, width, height, detection.clipped))
-        settings, sizes = self.settings, self.sizes
-        while sizes[0].t < self.t - max(settings.size_s, settings.beat_s):
-            sizes.popleft()
-        recent = [size for size in sizes if size.t >= self.t - settings.size_s]
-        # The border makes boxes smaller: those that it did not cut count, or else the largest of those it did.
-        whole = [size for size in recent if not size.clipped]
-        self.size: Array = np.array(
-            [
-                statistics.median(sides) if whole else max(sides)
-                for sides in ([size.width for size in whole or recent], [size.height for size in whole or recent])
-            ]
-        )
-        recent = [size for size in sizes if size.t >= self.t - settings.beat_s]
-        beat = [size for size in recent if not size.clipped] or recent
-        self.larger_side = _quantile([max(size.width, size.height) for size in beat], BEAT_PART)
+    def _note(self, detection: Measurement) -> None:
+        """Remember a box."""
+        (u, v), (width, height) = detection.center_px.tolist(), detection.size_px.tolist()
+        self._sizes.note(self.t, width, height, detection.clipped)
+        if self._trail is not None:
+            self._trail.note(self.t, (u, v), (width, height), detection.clipped)
+
+    def _has_travelled(self) -> bool:
+        """Whether it has come far enough to be believed."""
+        if self._trail is None:
+            return True
+        return self._trail.travel() >= self.settings.confirm_travel * max(1.0, *self.size.tolist())
 
     def _measure(self, center: Sequence[float], variance: Sequence[float]) -> None:
         """Take a measured centre [px] with its variance [px^2] into account, both (2,)."""
@@ -277,15 +273,6 @@ class TargetFilter:
             axis.correct(at, spread)
         self.seen = self.t
         self.missed = 0
-
-
-def _quantile(values: Sequence[float], part: float) -> float:
-    """The value of which a part of others is smaller, linearly between two; numpy's takes forty times as long."""
-    ordered = sorted(values)
-    at = part * (len(ordered) - 1)
-    low = int(at)
-    high = min(low + 1, len(ordered) - 1)
-    return ordered[low] + (at - low) * (ordered[high] - ordered[low])
 
 
 def missing(usual: Array, size: Array) -> Array:

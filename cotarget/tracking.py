@@ -113,7 +113,7 @@ class Tracker:
         born: list[TargetFilter] = []
         for detection in (detections[int(j)] for j in np.flatnonzero(~explained)):
             if not (_Pairs(born, [detection]).covered > COVERED).any():
-                born.append(TargetFilter(self._next_id, detection, t, self._settings))
+                born.append(TargetFilter(self._next_id, detection, t, self._settings, self._image_size))
                 self._next_id += 1
         self._tracks += born
 
@@ -135,7 +135,7 @@ class _Pairs:
         self.confirmed = [state.confirmed for state in states]
         at = np.array([state.center for state in states]).reshape(n, 1, 2)
         size = np.array([state.size for state in states]).reshape(n, 1, 2)
-        spread = np.array([state.center_variance for state in states]).reshape(n, 1, 2)
+        spread = np.array([state.place_variance for state in states]).reshape(n, 1, 2)
         center = np.array([detection.center_px for detection in detections]).reshape(1, m, 2)
         extent = np.array([detection.size_px for detection in detections]).reshape(1, m, 2)
         cut = np.array([detection.clipped for detection in detections], dtype=bool)  # its size says nothing

@@ -116,10 +116,11 @@ def test_spacing_is_of_the_corners_that_are_seen():
 
 
 @pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"the real stereo photos are not at {PHOTOS}")
-def test_real_photos_show_the_board_they_show():
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.slow), 4])
+def test_real_photos_show_the_board_they_show(every):
     """Its outer squares are cut short, and a screen behind it shows two small boards in some."""
     guesses = []
-    for path in sorted(PHOTOS.glob("left*.jpg")):
+    for path in sorted(PHOTOS.glob("left*.jpg"))[::every]:
         image = cv2.imread(str(path))
         corners = find_corners(image, BOARD)
         assert corners is not None
@@ -127,4 +128,4 @@ def test_real_photos_show_the_board_they_show():
         assert find_corners(image, BoardConfig(corners=(6, 5))) is None
         guesses.append(guess_corners(image))
     assert set(guesses) <= {(9, 6), None}
-    assert guesses.count((9, 6)) >= 8
+    assert guesses.count((9, 6)) >= 0.6 * len(guesses)

@@ -447,6 +447,7 @@ def zooming(tmp_path_factory):
     return directory, rows
 
 
+@pytest.mark.slow
 def test_who_insists_is_heard_at_every_focal_length(folder, capsys, zooming):
     """With pan alone the first fit, of the shortest focal length, is refused already."""
     directory, rows = zooming

@@ -298,8 +298,10 @@ NOT_HALTED = (
     [
         ("stop", 1),
         (signal.SIGINT, 130),
-        (signal.SIGQUIT, 128 + signal.SIGQUIT),
-        *(pytest.param(n, 128 + n, marks=slow) for n in (signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)),
+        *(
+            pytest.param(n, 128 + n, marks=slow)
+            for n in (signal.SIGQUIT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)
+        ),
     ],
 )
 def test_a_reset_is_broken_off_by_whatever_ends_it(stock, state_home, how, status):

@@ -179,6 +179,7 @@ def red_box(image):
     return np.array([x + (w - 1) / 2, y + (h - 1) / 2]), float(w)
 
 
+@pytest.mark.slow
 def test_the_book_is_followed_through_the_protocols_alone(line):
     config = parse_config(TABLE)
     target = config.target("book")

@@ -58,7 +58,7 @@ def watch(clip, detector, folder):
     return dataclasses.replace(result, false_tracks=known.false_tracks, false_tracks_per_min=known.false_tracks_per_min)
 
 
-@pytest.mark.parametrize("clip", ["V_BIRD_016", "V_BIRD_034"])
+@pytest.mark.parametrize("clip", [pytest.param("V_BIRD_016", marks=pytest.mark.slow), "V_BIRD_034"])
 def test_a_real_bird_is_followed_by_its_motion(clip, tmp_path):
     result = watch(clip, "motion", tmp_path)
     assert result.on_target_ratio >= LEAST_COVERAGE
@@ -66,7 +66,14 @@ def test_a_real_bird_is_followed_by_its_motion(clip, tmp_path):
     assert result.false_tracks_per_min <= MOST_FALSE_PER_MINUTE
 
 
-@pytest.mark.parametrize("clip", ["V_BIRD_016", "V_BIRD_034", "V_BIRD_036", "V_BIRD_039"])
+@pytest.mark.parametrize(
+    "clip",
+    [
+        *(pytest.param(clip, marks=pytest.mark.slow) for clip in ("V_BIRD_016", "V_BIRD_034")),
+        "V_BIRD_036",
+        "V_BIRD_039",
+    ],
+)
 def test_a_real_bird_is_followed_as_a_speck(clip, tmp_path):
     """In 036 and 039 it hovers: its motion alone finds it in 65 and 0 % of the frames."""
     result = watch(clip, "speck", tmp_path)

@@ -13,12 +13,12 @@ from cotarget.errors import DeviceError
 from cotarget.sim.ahead import READ_IN_TURN, Ahead
 from cotarget.sim.world import SimWorld
 
-FRAMES = READ_IN_TURN + 12
+FRAMES = READ_IN_TURN + 8
 SMALL = {"size": [160, 120], "exposure_s": 0.01}
 
 
 def world(**more):
-    sim = {"scene": "outdoor", "targets": ["bird"], "fixed": {"size": [160, 120]}, "zoom": SMALL}
+    sim = {"scene": "indoor", "targets": ["book"], "fixed": {"size": [160, 120]}, "zoom": SMALL}
     return SimWorld(parse_config({"sim": sim}), **more)
 
 
@@ -52,8 +52,15 @@ def test_frames_are_the_same_whether_rendered_ahead_or_not():
     assert len(workers()) == before
 
 
-def renderer(closed):
-    return SimpleNamespace(close=lambda: closed.append(threading.current_thread().name))
+@pytest.fixture
+def closed():
+    """The threads on which renderers were closed."""
+    return []
+
+
+@pytest.fixture
+def ahead(closed):
+    return Ahead(lambda: SimpleNamespace(close=lambda: closed.append(threading.current_thread().name)))
 
 
 def read(ahead, indices):
@@ -65,9 +72,7 @@ def read(ahead, indices):
     return [None if image is None else int(image[0]) for image in ready]
 
 
-def test_only_what_is_read_in_turn_is_begun():
-    closed = []
-    ahead = Ahead(lambda: renderer(closed))
+def test_only_what_is_read_in_turn_is_begun(ahead, closed):
     turn = list(range(5, 5 + READ_IN_TURN + 1))  # the first one is not in turn
     assert read(ahead, turn) == [None] * len(turn)
     assert read(ahead, [turn[-1] + 1, turn[-1] + 2]) == [turn[-1] + 1, turn[-1] + 2]
@@ -77,9 +82,8 @@ def test_only_what_is_read_in_turn_is_begun():
     assert closed == ["render ahead"]
 
 
-def test_the_thread_ends_also_if_nobody_closes_it():
-    closed = []
-    ahead = Ahead(lambda: renderer(closed))
+def test_the_thread_ends_also_if_nobody_closes_it(closed):
+    ahead = Ahead(lambda: SimpleNamespace(close=lambda: closed.append(threading.current_thread().name)))
     read(ahead, range(READ_IN_TURN))
     assert closed == []
     del ahead
@@ -87,9 +91,7 @@ def test_the_thread_ends_also_if_nobody_closes_it():
     assert closed == ["render ahead"]
 
 
-def test_what_goes_wrong_there_is_told_here():
-    closed = []
-    ahead = Ahead(lambda: renderer(closed))
+def test_what_goes_wrong_there_is_told_here(ahead, closed):
     read(ahead, range(READ_IN_TURN))
     ahead.begin(READ_IN_TURN, lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):

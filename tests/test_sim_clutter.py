@@ -34,7 +34,7 @@ def false_blobs_a_minute(w, start):
     return count * 60 * RATE_HZ / FRAMES
 
 
-@pytest.mark.parametrize("seed", [0, 100])
+@pytest.mark.parametrize("seed", [0, pytest.param(100, marks=pytest.mark.slow)])
 def test_plain_frame_differencing_finds_false_blobs(seed):
     with (w := world(seed=seed, effects={"clutter": True})).rig:
         rate = false_blobs_a_minute(w, 3.0)

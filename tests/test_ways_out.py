@@ -226,7 +226,7 @@ def test_a_program_that_sets_its_own_handlers_keeps_them(start):
 @pytest.mark.render
 @pytest.mark.parametrize(("number", "status", "said"), [
     (signal.SIGINT, 130, "cotarget follow: interrupted\n"),
-    (signal.SIGTERM, 143, ""),
+    pytest.param(signal.SIGTERM, 143, "", marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_following_is_ended_by_a_signal_with_the_head_halted(start, tmp_path, number, status, said):
     """A second signal comes while the head is being halted."""

@@ -1,6 +1,7 @@
 """What the wide view shows of the target: a patch of it, how much each of its pixels counts, and the body's middle."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -39,9 +40,9 @@ COLOUR_SIGMA = np.array([0.01, 0.01])
 Pixels = npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sight:
-    """The target as one wide frame shows it.
+    """The target as one wide frame shows it. What only a search for it needs is worked out when it is asked for.
 
     Attributes:
         t: when [s].
@@ -49,10 +50,9 @@ class Sight:
         body_sigma_px: how far off that may be along u and v, one standard deviation, (2,).
         size_px: width and height of its box, (2,).
         patch: the image around it, (h, w, 3) BGR.
-        weight: how much each pixel of the patch counts, (h, w), 0 to 1.
         corner_px: the patch's top-left pixel in the frame, (2,).
-        whitening: mixes the colours so that the background varies by one in each direction of colour, (3, 3): what
-            looks like the background's own variety then counts for little.
+        foreground: the pixels of the patch that are the target's, (h, w).
+        outside_px: how far beyond its box each pixel of the patch lies [px], (h, w); none inside it.
     """
 
     t: float
@@ -60,14 +60,33 @@ class Sight:
     body_sigma_px: Array
     size_px: Array
     patch: Image
-    weight: Samples
     corner_px: Array
-    whitening: Array
+    foreground: Pixels
+    outside_px: Samples
 
     @property
     def side_px(self) -> float:
         """The larger side of its box [px]."""
         return float(self.size_px.max())
+
+    @cached_property
+    def weight(self) -> Samples:
+        """How much each pixel of the patch counts, (h, w), 0 to 1."""
+        around = MARGIN_WEIGHT * np.clip(1 - self.outside_px / _margin(self.size_px), 0, 1)
+        return np.maximum(np.where(self.foreground, 1.0, RIM_WEIGHT * self._grown), around).astype(np.float32)
+
+    @cached_property
+    def whitening(self) -> Array:
+        """Mixes the colours so that the background varies by one in each direction of colour, (3, 3).
+
+        What looks like the background's own variety then counts for little.
+        """
+        return _whitening(self.patch[self._grown == 0])
+
+    @cached_property
+    def _grown(self) -> Image:
+        """The foreground and its rim, (h, w), 1 or 0."""
+        return cv2.dilate(self.foreground.astype(np.uint8), np.ones((3, 3), np.uint8))
 
     def at_pitch(self, pitch_px: float) -> tuple[Samples, Samples, Array]:
         """The patch and its weights, sampled every ``pitch_px`` of the frame's pixels about the body's middle.
@@ -99,40 +118,42 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetC
     center, size = np.asarray(detection.center_px, dtype=float), np.maximum(detection.size_px, 1.0)
     if not (np.isfinite(center).all() and np.isfinite(size).all()):
         return None
-    margin = max(LEAST_MARGIN_PX, MARGIN * float(size.max()))
+    margin = _margin(size)
     limit = np.array(frame.image.shape[1::-1])
     low = np.maximum(np.floor(center - size / 2 - margin).astype(int), 0)
     high = np.minimum(np.ceil(center + size / 2 + margin).astype(int) + 1, limit)
     if (high - low < 1).any():
         return None
-    v, u = np.mgrid[low[1] : high[1], low[0] : high[0]].astype(np.float32)
-    du, dv = np.abs(u - center[0]), np.abs(v - center[1])
-    in_box = (du <= size[0] / 2) & (dv <= size[1] / 2)
-    patch = frame.image[low[1] : high[1], low[0] : high[0]].copy()
-    foreground = np.zeros_like(in_box)
-    if mask is not None:
-        foreground = (mask[low[1] : high[1], low[0] : high[0]] > 0) & in_box
+    here = slice(low[1], high[1]), slice(low[0], high[0])
+    patch = frame.image[here].copy()
+    u, v = (np.arange(first, last, dtype=np.float32) for first, last in zip(low, high, strict=True))
+    beyond = np.abs(u - center[0]) - size[0] / 2, np.abs(v - center[1])[:, None] - size[1] / 2
+    outside = np.maximum(np.maximum(*beyond), 0)
+    in_box = outside == 0
+    foreground = np.zeros_like(in_box) if mask is None else (mask[here] > 0) & in_box
     if not _is_outline(foreground, in_box):
         foreground = _stands_out(patch, in_box)
     masked = _is_outline(foreground, in_box)
-    if not masked:
-        foreground = (2 * du / size[0]) ** 2 + (2 * dv / size[1]) ** 2 <= 1
-    outside = np.maximum(du - size[0] / 2, dv - size[1] / 2)
-    around = MARGIN_WEIGHT * np.clip(1 - np.maximum(outside, 0) / margin, 0, 1)
-    grown = cv2.dilate(foreground.astype(np.uint8), np.ones((3, 3), np.uint8))
-    weight = np.maximum(np.where(foreground, 1.0, RIM_WEIGHT * grown), around).astype(np.float32)
     body, sigma = center, BOX_SIGMA * size
     if target.detector == "colour":
         sigma = COLOUR_SIGMA * size
     elif masked:
-        middle = np.array([np.median(u[foreground]), np.median(v[foreground])], dtype=float)
+        rows, columns = foreground.nonzero()
+        middle = np.array([np.median(u[columns]), np.median(v[rows])], dtype=float)
         upright = target.dimension == "height"
         body = np.array([middle[0], center[1]]) if upright else middle
         sigma = (UPRIGHT_SIGMA if upright else FLYING_SIGMA) * size
+    if not masked:
+        du, dv = (2 * (each + side / 2) / side for each, side in zip(beyond, size, strict=True))
+        foreground = du**2 + dv**2 <= 1
     if detection.clipped:  # the hidden part may be as large again
         sigma = np.hypot(sigma, size / 2)
-    whitening = _whitening(patch[grown == 0])
-    return Sight(frame.t, body, sigma, size, patch, weight, low.astype(float), whitening)
+    return Sight(frame.t, body, sigma, size, patch, low.astype(float), foreground, outside)
+
+
+def _margin(size: Array) -> float:
+    """How much of a box's surroundings counts [px]."""
+    return max(LEAST_MARGIN_PX, MARGIN * float(size.max()))
 
 
 def _is_outline(foreground: Pixels, in_box: Pixels) -> bool:

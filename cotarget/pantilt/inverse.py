@@ -74,16 +74,18 @@ def solve(
         nearer than the lever arm. Within half a degree of the pan axis, where the branches meet, both may be the same
         solution.
     """
-    x_base, ray = np.broadcast_arrays(np.asarray(x_base, float), np.asarray(ray, float))
+    x_base, ray = np.asarray(x_base, float), np.asarray(ray, float)
     T = T_head_zoom.as_matrix()
-    R, t = T[:3, :3], T[:3, 3] + T[:3, 2] * pupil - (0.0, 0.0, head.axis_offset)
-    d = ray / np.linalg.norm(ray, axis=-1, keepdims=True) @ R.T
-    if x_base.ndim == 1:
-        ways = _solve_one(_floats(x_base), _floats(d), _floats(t), head)
-        pan, tilt, reach = (np.array(values) for values in zip(*ways, strict=True))
+    R, t = T[:3, :3], T[:3, 3] + T[:3, 2] * pupil
+    t[2] -= head.axis_offset
+    if x_base.ndim == ray.ndim == 1:
+        d = _floats(R @ ray / math.hypot(*ray))
+        pan, tilt, reach = np.array(_solve_one(_floats(x_base), d, _floats(t), head)).T
     else:
+        x_base, ray = np.broadcast_arrays(x_base, ray)
         with np.errstate(invalid="ignore", divide="ignore"):
-            pan, tilt, reach = _solve_many(x_base, d, t, head)
+            d_many = ray / np.linalg.norm(ray, axis=-1, keepdims=True) @ R.T
+            pan, tilt, reach = _solve_many(x_base, d_many, t, head)
     wrapped = head.reported_angles(*((angle + np.pi) % TURN - np.pi for angle in (pan, tilt)))
     return Pointing(*(np.where(reach > 0, value, np.nan) for value in (*wrapped, reach)))
 
