@@ -90,7 +90,8 @@ class Servo:
         state = self._rig.head.state()
         self._steering.head.saw(state)  # a head that was halted, or is slow, is not where it was sent
         reach = reach_of(self._rig, state)
-        first, found = self._aim(at_effect, reach), self._aim(then, reach)
+        first = self._aim(at_effect, reach)
+        found = self._aim(then, reach, first)
         rates = (found.pan - first.pan) / interval, (found.tilt - first.tilt) / interval
         pan, tilt, focal = self.commanded
         focal_now = self._true(focal)
@@ -103,7 +104,7 @@ class Servo:
         (pan_then, _), (tilt_then, _) = self._steering.head.at(effect + interval)
         choice = self._zoom.choose(
             expect(then, pan_then, tilt_then, focal),
-            found.focal_px,
+            first.focal_px * found.range / first.range,
             focal_now,
             now,
             self._true(self._rig.zoom.state().focal_px),
@@ -133,9 +134,12 @@ class Servo:
         """The true focal length at a nominal one [px]."""
         return self._calibration.zoom.at(nominal_px).focal_px[0]
 
-    def _aim(self, estimate: Estimate, reach: Reach) -> Aim:
-        """Solve for an estimate, the head's bias allowed for."""
-        found = aim(self._calibration, estimate.x_fixed, reach, closeup=estimate.closeup)
+    def _aim(self, estimate: Estimate, reach: Reach, zoomed: Aim | None = None) -> Aim:
+        """Solve for an estimate, the head's bias allowed for; at the focal length of another aim, if there is one."""
+        if zoomed is None:
+            found = aim(self._calibration, estimate.x_fixed, reach, closeup=estimate.closeup)
+        else:
+            found = aim(self._calibration, estimate.x_fixed, reach, nominal_px=zoomed.nominal_px)
         pan, tilt = found.pan - estimate.bias[0], found.tilt - estimate.bias[1]
         pan = min(max(pan, reach.pan[0]), reach.pan[1])
         tilt = min(max(tilt, reach.tilt[0]), reach.tilt[1])

@@ -165,7 +165,7 @@ def _is_outline(foreground: Pixels, in_box: Pixels) -> bool:
 def _stands_out(patch: Image, in_box: Pixels) -> Pixels:
     """Where the colours in the box are none that are around it."""
     background = patch[~in_box]
-    if len(background) < LEAST_BACKGROUND:
+    if len(background) < LEAST_BACKGROUND or np.ptp(patch) == 0:
         return np.zeros_like(in_box)
     away = (patch - np.median(background, axis=0)) @ _whitening(background)
     return np.asarray((np.sum(away**2, axis=2) > STANDS_OUT**2) & in_box)

@@ -47,6 +47,7 @@ class WorldState:
         self._board = self._mocap("board")
         self._boards: list[tuple[float, RigidTransform | None, bool]] = [(-math.inf, None, False)]
         self._shown: tuple[float, float, float, int] | None = None
+        self._cluttered = False
 
     def apart(self, model: "mujoco.MjModel") -> "WorldState":
         """The same world's poses in a copy of its model, for another thread."""
@@ -61,6 +62,14 @@ class WorldState:
 
     def at(self, t: float) -> "mujoco.MjData":
         """Everything's pose at time t [s]; the data is the world's own and changes with the next call."""
+        data = self.bodies_at(t)
+        if self._clutter is not None and not self._cluttered:
+            self._clutter.move(data, t)
+            self._cluttered = True
+        return data
+
+    def bodies_at(self, t: float) -> "mujoco.MjData":
+        """The same for who asks for rig, targets and board only: foliage and clouds are where they were."""
         pan, tilt = self._head.angles_at(t)
         wanted = (t, pan, tilt, len(self._boards))
         if wanted == self._shown:
@@ -80,9 +89,7 @@ class WorldState:
                 quaternion(T_world_board),
             )
         mujoco.mj_kinematics(self._model, data)
-        if self._clutter is not None:
-            self._clutter.move(data, t)
-        self._shown = wanted
+        self._shown, self._cluttered = wanted, False
         return data
 
     def lit(self, t: float) -> "mujoco.MjData":

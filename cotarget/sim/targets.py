@@ -113,12 +113,13 @@ class Target:
             velocity = self.path.velocity(t)
             joints, bob = _walk(step, min(math.hypot(*velocity.tolist()) / WALK_SPEED, 1.0))
             position = self.path.position(t)
-            rotation = Rotation.from_matrix(_heading(position, velocity * FLAT))
+            rotation = Rotation.from_matrix(_heading(position, velocity * FLAT), assume_valid=True)
             position[2] += bob * self.size + (0.5 * PERSON_HEIGHT * self.size if self.grounded else 0.0)
             return TargetPose(position, rotation, joints)
         position = self.path.position(t)
         axes = _bank(_heading(position, self.path.velocity(t)), self.path.acceleration(t))
-        return TargetPose(position, Rotation.from_matrix(axes), _flap(self.phase + 2 * np.pi * WING_BEAT_HZ * t))
+        rotation = Rotation.from_matrix(axes, assume_valid=True)
+        return TargetPose(position, rotation, _flap(self.phase + 2 * np.pi * WING_BEAT_HZ * t))
 
 
 def make_target(

@@ -74,6 +74,7 @@ class Truth:
     Attributes:
         model: the compiled world.
         set_state: brings the world to a time.
+        set_bodies: brings rig and targets there, and not what may hide them.
         fixed_lens: the wide camera's optics.
         nominal_at: what the zoom camera's device calls its focal length at a time [px].
         zoom_lens_for: the zoom camera's optics at what its device calls a focal length [px].
@@ -86,6 +87,7 @@ class Truth:
 
     model: "mujoco.MjModel"
     set_state: Callable[[float], "mujoco.MjData"]
+    set_bodies: Callable[[float], "mujoco.MjData"]
     fixed_lens: TrueLens
     nominal_at: Callable[[float], float]
     zoom_lens_for: Callable[[float], TrueLens]
@@ -104,8 +106,8 @@ class Truth:
 
     def T_world_camera(self, camera: CameraName, t: float) -> RigidTransform:
         """Pose of a camera's optical centre at time t, in OpenCV's axes."""
-        eye, axes = self._camera(self.set_state(t), camera, self.lens(camera, t))
-        return RigidTransform.from_components(eye, Rotation.from_matrix(axes))
+        eye, axes = self._camera(self.set_bodies(t), camera, self.lens(camera, t))
+        return RigidTransform.from_components(eye, Rotation.from_matrix(axes, assume_valid=True))
 
     def center(self, name: str, t: float) -> Array:
         """A target's body centre in the world [m], (3,)."""
@@ -114,7 +116,7 @@ class Truth:
     def pixel(self, camera: CameraName, x_world: Array, t: float) -> Array:
         """Where a point of the world appears, (..., 2) [px]; nan behind the camera."""
         lens = self.lens(camera, t)
-        eye, axes = self._camera(self.set_state(t), camera, lens)
+        eye, axes = self._camera(self.set_bodies(t), camera, lens)
         return lens.project((np.asarray(x_world, dtype=float) - eye) @ axes)
 
     def line_of_sight_miss(self, pan: float, tilt: float, nominal_px: float, x_world: Array) -> float:
@@ -126,7 +128,7 @@ class Truth:
             nominal_px: what the device calls the focal length [px].
             x_world: the point [m], (3,).
         """
-        data = self._copy(self.set_state(0.0))
+        data = self._copy(self.set_bodies(0.0))
         data.joint(RIG + "pan").qpos[0], data.joint(RIG + "tilt").qpos[0] = pan, tilt
         mujoco.mj_kinematics(self.model, data)
         lens = self.zoom_lens_for(nominal_px)
@@ -155,7 +157,7 @@ class Truth:
 
         Quicker than its silhouette, whose corners they are; None if any of it is behind the camera.
         """
-        data, lens = self.set_state(t), self.lens(camera, t)
+        data, lens = self.set_bodies(t), self.lens(camera, t)
         pixels = self._outline(name, data, self._camera(data, camera, lens), lens)
         return (pixels.min(axis=0), pixels.max(axis=0)) if np.isfinite(pixels).all() else None
 
@@ -163,7 +165,7 @@ class Truth:
         """The larger side of the box, the maximum over one wing beat at the pose of time t [px]; nan behind."""
         target = self.targets[name]
         phases = np.arange(BEAT_PHASES) / BEAT_PHASES * target.beat_s if target.beat_s else [0.0]
-        data = self._copy(self.set_state(t))
+        data = self._copy(self.set_bodies(t))
         lens = self.lens(camera, t)
         view = self._camera(data, camera, lens)
         joints = [int(self.model.joint(f"{name}/{joint}").qposadr[0]) for joint in target.pose(t).joints]

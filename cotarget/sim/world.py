@@ -102,6 +102,7 @@ class SimWorld:
         return Truth(
             model=self._model,
             set_state=self._state.at,
+            set_bodies=self._state.bodies_at,
             fixed_lens=self._fixed_lens,
             nominal_at=self.lens_drive.focal_at,
             zoom_lens_for=self.zoom_lens_for,
