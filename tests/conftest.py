@@ -1,7 +1,10 @@
-"""How many processes and threads the tests run in, and which signals reach the programs that they start."""
+"""How many processes and threads the tests run in, and what the programs that they start inherit."""
 
 import os
+import shutil
 import signal
+import sys
+import tempfile
 
 # Tests run side by side: threads of their own in each would only get into each other's way.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -11,6 +14,19 @@ FEWEST = 3
 
 def pytest_xdist_auto_num_workers(config):
     return max(FEWEST, os.cpu_count() or FEWEST)
+
+
+# Where nobody wants bytecode it is kept for as long as the tests run, elsewhere: every program that they start would
+# compile everything anew.
+_bytecode = tempfile.mkdtemp(prefix="cotarget-tests-") if sys.dont_write_bytecode else None
+if _bytecode:
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ["PYTHONPYCACHEPREFIX"] = _bytecode
+
+
+def pytest_unconfigure(config):
+    if _bytecode:
+        shutil.rmtree(_bytecode, ignore_errors=True)
 
 
 def pytest_configure(config):

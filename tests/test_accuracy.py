@@ -14,7 +14,7 @@ from experiments.harness import EXPECTED
 EXPERIMENTS = {
     module.EXPERIMENT.name: module.EXPERIMENT for module in (chain, hand_eye, honesty, mismatch, random_rigs)
 }
-SLOW = ("mismatch", "random_rigs")
+SLOW = ("chain", "mismatch", "random_rigs")
 WORSE = 1.10  # times the bound
 
 

@@ -269,6 +269,7 @@ def test_a_limit_hit_ends_it(stock):
         stock.open()
 
 
+@pytest.mark.slow
 def test_a_power_cycle_ends_it_and_a_reset_mends_it(hasty):
     head = hasty.open()
     head.move(100 * STEP, 0.0, wait=True)

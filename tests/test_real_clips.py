@@ -69,9 +69,8 @@ def test_a_real_bird_is_followed_by_its_motion(clip, tmp_path):
 @pytest.mark.parametrize(
     "clip",
     [
-        *(pytest.param(clip, marks=pytest.mark.slow) for clip in ("V_BIRD_016", "V_BIRD_034")),
+        *(pytest.param(clip, marks=pytest.mark.slow) for clip in ("V_BIRD_016", "V_BIRD_034", "V_BIRD_039")),
         "V_BIRD_036",
-        "V_BIRD_039",
     ],
 )
 def test_a_real_bird_is_followed_as_a_speck(clip, tmp_path):
