@@ -87,7 +87,7 @@ def settings_for(target: TargetConfig) -> TrackerSettings:
     """Choose the tracker's settings for a target.
 
     A colour is found to a fraction of a pixel. What is found by its motion jitters with limbs and wings, and
-    must have moved before it is believed.
+    must have moved before it is believed: whoever comes straight on is, once he has gone that far aside.
     """
     detector: str = target.detector
     if detector == "colour":

@@ -69,6 +69,18 @@ def test_frames_are_a_function_of_seed_and_time_alone():
         assert (third.expose("fixed", 5, 4.0) != image).mean() > 0.1
 
 
+def test_foliage_stands_where_it_is_though_only_the_target_was_asked_for_before():
+    config = parse_config({"sim": {"scene": "outdoor", "targets": ["bird"], "effects": {"clutter": True}}})
+    asked, plain = (SimWorld(config, rendered=()).truth() for _ in range(2))
+    places = []
+    for t in (1.0, 4.0):
+        assert np.isfinite(asked.pixel("fixed", asked.center("bird", t), t)).all()  # needs no foliage
+        places.append(asked.set_state(t).geom_xpos.copy())
+        np.testing.assert_array_equal(places[-1], plain.set_state(t).geom_xpos)
+    crowns = [g for g in range(asked.model.ngeom) if asked.model.geom(g).name.startswith("clutter/crown_")]
+    assert np.abs(places[1] - places[0])[crowns].max() > 1e-3
+
+
 def test_indoors_nothing_changes():
     images = []
     for clutter in (False, True):
