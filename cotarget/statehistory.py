@@ -14,6 +14,8 @@ REMEMBERED_S = 2.0  # more than any latency [s]
 # A cubic through the two states before a time and the two after it: the head's acceleration is constant for longer than
 # states are apart. Where that changes, it is off by 0.024 degrees for states 40 ms apart, a straight line by 0.041.
 POINTS = 4
+# States are kept no nearer together than this [s]: through two that are, a cubic shows their rounding many times over.
+SPACING_S = 0.01
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,8 @@ class StateHistory:
 def _append(kept: "deque[tuple[float, ...]]", state: tuple[float, ...]) -> None:
     if kept and state[0] <= kept[-1][0]:
         return
+    if len(kept) > 1 and kept[-1][0] - kept[-2][0] < SPACING_S:
+        kept.pop()
     kept.append(state)
     while kept[0][0] < state[0] - REMEMBERED_S:
         kept.popleft()

@@ -111,3 +111,11 @@ def test_a_machine_that_cannot_open_another_says_so_each_time():
         with pytest.raises(DeviceError, match="no more"):
             ahead.begin(index + 1, lambda _: np.zeros(1))
     ahead.close()
+
+
+def test_it_begins_anew_after_it_was_closed(ahead, closed):
+    for _ in range(2):
+        turn = range(READ_IN_TURN + 2)
+        assert read(ahead, turn)[-1] == turn[-1]
+        ahead.close()
+    assert len(closed) == 2

@@ -64,3 +64,25 @@ def test_what_was_not_told_is_not_known():
     assert history.at(5.05).pan == pytest.approx(0.15)
     history.add(PanTiltState(0.2, 0.2, False, 5.1 + REMEMBERED_S), ZoomState(700.0, False, 5.1 + REMEMBERED_S))
     assert history.at(5.05) is None
+
+
+@pytest.mark.parametrize("apart", [1e-4, 1e-3, 2e-3])
+def test_states_that_come_in_pairs_do_not_multiply_their_rounding(apart):
+    step, rate = math.radians(0.0514286), math.radians(30.0)
+    history = StateHistory()
+    for k in range(40):
+        for t in (k * RATE_S, k * RATE_S + apart):
+            pan = round(rate * t / step) * step
+            history.add(PanTiltState(pan, 0.0, True, t), ZoomState(1000.0, False, t))
+    times = np.arange(0.5, 1.4, 0.003)
+    off = [history.at(t).pan - rate * t for t in times]
+    assert np.sqrt(np.mean(np.square(off))) < 0.5 * step
+    assert history.at(39 * RATE_S + apart) is not None  # the newest one counts
+
+
+def test_states_that_come_fast_are_kept_evenly():
+    history = StateHistory()
+    for t in np.arange(0.0, 1.0, 0.002):
+        history.add(PanTiltState(math.sin(t), 0.0, True, t), ZoomState(1000.0, False, t))
+    for t in np.arange(0.0, 0.99, 0.007):
+        assert history.at(t).pan == pytest.approx(math.sin(t), abs=1e-6)

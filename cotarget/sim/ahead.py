@@ -60,7 +60,7 @@ class Ahead:
         """Release OpenGL, once what was begun is ready; more than once does no harm."""
         if self._finish is not None:
             self._finish()
-        self._in_turn, self._begun = 0, None
+        self._finish, self._in_turn, self._begun = None, 0, None
 
     def _start(self) -> None:
         """Open the renderer; waited for, because nothing may be rendered while another OpenGL is being opened."""
