@@ -58,6 +58,8 @@ class TargetConfig:
         detector: how it is found in the wide view.
         template: picture of the target, cut to its outline, for one that is found by its colour; a relative path is
             relative to rig.toml.
+        motion: how it moves: a thing that stands and is put elsewhere at times, who walks, or who flies; by default
+            what is found by its colour stands, what has a wingspan flies, and all else walks.
     """
 
     size: float
@@ -65,6 +67,7 @@ class TargetConfig:
     wanted_px: float
     detector: Literal["colour", "motion", "speck", "mog2"]
     template: Path | None = None
+    motion: Literal["standing", "walking", "flying"] | None = None
 
 
 DEFAULT_TARGETS: Mapping[str, TargetConfig] = types.MappingProxyType(
@@ -167,6 +170,11 @@ class RigConfig:
         if self.backend != "sim":
             return self.hardware.head.command_delay_s
         return self.sim.head.command_delay_s if self.sim.effects.command_delay else 0.0
+
+    @property
+    def lens_delay_s(self) -> float:
+        """From a command to the start of the lens's motion, as far as it is known [s]."""
+        return self.command_delay_s if self.backend == "sim" else self.hardware.zoom.command_delay_s
 
     def target(self, name: str) -> TargetConfig:
         """Look a target up by name; a further one of a kind, as ``bird2``, is like the first unless it has its own.

@@ -138,7 +138,8 @@ class TargetStages:
         away_px = self._away_in_view() * self._focal_of_view()
         size = float(np.max(step.target.box.size_px))
         settled = abs(math.log(self._focal_of_view() / step.aim.nominal_px)) < SETTLED
-        if settled and away_px < SETTLED * step.zoom.image.shape[1] and size > self._largest:
+        alone = not step.target.shared  # or else the box is as large as all that it covers
+        if alone and settled and away_px < SETTLED * step.zoom.image.shape[1] and size > self._largest:
             self._largest, self.close = size, step
 
     def _focal_of_view(self) -> float:

@@ -14,6 +14,11 @@ from cotarget.safety.devices import FUTURE_S
 
 # Longer than this nobody waits for a zoom frame that is not there yet, but for the first [s].
 ZOOM_WAIT_S = 2e-3
+# Frames of the wide camera that repeat, or whose times jump, may do so for that long [s]. Nobody steers by them, and
+# a head that moves is halted meanwhile, by the watchdog; so often they are asked for anew [s].
+REPEATED_S, AGAIN_S = 0.5, 5e-3
+# So long a camera waits for a frame by itself [s]; if none has come by then, none will.
+PATIENCE_S = 1.0
 # A zoom camera that gives the same frame for so long shows nothing new [s] ...
 BLIND_S = 0.5
 # ... and after so long it is gone [s]: longer than a driver that has lost its camera looks for it, which is 5 s.
@@ -42,30 +47,50 @@ class Eyes:
         self._close: Frame | None = None
         # By the times of wide frames:
         self._now = self._picture_t = self._close_t = -math.inf
-        self._why_blind = ""
+        self._why_blind = self._why_late = ""
+        self._looked_t = -math.inf  # by the rig's clock
         self.interval, self.close_is_new = math.inf, False
 
     def look_wide(self) -> Frame:
-        """Wait for the next wide frame.
+        """Wait for the next wide frame; those that repeat or cannot be true are passed over for a while.
 
         Raises:
-            StaleFrameError: there is none, or it is not newer, or from later than now.
+            StaleFrameError: there is none, or for too long none that is newer, and not from later than now.
             DeviceError: it is of another size.
         """
+        self._why_late, until, timeout = "", math.inf, PATIENCE_S
+        while True:
+            try:
+                return self._next_wide(timeout, until)
+            except StaleFrameError as error:
+                now = self._clock.now()
+                if not self._why_late:
+                    until = now + REPEATED_S
+                if self._wide is None or now - self._looked_t >= PATIENCE_S or not now < until:
+                    raise
+                self._why_late = str(error)
+                self._clock.sleep_until(now + AGAIN_S)
+                timeout = until - now
+
+    def _next_wide(self, timeout: float, until: float) -> Frame:
+        """The next wide frame, by a time. Raises as `look_wide` does, but at once."""
         before = self._wide
-        frame = self._fixed.read(newer_than=None if before is None else before.t)
+        frame = self._fixed.read(None if before is None else before.t, timeout)
         _check_size(frame, self._fixed, "fixed")
         if not frame.t > self._now:
             after = "" if before is None else f" after one of {before.t:.3f} s"
             raise StaleFrameError(
                 f"the fixed camera gave a frame of {frame.t:.3f} s{after}: its frames repeat, or its clock has jumped"
             )
-        if (ahead := frame.t - self._clock.now()) > FUTURE_S:
+        now = self._clock.now()
+        if (ahead := frame.t - now) > FUTURE_S:
             raise StaleFrameError(f"the fixed camera's frame is from {ahead:.2f} s in the future; mind the clock")
+        if now > until:  # its times have jumped back, and have now come up with the last one
+            raise StaleFrameError(self._why_late)
         if before is None or not _same(frame.image, before.image):
             self._picture_t = frame.t
         self.interval = frame.t - self._now
-        self._wide, self._now = frame, frame.t
+        self._wide, self._now, self._looked_t = frame, frame.t, now
         return frame
 
     def look_close(self) -> Frame:
@@ -95,6 +120,8 @@ class Eyes:
     def troubles(self) -> list[str]:
         """What is wrong with the newest frames."""
         found = []
+        if self._why_late:
+            found.append(f"{self._why_late}; this one is {self.interval:.2f} s after the last")
         if (same := self._now - self._picture_t) > FROZEN_S:
             found.append(f"the fixed camera has shown the same picture for {same:.1f} s")
         if self._why_blind or self._now - self._close_t > BLIND_S:

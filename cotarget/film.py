@@ -58,7 +58,8 @@ def run_on_film(
     """Find and track a target in a film.
 
     The table has a row for each confirmed track in each frame; in a frame in which the target was not detected
-    and its place is the motion filter's prediction, the score is 0. Files appear only when complete.
+    and its place is the motion filter's prediction, the score is 0, and in one in which several were seen as one, each
+    has the score of that. Files appear only when complete.
 
     Args:
         video: the film.

@@ -69,7 +69,8 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
     longest = truth.zoom_lens_for(truth.focal_range[1]).focal_px[0]
     pan, tilt = truth.head_at(t)
     followed = step.target
-    detected = (math.nan, math.nan) if followed is None or followed.missed else followed.box.center_px
+    alone = followed is not None and not followed.missed and not followed.shared
+    detected = followed.box.center_px if followed is not None and alone else (math.nan, math.nan)
     height_px, width_px = step.zoom.image.shape[:2]
     return Row(
         t_s=t,
@@ -100,6 +101,8 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
         tilt_deg=math.degrees(tilt),
         focal_px=focal,
         target=name,
+        head_commands=step.head_commands,
+        lens_commands=step.lens_commands,
     )
 
 

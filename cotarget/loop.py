@@ -4,9 +4,8 @@ Everything that records, draws, scores or prints consumes Steps.
 """
 
 import enum
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,13 +19,13 @@ from cotarget.eyes import Eyes
 from cotarget.policies import FirstCome, Policy
 from cotarget.pursuit import Pursuit
 from cotarget.rig import Frame, Image, PanTiltState, Rig, ZoomState
-from cotarget.servo import Drive, Servo, ServoSettings
+from cotarget.servo import Predict, Servo, ServoSettings
 from cotarget.targeting import Aim
 from cotarget.tracking import Track, Tracker, settings_for
+from cotarget.zoompolicy import shape_of
 
 # Longest interval between frames that is taken for the rhythm of commands [s]; a longer one was a gap.
 LONGEST_INTERVAL_S = 0.2
-SEEN_WELL = 0.8  # a chance of being wholly in the close-up that counts as being there
 
 
 class State(enum.StrEnum):
@@ -35,7 +34,7 @@ class State(enum.StrEnum):
     SEARCHING = "searching"  # nothing to follow; the lens is at its shortest
     FOLLOWING = "following"  # the head follows the target
     COASTING = "coasting"  # the target is out of sight for a moment; the head follows its prediction
-    LOST = "lost"  # out of sight for longer: the lens zooms out, the head waits
+    LOST = "lost"  # out of sight for longer: the lens zooms out, the head goes on as long as it is known where to
     UNREACHABLE = "unreachable"  # the target is seen but cannot be aimed at
 
 
@@ -46,12 +45,12 @@ class FollowSettings(ServoSettings):
     Attributes:
         zoom_out_after_s: how long a target may be out of sight before the lens zooms out [s].
         closed_loop: whether the target is looked for in the zoom view too.
-        policy: which of several targets is followed; the first by default.
+        policy: makes, for each run, what decides which of several targets is followed; the first by default.
     """
 
     zoom_out_after_s: float = 0.4
     closed_loop: bool = True
-    policy: Policy = field(default_factory=FirstCome)
+    policy: Callable[[], Policy] = FirstCome
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,10 @@ class Step:
         head: the head's state.
         lens: the lens's state.
         estimate: of the target in 3D, for the time of the fixed frame.
-        found: the target in the zoom frame, where this Step's is a new one and it was found there.
+        found: the target in the zoom view, where it was looked for and found; that is in this Step's zoom frame, or in
+            an earlier one, of the time that `found` says, where the wide view comes later.
+        head_commands: how many the head was sent since the run began.
+        lens_commands: how many the lens was sent.
     """
 
     index: int
@@ -93,6 +95,8 @@ class Step:
     lens: ZoomState
     estimate: Estimate | None = None
     found: Found | None = None
+    head_commands: int = 0
+    lens_commands: int = 0
 
 
 def follow(
@@ -140,7 +144,8 @@ class _Loop:
         self._servo = Servo(rig, calibration, settings)
         self._eyes = Eyes(rig.fixed, rig.zoom, rig.clock)
         self._beyond: set[int] = set()  # tracks that could not be aimed at
-        self._last_seen = -math.inf
+        self._policy = settings.policy()
+        self._seen_t: dict[int, float] = {}  # when each track was seen last
         self._index = 0
 
     def turn(self) -> Step:
@@ -150,17 +155,19 @@ class _Loop:
         interval = min(self._eyes.interval, LONGEST_INTERVAL_S)
         detections = self._detector.detect(frame)
         tracks = self._tracker.update(detections, frame.t)
-        favoured = {track.id for track in tracks if self._settings.policy.favours(track)}
+        self._seen_t = {each.id: self._seen_t.get(each.id, frame.t) if each.missed else frame.t for each in tracks}
+        favoured = {track.id for track in tracks if self._policy.favours(track)}
         pursuit.see_wide(frame, tracks, self._detector.mask, favoured)
         self._hear()
         zoom = self._eyes.look_close()
-        found = pursuit.see_zoom(zoom) if self._eyes.close_is_new else None
+        found = pursuit.see_zoom(zoom if self._eyes.close_is_new else None, frame.t)
         chosen = self._choose(tracks)
-        mode, reason, drive = self._drive(chosen, frame, interval)
         if chosen is None:
-            reason = self._why_nobody(tracks)
-        if drive is not None and chosen is not None and drive.chance >= SEEN_WELL and drive.zoom_reason == "wanted":
-            pursuit.seen_well(chosen.id, interval)
+            self._servo.zoom_out()
+            mode, reason, aim = State.SEARCHING, self._why_nobody(tracks), None
+        else:
+            pursuit.count_seen_well(chosen, interval, rig.zoom.focal_range[1])
+            mode, reason, aim = self._drive(chosen, frame.t, interval)
         self._hear()
         doubts = [] if chosen is None else pursuit.doubts(chosen.id, frame.t)
         step = Step(
@@ -174,12 +181,14 @@ class _Loop:
             detections=tuple(detections),
             tracks=tuple(tracks),
             target=chosen,
-            aim=None if drive is None else drive.aim,
+            aim=aim,
             commanded=self._servo.commanded,
             head=self._head,
             lens=self._lens,
             estimate=None if chosen is None else pursuit.estimate(chosen.id, frame.t),
             found=found,
+            head_commands=self._servo.head_commands,
+            lens_commands=self._servo.lens_commands,
         )
         self._index += 1
         return step
@@ -191,7 +200,7 @@ class _Loop:
 
     def _why_nobody(self, tracks: list[Track]) -> str:
         """Why nobody is followed."""
-        if unmet := self._settings.policy.unmet:
+        if unmet := self._policy.unmet:
             return unmet
         if not tracks:
             return "nothing is detected"
@@ -206,23 +215,34 @@ class _Loop:
             self._beyond = {n for n, each in estimates.items() if each is not None and not self._servo.can_reach(each)}
             candidates = [replace(each, reachable=each.id not in self._beyond) for each in candidates]
         head = np.array([self._head.pan, self._head.tilt])
-        number = self._settings.policy.select(candidates, head, self._rig.head.limits)
+        number = self._policy.select(candidates, head, self._rig.head.limits)
         self._pursuit.follow(number)
         return next((track for track in tracks if track.id == number), None)
 
-    def _drive(self, chosen: Track | None, frame: Frame, interval: float) -> tuple[State, str, Drive | None]:
-        """Command head and lens; what the loop is doing then, and why."""
-        if chosen is None:
-            self._servo.zoom_out()
-            return State.SEARCHING, "", None
-        if chosen.missed == 0:
-            self._last_seen = frame.t
-        if frame.t - self._last_seen > self._settings.zoom_out_after_s:
-            self._servo.zoom_out()
-            return State.LOST, f"out of sight for {frame.t - self._last_seen:.1f} s", None
+    def _drive(self, chosen: Track, t: float, interval: float) -> tuple[State, str, Aim | None]:
+        """Command head and lens; what the loop is doing then, why, and what was aimed at."""
+        seen_t = self._seen_t[chosen.id]
+        if t - seen_t > self._settings.zoom_out_after_s:
+            reason, aim = self._search(chosen, seen_t, interval)
+            return State.LOST, f"out of sight for {t - seen_t:.1f} s; {reason}", aim
         try:
-            drive = self._servo.drive(lambda t: self._pursuit.estimate(chosen.id, t), self._last_seen, interval)
+            drive = self._servo.drive(self._predict(chosen), seen_t, interval, shape=shape_of(chosen))
         except UnreachableError as error:
             self._beyond.add(chosen.id)
             return State.UNREACHABLE, str(error), None
-        return State.FOLLOWING if chosen.missed == 0 else State.COASTING, "", drive
+        zoom = "" if drive.zoom_reason == "wanted" else f"zoom: {drive.zoom_reason}"
+        return State.COASTING if chosen.missed else State.FOLLOWING, zoom, drive.aim
+
+    def _search(self, chosen: Track, seen_t: float, interval: float) -> tuple[str, Aim | None]:
+        """Look for a target that is out of sight; what the head does, and what it is aimed at."""
+        try:
+            aim = self._servo.search(self._predict(chosen), seen_t, interval)
+        except UnreachableError as error:
+            return f"the head waits: {error}", None
+        if aim is None:
+            return "the head waits: where it is by now is not known well enough", None
+        return "looked for where it should be", aim
+
+    def _predict(self, chosen: Track) -> Predict:
+        """The target at any time."""
+        return lambda t: self._pursuit.estimate(chosen.id, t)

@@ -6,13 +6,13 @@ It is driven by white acceleration, so that frames may come at any times. To the
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.axisfilter import AxisFilter, Spread, covariance_of
+from cotarget.axisfilter import AxisFilter, covariance_of
 from cotarget.boxhistory import SizeHistory, Trail
 from cotarget.config import TargetConfig
 from cotarget.geometry import Array
@@ -115,7 +115,7 @@ class Track:
         covariance: of (u, v, du, dv), (4, 4).
         score: of the last detection, 0 to 1.
         box: the last detection.
-        noise: spectral density of the acceleration that ``at`` grows the covariance with [px^2/s^3].
+        shared: whether that covers other targets too, so that it tells only what this one is inside of.
     """
 
     id: int
@@ -129,18 +129,7 @@ class Track:
     covariance: Array
     score: float
     box: Measurement
-    noise: float
-
-    def predict(self, t: float) -> Array:
-        """Where its middle will be at time ``t`` [s] if it keeps its velocity, (2,)."""
-        return self.center_px + (t - self.t) * self.velocity_px
-
-    def at(self, t: float) -> "Track":
-        """The track as expected at time ``t`` [s], with the covariance grown accordingly."""
-        P = self.covariance
-        spreads = [Spread(*map(float, (P[i, i], P[i, i + 2], P[i + 2, i + 2]))) for i in range(2)]
-        grown = [spread.after(t - self.t, self.noise) for spread in spreads]
-        return replace(self, t=t, center_px=self.predict(t), covariance=covariance_of(*grown))
+    shared: bool = False
 
 
 class TargetFilter:
@@ -158,7 +147,7 @@ class TargetFilter:
         self.settings = settings
         self.noise = settings.acceleration_px**2 * settings.manoeuvre_s
         self.t = self.born = self.seen = t
-        self.detection = detection
+        self.detection, self.shared = detection, False
         self.hits = 1
         self.missed = 0
         self.confirmed = False
@@ -199,7 +188,7 @@ class TargetFilter:
         self.mean_score += weight * (detection.score - self.mean_score)
         self._measure(detection.center_px.tolist(), self.variance(detection).tolist())
         self._note(detection)
-        self.detection = detection
+        self.detection, self.shared = detection, False
         self.hits += 1
         if not self.confirmed:
             settings = self.settings
@@ -214,22 +203,27 @@ class TargetFilter:
 
     def share(self, detection: Measurement) -> None:
         """Take a detection into account that covers other targets too: all it tells is that this one is inside."""
-        size = self.size
-        room = np.maximum(0.0, (detection.size_px - size) / 2)
+        room = room_inside(detection.size_px, self.size)
         inside = np.clip(self.center, detection.center_px - room, detection.center_px + room)
-        self._measure(inside.tolist(), ((size / 4) ** 2 + room**2).tolist())
+        self._measure(inside.tolist(), ((self.size / 4) ** 2 + room**2).tolist())
+        self.detection, self.shared = detection, True
+
+    @property
+    def patience_s(self) -> float:
+        """How long it lives without a detection [s]."""
+        if not self.confirmed:
+            return self.settings.drop_s
+        return min(self.settings.lose_s, self.seen - self.born)
 
     def is_over(self, image_size: tuple[int, int] | None) -> bool:
-        """Whether the track has been without a detection for too long, or has left the image."""
+        """Whether the track has been without a detection for too long, has left the image, or is not believed."""
         if self.missed and image_size is not None:
             width, height = image_size
             if not (-0.5 <= self._u.at <= width - 0.5 and -0.5 <= self._v.at <= height - 0.5):
                 return True
-        if not self.confirmed:
-            return self.t - self.seen > self.settings.drop_s
-        if self.mean_score < self.settings.doubt_score:
+        if self.confirmed and self.mean_score < self.settings.doubt_score:
             return True
-        return self.t - self.seen > min(self.settings.lose_s, self.seen - self.born)
+        return self.t - self.seen > self.patience_s
 
     def track(self) -> Track:
         """What the outside sees."""
@@ -245,7 +239,7 @@ class TargetFilter:
             covariance=covariance_of(self._u.spread, self._v.spread),
             score=self.detection.score,
             box=self.detection,
-            noise=self.noise,
+            shared=self.shared,
         )
 
     def variance(self, detection: Measurement) -> Array:
@@ -278,6 +272,11 @@ class TargetFilter:
 def missing(usual: Array, size: Array) -> Array:
     """How much of a target's usual width and height a box lacks [px], (..., 2), if it is a piece of it; else 0."""
     return np.asarray(np.where(size < PIECE * usual, usual - size, 0.0))
+
+
+def room_inside(around: Array, size: Array) -> Array:
+    """How far to either side of a box's middle a target of a usual size that is inside may be [px], (2,)."""
+    return np.maximum(0.0, (around - size) / 2)
 
 
 def center_variance(

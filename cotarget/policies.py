@@ -9,61 +9,18 @@ whoever leaves first, the other plans the order that serves most.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
 from cotarget.geometry import Array
 from cotarget.motionfilter import Track
+from cotarget.planning import LOOK_S, Candidate, Outlook, done_in, plan
 from cotarget.rig import PanTiltLimits
 
-# A good close-up of a second is what a target should have; some more for what the plan does not know [s].
-LOOK_S = 1.2
-# From a head that has arrived to a close-up that is good: the lens's travel and a frame [s].
-SETTLE_S = 0.6
-# An order of more targets than these is not searched whole; those that leave first are taken.
-MOST_PLANNED = 7
 # A click means the target in whose box it is, or one whose middle is within this part of the image's width.
 CLICK_PART = 0.08
-
-
-# How fast a target goes round the head is taken over this time [s].
-RATE_S = 0.1
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A confirmed track, as a policy sees it; where it is, is worked out for those policies that ask.
-
-    Attributes:
-        track: in the wide view.
-        where: gives pan and tilt that point at it so many seconds from now, (2,) [rad].
-        leaves_in: how long until it leaves the wide view [s]; inf for one that does not.
-        seen_s: how long it has been well in the close-up so far [s].
-        reachable: whether the head can point at it.
-    """
-
-    track: Track
-    where: Callable[[float], Array]
-    leaves_in: float = math.inf
-    seen_s: float = 0.0
-    reachable: bool = True
-
-    @property
-    def id(self) -> int:
-        """The track's number."""
-        return self.track.id
-
-    @cached_property
-    def at(self) -> Array:
-        """Pan and tilt that point at it now, (2,) [rad]."""
-        return self.where(0.0)
-
-    @cached_property
-    def rate(self) -> Array:
-        """How fast these change, (2,) [rad/s]."""
-        return (self.where(RATE_S) - self.at) / RATE_S
 
 
 class Policy(Protocol):
@@ -110,25 +67,6 @@ class FirstCome:
         return self._id
 
 
-@dataclass(frozen=True)
-class Outlook:
-    """What an order is made from.
-
-    Attributes:
-        waiting: those not seen for long enough yet; who leaves first comes first.
-        current: the number of the track followed before.
-        head: pan and tilt now, (2,) [rad].
-        limits: the head's.
-        look_s: how long each is looked at [s].
-    """
-
-    waiting: Sequence[Candidate]
-    current: int | None
-    head: Array
-    limits: PanTiltLimits
-    look_s: float
-
-
 @dataclass
 class Rounds:
     """Look at every target for a while and go on to the next; once all were seen, at whoever was seen least.
@@ -152,7 +90,8 @@ class Rounds:
         candidates = _reachable(candidates)
         waiting = sorted((c for c in candidates if c.seen_s < self.look_s), key=lambda c: (c.leaves_in, c.id))
         if waiting:
-            self._id = self.next_of(Outlook(waiting, self._id, head, limits, self.look_s))
+            pan, tilt = head.tolist()
+            self._id = self.next_of(Outlook(waiting, self._id, (pan, tilt), limits, self.look_s))
         else:
             least = min(candidates, key=lambda c: (c.seen_s, c.id), default=None)
             self._id = None if least is None else least.id
@@ -163,7 +102,7 @@ def nearest_deadline(outlook: Outlook) -> int:
     """The one followed before to its end; then whoever leaves first of those that can still be seen."""
     if outlook.current in {c.id for c in outlook.waiting}:
         return outlook.current
-    in_time = [c for c in outlook.waiting if _end(c, outlook, outlook.head, 0.0) <= c.leaves_in]
+    in_time = [c for c in outlook.waiting if done_in(c, outlook, outlook.head, 0.0) <= c.leaves_in]
     return (in_time or outlook.waiting)[0].id
 
 
@@ -173,34 +112,9 @@ def most_served(outlook: Outlook) -> int:
     When a target leaves is known badly: whoever made another plan at every frame would look at nobody for long enough.
     """
     current = next((c for c in outlook.waiting if c.id == outlook.current), None)
-    if current is not None and _end(current, outlook, outlook.head, 0.0) <= current.leaves_in:
+    if current is not None and done_in(current, outlook, outlook.head, 0.0) <= current.leaves_in:
         return current.id
-    planned = outlook.waiting[:MOST_PLANNED]
-    plans = {c.id: plan(c, [o for o in planned if o is not c], outlook) for c in planned}
-    return max(plans, key=lambda number: (plans[number], -number))
-
-
-def plan(first: Candidate, others: Sequence[Candidate], outlook: Outlook) -> tuple[int, float]:
-    """How many targets the best order that begins with one serves, and minus when it is over [s].
-
-    Args:
-        first: who comes first.
-        others: who may come after.
-        outlook: gives the head, and who is looked at now.
-    """
-    return _order(first, others, outlook, outlook.head, (0, 0.0)) or (0, -_end(first, outlook, outlook.head, 0.0))
-
-
-def _order(
-    first: Candidate, others: Sequence[Candidate], outlook: Outlook, head: Array, so_far: tuple[int, float]
-) -> tuple[int, float] | None:
-    """The best order from where the head is then, after what was served so far; None where the first leaves before."""
-    end = _end(first, outlook, head, -so_far[1])
-    if end > first.leaves_in:  # nobody waits for what cannot be had
-        return None
-    served, there = (so_far[0] + 1, -end), first.at + first.rate * end
-    rest = (_order(c, [o for o in others if o is not c], outlook, there, served) for c in others)
-    return max([served, *(order for order in rest if order is not None)])
+    return plan(outlook).first
 
 
 @dataclass
@@ -276,31 +190,6 @@ def leaves_in(track: Track, size: tuple[int, int]) -> float:
             border = side - 0.5 if speed > 0 else -0.5
             times.append((border - at) / speed)
     return float(max(min(times, default=math.inf), 0.0))
-
-
-def travel_s(way: Array, limits: PanTiltLimits) -> float:
-    """How long the head takes from rest to rest over a way in pan and tilt, (2,) [rad], both axes at once [s]."""
-    longest = float(np.max(np.abs(way)))
-    if longest * limits.acceleration <= limits.speed**2:  # it never reaches its speed
-        return 2 * math.sqrt(longest / limits.acceleration)
-    return longest / limits.speed + limits.speed / limits.acceleration
-
-
-def _end(candidate: Candidate, outlook: Outlook, head: Array, now: float) -> float:
-    """When a target will have been seen for long enough if it comes next; it moves on meanwhile [s from now].
-
-    Args:
-        candidate: the target.
-        outlook: gives the head's limits, and who is looked at already.
-        head: where the head is then, (2,) [rad].
-        now: when it sets out [s from now].
-    """
-    arrival = now
-    if now > 0 or candidate.id != outlook.current:  # the head is not there already
-        for _ in range(2):  # the way depends on when the head arrives; the second time is right to a few hundredths
-            arrival = now + travel_s(candidate.at + candidate.rate * arrival - head, outlook.limits)
-        arrival += SETTLE_S
-    return arrival + max(outlook.look_s - candidate.seen_s, 0.0)
 
 
 # By the names that users call them.

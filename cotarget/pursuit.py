@@ -5,6 +5,7 @@ triangulates its depth and shows any error of head or calibration.
 """
 
 import math
+from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
@@ -12,17 +13,19 @@ from functools import partial
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.closeup import CloseupFinder, Expected, Found
+from cotarget.closeup import LATEST_S, CloseupFinder, Expected, Found
 from cotarget.config import TargetConfig
 from cotarget.detection import Detection
 from cotarget.estimation import Appearance, Estimate, SpatialFilter, estimation_settings_for
 from cotarget.estimation.motion import PAN, TILT, K, L
 from cotarget.geometry import Array
-from cotarget.motionfilter import missing
-from cotarget.policies import Candidate, leaves_in
+from cotarget.motionfilter import missing, room_inside
+from cotarget.planning import Candidate
+from cotarget.policies import leaves_in
 from cotarget.rig import Frame, Image
 from cotarget.statehistory import StateHistory
 from cotarget.tracking import Track
+from cotarget.zoompolicy import is_seen_well, shape_of
 
 # Of more tracks than these only the first have a filter; there is no telling a hundred moving things apart.
 MOST_FILTERS = 12
@@ -41,6 +44,8 @@ DOUBTED_SIZE, DOUBTED_BIAS = 0.4, 5e-3
 NEAR = 3.0
 # So long after the wide view has shown it a target may have gone elsewhere [s].
 JUST_SEEN_S = 0.2
+# Of more zoom frames than these the oldest wait no longer for the wide view of their time.
+MOST_WAITING = 30
 
 
 class Pursuit:
@@ -65,6 +70,8 @@ class Pursuit:
         self._zoom_t = math.inf
         self._unfound_s = 0.0
         self._finder = CloseupFinder(calibration, target)
+        self._waiting: deque[Frame] = deque(maxlen=MOST_WAITING)  # zoom frames without a wide view of their time
+        self._apart_s = 0.0  # by which the newest zoom frame was newer than the newest wide one
         self._to_base = calibration.hand_eye() * calibration.T_zoom0_fixed
         self.states = StateHistory()
 
@@ -100,6 +107,11 @@ class Pursuit:
                 self._filters[track.id] = SpatialFilter(self._calibration, self._target, self._assumed)
             found = self._filters[track.id]
             box, sigma_px = track.box, None
+            if track.shared:  # it is inside of what covers others too, and the finder would learn those
+                inside = Detection(track.center_px, np.zeros(2), track.score, clipped=True)  # this frame shows no size
+                room = room_inside(box.size_px, track.size_px)
+                found.see_wide(inside, frame.t, sigma_px=np.hypot(room, track.size_px / 2))
+                continue
             lacks = missing(track.size_px, box.size_px)
             if lacks.any() and isinstance(box, Detection):  # a piece of it, which tells no size and its middle badly
                 found.see_wide(replace(box, clipped=True), frame.t, sigma_px=lacks / 2)
@@ -111,10 +123,34 @@ class Pursuit:
             size_px = track.larger_side_px if self._target.dimension == "wingspan" else None
             found.see_wide(box, frame.t, sigma_px=sigma_px, size_px=size_px)
 
-    def see_zoom(self, frame: Frame) -> Found | None:
-        """Look for the followed target in a frame of the zoom view, and take it into account where it is found."""
-        if not self._closed_loop or self._followed is None:
+    def see_zoom(self, frame: Frame | None, wide_t: float) -> Found | None:
+        """Look for the followed target in the zoom view, and take it into account where it is found.
+
+        A frame that is newer than the wide view waits until that has shown the target at about its time.
+
+        Args:
+            frame: of the zoom view; None where there is no new one.
+            wide_t: when the newest wide frame was exposed [s].
+        """
+        if not self._closed_loop:
             return None
+        if frame is not None:
+            self._waiting.append(frame)
+            self._apart_s = frame.t - wide_t
+        if self._followed is None:
+            self._waiting.clear()
+            return None
+        due = next((each for each in reversed(self._waiting) if self._finder.sight_at(each.t) is not None), None)
+        done_t = (
+            wide_t - LATEST_S if due is None else due.t
+        )  # what is older was not seen then, or will not be looked at
+        while self._waiting and self._waiting[0].t <= done_t:
+            self._waiting.popleft()
+        return None if due is None else self._look_close(due)
+
+    def _look_close(self, frame: Frame) -> Found | None:
+        """Look for the followed target in a frame of whose time the wide view has shown it."""
+        assert self._followed is not None, "who asks has looked"
         pose, estimate = self.states.at(frame.t), self.estimate(self._followed, frame.t)
         if pose is None or estimate is None:
             return None
@@ -177,7 +213,10 @@ class Pursuit:
             wrong.append(f"the head points {math.degrees(math.hypot(*estimate.bias)):.2g} degrees beside")
         if wrong:
             found.append(f"the told size or the calibration seems wrong: {', '.join(wrong)}")
-        if number == self._followed and self._overdue:
+        if number == self._followed and abs(self._apart_s) > LATEST_S:
+            later = "zoom" if self._apart_s < 0 else "wide"
+            found.append(f"the views are too far apart in time: the {later} one comes {abs(self._apart_s):.2f} s later")
+        elif number == self._followed and self._overdue:
             found.append(
                 f"for {self._unfound_s:.1f} s not found where the zoom view should show it: it is hidden there, or the "
                 "told size or the calibration is wrong"
@@ -190,9 +229,19 @@ class Pursuit:
             self._followed, self._unfound_s = number, 0.0
             self._finder = CloseupFinder(self._calibration, self._target)
 
-    def seen_well(self, number: int, seconds: float) -> None:
-        """Note that a track was well in the close-up for some time [s]."""
-        self._seen_s[number] = self._seen_s.get(number, 0.0) + seconds
+    def count_seen_well(self, track: Track, seconds: float, longest_px: float) -> None:
+        """Note whether a track was well in the close-up, by where head and lens have told that they were at its time.
+
+        Args:
+            track: as the newest wide frame has it.
+            seconds: for how long [s] it counts.
+            longest_px: longest focal length, as the lens tells it [px].
+        """
+        pose, estimate = self.states.at(track.t), self.estimate(track.id, track.t)
+        if pose is None or estimate is None or track.t - estimate.measured_t > JUST_SEEN_S:
+            return
+        if is_seen_well(estimate, pose.pan, pose.tilt, pose.nominal_px, longest_px, shape=shape_of(track)):
+            self._seen_s[track.id] = self._seen_s.get(track.id, 0.0) + seconds
 
     def estimate(self, number: int, t: float) -> Estimate | None:
         """A track at a time [s]; None where it is not known."""

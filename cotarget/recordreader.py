@@ -56,6 +56,12 @@ class Recording:
         return sum(event.call == "fixed.read" and event.image is not None for event in self.events)
 
     @property
+    def pictures(self) -> dict[float, int]:
+        """The numbers of the fixed camera's pictures, from 0, by when they were exposed [s]."""
+        frames = [event for event in self.events if event.call == "fixed.read"]
+        return {float(e.result[0] or 0.0): int(Path(e.image).stem) for e in frames if e.image is not None}
+
+    @property
     def seconds(self) -> float:
         """From the first call to the last, on the rig's clock [s]."""
         return self.events[-1].at - self.events[0].at if self.events else 0.0

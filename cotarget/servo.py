@@ -8,6 +8,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from cotarget.calibration import Calibration
 from cotarget.deadzone import Steering, SteeringSettings
 from cotarget.errors import UnreachableError
@@ -26,13 +28,15 @@ class ServoSettings:
     """How head and lens are driven.
 
     Attributes:
-        command_delay_s: from a command to the start of motion [s].
+        command_delay_s: from a command to the start of the head's motion [s].
+        lens_delay_s: likewise of the lens's [s]; as the head's by default.
         predict: whether the target's motion is allowed for; without it the head is sent where the target was seen.
         steering: how the head keeps up, and when it is left alone.
         zoom: when the lens zooms in and out.
     """
 
     command_delay_s: float = 0.0
+    lens_delay_s: float | None = None
     predict: bool = True
     steering: SteeringSettings = field(default_factory=SteeringSettings)
     zoom: ZoomSettings = field(default_factory=ZoomSettings)
@@ -53,8 +57,25 @@ class Drive:
     zoom_reason: str
 
 
+@dataclass(frozen=True)
+class _Course:
+    """Where the head shall be.
+
+    Attributes:
+        effect_t: when a command given now takes effect [s].
+        target: the target then.
+        first: the aim at it.
+        then: the aim at where it is a frame later, at the same focal length.
+    """
+
+    effect_t: float
+    target: Estimate
+    first: Aim
+    then: Aim
+
+
 class Servo:
-    """Drives head and lens after one target at a time; remembers what was commanded.
+    """Drives head and lens after one target at a time; remembers what was commanded, and how often.
 
     Args:
         rig: its head, lens and clock.
@@ -69,18 +90,66 @@ class Servo:
         self._steering = Steering(rig.head.limits, settings.steering)
         state = rig.head.state()
         self.commanded = (state.pan, state.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
+        self.head_commands, self.lens_commands = 0, 1  # sent so far
 
-    def drive(self, predict: Predict, seen_t: float, interval: float) -> Drive:
+    def drive(self, predict: Predict, seen_t: float, interval: float, *, shape: float = 1.0) -> Drive:
         """Send head and lens after a target.
 
         Args:
             predict: the target at any time [s].
             seen_t: when it was seen last [s].
             interval: from one command to the next [s].
+            shape: width over height of its box.
 
         Raises:
             UnreachableError: no pan and tilt within the limits do it, or nothing is known of it.
         """
+        course = self._course(predict, seen_t, interval)
+        self._steer(course, interval)
+        pan, tilt, focal = self.commanded
+        now, lens_delay_s = self._rig.clock.now(), self._settings.lens_delay_s
+        exposed = interval + (course.effect_t if lens_delay_s is None else now + lens_delay_s)
+        (pan_then, _), (tilt_then, _) = self._steering.head.at(exposed)
+        then = predict(exposed if self._settings.predict else seen_t)
+        choice = self._zoom.choose(
+            None if then is None else expect(then, pan_then, tilt_then, focal, shape=shape),
+            course.first.focal_px * course.then.range / course.first.range,
+            self._true(focal),
+            now,
+            self._true(self._rig.zoom.state().focal_px),
+        )
+        nominal = self._calibration.zoom.nominal_for(choice.focal_px)
+        if abs(math.log(nominal / focal)) > NO_CHANGE:
+            focal = self._rig.zoom.zoom(nominal)
+            self.lens_commands += 1
+        self.commanded = (pan, tilt, focal)
+        return Drive(course.first, choice.chance, choice.reason)
+
+    def search(self, predict: Predict, seen_t: float, interval: float) -> Aim | None:
+        """Zoom out, and send the head to where a target should be that is out of sight.
+
+        Args:
+            predict: the target at any time [s].
+            seen_t: when it was seen last [s].
+            interval: from one command to the next [s].
+
+        Returns:
+            The aim at it; None where it may as well be outside of all that the zoom camera sees, and the head waits:
+            one standard deviation of where it is reaches beyond the border of the widest close-up.
+
+        Raises:
+            UnreachableError: no pan and tilt within the limits do it, or nothing is known of it.
+        """
+        self.zoom_out()
+        course = self._course(predict, seen_t, interval)
+        seen = course.target.appearance(course.first.pan, course.first.tilt, self._rig.zoom.focal_range[0])
+        if seen is None or (np.sqrt(np.diag(seen.covariance)) > np.array(self._rig.zoom.size) / 2).any():
+            return None
+        self._steer(course, interval)
+        return course.first
+
+    def _course(self, predict: Predict, seen_t: float, interval: float) -> _Course:
+        """Where the head shall be. Raises as `drive` does."""
         now = self._rig.clock.now()
         effect = now + self._settings.command_delay_s
         times = (effect, effect + interval) if self._settings.predict else (seen_t, seen_t)
@@ -91,29 +160,25 @@ class Servo:
         self._steering.head.saw(state)  # a head that was halted, or is slow, is not where it was sent
         reach = reach_of(self._rig, state)
         first = self._aim(at_effect, reach)
-        found = self._aim(then, reach, first)
-        rates = (found.pan - first.pan) / interval, (found.tilt - first.tilt) / interval
+        return _Course(effect, at_effect, first, self._aim(then, reach, first))
+
+    def _steer(self, course: _Course, interval: float) -> None:
+        """Send the head, if that is worth it."""
+        effect, first, then = course.effect_t, course.first, course.then
+        rates = (then.pan - first.pan) / interval, (then.tilt - first.tilt) / interval
         pan, tilt, focal = self.commanded
-        focal_now = self._true(focal)
-        view = self._rig.zoom.size[0] / focal_now
         command = self._steering.decide(
-            effect, interval, (first.pan, first.tilt), rates, view, effect - at_effect.measured_t
+            effect,
+            interval,
+            (first.pan, first.tilt),
+            rates,
+            self._rig.zoom.size[0] / self._true(focal),
+            effect - course.target.measured_t,
         )
         if command is not None:
             pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)
-        (pan_then, _), (tilt_then, _) = self._steering.head.at(effect + interval)
-        choice = self._zoom.choose(
-            expect(then, pan_then, tilt_then, focal),
-            first.focal_px * found.range / first.range,
-            focal_now,
-            now,
-            self._true(self._rig.zoom.state().focal_px),
-        )
-        nominal = self._calibration.zoom.nominal_for(choice.focal_px)
-        if abs(math.log(nominal / focal)) > NO_CHANGE:
-            focal = self._rig.zoom.zoom(nominal)
-        self.commanded = (pan, tilt, focal)
-        return Drive(first, choice.chance, choice.reason)
+            self.head_commands += 1
+            self.commanded = (pan, tilt, focal)
 
     def zoom_out(self) -> None:
         """Send the lens to its shortest focal length; the head waits."""
@@ -121,6 +186,7 @@ class Servo:
         shortest = self._rig.zoom.focal_range[0]
         if focal > shortest:
             self.commanded = (pan, tilt, self._rig.zoom.zoom(shortest))
+            self.lens_commands += 1
 
     def can_reach(self, estimate: Estimate) -> bool:
         """Whether the head can point at where a target is estimated to be."""

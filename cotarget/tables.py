@@ -56,7 +56,7 @@ def _join(where: str, name: str) -> str:
 def _convert(hint: Any, value: Any, where: str) -> Any:
     """Check one value against its field's type and convert it."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin is types.UnionType:  # the only unions are "or None", which TOML cannot say
+    if origin in (types.UnionType, typing.Union):  # the only unions are "or None", which TOML cannot say
         return _convert(args[0], value, where)
     if origin is Literal:
         if value not in args or isinstance(value, bool):

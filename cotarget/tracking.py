@@ -4,8 +4,9 @@ Every track has its own motion filter; detections are assigned to tracks by the 
 Mahalanobis gate.
 """
 
+import statistics
+from collections import deque
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -21,7 +22,7 @@ from cotarget.motionfilter import (
     settings_for,
 )
 
-__all__ = ["Measurement", "Track", "Tracker", "TrackerSettings", "settings_for", "size_for"]
+__all__ = ["Measurement", "Track", "Tracker", "TrackerSettings", "settings_for"]
 
 # A cost that no assignment inside the gate reaches, so that it marks pairs that must not be matched.
 IMPOSSIBLE = 1e6
@@ -39,13 +40,11 @@ OVERLAP_ENOUGH = 0.3
 OVERLAP_BONUS = 4.0
 # A detection that covers this much of a track's predicted box explains that track, even where another has won it.
 COVERED = 0.6
-
-
-def size_for(track: Track, dimension: Literal["width", "height", "wingspan"]) -> float:
-    """The size of a track [px] along the dimension whose true size is known."""
-    if dimension == "wingspan":
-        return track.larger_side_px
-    return float(track.size_px[0 if dimension == "width" else 1])
+# Of more detections in a frame than these the rest is left out: snow, rain or flicker must not hold up the next frame.
+# Real films of birds and of a dozen people have up to 10.
+MOST_DETECTIONS = 100
+# The usual time between frames is the median of so many; before a second frame has come it is taken for this [s].
+INTERVALS, FIRST_INTERVAL_S = 5, 1.0
 
 
 class Tracker:
@@ -63,6 +62,7 @@ class Tracker:
         self._tracks: list[TargetFilter] = []
         self._next_id = 1
         self._t: float | None = None
+        self._intervals = deque([FIRST_INTERVAL_S], INTERVALS)
 
     @property
     def tracks(self) -> list[Track]:
@@ -73,7 +73,8 @@ class Tracker:
         """Take one frame's detections into account.
 
         Args:
-            detections: what was found, best first.
+            detections: what was found, best first. Of more than MOST_DETECTIONS those next to confirmed tracks are
+                taken, then the best.
             t: when the frame's light fell [s]. A frame that is not newer than the last one tells nothing and is
                 ignored; a clock that jumped back by more than a track lives starts everything anew.
 
@@ -84,9 +85,8 @@ class Tracker:
             if self._t - t <= self._settings.lose_s:
                 return self.tracks
             self._tracks.clear()
-        self._t = t
-        for state in self._tracks:
-            state.predict(t)
+        self._begin(t)
+        detections = self._worth(detections)
         matches: dict[int, int] = {}
         crowds: dict[int, int] = {}
         if self._tracks and detections:
@@ -105,17 +105,44 @@ class Tracker:
         self._bear([detection for j, detection in enumerate(detections) if j not in taken], t)
         return self.tracks
 
+    def _begin(self, t: float) -> None:
+        """Move all tracks to a new frame's time, but for those that a gap between frames has outlived.
+
+        The room in which a target is looked for grows with the gap, until whatever appears would be taken for it. The
+        usual time between frames is no such gap, even where a track lives no longer.
+        """
+        usual = statistics.median(self._intervals)
+        self._tracks = [state for state in self._tracks if t - state.seen <= state.patience_s + usual]
+        for state in self._tracks:
+            state.predict(t)
+        if self._t is not None and t > self._t:
+            self._intervals.append(t - self._t)
+        self._t = t
+
+    def _worth(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
+        """The detections to be taken, in their order: no more than MOST_DETECTIONS."""
+        if len(detections) <= MOST_DETECTIONS:
+            return detections
+        distance = np.full(len(detections), np.inf)
+        confirmed = [state for state in self._tracks if state.confirmed]
+        if confirmed:
+            pairs = _Pairs(confirmed, detections)
+            distance = np.where(pairs.possible | (pairs.covered > COVERED), pairs.distance, np.inf).min(axis=0)
+        return [detections[j] for j in sorted(np.argsort(distance, kind="stable")[:MOST_DETECTIONS].tolist())]
+
     def _bear(self, detections: Sequence[Measurement], t: float) -> None:
         """Begin a track at each detection that does not cover one."""
         if not detections:
             return
-        explained = (_Pairs(self._tracks, detections).covered > COVERED).any(axis=0)
-        born: list[TargetFilter] = []
-        for detection in (detections[int(j)] for j in np.flatnonzero(~explained)):
-            if not (_Pairs(born, [detection]).covered > COVERED).any():
-                born.append(TargetFilter(self._next_id, detection, t, self._settings, self._image_size))
+        at, size = _boxes_of(self._tracks)
+        center, extent = _boxes(detections)
+        free = np.all(_shared(at, size, center, extent) <= COVERED * _area(size)[:, None], axis=0)
+        covers = _shared(center, extent, center, extent) > COVERED * _area(extent)[:, None]
+        for j, detection in enumerate(detections):
+            if free[j]:  # whoever covers what is born here is no other
+                free &= ~covers[j]
+                self._tracks.append(TargetFilter(self._next_id, detection, t, self._settings, self._image_size))
                 self._next_id += 1
-        self._tracks += born
 
 
 class _Pairs:
@@ -127,32 +154,48 @@ class _Pairs:
         covered: the part of the track's box that the detection covers, 0 to 1.
         overlap: intersection over union of the boxes, 0 to 1.
         confirmed: which tracks are.
+        possible: which detections may be of which track.
     """
 
     def __init__(self, states: Sequence[TargetFilter], detections: Sequence[Measurement]) -> None:
-        """Compare tracks and detections."""
-        n, m = len(states), len(detections)
+        """Compare tracks and detections, some of each."""
         self.confirmed = [state.confirmed for state in states]
-        at = np.array([state.center for state in states]).reshape(n, 1, 2)
-        size = np.array([state.size for state in states]).reshape(n, 1, 2)
-        spread = np.array([state.place_variance for state in states]).reshape(n, 1, 2)
-        center = np.array([detection.center_px for detection in detections]).reshape(1, m, 2)
-        extent = np.array([detection.size_px for detection in detections]).reshape(1, m, 2)
+        (at, size), (center, extent) = _boxes_of(states), _boxes(detections)
+        spread = np.array([state.place_variance for state in states])[:, None]
         cut = np.array([detection.clipped for detection in detections], dtype=bool)  # its size says nothing
-        if states:
-            spread = spread + center_variance(states[0].settings, extent, cut[:, None], missing(size, extent))
-        own, other = _area(size), _area(extent)
+        lacks = missing(size[:, None], extent)
+        spread = spread + center_variance(states[0].settings, extent, cut[:, None], lacks)
+        own, other = _area(size)[:, None], _area(extent)
         resized = np.where(cut, 0.0, np.log(other / own) / 2 / SIZE_SIGMA)
-        off = (center - at) ** 2 / spread
+        off = (center - at[:, None]) ** 2 / spread
         self.distance: Array = off[..., 0] + off[..., 1] + resized**2
         score = np.array([min(max(detection.score, LEAST_SCORE), 0.5) for detection in detections])
         self.distance += 2 * np.log((1 - score) / score)
         self.log_volume: Array = np.log(_area(spread))
-        low = np.maximum(at - size / 2, center - extent / 2)
-        high = np.minimum(at + size / 2, center + extent / 2)
-        shared = _area(np.maximum(0.0, high - low))
+        shared = _shared(at, size, center, extent)
         self.covered: Array = shared / own
         self.overlap: Array = shared / (own + other - shared)
+        # A box that grew into another still overlaps its track.
+        self.possible = (self.distance <= GATE_CHI2) | (self.overlap > OVERLAP_ENOUGH)
+
+
+def _boxes_of(states: Sequence[TargetFilter]) -> tuple[Array, Array]:
+    """Middles and sizes of tracks [px], (n, 2) each."""
+    at, size = [state.center for state in states], [state.size for state in states]
+    return np.array(at).reshape(-1, 2), np.array(size).reshape(-1, 2)
+
+
+def _boxes(detections: Sequence[Measurement]) -> tuple[Array, Array]:
+    """Those of detections."""
+    center, size = [each.center_px for each in detections], [each.size_px for each in detections]
+    return np.array(center).reshape(-1, 2), np.array(size).reshape(-1, 2)
+
+
+def _shared(at: Array, size: Array, center: Array, extent: Array) -> Array:
+    """Area that n boxes share with m others [px^2], (n, m); middles and sizes are (n, 2) and (m, 2)."""
+    low = np.maximum((at - size / 2)[:, None], center - extent / 2)
+    high = np.minimum((at + size / 2)[:, None], center + extent / 2)
+    return _area(np.maximum(0.0, high - low))
 
 
 def _area(sides: Array) -> Array:
@@ -166,9 +209,7 @@ def _assign(pairs: _Pairs) -> dict[int, int]:
     Confirmed tracks choose first: one that coasts knows badly where its target is, and a new track that was begun there
     meanwhile knows it well, yet it is the old target that was found again.
     """
-    # A box that grew into another still overlaps its track.
-    possible = (pairs.distance <= GATE_CHI2) | (pairs.overlap > OVERLAP_ENOUGH)
-    cost = np.where(possible, pairs.distance + pairs.log_volume - OVERLAP_BONUS * pairs.overlap, IMPOSSIBLE)
+    cost = np.where(pairs.possible, pairs.distance + pairs.log_volume - OVERLAP_BONUS * pairs.overlap, IMPOSSIBLE)
     matches: dict[int, int] = {}
     for confirmed in (True, False):
         group = [i for i, each in enumerate(pairs.confirmed) if each == confirmed]
@@ -177,7 +218,7 @@ def _assign(pairs: _Pairs) -> dict[int, int]:
         if group and free:
             rows, columns = linear_sum_assignment(cost[group][:, free])
             found = ((group[i], free[j]) for i, j in zip(rows.tolist(), columns.tolist(), strict=True))
-            matches |= {i: j for i, j in found if possible[i, j]}
+            matches |= {i: j for i, j in found if pairs.possible[i, j]}
     return matches
 
 

@@ -1,6 +1,11 @@
 """How far to zoom in: as close as is wanted while the target surely stays in the image, and out before it is lost.
 
 Pure: everything is in tangents at the zoom camera and in times that the caller gives. Focal lengths are true ones [px].
+
+Chances are for the first frame that a command can change, though the lens may travel on for a second: the next frame
+corrects it on its way. Counting with what may become of the target until the lens arrives, unseen all the while, keeps
+it too wide: of birds 25 m away that are in frame all the time as it is, 56 % of the frames were good close-ups, and not
+69 %; counting with a fifth of the whole way out besides, 22 %. For persons it changed nothing.
 """
 
 import math
@@ -8,11 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cotarget.estimation.estimate import Estimate
+from cotarget.estimation.estimate import Appearance, Estimate
 from cotarget.geometry import Array
+from cotarget.motionfilter import Track
 
 # Halvings of the range of focal lengths, tenfold or so, until it is known to a thousandth.
 HALVINGS = 12
+# Well seen is whoever is wholly in the image with this chance, at such a part of the wanted size; as `cotarget.metrics`
+# has a good close-up.
+SEEN_WELL, GOOD_SIZE = 0.8, (0.8, 1.25)
 
 
 @dataclass(frozen=True)
@@ -67,9 +76,13 @@ class ZoomChoice:
     reason: str
 
 
-def expect(
-    estimate: Estimate, pan: float, tilt: float, nominal_px: float, *, width_over_height: float = 1.0
-) -> Expected | None:
+def shape_of(track: Track) -> float:
+    """A track's usual width over its height."""
+    width, height = track.size_px.tolist()
+    return float(width / height)
+
+
+def expect(estimate: Estimate, pan: float, tilt: float, nominal_px: float, *, shape: float = 1.0) -> Expected | None:
     """Work out how a target will stand to the line of sight.
 
     Args:
@@ -77,26 +90,51 @@ def expect(
         pan: where the head will be then [rad].
         tilt: likewise.
         nominal_px: any focal length near the one in question; it only matters for the lens's centre.
-        width_over_height: of the target's box.
+        shape: width over height of the target's box.
 
     Returns:
         None where it will be behind the zoom camera.
     """
     seen = estimate.appearance(pan, tilt, nominal_px)
-    if seen is None:
-        return None
+    return None if seen is None else _expected(estimate, seen, shape)
+
+
+def _expected(estimate: Estimate, seen: Appearance, shape: float) -> Expected:
     focal = seen.focal_px
-    shape = {
-        "height": (width_over_height, 1.0),
-        "width": (1.0, 1 / width_over_height),
-        "wingspan": (min(width_over_height, 1.0), min(1 / width_over_height, 1.0)),
+    sides = {
+        "height": (shape, 1.0),
+        "width": (1.0, 1 / shape),
+        "wingspan": (min(shape, 1.0), min(1 / shape, 1.0)),
     }[estimate.target.dimension]
     return Expected(
         seen.offset_px / focal,
         seen.covariance / (focal[:, None] * focal),
-        0.5 * seen.size_px / focal * np.array(shape),
+        0.5 * seen.size_px / focal * np.array(sides),
         seen.size_sigma,
     )
+
+
+def is_seen_well(
+    estimate: Estimate, pan: float, tilt: float, nominal_px: float, longest_px: float, *, shape: float = 1.0
+) -> bool:
+    """Whether a target is wholly in the close-up and about as large as wanted, as far as is known.
+
+    Args:
+        estimate: of the target, for the time of that close-up.
+        pan: where the head was then [rad].
+        tilt: likewise.
+        nominal_px: what the lens told then [px].
+        longest_px: the most that it can tell [px]; a target that is too far off for the wanted size need not have it.
+        shape: width over height of the target's box.
+    """
+    seen = estimate.appearance(pan, tilt, nominal_px)
+    if seen is None:
+        return False
+    zoom, focal = estimate.calibration.zoom, float(seen.focal_px[0])
+    wanted_px = min(estimate.target.wanted_px, seen.size_px * zoom.at(longest_px).focal_px[0] / focal)
+    if not GOOD_SIZE[0] * wanted_px <= seen.size_px <= GOOD_SIZE[1] * wanted_px:
+        return False
+    return chance_inside(_expected(estimate, seen, shape), focal, zoom.size) >= SEEN_WELL
 
 
 def chance_inside(expected: Expected, focal_px: float, size: tuple[int, int], rim_px: float = 0.0) -> float:

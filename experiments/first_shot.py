@@ -4,7 +4,9 @@ A book, a person and a bird in the field of `experiments.hold_scenes` are shot a
 each time one command from what the wide view has told, judged in the zoom frame that follows at the focal length
 solved for, then one more after a look through the zoom camera. Beside what was measured stands the sum, in quadrature,
 of what each cause leaves alone while all else is as it truly is: detection, size, calibration, delay, the head's steps
-and the lens's positions. A shot at something else than the target counts as a miss, and not in the budget.
+and the lens's positions. A shot at something else than the target counts as a miss, and not in the budget. A chance
+passes unused while the target is not seen or cannot be reached: how many did is told beside, and a correction that
+could not be fired counts as one that missed.
 
     python -m experiments.first_shot [--seeds 10] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -13,7 +15,7 @@ import dataclasses
 import functools
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,7 +39,7 @@ WANTED: Mapping[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class FirstShotSettings(FieldSettings):
-    """How many seeds, and which targets; a shot every 0.8 s from the third second on.
+    """How many seeds, and which targets; a chance to shoot every 0.8 s from the third second on.
 
     Attributes:
         targets: book, person, bird.
@@ -48,22 +50,24 @@ class FirstShotSettings(FieldSettings):
 
 
 def run(settings: FirstShotSettings) -> list[Row]:
-    """Calibrate the rig once, then shoot at each target; a row for each shot."""
+    """Calibrate the rig once, then shoot at each target; a row for each chance."""
     return over_seeds(functools.partial(one, calibrated(settings)), settings)
 
 
 def one(calibration: Calibration, settings: FirstShotSettings, seed: int) -> list[Row]:
-    """All shots of a seed."""
+    """All chances of a seed."""
     rows: list[Row] = []
     for name in settings.targets:
         config = hold_config(name, seed)
         fired = fire(calibration, config, name, target_of(config, name), settings.seconds)
-        rows += [{"seed": seed, "target": name} | _row(each) for each in fired]
+        rows += [{"seed": seed, "target": name, "fired": each is not None} | _row(each) for each in fired]
     return rows
 
 
-def _row(fired: Fired) -> Row:
-    """One shot; angles as parts of the image's width."""
+def _row(fired: Fired | None) -> Row:
+    """One shot; angles as parts of the image's width. Nothing of a chance that passed."""
+    if fired is None:
+        return {}
     row = fired.row
 
     def of_width(angle: float) -> float:
@@ -91,21 +95,28 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def _figures(rows: Sequence[Row]) -> dict[str, float]:
-    hits = [row for row in rows if row["on_target"]]
+    shots = [row for row in rows if row["fired"]]
+    hits = [row for row in shots if row["on_target"]]
     causes = {cause: rms(row[cause] for row in hits) for cause in CAUSES}
     total, measured = math.hypot(*causes.values()), rms(row["measured"] for row in hits)
-    corrected = [row["corrected_width"] for row in rows if row["corrected_width"] is not None]
+    corrected = [math.inf if row["corrected_width"] is None else row["corrected_width"] for row in shots]
     return {
-        "shots": len(rows),
-        "in_frame": float(np.mean([row["in_frame"] for row in rows])),
-        "tpo_width": float(np.median([row["tpo_width"] for row in rows])),
-        "found": float(np.mean([row["found"] for row in rows])),
-        "corrected_width": float(np.median(corrected)) if corrected else math.nan,
+        "shots": len(shots),
+        "not fired": len(rows) - len(shots),
+        "in_frame": _of(np.mean, [row["in_frame"] for row in shots]),
+        "tpo_width": _of(np.median, [row["tpo_width"] for row in shots]),
+        "found": _of(np.mean, [row["found"] for row in shots]),
+        "corrected_width": _of(np.median, corrected),
         **causes,
         "sum": total,
         "measured": measured,
         "sum over measured": total / measured,
     }
+
+
+def _of(mean: Callable[[Sequence[float]], Any], values: Sequence[float]) -> float:
+    """A mean or median; nan of nothing."""
+    return float(mean(values)) if values else math.nan
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
@@ -136,7 +147,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Offsets of first shots and corrected ones, and the budgets."""
     left, right = figure.subplots(1, 2)
     for name, figures in summarise(rows).items():
-        mine = [row for row in rows if row["target"] == name]
+        mine = [row for row in rows if row["target"] == name and row["fired"]]
         for key, style in (("tpo_width", "-"), ("corrected_width", "--")):
             offsets = np.sort([row[key] for row in mine if row[key] is not None])
             label = name if key == "tpo_width" else f"{name}, corrected"

@@ -61,9 +61,7 @@ def one(calibration: Calibration, settings: FiveSettings, seed: int) -> list[Row
         target = target_of(config, kind)
         view = record(config, target, settings.seconds, pictures=settings.closed_loop)
         for policy, make in POLICIES.items():
-            how = FollowSettings(
-                command_delay_s=config.command_delay_s, policy=make(), closed_loop=settings.closed_loop
-            )
+            how = FollowSettings(command_delay_s=config.command_delay_s, policy=make, closed_loop=settings.closed_loop)
             seconds = good_seconds(calibration, config, target, settings.seconds, how, view)
             rows.append(
                 {

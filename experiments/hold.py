@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration, calibrate_rig
 from cotarget.config import RigConfig, SimConfig, TargetConfig
-from cotarget.detection import make_detector
+from cotarget.detection import Detector, make_detector
 from cotarget.judging import add_row
 from cotarget.loop import FollowSettings, Step, follow
 from cotarget.metrics import Row as Judged
@@ -68,7 +68,7 @@ WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
     },
 }
 # Told beside them.
-ALSO = ("tpe_px_median", "false_tracks_per_min", "commands_per_min", "reversals_per_min")
+ALSO = ("tpe_px_median", "false_tracks_per_min", "commands_per_min", "reversals_per_min", "lens_commands_per_min")
 
 
 @dataclass(frozen=True)
@@ -161,8 +161,20 @@ def watched(
         world, detector = SimWorld(config), make_detector(target, config.rate_hz)
     else:
         world, detector = open_on(view, config, closed_loop=settings.closed_loop)
+    yield from watched_in(world, detector, calibration, target, seconds, settings)
+
+
+def watched_in(
+    world: SimWorld,
+    detector: Detector,
+    calibration: Calibration,
+    target: TargetConfig,
+    seconds: float,
+    settings: FollowSettings,
+) -> Iterator[tuple[Step, Truth]]:
+    """The same in a world that is open, with a detector of one's own."""
     truth = world.truth()
-    with SafeRig(world.rig, config.safety) as rig:
+    with SafeRig(world.rig, world.config.safety) as rig:
         for step in follow(rig, calibration, target, detector, seconds=seconds, settings=settings):
             yield step, truth
 
@@ -231,7 +243,7 @@ EXPERIMENT = Experiment(
     "hold",
     "How long and how well a target is held in the close-up.",
     SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=10.0, calibrated=False),
+    dataclasses.replace(SETTINGS, seeds=1, seconds=7.0, calibrated=False),
     run,
     summarise,
     describe,

@@ -35,8 +35,8 @@ from experiments.true_rig import true_calibration
 # A head and a lens that are wherever they are sent within a millisecond.
 QUICK_DEG_S, QUICK_DEG_S2, QUICK_STEPS_S = 1e6, 1e9, 1e6
 BEGIN_S = 3.0  # of the first shot, one second after the background was learnt
-EVERY_S = 0.8  # from one shot to the next at least; a shot and its correction take 0.7 s
-ROUNDING = 1e-6  # of frame times over the period
+EVERY_S = 0.8  # from one chance to shoot to the next; a shot and its correction take 0.7 s
+ROUNDING = 1e-6  # of frame times, and of them over the period
 CAUSES = ("detection", "size", "calibration", "delay", "steps", "lens")
 
 
@@ -97,8 +97,12 @@ def quick(config: RigConfig) -> RigConfig:
     return replace(config, sim=replace(config.sim, head=head, zoom=zoom))
 
 
-def fire(calibration: Calibration, config: RigConfig, name: str, target: TargetConfig, seconds: float) -> list[Fired]:
+def fire(
+    calibration: Calibration, config: RigConfig, name: str, target: TargetConfig, seconds: float
+) -> list[Fired | None]:
     """Shoot at a target again and again, each time from the wide view alone.
+
+    A chance to shoot comes every EVERY_S, and passes where the target is not seen just then or cannot be reached.
 
     Args:
         calibration: what is known of the rig.
@@ -106,20 +110,24 @@ def fire(calibration: Calibration, config: RigConfig, name: str, target: TargetC
         name: of the target.
         target: what is told of it.
         seconds: for how long [s].
+
+    Returns:
+        What came of each chance; None where nothing was fired.
     """
     config = quick(config)
     world = SimWorld(config)
     truth, exact = world.truth(), true_calibration(world, stops=config.sim.zoom.lens_steps)
-    fired = []
+    fired: list[Fired | None] = []
     with SafeRig(world.rig, config.safety) as rig:
         lookout = _Lookout(rig, calibration, config, target)
         begin = BEGIN_S
         while rig.clock.now() < seconds:
             lookout.look()
-            if lookout.frame.t < begin or lookout.track is None or lookout.track.missed:
+            if lookout.frame.t < begin - ROUNDING:
                 continue
             begin = lookout.frame.t + EVERY_S
-            if (shot := lookout.shoot()) is None:
+            if lookout.track is None or lookout.track.missed or (shot := lookout.shoot()) is None:
+                fired.append(None)
                 continue
             row = observe(lookout.judged(shot), truth, name, target)
             t = shot.exposed_t
@@ -209,7 +217,7 @@ class _Lookout:
     def see_zoom(self) -> bool:
         """Look for the target in the shot's zoom frame, for the next shot; whether it was found."""
         assert self._both is not None, "a shot was taken"
-        return self._both.see_zoom(self._zoom) is not None
+        return self._both.see_zoom(self._zoom, self.frame.t) is not None
 
     def forget(self) -> None:
         """Forget what the zoom view has shown."""

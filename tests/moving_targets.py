@@ -108,7 +108,6 @@ class ZoomView:
     tilt: float
     nominal_px: float
     t: float
-    size_px: float
 
 
 class Flight:
@@ -180,8 +179,7 @@ class Flight:
         if not lens.inside(x_zoom[None])[0]:
             return None
         pixel = lens.project(x_zoom[None])[0] + self.rng.normal(0, ZOOM_NOISE[self.name], 2)
-        side = max(self.sides(t)) * lens.fx / x_zoom[2]
-        return ZoomView(pixel, ZOOM_NOISE[self.name], float(reported[0]), float(reported[1]), nominal_px, t, side)
+        return ZoomView(pixel, ZOOM_NOISE[self.name], float(reported[0]), float(reported[1]), nominal_px, t)
 
     def miss_percent(self, x_fixed, t):
         """How far off an estimated position lies in the close-up, in % of its width."""
@@ -194,6 +192,4 @@ class Flight:
 
 def show(spatial_filter, view):
     """Give a filter what the zoom camera saw."""
-    return spatial_filter.see_zoom(
-        view.pixel, view.sigma_px, view.pan, view.tilt, view.nominal_px, view.t, size_px=view.size_px
-    )
+    return spatial_filter.see_zoom(view.pixel, view.sigma_px, view.pan, view.tilt, view.nominal_px, view.t)

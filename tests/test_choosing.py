@@ -13,7 +13,7 @@ from cotarget.calibration import save_calibration
 from cotarget.cli.choosing import POLICIES, Choice, add_choice
 from cotarget.config import RigConfig
 from cotarget.motionfilter import Track
-from cotarget.policies import Candidate
+from cotarget.planning import Candidate
 from cotarget.rig import PanTiltLimits
 from cotarget.sim.world import SimWorld
 from experiments.true_rig import true_calibration
@@ -30,7 +30,7 @@ def chosen(*arguments):
 
 def track(number, center, confirmed=True):
     center, size = np.array(center, float), np.array([20.0, 30.0])
-    return Track(number, 0.0, confirmed, 0, center, np.zeros(2), size, 30.0, np.eye(4), 1.0, None, 1.0)
+    return Track(number, 0.0, confirmed, 0, center, np.zeros(2), size, 30.0, np.eye(4), 1.0, None)
 
 
 def pick(choice, seen=(0.0, 0.0, 0.0)):
@@ -41,7 +41,7 @@ def pick(choice, seen=(0.0, 0.0, 0.0)):
         Candidate(track(number, at), lambda _, at=at: np.array([(at[0] - 320) / 686, 0.0]), end, done)
         for (number, at), end, done in zip(places.items(), leaves, seen, strict=True)
     ]
-    return choice.policy.select(candidates, np.zeros(2), LIMITS)
+    return choice.policy().select(candidates, np.zeros(2), LIMITS)
 
 
 def test_the_names_are_those_of_the_policies():

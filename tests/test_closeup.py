@@ -110,12 +110,13 @@ class Scene:
         finder.see_wide(*self.wide())
         return finder
 
-    def error(self, found):
+    def error(self, found, finder=None):
         """How far the point that was found is from the point that the wide view shows, in wide pixels."""
+        body_px = (self.finder() if finder is None else finder).sight_at(0.0).body_px
         depth = self.birds[0][2]
         ray = np.append(
             cv2.undistortPoints(
-                found.wide_px.reshape(1, 1, 2),
+                body_px.reshape(1, 1, 2),
                 np.array([[FOCAL, 0, CENTER[0]], [0, FOCAL, CENTER[1]], [0, 0, 1.0]]),
                 np.array([-0.2, 0, 0, 0]),
             )[0, 0],
@@ -203,7 +204,9 @@ def test_the_sight_nearest_in_time_counts_and_an_old_one_does_not():
     assert finder.find(zoom, scene.expected()) is None
     for t in (0.8, 0.94, 0.98, 1.03):
         finder.see_wide(Frame(frame.image, t), detection, mask)
-    assert finder.find(zoom, scene.expected()).wide_t == 0.98
+    assert finder.sight_at(1.0).t == 0.98
+    assert finder.find(zoom, scene.expected()).t == 1.0
+    assert finder.sight_at(1.2) is None
     assert finder.find(Frame(zoom.image, 1.2), scene.expected()) is None
 
 
@@ -215,7 +218,7 @@ def test_without_a_foreground_the_box_does():
         finder.see_wide(frame, detection, nothing)
         found = finder.find(scene.zoom(), scene.expected())
         assert found is not None
-        assert scene.error(found) < REGISTERED_PX
+        assert scene.error(found, finder) < REGISTERED_PX
 
 
 def test_after_good_finds_a_bad_likeness_elsewhere_is_not_believed():
@@ -303,14 +306,14 @@ def test_rendered_targets_are_found_from_the_shortest_focal_length_to_the_longes
         mask = (np.abs(wide.image.astype(int) - nothing.image).max(axis=2) > 25).astype(np.uint8)
         outline = truth.silhouette(name, "fixed", t)
         box = Detection((outline.low_px + outline.high_px) / 2, outline.size_px, 0.9)
-        finder.see_wide(wide, box, mask)
+        sight = finder.see_wide(wide, box, mask)
         # As if the depth were known to a twentieth, by which it is wrong.
         head, lens = truth.head_at(t), truth.nominal_at(t)
         found = finder.find(zoom, Expected(x_fixed * 1.05, 30.0**2 * np.eye(2), *head, lens))
         assert found is not None, f"at {nominal:.0f} px"
         scale = float(np.mean(found.size_px / box.size_px))
         error = (found.center_px - truth.pixel("zoom", truth.center(name, t), t)) / scale
-        body = found.wide_px - truth.pixel("fixed", truth.center(name, t), t)
+        body = sight.body_px - truth.pixel("fixed", truth.center(name, t), t)
         off = float(np.linalg.norm(error - body))
         print(f"{name} at {nominal:.0f} px: score {found.score:.2f}, {off:.2f} px of the wide view")
         assert off < RENDERED_PX[name]

@@ -99,6 +99,10 @@ def test_offsets_and_targets_are_taken(tmp_path):
         ),
         ("[safety]\nstop_file = 1", "safety.stop_file: 1 is not a text"),
         (
+            '[targets.book]\nmotion = "rolling"',
+            "targets.book.motion: 'rolling' is not one of: flying, standing, walking",
+        ),
+        (
             "[safety]\nwatchdog = 1",
             "valid here: max_frame_age_s, pan_deg, speed_deg_s, stop_file, tilt_deg, watchdog_s",
         ),

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS, TargetConfig
-from cotarget.detection import ColourDetector, MotionDetector, make_detector
+from cotarget.detection import ColourDetector, MotionDetector, colour, make_detector
+from cotarget.detection.colour import LARGEST_FITTED_PX, MOST_FITTED
+from cotarget.detection.templatefit import MARGIN_PX, fit_template
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.rig import Frame
 
@@ -67,11 +69,59 @@ def test_colour_is_located_to_a_fraction_of_a_pixel(turn_deg):
     assert rms.max() < ACCURACY_PX
 
 
+def on_a_wall(*things):
+    """A picture of 640x480 with pictures (h, w, 3) at their (left, top), as a camera has it."""
+    image = np.full((480, 640, 3), (120, 130, 140), np.uint8)
+    for thing, left, top in things:
+        image[top : top + thing.shape[0], left : left + thing.shape[1]] = thing
+    return photograph(cv2.GaussianBlur(image, (0, 0), 0.5), np.random.default_rng(1))
+
+
+def book_of(width):
+    return cv2.resize(cover(), (width, width * 3 // 4), interpolation=cv2.INTER_AREA)
+
+
+@pytest.mark.parametrize("width", [40, 60, 120, 200, 310])
+def test_a_large_book_is_located_as_well_and_by_no_more_pixels(width, monkeypatch):
+    fitted = []
+
+    def fit(template, patch, center, size):
+        fitted.append(patch.shape)
+        return fit_template(template, patch, center, size)
+
+    monkeypatch.setattr(colour, "fit_template", fit)
+    (found,) = ColourDetector(cover()).detect(Frame(on_a_wall((book_of(width), 107, 63)), 0.0))
+    height = width * 3 // 4
+    np.testing.assert_allclose(found.center_px, (107 + (width - 1) / 2, 63 + (height - 1) / 2), atol=ACCURACY_PX)
+    np.testing.assert_allclose(found.size_px, (width, height), atol=ACCURACY_PX)
+    ((rows, columns),) = fitted
+    assert max(rows, columns) <= LARGEST_FITTED_PX + 2 * MARGIN_PX + 3  # and a pixel for each rounding
+
+
+def test_a_large_book_at_the_border_is_located():
+    (found,) = ColourDetector(cover()).detect(Frame(on_a_wall((book_of(200), 440, 330)), 0.0))
+    assert found.clipped
+    np.testing.assert_allclose(found.center_px, (440 + 199 / 2, 330 + 149 / 2), atol=1.0)
+
+
+@pytest.mark.parametrize("size", [10, 24, 40])
+def test_among_a_hundred_red_things_the_book_is_found_by_a_few_fits(size, monkeypatch):
+    fits = []
+    monkeypatch.setattr(colour, "fit_template", lambda *args: fits.append(1) or fit_template(*args))
+    red = np.full((size * 3 // 4, size, 3), (35, 25, 190), np.uint8)
+    red[:, : size // 4] = (60, 40, 150)
+    things = [(red, 20 + 60 * (k % 10), 10 + 47 * (k // 10)) for k in range(100)]
+    things[37] = (book_of(16), *things[37][1:])
+    best = ColourDetector(cover()).detect(Frame(on_a_wall(*things), 0.0))[0]
+    np.testing.assert_allclose(best.center_px, np.add(things[37][1:], (15 / 2, 11 / 2)), atol=ACCURACY_PX)
+    assert len(fits) == MOST_FITTED
+
+
 def test_another_colour_is_not_taken_for_the_target():
     rng = np.random.default_rng(1)
     image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
-    for k, colour in enumerate([(190, 25, 35), (25, 190, 35), (20, 120, 160), (250, 250, 250), (0, 0, 0)]):
-        image[30:42, 5 + 18 * k : 18 + 18 * k] = colour
+    for k, other in enumerate([(190, 25, 35), (25, 190, 35), (20, 120, 160), (250, 250, 250), (0, 0, 0)]):
+        image[30:42, 5 + 18 * k : 18 + 18 * k] = other
     assert ColourDetector(cover()).detect(Frame(photograph(image, rng), 0.0)) == []
 
 
@@ -182,5 +232,5 @@ def test_another_image_size_is_an_error(name):
 
 def test_the_kind_of_detector_follows_the_target():
     assert isinstance(motion("bird"), MotionDetector)
-    colour = TargetConfig(0.2, "width", 160.0, "colour")
-    assert isinstance(make_detector(colour, RATE, cover()), ColourDetector)
+    red = TargetConfig(0.2, "width", 160.0, "colour")
+    assert isinstance(make_detector(red, RATE, cover()), ColourDetector)

@@ -4,13 +4,15 @@ import csv
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from cotarget.geometry import RigidTransform, pose
-from experiments import photos, random_rigs
+from experiments import __main__ as everything
+from experiments import photos, pipeline_speed, random_rigs
 from experiments.harness import Experiment, Settings, over_seeds, rms, spread, table
 from experiments.synthetic import (
     SIZE,
@@ -72,6 +74,48 @@ def test_a_run_writes_its_files(tmp_path, capsys):
     assert cv2.imread(str(out / "figure.png")) is not None
     assert EXPERIMENT.main(["--quick", "--processes", "1"]) == 0
     assert capsys.readouterr().out == "sum 2.0\n"
+
+
+def test_all_of_them_fail_where_one_fails(monkeypatch, capsys, tmp_path):
+    """One is fine, one misses a figure, and one lacks the film that it needs."""
+    asked = []
+
+    def module(name, status, **more):
+        def main(arguments):
+            asked.append((name, arguments))
+            return status
+
+        return SimpleNamespace(EXPERIMENT=SimpleNamespace(main=main), **more)
+
+    modules = {
+        "fine": module("fine", 0),
+        "bad": module("bad", 1),
+        "film": module("film", 0, FILM=tmp_path / "none.mp4"),
+    }
+    monkeypatch.setattr(everything, "EXPERIMENTS", ("bad", "fine", "film"))
+    monkeypatch.setattr(everything.importlib, "import_module", lambda name: modules[name.removeprefix("experiments.")])
+    assert everything.main(["--quick", "--out", "there"]) == 1
+    assert asked == [(name, ["--quick", "--out", f"there/{name}"]) for name in ("bad", "fine")]
+    out = capsys.readouterr().out
+    assert "none.mp4, which is not part of the project" in out
+    assert out.endswith("not what is wanted: bad\n")
+    monkeypatch.setattr(everything, "EXPERIMENTS", ("fine", "film"))
+    assert everything.main([]) == 0
+    (tmp_path / "none.mp4").touch()
+    assert everything.main([]) == 0
+    assert asked[-1] == ("film", [])
+
+
+def test_a_pipeline_that_is_too_slow_is_missed():
+    def rows(motion, speck):
+        took = {pipeline_speed.ALONE: 4.0, "mog2": 40.0, "motion": motion, "speck": speck}
+        return [{"way": way, "ms": ms, "aimed": True} for way, ms in took.items()]
+
+    assert pipeline_speed.missed(pipeline_speed.summarise(rows(6.0, 10.0))) == []  # the mixture's own is told, no more
+    summary = pipeline_speed.summarise(rows(6.1, 10.1))
+    assert pipeline_speed.missed(summary) == ["motion", "speck"]
+    assert pipeline_speed.EXPERIMENT.missed is pipeline_speed.missed
+    assert "<= 2.5" in pipeline_speed.describe(pipeline_speed.SETTINGS, summary)
 
 
 def test_processes_change_nothing():

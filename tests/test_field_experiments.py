@@ -8,21 +8,25 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from cotarget import pursuit
 from cotarget.config import parse_config
+from cotarget.deadzone import SteeringSettings
 from cotarget.geometry import pose
 from cotarget.loop import FollowSettings
+from cotarget.metrics import score
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
-from experiments import dead_zone, delay, first_shot, five_targets, hold
+from experiments import dead_zone, delay, first_shot, five_targets, hold, pipeline_speed, shots, sim_speed
 from experiments.__main__ import EXPERIMENTS
 from experiments.harness import EXPECTED
 from experiments.hold_scenes import TruthDetector, TruthNoise, hold_config
 from experiments.shots import CAUSES, Shot, budget
 from experiments.true_rig import true_calibration
 from experiments.wide_view import Seen, WideView, open_on, record
+from tests.true_finder import true_finder
 
-FIELD = (hold, first_shot, delay, five_targets, dead_zone)
+FIELD = (hold, first_shot, delay, five_targets, dead_zone, sim_speed, pipeline_speed)
 SMALL = 0.03  # relative: products of angles of a hundredth that are taken for sums
 FRAME_S = 0.04
 
@@ -113,6 +117,53 @@ def test_how_many_times_is_of_medians_at_one_delay():
     assert delay.missed(delay.summarise(rows)) == ["bird"]
 
 
+WALKED = 3.0, 5.0  # of a person who walks from 1 s on; nothing is left of how it was acquired [s]
+SETTLED = 7.4, 9.0  # who stops at 5 s and is known of 0.6 s later, with a head that was on its way [s]
+NO_WORSE = 1.2  # times the wide view's own offset: medians of 50 frames
+ZONE = SteeringSettings().zone  # the head of who stands is left alone in it
+SWING = ZONE / 2  # an offset that goes to and fro beyond it on both sides swings
+
+
+def offsets_of_who_stops(exact, monkeypatch, delay_s, closed_loop):
+    """Offsets over the width, (n, 2), of one who walks past 10 m away at 1.5 m/s and stops, while walking and after.
+
+    Nothing is rendered: both views show the person where it is, with noise.
+    """
+    config = delay.delayed(hold_config("person", 0), delay_s)
+    path = [(t, -3.0 + 1.5 * float(np.clip(t - 1.0, 0.0, 4.0)), 10.0, 0.875) for t in np.arange(-1.0, 12.0, 0.1)]
+    config = dataclasses.replace(config, sim=dataclasses.replace(config.sim, paths={"person": tuple(path)}))
+    world = SimWorld(config, rendered=())
+    truth = world.truth()
+    monkeypatch.setattr(pursuit, "CloseupFinder", true_finder(truth, "person", 0))
+    detector = TruthDetector(truth, 0, TruthNoise(0.5, 0.04, 0.05))
+    how = FollowSettings(command_delay_s=config.command_delay_s, closed_loop=closed_loop)
+    target, end = config.target("person"), SETTLED[1]
+    steps = [step for step, _ in hold.watched_in(world, detector, exact, target, end, how)]
+    t = np.array([step.zoom.t for step in steps])
+    off = np.array([truth.pixel("zoom", truth.center("person", each), each) - (319.5, 239.5) for each in t]) / 640
+    walking, after = ((t > begin) & (t < end) for begin, end in (WALKED, SETTLED))
+    found = np.array([step.found is not None for step in steps])
+    assert found[walking].mean() > 0.5 if closed_loop else not found.any()
+    return off[walking], off[after]
+
+
+def swings(values):
+    """How often a signal goes from beyond SWING on one side to beyond it on the other."""
+    sides = np.sign(values[np.abs(values) > SWING])
+    return int(np.count_nonzero(np.diff(sides)))
+
+
+@pytest.mark.parametrize("delay_s", [0.2, pytest.param(0.4, marks=pytest.mark.slow), 0.6])
+def test_the_whole_loop_does_not_oscillate_however_late_it_is(exact, monkeypatch, delay_s):
+    """Corrections that come late add nothing to the offset of who walks, and come to rest when that stops."""
+    wide, _ = offsets_of_who_stops(exact, monkeypatch, delay_s, closed_loop=False)
+    walking, after = offsets_of_who_stops(exact, monkeypatch, delay_s, closed_loop=True)
+    offset, alone = (float(np.median(np.linalg.norm(each, axis=1))) for each in (walking, wide))
+    assert offset < NO_WORSE * alone
+    assert np.linalg.norm(after, axis=1).max() < ZONE
+    assert [swings(axis) for axis in after.T] == [0, 0]
+
+
 # ---------------------------------------------------------------- five targets
 
 
@@ -166,7 +217,8 @@ def test_a_dead_zone_spares_the_head_that_looks_at_a_book(exact, monkeypatch):
     summary = dead_zone.summarise(rows)
     # Half is what is asked for; that takes the zoom view, for in the wide one noise looks like motion.
     assert summary["book"]["commands_per_min"]["over"] < 0.7
-    assert summary["book"]["commands_per_min"]["without"] > 0
+    # One with every frame at 25 Hz, whether it changes the goal or not.
+    assert summary["book"]["commands_per_min"]["without"] == pytest.approx(1500, rel=0.02)
     dead_zone.plot(rows, Figure())
     assert "book, commands_per_min" in dead_zone.describe(settings, summary)
 
@@ -247,11 +299,42 @@ def test_each_cause_alone(still):
     assert steps == pytest.approx(math.hypot(pan + 0.03, tilt), rel=0.2)
 
 
+def test_a_chance_passes_while_the_target_is_not_seen(exact, monkeypatch):
+    """Chances come at 3.0, 3.8, 4.6 and 5.4 s, and from 4.3 s on nothing is detected any more."""
+
+    class Blinded(TruthDetector):
+        def detect(self, frame):
+            return super().detect(frame) if frame.t < 4.3 else []
+
+    config = hold_config("book", 1)
+    with (world := SimWorld(config, rendered=())).rig:
+        finder = Blinded(world.truth(), 1, TruthNoise(0.2, 0.01, 0.0))
+        monkeypatch.setattr(shots, "make_detector", lambda *_: finder)
+        monkeypatch.setattr(shots, "SimWorld", lambda config: SimWorld(config, rendered=()))
+        settings = first_shot.FirstShotSettings(targets=("book",), seconds=5.9)
+        rows = first_shot.one(exact, settings, 1)
+    assert [row["fired"] for row in rows] == [True, True, False, False]
+    figures = first_shot.summarise(rows)["book"]
+    assert (figures["shots"], figures["not fired"]) == (2, 2)
+    blind = first_shot.summarise([row for row in rows if not row["fired"]])["book"]
+    assert (blind["shots"], blind["not fired"]) == (0, 2)
+    assert set(first_shot.missed({"book": blind})) == {f"book: {key}" for key in first_shot.WANTED}
+
+
+def test_a_correction_that_could_not_be_fired_counts_as_one_that_missed():
+    row = {"target": "book", "fired": True, "on_target": True, "in_frame": True, "tpo_width": 0.01, "found": True}
+    row |= dict.fromkeys(CAUSES, 0.01) | {"measured": math.hypot(*[0.01] * len(CAUSES)), "corrected_width": 0.01}
+    none = row | {"corrected_width": None}
+    assert first_shot.summarise([row, row, none])["book"]["corrected_width"] == 0.01
+    assert first_shot.missed(first_shot.summarise([row, row, none, none, none])) == ["book: corrected_width"]
+
+
 def test_a_budget_is_summed_in_quadrature_over_shots_at_the_target():
     def row(on_target, offset, **parts):
         told = dict.fromkeys(CAUSES, 0.0) | parts
         return {
             "target": "book",
+            "fired": True,
             "on_target": on_target,
             "in_frame": on_target,
             "tpo_width": min(offset, 0.625),
@@ -282,6 +365,7 @@ def test_a_target_that_is_never_acquired_is_missed():
     good = {"closeup_yield": 0.95, "in_frame_ratio": 1.0, "tpo_width_median": 0.01, "size_ratio_median": 1.0}
     good |= {"fragmentation_per_min": 0.0, "time_to_acquire_s": 0.5, "identification": 1.0, "identification_wide": 0.0}
     good |= {"tpe_px_median": 0.5, "false_tracks_per_min": 3.0, "commands_per_min": 60.0, "reversals_per_min": 30.0}
+    good |= {"lens_commands_per_min": 9.0}
     rows = [{"target": "book", **good} for _ in range(3)]
     summary = hold.summarise(rows)
     assert summary == {"book": good}
@@ -298,8 +382,52 @@ def test_a_target_that_is_never_acquired_is_missed():
 
 # ---------------------------------------------------------------- quick runs, rendered
 
-WORSE = 1.10  # times the bound
-BOUNDED = (first_shot,)
+SLACK = 1.10  # so many times worse than the bound is still a pass: other machines round and render otherwise
+BOUNDED = (first_shot, five_targets, dead_zone)
+HELD_S = 6.0  # two seconds to learn the background, four to hold
+
+
+def outside(found, bounds, where=""):
+    """What of a summary is worse than its bounds, in words.
+
+    Bounds are as nested as the summary is. In the place of a figure they say one or both of: at_least, at_most, which
+    were reached and may be missed by SLACK; and within, a pair that is what is wanted itself.
+    """
+    if not bounds.keys() & {"at_least", "at_most", "within"}:
+        return [
+            text
+            for key, inner in bounds.items()
+            for text in outside(
+                found.get(key, math.nan) if isinstance(found, dict) else math.nan, inner, f"{where}/{key}"
+            )
+        ]
+    least, most = bounds.get("at_least", -math.inf), bounds.get("at_most", math.inf)
+    low, high = bounds.get("within", (-math.inf, math.inf))
+    if not isinstance(found, dict) and least <= SLACK * found and found <= SLACK * most and low <= found <= high:
+        return []
+    return [f"{where[1:]}: {found}, where the bounds are {bounds}"]
+
+
+def test_bounds_are_kept_to_from_either_side():
+    bounds = {"book": {"yield": {"at_least": 0.88}, "offset": {"at_most": 0.02}, "sum": {"within": [0.85, 1.15]}}}
+    good = {"book": {"yield": 0.81, "offset": 0.0219, "sum": 1.14, "more": 7.0}}
+    assert outside(good, bounds) == []
+    for key, bad in (("yield", 0.79), ("offset", 0.0221), ("sum", 1.16), ("sum", 0.84), ("offset", math.nan)):
+        (text,) = outside({"book": good["book"] | {key: bad}}, bounds)
+        assert text.startswith(f"book/{key}: {bad}")
+    assert len(outside({"bird": good["book"]}, bounds)) == len(outside({"book": {}}, bounds)) == 3
+    assert outside({"n": 0.0}, {"n": {"at_most": 0.0}}) == []
+    assert len(outside({"n": 0.1}, {"n": {"at_most": 0.0}})) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_a_book_is_held_through_the_cameras(exact):
+    """The whole loop, rendered: all that is wanted of a median over many long runs, of one short one."""
+    config = hold_config("book", 0)
+    found = dataclasses.asdict(score(hold.held(exact, config, "book", HELD_S)))
+    assert found["frames"] > 90
+    assert hold.missed(hold.summarise([{"target": "book", **found}])) == []
 
 
 @pytest.mark.slow
@@ -307,10 +435,7 @@ BOUNDED = (first_shot,)
 @pytest.mark.parametrize("module", BOUNDED, ids=lambda module: module.EXPERIMENT.name)
 def test_no_figure_gets_worse(module):
     experiment = module.EXPERIMENT
-    summary = experiment.summarise(experiment.run(experiment.quick))
     bounds = json.loads((EXPECTED / f"{experiment.name}.json").read_text())
     assert bounds
-    for target, figures in bounds.items():
-        for key, bound in figures.items():
-            found = summary[target][key]
-            assert found <= WORSE * bound, f"{target}, {key}: {found:.4g}, where {bound:.4g} was reached"
+    summary = experiment.summarise(experiment.run(experiment.quick))
+    assert outside(summary, bounds) == []

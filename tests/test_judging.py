@@ -130,7 +130,7 @@ def track(number, center_px, t=0.0, box_px=None, confirmed=True, missed=0):
     """A track whose filtered middle need not be where its last detection is."""
     center, size = np.array(center_px, dtype=float), np.array([16.0, 12.0])
     box = Detection(center if box_px is None else np.array(box_px, dtype=float), size, 1.0)
-    return Track(number, t, confirmed, missed, center, np.zeros(2), size, 16.0, np.eye(4), 1.0, box, 1.0)
+    return Track(number, t, confirmed, missed, center, np.zeros(2), size, 16.0, np.eye(4), 1.0, box)
 
 
 def row_of(world, **changes):
@@ -155,14 +155,21 @@ def test_a_row_says_what_is_so(book):
     assert row.off_target == ""
 
 
+def test_a_row_says_how_many_commands_were_sent(book):
+    row = row_of(book, head_commands=3, lens_commands=2)
+    assert (row.head_commands, row.lens_commands) == (3, 2)
+
+
 def test_the_detection_is_judged_and_only_where_there_is_one(book):
     """The filter's middle and its prediction are not the detection; a coasting track has none."""
     seen = row_of(book, target=track(4, (300, 200), box_px=(325 + 3, 239 - 4)))
     assert seen.track == 4
     assert seen.tpe_px == pytest.approx(5.0, abs=1e-6)
-    coasting = row_of(book, target=track(4, (325, 239), missed=1))
-    assert coasting.track == 4
-    assert math.isnan(coasting.tpe_px)
+    shared = dataclasses.replace(track(4, (325, 239), box_px=(340, 239)), shared=True)
+    for nothing in (track(4, (325, 239), missed=1), shared):  # the box of two is the detection of neither
+        row = row_of(book, target=nothing)
+        assert row.track == 4
+        assert math.isnan(row.tpe_px)
 
 
 def test_a_track_is_off_target_when_it_is_farther_than_the_larger_side(book):

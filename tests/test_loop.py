@@ -13,6 +13,7 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError, StaleFrameError
 from cotarget.loop import FollowSettings, State, follow
+from cotarget.policies import FirstCome
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
 from cotarget.sim.motion import Axis
 from cotarget.zoompolicy import ZoomSettings
@@ -45,14 +46,22 @@ class Rig:
     t: float = 0.0
     moves: list = field(default_factory=list)
     zooms: list = field(default_factory=list)
+    lens_speed: float = math.inf  # of the logarithm of the focal length [1/s]
 
     def __post_init__(self):
         self.pan, self.tilt = (Axis(self.limits.speed, self.limits.acceleration) for _ in range(2))
-        self.focal = 667.0
+        self.focal = self.focal_before = 667.0
         self.fixed, self.zoom, self.head, self.clock = _Camera(self), _Zoom(self), _Head(self), _Clock(self)
 
     def pose(self, t):
         return self.pan.motor(t)[0], self.tilt.motor(t)[0]
+
+    def lens(self, t):
+        """Where the lens is, which sets out for its goal when it is told to."""
+        if math.isinf(self.lens_speed):
+            return self.focal
+        way, most = math.log(self.focal / self.focal_before), self.lens_speed * (t - self.zooms[-1][0])
+        return self.focal_before * math.exp(math.copysign(min(abs(way), most), way))
 
 
 @dataclass
@@ -78,12 +87,14 @@ class _Zoom(_Camera):
     focal_range = (667.0, 8000.0)
 
     def zoom(self, focal_px):
+        if self.rig.zooms:
+            self.rig.focal_before = self.rig.lens(self.rig.t)
         self.rig.zooms.append((self.rig.t, focal_px))
         self.rig.focal = focal_px
         return focal_px
 
     def state(self):
-        return ZoomState(self.rig.focal, False, self.rig.t)
+        return ZoomState(self.rig.lens(self.rig.t), False, self.rig.t)
 
 
 @dataclass
@@ -181,19 +192,22 @@ def test_from_searching_to_lost_and_back():
     numbers = {step.target.id for step in steps if step.state is State.FOLLOWING}
     assert len(numbers) == 2  # a target that was forgotten comes back under a new number
     for step in steps:
-        aimed = step.state in (State.FOLLOWING, State.COASTING)
-        assert (step.aim is not None) == aimed
+        followed = step.state in (State.FOLLOWING, State.COASTING)
+        assert (step.aim is None) == (step.state is State.SEARCHING)
         if step.state is State.LOST:
             assert step.reason.startswith("out of sight for 0.")
+            assert "s; looked for where it should be" in step.reason
         if step.state is State.SEARCHING:
             assert step.reason == ("what is detected is not believed yet" if step.tracks else "nothing is detected")
-        if not aimed:
+        if not followed:
             assert step.commanded[2] == 667.0  # zoomed out to see more
         assert step.t >= step.fixed.t + LATENCY - 1e-9
     zoomed = [t for t, focal in rig.zooms if focal == 667.0]
     assert len(zoomed) == 2  # told once at the start and once when lost, not with every frame
     assert zoomed[1] == pytest.approx(found[3][1] + LATENCY)
-    assert not [t for t, *_ in rig.moves if found[3][1] + LATENCY <= t < 6.0]  # the head waits while it is lost
+    # It stands, so that the head has no way to go, and waits when nobody knows any more where it would be.
+    assert off(rig, still, 6.0) < STEP
+    assert not [t for t, *_ in rig.moves if found[4][1] + LATENCY <= t < 6.0]
 
 
 def test_a_still_target_is_centred_and_as_large_as_wanted():
@@ -211,6 +225,120 @@ def test_a_still_target_is_centred_and_as_large_as_wanted():
 def crossing(t):
     """Past the rig at 10 m, at 2 m/s: some 11 degrees/s."""
     return (-3.0 + 2.0 * t, 0.3, 10.0)
+
+
+def test_the_head_goes_on_with_the_target_while_it_is_lost():
+    """Out of sight for 0.6 s at 0.2 rad/s, it goes on unseen: the wide close-up holds it, and then it is the same."""
+    rig = Rig()
+    offs = []
+    steps = []
+    settings = FollowSettings(command_delay_s=DELAY)
+    seer = Seer(crossing, lambda t: t < 1.5 or t > 2.1)
+    for step in follow(rig, CALIBRATION, BOOK, seer, seconds=3.0, settings=settings):
+        steps.append(step)
+        offs.append(off(rig, crossing, step.t))
+    lost = [i for i, step in enumerate(steps) if step.state is State.LOST]
+    assert len(lost) > 3
+    # A head that waits would be left behind by 0.04 rad after 0.2 s; the dead zone of the widest close-up is 0.02 rad.
+    assert max(offs[i] for i in lost) < 0.03
+    assert {steps[i].commanded[2] for i in lost} == {667.0}
+    assert {steps[i].aim is None for i in lost} == {False}
+    assert [state for state, _ in spans(steps)][-2:] == [State.LOST, State.FOLLOWING]
+    assert len({step.target.id for step in steps if step.target}) == 1
+
+
+def test_the_head_waits_where_a_lost_target_is_beyond_its_limits():
+    rig = Rig(replace(WIDE, pan=(-0.15, 0.1)))
+    steps = run(rig, Seer(crossing, lambda t: t < 1.7), 2.6)
+    lost = [step for step in steps if step.state is State.LOST]
+    assert lost[-1].reason.startswith("out of sight for 0.8 s; the head waits: ")
+    assert "beyond the limits" in lost[-1].reason
+    assert lost[-1].aim is None
+    assert rig.pan.motor(rig.t)[1] == 0.0
+
+
+class Switch:
+    """Follows the first track and from a time on the second."""
+
+    unmet = ""
+
+    def __init__(self, rig, at):
+        self.rig, self.at = rig, at
+
+    def favours(self, track):
+        return False
+
+    def select(self, candidates, head, limits):
+        return 1 if self.rig.t < self.at else 2
+
+
+def test_whoever_was_out_of_sight_before_it_was_chosen_is_lost_at_once():
+    """The second is hidden from 1.5 s on and chosen at 2.1 s: that the first was in sight all the time says nothing."""
+
+    class Two:
+        mask = None
+        near, far = Seer(still), Seer(lambda t: (-1.0, 0.4, 10.0), lambda t: t < 1.5)
+
+        def detect(self, frame):
+            return self.near.detect(frame) + self.far.detect(frame)
+
+    rig = Rig()
+    steps = run(rig, Two(), 2.25, policy=lambda: Switch(rig, 2.1))
+    second = [step for step in steps if step.target and step.target.id == 2]
+    assert {step.state for step in second} == {State.LOST}
+    assert second[0].reason.startswith("out of sight for 0.6 s")
+
+
+def test_runs_with_the_same_settings_do_not_steer_each_other():
+    """In one of two runs side by side the first target goes, and a second one stays."""
+
+    def seen(until):
+        class Two:
+            mask = None
+            near, far = Seer(still, lambda t: t < until), Seer(lambda t: (-1.0, 0.4, 10.0))
+
+            def detect(self, frame):
+                return self.near.detect(frame) + self.far.detect(frame)
+
+        return Two()
+
+    pairs = zip(
+        follow(Rig(), CALIBRATION, BOOK, seen(1.0), seconds=3.0),
+        follow(Rig(), CALIBRATION, BOOK, seen(9.0), seconds=3.0),
+        strict=False,
+    )
+    followed = [[step.target and step.target.id for step in pair] for pair in pairs]
+    assert followed[-1] == [2, 1]
+    assert {ours for _, ours in followed} == {None, 1}
+
+
+def test_a_policy_is_told_how_long_a_target_was_seen_well():
+    """Not before the lens has arrived, which takes it more than a second here, and neither when it was once off."""
+
+    class Noting(FirstCome):
+        told = 0.0
+
+        def select(self, candidates, head, limits):
+            self.told = max([0.0, *(each.seen_s for each in candidates)])
+            return super().select(candidates, head, limits)
+
+    policy = Noting()
+    rig, true = Rig(lens_speed=1.5), 0
+    settings = FollowSettings(command_delay_s=DELAY, policy=lambda: policy)
+    for _ in follow(rig, CALIBRATION, BOOK, Seer(still), seconds=4.0, settings=settings):
+        wanted = 160 * np.linalg.norm(still(0)) / 0.234 * 667 / 692
+        off_px = off(rig, still, rig.t) * rig.lens(rig.t)
+        true += rig.lens(rig.t) / wanted > 0.8 and off_px < 140  # half the height without half the book's
+    assert 1.0 < true / RATE_HZ < 3.0
+    assert policy.told == pytest.approx(true / RATE_HZ, abs=LATENCY + 3 / RATE_HZ)
+
+
+def test_why_the_lens_is_not_as_close_as_wanted_is_told():
+    steps = run(Rig(), Seer(still), 4.0, closed_loop=False)
+    followed = [step.reason for step in steps if step.state is State.FOLLOWING]
+    assert followed[0] == "zoom: unsure"  # the head has a way to go
+    assert followed[-1] == ""
+    assert set(followed) <= {"", "zoom: unsure", "zoom: settling", "zoom: about to be lost"}
 
 
 def mean_off(**settings):

@@ -5,6 +5,7 @@ Nothing ends in a crash, a head that runs away, or a Step that does not say what
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -122,7 +123,8 @@ def shifted(by):
     """Frames whose times jump by so much [s]."""
 
     def change(read, t, newer_than, timeout):
-        asked = newer_than if newer_than is None or t <= FAULT + LATENCY + FRAME_S else newer_than - by
+        known = newer_than is None or t <= FAULT + LATENCY + FRAME_S or math.isnan(newer_than - by)
+        asked = newer_than if known else newer_than - by
         frame = read(asked, timeout)
         return replace(frame, t=frame.t + by) if frame.t > FAULT else frame
 
@@ -143,6 +145,43 @@ def test_frames_that_repeat_or_jump_in_time(change, told):
     assert told in str(error)
     assert steps[-1].state is State.FOLLOWING
     assert_it_comes_to_rest(rig, steps[-1].t)
+    assert all(step.t < FAULT + LATENCY + 2 * FRAME_S for step in steps)  # nobody steers by them
+
+
+@pytest.mark.parametrize(("spoil", "told"), [
+    (lambda last, frame: last, "frames repeat, or its clock has jumped; this one is 0.0"),
+    (lambda last, frame: replace(frame, t=frame.t - 0.2), "frames repeat, or its clock has jumped; this one is 0.0"),
+    (lambda last, frame: replace(frame, t=frame.t + 5.0), "in the future; mind the clock; this one is 0.0"),
+])  # fmt: skip
+@pytest.mark.parametrize("safe", [False, True])
+def test_a_frame_that_repeats_or_jumps_is_passed_over_and_told(spoil, told, safe):
+    rig, frames, spoilt = Rig(), [], []
+
+    def change(read, t, newer_than, timeout):
+        frame = read(newer_than, timeout)
+        if t > FAULT and not spoilt:
+            spoilt.append(spoil(frames[-1], frame))
+            return spoilt[0]
+        frames.append(frame)
+        return frame
+
+    rig.fixed = Faulty(rig.fixed, change)
+    if safe:
+        rig.head.halt = lambda: [axis.halt(rig.t) for axis in (rig.pan, rig.tilt)]
+        rig.board, rig.close = None, lambda: None
+        with SafeRig(rig, SafetyConfig()) as each:
+            steps, error = attempt(each, Seer(crossing), 3.0)
+    else:
+        steps, error = attempt(rig, Seer(crossing), 3.0)
+    assert error is None
+    (said,) = [step for step in steps if "this one is" in step.reason]
+    assert said.t == pytest.approx(FAULT + LATENCY, abs=2 * FRAME_S)
+    assert spoilt[0].t not in {step.fixed.t for step in steps[steps.index(said) :]}
+    if not safe:  # who reads for the safety layer says it in words of its own
+        assert told in said.reason
+    assert np.max(np.diff([step.fixed.t for step in steps])) < 3 * FRAME_S
+    assert {step.state for step in steps if step.t > FAULT} == {State.FOLLOWING}
+    assert off(rig, crossing, rig.t) < RATE * FRAME_S
 
 
 def test_time_that_leaps_for_all():
@@ -157,8 +196,9 @@ def test_time_that_leaps_for_all():
 
     rig.fixed = Faulty(rig.fixed, change)
     steps = run(rig, Seer(lambda t: crossing(t) if t < 2 * FAULT else still(t)), 9.0)
-    before, after = ([s for s in steps if (s.t < gone[0]) == early] for early in (True, False))
+    before, after = ([s for s in steps if (s.t <= gone[0]) == early] for early in (True, False))
     assert [state for state, _ in spans(after)][-1] is State.FOLLOWING
+    assert [{s.target.id for s in part if s.target is not None} for part in (before, after)] == [{1}, {2}]
     assert off(rig, still, rig.t) < STEP
     there = rig.pose(math.inf)[0]
     low, high = sorted((before[-1].head.pan, there))
@@ -357,7 +397,7 @@ def test_whoever_is_chosen_of_a_hundred_is_followed(click):
     """Though there are more tracks than are known in 3D."""
     rig, crowd, number = Rig(), Crowd(), 77
     pixel = tuple(PLAIN.project(crowd.at(number, 0.2))[0])
-    policy = Chosen(pixel=pixel, width_px=100.0) if click else Chosen(number=number + 1)
+    policy = partial(Chosen, pixel=pixel, width_px=100.0) if click else partial(Chosen, number=number + 1)
     steps = run(rig, crowd, 2.0, policy=policy)
     assert number > MOST_FILTERS
     assert {step.target.id for step in steps if step.target is not None} == {number + 1}
@@ -366,8 +406,8 @@ def test_whoever_is_chosen_of_a_hundred_is_followed(click):
 
 
 @pytest.mark.parametrize(("policy", "told"), [
-    (Chosen(number=7), "track 7 is not there"),
-    (Chosen(pixel=(20.0, 30.0), width_px=640.0), "no track at the click (20, 30)"),
+    (partial(Chosen, number=7), "track 7 is not there"),
+    (partial(Chosen, pixel=(20.0, 30.0), width_px=640.0), "no track at the click (20, 30)"),
 ])  # fmt: skip
 def test_a_choice_that_meets_nobody_is_told(policy, told):
     rig = Rig()
@@ -380,7 +420,7 @@ def test_a_choice_that_meets_nobody_is_told(policy, told):
 def test_a_chosen_target_that_has_gone_is_told():
     rig = Rig()
     pixel = tuple(PLAIN.project(np.array(still(0)))[0].round())
-    steps = run(rig, Seer(still, lambda t: t < 1.0), 3.0, policy=Chosen(pixel=pixel, width_px=640.0))
+    steps = run(rig, Seer(still, lambda t: t < 1.0), 3.0, policy=partial(Chosen, pixel=pixel, width_px=640.0))
     assert [state for state, _ in spans(steps)] == [
         State.SEARCHING,
         State.FOLLOWING,
@@ -408,7 +448,7 @@ class Two:
 @pytest.mark.parametrize("policy", sorted(POLICIES))
 def test_a_target_beyond_the_limits_keeps_nobody_from_another(policy):
     rig = Rig(replace(WIDE, pan=(-0.15, 0.15)))
-    steps = run(rig, Two(), 4.0, policy=POLICIES[policy]())
+    steps = run(rig, Two(), 4.0, policy=POLICIES[policy])
     alone = [step for step in steps if 0.3 < step.t < 1.0]
     assert {step.state for step in alone} == {State.UNREACHABLE}
     assert all("beyond the limits" in step.reason for step in alone)
@@ -419,7 +459,7 @@ def test_a_target_beyond_the_limits_keeps_nobody_from_another(policy):
 
 def test_a_chosen_target_beyond_the_limits_is_not_exchanged():
     rig = Rig(replace(WIDE, pan=(-0.15, 0.15)))
-    steps = run(rig, Two(), 3.0, policy=Chosen(number=1))
+    steps = run(rig, Two(), 3.0, policy=partial(Chosen, number=1))
     assert {(step.state, step.target.id) for step in steps if step.t > 0.3} == {(State.UNREACHABLE, 1)}
     assert not rig.moves
 

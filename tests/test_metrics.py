@@ -71,6 +71,7 @@ def test_a_perfect_run():
         commands_per_min=0.0,
         reversals_per_min=0.0,
         false_tracks_per_min=0.0,
+        lens_commands_per_min=0.0,
     )
 
 
@@ -84,6 +85,12 @@ def test_the_clock_starts_when_the_target_is_wholly_in_the_wide_view_and_2_s_hav
     assert early.time_to_acquire_s == pytest.approx(10 * PERIOD, abs=EXACT)
     gone_again = score(run((60, {}), (40, {"in_wide": False, **AWAY})))
     assert gone_again.frames == 50
+
+
+def test_the_2_s_are_counted_from_the_first_row_on():
+    """A clock that stood at 1000 s when the run began: 50 of 120 rows lie before 1002 s."""
+    rows = [dataclasses.replace(row, t_s=1000.0 + row.t_s) for row in run((120, {}))]
+    assert score(rows).frames == 70
 
 
 def test_acquisition_is_dated_to_the_start_of_the_first_half_second_on_end():
@@ -102,6 +109,14 @@ def test_lost_frames_count():
     mostly = score(run((50, {}), (40, {}), (60, AWAY)))
     assert mostly.tpo_px_median == pytest.approx(HALF_DIAGONAL)
     assert mostly.tpo_width_median == pytest.approx(HALF_DIAGONAL / 640)
+
+
+def test_a_frame_with_the_target_behind_the_camera_counts_as_nothing_of_it():
+    """30 good frames, then 50 that show nothing of it: of 80 the median is 0, as that of the offset is the worst."""
+    behind = {"u_px": math.nan, "v_px": math.nan, "size_px": math.nan, "visible": 0.0}
+    found = score(run((50, {}), (30, {}), (50, behind)))
+    assert found.size_ratio_median == 0.0
+    assert found.tpo_width_median == pytest.approx(HALF_DIAGONAL / 640)
 
 
 def test_never_acquired_and_never_there():
@@ -195,19 +210,30 @@ def commanded(*pairs):
     ]
 
 
-@pytest.mark.parametrize(("pairs", "commands", "reversals"), [
-    ([(0, 0)], 0, 0),
-    ([(0, 0), (1, 0), (2, 0), (2, 0), (3, 0)], 3, 0),  # on in one direction, with a pause
-    ([(0, 0), (1, 1), (2, 2)], 2, 0),  # both axes are one command
-    ([(0, 0), (1, 0), (1, 1), (2, 1)], 3, 0),
-    ([(0, 0), (1, 0), (0, 0), (1, 0)], 3, 2),
-    ([(0, 0), (1, 0), (1, 0), (0, 0)], 2, 1),  # a pause does not hide a reversal
-    ([(0, 0), (1, 1), (0, 0)], 2, 2),  # of each axis
+@pytest.mark.parametrize(("pairs", "reversals"), [
+    ([(0, 0)], 0),
+    ([(0, 0), (1, 0), (2, 0), (2, 0), (3, 0)], 0),  # on in one direction, with a pause
+    ([(0, 0), (1, 1), (2, 2)], 0),
+    ([(0, 0), (1, 0), (1, 1), (2, 1)], 0),
+    ([(0, 0), (1, 0), (0, 0), (1, 0)], 2),
+    ([(0, 0), (1, 0), (1, 0), (0, 0)], 1),  # a pause does not hide a reversal
+    ([(0, 0), (1, 1), (0, 0)], 2),  # of each axis
 ])  # fmt: skip
-def test_wear(pairs, commands, reversals):
-    found = score(commanded(*pairs))
-    assert found.commands_per_min == pytest.approx(commands / COUNTED_MIN)
-    assert found.reversals_per_min == pytest.approx(reversals / COUNTED_MIN)
+def test_reversals(pairs, reversals):
+    assert score(commanded(*pairs)).reversals_per_min == pytest.approx(reversals / COUNTED_MIN)
+
+
+def test_commands_count_whether_a_goal_changes_or_not():
+    """A command with every row to the same goal, and a lens that was told something with every tenth."""
+    rows = [
+        dataclasses.replace(row, head_commands=7 + i, lens_commands=1 + i // 10) for i, row in enumerate(run((150, {})))
+    ]
+    found = score(rows)
+    assert found.commands_per_min == pytest.approx(99 / COUNTED_MIN)  # those of the start are forgotten
+    assert found.lens_commands_per_min == pytest.approx(9 / COUNTED_MIN)
+    assert found.reversals_per_min == 0.0
+    every_other = score(rows[::2])  # of a zoom camera half as fast: what was sent between its frames counts too
+    assert every_other.commands_per_min == pytest.approx(98 / (98 * PERIOD / 60))
 
 
 @pytest.mark.parametrize(("parts", "count"), [

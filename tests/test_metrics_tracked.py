@@ -1,6 +1,7 @@
 """Scores of tracks by labels, on cases worked out by hand."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from cotarget.errors import ConfigError
 from cotarget.metrics import Label, read_labels, read_tracks, score_tracks
 from cotarget.metrics.tracked import Tracked
 from cotarget.video import FilmWriter
+from tests.recorded_run import RATE_HZ, Bright, calibration_file, record
 
 RATE = 25.0
 FRAMES = 100
@@ -47,6 +49,21 @@ def test_a_track_beside_the_target_is_false_when_it_lives():
     assert found.false_tracks == 1  # 0.52 s
     assert found.false_tracks_per_min == pytest.approx(60 / (FRAMES / RATE))
     assert (found.on_target_ratio, found.numbers, found.fragmentation_per_min) == (1.0, 1, 0.0)
+
+
+@pytest.mark.parametrize(("away", "false"), [(13, 0), (14, 1)])
+def test_a_track_that_was_on_target_once_is_false_when_it_stays_off(away, false):
+    """13 frames are 0.48 s from the first to the last, 14 are 0.52."""
+    other = [*track(2, range(40, 50)), *track(2, range(50, 50 + away), 30.0), *track(2, range(50 + away, 90))]
+    assert score_tracks([*track(1, range(FRAMES)), *other], LABELS, RATE, FRAMES).false_tracks == false
+
+
+def test_frames_without_a_label_are_not_held_against_a_track_that_was_on_target():
+    other = [*track(2, range(40, 50)), *track(2, range(50, 90), 30.0)]
+    labels = {i: boxes for i, boxes in LABELS.items() if i < 62 or i % 10 == 0}  # 12 frames, and one at a time
+    assert score_tracks([*track(1, range(FRAMES)), *other], labels, RATE, FRAMES).false_tracks == 0
+    never_on = track(3, range(62, 90), 30.0)
+    assert score_tracks([*track(1, range(FRAMES)), *other, *never_on], labels, RATE, FRAMES).false_tracks == 1
 
 
 @pytest.mark.parametrize(("gap", "breaks"), [(5, 0), (6, 1), (20, 1)])
@@ -117,4 +134,31 @@ def test_the_command_scores_a_film(tmp_path, capsys):
     assert found["offset_px_median"] < 1.5
     assert len(read_tracks(tmp_path / "tracks.csv")) >= 50
     assert main([*arguments, "--labels", str(tmp_path / "none.csv")]) == 1
+    assert "none.csv" in capsys.readouterr().err
+
+
+def test_the_command_scores_a_recording(tmp_path, capsys, monkeypatch):
+    """The bright bird of `tests.recorded_run`, labelled where it is drawn, by the numbers of the recorded pictures."""
+    monkeypatch.setattr("cotarget.detection.make_detector", lambda *_: Bright())
+    steps = record(tmp_path / "run", calibration_file(tmp_path), seconds=1.6)
+    rows = []
+    for number, step in enumerate(steps):
+        assert (tmp_path / "run" / "fixed" / f"{number:06d}.png").is_file()
+        index = round(step.fixed.t * RATE_HZ)
+        u, v = round(20 + 0.7 * (index % 80)), round(36 + 10 * math.sin(index / 9))
+        rows.append(f"{number},{u - 4},{v - 4},9,9")
+    assert main(["replay", str(tmp_path / "run")]) == 0
+    assert "on_target_ratio" not in json.loads(capsys.readouterr().out)
+    arguments = ["replay", str(tmp_path / "run"), "--labels"]
+    assert main([*arguments, str(write_labels(tmp_path / "labels.csv", rows))]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["steps"] == len(steps)
+    assert (found["labelled_frames"], found["on_target_ratio"], found["numbers"]) == (len(steps) - 30, 1.0, 1)
+    assert found["false_tracks"] == 0
+    assert found["offset_px_median"] < 1.5
+    beside = [f"{number},60,2,9,9" for number in range(len(steps))]
+    assert main([*arguments, str(write_labels(tmp_path / "beside.csv", beside))]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["on_target_ratio"], found["false_tracks"]) == (0.0, 1)
+    assert main([*arguments, str(tmp_path / "none.csv")]) == 1
     assert "none.csv" in capsys.readouterr().err

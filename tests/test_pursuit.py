@@ -11,14 +11,16 @@ import pytest
 
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.closeup import Found
+from cotarget.closeup import CloseupFinder, Found
+from cotarget.closeup.finder import LONGEST_APART_S
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.geometry import pose
 from cotarget.motionfilter import Track
-from cotarget.policies import RATE_S
-from cotarget.pursuit import MOST_FILTERS, UNFOUND_S, Pursuit
+from cotarget.planning import RATE_S
+from cotarget.pursuit import MOST_FILTERS, MOST_WAITING, UNFOUND_S, Pursuit
 from cotarget.rig import Frame, PanTiltState, ZoomState
+from cotarget.tracking import Tracker, settings_for
 
 SIZE, CENTER, FOCAL, ZOOMED = (640, 480), (319.5, 239.5), 700.0, 3000.0
 BASELINE = 0.4
@@ -28,7 +30,7 @@ CALIBRATION = Calibration(
     pose([-BASELINE, 0, 0], [0, 0, 0]),
     pose([0, 0, 0], [0, 0, 0]),
 )
-BOOK, BIRD = DEFAULT_TARGETS["book"], DEFAULT_TARGETS["bird"]
+BOOK, BIRD, PERSON = (DEFAULT_TARGETS[name] for name in ("book", "bird", "person"))
 PICTURE = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
 FRAME_S = 0.04
 
@@ -42,7 +44,7 @@ def box_at(x, y, z, size=BOOK.size, wrong=1.0):
 def track(number, box, t=0.0, *, missed=0, confirmed=True, larger=None):
     side = float(box.size_px.max()) if larger is None else larger
     still = np.zeros(2)
-    return Track(number, t, confirmed, missed, box.center_px, still, box.size_px, side, np.eye(4), 1.0, box, 1.0)
+    return Track(number, t, confirmed, missed, box.center_px, still, box.size_px, side, np.eye(4), 1.0, box)
 
 
 def seen(pursuit, tracks_at, frames):
@@ -108,18 +110,100 @@ def test_a_policy_is_told_directions_and_speeds_as_the_head_sees_them():
     assert found.rate[0] == pytest.approx((later - math.atan2(-BASELINE, 10.0)) / RATE_S, rel=0.05)
 
 
+def crossing_persons(t, speed=1.5, depth=10.0):
+    """Middles and common size of two persons who cross in the middle of the view at 2 s, (2, 2) and (2,) [px]."""
+    way = FOCAL * speed * (t - 2.0) / depth
+    return CENTER + np.array([[way, 0.0], [-way, 0.0]]), np.array([0.4, 1.75]) * FOCAL / depth
+
+
+class Learner:
+    """A finder that notes at what times it was shown the target, and how large."""
+
+    def __init__(self):
+        self.shown = {}
+
+    def see_wide(self, frame, detection, mask):
+        self.shown[frame.t] = detection.size_px
+
+
+def test_who_crosses_another_is_predicted_as_before():
+    """While both are one box neither is where its own last box was, 6 px a frame ago and more."""
+    tracker, pursuit = Tracker(settings_for(PERSON), SIZE), Pursuit(CALIBRATION, PERSON, SIZE)
+    pursuit.follow(1)
+    pursuit._finder, merged, worst = Learner(), [], 0.0
+    for i in range(100):
+        t = i * FRAME_S
+        middles, size = crossing_persons(t)
+        boxes = [Detection(middle, size, 1.0) for middle in middles]
+        if abs(middles[0, 0] - middles[1, 0]) <= size[0]:
+            merged.append(t)
+            boxes = [Detection(np.array(CENTER), size + np.abs(middles[0] - middles[1]), 1.0)]
+        pursuit.see_wide(Frame(PICTURE, t), tracker.update(boxes, t), None)
+        for number in (1, 2) if t > 1.0 else ():
+            found = pursuit.estimate(number, t + 0.2)
+            at = CENTER + FOCAL * found.x_fixed[:2] / found.x_fixed[2]
+            worst = max(worst, np.linalg.norm(at - crossing_persons(t + 0.2)[0][number - 1]))
+            assert found.measured_t == pytest.approx(t + 0.2, abs=0.2 + 1e-9)
+            assert found.depth == pytest.approx(10.0, rel=0.01)
+    assert len(merged) >= 5
+    assert worst < 1.0  # stale boxes make it 50 px and more
+    assert not set(merged) & set(pursuit._finder.shown)
+    np.testing.assert_allclose(list(pursuit._finder.shown.values()), [size] * len(pursuit._finder.shown))
+
+
+def test_a_share_of_a_box_is_the_less_believed_the_more_room_there_is():
+    """Two stand as one box, and the tracker has drifted 10 px aside: what it says may not carry the estimate away."""
+
+    def pulled(around):
+        pursuit = Pursuit(CALIBRATION, PERSON, SIZE)
+        own = Detection(np.array(CENTER), np.array([28.0, 122.5]), 1.0)
+        t = seen(pursuit, lambda t: [track(1, own, t)], 25) + FRAME_S
+        aside = track(1, replace(own, center_px=np.add(CENTER, (10.0, 0.0))), t)
+        tracks = [replace(aside, box=replace(own, size_px=np.array([around, 122.5])), shared=True)]
+        pursuit.see_wide(Frame(PICTURE, t), tracks, None)
+        return FOCAL * pursuit.estimate(1, t).x_fixed[0] / 10.0
+
+    assert 0 < pulled(100.0) < pulled(40.0) < 1.0
+
+
 def test_a_policy_is_told_of_confirmed_tracks_only_and_of_how_long_each_was_seen_well():
     pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
     tracks = [track(n, box_at(float(n), 0.0, 10.0), confirmed=n < 3) for n in (1, 2, 3)]
     pursuit.see_wide(Frame(PICTURE, 0.0), tracks, None)
+    pursuit.states.add(PanTiltState(math.atan2(2.0 - BASELINE, 10.0), 0.0, False, 0.0), ZoomState(ZOOMED, False, 0.0))
     for _ in range(3):
-        pursuit.seen_well(2, 0.5)
+        pursuit.count_seen_well(tracks[1], 0.5, ZOOMED)
     unknown = track(4, box_at(0.0, 0.0, 10.0))
     found = {each.track.id: each.seen_s for each in pursuit.candidates([*tracks, unknown], 0.0)}
     assert found == {1: 0.0, 2: 1.5}
     pursuit.see_wide(Frame(PICTURE, FRAME_S), tracks[:1], None)  # it is gone ...
     pursuit.see_wide(Frame(PICTURE, 2 * FRAME_S), tracks, None)  # ... and whoever has its number is another
     assert {each.seen_s for each in pursuit.candidates(tracks, 2 * FRAME_S)} == {0.0}
+
+
+@pytest.mark.parametrize(("pan", "nominal", "well"), [
+    (0.0, ZOOMED, True),  # it is 70 px large, and 160 are wanted: the lens can do no more
+    (0.0, 0.85 * ZOOMED, True),
+    (0.0, 0.75 * ZOOMED, False),  # on its way
+    (0.07, ZOOMED, True),
+    (0.11, ZOOMED, False),  # of 0.107 to the border half the book is 0.012
+])  # fmt: skip
+def test_seen_well_is_whoever_is_as_large_as_wanted_and_in_the_image(pan, nominal, well):
+    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    box = box_at(BASELINE, 0.0, 10.0)
+    t = seen(pursuit, lambda t: [track(1, box, t)], 20)
+
+    def told(number_of_frames_missed=0, t=t):
+        there = track(1, box, t, missed=number_of_frames_missed)
+        before = pursuit.candidates([there], t)[0].seen_s
+        pursuit.count_seen_well(there, 0.5, ZOOMED)
+        return pursuit.candidates([there], t)[0].seen_s - before
+
+    assert told() == 0.0  # nothing was heard of head and lens
+    for when in (t, t + 1.0):
+        pursuit.states.add(PanTiltState(pan, 0.0, False, when), ZoomState(nominal, False, when))
+    assert told() == 0.5 * well
+    assert told(25, t + 1.0) == 0.0  # whoever is out of sight is not seen
 
 
 class Finder:
@@ -131,11 +215,14 @@ class Finder:
     def see_wide(self, frame, detection, mask):
         return None
 
+    def sight_at(self, t):
+        return "a sight"
+
     def find(self, frame, expected):
         self.asked.append(expected)
         tangent = (self.x[:2] - (BASELINE, 0.0)) / self.x[2]  # the head looks straight ahead
         body = np.full(2, self.body_sigma_px)
-        return Found(np.array(CENTER) + ZOOMED * tangent, 1.0, body, 1.0, 1.0, np.ones(2), np.zeros(2), frame.t)
+        return Found(np.array(CENTER) + ZOOMED * tangent, 1.0, body, 1.0, 1.0, np.ones(2), frame.t)
 
 
 def followed(x_fixed, wrong, frames, finder, **pursuit):
@@ -148,7 +235,7 @@ def followed(x_fixed, wrong, frames, finder, **pursuit):
         t = i * FRAME_S
         pursuit.see_wide(Frame(PICTURE, t), [track(1, box_at(*x_fixed, wrong=wrong), t)], None)
         pursuit.states.add(PanTiltState(0.0, 0.0, False, t), ZoomState(ZOOMED, False, t))
-        found.append(pursuit.see_zoom(Frame(PICTURE, t)))
+        found.append(pursuit.see_zoom(Frame(PICTURE, t), t))
     return pursuit, found
 
 
@@ -183,12 +270,12 @@ def test_the_zoom_view_is_not_asked_before_it_is_known_where_it_looks_and_for_wh
     pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
     pursuit._finder = Finder(x)
     pursuit.see_wide(Frame(PICTURE, 0.0), [track(1, box_at(*x))], None)
-    assert pursuit.see_zoom(Frame(PICTURE, 0.0)) is None  # nobody is followed, and nothing was heard of the head
+    assert pursuit.see_zoom(Frame(PICTURE, 0.0), 0.0) is None  # nobody is followed, and nothing was heard of the head
     pursuit.states.add(PanTiltState(0.0, 0.0, False, 0.0), ZoomState(ZOOMED, False, 0.0))
-    assert pursuit.see_zoom(Frame(PICTURE, 0.0)) is None
+    assert pursuit.see_zoom(Frame(PICTURE, 0.0), 0.0) is None
     pursuit.follow(1)
     pursuit._finder = Finder(x)
-    assert pursuit.see_zoom(Frame(PICTURE, 0.0)) is not None
+    assert pursuit.see_zoom(Frame(PICTURE, 0.0), 0.0) is not None
 
 
 def test_another_target_is_looked_for_by_another_finder():
@@ -292,10 +379,72 @@ def test_what_cannot_be_seen_is_not_missed():
         t = i * FRAME_S
         pursuit.see_wide(Frame(PICTURE, t), [track(1, box_at(*seen_last), t, missed=i)], None)
         pursuit.states.add(PanTiltState(0.0, 0.0, False, t), ZoomState(ZOOMED, False, t))
-        pursuit.see_zoom(Frame(PICTURE, t))
+        pursuit.see_zoom(Frame(PICTURE, t), t)
     assert pursuit.doubts(1, t) == []
 
 
 class Nowhere(Finder):
     def find(self, frame, expected):
         return None
+
+
+class Compared(CloseupFinder):
+    """Finds the point in each zoom frame of whose time the wide view has shown it, or at which it is looked for."""
+
+    def find(self, frame, expected):
+        self.asked = [*getattr(self, "asked", []), frame.t]
+        return Found(np.array(CENTER), 1.0, np.ones(2), 1.0, 1.0, np.ones(2), frame.t)
+
+
+def apart(by, frames=60):
+    """Views of which the zoom camera's newest frame is newer by so much [s] than the wide one's; the finds."""
+    x = (BASELINE, 0.0, 10.0)
+    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    pursuit.follow(1)
+    pursuit._finder = Compared(CALIBRATION, BOOK)
+    found = []
+    for i in range(frames):
+        t = 1.0 + i * FRAME_S
+        pursuit.see_wide(Frame(PICTURE, t), [track(1, box_at(*x), t)], None)
+        for when in (t, t + by):
+            pursuit.states.add(PanTiltState(0.0, 0.0, False, when), ZoomState(ZOOMED, False, when))
+        found.append(pursuit.see_zoom(Frame(PICTURE, t + by), t))
+        if found[-1] is not None:
+            assert abs(found[-1].t - t) <= max(LONGEST_APART_S, -by) + 1e-9
+            assert pursuit.estimate(1, t).measured_t == pytest.approx(max(t, found[-1].t) if found[-1].t <= t else t)
+    return found, pursuit.doubts(1, t)
+
+
+@pytest.mark.parametrize("by", [0.08, 0.13, 0.29, 0.49, -0.13, -0.29, -0.49])
+def test_views_of_other_latencies_are_compared(by):
+    found, doubts = apart(by)
+    assert all(each is not None for each in found[15:])
+    assert np.diff([each.t for each in found[15:]]) == pytest.approx(FRAME_S)
+    assert doubts == []
+
+
+@pytest.mark.parametrize(("by", "later"), [(0.7, "wide"), (-0.7, "zoom")])
+def test_views_that_are_too_far_apart_in_time_are_told(by, later):
+    doubts = apart(by)[1]
+    assert doubts == [f"the views are too far apart in time: the {later} one comes 0.70 s later"]
+
+
+def test_a_zoom_frame_without_a_wide_view_of_its_time_is_not_one_without_the_target():
+    """The wide view shows the target now and then only; the calibration is not to blame."""
+    x = (BASELINE, 0.0, 10.0)
+    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    pursuit.follow(1)
+    pursuit._finder = Sparse(CALIBRATION, BOOK)
+    for i in range(100):
+        t = i * FRAME_S
+        pursuit.see_wide(Frame(PICTURE, t), [track(1, box_at(*x), t, missed=i % 25)], None)
+        pursuit.states.add(PanTiltState(0.0, 0.0, False, t), ZoomState(ZOOMED, False, t))
+        pursuit.see_zoom(Frame(PICTURE, t), t)
+    assert len(pursuit._finder.asked) <= 4 * 2 * LONGEST_APART_S / FRAME_S + 1
+    assert len(pursuit._waiting) <= MOST_WAITING
+    assert pursuit.doubts(1, t) == []
+
+
+class Sparse(Compared):
+    def find(self, frame, expected):
+        super().find(frame, expected)

@@ -33,9 +33,7 @@ IMAGE_BYTES = SIZE[0] * SIZE[1] * 3
 
 def step(index=0, found=True):
     detection = Detection(np.array([10.0, 20.0]), np.array([3.0, 4.0]), 1.0)
-    track = Track(
-        7, 0.5, True, 0, detection.center_px, np.zeros(2), detection.size_px, 4.0, np.eye(4), 1.0, detection, 1.0
-    )
+    track = Track(7, 0.5, True, 0, detection.center_px, np.zeros(2), detection.size_px, 4.0, np.eye(4), 1.0, detection)
     aim = Aim(0.1, 0.2, 5000.0, 4900.0, False, np.array([1.0, 2.0, 10.0]), 10.5)
     return Step(
         index=index,

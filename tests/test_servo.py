@@ -121,6 +121,22 @@ def test_the_lens_starts_at_its_shortest_and_the_head_where_it_is():
     assert (rig.moves, rig.zooms) == ([], [SHORTEST])
 
 
+def test_whatever_is_sent_is_counted():
+    """Without a dead zone the head is told where a book is with every frame: by turns two places for a unit's one."""
+    rig = Rig(t=2.0)
+    move, goal = rig.head.move, (0.05, 0.1)
+    rig.head.move = lambda *command: move(*command) and goal
+    driver = servo(rig, steering=SteeringSettings(zone=0.0))
+    for i in range(20):
+        driver.drive(still(0.5 + 1e-4 * (i % 2)), rig.t, FRAME)
+        assert driver.commanded[:2] == goal
+        rig.t += FRAME
+    assert driver.head_commands == len(rig.moves) == 20
+    driver.zoom_out()
+    driver.zoom_out()  # it is there already
+    assert driver.lens_commands == len(rig.zooms) > 2
+
+
 def test_the_aim_is_at_where_the_target_will_be_when_the_command_takes_effect():
     rig = Rig(t=2.0)
     found = servo(rig).drive(moving(1.0), 1.9, FRAME).aim
@@ -214,6 +230,52 @@ def test_a_head_that_was_halted_on_its_way_is_sent_again():
     rig.t += 2.0
     assert len(rig.moves) == 2
     assert rig._head().pan == pytest.approx(math.atan(0.5))
+
+
+def test_a_lost_target_is_looked_for_with_the_shortest_focal_length():
+    rig = Rig()
+    driver = servo(rig)
+    driver.drive(still(0.5), 0.0, FRAME)
+    assert rig.zooms[-1] > SHORTEST
+    rig.t = 1.0
+    found = driver.search(still(2.0), 0.0, FRAME)
+    assert rig.zooms[-1] == driver.commanded[2] == SHORTEST
+    assert found.pan == pytest.approx(math.atan(0.2))
+    assert rig.moves[-1][:2] == driver.commanded[:2] == pytest.approx((found.pan, found.tilt))
+
+
+def test_a_lost_target_of_which_too_little_is_known_is_waited_for():
+    """Half the height of the widest close-up is 240 px of 770: 0.31 rad."""
+    for sigma, goes in ((0.30, True), (0.32, False)):
+        rig = Rig()
+        assert (servo(rig).search(still(2.0, sigma=sigma), 0.0, FRAME) is not None) == goes
+        assert len(rig.moves) == goes
+    rig = Rig()
+    with pytest.raises(UnreachableError):
+        servo(rig).search(still(30.0), 0.0, FRAME)
+    assert not rig.moves
+
+
+def test_the_lens_has_a_delay_of_its_own():
+    for delay, exposed in ((None, DELAY), (0.5, 0.5), (0.0, 0.0)):
+        rig, asked = Rig(t=2.0), []
+
+        def predict(t, asked=asked):
+            asked.append(t)
+            return Known(np.array([0.5, -1.0, 10.0]), t)
+
+        servo(rig, lens_delay_s=delay).drive(predict, 1.9, FRAME)
+        assert asked == pytest.approx([2.0 + DELAY, 2.0 + DELAY + FRAME, 2.0 + exposed + FRAME])
+
+
+def test_a_narrow_target_may_be_larger():
+    """Its direction is known badly along the width, of which it takes but a part."""
+    focals = []
+    for shape in (1.0, 2.5):
+        rig = Rig(moves=[(0.0, math.atan(0.1), None)])
+        servo(rig).drive(still(0.0, sigma=0.02), 0.0, FRAME, shape=shape)  # of a book its width is told
+        focals.append(rig.zooms[-1])
+    assert focals[1] > 1.02 * focals[0]
 
 
 def test_what_can_be_reached():

@@ -1,6 +1,8 @@
 """Which of several targets a command follows: by a policy, by a click into the wide view, or by a track's number."""
 
 import argparse
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from cotarget.cli.arguments import count, number
@@ -50,18 +52,18 @@ class Choice:
         self._wish = ""
         self._seen: set[int] = set()
         self._followed = False
-        self.policy: Policy
+        self.policy: Callable[[], Policy]
         if options.click is not None:
             u, v = options.click
             if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
                 raise ConfigError(f"--click: ({u:g}, {v:g}) is not in the wide view's {size[0]}x{size[1]} image")
-            self.policy = Chosen(pixel=(u, v), width_px=size[0])
+            self.policy = partial(Chosen, pixel=(u, v), width_px=size[0])
             self._wish = f"--click: no track came near ({u:g}, {v:g})"
         elif options.track is not None:
-            self.policy = Chosen(number=options.track)
+            self.policy = partial(Chosen, number=options.track)
             self._wish = f"--track: there was no track {options.track}"
         else:
-            self.policy = MAKERS[options.policy or POLICIES[0]]()
+            self.policy = MAKERS[options.policy or POLICIES[0]]
 
     def see(self, step: "Step") -> None:
         """Take note of a Step."""

@@ -161,6 +161,12 @@ def _parser() -> argparse.ArgumentParser:
     replay = command("replay", running.replay, "run the pipeline again on a recording of follow --record")
     replay.add_argument("recording", type=Path, metavar="DIR")
     add_choice(replay)
+    replay.add_argument(
+        "--labels",
+        type=Path,
+        metavar="FILE",
+        help="score the tracks by these: a csv as for detect, whose frame is the picture's number in DIR/fixed",
+    )
     replay.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
     replay.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
 

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,8 @@ from cotarget.errors import ConfigError
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig
+    from cotarget.loop import Step
+    from cotarget.metrics import Label, Tracked
     from cotarget.rig import Rig
 
 
@@ -61,6 +64,7 @@ def follow(options: argparse.Namespace) -> None:
 def replay(options: argparse.Namespace) -> None:
     """Cotarget replay."""
     from cotarget.calibration import load_calibration
+    from cotarget.metrics import Tracked, read_labels
     from cotarget.replay import ReplayRig, open_recording
     from cotarget.safety import SafeRig
 
@@ -68,14 +72,22 @@ def replay(options: argparse.Namespace) -> None:
     for note in recording.notes:
         print(f"{options.recording}: {note}", file=sys.stderr)
     calibration = load_calibration(recording.calibration)
-    check_outputs([options.csv, options.video], [recording.calibration])
+    check_outputs([options.csv, options.video], [recording.calibration, options.labels])
+    labels = None if options.labels is None else read_labels(options.labels)
+    pictures, tracks = recording.pictures, list[Tracked]()
+
+    def see(step: "Step") -> None:
+        number = pictures[step.fixed.t]
+        tracks.extend(Tracked(number, step.fixed.t, each.id, each.center_px) for each in step.tracks if each.confirmed)
+
     played = ReplayRig(recording)
     choice = Choice(options, played.fixed.size)
     with SafeRig(played, recording.config.safety) as rig:
         config, name, steps = recording.config, recording.target, recording.steps
-        states = _follow(rig, calibration, config, name, choice, math.inf, options.csv, options.video, steps)
+        states = _follow(rig, calibration, config, name, choice, math.inf, options.csv, options.video, steps, see)
     _tell_if_nothing_was_seen("replay", recording.target, states["states"], choice)
-    print_json(states | {"differences": dataclasses.asdict(played.differences)})
+    scores = _scores(tracks, labels, config.rate_hz, states["steps"])
+    print_json(states | {"differences": dataclasses.asdict(played.differences)} | scores)
 
 
 def _follow(
@@ -88,6 +100,7 @@ def _follow(
     csv: Path | None,
     video: Path | None,
     frames: int | None = None,
+    see: "Callable[[Step], None]" = lambda _: None,
 ) -> dict[str, Any]:
     """Follow a target, show the progress, keep what is asked for; how many steps there were, and in which states."""
     from cotarget.detection import make_detector
@@ -99,7 +112,9 @@ def _follow(
 
     target = config.target(name)
     detector = make_detector(target, config.rate_hz)
-    settings = FollowSettings(command_delay_s=config.command_delay_s, policy=choice.policy)
+    settings = FollowSettings(
+        command_delay_s=config.command_delay_s, lens_delay_s=config.lens_delay_s, policy=choice.policy
+    )
     states: dict[str, int] = dict.fromkeys(State, 0)
     expected = math.ceil(seconds * config.rate_hz) if frames is None else frames
     with (
@@ -110,6 +125,7 @@ def _follow(
         for step in until_end(follow(rig, calibration, target, detector, seconds=seconds, settings=settings)):
             table.write(step)
             choice.see(step)
+            see(step)
             states[step.state] += 1
             if film is not None:
                 film.write(side_by_side(step, name))
@@ -136,7 +152,7 @@ def detect(options: argparse.Namespace) -> None:
     """Cotarget detect."""
     from cotarget.config import RigConfig, load_config
     from cotarget.film import run_on_film
-    from cotarget.metrics import read_labels, read_tracks, score_tracks
+    from cotarget.metrics import read_labels, read_tracks
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
     target = config.target(options.target)
@@ -150,10 +166,17 @@ def detect(options: argparse.Namespace) -> None:
             options.video,
             lambda done, total: progress(f"detecting: {options.target}", done, total or done),
         )
-    table = dataclasses.asdict(found)
-    if labels is not None:
-        table |= dataclasses.asdict(score_tracks(read_tracks(options.csv), labels, found.rate_hz, found.frames))
-    print_json(table)
+    scores = _scores(read_tracks(options.csv), labels, found.rate_hz, found.frames)
+    print_json(dataclasses.asdict(found) | scores)
+
+
+def _scores(
+    tracks: "Iterable[Tracked]", labels: "Mapping[int, Sequence[Label]] | None", rate_hz: float, frames: int
+) -> dict[str, Any]:
+    """How well tracks keep to what is labelled; nothing where nobody gave labels."""
+    from cotarget.metrics import score_tracks
+
+    return {} if labels is None else dataclasses.asdict(score_tracks(tracks, labels, rate_hz, frames))
 
 
 def doctor(options: argparse.Namespace) -> int:

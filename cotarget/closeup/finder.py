@@ -15,8 +15,10 @@ from cotarget.geometry import Array
 from cotarget.pantilt import base_head
 from cotarget.rig import Frame, Image
 
-# Wide frames that are kept, and how far apart in time the two views may be: limbs and wings move [s].
-KEPT_SIGHTS, LONGEST_APART_S = 8, 0.1
+# How far apart in time the two views of a find may be: limbs and wings move [s].
+LONGEST_APART_S = 0.1
+# By so much one camera's frames may come later than the other's [s]; for so long wide frames are kept.
+LATEST_S = 0.5
 # A small step for derivatives, as a part of the depth.
 STEP = 1e-3
 # Lens, head and the times of frames are never known better than this, one standard deviation [px].
@@ -56,13 +58,12 @@ class Found:
 
     Attributes:
         center_px: that point in the zoom frame (u, v), (2,).
-        sigma_px: how far it may be from the point that ``wide_px`` shows, along u and v each, one standard deviation.
+        sigma_px: how far it may be from the same point in the wide view, along u and v each, one standard deviation.
         body_sigma_px: how far it may be from the true middle of the body, likewise, (2,).
         score: how alike both views are there, 0 to 1.
         seen: the part of the target that is inside the zoom frame, 0 to 1.
         size_px: the width and height of the wide view's box as large as the zoom frame shows them, (2,).
-        wide_px: the same point in the wide view, (2,), and ...
-        wide_t: ... when that view was exposed [s].
+        t: when the zoom frame was exposed [s].
     """
 
     center_px: Array
@@ -71,8 +72,7 @@ class Found:
     score: float
     seen: float
     size_px: Array
-    wide_px: Array
-    wide_t: float
+    t: float
 
 
 class CloseupFinder:
@@ -92,7 +92,7 @@ class CloseupFinder:
         self._T_base_fixed = calibration.hand_eye() * calibration.T_zoom0_fixed  # (6)
         self._T_zoom_head = calibration.hand_eye().inv()
         self._target = target
-        self._sights: deque[Sight] = deque(maxlen=KEPT_SIGHTS)
+        self._sights: deque[Sight] = deque()
         self._usual_score, self._sure_t = 0.0, -math.inf
         self._last_t = -math.inf
         self._last_offset: Array = np.zeros(2)  # beside the expected place, in wide pixels
@@ -111,7 +111,14 @@ class CloseupFinder:
         sight = look(frame, detection, mask, self._target)
         if sight is not None:
             self._sights.append(sight)
+            while self._sights[0].t < sight.t - LATEST_S - LONGEST_APART_S:
+                self._sights.popleft()
         return sight
+
+    def sight_at(self, t: float) -> Sight | None:
+        """What the wide view showed of the target at about a time [s]; None where it did not, or has not yet."""
+        near = min(self._sights, key=lambda sight: abs(sight.t - t), default=None)
+        return None if near is None or abs(near.t - t) > LONGEST_APART_S else near
 
     def find(self, frame: Frame, expected: Expected) -> Found | None:
         """Find the target in a zoom frame.
@@ -123,11 +130,9 @@ class CloseupFinder:
         Returns:
             None where it is not there, or not for sure.
         """
-        near = [sight for sight in self._sights if abs(sight.t - frame.t) <= LONGEST_APART_S]
-        view = self._view(expected)
-        if not near or view is None:
+        sight, view = self.sight_at(frame.t), self._view(expected)
+        if sight is None or view is None:
             return None
-        sight = min(near, key=lambda sight: abs(sight.t - frame.t))
         place = register(frame.image, sight, view)
         if place is None or not self._believes(place, sight, view, frame.t):
             return None
@@ -138,8 +143,7 @@ class CloseupFinder:
             score=place.score,
             seen=place.seen,
             size_px=np.linalg.norm(view.J, axis=0) * sight.size_px,
-            wide_px=sight.body_px,
-            wide_t=sight.t,
+            t=frame.t,
         )
 
     def _believes(self, place: Place, sight: Sight, view: View, t: float) -> bool:

@@ -1,11 +1,14 @@
 """What has a template's colour, located to a fraction of a pixel (the book)."""
 
+import math
+
 import cv2
 import numpy as np
 
 from cotarget.detection.base import Detection, box_detection, check_size
-from cotarget.detection.templatefit import MARGIN_PX, fit_template
+from cotarget.detection.templatefit import BLUR_PX, MARGIN_PX, fit_template
 from cotarget.errors import ConfigError
+from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
 # A template whose mean colour is closer to grey than this tells nothing by its colour [grey levels].
@@ -22,6 +25,12 @@ LEAST_PIXELS = 12
 LARGEST_COLOURED = 0.5
 # A detection must explain this part of the variation around it.
 LEAST_FIT = 0.3
+# A fit takes milliseconds: of all patches of the colour the largest are looked at, and of these the likeliest fitted.
+MOST_LOOKED_AT, MOST_FITTED = 100, 8
+# Patch and template are compared at this width and height, with this part of their sides around them [px].
+LOOK, AROUND = (16, 16), 0.25
+# A patch whose larger side is longer is fitted at a scale at which it is not [px]: no worse, for its noise is averaged.
+LARGEST_FITTED_PX = 48.0
 
 
 class ColourDetector:
@@ -50,6 +59,10 @@ class ColourDetector:
         across = np.cross(np.full(3, 1 / np.sqrt(3)), self._along)
         plane = template.astype(float) @ self._along
         self._plane = (plane / np.percentile(plane, 75)).astype(np.float32)
+        h, w = plane.shape
+        top, left = round(AROUND * h), round(AROUND * w)
+        framed = cv2.copyMakeBorder(self._plane, top, top, left, left, cv2.BORDER_CONSTANT, value=0)
+        self._look = _normalised(cv2.resize(framed, LOOK, interpolation=cv2.INTER_AREA))
         tests = np.vstack([self._along, HUE_TANGENT * self._along - across, HUE_TANGENT * self._along + across])
         self._tests = tests * CHROMA_BYTE / np.percentile(plane, 75)
         self._shape: tuple[int, ...] | None = None
@@ -66,7 +79,7 @@ class ColourDetector:
         tests = cv2.transform(frame.image, self._tests)  # saturates at 0: a wrong hue fails one of the last two
         self.mask = cv2.inRange(tests, (LEAST_WEIGHT * CHROMA_BYTE, 1, 1), (255, 255, 255))
         joined = cv2.dilate(self.mask, np.ones((3, 3), np.uint8))
-        found = []
+        boxes = []
         for contour in cv2.findContours(joined, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]:
             x, y, w, h = cv2.boundingRect(contour)
             inside = self.mask[y : y + h, x : x + w]
@@ -74,16 +87,45 @@ class ColourDetector:
                 continue
             dx, dy, w, h = cv2.boundingRect(inside)
             if max(w / self.mask.shape[1], h / self.mask.shape[0]) <= LARGEST_COLOURED:
-                found.append(self._refine(frame.image, box_detection(x + dx, y + dy, w, h, 0.0, self.mask.shape)))
+                boxes.append(box_detection(x + dx, y + dy, w, h, 0.0, self.mask.shape))
+        found = [self._refine(frame.image, box) for box in self._likeliest(tests[..., 0], boxes)]
         return sorted((d for d in found if d.score >= LEAST_FIT), key=lambda d: -d.score)
+
+    def _likeliest(self, plane: Image, boxes: list[Detection]) -> list[Detection]:
+        """Those that look most like the template in the plane of its colour (H, W): MOST_FITTED at most."""
+        if len(boxes) <= MOST_FITTED:
+            return boxes
+
+        def likeness(box: Detection) -> float:
+            width, height = ((1 + 2 * AROUND) * box.size_px).round().astype(int).tolist()
+            part = cv2.getRectSubPix(plane, (width, height), box.center_px.tolist())
+            return float(np.sum(self._look * _normalised(cv2.resize(part, LOOK, interpolation=cv2.INTER_AREA))))
+
+        largest = sorted(boxes, key=lambda box: -float(box.size_px.prod()))[:MOST_LOOKED_AT]
+        return sorted(largest, key=likeness, reverse=True)[:MOST_FITTED]
 
     def _refine(self, image: Image, coarse: Detection) -> Detection:
         """Locate the target in its coarse box to a fraction of a pixel."""
-        low = np.maximum(0, np.rint(coarse.center_px - coarse.size_px / 2 - MARGIN_PX)).astype(int)
-        high = np.rint(coarse.center_px + coarse.size_px / 2 + MARGIN_PX).astype(int) + 1
+        scale = math.ceil(float(coarse.size_px.max()) / LARGEST_FITTED_PX)
+        low = np.maximum(0, np.rint(coarse.center_px - coarse.size_px / 2 - scale * MARGIN_PX)).astype(int)
+        high = np.rint(coarse.center_px + coarse.size_px / 2 + scale * MARGIN_PX).astype(int) + 1
+        high = np.minimum(high, image.shape[1::-1])
+        high -= (high - low) % scale  # of pixels all alike
         part = image[low[1] : high[1], low[0] : high[0]].astype(np.float32) @ self._along.astype(np.float32)
-        fit = fit_template(self._plane, part, coarse.center_px - low, coarse.size_px)
+        if scale > 1:
+            width, height = ((high - low) // scale).tolist()
+            part = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA)
+            # As blurred as the fit takes it to be; at this scale the camera's own blur is hardly any.
+            part = np.asarray(cv2.GaussianBlur(part, (0, 0), BLUR_PX * math.sqrt(1 - 1 / scale**2)), np.float32)
+        corner = low + (scale - 1) / 2  # where the first of its pixels has its middle
+        fit = fit_template(self._plane, part, (coarse.center_px - corner) / scale, coarse.size_px / scale)
         if fit is None:
             return coarse
         center, size, likeness = fit
-        return Detection(center + low, size, likeness, coarse.clipped)
+        return Detection(scale * center + corner, scale * size, likeness, coarse.clipped)
+
+
+def _normalised(picture: Image) -> Array:
+    """The same with a mean of 0 and a length of 1; all 0 where nothing is to be seen."""
+    off = picture - np.mean(picture)
+    return np.asarray(off / max(1e-9, float(np.linalg.norm(off))))

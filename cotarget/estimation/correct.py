@@ -18,10 +18,14 @@ SETTLED = 1e-3  # it has converged when the depth changes by less than this part
 
 @dataclass(frozen=True)
 class SizeSeen:
-    """An apparent size: the logarithm of the depth that it means for a target as large as told, and its sigma."""
+    """An apparent size: the logarithm of the depth that it means for a target as large as told, and its sigma.
+
+    Of a target that is only seen in part it is a bound: it is at least that large in the image, so at most so far away.
+    """
 
     log_depth: float
     sigma: float
+    bound: bool = False
 
 
 @dataclass(frozen=True)
@@ -41,13 +45,12 @@ class WideSeen:
 
 @dataclass(frozen=True)
 class ZoomSeen:
-    """A target's middle in the zoom view: tangents (2,), their covariance (2, 2), where it looked, and the size."""
+    """A target's middle in the zoom view: tangents (2,), their covariance (2, 2), and where it looked."""
 
     t: float
     tangent: Array
     R: Array
     sight: Sight
-    size: SizeSeen | None
 
     @property
     def key(self) -> tuple[float, int]:
@@ -61,7 +64,7 @@ def begin(seen: WideSeen, settings: EstimationSettings) -> Node:
     x = np.zeros(STATES)
     x[:2] = seen.tangent
     x[G] = motion.attitude_mean
-    x[L] = math.log(USUAL_DEPTH) if seen.size is None else seen.size.log_depth + x[G]
+    x[L] = math.log(USUAL_DEPTH) if seen.size is None or seen.size.bound else seen.size.log_depth + x[G]
     nearness = math.exp(-x[L])
     sigma = np.zeros(STATES)
     sigma[L] = settings.depth_sigma
@@ -75,6 +78,8 @@ def begin(seen: WideSeen, settings: EstimationSettings) -> Node:
 
 def correct_wide(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node:
     """Take a middle and a size in the wide view into account."""
+    if seen.size is None or seen.size.bound:
+        node = _slowed(node, settings)
     PHt = node.P[:, :2]
     innovation = seen.tangent - node.x[:2]
     R = seen.R * _repeated(node.t - node.wide_t, settings.noise_s)
@@ -94,7 +99,7 @@ def correct_wide(node: Node, seen: WideSeen, settings: EstimationSettings) -> No
 
 
 def correct_zoom(node: Node, seen: ZoomSeen, settings: EstimationSettings) -> Node:
-    """Take a middle and a size in the zoom view into account, iterated because the depth enters in no linear way."""
+    """Take a middle in the zoom view into account, iterated because the depth enters in no linear way."""
     if node.missed_zoom >= settings.zoom_misses or math.hypot(*node.lean) > settings.most_lean:
         node = replace(node, P=_doubted(node.P, settings), missed_zoom=0, lean=(0.0, 0.0))
     # While the wide view surprises too, it is the target that moved, and neither its size nor the head is to blame.
@@ -118,18 +123,13 @@ def correct_zoom(node: Node, seen: ZoomSeen, settings: EstimationSettings) -> No
         if abs(x[L] - before) < SETTLED:
             break
     P = node.P - gain @ PHt.T
-    node = _told(replace(node, x=x, P=P, missed_zoom=0, lean=lean), surprise, settings)
-    if seen.size is None:
-        return node
-    # The size tells the depth in the zoom camera; what that is over the depth in the fixed one is known far better.
-    size = replace(seen.size, log_depth=seen.size.log_depth - math.log(d[2]))
-    return _size(node, size, settings)
+    return _told(replace(node, x=x, P=P, missed_zoom=0, lean=lean), surprise, settings)
 
 
 def _size(node: Node, size: SizeSeen | None, settings: EstimationSettings) -> Node:
     """Take an apparent size into account: l - k - g."""
     if size is None:
-        return replace(node, P=(node.P + node.P.T) / 2)
+        return node
     P = node.P
     h = np.zeros(STATES)
     h[L], h[K], h[G] = 1.0, -1.0, -1.0
@@ -138,9 +138,11 @@ def _size(node: Node, size: SizeSeen | None, settings: EstimationSettings) -> No
     Ph = P @ h
     S = float(h @ Ph) + variance
     innovation = size.log_depth - float(h @ node.x)
+    if size.bound and innovation >= 0:  # it is no farther away already
+        return node
     if innovation * innovation > settings.size_gate * S:
         if node.missed_size + 1 < settings.misses:
-            return replace(node, P=(P + P.T) / 2, missed_size=node.missed_size + 1)
+            return replace(node, missed_size=node.missed_size + 1)
         # Turned or come nearer, against all expectation: let both give way.
         P = P.copy()
         P[L, L] += settings.depth_doubt**2
@@ -149,7 +151,22 @@ def _size(node: Node, size: SizeSeen | None, settings: EstimationSettings) -> No
         S = float(h @ Ph) + variance
     x = node.x + Ph * (innovation / S)
     P = P - np.outer(Ph, Ph / S)
-    return replace(node, x=x, P=(P + P.T) / 2, missed_size=0, size_t=node.t)
+    return replace(node, x=x, P=P, missed_size=0, size_t=node.size_t if size.bound else node.t)
+
+
+def _slowed(node: Node, settings: EstimationSettings) -> Node:
+    """Forget a motion along the axis that sizes have told, where none tells whether it goes on."""
+    if math.isinf(node.size_t):
+        return node
+    rho = math.exp(-(node.t - node.wide_t) / settings.unsized_s)
+    usual = np.array([settings.motion.speed, settings.motion.acceleration]) * math.exp(-node.x[L])
+    x, P = node.x.copy(), node.P.copy()
+    along = [W.stop - 1, C.stop - 1]
+    x[along] *= rho
+    P[along] *= rho
+    P[:, along] *= rho
+    P[along, along] += (1 - rho**2) * usual**2
+    return replace(node, x=x, P=P)
 
 
 def _told(node: Node, surprise: float, settings: EstimationSettings) -> Node:

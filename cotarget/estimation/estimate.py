@@ -1,4 +1,4 @@
-"""What is known of a target at one time: position and velocity in 3D, size, and where the zoom camera would see it."""
+"""What is known of a target at one time: position in 3D, size, and where the zoom camera would see it."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import TargetConfig
-from cotarget.estimation.motion import PAN, SEEN, STATES, TILT, G, K, L, W
+from cotarget.estimation.motion import PAN, SEEN, STATES, TILT, G, K, L
 from cotarget.estimation.sight import Sights
 from cotarget.geometry import Array
 from cotarget.targeting import Closeup
@@ -73,27 +73,9 @@ class Estimate:
         return math.exp(log_depth) * np.array([a, b, 1.0])
 
     @property
-    def velocity(self) -> Array:
-        """Velocity in the fixed camera's frame [m/s], (3,)."""
-        return math.exp(self.state[L]) * self.state[W]
-
-    @property
-    def covariance(self) -> Array:
-        """Of position and velocity in the fixed camera's frame [m, m/s], (6, 6), to first order."""
-        J = np.eye(6) * self.depth
-        J[:3, L] = self.x_fixed
-        J[3:, L] = self.velocity
-        return J @ self.state_covariance[:6, :6] @ J.T
-
-    @property
     def depth(self) -> float:
         """Along the fixed camera's axis [m]."""
         return math.exp(self.state[L])
-
-    @property
-    def depth_sigma(self) -> float:
-        """Standard deviation of the depth, relative."""
-        return math.sqrt(self.state_covariance[L, L])
 
     @property
     def bias(self) -> tuple[float, float]:

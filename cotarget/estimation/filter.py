@@ -11,7 +11,7 @@ from cotarget.config import TargetConfig
 from cotarget.estimation.correct import SizeSeen, WideSeen, ZoomSeen, begin, correct_wide, correct_zoom
 from cotarget.estimation.estimate import Estimate
 from cotarget.estimation.motion import propagate
-from cotarget.estimation.node import Node
+from cotarget.estimation.node import Node, sound
 from cotarget.estimation.settings import EstimationSettings, estimation_settings_for
 from cotarget.estimation.sight import Sights
 from cotarget.geometry import Array
@@ -53,7 +53,7 @@ class SpatialFilter:
         """Take a detection in the wide view into account.
 
         Args:
-            detection: its box; one that the image's border cuts tells its size no more, and its middle badly.
+            detection: its box; one that is cut tells its middle badly, and of its size only that it is no smaller.
             t: when the frame's light fell [s].
             sigma_px: standard deviation of the middle, (2,) [px]; by default from the settings and the box's size.
             size_px: the known dimension in the image [px], where it is better known than from this box alone, as
@@ -77,8 +77,10 @@ class SpatialFilter:
         if detection.clipped:  # the hidden part may be as large again
             sigma_u, sigma_v = math.hypot(sigma_u, width / 2), math.hypot(sigma_v, height / 2)
         vertical = self._vertical(width, height)
-        side = size_px if size_px is not None else (height if vertical else width)
-        size = None if detection.clipped else self._size(side, J[int(vertical), int(vertical)])
+        side = height if vertical else width
+        if size_px is not None and not detection.clipped:
+            side = size_px
+        size = self._size(side, J[int(vertical), int(vertical)], bound=detection.clipped)
         return self._insert(WideSeen(t, z, (J * np.array([sigma_u**2, sigma_v**2])) @ J.T, size))
 
     def see_zoom(
@@ -90,7 +92,6 @@ class SpatialFilter:
         nominal_px: float,
         t: float,
         *,
-        size_px: float | None = None,
         head_sigma: float | None = None,
     ) -> bool:
         """Take what the zoom camera sees of the target into account.
@@ -102,7 +103,6 @@ class SpatialFilter:
             tilt: likewise.
             nominal_px: what the lens reported for that time [px].
             t: when the frame's light fell [s].
-            size_px: the known dimension in the zoom image [px], where it is wholly seen.
             head_sigma: standard deviation of what the head reports [rad]; larger while it moves and its time is
                 known badly. By default from the settings.
 
@@ -116,9 +116,7 @@ class SpatialFilter:
         z, J = found
         sigma = self._settings.head_sigma if head_sigma is None else head_sigma
         R = (J * np.square(sigma_px)) @ J.T + np.eye(2) * sigma**2
-        vertical = self._target.dimension == "height"
-        size = None if size_px is None else self._size(size_px, J[int(vertical), int(vertical)])
-        return self._insert(ZoomSeen(t, z, R, self._sights.at(pan, tilt, nominal_px), size))
+        return self._insert(ZoomSeen(t, z, R, self._sights.at(pan, tilt, nominal_px)))
 
     def at(self, t: float) -> Estimate | None:
         """The estimate for a time [s], later than the newest measurement or up to a second or so before it.
@@ -158,13 +156,13 @@ class SpatialFilter:
         dimension = self._target.dimension
         return dimension == "height" or (dimension == "wingspan" and height > width)
 
-    def _size(self, size_px: float, tangent_per_px: float) -> SizeSeen | None:
-        """What a size in the image [px] tells."""
+    def _size(self, size_px: float, tangent_per_px: float, *, bound: bool) -> SizeSeen | None:
+        """What a size in the image [px] tells, or a part of it."""
         if not size_px > 0:
             return None
         settings = self._settings
         sigma = math.hypot(settings.size_noise, settings.size_noise_px / size_px)
-        return SizeSeen(math.log(self._target.size / (size_px * abs(tangent_per_px))), sigma)
+        return SizeSeen(math.log(self._target.size / (size_px * abs(tangent_per_px))), sigma, bound)
 
     def _insert(self, seen: WideSeen | ZoomSeen) -> bool:
         """Put a measurement where its time belongs; what came after it will be gone over again."""
@@ -188,10 +186,15 @@ class SpatialFilter:
 
     def _step(self, node: Node | None, seen: WideSeen | ZoomSeen) -> Node | None:
         """The state after one more measurement."""
+        settings = self._settings
+        nearest = settings.motion.nearest
         if node is None:
-            return begin(seen, self._settings) if isinstance(seen, WideSeen) else None
-        x, P = propagate(node.x, node.P, seen.t - node.t, self._settings.motion, node.boost)
+            return sound(begin(seen, settings), nearest) if isinstance(seen, WideSeen) else None
+        x, P = propagate(node.x, node.P, seen.t - node.t, settings.motion, node.boost)
         node = replace(node, t=seen.t, x=x, P=P)
         if isinstance(seen, WideSeen):
-            return correct_wide(node, seen, self._settings)
-        return correct_zoom(node, seen, self._settings)
+            corrected = correct_wide(node, seen, settings)
+        else:
+            corrected = correct_zoom(node, seen, settings)
+        # What makes no sense of it is as good as not measured.
+        return sound(corrected, nearest) or sound(node, nearest)

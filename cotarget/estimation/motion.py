@@ -32,6 +32,10 @@ NEAREST = 0.2
 SHORT = 0.03
 _UNIT = np.eye(MOVING)
 MOST_DOUBT = 0.5  # of the logarithm's variance
+# However long nothing is measured, no more is doubted than this, in standard deviations: that it is anywhere in view, a
+# factor of some five in the depth, three in size and attitude, and six degrees of the head.
+MOST_SIGMA = np.array([3.0, 3.0, 1.5, *[1e2] * 3, *[1e3] * 3, 1.0, 1.0, 0.1, 0.1])
+_MOST_VARIANCE = MOST_SIGMA**2
 CACHED = 1024  # spans of time; frames come at regular ones
 
 
@@ -106,17 +110,19 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, boost: floa
         return x, P
     span = span_of(dt, motion)
     closer = 1 + float(x[5]) * dt + float(x[8]) * span.reach  # the new depth over the old one
-    ratio = max(closer, NEAREST)
+    ratio = max(closer, NEAREST, min(motion.nearest * math.exp(-x[L]), 1.0))
     y = span.linear @ x
     log_depth = float(x[L]) + math.log(ratio)
     y[:MOVING] /= ratio
     y[L] = log_depth
     y[G] += motion.attitude_mean * (1 - span.linear[G, G])
+    if closer < ratio:  # it would be nearer than it can be: it has stopped
+        y[[5, 8]] = 0.0
     F = span.linear.copy()
     F[:MOVING] /= ratio
     F[L] = 0.0
     F[L, L] = 1.0
-    if closer > NEAREST:
+    if closer >= ratio:
         shrink = y[:MOVING] / ratio
         shrink[L] = -1 / ratio
         F[:MOVING, 5] -= shrink * dt
@@ -129,4 +135,13 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, boost: floa
     # The mean of 1 / depth^2 over all depths that it may have: an uncertain depth makes the noise larger.
     sigma = motion.acceleration * math.exp(min(P[L, L], MOST_DOUBT) - log_depth)
     P[:MOVING, :MOVING] += N @ span.noise @ N.T * (boost * sigma * sigma)
-    return y, P
+    return y, _bounded(P)
+
+
+def _bounded(P: Array) -> Array:
+    """Scale what is doubted more than it may be; correlations stay, and with them that it is a covariance."""
+    variances = P.diagonal()
+    if (variances <= _MOST_VARIANCE).all():
+        return P
+    scale = np.sqrt(np.minimum(1.0, _MOST_VARIANCE / variances))
+    return P * np.outer(scale, scale)

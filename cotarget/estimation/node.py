@@ -1,9 +1,14 @@
 """The filter's whole memory after a measurement: state, covariance, and how surprising the last ones were."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
+
+from cotarget.estimation.motion import L
 from cotarget.geometry import Array
+
+FARTHEST = 1e5  # [m]; nothing is seen from farther away
 
 
 @dataclass(frozen=True)
@@ -37,3 +42,17 @@ class Node:
     wide_t: float = -math.inf
     moved_t: float = -math.inf
     lean: tuple[float, float] = (0.0, 0.0)
+
+
+def sound(node: Node, nearest: float) -> Node | None:
+    """The same with a depth that can be and a covariance that is symmetric; None where it tells nothing any more.
+
+    Args:
+        node: after a measurement.
+        nearest: no target is nearer than this [m].
+    """
+    x, P = node.x.copy(), (node.P + node.P.T) / 2
+    if not (np.isfinite(x).all() and np.isfinite(P).all() and (P.diagonal() > 0).all()):
+        return None
+    x[L] = min(max(x[L], math.log(nearest)), math.log(FARTHEST))
+    return replace(node, x=x, P=P)

@@ -16,6 +16,9 @@ from cotarget.config import TargetConfig
 LEAST_BIAS = 5e-4
 # The bias of a rig whose calibration does not say how good it is: 0.04 degrees [rad].
 USUAL_BIAS = 7e-4
+# Nearer than this many of its own sizes a target spans more than a right angle: it fills the view of any lens that the
+# fixed camera is likely to have, and no pointing at it helps.
+NEAREST_SIZES = 0.5
 USUAL_DEPTH = 15.0  # [m]; a target whose size is not seen, at first
 
 
@@ -34,6 +37,7 @@ class MotionSettings:
         attitude_s: how long an attitude lasts [s].
         bias_sigma: of the head's pan and tilt each [rad].
         bias_s: how long such a bias lasts [s].
+        nearest: no target is nearer to the fixed camera than this, along its axis [m].
     """
 
     acceleration: float
@@ -45,6 +49,7 @@ class MotionSettings:
     attitude_s: float = 0.5
     bias_sigma: float = USUAL_BIAS
     bias_s: float = 60.0
+    nearest: float = 0.1
 
     @property
     def fading_s(self) -> float:
@@ -64,6 +69,8 @@ class EstimationSettings:
         size_noise: standard deviation of a box's side, relative.
         size_noise_px: the part that does not depend on its size [px].
         size_s: how long an error of the side lasts [s]; half a wing beat or step.
+        unsized_s: how long a velocity along the axis lasts while the wide view shows a piece of the target only [s]:
+            long enough for a moment behind a post; whoever fills the view has mostly stopped.
         head_sigma: of the angles that the head reports for a frame [rad]; rounding of 0.05 degrees leaves that.
         gate: largest squared innovation, in variances, of a middle; 99.9 % of a chi-square with two degrees of freedom.
         jump_gate: beyond this it is either wrong or elsewhere: ten standard deviations. Between the two it counts less.
@@ -92,6 +99,7 @@ class EstimationSettings:
     size_noise: float = 0.05
     size_noise_px: float = 1.0
     size_s: float = 0.2
+    unsized_s: float = 0.5
     head_sigma: float = 3e-4
     gate: float = 13.8
     jump_gate: float = 100.0
@@ -138,8 +146,15 @@ BIRD = EstimationSettings(
 )
 
 
+# How a target moves that is told to stand (but for being carried elsewhere), walk or fly.
+KINDS = {"standing": BOOK, "walking": PERSON, "flying": BIRD}
+
+
 def estimation_settings_for(target: TargetConfig, calibration: Calibration | None = None) -> EstimationSettings:
     """Choose the settings for a target's kind; a calibration that knows its own error gives the head's bias.
+
+    How well it is measured, and in what attitudes it shows itself, follows from its detector and dimension; how it
+    moves does too, unless that is told.
 
     Args:
         target: the target.
@@ -150,6 +165,10 @@ def estimation_settings_for(target: TargetConfig, calibration: Calibration | Non
         settings = BOOK
     elif target.dimension == "wingspan":
         settings = BIRD
+    told = settings.motion if target.motion is None else KINDS[target.motion].motion
+    moves = {"acceleration": told.acceleration, "manoeuvre_s": told.manoeuvre_s, "speed": told.speed}
+    motion = replace(settings.motion, **moves, nearest=NEAREST_SIZES * target.size)
+    settings = replace(settings, motion=motion)
     if calibration is None or calibration.covariance is None:
         return settings
     middle = calibration.fixed.image_center_px

@@ -1,7 +1,8 @@
 """The field's figures: of a target that was held, by the truth, and of tracks on a film, by labels."""
 
-from cotarget.metrics.held import WHOLLY_VISIBLE, Row, Score, read_rows, score, write_rows
-from cotarget.metrics.tracked import Label, TrackScore, read_labels, read_tracks, score_tracks
+from cotarget.metrics.held import Score, score
+from cotarget.metrics.rows import WHOLLY_VISIBLE, Row, read_rows, write_rows
+from cotarget.metrics.tracked import Label, Tracked, TrackScore, read_labels, read_tracks, score_tracks
 
 __all__ = [
     "WHOLLY_VISIBLE",
@@ -9,6 +10,7 @@ __all__ = [
     "Row",
     "Score",
     "TrackScore",
+    "Tracked",
     "read_labels",
     "read_rows",
     "read_tracks",

@@ -2,7 +2,8 @@
 
 The table is the one that `cotarget.film.run_on_film` writes, and a label a box around the target in one frame; a frame
 may have several, and frames without any say nothing of what is found in them, but that a track which is never on a
-label is false.
+label is false. Where there are labels a track is false as it is beside the truth: off all of them for half a second on
+end.
 """
 
 import csv
@@ -57,7 +58,8 @@ class TrackScore:
         numbers: how many different tracks were on a label in them.
         offset_px_median: of the track on it, from the label's middle [px].
         fragmentation_per_min: how often no track was on a label for longer than 0.2 s, a minute of labelled frames.
-        false_tracks: tracks that lived for 0.5 s and were never on a label.
+        false_tracks: tracks that were off every label for 0.5 s on end in frames that have labels, or that lived for
+            0.5 s and were never on one.
         false_tracks_per_min: the same, a minute of the film.
     """
 
@@ -87,16 +89,15 @@ def score_tracks(
         learning_frames: so many at its beginning are not judged.
     """
     offsets: dict[int, dict[int, float]] = {}  # by frame and track, of those on a label
-    lives: dict[int, list[float]] = {}
+    lives: dict[int, list[Tracked]] = {}
     for each in tracks:
-        lives.setdefault(each.track, []).append(each.t)
+        lives.setdefault(each.track, []).append(each)
         for label in labels.get(each.frame, ()):
             offset = float(np.linalg.norm(each.center_px - label.center_px))
             if offset <= label.larger_side_px:
                 on = offsets.setdefault(each.frame, {})
                 on[each.track] = min(offset, on.get(each.track, math.inf))
-    ever = {track for on in offsets.values() for track in on}
-    false = sum(t[-1] - t[0] >= FALSE_S - ROUNDING_S for track, t in lives.items() if track not in ever)
+    false = sum(_is_false(life, labels, offsets) for life in lives.values())
     judged = sorted(frame for frame, boxes in labels.items() if boxes and frame >= learning_frames)
     hits = [offsets[frame] for frame in judged if frame in offsets]
     minutes, labelled_minutes = frames / rate_hz / 60, len(judged) / rate_hz / 60
@@ -110,6 +111,25 @@ def score_tracks(
         false_tracks=false,
         false_tracks_per_min=false / minutes if frames else None,
     )
+
+
+def _is_false(
+    life: Sequence[Tracked], labels: Mapping[int, Sequence[Label]], offsets: Mapping[int, Mapping[int, float]]
+) -> bool:
+    """Whether a track was off every label for half a second on end; a frame without labels ends what was before it."""
+    if not any(each.track in offsets.get(each.frame, ()) for each in life):
+        return life[-1].t - life[0].t >= FALSE_S - ROUNDING_S
+    since: Tracked | None = None
+    last = -1
+    for each in life:
+        if not labels.get(each.frame) or each.track in offsets.get(each.frame, ()):
+            since = None
+        elif since is None or each.frame != last + 1:
+            since = each
+        elif each.t - since.t >= FALSE_S - ROUNDING_S:
+            return True
+        last = each.frame
+    return False
 
 
 def _breaks(on: Sequence[bool], frames: Sequence[int], rate_hz: float) -> int:
