@@ -26,14 +26,14 @@ from matplotlib.figure import Figure
 from cotarget.config import RigConfig
 from cotarget.detection import make_detector
 from cotarget.loop import FollowSettings, follow
+from cotarget.oracle import TruthDetector, true_calibration
 from cotarget.sim.model import RENDER_PITCH, RIG, build_model
 from cotarget.sim.opengl import make_renderer, mujoco
 from cotarget.sim.state import WorldState
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import CAMERAS, SimWorld
 from experiments.harness import Experiment, Row, Settings, over_seeds, seeds_of, table
-from experiments.hold_scenes import TruthDetector, hold_config
-from experiments.true_rig import true_calibration
+from experiments.hold_scenes import hold_config
 
 IMAGE_EFFECTS = ("noise", "jpeg", "distortion", "blur", "clutter")
 TARGET = "bird"

@@ -11,15 +11,15 @@ from matplotlib.figure import Figure
 from cotarget.config import parse_config
 from cotarget.geometry import pose
 from cotarget.loop import FollowSettings
+from cotarget.oracle import TruthDetector, TruthNoise, true_calibration
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
 from experiments import dead_zone, delay, first_shot, five_targets, hold
 from experiments.__main__ import EXPERIMENTS
 from experiments.harness import EXPECTED
-from experiments.hold_scenes import TruthDetector, TruthNoise, hold_config
+from experiments.hold_scenes import hold_config
 from experiments.shots import CAUSES, Shot, budget
-from experiments.true_rig import true_calibration
 from experiments.wide_view import Seen, WideView, open_on, record
 
 FIELD = (hold, first_shot, delay, five_targets, dead_zone)
