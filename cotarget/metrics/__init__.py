@@ -1,10 +1,12 @@
 """The field's figures: of a target that was held, by the truth, and of tracks on a film, by labels."""
 
-from cotarget.metrics.held import WHOLLY_VISIBLE, Row, Score, read_rows, score, write_rows
+from cotarget.metrics.closeup import WHOLLY_VISIBLE, Closeup
+from cotarget.metrics.held import Row, Score, read_rows, score, write_rows
 from cotarget.metrics.tracked import Label, TrackScore, read_labels, read_tracks, score_tracks
 
 __all__ = [
     "WHOLLY_VISIBLE",
+    "Closeup",
     "Label",
     "Row",
     "Score",
