@@ -3,21 +3,18 @@
 Detections without pictures, and a calibration without error: for runs that need neither rendering nor boards.
 """
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.detection import Detection
-from cotarget.geometry import Array
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig import Frame, Image
-from cotarget.sim.lens import TrueLens
-from cotarget.sim.targets import Target
-from cotarget.sim.truth import CameraName
+from cotarget.sim.appearances import Appearances
 from cotarget.sim.world import SimWorld
 
 
@@ -38,21 +35,6 @@ def true_calibration(world: SimWorld, stops: int = 8) -> Calibration:
         head=HeadGeometry(sim.head.axis_offset_mm / 1000 * real, np.radians(sim.head.squareness_deg) * real),
         pitch_mm=sim.zoom.pitch_mm,
     )
-
-
-class Boxes(Protocol):
-    """Tells where the targets of a world appear; `Truth` does."""
-
-    @property
-    def targets(self) -> Mapping[str, Target]:
-        """By name."""
-
-    @property
-    def fixed_lens(self) -> TrueLens:
-        """The wide camera's optics."""
-
-    def box(self, name: str, camera: CameraName, t: float) -> tuple[Array, Array] | None:
-        """Top-left and bottom-right corner of a target's outline at a time [s], (2,) [px] each; None behind."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +63,7 @@ class TruthDetector:
     mask: Image | None = None
 
     def __init__(
-        self, truth: Boxes, seed: int, noise: TruthNoise = TruthNoise(), names: Iterable[str] | None = None
+        self, truth: Appearances, seed: int, noise: TruthNoise = TruthNoise(), names: Iterable[str] | None = None
     ) -> None:
         """Begin.
 
@@ -96,19 +78,24 @@ class TruthDetector:
 
     def detect(self, frame: Frame) -> list[Detection]:
         """Find the targets, largest first."""
-        noise, size = self._noise, np.array(self._truth.fixed_lens.size)
+        noise, size = self._noise, self._truth.fixed_lens.size
         rng = np.random.default_rng((self._seed, round(frame.t * 1e6)))
         found = []
         for name in self._names:
             # Drawn whether the target is seen or not, so that none changes another's.
-            shift, scale, luck = rng.normal(size=2), rng.normal(size=2), rng.random()
+            draws, luck = rng.normal(size=4).tolist(), rng.random()
             box = self._truth.box(name, "fixed", frame.t)
             if box is None or luck < noise.miss:
                 continue
-            clipped = bool((box[0] < -0.5).any() or (box[1] > size - 0.5).any())
-            low, high = box[0].clip(-0.5, size - 0.5), box[1].clip(-0.5, size - 0.5)
-            sides = (high - low) * np.maximum(1 + noise.size * scale, 0.1)
-            if (high <= low).any() or sides.max() < noise.smallest_px:
+            middle, sides, clipped = [], [], False
+            corners = zip(*(corner.tolist() for corner in box), strict=True)
+            # In floats: numpy takes several times as long for so few numbers.
+            for (low, high), side, shift, scale in zip(corners, size, draws[:2], draws[2:], strict=True):
+                begin, end = max(low, -0.5), min(high, side - 0.5)
+                clipped |= low < begin or high > end
+                middle.append((begin + end) / 2 + noise.center_px * shift)
+                sides.append((end - begin) * max(1 + noise.size * scale, 0.1))
+            if min(sides) <= 0 or max(sides) < noise.smallest_px:
                 continue
-            found.append(Detection((low + high) / 2 + noise.center_px * shift, sides, 1.0, clipped))
-        return sorted(found, key=lambda detection: -float(np.prod(detection.size_px)))
+            found.append(Detection(np.array(middle), np.array(sides), 1.0, clipped))
+        return sorted(found, key=lambda detection: -math.prod(detection.size_px.tolist()))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 EXPERIMENTS = (
     *("hand_eye", "chain", "random_rigs", "mismatch", "honesty", "speed", "pointing", "zoom_range", "wire"),
-    *("hold", "first_shot", "delay", "five_targets", "dead_zone", "sim_speed"),
+    *("hold", "first_shot", "delay", "five_targets", "dead_zone", "sim_speed", "env_score", "env_speed"),
 )
 
 

@@ -32,6 +32,7 @@ from cotarget.sim.opengl import make_renderer, mujoco
 from cotarget.sim.state import WorldState
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import CAMERAS, SimWorld
+from cotarget.simconfig import Size
 from experiments.harness import Experiment, Row, Settings, over_seeds, seeds_of, table
 from experiments.hold_scenes import hold_config
 
@@ -104,13 +105,23 @@ class Stepper:
 class PlainRenderer:
     """mujoco.Renderer on the frames of a world whose image effects are off."""
 
-    def __init__(self, world: SimWorld) -> None:
+    def __init__(self, world: SimWorld, size: Size | None = None) -> None:
+        """Open it.
+
+        Args:
+            world: whose frames.
+            size: of the pictures, with the same field of view; that of the streams by default.
+        """
         sim, self._truth = world.config.sim, world.truth()
-        self._sizes = {"fixed": sim.fixed.size, "zoom": sim.zoom.size}
-        size = sim.fixed.size
-        self._model = build_model(world.config, tuple(world.targets.values()), size)
-        self._state = WorldState(self._model, world.targets, world.head_drive, self._truth.T_world_fixed, None)
-        self._renderer = make_renderer(self._model, *size)
+        size = sim.fixed.size if size is None else size
+        self._scales = {
+            "fixed": np.divide(size, sim.fixed.size) * RENDER_PITCH,
+            "zoom": np.divide(size, sim.zoom.size) * RENDER_PITCH,
+        }
+        self.model = build_model(world.config, tuple(world.targets.values()), size)
+        self.model.vis.global_.offwidth, self.model.vis.global_.offheight = size
+        self._state = WorldState(self.model, world.targets, world.head_drive, self._truth.T_world_fixed, None)
+        self._renderer = make_renderer(self.model, *size)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = sim.effects.shadows
 
     def draw(self, t: float) -> float:
@@ -118,8 +129,8 @@ class PlainRenderer:
         data, option, took = self._state.lit(t), mujoco.MjvOption(), 0.0
         option.geomgroup[3:] = 0  # neither the board nor the rig itself
         for camera in CAMERAS:
-            number, focal = self._model.camera(RIG + camera).id, self._truth.lens(camera, t).focal_px
-            self._model.cam_intrinsic[number] = (focal[0] * RENDER_PITCH, focal[1] * RENDER_PITCH, 0.0, 0.0)
+            number, focal = self.model.camera(RIG + camera).id, self._truth.lens(camera, t).focal_px
+            self.model.cam_intrinsic[number] = (*(self._scales[camera] * focal), 0.0, 0.0)
             began = time.perf_counter()
             self._renderer.update_scene(data, number, option)
             self._renderer.render()

@@ -101,7 +101,7 @@ class SimZoomStream(SimStream):
     ) -> None:
         super().__init__(camera, effects, clock, expose)
         self._drive, self._delay = drive, delay
-        self._rests = 0.0
+        self._rests, self._goal = 0.0, drive.axis.position
 
     @property
     def still_size(self) -> tuple[int, int]:
@@ -118,7 +118,9 @@ class SimZoomStream(SimStream):
         if not focal_px > 0 or math.isinf(focal_px):
             raise DeviceError(f"the lens cannot go to a focal length of {focal_px} px")
         position = self._drive.position_for(focal_px)
-        self._rests = self._drive.axis.command(self._clock.now() + self._delay, position)
+        if position != self._goal:
+            self._goal = position
+            self._rests = self._drive.axis.command(self._clock.now() + self._delay, position)
         return self._drive.focal_of(position)
 
     def state(self) -> ZoomState:

@@ -60,6 +60,19 @@ class Path:
         (a, b, _, _), s = self._piece(self.within(t))
         return 6 * a * s + 2 * b
 
+    def motion(self, t: float) -> tuple[list[float], list[float], list[float]]:
+        """Position [m], velocity [m/s] and acceleration [m/s^2] at once, (3,) each: quicker than one by one."""
+        first, last = self._knots[0], self._knots[-1]
+        inside = 1e-3 * (last - first)
+        at = self.within(t)
+        moving = min(max(at, first + inside), last - inside)
+        piece, s = self._piece(at)
+        if moving != at:
+            return self.position(t).tolist(), self.velocity(t).tolist(), self.acceleration(t).tolist()
+        powers = ((s * s * s, s * s, s, 1.0), (3 * s * s, 2 * s, 1.0, 0.0), (6 * s, 2.0, 0.0, 0.0))
+        x, v, a = (np.array(powers) @ piece).tolist()
+        return x, v, a
+
     @cached_property
     def _knots(self) -> list[float]:
         return self.spline.x.tolist()
