@@ -168,3 +168,21 @@ def test_an_axis_that_forgets_goes_on_as_if_it_remembered():
     for t in (4.6, 5.2, 5.5, 7.0):
         assert axes[1].driven(t) == axes[0].driven(t)
         assert axes[1].motor(t) == axes[0].motor(t)
+
+
+def test_a_lens_that_is_told_its_goal_again_goes_on_as_before():
+    lenses = []
+    for repeats in (False, True):
+        clock, drive = SimClock(), lens_drive(SimZoomCamera(), SimEffects())
+        lens = SimZoomStream(
+            SimZoomCamera(), SimEffects(), clock, lambda k, t: np.zeros((1, 1, 3), np.uint8), drive, 0.04
+        )
+        seen = []
+        for k in range(40):
+            if k in (0, 15) or repeats:
+                lens.zoom(3000.0 if k < 15 else 900.0)
+            clock.sleep_until(clock.now() + 0.04)
+            seen.append((lens.state().focal_px, lens.state().moving))
+        lenses.append(seen)
+    assert [moving for _, moving in lenses[0]] == [moving for _, moving in lenses[1]]
+    assert [focal for focal, _ in lenses[0]] == pytest.approx([focal for focal, _ in lenses[1]])

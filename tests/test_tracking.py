@@ -217,3 +217,19 @@ def test_who_is_found_again_is_no_newcomer():
         place = place + np.array([200.0, 15.0]) / RATE + (np.array([0.0, 12.0]) if i == 1 else 0)
         tracks = tracker.update([seen(*place)], t + i / RATE)
     assert [(track.id, track.missed) for track in tracks if track.confirmed] == [(1, 0)]
+
+
+def test_a_lone_pair_is_matched_as_any_other():
+    """A second target far away takes the shortcut for one track and one detection away, and changes nothing."""
+    rng = np.random.default_rng(5)
+    alone, beside = Tracker(PLAIN, SIZE), Tracker(PLAIN, SIZE)
+    numbers = []
+    for i in range(60):
+        at = 100 + 4 * i + rng.normal(0, 8), 200 + rng.normal(0, 8)  # some jumps are too far
+        box, far = seen(*at, *rng.uniform(12, 30, 2)), seen(600, 450)
+        one = alone.update([box], i / RATE)
+        two = [track for track in beside.update([box, far], i / RATE) if track.center_px[1] < 400]
+        assert [track.center_px.tolist() for track in one] == [track.center_px.tolist() for track in two]
+        assert [track.missed for track in one] == [track.missed for track in two]
+        numbers.append(len(one))
+    assert max(numbers) > 1  # where a jump was too far, another track began

@@ -24,6 +24,7 @@ from cotarget.sim.fieldpaths import GROUPED, SECONDS, group_paths
 from cotarget.simconfig import Size
 
 SLOTS = 8  # for tracks: five targets, and those that were lost and found under another number
+ROUNDING_S = 1e-6  # frame times are sums and differences of binary fractions
 SERVED_S = 1.0  # of good close-up, and a target counts as served
 SERVED_REWARD = 5.0  # for each: as much as looking on at one of them is worth in as many seconds
 
@@ -179,10 +180,11 @@ class Schedule(RigEnv[dict[str, Any], int]):
         self._turn()
         passed, good = self._step.zoom.t - before, self._good()
         reward = 0.0
-        for name in (name for name, well in good.items() if well):
-            served = self._good_s[name] >= SERVED_S
-            self._good_s[name] += passed
-            reward += passed + self._served_reward * (self._good_s[name] >= SERVED_S and not served)
+        before_served = self._served()
+        for name, well in good.items():
+            self._good_s[name] += passed * well
+            reward += passed * well
+        reward += self._served_reward * (self._served() - before_served)
         return self._observe(), reward, False, self._index >= self._last, self._info(good)
 
     def _turn(self) -> None:
@@ -198,6 +200,10 @@ class Schedule(RigEnv[dict[str, Any], int]):
         """Which targets are well in the newest zoom frame."""
         outlines, t = self.episode.outlines, self._step.zoom.t
         return {name: closeup_of(outlines, name, self.target, t).good for name in self._good_s}
+
+    def _served(self) -> int:
+        """How many targets have been well in the close-up for long enough."""
+        return sum(seconds >= SERVED_S - ROUNDING_S for seconds in self._good_s.values())
 
     def _observe(self) -> dict[str, Any]:
         step = self._step
@@ -241,6 +247,6 @@ class Schedule(RigEnv[dict[str, Any], int]):
             "box_closeup": np.array([corners(outlines.box(name, "zoom", t_closeup)) for name in names]),
             "box_wide": np.array([corners(outlines.box(name, "fixed", t)) for name in names]),
             "direction": np.array([episode.direction(name, t) for name in names]),
-            "served": sum(seconds >= SERVED_S for seconds in self._good_s.values()),
+            "served": self._served(),
             "action_mask": np.array([number is not None for number in self._slots], dtype=np.int8),
         }

@@ -101,7 +101,7 @@ class SimZoomStream(SimStream):
     ) -> None:
         super().__init__(camera, effects, clock, expose)
         self._drive, self._delay = drive, delay
-        self._rests, self._goal = 0.0, drive.axis.position
+        self._rests = 0.0
 
     @property
     def still_size(self) -> tuple[int, int]:
@@ -118,8 +118,7 @@ class SimZoomStream(SimStream):
         if not focal_px > 0 or math.isinf(focal_px):
             raise DeviceError(f"the lens cannot go to a focal length of {focal_px} px")
         position = self._drive.position_for(focal_px)
-        if position != self._goal:
-            self._goal = position
+        if position != self._drive.axis.goal:  # it is on its way there
             self._rests = self._drive.axis.command(self._clock.now() + self._delay, position)
         return self._drive.focal_of(position)
 

@@ -71,6 +71,11 @@ class Axis:
         self._segments = [(-math.inf, self.position, 0.0, 0.0)]
         self._before = self.position
 
+    @property
+    def goal(self) -> float:
+        """Where it will come to rest."""
+        return self._segments[-1][1]
+
     def command(self, t: float, goal: float, speed: float | None = None) -> float:
         """Replace the motion from time t on; return when it will rest [s]."""
         x, v = self.motor(t)
