@@ -1,32 +1,182 @@
-"""Runs all experiments that need no photos, one after the other.
+"""Runs all experiments, or those named, over the cores or on a cluster; what is done is kept, and the rest goes on.
 
-python -m experiments [--quick] [--out DIR]
+python -m experiments [NAME ...] [--quick] [--out DIR] [--seeds N] [--seed-base B] [--set NAME.KEY=VALUE] [--list]
 """
 
 import argparse
-import importlib
+import functools
+import os
+import shlex
+import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-EXPERIMENTS = (
-    *("hand_eye", "chain", "random_rigs", "mismatch", "honesty", "speed", "pointing", "zoom_range", "wire"),
-    *("hold", "first_shot", "delay", "five_targets", "dead_zone", "sim_speed"),
-)
+from cotarget.cli.arguments import count, not_negative, progress_bar
+from cotarget.errors import ConfigError, CotargetError
+from experiments.bounds import EXPECTED, tighten
+from experiments.cases import Case, Known, choose, known_experiments
+from experiments.harness import INTERRUPTED, TERMINATED, Parser
+from experiments.outcome import Outcome, conclude
+from experiments.report import Run, duration, write_report
+from experiments.runner import Engine, Sweep, forget, sessions
+from experiments.workers import in_processes, on_dask
+
+PROGRAM = "python -m experiments"
+OUT, OUT_QUICK = Path("experiments-out"), Path("experiments-out-quick")
+LINES = 12  # of failed jobs that are told on stderr; the report tells all
 
 
-def main() -> int:
-    """The command."""
-    parser = argparse.ArgumentParser(prog="python -m experiments", description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="a few seeds of each only")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write each one's files into a folder of its own there")
-    given = parser.parse_args()
-    for name in EXPERIMENTS:
-        arguments = ["--quick"] if given.quick else []
-        if given.out is not None:
-            arguments += ["--out", str(given.out / name)]
-        print(f"\n{name}")
-        importlib.import_module(f"experiments.{name}").EXPERIMENT.main(arguments)
+def main(arguments: Sequence[str] | None = None, known: Known | None = None, expected: Path = EXPECTED) -> int:
+    """The command.
+
+    Args:
+        arguments: what was typed.
+        known: the experiments there are.
+        expected: the folder of their bounds.
+
+    Returns:
+        The exit status: 1 where a job failed, a bound is broken or, but for a quick run, a wanted figure is missed.
+    """
+    typed = sys.argv[1:] if arguments is None else list(arguments)
+    known = known_experiments() if known is None else known
+    given = _parser().parse_args(typed)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))  # a polite end: what was started ends too
+    try:
+        return _list(known) if given.list else _run(given, typed, known, expected)
+    except CotargetError as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        where = "" if error.filename is None else f"{error.filename}: "
+        print(f"{PROGRAM}: {where}{error.strerror or error}", file=sys.stderr)
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(prog=PROGRAM, description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help="which; all by default")
+    parser.add_argument("--list", action="store_true", help="tell which there are")
+    parser.add_argument("--quick", action="store_true", help="a few seeds of each, for some seconds only")
+    parser.add_argument("--out", type=Path, metavar="DIR", help=f"results and report ({OUT}, or {OUT_QUICK})")
+    parser.add_argument("--seeds", type=count, metavar="N", help="of each; its own number by default")
+    parser.add_argument("--seed-base", type=not_negative, metavar="B", help="the first seed (0)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME.KEY=VALUE",
+        help="change a setting; given more than once with the same key, each value is a case of its own",
+    )
+    parser.add_argument("--processes", type=count, default=os.cpu_count() or 1, metavar="P", help="on this machine")
+    parser.add_argument("--backend", choices=("processes", "dask"), default="processes", help="who does the jobs")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="of the Dask cluster, such as tcp://10.0.0.1:8786")
+    parser.add_argument("--fresh", action="store_true", help="forget what is in the folder of these experiments")
+    parser.add_argument("--any-code", action="store_true", help="keep results that other code of this version gave")
+    parser.add_argument("--report", action="store_true", help="do nothing but report what is there")
+    parser.add_argument("--update-expected", action="store_true", help="tighten the bounds in experiments/expected")
+    return parser
+
+
+def _list(known: Known) -> int:
+    width = max(map(len, known))
+    for name, load in known.items():
+        print(f"{name:{width}}  {load().purpose}")
     return 0
+
+
+def _run(given: argparse.Namespace, typed: Sequence[str], known: Known, expected: Path) -> int:
+    engine, what = _engine(given)
+    folder: Path = given.out or (OUT_QUICK if given.quick else OUT)
+    chosen = choose(
+        known, given.names, quick=given.quick, seeds=given.seeds, seed_base=given.seed_base, changes=given.set
+    )
+    if given.update_expected and not all(case.has_bounds for case in chosen):
+        raise ConfigError("the bounds are of quick runs as they are: --update-expected goes with --quick alone")
+    cases, skipped = _split(chosen, named=bool(given.names))
+    if given.fresh and not given.report:
+        forget(cases, folder)
+    sweep = Sweep(cases, folder, given.any_code)
+    if not given.report:
+        folder.mkdir(parents=True, exist_ok=True)
+        status = _do(sweep, engine, what)
+        if status:
+            return status
+    outcomes = [
+        conclude(case, records, folder / case.folder, expected)
+        for case, records in zip(cases, sweep.records, strict=True)
+    ]
+    _tell(outcomes, skipped)
+    if given.update_expected:
+        _update(outcomes, expected)
+    page = folder / "report.html"
+    write_report(page, Run(outcomes, skipped, sessions(folder), shlex.join([*PROGRAM.split(), *typed])))
+    print(f"\n{page}")
+    return 0 if all(outcome.ok for outcome in outcomes) else 1
+
+
+def _engine(given: argparse.Namespace) -> tuple[Engine, str]:
+    if given.backend == "dask":
+        if given.scheduler is None:
+            raise ConfigError("--backend dask needs --scheduler ADDRESS, such as tcp://10.0.0.1:8786")
+        return functools.partial(on_dask, scheduler=given.scheduler), "Dask cluster"
+    if given.scheduler is not None:
+        raise ConfigError("--scheduler goes with --backend dask")
+    return functools.partial(in_processes, processes=given.processes), f"{given.processes} processes"
+
+
+def _split(chosen: Sequence[Case], *, named: bool) -> tuple[list[Case], dict[str, str]]:
+    """The cases that can be run, and why the others cannot; an experiment that was asked for by its name must."""
+    lacks = {case.title: "" if (needs := case.experiment.needs) is None else needs(case.settings) for case in chosen}
+    skipped = {title: lack for title, lack in lacks.items() if lack}
+    if named and skipped:
+        title, lack = next(iter(skipped.items()))
+        raise ConfigError(f"{title} {lack}")
+    return [case for case in chosen if case.title not in skipped], skipped
+
+
+def _do(sweep: Sweep, engine: Engine, what: str) -> int:
+    """Do the jobs that are missing; the exit status where that was broken off."""
+    try:
+        with progress_bar() as show:
+            sweep.run(engine, show, what)
+    except KeyboardInterrupt:
+        print(
+            f"{PROGRAM}: interrupted; {sweep.done} of {sweep.total} jobs are done and kept in {sweep.folder}, and the "
+            "same command goes on from there",
+            file=sys.stderr,
+        )
+        return INTERRUPTED
+    return 0
+
+
+def _tell(outcomes: Sequence[Outcome], skipped: dict[str, str]) -> None:
+    """Print each case's figures; on stderr what went wrong."""
+    for outcome in outcomes:
+        print(f"\n{outcome.case.title} ({duration(sum(outcome.seconds))})")
+        if outcome.text:
+            print(outcome.text)
+        remarks = [outcome.broken] if outcome.broken else []
+        remarks += [f"{outcome.undone} jobs are not done yet"] if outcome.undone else []
+        remarks += [f"missed: {name}" for name in outcome.missed or ()]
+        remarks += [f"worse than its bound {bound.bound}: {bound.name}, {bound.reached}" for bound in outcome.worse]
+        print(*remarks, sep="\n", end="\n" if remarks else "")
+    for title, lack in skipped.items():
+        print(f"\n{title}\nnot run: {lack}")
+    failed = [(o.case.title, number, record.failed) for o in outcomes for number, record in o.failed.items()]
+    for title, number, why in failed[:LINES]:
+        print(f"{PROGRAM}: {title}, seed {number} failed: {why}", file=sys.stderr)
+    if len(failed) > LINES:
+        print(f"{PROGRAM}: and {len(failed) - LINES} more failed", file=sys.stderr)
+
+
+def _update(outcomes: Sequence[Outcome], expected: Path) -> None:
+    changed: list[Any] = []
+    for outcome in outcomes:
+        if outcome.summary is not None and not outcome.failed and not outcome.undone:
+            changed += tighten(outcome.case.experiment, outcome.summary, expected)
+    print("\nbounds that are tighter now:" if changed else "\nno bound is tighter now", *changed, sep="\n")
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from cotarget.sim.opengl import make_renderer, mujoco
 from cotarget.sim.state import WorldState
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import CAMERAS, SimWorld
-from experiments.harness import Experiment, Row, Settings, over_seeds, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, seeds_of, table
 from experiments.hold_scenes import TruthDetector, hold_config
 from experiments.true_rig import true_calibration
 
@@ -53,13 +53,8 @@ class SimSpeedSettings(Settings):
     seconds_unrendered: float = 20.0
 
 
-def run(settings: SimSpeedSettings) -> list[Row]:
-    """All rows; in one process, whatever the settings say."""
-    return over_seeds(one, replace(settings, processes=1))
-
-
-def one(settings: SimSpeedSettings, seed: int) -> list[Row]:
-    """Time everything once."""
+def one(_: None, settings: SimSpeedSettings, seed: int) -> list[Row]:
+    """Time everything once; a row for each step."""
     rows = _beside_renderer(settings, seed)
     for effects in (*((name,) for name in IMAGE_EFFECTS), IMAGE_EFFECTS):
         rows += _beside_none(settings, seed, effects)
@@ -258,10 +253,12 @@ EXPERIMENT = Experiment(
     "The simulation's speed, beside mujoco.Renderer, effect by effect and against real time.",
     SETTINGS,
     replace(SETTINGS, seeds=1, steps=3, seconds_rendered=0.4, seconds_unrendered=2.0),
-    run,
+    one,
     summarise,
     describe,
     plot,
+    alone=True,
+    cost_s=120.0,
 )
 
 if __name__ == "__main__":
