@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, pose
 from experiments import photos, random_rigs
-from experiments.harness import Experiment, Settings, over_seeds, rms, spread, table
+from experiments.harness import Experiment, Settings, rms, table
 from experiments.synthetic import (
     SIZE,
     Lens,
@@ -38,8 +39,12 @@ class DummySettings(Settings):
     factor: float = 2.0
 
 
-def dummy(settings, seed):
-    return [{"seed": seed, "value": settings.factor * seed, "missing": None}, {"seed": seed, "extra": "a"}]
+def shared(settings):
+    return "a"
+
+
+def dummy(extra, settings, seed):
+    return [{"seed": seed, "value": settings.factor * seed, "missing": None}, {"seed": seed, "extra": extra}]
 
 
 def summed(rows):
@@ -51,10 +56,11 @@ EXPERIMENT = Experiment(
     "Sums.",
     DummySettings(seeds=4),
     DummySettings(seeds=2),
-    lambda settings: over_seeds(dummy, settings),
+    dummy,
     summed,
     lambda _, summary: f"sum {summary['sum']}",
     lambda rows, figure: figure.subplots().plot([row.get("value", 0.0) for row in rows]),
+    prepare=shared,
 )
 
 
@@ -65,7 +71,7 @@ def test_a_run_writes_its_files(tmp_path, capsys):
     result = json.loads((out / "result.json").read_text())
     assert result["settings"] == {"seeds": 3, "seed_base": 10, "processes": 1, "factor": 2.0}
     assert result["summary"] == {"sum": 66.0, "nothing": None, "by": {"1": 2.5}}
-    assert set(result["versions"]) == {"cotarget", "opencv", "numpy", "scipy"}
+    assert set(result["versions"]) == {"cotarget", "opencv", "numpy", "scipy", "mujoco", "matplotlib"}
     rows = list(csv.DictReader((out / "rows.csv").read_text().splitlines()))
     assert [row["seed"] for row in rows] == ["10", "10", "11", "11", "12", "12"]
     assert (rows[0]["value"], rows[0]["extra"], rows[1]["extra"]) == ("20.0", "", "a")
@@ -75,7 +81,29 @@ def test_a_run_writes_its_files(tmp_path, capsys):
 
 
 def test_processes_change_nothing():
-    assert list(spread(str, range(3), 2)) == list(spread(str, range(3), 1)) == ["0", "1", "2"]
+    assert EXPERIMENT.run(replace(EXPERIMENT.settings, processes=2)) == EXPERIMENT.run(EXPERIMENT.settings)
+    assert [row["seed"] for row in EXPERIMENT.run(EXPERIMENT.settings)] == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_what_is_lacking_or_cannot_be_ends_in_one_line(capsys):
+    lacking = replace(EXPERIMENT, needs=lambda settings: "needs the moon")
+    assert lacking.main([]) == 1
+    assert capsys.readouterr().err == "experiments.dummy: needs the moon\n"
+    with pytest.raises(SystemExit):
+        EXPERIMENT.main(["--seeds", "none"])
+    assert capsys.readouterr().err.count("\n") == 1
+    with pytest.raises(ConfigError, match="seeds = 0: at least 1 is needed"):
+        DummySettings(seeds=0)
+
+
+def test_a_pair_is_left_out_for_each_photo(tmp_path):
+    for number in range(3):
+        (tmp_path / f"left{number}.jpg").touch()
+    settings = replace(photos.SETTINGS, directory=str(tmp_path))
+    assert list(photos.jobs(settings)) == [0, 1, 2]
+    assert list(photos.jobs(replace(settings, seeds=2))) == [0, 1]
+    assert photos.needs(settings) == ""
+    assert "which are not part of the project" in photos.needs(replace(settings, directory=str(tmp_path / "none")))
 
 
 def test_tables_and_rms():
