@@ -48,6 +48,9 @@ def main(arguments: Sequence[str] | None = None, known: Known | None = None, exp
     except CotargetError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print(f"{PROGRAM}: interrupted", file=sys.stderr)
+        return INTERRUPTED
     except OSError as error:
         where = "" if error.filename is None else f"{error.filename}: "
         print(f"{PROGRAM}: {where}{error.strerror or error}", file=sys.stderr)
@@ -141,14 +144,16 @@ def _do(sweep: Sweep, engine: Engine, what: str) -> int:
     try:
         with progress_bar() as show:
             sweep.run(engine, show, what)
+        return 0
+    except CotargetError as error:
+        why, status = str(error), 1
     except KeyboardInterrupt:
-        print(
-            f"{PROGRAM}: interrupted; {sweep.done} of {sweep.total} jobs are done and kept in {sweep.folder}, and the "
-            "same command goes on from there",
-            file=sys.stderr,
-        )
-        return INTERRUPTED
-    return 0
+        why, status = "interrupted", INTERRUPTED
+    except SystemExit:
+        why, status = "ended", TERMINATED
+    kept = f"{sweep.done} of {sweep.total} jobs are done and kept in {sweep.folder}"
+    print(f"{PROGRAM}: {why}; {kept}, and the same command goes on from there", file=sys.stderr)
+    return status
 
 
 def _tell(outcomes: Sequence[Outcome], skipped: dict[str, str]) -> None:

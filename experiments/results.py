@@ -19,14 +19,17 @@ from typing import Any
 
 import cotarget
 import experiments
+from cotarget.assets import assets_dir
 from cotarget.calibration.atomic import write_atomically
 from cotarget.errors import ConfigError
 from experiments.harness import Row, Settings
 
 FORMAT = 1  # of the files
+JOBS = "jobs"  # their folder
 ONLY_HOW_MANY = ("seeds", "processes")  # settings that change no job, only how many there are and who does them
 SHORT = 8  # digits of a fingerprint
 REMEDY = "take another folder with --out, or begin anew with --fresh"
+KEEP = ", or keep it all the same with --any-code"
 
 
 @dataclass(frozen=True)
@@ -52,11 +55,13 @@ class Record:
 
 @functools.cache
 def code_version() -> str:
-    """The package's version and a fingerprint of the code: what is changed between two releases shows, too."""
-    folders = [Path(module.__file__ or "").parent for module in (cotarget, experiments)]
+    """The package's version and a fingerprint of the code: what is changed between two releases shows, too.
+
+    Of the scenes and targets the descriptions count; their meshes and pictures are made by a program that does.
+    """
     found = hashlib.sha256()
-    for folder in folders:
-        for path in sorted(folder.rglob("*.py")):
+    for folder in (*(Path(module.__file__ or "").parent for module in (cotarget, experiments)), assets_dir()):
+        for path in sorted(path for kind in ("*.py", "*.xml") for path in folder.rglob(kind)):
             found.update(path.relative_to(folder.parent).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return f"{cotarget.__version__}+{found.hexdigest()[:SHORT]}"
 
@@ -89,7 +94,7 @@ class Jobs:
     """
 
     def __init__(self, folder: Path, name: str, settings: Settings) -> None:
-        self._folder, self._name, self._identity = folder / "jobs", name, identity(settings)
+        self._folder, self._name, self._identity = folder / JOBS, name, identity(settings)
 
     def read(self, *, any_code: bool = False) -> dict[int, Record]:
         """What is there, by number.
@@ -146,6 +151,3 @@ class Jobs:
         for pattern in ("*.json", "*.traceback.txt"):
             for path in self._folder.glob(pattern):
                 path.unlink()
-
-
-KEEP = ", or keep it all the same with --any-code"

@@ -24,7 +24,7 @@ from cotarget.calibration.atomic import write_atomically
 from cotarget.errors import CotargetError
 from experiments.cases import Case
 from experiments.harness import versions
-from experiments.results import Jobs, Record, code_version, is_same_version
+from experiments.results import JOBS, Jobs, Record, code_version, is_same_version
 from experiments.workers import Died
 
 DIED = "its process died; is there memory enough?"
@@ -227,7 +227,7 @@ class Sweep:
     def _keep(self, i: int, number: int, done: Done) -> None:
         failed = done.failed
         if not failed and not is_same_version(done.version, code_version(), any_code=self.any_code):
-            failed = f"was done by cotarget {done.version}, this is {code_version()}; give the workers the same code"
+            failed = f"was done by cotarget {done.version}, this is {code_version()}; all must have the same code"
         if failed:
             record = Record(number, done.seconds, code_version(), None, failed, done.traceback)
         else:
@@ -252,6 +252,8 @@ def sessions(folder: Path) -> list[dict[str, Any]]:
 
 
 def forget(cases: Sequence[Case], folder: Path) -> None:
-    """Delete what some cases' jobs have left in a folder, whatever it is of."""
+    """Delete what some cases' jobs have left in a folder, whatever it is of; with the last of them the sessions."""
     for case in cases:
         Jobs(folder / case.folder, case.title, case.settings).forget()
+    if next(folder.glob(f"*/{JOBS}/*.json"), None) is None:
+        (folder / SESSIONS).unlink(missing_ok=True)

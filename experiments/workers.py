@@ -149,7 +149,9 @@ def _interrupts_kept_from_children() -> Iterator[None]:
 
 
 def on_dask(work: Callable[[Job], Any], jobs: Sequence[Job], scheduler: str) -> Results:
-    """Do jobs on a Dask cluster, through joblib; what each gives as it comes, with its number.
+    """Do jobs on a Dask cluster, begun in their order; what each gives as it comes, with its number.
+
+    A job whose worker dies is tried by others; whose workers die again and again, that is what came of it.
 
     Args:
         work: a function at the top of a module that the cluster's workers find too, or a partial one of it.
@@ -157,26 +159,33 @@ def on_dask(work: Callable[[Job], Any], jobs: Sequence[Job], scheduler: str) -> 
         scheduler: its address, such as tcp://10.0.0.1:8786.
 
     Raises:
-        ConfigError: joblib or Dask is missing, nobody answers there, or the workers are not fit for the work.
-        DeviceError: the cluster lost a job.
+        ConfigError: Dask is missing, nobody answers there, or the workers are not fit for the work.
+        DeviceError: the scheduler is gone.
         Exception: what a job raised.
     """
-    joblib, distributed = _needed("joblib"), _needed("distributed")
+    distributed = _needed("distributed")
     try:
         client = distributed.Client(scheduler, timeout=ANSWER_S)
     except (OSError, ValueError, TypeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ConfigError(f"no Dask scheduler answers at {scheduler}: {reason}") from None
     with client:
-        _check_workers(client)
-        with joblib.parallel_config(backend="dask", client=client):
-            parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
-        results = parallel(joblib.delayed(_numbered)(work, number, job) for number, job in enumerate(jobs))
-        with contextlib.closing(results):
-            try:
-                yield from results
-            except (distributed.KilledWorker, distributed.client.FutureCancelledError) as error:
-                raise DeviceError(f"the Dask cluster lost a job: {str(error).splitlines()[0]}") from None
+        _check_workers(client, scheduler)
+        numbers = {
+            client.submit(_held_to_one_thread, work, job, pure=False, priority=-number): number
+            for number, job in enumerate(jobs)
+        }
+        try:
+            for future in distributed.as_completed(list(numbers)):
+                try:
+                    result = future.result()
+                except distributed.KilledWorker:
+                    result = Died
+                except concurrent.futures.CancelledError:
+                    raise DeviceError(f"the Dask scheduler at {scheduler} is gone") from None
+                yield numbers.pop(future), result
+        finally:
+            client.cancel(list(numbers))  # those that a worker has in hand it still finishes, for nobody
 
 
 def _needed(name: str) -> Any:
@@ -186,13 +195,11 @@ def _needed(name: str) -> Any:
         raise ConfigError(f"a Dask cluster needs {name}, which is not installed: pip install '{EXTRA}'") from None
 
 
-def _check_workers(client: Any) -> None:
+def _check_workers(client: Any, scheduler: str) -> None:
     """Refuse workers that could not do the work, or not one job at a time each."""
     threads: dict[str, int] = client.nthreads()
     if not threads:
-        raise ConfigError(
-            f"the Dask scheduler at {client.scheduler.address} has no workers; start some with dask worker"
-        )
+        raise ConfigError(f"the Dask scheduler at {scheduler} has no workers; start some with dask worker")
     for worker, count in threads.items():
         if count > 1:  # an OpenGL context belongs to one thread
             raise ConfigError(
@@ -207,8 +214,8 @@ def _check_workers(client: Any) -> None:
             )
 
 
-def _numbered(work: Callable[[Job], Any], number: int, job: Job) -> tuple[int, Any]:
+def _held_to_one_thread(work: Callable[[Job], Any], job: Job) -> Any:
     for name, value in ONE_THREAD.items():
         os.environ.setdefault(name, value)  # linear algebra is loaded already; Dask itself holds it to one thread
     cv2.setNumThreads(1)
-    return number, work(job)
+    return work(job)

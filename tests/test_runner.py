@@ -311,15 +311,23 @@ def test_a_killed_run_goes_on_where_it_was(started, tmp_path):
     assert sorted(notes(tmp_path)) == ["job 0", "job 1", "job 2", "job 2", "job 3", "job 3"]
 
 
-def test_ctrl_c_ends_quickly_and_says_how_to_go_on(started, tmp_path):
+@pytest.mark.parametrize(
+    ("end", "status"),
+    [
+        (lambda program: os.killpg(program.pid, signal.SIGINT), 130),  # as a terminal does: to all processes
+        pytest.param(lambda program: program.terminate(), 143, marks=pytest.mark.slow),
+    ],
+    ids=["Ctrl-C", "kill"],
+)
+def test_a_polite_end_is_quick_and_says_how_to_go_on(started, tmp_path, end, status):
     program = started()
     until(lambda: len(notes(tmp_path)) == 4, "all four jobs have begun, two of them wait")
     until(lambda: len(list((tmp_path / "out").glob("*/jobs/*.json"))) == 2, "two are on disk")
-    os.killpg(program.pid, signal.SIGINT)  # as a terminal does: to all processes
+    end(program)
     told, complaints = program.communicate(timeout=QUICKLY_S)
-    assert (program.returncode, told) == (130, "")
-    assert complaints.count("\n") == 1
-    assert "interrupted; 2 of 4 jobs are done and kept" in complaints
+    assert (program.returncode, told) == (status, "")
+    assert "; 2 of 4 jobs are done and kept" in complaints
+    assert "Traceback" not in complaints
     assert all(map(is_gone, pids(tmp_path)))
 
 
@@ -421,7 +429,6 @@ def test_all_experiments_are_of_one_shape(capsys):
 
 @pytest.fixture
 def cluster():
-    pytest.importorskip("joblib", reason="joblib is not installed: pip install 'cotarget[sweeps]'")
     distributed = pytest.importorskip("distributed", reason="Dask is not installed: pip install 'cotarget[sweeps]'")
 
     def start(threads):
@@ -455,6 +462,15 @@ def test_the_same_sweep_on_a_cluster(run, tmp_path, cluster):
     assert [path.read_bytes() for path in ours] == [path.read_bytes() for path in theirs]
 
 
+@pytest.mark.slow
+def test_a_job_that_kills_its_workers_on_a_cluster(run, cluster):
+    where = ("--backend", "dask", "--scheduler", cluster(1))
+    status, told, complaints = run("tiny", "--set", "tiny.fatal=[1]", *where)
+    assert (status, complaints.count("\n")) == (1, 1)
+    assert "seed 1 failed: its process died" in complaints
+    assert "<total> 5" in told  # 0 + 2 + 3
+
+
 def test_a_cluster_that_is_not_fit(run, cluster):
     status, _, complaints = run("tiny", "--backend", "dask", "--scheduler", cluster(2))
     assert (status, complaints.count("\n")) == (1, 1)
@@ -462,7 +478,7 @@ def test_a_cluster_that_is_not_fit(run, cluster):
 
 
 def test_a_missing_engine_is_named_with_what_brings_it(run, monkeypatch):
-    monkeypatch.setitem(sys.modules, "joblib", None)
+    monkeypatch.setitem(sys.modules, "distributed", None)
     status, _, complaints = run("tiny", "--backend", "dask", "--scheduler", "tcp://127.0.0.1:1")
     assert (status, complaints.count("\n")) == (1, 1)
-    assert "needs joblib, which is not installed: pip install 'cotarget[sweeps]'" in complaints
+    assert "needs distributed, which is not installed: pip install 'cotarget[sweeps]'" in complaints
