@@ -108,16 +108,17 @@ def _closeup(truth: Appearances, name: str, target: TargetConfig, t: float, outl
     u, v = truth.center_px(name, "zoom", t).tolist()
     size = math.nan
     if outline is not None:
-        width, height = outline.size_px
+        width, height = outline.size_px.tolist()
         sides = {"width": width, "height": height}
         size = sides[target.dimension] if target.dimension in sides else truth.largest_side_px(name, "zoom", t)
+    longest = size * truth.longest_px / lens.focal_px[0]
     return Closeup(
         u_px=u,
         v_px=v,
         width_px=lens.size[0],
         height_px=lens.size[1],
-        size_px=float(size),
-        wanted_px=float(np.fmin(target.wanted_px, size * truth.longest_px / lens.focal_px[0])),
+        size_px=size,
+        wanted_px=longest if longest < target.wanted_px else target.wanted_px,
         visible=0.0 if outline is None else outline.visible,
     )
 

@@ -37,6 +37,9 @@ def true_calibration(world: SimWorld, stops: int = 8) -> Calibration:
     )
 
 
+MOST_COUNTS = 2**64  # times before 0 count from there downwards
+
+
 @dataclass(frozen=True)
 class TruthNoise:
     """How a detector errs.
@@ -73,13 +76,17 @@ class TruthDetector:
             noise: how it errs.
             names: the targets to find; all by default.
         """
-        self._truth, self._seed, self._noise = truth, seed, noise
+        self._truth, self._noise = truth, noise
         self._names = tuple(truth.targets if names is None else names)
+        # It counts, so that the numbers of any time can be drawn at once: quicker than to seed another for each.
+        self._bits = np.random.Philox(key=seed)
+        self._rng, self._start = np.random.Generator(self._bits), self._bits.state
 
     def detect(self, frame: Frame) -> list[Detection]:
         """Find the targets, largest first."""
         noise, size = self._noise, self._truth.fixed_lens.size
-        rng = np.random.default_rng((self._seed, round(frame.t * 1e6)))
+        self._start["state"]["counter"][0] = round(frame.t * 1e6) % MOST_COUNTS
+        self._bits.state, rng = self._start, self._rng
         found = []
         for name in self._names:
             # Drawn whether the target is seen or not, so that none changes another's.

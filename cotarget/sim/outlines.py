@@ -37,14 +37,14 @@ class View:
 
     Attributes:
         eye: its optical centre in the world [m], (3,).
-        axes: the world's coordinates of its x (right), y (down) and z (forward), as columns, (3, 3).
         lens: its optics.
-        to_image: from directions in the world to homogeneous pixels, distortion aside, (3, 3).
+        bent: whether they distort.
+        to_image: from directions in the world to homogeneous pixels, (3, 3); where the lens distorts, to its axes.
     """
 
     eye: Array
-    axes: Array
     lens: TrueLens
+    bent: bool
     to_image: Array
 
 
@@ -60,6 +60,8 @@ class Outlines:
         """
         self._truth, self._model, self._data = truth, truth.model, mujoco.MjData(truth.model)
         mujoco.mj_kinematics(self._model, self._data)
+        data = self._data  # to ask it for its arrays takes as long as to work with them
+        self._qpos, self._places, self._turns = data.qpos, data.xpos, data.xmat.reshape(-1, 3, 3)
         self._points = {name: outermost(each.kind) * each.size for name, each in truth.targets.items()}
         self._beats = {name: np.concatenate(points[::EVERY], axis=1) for name, points in self._points.items()}
         self._reach = {name: float(np.linalg.norm(points, axis=1).max()) for name, points in self._points.items()}
@@ -138,19 +140,18 @@ class Outlines:
             return self._fixed
         self._at(t)
         if self._zoom is None:
-            data, axes = self._data, self._axes
-            data.qpos[axes[0]], data.qpos[axes[1]] = self._truth.head_at(t)
-            mujoco.mj_kinematics(self._model, data)
+            self._qpos[self._axes[0]], self._qpos[self._axes[1]] = self._truth.head_at(t)
+            mujoco.mj_kinematics(self._model, self._data)
             self._zoom = self._placed(camera, self._truth.lens(camera, t))
         return self._zoom
 
     def _placed(self, camera: CameraName, lens: TrueLens) -> View:
         """A camera as it stands now."""
         body = self._bodies[camera]
-        axes = self._data.xmat[body].reshape(3, 3).copy()
-        (fx, fy), (cx, cy) = lens.focal_px, lens.center_px
-        to_image = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) @ axes.T
-        return View(self._data.xpos[body] + axes[:, 2] * lens.pupil, axes, lens, to_image)
+        axes = self._turns[body].copy()
+        (fx, fy), (cx, cy), bent = lens.focal_px, lens.center_px, any(lens.distortion)
+        to_image = axes.T if bent else np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) @ axes.T
+        return View(self._places[body] + axes[:, 2] * lens.pupil, lens, bent, to_image)
 
     def _at(self, t: float) -> None:
         """Forget what was worked out for another time."""
@@ -180,15 +181,13 @@ class Outlines:
     def _project(self, name: str, camera: CameraName, t: float, points: Array) -> Array | None:
         """Pixels of points (3, n) in a target's body's frame, (2, n); None behind the camera or beyond its lens."""
         (position, turn, _), view = self._pose(name, t), self.view(camera, t)
-        x, y, z = (view.axes.T @ (position - view.eye)).tolist()
-        if z <= self._reach[name] or math.hypot(x, y) >= fold(view.lens.distortion) * z:
+        center = view.to_image @ (position - view.eye)
+        x, y, z = center.tolist()
+        if z <= self._reach[name] or (view.bent and math.hypot(x, y) >= fold(view.lens.distortion) * z):
             return None
-        bent = any(view.lens.distortion)
-        to_image = view.axes.T if bent else view.to_image
-        x_image = (to_image @ turn) @ points
-        x_image += (to_image @ (position - view.eye))[:, None]
+        x_image = (view.to_image @ turn) @ points + center[:, None]
         xy = x_image[:2] / x_image[2]
-        return (view.lens.bend(xy.T) * view.lens.focal_px + view.lens.center_px).T if bent else xy
+        return (view.lens.bend(xy.T) * view.lens.focal_px + view.lens.center_px).T if view.bent else xy
 
     def _stands_free(self, name: str) -> bool:
         """Whether nothing that stands can come between the cameras and a target, wherever it goes.
