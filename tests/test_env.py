@@ -51,7 +51,7 @@ def run(env, policy, seed, seconds=math.inf):
 
 @pytest.mark.parametrize("make", [Follow, Schedule])
 def test_tracks_pass_the_checker(make):
-    env = make(seconds=2.0)
+    env = make("bird", seconds=2.0)
     check_env(env, skip_render_check=True)
     env.close()
 
@@ -59,7 +59,7 @@ def test_tracks_pass_the_checker(make):
 @pytest.mark.render
 @pytest.mark.parametrize("make", [Follow, Schedule])
 def test_images_pass_the_checker(make):
-    env = make(observation="images", seconds=2.0, image_size=(48, 32))
+    env = make("bird", "images", seconds=2.0, image_size=(48, 32))
     check_env(env, skip_render_check=True)
     observation, _ = env.reset(seed=0)
     assert observation["wide"].shape == observation["closeup"].shape == (32, 48, 3)
@@ -112,7 +112,7 @@ def test_vectors_of_environments_agree_with_one():
 
 @pytest.mark.parametrize("make", [Follow, Schedule])
 def test_the_same_seed_gives_the_same_episode_and_no_seed_another(make):
-    env = make(seconds=1.0)
+    env = make("bird", seconds=1.0)
     env.action_space.seed(1)
     actions = [env.action_space.sample() for _ in range(20)]
 
@@ -256,6 +256,21 @@ def test_pictures_show_what_the_streams_show():
         assert np.median(off) <= 3  # grey levels; edges are softer in the stream
         assert np.abs(off.mean(axis=(0, 1))).max() < 6
     env.close()
+
+
+@pytest.mark.render
+def test_effects_of_the_rig_show_in_the_pictures():
+    """Noise of 2 grey levels, rounded to whole ones; at black and white it is cut."""
+    seen = []
+    for noise in (False, True):
+        sim = dataclasses.replace(DEFAULT_RIG.sim, effects=dataclasses.replace(DEFAULT_RIG.sim.effects, noise=noise))
+        env = Follow("book", "images", rig=dataclasses.replace(DEFAULT_RIG, sim=sim), seconds=1.0)
+        told = run(env, lambda _: STILL, seed=2, seconds=0.1)
+        seen.append([np.stack([o["wide"], o["closeup"]]).astype(float) for o, *_ in told[:2]])
+        env.close()
+    noises = [noisy - plain for plain, noisy in zip(*seen, strict=True)]
+    assert [noise.std() for noise in noises] == pytest.approx([2.0, 2.0], rel=0.1)
+    assert np.corrcoef(noises[0].ravel(), noises[1].ravel())[0, 1] < 0.1  # another one in each frame
 
 
 # ---------------------------------------------------------------- rewards

@@ -75,7 +75,8 @@ class Follow(RigEnv[Any, Vector]):
             target: book, person or bird.
             observation: "tracks" or "images".
             rig: a simulated one, or its rig.toml; the default one without noise, JPEG, distortion, blur and
-                antialiasing, where none is given. Whose targets, paths and seed it names does not count.
+                antialiasing, where none is given. Which targets, paths and seed it names does not count, nor its
+                safety, but for the ranges of pan and tilt that -1 to 1 stand for.
             calibration: that a policy may use, or its file; the true one by default.
             seconds: of an episode, at most 20 [s].
             image_size: (width, height) of the pictures [px].

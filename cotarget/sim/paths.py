@@ -65,10 +65,9 @@ class Path:
         first, last = self._knots[0], self._knots[-1]
         inside = 1e-3 * (last - first)
         at = self.within(t)
-        moving = min(max(at, first + inside), last - inside)
-        piece, s = self._piece(at)
-        if moving != at:
+        if not first + inside <= at <= last - inside:  # it is held, or nearly
             return self.position(t).tolist(), self.velocity(t).tolist(), self.acceleration(t).tolist()
+        piece, s = self._piece(at)
         powers = ((s * s * s, s * s, s, 1.0), (3 * s * s, 2 * s, 1.0, 0.0), (6 * s, 2.0, 0.0, 0.0))
         x, v, a = (np.array(powers) @ piece).tolist()
         return x, v, a
