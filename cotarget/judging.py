@@ -1,7 +1,7 @@
 """Puts Steps and calibrations beside a simulated world's truth, which the pipeline cannot see."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import cv2
 import numpy as np
@@ -103,6 +103,7 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
         target=name,
         head_commands=step.head_commands,
         lens_commands=step.lens_commands,
+        on_target=" ".join(f"{i}:{each}" for i, each in on_target(step.tracks, wide_outlines)),
     )
 
 
@@ -137,12 +138,39 @@ def off_target(tracks: Iterable[Track], outlines: Iterable[Silhouette | None]) -
         outlines: the targets' true ones in it; a track is off a target when it is farther from the middle of its box
             than the box's larger side.
     """
-    boxes = [((o.low_px + o.high_px) / 2, float(o.size_px.max())) for o in outlines if o is not None]
+    found = [outline for outline in outlines if outline is not None]
+    return [track.id for track in tracks if track.confirmed and not any(_is_on(track, each) for each in found)]
+
+
+def on_target(tracks: Iterable[Track], outlines: Mapping[str, Silhouette | None]) -> list[tuple[int, str]]:
+    """Confirmed tracks that a frame shows alone, each with every target that it is on, the nearest first.
+
+    One that coasts is where nobody looks, and one in a box with others is on them all.
+
+    Args:
+        tracks: at a fixed frame's time.
+        outlines: the targets' true ones in it, by name.
+    """
+    seen = [track for track in tracks if track.confirmed and not track.missed and not track.shared]
     return [
-        track.id
-        for track in tracks
-        if track.confirmed and not any(np.linalg.norm(track.center_px - middle) <= side for middle, side in boxes)
+        (track.id, name)
+        for track in seen
+        for _, name in sorted(
+            (_off_px(track, outline), name)
+            for name, outline in outlines.items()
+            if outline is not None and _is_on(track, outline)
+        )
     ]
+
+
+def _is_on(track: Track, outline: Silhouette) -> bool:
+    """Whether a track is no farther from the middle of an outline's box than the box's larger side."""
+    return _off_px(track, outline) <= float(outline.size_px.max())
+
+
+def _off_px(track: Track, outline: Silhouette) -> float:
+    """From the middle of an outline's box to a track [px]."""
+    return float(np.linalg.norm(track.center_px - (outline.low_px + outline.high_px) / 2))
 
 
 def pointing_errors(

@@ -16,7 +16,7 @@ import numpy as np
 
 from cotarget.geometry import Array
 from cotarget.motionfilter import Track
-from cotarget.planning import LOOK_S, Candidate, Outlook, done_in, plan
+from cotarget.planning import LOOK_S, SETTLE_S, Candidate, Outlook, done_in, plan
 from cotarget.rig import PanTiltLimits
 
 # A click means the target in whose box it is, or one whose middle is within this part of the image's width.
@@ -71,6 +71,10 @@ class FirstCome:
 class Rounds:
     """Look at every target for a while and go on to the next; once all were seen, at whoever was seen least.
 
+    Turning away costs the way, and the time until the lens has settled again: whoever turned before that would see
+    nobody. So each is kept for SETTLE_S unless it is gone or was seen for long enough; and once all were, until it has
+    been seen longer than another by a whole look.
+
     Attributes:
         next_of: gives the number of the next one; asked at every frame, and never without anybody waiting.
         look_s: how long each is looked at [s].
@@ -79,6 +83,7 @@ class Rounds:
     next_of: Callable[[Outlook], int]
     look_s: float = LOOK_S
     _id: int | None = None
+    _since: float = -math.inf
     unmet = ""
 
     def favours(self, track: Track) -> bool:
@@ -89,13 +94,27 @@ class Rounds:
         """The next one, as long as somebody waits."""
         candidates = _reachable(candidates)
         waiting = sorted((c for c in candidates if c.seen_s < self.look_s), key=lambda c: (c.leaves_in, c.id))
+        t = max((c.track.t for c in candidates), default=-math.inf)
         if waiting:
-            pan, tilt = head.tolist()
-            self._id = self.next_of(Outlook(waiting, self._id, (pan, tilt), limits, self.look_s))
+            if self._id not in {c.id for c in waiting} or not 0 <= t - self._since < SETTLE_S:
+                pan, tilt = head.tolist()
+                self._turn(self.next_of(Outlook(waiting, self._id, (pan, tilt), limits, self.look_s)), t)
         else:
-            least = min(candidates, key=lambda c: (c.seen_s, c.id), default=None)
-            self._id = None if least is None else least.id
+            self._turn(self._least_seen(candidates), t)
         return self._id
+
+    def _turn(self, number: int | None, t: float) -> None:
+        """Look at somebody from a time on [s]."""
+        if number != self._id:
+            self._id, self._since = number, t
+
+    def _least_seen(self, candidates: Sequence[Candidate]) -> int | None:
+        """Whoever was seen least; the one followed before until it is a whole look ahead."""
+        least = min(candidates, key=lambda c: (c.seen_s, c.id), default=None)
+        current = next((c for c in candidates if c.id == self._id), least)
+        if current is None or least is None:
+            return None
+        return current.id if current.seen_s < least.seen_s + self.look_s else least.id
 
 
 def nearest_deadline(outlook: Outlook) -> int:

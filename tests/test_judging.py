@@ -182,6 +182,14 @@ def test_a_track_is_off_target_when_it_is_farther_than_the_larger_side(book):
         track(7, (325, 239 + 18)),
     )
     assert row_of(book, tracks=tracks).off_target == "3 7"
+    assert row_of(book, tracks=tracks).on_target == "2:book 5:book"
+
+
+def test_a_track_is_on_a_target_only_while_it_is_seen_alone(book):
+    at = (325, 239)
+    tracks = (track(2, at, missed=1), dataclasses.replace(track(3, at), shared=True), track(4, at, confirmed=False))
+    row = row_of(book, tracks=(*tracks, track(5, at)))
+    assert (row.on_target, row.off_target) == ("5:book", "")
 
 
 def test_a_zoom_frame_has_one_row(book):

@@ -72,6 +72,7 @@ def test_a_perfect_run():
         reversals_per_min=0.0,
         false_tracks_per_min=0.0,
         lens_commands_per_min=0.0,
+        id_switches_per_min=0.0,
     )
 
 
@@ -248,6 +249,20 @@ def test_commands_count_whether_a_goal_changes_or_not():
 ])  # fmt: skip
 def test_false_tracks(parts, count):
     assert score(run((50, {}), *parts)).false_tracks_per_min == pytest.approx(count / COUNTED_MIN)
+
+
+@pytest.mark.parametrize(("parts", "count"), [
+    ([(50, {"on_target": "3:bird"}), (50, {"on_target": "3:bird"})], 0),
+    ([(50, {"on_target": "3:bird"}), (50, {"on_target": "3:bird2"})], 1),
+    ([(40, {"on_target": "3:bird"}), (20, {}), (40, {"on_target": "3:bird2"})], 1),  # over a gap, too
+    ([(50, {"on_target": "3:bird 7:bird2"}), (50, {"on_target": "3:bird2 7:bird"})], 2),
+    ([(50, {"on_target": "3:bird"}), (50, {"on_target": "7:bird2"})], 0),  # another track
+    ([(50, {"on_target": "3:bird"}), (20, {"on_target": "3:bird2 3:bird"}), (30, {"on_target": "3:bird"})], 0),  # pass
+    ([(50, {"on_target": "3:bird"}), (20, {"on_target": "3:bird2 3:bird"}), (30, {"on_target": "3:bird2"})], 1),
+    ([(30, {"on_target": "3:bird"}), (30, {"on_target": "3:bird2"}), (40, {"on_target": "3:bird"})], 2),
+])  # fmt: skip
+def test_id_switches(parts, count):
+    assert score(run((50, {}), *parts)).id_switches_per_min == pytest.approx(count / COUNTED_MIN)
 
 
 def test_a_single_row_has_no_rates():

@@ -18,9 +18,9 @@ STILL = np.zeros(2)
 nearest_deadline, most_served = POLICIES["nearest-deadline"], POLICIES["most-served"]
 
 
-def track(number, center=(320.0, 240.0), velocity=(0.0, 0.0), size=(20.0, 20.0)):
+def track(number, center=(320.0, 240.0), velocity=(0.0, 0.0), size=(20.0, 20.0), t=0.0):
     center, velocity, size = (np.array(each, float) for each in (center, velocity, size))
-    return Track(number, 0.0, True, 0, center, velocity, size, float(size.max()), np.eye(4), 1.0, None)
+    return Track(number, t, True, 0, center, velocity, size, float(size.max()), np.eye(4), 1.0, None)
 
 
 def candidate(number, pan=0.0, *, rate=0.0, leaves=math.inf, seen=0.0, **where):
@@ -90,11 +90,48 @@ def test_a_plan_is_kept_while_the_times_to_leave_waver():
     chosen = set()
     for k in range(25):  # a second
         leaves = rng.uniform(3.0, 9.0, 3)
-        there = [candidate(i, 0.2 * i, leaves=leaves[i], seen=0.04 * k * (i in chosen)) for i in range(3)]
+        there = [candidate(i, 0.2 * i, leaves=leaves[i], seen=0.04 * k * (i in chosen), t=0.04 * k) for i in range(3)]
         chosen.add(policy.select(there, STILL, LIMITS))
     assert len(chosen) == 1
-    gone = [candidate(i, 0.2 * i, leaves=0.1 if i in chosen else 9.0) for i in range(3)]
+    gone = [candidate(i, 0.2 * i, leaves=0.1 if i in chosen else 9.0, t=1.0) for i in range(3)]
     assert policy.select(gone, STILL, LIMITS) not in chosen
+
+
+@pytest.mark.parametrize("make", [nearest_deadline, most_served])
+def test_nobody_is_left_before_the_lens_has_settled(make):
+    """Two that leave in turn too soon: a plan anew at every frame would go to and fro between them."""
+    policy = make()
+    first = policy.select([candidate(1, 0.2, leaves=1.0), candidate(2, -0.2, leaves=9.0)], STILL, LIMITS)
+    turned = []
+    for k in range(1, 100):
+        leaves = (9.0, 1.0) if k % 2 else (1.0, 9.0)
+        there = [candidate(i, 0.4 * i - 0.6, leaves=leaves[i - 1], t=0.04 * k) for i in (1, 2)]
+        found = policy.select(there, STILL, LIMITS)
+        if found != first:
+            turned.append(0.04 * k)
+            first = found
+    assert all(np.diff([0.0, *turned]) >= SETTLE_S - 1e-9)
+    assert policy.select([candidate(3 - first, t=4.0)], STILL, LIMITS) == 3 - first  # who is gone is not waited for
+
+
+@pytest.mark.parametrize("make", [nearest_deadline, most_served])
+@pytest.mark.parametrize("apart", [0.01, 0.1, 0.4])
+def test_who_were_all_seen_are_looked_at_in_turn_and_for_long_enough(make, apart):
+    """Three who stay: each frame at one makes another the least seen, and the head would be under way all the time."""
+    policy, pans, seen, head, goal, arrives, turned = make(), apart * np.arange(3), np.zeros(3), 0.0, None, 0.0, []
+    for t in np.arange(0, 20, 0.04):
+        there = [candidate(i, pans[i], seen=seen[i], t=t) for i in range(3)]
+        found = policy.select(there, np.array([head, 0.0]), LIMITS)
+        if found != goal:
+            arrives = t + travel_s((pans[found] - head, 0.0), LIMITS) + 0.3
+            goal = found
+            turned.append(t)
+        if t >= arrives:
+            head = pans[goal]
+            seen[goal] += 0.04
+    assert np.diff(turned).min() >= LOOK_S - 0.041
+    assert seen.sum() > 20 / 2
+    assert np.ptp(seen) <= LOOK_S + 0.041
 
 
 def served_by_best_order(candidates, head):
@@ -165,6 +202,7 @@ def simulated(policy, rng, seconds=20.0, targets=5, dt=0.04):
                 rate=speeds[i],
                 leaves=(0.43 - abs(at[i]) * np.sign(at[i] * speeds[i])) / abs(speeds[i]),
                 seen=seen[i],
+                t=t,
             )
             for i in there
         ]

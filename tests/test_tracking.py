@@ -195,9 +195,9 @@ def test_comparing_everything_with_everything_is_done_once_a_frame(monkeypatch):
     asked = []
 
     class Counted(tracking._Pairs):
-        def __init__(self, states, detections):
+        def __init__(self, states, detections, image_size):
             asked.append((len(states), len(detections)))
-            super().__init__(states, detections)
+            super().__init__(states, detections, image_size)
 
     monkeypatch.setattr(tracking, "_Pairs", Counted)
     tracker = Tracker(PLAIN, SIZE)
@@ -319,4 +319,55 @@ def test_who_is_found_again_is_no_newcomer():
     for i in range(1, 20):
         place = place + np.array([200.0, 15.0]) / RATE + (np.array([0.0, 12.0]) if i == 1 else 0)
         tracks = tracker.update([seen(*place)], t + i / RATE)
+    assert [(track.id, track.missed) for track in tracks if track.confirmed] == [(1, 0)]
+
+
+@pytest.mark.parametrize(("off_px", "number"), [(30, 1), (50, 1), (110, None), (150, None)])
+def test_of_two_who_pass_one_vanishes_and_his_track_does_not_jump_on(off_px, number):
+    """0.7 s later the filter knows his place to 35 px, and four times that are in its gate: it is somebody else."""
+    tracker = Tracker(settings_for(DEFAULT_TARGETS["person"]), SIZE)
+    ids = {}
+    for i in range(80):
+        t = i / RATE
+        stays, goes = seen(440 - 60 * t, 300, 30, 80), seen(200 + 60 * t, 200, 30, 80)
+        comes = seen(*(goes.center_px - (0, off_px)), 30, 80)
+        there = {"stays": stays} | ({"goes": goes} if t <= 2 else {"comes": comes} if t > 2.65 else {})
+        tracks = tracker.update(list(there.values()), t)
+        ids |= {name: track.id for name, box in there.items() for track in tracks if track.box is box}
+    assert ids["stays"] not in (ids["goes"], ids["comes"])
+    assert (ids["comes"] == ids["goes"]) == (number is not None)
+
+
+@pytest.mark.parametrize(("size", "taken"), [((50, 70), False), ((8, 6), True)])
+def test_what_the_border_cuts_is_at_least_as_large_as_it_looks(size, taken):
+    """A post that rises from the lower border is no bird; a part of a bird may be one."""
+    tracker = Tracker(settings_for(DEFAULT_TARGETS["bird"]))
+    for i in range(40):
+        tracker.update([seen(300 + i, 450, 9, 7)], i / RATE)
+    for i in range(40, 50):
+        tracker.update([], i / RATE)
+    tracks = tracker.update([seen(380, 479.5 - size[1] / 2, *size, clipped=True)], 2.0)
+    assert (tracks[0].id, tracks[0].missed == 0) == (1, taken)
+
+
+def test_who_enters_at_a_corner_is_one_although_the_next_box_is_far_larger():
+    """Of 3 by 10 px that the border left, 38 by 60 are no other."""
+    tracker = Tracker(settings_for(DEFAULT_TARGETS["person"]), SIZE)
+    for i, (width, height) in enumerate([(3, 10), (38, 60), (40, 62), (40, 64)]):
+        tracks = tracker.update([seen(width / 2, height / 2, width, height, clipped=True)], i / RATE)
+        assert [(track.id, track.missed) for track in tracks] == [(1, 0)]
+
+
+@pytest.mark.parametrize("gap_s", [0.3, 0.5, 0.7])
+@pytest.mark.parametrize("turn", [-0.9, 0.9])
+def test_a_bird_that_turns_behind_foliage_is_found_again(gap_s, turn):
+    """At 25 m it flies at 10 m/s, 280 px/s, and turns by 0.9 rad/s, with 9 m/s^2: newcomers are not that near."""
+    tracker = Tracker(settings_for(DEFAULT_TARGETS["bird"]), SIZE)
+    rng = np.random.default_rng(5)
+    place, heading = np.array([120.0, 240.0]), 0.0
+    for i in range(int((1.2 + gap_s) * RATE)):
+        heading += turn / RATE * (i > 0.9 * RATE)
+        place = place + 280 / RATE * np.array([np.cos(heading), np.sin(heading)])
+        hidden = 0 < i / RATE - 0.9 <= gap_s
+        tracks = tracker.update([] if hidden else [seen(*(place + rng.normal(0, 1.5, 2)), 17, 9)], i / RATE)
     assert [(track.id, track.missed) for track in tracks if track.confirmed] == [(1, 0)]

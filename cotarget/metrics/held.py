@@ -28,7 +28,7 @@ ROUNDING_S = 1e-6  # frame times are sums and differences of binary fractions
 class Score:
     """How well a target was held; None where it was never acquired, or never there.
 
-    Wear and false tracks are counted, like the yield, from when the target was wholly in the wide view.
+    Wear, false tracks and ID switches are counted, like the yield, from when the target was wholly in the wide view.
 
     Attributes:
         frames: zoom frames since the target was wholly in the wide view.
@@ -51,6 +51,9 @@ class Score:
         reversals_per_min: changes of direction of its goals from row to row, both axes together [1/min].
         false_tracks_per_min: tracks that were confirmed and off every target for 0.5 s on end [1/min].
         lens_commands_per_min: commands that the lens was sent [1/min].
+        id_switches_per_min: how often a track was on another target than before, of all tracks (ID switches after Li,
+            Huang and Nevatia 2009, "Learning to associate") [1/min]. One that is off every target after it was on one
+            is a false track.
     """
 
     frames: int
@@ -71,6 +74,7 @@ class Score:
     reversals_per_min: float | None = None
     false_tracks_per_min: float | None = None
     lens_commands_per_min: float | None = None
+    id_switches_per_min: float | None = None
 
 
 def score(rows: Sequence[Row]) -> Score:
@@ -106,6 +110,7 @@ def score(rows: Sequence[Row]) -> Score:
         reversals_per_min=_per_minute(_reversals(counted), counted),
         false_tracks_per_min=_per_minute(_false_tracks(counted), counted),
         lens_commands_per_min=_per_minute(counted[-1].lens_commands - counted[0].lens_commands, counted),
+        id_switches_per_min=_per_minute(_id_switches(counted), counted),
     )
 
 
@@ -153,3 +158,19 @@ def _false_tracks(rows: Sequence[Row]) -> int:
         since = {track: since.get(track, row.t_s) for track in row.off_target.split()}
         false |= {track for track, begin in since.items() if row.t_s - begin >= FALSE_S - ROUNDING_S}
     return len(false)
+
+
+def _id_switches(rows: Sequence[Row]) -> int:
+    """How often a track was on another target than before: on that no more, and on one."""
+    switches = 0
+    was_on: dict[str, str] = {}
+    for row in rows:
+        on: dict[str, list[str]] = {}
+        for pair in row.on_target.split():
+            track, target = pair.split(":")
+            on.setdefault(track, []).append(target)
+        for track, targets in on.items():
+            switches += was_on.get(track, targets[0]) not in targets
+            if was_on.get(track) not in targets:
+                was_on[track] = targets[0]
+    return switches

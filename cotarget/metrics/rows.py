@@ -54,6 +54,8 @@ class Row:
         target: name of the target that is followed.
         head_commands: how many the head was sent until then, whether its goal changed or not.
         lens_commands: how many the lens was sent until then.
+        on_target: the confirmed tracks that the fixed frame shows alone, each with every target that it is on, the
+            nearest first, as "3:bird 3:bird2 7:bird".
     """
 
     t_s: float
@@ -86,6 +88,7 @@ class Row:
     target: str = ""
     head_commands: int = 0
     lens_commands: int = 0
+    on_target: str = ""
 
     @property
     def inside(self) -> bool:
