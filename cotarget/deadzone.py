@@ -27,6 +27,11 @@ FRAMES_AHEAD = 1.5  # a goal lies no nearer than that, so that a head of slow ca
 FINE = 0.1  # of the zone; a target that stands is not centred better than this, however fine the head's steps are
 
 
+# Of what an axis that is slow, while the other turns, is told to lead by, so much is left out: with all of it the head
+# nods with the noise of the speed, without any it lags behind whoever goes slightly aslant.
+DOUBTED_LEAD = 0.5
+
+
 @dataclass(frozen=True)
 class SteeringSettings:
     """How the head is spared.
@@ -38,17 +43,40 @@ class SteeringSettings:
         catch_s: what the head is off is made good in about this time [s]; shorter is nearer, longer is steadier.
         far: from so many zones on it hurries, because that is no noise any more ...
         hurry_s: ... and makes it good in about this time [s].
-        still: a target slower than this many zones a second stands.
+        still: a target slower than this many zones a second stands; so does an axis.
+        near: an axis that stands keeps its goal while the target is within this part of the zone.
         rest_s: one that stands in the zone is centred no sooner than so long after the last command [s].
     """
 
-    zone: float = 0.02
-    ahead_s: float = 0.15
+    zone: float = 0.015
+    ahead_s: float = 0.2
     catch_s: float = 0.2
     far: float = 6.0
     hurry_s: float = 0.1
     still: float = 5.0
+    near: float = 0.7
     rest_s: float = 1.0
+
+
+@dataclass(frozen=True)
+class _Way:
+    """Where the head shall be, as far as that is worth following.
+
+    Attributes:
+        wanted: when a command given now takes effect [rad].
+        rates: how fast that changes [rad/s]; 0 for an axis that is slow.
+        slow: of each axis, whether it hardly turns.
+        still: whether the target stands: neither does, and both together do not.
+    """
+
+    wanted: Angles
+    rates: Angles
+    slow: tuple[bool, bool]
+    still: bool
+
+    def after(self, seconds: float) -> Angles:
+        """Where it shall be so much later [rad]."""
+        return self.wanted[0] + seconds * self.rates[0], self.wanted[1] + seconds * self.rates[1]
 
 
 class Steering:
@@ -88,46 +116,55 @@ class Steering:
             None where it is best left alone.
         """
         zone = self._settings.zone * field
-        still = _apart(rates, (0.0, 0.0), wanted[1]) <= self._settings.still * zone
-        if still:  # what seems to be a speed is mostly noise, and a guess ahead of it too
-            wanted, rates = (wanted[0] - lead_s * rates[0], wanted[1] - lead_s * rates[1]), (0.0, 0.0)
-        if self._may_rest(effect_t, interval_s, wanted, rates, zone, still):
+        way = self._calmed(wanted, rates, zone, lead_s)
+        if self._may_rest(effect_t, interval_s, way, zone):
             return None
-        pan, tilt = self.head.at(effect_t)
-        off = _apart(wanted, (pan[0], tilt[0]), wanted[1])
+        off = _apart(way.wanted, self._at(effect_t), wanted[1])
         if math.isinf(self._limits.acceleration):  # it jumps: to the middle of the target's way until the next chance
-            half = interval_s / 2
-            command = HeadCommand(wanted[0] + half * rates[0], wanted[1] + half * rates[1], None)
-        elif still and off > zone:
-            command = HeadCommand(*wanted, None)
+            command = HeadCommand(*way.after(interval_s / 2), None)
+        elif way.still and off > zone:
+            command = HeadCommand(*way.wanted, None)
         else:
             catch_s = self._settings.hurry_s if off > self._settings.far * zone else self._settings.catch_s
-            command = self._along((pan, tilt), wanted, rates, interval_s, catch_s)
+            command = self._spared(self._along(effect_t, interval_s, way, catch_s), effect_t + interval_s, way, zone)
         command = self._within(command)
         self.head.obeys(effect_t, command)
         return command
 
-    def _may_rest(
-        self, effect_t: float, interval_s: float, wanted: Angles, rates: Angles, zone: float, still: bool
-    ) -> bool:
+    def _calmed(self, wanted: Angles, rates: Angles, zone: float, lead_s: float) -> _Way:
+        """The target's way, without the speed of what stands: that is mostly noise, and a guess ahead of it too."""
+        limit = self._settings.still * zone
+        slow = tuple(abs(rate) * scale <= limit for rate, scale in zip(rates, _scales(wanted[1]), strict=True))
+        still = _apart(rates, (0.0, 0.0), wanted[1]) <= limit
+        back_s = lead_s if still else DOUBTED_LEAD * lead_s
+        pan, tilt = (q - back_s * rate if at_rest else q for q, rate, at_rest in zip(wanted, rates, slow, strict=True))
+        pan_rate, tilt_rate = (0.0 if at_rest else rate for rate, at_rest in zip(rates, slow, strict=True))
+        return _Way((pan, tilt), (pan_rate, tilt_rate), (slow[0], slow[1]), still)
+
+    def _may_rest(self, effect_t: float, interval_s: float, way: _Way, zone: float) -> bool:
         """Whether the last command will do until the next chance."""
         command = self.head.command
         if command is None:
             return False
-        off_goal = _apart(wanted, (command.pan, command.tilt), wanted[1])
-        if still and off_goal <= zone:  # there, or on the way to the right place
+        off_goal = _apart(way.wanted, (command.pan, command.tilt), way.wanted[1])
+        off_then = _apart(way.after(interval_s), self._at(effect_t + interval_s), way.wanted[1])
+        # There, or on the way to the right place; a head that ran past it while it followed would come back at a crawl.
+        if way.still and off_goal <= zone and (command.speed is None or off_then <= zone):
             fine = max(self._limits.step, FINE * zone)
             return off_goal <= fine or effect_t - self.head.commanded_t < self._settings.rest_s
-        pan, tilt = self.head.at(effect_t + interval_s)
-        then = wanted[0] + rates[0] * interval_s, wanted[1] + rates[1] * interval_s
-        return _apart(then, (pan[0], tilt[0]), wanted[1]) <= zone
+        return off_then <= zone
 
-    def _along(self, heads: Motion, wanted: Angles, rates: Angles, interval_s: float, catch_s: float) -> HeadCommand:
+    def _at(self, t: float) -> Angles:
+        """Where the head is at a time [s] if it is left alone [rad]."""
+        (pan, _), (tilt, _) = self.head.at(t)
+        return pan, tilt
+
+    def _along(self, effect_t: float, interval_s: float, way: _Way, catch_s: float) -> HeadCommand:
         """A goal ahead of each axis, and the target's speed, faster where it is behind."""
         limits = self._limits
         ahead = max(self._settings.ahead_s, FRAMES_AHEAD * interval_s)
         goals, speeds = [], []
-        for w, r, (x, _) in zip(wanted, rates, heads, strict=True):
+        for w, r, x in zip(way.wanted, way.rates, self._at(effect_t), strict=True):
             v = r + (w - x) / catch_s
             v = math.copysign(min(abs(v), limits.speed), v)
             # Behind, it goes to where the target will be; before it, it slows down until that has caught up.
@@ -136,6 +173,30 @@ class Steering:
             speeds.append(max(abs(v), LEAST_SPEED))
         return HeadCommand(goals[0], goals[1], (speeds[0], speeds[1]))
 
+    def _spared(self, command: HeadCommand, then_t: float, way: _Way, zone: float) -> HeadCommand:
+        """The same, but an axis that is slow and near enough keeps its goal and its speed.
+
+        Whoever walks by stays at one height. Where the tilt is told anew as often as the pan has to be, it goes up and
+        down with every error of the estimate.
+        """
+        last = self.head.command
+        if last is None:
+            return command
+        near = [
+            abs(q - x) * scale <= self._settings.near * zone
+            for q, x, scale in zip(way.wanted, self._at(then_t), _scales(way.wanted[1]), strict=True)
+        ]
+        (pan, pan_speed), (tilt, tilt_speed) = (
+            old if at_rest and close else new
+            for old, new, at_rest, close in zip(self._axes(last), self._axes(command), way.slow, near, strict=True)
+        )
+        return HeadCommand(pan, tilt, (pan_speed, tilt_speed))
+
+    def _axes(self, command: HeadCommand) -> Motion:
+        """Goal and speed of each axis."""
+        pan, tilt = self._limits.capped(command.speed)
+        return (command.pan, pan), (command.tilt, tilt)
+
     def _within(self, command: HeadCommand) -> HeadCommand:
         """The same within the limits."""
         pan, tilt = (
@@ -143,6 +204,11 @@ class Steering:
             for q, (low, high) in ((command.pan, self._limits.pan), (command.tilt, self._limits.tilt))
         )
         return HeadCommand(pan, tilt, command.speed)
+
+
+def _scales(tilt: float) -> Angles:
+    """What a radian of pan, and of tilt, is on the sphere at that tilt."""
+    return math.cos(tilt), 1.0
 
 
 def _apart(a: Angles, b: Angles, tilt: float) -> float:
