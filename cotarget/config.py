@@ -6,19 +6,30 @@ Defaults are the rig that the project's figures are stated for.
 
 import dataclasses
 import math
-import re
 import tomllib
 import types
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from cotarget.assets import assets_dir
 from cotarget.errors import ConfigError, choices
 from cotarget.hwconfig import HardwareConfig, check_hardware
 from cotarget.simchecks import check_sim
-from cotarget.simconfig import Pair, SimCamera, SimConfig, SimEffects, SimHead, SimZoomCamera, Size
+from cotarget.simconfig import (
+    Limits,
+    Pair,
+    SimCamera,
+    SimConfig,
+    SimEffects,
+    SimHead,
+    SimZoomCamera,
+    Size,
+    expand_all,
+    fit_sizes,
+    split_name,
+)
 from cotarget.tables import build, expect_table
 
 __all__ = [
@@ -43,7 +54,7 @@ class BoardConfig:
     """The calibration board: inner corners (columns, rows) and the side of a square [m]."""
 
     kind: Literal["chessboard", "charuco"] = "chessboard"
-    corners: Size = (9, 6)
+    corners: Annotated[tuple[int, int], "[columns, rows]"] = (9, 6)
     square: float = 0.1
 
 
@@ -93,8 +104,8 @@ class SafetyConfig:
         stop_file: while this file exists, the head does not move; None for no such file.
     """
 
-    pan_deg: Pair | None = None
-    tilt_deg: Pair | None = None
+    pan_deg: Limits | None = None
+    tilt_deg: Limits | None = None
     speed_deg_s: float | None = None
     max_frame_age_s: float = 1.0
     watchdog_s: float = 0.35
@@ -235,29 +246,16 @@ def parse_config(table: Mapping[str, Any]) -> RigConfig:
         targets[name] = build(TargetConfig, values, f"targets.{name}", base=_of_kind(targets, name))
     sim_table = table.get("sim")
     if isinstance(sim_table, Mapping) and isinstance(sim_table.get("effects"), Mapping):
-        table["sim"] = {**sim_table, "effects": _expand_all(dict(sim_table["effects"]))}
-    config = dataclasses.replace(build(RigConfig, table, ""), targets=targets)
+        table["sim"] = {**sim_table, "effects": expand_all(sim_table["effects"])}
+    config = build(RigConfig, table, "")
+    config = dataclasses.replace(config, targets=targets, sim=fit_sizes(config.sim, table.get("sim", {})))
     _check(config)
     return config
 
 
-# No effect of a real rig but the quality of the rendering, which `all` leaves alone.
-QUALITY = ("multisampling", "shadows")
-
-
-def _expand_all(effects: dict[str, Any]) -> dict[str, Any]:
-    """Let ``all`` set every switch that is not named."""
-    every = effects.pop("all", None)
-    if every is None:
-        return effects
-    if not isinstance(every, bool):
-        raise ConfigError(f"sim.effects.all: {every!r} is not true or false")
-    return {f.name: every for f in dataclasses.fields(SimEffects) if f.name not in QUALITY} | effects
-
-
 def _of_kind(targets: Mapping[str, TargetConfig], name: str) -> TargetConfig | None:
     """The target of that name, or of the name without the number from 2 on at its end."""
-    return targets.get(name) or targets.get(re.sub(r"(?<=[^\d])([2-9]|[1-9]\d+)$", "", name))
+    return targets.get(name) or targets.get(split_name(name)[0])
 
 
 def _overlap(own: Pair, soft: Pair | None, where: str) -> Pair:
@@ -293,8 +291,3 @@ def _check(config: RigConfig) -> None:
         )
     if min(config.board.corners) < 3:
         raise ConfigError(f"board.corners: {list(config.board.corners)} has fewer than 3 corners a side")
-    for name in config.sim.targets:
-        config.target(name)
-    for name in config.sim.paths:
-        if _of_kind(config.targets, name) is None:
-            raise ConfigError(f"sim.paths.{name}: is no target; the targets are: {choices(config.targets)}")

@@ -141,11 +141,15 @@ def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> 
                 POINTING_TARGETS,
             )
         )
+        rig.head.move(0.0, 0.0, wait=True)  # where the zoom camera's frame is zoom0
         front, back = world.portrait(FRONT_DEG, axes=False), world.portrait(BACK_DEG, axes=True)
         picture = np.hstack(
             [
                 captioned(front.image, "the rig: a fixed camera, and a zoom camera on a pan-tilt unit"),
-                captioned(draw_frames(back.image, back.origins_px), "its frames: x red, y green, z blue"),
+                captioned(
+                    draw_frames(back.image, back.origins_px),
+                    "its frames (x red, y green, z blue), Gamma = T_zoom0_fixed and T = T_head_zoom",
+                ),
             ]
         )
         write_picture(work / "rig.png", picture)

@@ -1,6 +1,7 @@
 """Pictures from Steps: side by side frames, one picture a target, and the aim error over time."""
 
 import math
+import textwrap
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 
 from cotarget.geometry import Array
 from cotarget.loop import State, Step
+from cotarget.outputs import write_whole
 from cotarget.rig import Image
 
 FOUND, FOLLOWED, CROSS, INK, PAPER, ARROW = (
@@ -21,13 +23,12 @@ FOUND, FOLLOWED, CROSS, INK, PAPER, ARROW = (
     (0, 120, 235),
 )
 STRIP_PX = 36  # height of a caption
-# For the picture "centred" the lens may have begun to zoom in by this factor.
-ZOOMED_OUT = 1.6
-AIM_AHEAD_S = 0.08  # an aim is for about this long after its step: the command's delay and a frame
 SIZE_KNOWN_S = 1.5  # a target that has just come in is still cut by the border, or not yet seen with wings spread
 RECENT_STEPS = 16  # states kept to tell what the lens was when a frame was exposed; more than any latency needs
 # For the close-up, focal length (relative) and target (over the image's width) are this near to what is wanted.
 SETTLED = 0.08
+CENTRED = 0.04  # so near to the middle, over the image's width, is what is shown as centred before it is close up
+REASON_SCALE, REASON_LETTER_PX, REASON_LINE_PX, REASON_MARGIN_PX = 0.45, 8, 16, 8  # few letters are wider
 BOX_MARGIN_PX = 4  # a box stands this far outside of what it marks
 
 
@@ -41,12 +42,12 @@ def write_text(image: Image, text: str, at: Sequence[float] | Array, scale: floa
 
 
 def write_picture(path: Path, image: Image) -> None:
-    """Write an image as PNG.
+    """Write an image as PNG, in one step.
 
     Raises:
-        OSError: it cannot be written.
+        ConfigError: it cannot be written.
     """
-    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    write_whole(path, cv2.imencode(".png", image)[1].tobytes())
 
 
 def captioned(image: Image, text: str) -> Image:
@@ -89,7 +90,9 @@ def side_by_side(step: Step, title: str) -> Image:
     """One frame of the video: the wide view with its detection, the zoom view, and what the loop does."""
     pan, tilt = np.degrees(step.head.pan), np.degrees(step.head.tilt)
     depth = f"depth {step.aim.depth:5.1f} m" if step.aim is not None else ""
-    wide = captioned(draw_wide(step), f"{title}   t = {step.fixed.t:5.2f} s   {step.state}   {depth}")
+    wide = captioned(
+        _explained(draw_wide(step), step.reason), f"{title}   t = {step.fixed.t:5.2f} s   {step.state}   {depth}"
+    )
     zoomed = draw_zoom(step)
     if zoomed.shape[0] < step.fixed.image.shape[0]:  # a preview: as high as the wide view, for the eye
         factor = step.fixed.image.shape[0] / zoomed.shape[0]
@@ -105,17 +108,26 @@ def side_by_side(step: Step, title: str) -> Image:
     return np.hstack(padded)
 
 
+def _explained(image: Image, reason: str) -> Image:
+    """Write why the loop does what it does onto the foot of an image, in as many lines as it takes."""
+    lines = textwrap.wrap(reason, max(1, (image.shape[1] - 2 * REASON_MARGIN_PX) // REASON_LETTER_PX))
+    for number, line in enumerate(reversed(lines)):
+        at = (REASON_MARGIN_PX, image.shape[0] - REASON_MARGIN_PX - number * REASON_LINE_PX)
+        write_text(image, line, at, REASON_SCALE)
+    return image
+
+
 class TargetStages:
     """Picks from a run of Steps what one picture of a target shows: before, centred, and close up.
 
-    It judges by what the loop itself knows: where the devices said that head and lens were when a view was exposed,
-    and where the aims wanted them then.
+    It judges by what the loop itself knows: where it found the target in a zoom view, and where the lens said that it
+    was when that was exposed.
     """
 
     def __init__(self, shortest_px: float) -> None:
         """Begin; ``shortest_px`` is the shortest nominal focal length."""
         self._shortest = shortest_px
-        self._largest, self._nearest, self._since = 0.0, math.inf, math.inf
+        self._largest, self._widest, self._since = 0.0, math.inf, math.inf
         self._recent: deque[Step] = deque(maxlen=RECENT_STEPS)
         self.before: Step | None = None
         self.centred: Step | None = None
@@ -128,34 +140,22 @@ class TargetStages:
             self.before = step
         if step.state is not State.FOLLOWING or step.aim is None or step.target is None:
             return
-        if self.close is None and self._focal_of_view() < ZOOMED_OUT * self._shortest:
-            away = self._away_in_view()
-            if away < self._nearest:
-                self._nearest, self.centred = away, step
+        focal_px, away = self._focal_of_view(), _off_center(step)
+        if self.close is None and away < CENTRED and focal_px < self._widest:
+            self._widest, self.centred = focal_px, step
         self._since = min(self._since, step.t)
         if step.t - self._since < SIZE_KNOWN_S:
             return
-        away_px = self._away_in_view() * self._focal_of_view()
         size = float(np.max(step.target.box.size_px))
-        settled = abs(math.log(self._focal_of_view() / step.aim.nominal_px)) < SETTLED
+        settled = abs(math.log(focal_px / step.aim.nominal_px)) < SETTLED
         alone = not step.target.shared  # or else the box is as large as all that it covers
-        if alone and settled and away_px < SETTLED * step.zoom.image.shape[1] and size > self._largest:
+        if alone and settled and away < SETTLED and size > self._largest:
             self._largest, self.close = size, step
 
     def _focal_of_view(self) -> float:
         """Focal length of the latest zoom frame, which is older than the lens's latest state [px]."""
         t, focal = [s.lens.t for s in self._recent], [s.lens.focal_px for s in self._recent]
         return float(np.interp(self._recent[-1].zoom.t, t, focal))
-
-    def _away_in_view(self) -> float:
-        """How far the head was from the target when the latest zoom frame was exposed [rad]."""
-        t = self._recent[-1].zoom.t
-        heads = [(s.head.t, s.head.pan, s.head.tilt) for s in self._recent]
-        aims = [(s.t + AIM_AHEAD_S, s.aim.pan, s.aim.tilt) for s in self._recent if s.aim is not None]
-        (pan, tilt), (wanted_pan, wanted_tilt) = (
-            [np.interp(t, *np.array(told).T[[0, i]]) for i in (1, 2)] for told in (heads, aims)
-        )
-        return float(np.hypot(pan - wanted_pan, tilt - wanted_tilt))
 
     def picture(self, title: str) -> Image:
         """Both views of a target in six panels, as in Fig. 4 to 6: found, before, centred, close up."""
@@ -168,7 +168,7 @@ class TargetStages:
             (before.zoom.image, "(c) zoom view before"),
             (draw_zoom(centred), "(d) zoom view, turned to the target"),
             (self._enlarged(close), "(e) the wide view enlarged as much as the close-up"),
-            (draw_zoom(close), f"(f) close-up at {close.lens.focal_px:.0f} px"),
+            (draw_zoom(close), f"(f) close-up, at {close.lens.focal_px:.0f} px"),
         ]
         panels = [captioned(np.asarray(image, np.uint8), text) for image, text in rows]
         return np.vstack([np.hstack(panels[i : i + 2]) for i in range(0, len(panels), 2)])
@@ -188,8 +188,16 @@ class TargetStages:
         return np.asarray(cv2.resize(cut, (w, h), interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
+def _off_center(step: Step) -> float:
+    """How far from the middle of a Step's zoom view the target was found, over its width; infinite where it was not."""
+    height, width = step.zoom.image.shape[:2]
+    if step.found is None or step.found.t != step.zoom.t:
+        return math.inf
+    return float(np.linalg.norm(step.found.center_px - (np.array([width, height]) - 1) / 2)) / width
+
+
 def draw_frames(image: Image, origins_px: Mapping[str, Array]) -> Image:
-    """The rig's picture with the names of its frames, Gamma and T, as in Fig. 2.
+    """The picture of a rig at pan = tilt = 0 with the names of its frames, Gamma and T, as in Fig. 2.
 
     Args:
         image: the rig.
@@ -197,12 +205,13 @@ def draw_frames(image: Image, origins_px: Mapping[str, Array]) -> Image:
     """
     image = image.copy()
     fixed, zoom, base = (np.asarray(origins_px[name]) for name in ("fixed", "zoom", "base"))
-    for start, end, text in ((fixed, zoom, "Gamma"), (zoom, base, "T")):
+    for start, end in ((fixed, zoom), (zoom, base)):
         a, b = np.rint(start).astype(int).tolist(), np.rint(end).astype(int).tolist()
         cv2.arrowedLine(image, a, b, PAPER, 4, cv2.LINE_AA, tipLength=0.08)
         cv2.arrowedLine(image, a, b, ARROW, 2, cv2.LINE_AA, tipLength=0.08)
-        write_text(image, text, (start + end) / 2 + [-14, 24])
-    write_text(image, "{L} fixed", fixed + np.array([-50, -24]))
-    write_text(image, "{R0} zoom at home", zoom + np.array([14, -24]))
-    write_text(image, "{O} base, {P} head", base + np.array([24, 6]))
+    write_text(image, "Gamma", (fixed + zoom) / 2 + [-24, 24])
+    write_text(image, "T", (zoom + base) / 2 + [16, 12])
+    write_text(image, "fixed", fixed + np.array([-44, 20]))
+    write_text(image, "zoom0", zoom + np.array([14, -28]))
+    write_text(image, "base, head", base + np.array([34, 32]))
     return image

@@ -1,6 +1,5 @@
 """The fixed camera's detector and tracker on any film: a table of tracks, and the film with the tracks drawn."""
 
-import csv
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from cotarget.config import TargetConfig
 from cotarget.detection import make_detector
 from cotarget.errors import CotargetError
 from cotarget.geometry import Array
+from cotarget.outputs import CsvFile
 from cotarget.rig import Image
 from cotarget.tracking import Track, Tracker, settings_for
 from cotarget.video import Film, FilmWriter
@@ -38,6 +38,7 @@ class FilmSummary:
         tracks: how many tracks were confirmed.
         duration_s: from the first frame to the last [s].
         rate_hz: frames a second, as the film says.
+        shortfall: why there are fewer frames than the film says it has; None where it is whole or does not say.
     """
 
     frames: int
@@ -45,6 +46,7 @@ class FilmSummary:
     tracks: int
     duration_s: float
     rate_hz: float
+    shortfall: str | None = None
 
 
 def run_on_film(
@@ -54,12 +56,14 @@ def run_on_film(
     drawn: Path | None = None,
     progress: Progress | None = None,
     template: Image | None = None,
+    keep: bool = False,
 ) -> FilmSummary:
     """Find and track a target in a film.
 
     The table has a row for each confirmed track in each frame; in a frame in which the target was not detected
     and its place is the motion filter's prediction, the score is 0, and in one in which several were seen as one, each
-    has the score of that. Files appear only when complete.
+    has the score of that. Files appear only when complete. A film that is cut short is gone through as far as it can be
+    decoded, and the summary says so.
 
     Args:
         video: the film.
@@ -68,6 +72,7 @@ def run_on_film(
         drawn: the film to write with the tracks drawn, if any.
         progress: told (frames done, frames in all or None) after every frame.
         template: BGR picture of the target, for a target that is found by its colour.
+        keep: whether what there is so far is kept where the run ends in an error or is interrupted.
 
     Raises:
         CotargetError: the film cannot be read, or a file cannot be written.
@@ -77,23 +82,11 @@ def run_on_film(
             raise CotargetError(f"{out}: is the film itself; name another file to write")
         if out is not None and not out.resolve().parent.is_dir():
             raise CotargetError(f"{out}: its folder does not exist; name a file in an existing folder")
-    part = csv_path.with_name(f".{csv_path.name}.part")
-    with Film(video) as film:
-        try:
-            with part.open("w", newline="", encoding="utf-8") as file:
-                writer = csv.writer(file, lineterminator="\n")
-                writer.writerow(COLUMNS)
-                if drawn is None:
-                    summary = _run(film, target, writer.writerow, None, progress, template)
-                else:
-                    with FilmWriter(drawn, film.rate_hz) as out_film:
-                        summary = _run(film, target, writer.writerow, out_film.write, progress, template)
-            part.replace(csv_path)
-        except OSError as error:
-            raise CotargetError(f"{csv_path}: cannot be written ({error.strerror})") from None
-        finally:
-            part.unlink(missing_ok=True)
-    return summary
+    with Film(video) as film, CsvFile(csv_path, COLUMNS, keep=keep, line_end="\n") as table:
+        if drawn is None:
+            return _run(film, target, table.write, None, progress, template)
+        with FilmWriter(drawn, film.rate_hz, keep=keep) as out_film:
+            return _run(film, target, table.write, out_film.write, progress, template)
 
 
 def _run(
@@ -122,7 +115,8 @@ def _run(
             write_image(trails.draw(frame.image, tracks, frame.t))
         if progress is not None:
             progress(index + 1, film.count)
-    return FilmSummary(len(times), with_target, len(numbers), max(times) - min(times), film.rate_hz)
+    duration = max(times) - min(times)
+    return FilmSummary(len(times), with_target, len(numbers), duration, film.rate_hz, film.shortfall or None)
 
 
 def _row(index: int, t: float, track: Track) -> list[str]:

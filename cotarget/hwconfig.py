@@ -8,11 +8,11 @@ import itertools
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
 from cotarget.errors import ConfigError
-from cotarget.simconfig import Pair, Size
+from cotarget.simconfig import Limits, Size
 
 BAUDS = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 SOCKET = re.compile(r"socket://(\[[0-9A-Fa-f:.]+\]|[^:/\s]+):(\d+)/?")
@@ -39,8 +39,8 @@ class HardwareHead:
     port: str = ""
     baud: int = 9600
     step_deg: float = 0.0514286
-    pan_deg: Pair = (-158.9, 158.9)
-    tilt_deg: Pair = (-46.6, 31.1)
+    pan_deg: Limits = (-158.9, 158.9)
+    tilt_deg: Limits = (-46.6, 31.1)
     pan_sign: Literal[1, -1] = -1
     tilt_sign: Literal[1, -1] = 1
     speed_deg_s: float = 149.0
@@ -98,7 +98,7 @@ class HardwareZoom:
     model: str = ""
     settings: Mapping[str, str] = field(default_factory=dict)
     zoom_key: str = "zoom"
-    lens: tuple[tuple[int, float], ...] = S5_IS_LENS
+    lens: tuple[Annotated[tuple[int, float], "[position, mm]"], ...] = S5_IS_LENS
     lens_speed: float = 60.0
     size: Size = (320, 240)
     still_size: Size = (3264, 2448)

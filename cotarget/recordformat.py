@@ -1,9 +1,10 @@
 """The folder of a recorded run: who wrote what, and one line for every answer that the rig gave.
 
-    recording.json         schema, versions, when, target, config, what the rig is; written last of what comes before
+    recording.json         schema, versions, when, target, whom, config; written last of what comes before
     calibration.json       the very bytes that the run was started with
     template.*             the target's picture, where it is found by one
-    log.jsonl              one JSON object a line, appended and flushed: a call, its arguments, its result, its time
+    log.jsonl              one JSON object a line, appended and flushed: what the rig is, then calls with their
+                           arguments, results and times
     fixed/ and zoom/       the frames as PNG, by number; a line that names one is written after the image is complete
 
 So whatever moment the program dies at, the log up to there is whole but for its last line, and every image that it

@@ -1,13 +1,11 @@
 """Writes what a run did: a table of its Steps, and a recording of all that its rig saw and was told."""
 
 import contextlib
-import csv
 import dataclasses
 import json
 import math
 import platform
 import shutil
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +17,7 @@ from cotarget import __version__
 from cotarget.config import RigConfig
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.loop import Step
+from cotarget.outputs import CsvFile
 from cotarget.recordformat import (
     CALIBRATION,
     COMPLETE,
@@ -33,6 +32,7 @@ from cotarget.recordformat import (
 from cotarget.recordingrig import RecordingRig
 from cotarget.recordwriter import RecordWriter
 from cotarget.rig import Rig
+from cotarget.whom import ANYBODY, Whom, whom_table
 
 COLUMNS = (
     "index", "t_s", "t_fixed_s", "t_zoom_s", "state", "reason", "track", "u_px", "v_px", "width_px", "height_px",
@@ -44,26 +44,25 @@ COLUMNS = (
 class StepTable:
     """A table of Steps, one line each; appears under its name only when complete. A context manager."""
 
-    def __init__(self, path: Path | None) -> None:
+    def __init__(self, path: Path | None, *, keep: bool = False) -> None:
         """Prepare to write to ``path``, or nowhere.
+
+        Args:
+            path: the file.
+            keep: whether the Steps so far are kept where the block ends in an error.
 
         Raises:
             ConfigError: the file cannot be written.
         """
-        self._path = path
-        if path is None:
-            return
-        self._part = path.with_name(f".{path.name}.part")
-        try:
-            self._file = self._part.open("w", newline="", encoding="utf-8")
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
-        self._writer = csv.writer(self._file)
-        self._writer.writerow(COLUMNS)
+        self._file = None if path is None else CsvFile(path, COLUMNS, keep=keep)
 
     def write(self, step: Step) -> None:
-        """Append a line."""
-        if self._path is None:
+        """Append a line.
+
+        Raises:
+            ConfigError: the disk is full.
+        """
+        if self._file is None:
             return
         track, aim, (pan, tilt, focal) = step.target, step.aim, step.commanded
         box = ["", "", "", "", ""] if track is None else [track.id, *track.center_px, *track.size_px]
@@ -73,8 +72,7 @@ class StepTable:
             + [math.degrees(pan), math.degrees(tilt), focal]
             + [math.degrees(step.head.pan), math.degrees(step.head.tilt), step.lens.focal_px]
         )
-        with self._told(self._path):
-            self._writer.writerow([cell + 0.0 if isinstance(cell, float) else cell for cell in row])  # no -0.0
+        self._file.write(cell + 0.0 if isinstance(cell, float) else cell for cell in row)  # no -0.0
 
     def __enter__(self) -> "StepTable":
         """Give the table itself."""
@@ -83,28 +81,13 @@ class StepTable:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Complete the file and give it its name; after an error, remove what there is."""
-        if self._path is None:
-            return
-        try:
-            with self._told(self._path):
-                self._file.close()  # which writes what is left, and may find the disk full
-                if kind is None:
-                    self._part.replace(self._path)
-        except ConfigError:
-            if kind is None:  # otherwise there is an error to be told already
-                raise
-        finally:
-            self._part.unlink(missing_ok=True)
+        """Complete the file and give it its name; after an error, remove it or keep what there is.
 
-    @staticmethod
-    @contextlib.contextmanager
-    def _told(path: Path) -> Iterator[None]:
-        """Say which file it is that cannot be written; a full disk does not."""
-        try:
-            yield
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
+        Raises:
+            ConfigError: the file could not be completed, as on a full disk.
+        """
+        if self._file is not None:
+            self._file.__exit__(kind, error, trace)
 
 
 class Recorder:
@@ -117,7 +100,9 @@ class Recorder:
                 ...
     """
 
-    def __init__(self, directory: Path, config: RigConfig, calibration: Path, target: str) -> None:
+    def __init__(
+        self, directory: Path, config: RigConfig, calibration: Path, target: str, whom: Whom = ANYBODY
+    ) -> None:
         """Make the folder and write down what the run begins with.
 
         Args:
@@ -125,6 +110,7 @@ class Recorder:
             config: of the rig; passwords in it are not recorded.
             calibration: calibration.json, of which the recording gets a copy.
             target: name of the target that will be followed.
+            whom: which one, where there are several.
 
         Raises:
             ConfigError: the folder is not empty, something cannot be read or written, or there is no such target.
@@ -139,7 +125,7 @@ class Recorder:
         except OSError as error:
             raise ConfigError(f"{directory}: cannot hold a recording: {error.strerror}") from None
         try:
-            self._write_beginning(config, calibration, target)
+            self._write_beginning(config, calibration, target, whom)
             self._writer = RecordWriter(directory)
         except BaseException as error:
             self._remove()
@@ -183,7 +169,7 @@ class Recorder:
         elif self._writer.failure and kind is None:
             raise CotargetError(f"{self._directory}: the recording is cut short: {self._writer.failure}")
 
-    def _write_beginning(self, config: RigConfig, calibration: Path, target: str) -> None:
+    def _write_beginning(self, config: RigConfig, calibration: Path, target: str, whom: Whom) -> None:
         chosen = config.target(target)
         if chosen.template is not None:
             copy = TEMPLATE + chosen.template.suffix
@@ -199,6 +185,7 @@ class Recorder:
             "numpy": np.__version__,
             "when": datetime.now(UTC).isoformat(timespec="seconds"),
             "target": target,
+            "whom": whom_table(whom),
             "config": config_table(dataclasses.replace(config, targets={**config.targets, target: chosen})),
         }
         part = self._directory / f"{META}.part"

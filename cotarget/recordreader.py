@@ -22,6 +22,7 @@ from cotarget.recordformat import (
     read_json,
 )
 from cotarget.tables import expect_table
+from cotarget.whom import Whom, parse_whom
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Recording:
         config: of the rig that was recorded; its backend is that rig's.
         calibration: the run's calibration.json.
         target: name of the target that was followed.
+        whom: which one, where there were several; nothing is said where an older version recorded it.
         facts: what the rig said of itself.
         events: every call on the rig, in order.
         ending: "complete"; or the error that ended the run; or, where it just stops, what it stops with.
@@ -44,6 +46,7 @@ class Recording:
     config: RigConfig
     calibration: Path
     target: str
+    whom: Whom
     facts: RigFacts
     events: tuple[Event, ...]
     ending: str
@@ -76,7 +79,7 @@ def open_recording(directory: Path) -> Recording:
     if not directory.exists():
         raise ConfigError(f"{directory}: no such folder; give the folder of a recording")
     meta = read_json(directory / META)
-    target, config = _parse_meta(directory, meta)
+    target, whom, config = _parse_meta(directory, meta)
     if not (directory / CALIBRATION).is_file():
         raise ConfigError(f"{directory / CALIBRATION}: no such file; the recording is not whole")
     facts, rows, ending = None, [], ""
@@ -110,6 +113,7 @@ def open_recording(directory: Path) -> Recording:
         config,
         directory / CALIBRATION,
         target,
+        whom,
         facts,
         tuple(rows),
         ending or stop,
@@ -122,8 +126,8 @@ class _DamageError(Exception):
     """Where a log stops being whole."""
 
 
-def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, RigConfig]:
-    """The target's name and the configuration, whose picture of the target lies in the recording."""
+def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, Whom, RigConfig]:
+    """The target's name, which one, and the configuration, whose picture of the target lies in the recording."""
     path = directory / META
     name, table = meta["target"], meta["config"]
     try:
@@ -132,14 +136,17 @@ def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, RigConfi
         expect_table(table, "config")
         config = parse_config(table)
         target = config.target(name)
+        whom = parse_whom(meta.get("whom", {}))
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
+    except (ValueError, OverflowError) as error:
+        raise ConfigError(f"{path}: whom: {error}") from None
     recorded = table.get("targets", {}).get(name, {}).get("template")
     template = None if recorded is None else directory / Path(recorded).name
     if template is not None and not template.is_file():
         raise ConfigError(f"{template}: no such file; the recording is not whole")
     target = replace(target, template=template)
-    return name, dataclasses.replace(config, targets={**config.targets, name: target})
+    return name, whom, dataclasses.replace(config, targets={**config.targets, name: target})
 
 
 def _rows(path: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:

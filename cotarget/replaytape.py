@@ -10,6 +10,7 @@ import threading
 from collections import defaultdict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cotarget.errors
 from cotarget.errors import CotargetError, DeviceError, StaleFrameError
@@ -36,6 +37,10 @@ class Differences:
         largest_px: difference of focal length between them [px].
         missing: commands that were given then and not now, between the same two frames.
         extra: moves of head and lens that were given now and not then.
+        frames: of the fixed camera, up to the newest.
+        frames_differing: of them, after which another command was given, or one more, or one less.
+        first_frame: the picture's number of the first of those; None where there is none.
+        first_s: when it came, from the beginning of the recording [s].
     """
 
     moves: int = 0
@@ -46,6 +51,10 @@ class Differences:
     largest_px: float = 0.0
     missing: int = 0
     extra: int = 0
+    frames: int = 0
+    frames_differing: int = 0
+    first_frame: int | None = None
+    first_s: float | None = None
 
     @property
     def same(self) -> bool:
@@ -56,7 +65,9 @@ class Differences:
         """Say it in one line."""
         if self.same:
             return f"all {self.moves + self.zooms} commands as recorded"
+        since = "" if self.first_frame is None else f", from frame {self.first_frame} ({self.first_s:.2f} s) on"
         return (
+            f"the commands of {self.frames_differing} of {self.frames} frames differ from those recorded{since}: "
             f"{self.moves_differing} of {self.moves} moves differ, by {self.largest_deg:.3g} degrees at most; "
             f"{self.zooms_differing} of {self.zooms} focal lengths, by {self.largest_px:.3g} px at most; "
             f"{self.missing} commands missing, {self.extra} more"
@@ -113,6 +124,7 @@ class Tape:
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._spans, self._frames = _cut(recording.events)
+        self._differing: set[int] = set()  # places of those frames
         self._broke_off = not recording.truncated and recording.ending != COMPLETE
         self._index = 0
         self._ended = False
@@ -179,13 +191,14 @@ class Tape:
             if frame.error is not None or not (overtaken or too_old):
                 break
         else:
-            self._miss(self._spans[self._index :])
+            self._miss(range(self._index, len(self._spans)))
             raise self._end()
         if frame.args != (newer_than, timeout) and frame.at > self.now + timeout:
             self.now += timeout
             raise StaleFrameError(f"no frame within {timeout:g} s")
-        self._miss(self._spans[self._index : index])
+        self._miss(range(self._index, index))
         self._index = index
+        self.differences = replace(self.differences, frames=index)
         return self.play(frame)
 
     def compare(self, call: str, recorded: Event | None, args: Sequence[float | bool | None]) -> None:
@@ -196,6 +209,7 @@ class Tape:
         if recorded is None:
             if not (self._ended or self._breaks_off):
                 self.differences = replace(counts, extra=counts.extra + 1)
+                self._note(self._index)
             return
         differs = tuple(args) != recorded.args
         axes = 2 if call == "head.move" else 1
@@ -215,20 +229,36 @@ class Tape:
                 zooms_differing=counts.zooms_differing + differs,
                 largest_px=max(counts.largest_px, off),
             )
+        if differs:
+            self._note(self._index)
 
     def pass_to(self, t: float) -> None:
         """Let the clock show at least ``t`` [s]."""
         self.now = max(self.now, t)
 
-    def _miss(self, spans: Sequence[_Span]) -> None:
+    def _miss(self, over: range) -> None:
         """Count the commands of spans that are over; the last one's halts are not due before the rig is closed."""
-        missing = 0
-        for span in spans:
+        for index in over:
+            span = self._spans[index]
             due = COMMANDS[:-1] if span is self._spans[-1] else COMMANDS
+            missing = sum(span.left(call) for call in due)
             for call in due:
-                missing += span.left(call)
                 span.forget(call)
-        self.differences = replace(self.differences, missing=self.differences.missing + missing)
+            if missing:
+                self.differences = replace(self.differences, missing=self.differences.missing + missing)
+                self._note(index)
+
+    def _note(self, index: int) -> None:
+        """Count the frame that a span begins with; what is asked before the first frame is counted to it."""
+        place = max(index - 1, 0)
+        self._differing.add(place)
+        found = replace(self.differences, frames_differing=len(self._differing))
+        if min(self._differing) == place and self._frames:
+            frame, number = self._frames[place], sum(each.image is not None for each in self._frames[:place])
+            if frame.image is not None:
+                number = int(Path(frame.image).stem)
+            found = replace(found, first_frame=number, first_s=frame.at - self._recording.events[0].at)
+        self.differences = found
 
     def _end(self) -> RecordingEndedError:
         self._ended = True

@@ -6,8 +6,8 @@ import math
 import numpy as np
 
 from cotarget.camera import Intrinsics
-from cotarget.errors import ConfigError
-from cotarget.simconfig import SimCamera, SimConfig, SimZoomCamera
+from cotarget.errors import ConfigError, choices
+from cotarget.simconfig import TARGETS, SimCamera, SimConfig, SimZoomCamera, split_name
 
 # The curves of the zoom lens are checked at this many focal lengths.
 CHECKED_FOCALS = 33
@@ -42,6 +42,8 @@ def check_sim(sim: SimConfig) -> None:
         not_negative[f"sim.{name}.exposure_s"] = (camera.exposure_s,)
         if not 1 <= camera.jpeg_quality <= 100:
             raise ConfigError(f"sim.{name}.jpeg_quality: {camera.jpeg_quality} is not within 1 to 100")
+        _check_center(f"sim.{name}", camera)
+        _check_frame_time(f"sim.{name}", camera)
         _check_lens(f"sim.{name}", camera)
     for where, values in positive.items():
         if min(values) <= 0:
@@ -66,6 +68,40 @@ def check_sim(sim: SimConfig) -> None:
     for name, waypoints in sim.paths.items():
         if len(waypoints) < 2 or any(b[0] <= a[0] for a, b in itertools.pairwise(waypoints)):
             raise ConfigError(f"sim.paths.{name}: needs two or more waypoints [t, x, y, z] with increasing t")
+    _check_targets(sim)
+
+
+def told_targets() -> str:
+    """Which targets the simulation has, for messages."""
+    return f"the simulation has: {choices(TARGETS)}, and further ones with a number, as 'bird2'"
+
+
+def _check_targets(sim: SimConfig) -> None:
+    """Refuse targets of which there is no model, and two of a name."""
+    for where, names in (("sim.targets", sim.targets), ("sim.paths", tuple(sim.paths))):
+        for at, name in enumerate(names):
+            if split_name(name)[0] not in TARGETS:
+                raise ConfigError(f"{where}: unknown target '{name}'; {told_targets()}")
+            if name in names[:at]:
+                raise ConfigError(f"{where}: '{name}' is named twice; a further one has a number, as 'bird2'")
+
+
+def _check_frame_time(where: str, camera: SimCamera) -> None:
+    """Refuse an exposure that does not end before the next begins."""
+    if camera.rate_hz > 0 and camera.exposure_s * camera.rate_hz > 1:
+        raise ConfigError(
+            f"{where}.exposure_s: {camera.exposure_s:g} s is longer than the {1 / camera.rate_hz:g} s from one frame "
+            f"to the next, of which {camera.rate_hz:g} come a second"
+        )
+
+
+def _check_center(where: str, camera: SimCamera) -> None:
+    """Refuse a principal point outside of the picture, as one that was meant for a larger picture."""
+    (u, v), (width, height) = camera.center_px, camera.size
+    if min(camera.size) > 0 and not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+        raise ConfigError(
+            f"{where}.center_px: ({u:g}, {v:g}) is not in the {width}x{height} image; give one near its middle, or none"
+        )
 
 
 def _sees_nothing(lens: Intrinsics) -> bool:

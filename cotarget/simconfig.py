@@ -5,17 +5,26 @@ project's figures are stated for.
 """
 
 import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Any
 
+from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, pose
 
+# What the numbers of a list are, for who gives something else.
 Pair = tuple[float, float]
-Size = tuple[int, int]
-Distortion = tuple[float, float, float, float, float]
-Waypoint = tuple[float, float, float, float]
+Limits = Annotated[Pair, "[lowest, highest]"]
+Size = Annotated[tuple[int, int], "[width, height]"]
+Focal = Annotated[Pair, "[fx, fy]"]
+Center = Annotated[Pair, "[u, v]"]
+Distortion = Annotated[tuple[float, float, float, float, float], "[k1, k2, p1, p2, k3]"]
+Waypoint = Annotated[tuple[float, float, float, float], "[t, x, y, z]"]
 # Coefficients of s, s^2, s^3 ...: a curve that is 0 at the shortest focal length.
-Curve = tuple[float, ...]
+Curve = Annotated[tuple[float, ...], "[of s, of s^2, ...]"]
+
+TARGETS = ("book", "person", "bird")  # that the simulation has models of
 
 
 @dataclass(frozen=True)
@@ -24,8 +33,8 @@ class SimCamera:
 
     Attributes:
         size: (width, height) [px].
-        focal_px: true (fx, fy) [px].
-        center_px: true principal point [px].
+        focal_px: true (fx, fy) [px]; where a file gives another size and not this, the field of view stays as wide.
+        center_px: true principal point [px]; likewise it stays where it is beside the image's middle.
         distortion: true (k1, k2, p1, p2, k3).
         noise: standard deviation of the sensor's noise [grey levels].
         rate_hz: frames a second.
@@ -36,8 +45,8 @@ class SimCamera:
     """
 
     size: Size = (640, 480)
-    focal_px: Pair = (686.0, 684.0)
-    center_px: Pair = (325.0, 239.0)
+    focal_px: Focal = (686.0, 684.0)
+    center_px: Center = (325.0, 239.0)
     distortion: Distortion = (-0.2, 0.0, 0.0, 0.0, 0.0)
     noise: float = 2.0
     rate_hz: float = 25.0
@@ -45,13 +54,24 @@ class SimCamera:
     exposure_s: float = 0.0
     jpeg_quality: int = 90
 
+    def enlarged(self, size: Size) -> dict[str, Any]:
+        """What else is other in pixels when the same view is seen in an image of another (width, height)."""
+        by = size[0] / self.size[0]
+        return {
+            "focal_px": tuple(by * focal for focal in self.focal_px),
+            "center_px": tuple(
+                (new - 1) / 2 + by * (at - (old - 1) / 2)
+                for at, old, new in zip(self.center_px, self.size, size, strict=True)
+            ),
+        }
+
 
 @dataclass(frozen=True)
 class ZoomOptics:
     """What a zoom lens does at one focal length; ``pupil`` is how far forward its entrance pupil has moved [m]."""
 
-    focal_px: Pair
-    center_px: Pair
+    focal_px: Focal
+    center_px: Center
     distortion: Distortion
     pupil: float
 
@@ -74,10 +94,10 @@ class SimZoomCamera(SimCamera):
         pupil: how far the entrance pupil has moved along the axis [m]; forward is positive.
     """
 
-    focal_px: Pair = (692.0, 693.0)
-    center_px: Pair = (326.0, 235.0)
+    focal_px: Focal = (692.0, 693.0)
+    center_px: Center = (326.0, 235.0)
     distortion: Distortion = (-0.1, 0.0, 0.0, 0.0, 0.0)
-    focal_mm: Pair = (6.0, 72.0)
+    focal_mm: Limits = (6.0, 72.0)
     pitch_mm: float = 0.009
     lens_steps: int = 129
     lens_speed: float = 129.0
@@ -85,6 +105,15 @@ class SimZoomCamera(SimCamera):
     center_drift_px: tuple[Curve, Curve] = ((27.0, 85.0, -322.0, 268.0, -62.0), (-7.0, -4.0, -92.0, 195.0, -102.0))
     distortion_drift: Curve = (0.4, 0.04, -0.88, 0.62, -0.05)
     pupil: Curve = (0.03, 0.06, -0.9, 1.17, -0.44)
+
+    def enlarged(self, size: Size) -> dict[str, Any]:
+        """The same of a zoom camera: with the sensor as large, its pixels are smaller."""
+        by = size[0] / self.size[0]
+        return {
+            **super().enlarged(size),
+            "pitch_mm": self.pitch_mm / by,
+            "center_drift_px": tuple(tuple(by * c for c in curve) for curve in self.center_drift_px),
+        }
 
     def optics_at(self, magnification: float) -> ZoomOptics:
         """What the lens does at a nominal focal length, given as a multiple of the shortest."""
@@ -129,8 +158,8 @@ class SimHead:
     """
 
     step_deg: float = 0.0514286
-    pan_deg: Pair = (-158.9, 158.9)
-    tilt_deg: Pair = (-46.6, 31.1)
+    pan_deg: Limits = (-158.9, 158.9)
+    tilt_deg: Limits = (-46.6, 31.1)
     speed_deg_s: float = 149.0
     accel_deg_s2: float = 206.0
     command_delay_s: float = 0.04
@@ -217,3 +246,45 @@ class SimConfig:
     head: SimHead = SimHead()
     effects: SimEffects = SimEffects()
     paths: Mapping[str, tuple[Waypoint, ...]] = field(default_factory=dict)
+
+
+# No effect of a real rig but the quality of the rendering, which `all` leaves alone.
+QUALITY = ("multisampling", "shadows")
+
+
+def expand_all(effects: Mapping[str, Any]) -> dict[str, Any]:
+    """Let ``all`` set every switch of [sim.effects] that is not named.
+
+    Raises:
+        ConfigError: it is neither true nor false.
+    """
+    named = dict(effects)
+    every = named.pop("all", None)
+    if every is None:
+        return named
+    if not isinstance(every, bool):
+        raise ConfigError(f"sim.effects.all: {every!r} is not true or false")
+    return {f.name: every for f in fields(SimEffects) if f.name not in QUALITY} | named
+
+
+def fit_sizes(sim: SimConfig, given: Mapping[str, Any]) -> SimConfig:
+    """Let each camera's view stay what it is where another image size was given.
+
+    Args:
+        sim: as it was read.
+        given: the [sim] table that it was read from; what a camera's table says stays as it is said.
+    """
+    cameras: dict[str, SimCamera] = {}
+    for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
+        if min(camera.size) <= 0:
+            continue  # refused elsewhere
+        said = given.get(name, {})
+        follows = type(camera)().enlarged(camera.size)  # nothing changes where the size is the default's
+        cameras[name] = replace(camera, **{key: value for key, value in follows.items() if key not in said})
+    return replace(sim, **cameras)  # type: ignore[arg-type]
+
+
+def split_name(name: str) -> tuple[str, int]:
+    """A target's kind and its number among its kind: ("bird", 1) of ``bird``, ("bird", 2) of ``bird2``."""
+    number = re.search(r"(?<=\D)([2-9]|[1-9]\d+)\Z", name)
+    return (name, 1) if number is None else (name[: number.start()], int(number[0]))

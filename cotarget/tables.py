@@ -6,10 +6,12 @@ import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform, pose
+
+KINDS = {int: "whole numbers", float: "numbers", str: "texts"}  # what lists are of, beside lists
 
 
 def expect_table(value: Any, where: str) -> None:
@@ -31,7 +33,7 @@ def build(cls: type[Any], table: Any, where: str, base: Any = None) -> Any:
         ConfigError: an unknown key with the valid ones, a missing key, or a value of the wrong kind.
     """
     expect_table(table, where or "the file")
-    hints = typing.get_type_hints(cls)
+    hints = typing.get_type_hints(cls, include_extras=True)
     unknown = sorted(set(table) - set(hints))
     if unknown:
         raise ConfigError(f"unknown key '{_join(where, unknown[0])}'; valid here: {choices(hints)}")
@@ -55,6 +57,7 @@ def _join(where: str, name: str) -> str:
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
     """Check one value against its field's type and convert it."""
+    hint, form = _parts(hint)
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):  # the only unions are "or None", which TOML cannot say
         return _convert(args[0], value, where)
@@ -63,13 +66,15 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
             raise ConfigError(f"{where}: {value!r} is not one of: {choices(map(str, args))}")
         return value
     if hint is Path:
-        return Path(_convert(str, value, where))
+        if not _convert(str, value, where):
+            raise ConfigError(f"{where}: is empty; give a path, or leave it out")
+        return Path(value)
     if hint is RigidTransform:
         return _convert_pose(value, where)
     if dataclasses.is_dataclass(hint):
         return build(typing.cast(type[Any], hint), value, where)
     if origin is tuple:
-        return _convert_tuple(args, value, where)
+        return _convert_tuple(args, value, where, form)
     if origin is Mapping or (isinstance(origin, type) and issubclass(origin, Mapping)):
         expect_table(value, where)
         return {key: _convert(args[1], item, _join(where, key)) for key, item in value.items()}
@@ -83,13 +88,27 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
     return value
 
 
-def _convert_tuple(args: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+def _parts(hint: Any) -> tuple[Any, str]:
+    """A type, and the words beside it for what its values are: `Annotated[type, words]`; empty where there are none."""
+    if typing.get_origin(hint) is Annotated:
+        hint, form = typing.get_args(hint)
+        return hint, form
+    return hint, ""
+
+
+def _convert_tuple(args: tuple[Any, ...], value: Any, where: str, form: str = "") -> tuple[Any, ...]:
+    several = args[-1] is Ellipsis
+    if several and not form and (one := _parts(args[0])[1]):
+        form = f"[{one}, ...]"
+    form = form and f", {form}"
     if not isinstance(value, list):
-        raise ConfigError(f"{where}: {value!r} is not a list")
-    if args[-1] is Ellipsis:
+        kinds = [kind for kind in args if kind is not Ellipsis]
+        kind = KINDS.get(kinds[0] if len(set(kinds)) == 1 else float, "lists")
+        raise ConfigError(f"{where}: {value!r} is not a list of {'' if several else f'{len(args)} '}{kind}{form}")
+    if several:
         return tuple(_convert(args[0], item, f"{where}[{i}]") for i, item in enumerate(value))
     if len(value) != len(args):
-        raise ConfigError(f"{where}: has {len(value)} values where {len(args)} are wanted")
+        raise ConfigError(f"{where}: has {len(value)} values where {len(args)} are wanted{form}")
     return tuple(_convert(a, item, f"{where}[{i}]") for i, (a, item) in enumerate(zip(args, value, strict=True)))
 
 
@@ -103,6 +122,6 @@ def _convert_pose(value: Any, where: str) -> RigidTransform:
         )
     triple = (float, float, float)
     return pose(
-        _convert_tuple(triple, value["translation"], f"{where}.translation"),
-        _convert_tuple(triple, value["rotvec_deg"], f"{where}.rotvec_deg"),
+        _convert_tuple(triple, value["translation"], f"{where}.translation", "[x, y, z]"),
+        _convert_tuple(triple, value["rotvec_deg"], f"{where}.rotvec_deg", "[rx, ry, rz]"),
     )

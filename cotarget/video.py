@@ -5,12 +5,14 @@ from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
+from typing import cast
 
 import av
 import cv2
 import numpy as np
 
 from cotarget.errors import CotargetError
+from cotarget.outputs import PartFile
 from cotarget.rig import Frame, Image
 
 # For a film that does not say how fast it is [frames/s].
@@ -19,6 +21,11 @@ FALLBACK_RATE_HZ = 25.0
 QUALITY = "20"
 # x264's trade of time against size: this costs a fifth of its default's time and gives files a tenth larger.
 PRESET = "veryfast"
+# Containers whose header tells how long they are; elsewhere FFmpeg goes by what is there, or by the rate of bits.
+TELL_DURATION = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "flv", "asf")
+MICROSECONDS = 1e6  # in which FFmpeg tells it, a second
+# A film is not short by less than the longer of these: the last frame's length and edits at the end are told roughly.
+SHORT_S, SHORT_FRAMES = 0.5, 3
 
 
 class Film:
@@ -29,6 +36,8 @@ class Film:
         size: (width, height) [px].
         rate_hz: its mean frames a second.
         count: how many frames it says it has; None where it does not say.
+        shortfall: known after the last frame: why there are fewer than the film says it has; empty where it is whole,
+            and where it does not say.
     """
 
     def __init__(self, path: Path) -> None:
@@ -56,6 +65,8 @@ class Film:
         self.size = (int(stream.width), int(stream.height))
         self.rate_hz = float(stream.average_rate or stream.guessed_rate or FALLBACK_RATE_HZ)
         self.count: int | None = stream.frames or None
+        self.shortfall = ""
+        self._end = 0.0  # of what was read of pictures and sound, by the film's own time [s]
 
     def __enter__(self) -> "Film":
         """Give the film itself."""
@@ -70,13 +81,15 @@ class Film:
     def __iter__(self) -> Iterator[Frame]:
         """Decode the frames in order; times are the film's own [s], or by the count where it has none.
 
+        Frames end where one cannot be decoded, or where the file is cut short; `shortfall` says so then.
+
         Raises:
             CotargetError: nothing can be decoded, or the picture's size changes on the way.
         """
-        index = 0
+        index, reason, damaged = 0, "", False
         try:
-            for index, picture in enumerate(self._container.decode(video=0), start=1):
-                image = picture.to_ndarray(format="bgr24")
+            for index, picture in enumerate(self._pictures(), start=1):
+                image, damaged = picture.to_ndarray(format="bgr24"), picture.is_corrupt
                 if (image.shape[1], image.shape[0]) != self.size:
                     raise CotargetError(
                         f"{self.path}: the picture's size changes from {self.size[0]}x{self.size[1]} to "
@@ -84,38 +97,63 @@ class Film:
                     )
                 yield Frame(image, (index - 1) / self.rate_hz if picture.time is None else float(picture.time))
         except av.error.FFmpegError as error:
-            raise CotargetError(f"{self.path}: cannot be decoded after frame {index - 1} ({_reason(error)})") from None
+            reason = f" ({_reason(error)})"
         if index == 0:
-            raise CotargetError(f"{self.path}: holds no frame that can be decoded; give a complete film")
+            raise CotargetError(f"{self.path}: holds no frame that can be decoded{reason}; give a complete film")
+        self.shortfall = self._shortfall(damaged) or (f"what follows cannot be decoded{reason}" if reason else "")
+
+    def _pictures(self) -> Iterator[av.VideoFrame]:
+        """What can be decoded of the first video stream; packets of all streams are looked at for where they end."""
+        pictures = self._container.streams.video[0]
+        for packet in self._container.demux():
+            if packet.pts is not None and packet.time_base is not None:
+                self._end = max(self._end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
+            # An empty one stands for the frame before it, but for the last of all, which has no time and ends the work.
+            if packet.stream is pictures and (packet.size or packet.dts is None):
+                yield from cast(list[av.VideoFrame], packet.decode())
+
+    def _shortfall(self, damaged: bool) -> str:
+        """What the container says beyond what was read of it; and whether the last frame is damaged."""
+        stream, container = self._container.streams.video[0], self._container
+        begin, told = 0.0, 0.0
+        if container.format.name == "avi" and stream.frames and stream.time_base is not None:
+            told = float(stream.frames * stream.time_base)  # its duration is worked out from the file's size
+        elif container.format.name in TELL_DURATION and container.duration is not None:
+            begin, told = (container.start_time or 0) / MICROSECONDS, container.duration / MICROSECONDS
+        if begin + told - self._end > max(SHORT_S, SHORT_FRAMES / self.rate_hz):
+            return f"the film says that it lasts {told:.1f} s, and ends at {max(self._end - begin, 0.0):.1f} s"
+        return "its last frame is damaged" if damaged else ""
 
 
 class FilmWriter:
     """Writes a film as H.264 yuv420p; it appears under its name only when complete. A context manager."""
 
-    def __init__(self, path: Path, rate_hz: float) -> None:
+    def __init__(self, path: Path, rate_hz: float, *, keep: bool = False) -> None:
         """Prepare to write.
 
         Args:
             path: the film, with a suffix that names a container, such as .mp4.
             rate_hz: frames a second.
+            keep: whether the frames so far are kept as a film where the block ends in an error.
 
         Raises:
-            CotargetError: the folder is missing or the suffix names no container.
+            CotargetError: the folder is missing or the suffix names no container, or another run is writing the film.
         """
-        self._path = path
-        self._part = path.with_name(f".{path.stem}.part{path.suffix}")
+        self._path, self._keep, self._broken = path, keep, False
+        self._part = PartFile(path)
         self._rate = Fraction(rate_hz).limit_denominator(1001 * 30)
-        try:
-            self._container = av.open(str(self._part), "w")
-        except (av.error.FFmpegError, OSError, ValueError) as error:
-            raise CotargetError(f"{path}: cannot be written ({_reason(error)}); name e.g. an .mp4") from None
         self._stream: av.VideoStream | None = None
+        try:
+            self._container = av.open(str(self._part.path), "w")
+        except (av.error.FFmpegError, OSError, ValueError) as error:
+            with self._part.ending(keep=False):
+                raise self._said(error) from None
 
     def write(self, image: Image) -> None:
         """Append an image, (H, W, 3) BGR; an odd side is made even by repeating its last row or column.
 
         Raises:
-            CotargetError: the container cannot hold H.264.
+            CotargetError: the container cannot hold H.264, or the disk is full.
         """
         height, width = image.shape[:2]
         if height % 2 or width % 2:
@@ -130,7 +168,11 @@ class FilmWriter:
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24")
             self._container.mux(self._stream.encode(picture))
         except (av.error.FFmpegError, ValueError) as error:
-            raise CotargetError(f"{self._path}: cannot be written ({_reason(error)}); name e.g. an .mp4") from None
+            self._broken = True
+            raise self._said(error) from None
+
+    def _said(self, error: Exception) -> CotargetError:
+        return CotargetError(f"{self._path}: cannot be written ({_reason(error)}); name e.g. an .mp4")
 
     def __enter__(self) -> "FilmWriter":
         """Give the writer itself."""
@@ -139,26 +181,22 @@ class FilmWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Complete the film and give it its name; after an error, remove what there is.
+        """Complete the film and give it its name; after an error, remove it or keep what there is.
 
         Raises:
             CotargetError: the film could not be completed, as on a full disk.
         """
-        complete = False
-        try:
-            if kind is None and self._stream is not None:
-                self._container.mux(self._stream.encode(None))
-                self._container.close()
-                complete = True
-        except (av.error.FFmpegError, OSError) as failed:
-            raise CotargetError(f"{self._path}: cannot be completed ({_reason(failed)})") from None
-        finally:
-            if complete:
-                self._part.replace(self._path)
-            else:
+        keep = self._stream is not None and not self._broken and (error is None or self._keep)
+        with self._part.ending(keep=keep, error=error):
+            try:
+                if keep and self._stream is not None:
+                    self._container.mux(self._stream.encode(None))
+                    self._container.close()
+            except (av.error.FFmpegError, OSError) as failed:
+                raise CotargetError(f"{self._path}: cannot be completed ({_reason(failed)})") from None
+            finally:
                 with contextlib.suppress(av.error.FFmpegError, OSError):
                     self._container.close()
-                self._part.unlink(missing_ok=True)
 
 
 def join_films(parts: Sequence[Path], path: Path) -> None:

@@ -14,13 +14,16 @@ import json
 import math
 import multiprocessing
 import os
+import signal
+import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NoReturn, TypeVar
 
 import cv2
 import numpy as np
@@ -29,12 +32,23 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 import cotarget
+from cotarget.cli.arguments import count, not_negative
+from cotarget.errors import ConfigError
 from cotarget.geometry import Array
 
 Row = dict[str, Any]
 Job = TypeVar("Job")
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # a process each is faster than threads
 EXPECTED = Path(__file__).parent / "expected"
+USAGE, INTERRUPTED = 2, 130  # argparse's own exit status, and a shell's for Ctrl-C
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose mistakes end in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, without the usage in front of it."""
+        self.exit(USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
 @dataclass(frozen=True)
@@ -62,7 +76,7 @@ class Experiment(Generic[S]):
         name: of its module.
         purpose: one line, for --help.
         settings: as it is reported.
-        quick: the same in a few seconds.
+        quick: the same with less of everything.
         run: gives the rows.
         summarise: gives the figures, from the rows alone; nan where nothing was measured.
         describe: gives settings and figures as a text to print.
@@ -82,12 +96,20 @@ class Experiment(Generic[S]):
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
         """The command: run, print the figures, and write the files where asked to."""
-        parser = argparse.ArgumentParser(prog=f"python -m experiments.{self.name}", description=self.purpose)
-        parser.add_argument("--seeds", type=int, metavar="N", help=f"how many ({self.settings.seeds})")
-        parser.add_argument("--seed-base", type=int, default=0, metavar="B", help="the first seed (0)")
-        parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, metavar="P")
-        parser.add_argument("--quick", action="store_true", help="a few seeds only")
-        parser.add_argument("--out", type=Path, metavar="DIR", help="write result.json, rows.csv and figure.png there")
+        parser = Parser(prog=f"python -m experiments.{self.name}", description=self.purpose)
+        seeds, processes = self.settings.seeds, os.cpu_count() or 1
+        parser.add_argument("--seeds", type=count, metavar="N", help=f"how many ({seeds}; {self.quick.seeds} if quick)")
+        parser.add_argument("--seed-base", type=not_negative, default=0, metavar="B", help="the first seed (0)")
+        parser.add_argument(
+            "--processes",
+            type=count,
+            default=processes,
+            metavar="P",
+            help=f"jobs at a time, but one where time is measured ({processes})",
+        )
+        parser.add_argument("--quick", action="store_true", help=f"a look only: {_less(self.settings, self.quick)}")
+        files = "result.json and rows.csv" if self.plot is None else "result.json, rows.csv and figure.png"
+        parser.add_argument("--out", type=Path, metavar="DIR", help=f"write {files} there")
         given = parser.parse_args(arguments)
         settings = self.quick if given.quick else self.settings
         settings = dataclasses.replace(settings, seed_base=given.seed_base, processes=given.processes)
@@ -99,13 +121,22 @@ class Experiment(Generic[S]):
         """Run with these settings, print the figures, and write the files where there is a folder for them.
 
         Returns:
-            The exit status: 1 where a figure is missed.
+            The exit status: 1 where a figure is missed or the folder cannot be written to, 130 on Ctrl-C.
         """
-        rows = self.run(settings)
-        summary = self.summarise(rows)
-        print(self.describe(settings, summary))
-        if out is not None:
-            self.write(out, settings, rows, summary)
+        try:
+            if out is not None:
+                check_folder(out)
+            rows = self.run(settings)
+            summary = self.summarise(rows)
+            print(self.describe(settings, summary))
+            if out is not None:
+                self.write(out, settings, rows, summary)
+        except ConfigError as error:
+            print(f"experiments.{self.name}: {error}", file=sys.stderr)
+            return 1
+        except KeyboardInterrupt:
+            print(f"experiments.{self.name}: interrupted", file=sys.stderr)
+            return INTERRUPTED
         return 1 if self.missed is not None and self.missed(summary) else 0
 
     def write(self, out: Path, settings: S, rows: Sequence[Row], summary: Mapping[str, Any]) -> None:
@@ -133,6 +164,27 @@ class Experiment(Generic[S]):
             figure.savefig(out / "figure.png", dpi=110)
 
 
+def check_folder(out: Path) -> None:
+    """Refuse a folder for results that cannot be made or written to, before the work and not after it.
+
+    Raises:
+        ConfigError: it, or what it would be in, is a file or may not be written to.
+    """
+    there = next(path for path in (out.absolute(), *out.absolute().parents) if os.path.lexists(path))
+    if not there.is_dir():
+        raise ConfigError(f"--out: {there} is no folder; name one that is, or that can be made")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ConfigError(f"--out: {there} may not be written to; name another folder")
+
+
+def _less(settings: Settings, quick: Settings) -> str:
+    """What a quick run has other than the whole one, for --help."""
+    parts = {field.name: getattr(quick, field.name) for field in dataclasses.fields(quick)}
+    other = {name: value for name, value in parts.items() if value != getattr(settings, name)}
+    texts = (f"{name} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in other.items())
+    return ", ".join(texts).replace("%", "%%") or "the same"
+
+
 def over_seeds(one: Callable[[S, int], list[Row]], settings: S) -> list[Row]:
     """All rows of ``one(settings, seed)``, in the order of the seeds; see `spread`."""
     seeds = range(settings.seed_base, settings.seed_base + settings.seeds)
@@ -148,6 +200,7 @@ def spread(work: Callable[[Job], list[Row]], jobs: Iterable[Job], processes: int
         processes: 1 for this one.
     """
     jobs = list(jobs)
+    before = set(multiprocessing.active_children())
     progress = functools.partial(tqdm, total=len(jobs), disable=None, leave=False)
     if processes == 1 or len(jobs) == 1:
         yield from progress(map(work, jobs))
@@ -157,7 +210,27 @@ def spread(work: Callable[[Job], list[Row]], jobs: Iterable[Job], processes: int
         _one_thread_each(),
         ProcessPoolExecutor(min(processes, len(jobs)), context, initializer=cv2.setNumThreads, initargs=(1,)) as pool,
     ):
-        yield from progress(pool.map(work, jobs))
+        try:
+            with _interrupts_ignored():
+                futures = [pool.submit(work, job) for job in jobs]
+            yield from progress(future.result() for future in futures)
+        except BaseException:  # whatever ends this ends them; nobody waits for what they were at
+            for process in set(multiprocessing.active_children()) - before:
+                process.terminate()
+            raise
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Processes started meanwhile leave Ctrl-C, which a terminal sends to all, to this one."""
+    if threading.current_thread() is not threading.main_thread():  # which alone may say so
+        yield
+        return
+    kept = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, kept)
 
 
 @contextmanager

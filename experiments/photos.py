@@ -7,7 +7,6 @@ fitted to the corners of both photos of the pair. All corners count.
                                  [--processes P] [--quick] [--out DIR]
 """
 
-import argparse
 import functools
 import os
 import sys
@@ -24,9 +23,10 @@ from cotarget.calibration.boards import board_points
 from cotarget.calibration.bundle import fit
 from cotarget.calibration.placing import place_boards
 from cotarget.calibration.uncertainty import model_of
+from cotarget.cli.arguments import corners, count, positive
 from cotarget.config import BoardConfig
 from cotarget.errors import CotargetError
-from experiments.harness import Experiment, Row, Settings, rms, spread, table
+from experiments.harness import Experiment, Parser, Row, Settings, rms, spread, table
 
 NOT_HELD_OUT = Options(folds=0)
 
@@ -135,17 +135,20 @@ EXPERIMENT = Experiment(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m experiments.photos", description=EXPERIMENT.purpose)
+    parser = Parser(prog="python -m experiments.photos", description=EXPERIMENT.purpose)
     parser.add_argument("directory", metavar="DIR", help="the photos")
     parser.add_argument("--left", default=SETTINGS.left, metavar="GLOB")
     parser.add_argument("--right", default=SETTINGS.right, metavar="GLOB")
-    parser.add_argument("--board", default=f"{SETTINGS.columns}x{SETTINGS.rows}", metavar="CxR", help="inner corners")
-    parser.add_argument("--square", type=float, default=SETTINGS.square, metavar="M", help="side of a square [m]")
-    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, metavar="P")
+    board = (SETTINGS.columns, SETTINGS.rows)
+    parser.add_argument(
+        "--board", type=corners, default=board, metavar="CxR", help="inner corners ({}x{})".format(*board)
+    )
+    parser.add_argument("--square", type=positive, default=SETTINGS.square, metavar="M", help="side of a square [m]")
+    parser.add_argument("--processes", type=count, default=os.cpu_count() or 1, metavar="P")
     parser.add_argument("--quick", action="store_true", help="leave out two pairs only")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write result.json, rows.csv and figure.png there")
     given = parser.parse_args(arguments)
-    columns, rows = (int(text) for text in given.board.split("x"))
+    columns, rows = given.board
     settings = replace(
         EXPERIMENT.quick if given.quick else SETTINGS,
         directory=given.directory,

@@ -12,7 +12,6 @@ All run in real time beside the emulator, which needs a core of its own: figures
     python -m experiments.wire [--only NAME ...] [--seed-base 0] [--quick] [--out DIR]
 """
 
-import argparse
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -23,9 +22,10 @@ from typing import Any
 
 from tqdm import tqdm
 
+from cotarget.cli.arguments import count, not_negative
 from cotarget.errors import CotargetError
 from experiments import wire_age, wire_command, wire_faults, wire_latency, wire_parity, wire_polls
-from experiments.harness import Experiment, Row, Settings, table
+from experiments.harness import Experiment, Parser, Row, Settings, table
 from experiments.wire_figures import FAULT_COLUMNS, PART_COLUMNS, missed, summarise
 
 INTERRUPTED, TERMINATED = 130, 143  # exit status of who was ended by Ctrl-C, or by kill
@@ -126,11 +126,11 @@ EXPERIMENT = Experiment(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m experiments.wire", description=EXPERIMENT.purpose)
+    parser = Parser(prog="python -m experiments.wire", description=EXPERIMENT.purpose)
     parser.add_argument("--only", nargs="+", choices=tuple(RUNS), default=SETTINGS.only, metavar="NAME", help="figures")
     parser.add_argument("--fault", nargs="+", choices=wire_faults.all_faults(), metavar="DEVICE.FAULT", help="these")
-    parser.add_argument("--repetitions", type=int, metavar="N", help=f"of each fault ({SETTINGS.repetitions})")
-    parser.add_argument("--seed-base", type=int, default=0, metavar="B", help="the seed (0)")
+    parser.add_argument("--repetitions", type=count, metavar="N", help=f"of each fault ({SETTINGS.repetitions})")
+    parser.add_argument("--seed-base", type=not_negative, default=0, metavar="B", help="the seed (0)")
     parser.add_argument("--quick", action="store_true", help="each for some seconds only")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write result.json and rows.csv there")
     given = parser.parse_args(arguments)

@@ -105,6 +105,22 @@ def test_a_mistake_ends_in_one_line(folder, capsys, arguments, part):
     assert len(err.splitlines()) == 1
 
 
+DOG = "[targets.dog]\nsize = 0.6\ndimension = 'height'\nwanted_px = 200\ndetector = 'motion'\n"
+
+
+@pytest.mark.parametrize(("name", "part"), [
+    ("dog", "a simulated dog cannot be, whatever [targets.dog] says; the simulation has: bird, book, person, and"),
+    ("bird2", 'rig.toml: the simulated scene has no bird2; add it: [sim] targets = ["book", "bird2"]'),
+])  # fmt: skip
+def test_what_the_simulation_does_not_show_is_not_followed(folder, capsys, name, part):
+    with (folder / "rig.toml").open("a") as file:
+        file.write(DOG)
+    status, out, err = follow(capsys, "--target", name)
+    assert (status, out) == (1, "")
+    assert part in err
+    assert len(err.splitlines()) == 1
+
+
 @pytest.mark.render
 def test_follow_follows_what_was_chosen(folder, capsys):
     for arguments, state in ((("--track", "1"), "following"), (("--track", "9"), "searching")):

@@ -1,6 +1,7 @@
 """rig.toml: defaults, every section, and one clear line for each mistake."""
 
 import re
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from cotarget.config import SafetyConfig, SimEffects, load_config, parse_config
 from cotarget.errors import ConfigError
 
+DOG = "[targets.dog]\nsize = 0.6\ndimension = 'height'\nwanted_px = 200\ndetector = 'motion'\n"
 OPTICS = "[sim.effects]\noptics = true\n[sim.zoom]\n"
 
 
@@ -72,15 +74,49 @@ def test_offsets_and_targets_are_taken(tmp_path):
         ("[sim.fixed]\nnoise = 'much'", "sim.fixed.noise: 'much' is not a finite number"),
         ("[sim.fixed]\nnoise = -1", "sim.fixed.noise: -1 is negative"),
         ("[sim.fixed]\ndistortion = [-0.5, 0, 0, 0, 0]", "sim.fixed.distortion: [-0.5, 0.0, 0.0, 0.0, 0.0] folds back"),
-        ("[sim.paths]\nboook = [[0, 0, 0, 0], [1, 0, 0, 0]]", "sim.paths.boook: is no target; the targets are: bird"),
-        ("[sim.fixed]\nsize = [640]", "sim.fixed.size: has 1 values where 2 are wanted"),
+        (
+            "[sim.paths]\nboook = [[0, 0, 0, 0], [1, 0, 0, 0]]",
+            "sim.paths: unknown target 'boook'; the simulation has: bird, book, person, and further ones with a number",
+        ),
+        ("[sim.fixed]\nsize = [640]", "sim.fixed.size: has 1 values where 2 are wanted, [width, height]"),
         ("[sim.fixed]\nsize = [640, 480.5]", "sim.fixed.size[1]: 480.5 is not a whole number"),
         ("[sim.fixed]\nfocal_px = [0, 1]", "sim.fixed.focal_px: 0 is not greater than zero"),
         ("[sim.fixed]\njpeg_quality = 0", "sim.fixed.jpeg_quality: 0 is not within 1 to 100"),
         ("[sim.head]\npan_deg = [10, -10]", "sim.head.pan_deg: [10.0, -10.0] is not [lowest, highest]"),
         ("[sim.effects]\nall = 0", "sim.effects.all: 0 is not true or false"),
         ("sim = 3", "sim: 3 is not a table"),
-        ("[sim]\ntargets = ['cow']", "unknown target 'cow'; the targets are: bird, book, person"),
+        ("[sim]\ntargets = ['cow']", "sim.targets: unknown target 'cow'; the simulation has: bird, book, person, and"),
+        (
+            "[sim]\ntargets = ['dog']\n" + DOG,
+            "sim.targets: unknown target 'dog'; the simulation has: bird, book, person",
+        ),
+        (
+            "[sim]\ntargets = ['bird', 'bird2', 'bird']",
+            "sim.targets: 'bird' is named twice; a further one has a number",
+        ),
+        ("[sim]\ntargets = 'bird'", "sim.targets: 'bird' is not a list of texts"),
+        ("[sim.fixed]\nsize = 640", "sim.fixed.size: 640 is not a list of 2 whole numbers, [width, height]"),
+        ("[sim.head]\npan_deg = 90", "sim.head.pan_deg: 90 is not a list of 2 numbers, [lowest, highest]"),
+        ("[safety]\ntilt_deg = 30", "safety.tilt_deg: 30 is not a list of 2 numbers, [lowest, highest]"),
+        ("[board]\ncorners = '9x6'", "board.corners: '9x6' is not a list of 2 whole numbers, [columns, rows]"),
+        ("[sim.paths]\nbird = 3", "sim.paths.bird: 3 is not a list of lists, [[t, x, y, z], ...]"),
+        ("[sim.paths]\nbird = [0, 0, 20, 5]", "sim.paths.bird[0]: 0 is not a list of 4 numbers, [t, x, y, z]"),
+        ("[hardware.zoom]\nlens = [6, 72]", "hardware.zoom.lens[0]: 6 is not a list of 2 numbers, [position, mm]"),
+        (
+            "[sim]\nT_head_zoom = { translation = 1, rotvec_deg = [0, 0, 0] }",
+            "sim.T_head_zoom.translation: 1 is not a list of 3 numbers, [x, y, z]",
+        ),
+        (
+            "[sim.zoom]\nexposure_s = 10",
+            "sim.zoom.exposure_s: 10 s is longer than the 0.04 s from one frame to the next, of which 25 come a second",
+        ),
+        (
+            "[sim.fixed]\ncenter_px = [700, 239]",
+            "sim.fixed.center_px: (700, 239) is not in the 640x480 image; give one",
+        ),
+        ("[sim.zoom]\ncenter_px = [326, -1]", "sim.zoom.center_px: (326, -1) is not in the 640x480 image"),
+        ("[sim.zoom]\nsize = [0, 480]", "sim.zoom.size: 0 is not greater than zero"),
+        ("[safety]\nstop_file = ''", "safety.stop_file: is empty; give a path, or leave it out"),
         ("[sim]\nT_head_zoom = { translation = [0, 0, 0] }", "sim.T_head_zoom: missing key 'rotvec_deg'"),
         ("[sim]\nT_head_zoom = 3", "sim.T_head_zoom: 3 is not a table"),
         ("[sim.paths]\nbird = [[1, 0, 0, 0], [1, 1, 0, 0]]", "sim.paths.bird: needs two or more waypoints"),
@@ -161,6 +197,39 @@ def test_the_curves_of_the_zoom_lens_are_taken_and_checked_only_where_they_are_u
     assert SimEffects().optics
     with pytest.raises(ConfigError, match="does not grow"):
         parse_config({"sim": {"zoom": curves}})
+
+
+@pytest.mark.parametrize(("size", "by"), [([1280, 960], 2), ([320, 240], 0.5), ([1280, 720], 2)])
+def test_another_image_size_shows_the_same_view(size, by):
+    """As wide a view as before: the pixel at the left border, and the true centre, lie in the same directions."""
+    before = parse_config({}).sim
+    after = parse_config({"sim": {"fixed": {"size": size}, "zoom": {"size": size}}}).sim
+    for old, new in ((before.fixed, after.fixed), (before.zoom, after.zoom)):
+        assert new.focal_px == pytest.approx((by * old.focal_px[0], by * old.focal_px[1]))
+        assert (-0.5 - new.center_px[0]) / new.focal_px[0] == pytest.approx((-0.5 - old.center_px[0]) / old.focal_px[0])
+        middle = (size[1] - 1) / 2
+        assert new.center_px[1] - middle == pytest.approx(by * (old.center_px[1] - 239.5))
+    # The device tells focal lengths in its own pixels, as much off as before; the centre drifts as far on the sensor.
+    assert 6.0 / after.zoom.pitch_mm / after.zoom.focal_px[0] == pytest.approx(6.0 / 0.009 / 692)
+    assert after.zoom.center_drift_px[0][0] == pytest.approx(27.0 * by)
+
+
+def test_what_is_said_beside_another_image_size_is_taken_as_it_is_said():
+    camera = {"size": [1280, 960], "focal_px": [1200, 1201], "center_px": [600, 500]}
+    sim = parse_config(
+        {"sim": {"fixed": camera, "zoom": camera | {"pitch_mm": 0.01, "center_drift_px": [[1], []]}}}
+    ).sim
+    for found in (sim.fixed, sim.zoom):
+        assert (found.focal_px, found.center_px) == ((1200.0, 1201.0), (600.0, 500.0))
+    assert (sim.zoom.pitch_mm, sim.zoom.center_drift_px) == (0.01, ((1.0,), ()))
+
+
+def test_an_exposure_may_last_until_the_next_frame():
+    assert parse_config({"sim": {"fixed": {"rate_hz": 25.0, "exposure_s": 0.04}}}).sim.fixed.exposure_s == 0.04
+
+
+def test_a_target_of_ones_own_needs_no_model_as_long_as_the_scene_does_not_have_it():
+    assert parse_config(tomllib.loads(DOG)).target("dog2").wanted_px == 200
 
 
 def test_all_false_is_the_textbook():

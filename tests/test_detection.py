@@ -1,6 +1,7 @@
 """The detectors on drawn pictures: the colour detector's accuracy, and what the motion detector must not see."""
 
 import dataclasses
+import re
 
 import cv2
 import numpy as np
@@ -131,8 +132,11 @@ def test_a_grey_or_missing_template_is_refused(tmp_path):
     book = dataclasses.replace(DEFAULT_TARGETS["book"], template=None)
     with pytest.raises(ConfigError, match="template"):
         make_detector(book, RATE)
-    with pytest.raises(ConfigError, match=r"nothing\.png"):
-        make_detector(dataclasses.replace(book, template=tmp_path / "nothing.png"), RATE)
+    (tmp_path / "text.png").write_text("no picture")
+    for name, said in (("nothing", "no such file"), ("text", "is not a picture"), ("", "is not a picture")):
+        path = tmp_path / f"{name}.png" if name else tmp_path
+        with pytest.raises(ConfigError, match=re.escape(f"{path}: {said}; a target's template is a PNG or JPEG of it")):
+            make_detector(dataclasses.replace(book, template=path), RATE)
 
 
 def sky(rng, shape=(240, 320)):

@@ -1,32 +1,97 @@
-"""Which of a run's Steps a picture of a target shows."""
+"""Pictures and plots: which of a run's Steps a picture of a target shows, and that what is written is in the clear."""
+
+import dataclasses
+import re
+from pathlib import Path
 
 import numpy as np
+import pytest
 
+from cotarget import drawing
+from cotarget.closeup import Found
 from cotarget.detection import Detection
-from cotarget.drawing import SIZE_KNOWN_S, TargetStages
+from cotarget.drawing import SIZE_KNOWN_S, TargetStages, draw_frames
 from cotarget.loop import State, Step
+from cotarget.metrics import Row
 from cotarget.motionfilter import Track
+from cotarget.plots import aim_error_figure
 from cotarget.rig import Frame, PanTiltState, ZoomState
 from cotarget.targeting import Aim
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)
+MIDDLE = np.array([31.5, 23.5])
 AIM = Aim(0.1, 0.0, 3000.0, 3000.0, False, np.array([1.0, 0.0, 10.0]), 10.0)
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
-def step(t, side, shared=False):
-    """The head stands where it should, the lens as long as it should; the target's box has a side."""
+def step(t, side=8.0, shared=False, off_px=0.0, focal_px=3000.0, seen_s=0.0):
+    """The target's box has a side; it is found off the middle of the zoom view, in that frame or so much earlier."""
     size = np.full(2, side)
     box = Detection(np.array([30.0, 20.0]), size, 1.0)
     track = Track(1, t, True, 0, box.center_px, np.zeros(2), np.full(2, 8.0), 8.0, np.eye(4), 1.0, box, shared)
-    frame, head, lens = Frame(PICTURE, t), PanTiltState(0.1, 0.0, False, t), ZoomState(3000.0, False, t)
+    frame, head, lens = Frame(PICTURE, t), PanTiltState(0.1, 0.0, False, t), ZoomState(focal_px, False, t)
     told = (0.1, 0.0, 3000.0)
-    return Step(0, t, State.FOLLOWING, "", frame, frame, None, (box,), (track,), track, AIM, told, head, lens)
+    made = Step(0, t, State.FOLLOWING, "", frame, frame, None, (box,), (track,), track, AIM, told, head, lens)
+    at = Found(MIDDLE + np.array([off_px, 0.0]), 1.0, np.ones(2), 1.0, 1.0, size, t - seen_s)
+    return dataclasses.replace(made, found=at)
+
+
+def staged(steps):
+    stages = TargetStages(600.0)
+    for each in steps:
+        stages.see(each)
+    return stages
 
 
 def test_the_close_up_is_of_the_largest_box_of_the_target_alone():
-    stages = TargetStages(600.0)
     sides = [(8.0, False), (10.0, False), (20.0, True), (9.0, False)]
     steps = [step(i * (SIZE_KNOWN_S + 0.1), *each) for i, each in enumerate(sides)]
-    for each in steps:
-        stages.see(each)
+    assert staged(steps).close is steps[1]
+
+
+def test_centred_is_where_the_target_is_seen_in_the_middle_while_the_lens_is_shortest():
+    """While the head turns and the lens goes in: off, off, nearly (3 % of 64 px), in the middle, off, in the middle."""
+    course = [(700, 12), (900, 5), (1200, 2), (1500, 0), (2000, -4), (2500, 0)]
+    steps = [step(0.04 * i, focal_px=focal, off_px=off) for i, (focal, off) in enumerate(course)]
+    assert staged(steps).centred is steps[2]
+
+
+def test_centred_is_nothing_that_was_seen_in_another_picture_or_not_at_all():
+    unseen = [step(0.0, seen_s=0.04), dataclasses.replace(step(0.04), found=None)]
+    assert staged(unseen).centred is None
+    steps = [*unseen, step(0.08)]
+    assert staged(steps).centred is steps[2]
+
+
+def test_centred_comes_before_the_close_up():
+    steps = [step(0.0), step(SIZE_KNOWN_S + 0.1), step(SIZE_KNOWN_S + 0.2, focal_px=2900.0)]
+    stages = staged(steps)
     assert stages.close is steps[1]
+    assert stages.centred is steps[0]
+
+
+def test_the_rigs_frames_have_the_names_that_the_readme_uses(monkeypatch):
+    told = []
+    monkeypatch.setattr(drawing, "write_text", lambda image, text, *_: told.extend(text.split(", ")))
+    draw_frames(PICTURE, {"fixed": np.zeros(2), "zoom": np.ones(2), "base": np.ones(2)})
+    (frames,) = re.findall(r"The frames are (.*?)\. `T_a_b`", README, re.DOTALL)
+    names = set(re.findall(r"`(\w+)`", frames))
+    assert len(names) == 5
+    assert set(told) == names - {"zoom"} | {"Gamma", "T"}
+
+
+def row(t, focal_px):
+    """A frame with everything at its middle."""
+    numbers = {f.name: 0.0 if f.type is float else 0 for f in dataclasses.fields(Row)}
+    return Row(**numbers | {"t_s": t, "width_px": 64, "height_px": 48, "focal_px": focal_px, "wanted_px": 9.0})
+
+
+@pytest.mark.parametrize("names", [["book"], ["book", "person", "bird"]])
+def test_the_legend_of_the_aim_error_lies_on_no_curve(names):
+    figure = aim_error_figure({name: [row(0.1 * i, 700.0 + 90 * i) for i in range(9)] for name in names})
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    assert len(figure.axes) == 2 * len(names)
+    for ax in figure.axes:
+        assert ax.get_legend() is None
+        assert not legend.get_window_extent().overlaps(ax.get_window_extent())

@@ -117,7 +117,7 @@ def stays_within_limits(watch):
 def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
     table, again, recording = (rig.folder / name for name in ("wire.csv", "again.csv", "recording"))
     status, out, err = run(capsys, *rig.follow("--seconds", STANDS_S, "--csv", table, "--record", recording))
-    assert (status, err) == (0, "")
+    assert (status, err.count("\n") <= 1) == (0, True)  # frames of a busy machine are late, of which it may be warned
     states = json.loads(out)["states"]
     assert states["following"] > 0.8 * sum(states.values())
 
@@ -136,8 +136,8 @@ def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
     assert truth["pan_deg"] == pytest.approx(math.degrees(there.pan), abs=LOOKED_AT_DEG)
     assert truth["tilt_deg"] == pytest.approx(math.degrees(there.tilt), abs=LOOKED_AT_DEG)
 
-    status, out, err = run(capsys, "replay", recording, "--csv", again)
-    assert (status, err) == (0, "")
+    status, out, again_err = run(capsys, "replay", recording, "--csv", again)
+    assert (status, again_err) == (0, err.replace("cotarget follow", "cotarget replay"))
     differences = json.loads(out)["differences"]
     assert differences["moves"] > 0
     assert all(differences[name] == 0 for name in ("moves_differing", "zooms_differing", "missing", "extra"))

@@ -2,6 +2,12 @@
 
 import csv
 import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,6 +39,7 @@ PLAIN = Lens(500.0, 500.0, 320.0, 240.0)
 # Everything in one place, looking along +z.
 PLAIN_RIG = Truth(fixed=PLAIN, zoom=PLAIN, gamma=STILL, hand=STILL, dz=0.0, eps=0.0)
 ROUNDING = 1e-9
+DEADLINE_S = 60.0  # for what should come in some seconds
 
 
 @dataclass(frozen=True)
@@ -76,6 +83,105 @@ def test_a_run_writes_its_files(tmp_path, capsys):
     assert capsys.readouterr().out == "sum 2.0\n"
 
 
+def never(settings):
+    raise AssertionError("nothing is run before the arguments are looked at")
+
+
+UNRUN = replace(EXPERIMENT, run=never)
+
+
+@pytest.mark.parametrize(("arguments", "said"), [
+    (["--seeds", "0"], "--seeds: '0' is not a whole number from 1"),
+    (["--seed-base", "-5"], "--seed-base: '-5' is not a whole number from 0"),
+    (["--processes", "0"], "--processes: '0' is not a whole number from 1"),
+    (["--nothing"], "unrecognized arguments: --nothing"),
+])  # fmt: skip
+def test_wrong_arguments_end_in_one_line_before_any_work(capsys, arguments, said):
+    with pytest.raises(SystemExit) as caught:
+        UNRUN.main(arguments)
+    err = capsys.readouterr().err
+    assert caught.value.code == 2
+    assert said in err
+    assert err.startswith("python -m experiments.dummy: ")
+    assert err.count("\n") == 1
+
+
+def test_a_file_in_the_way_of_the_results_is_told_before_any_work(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    for out in (tmp_path / "file", tmp_path / "file" / "deeper" / "still"):
+        assert UNRUN.main(["--out", str(out)]) == 1
+        err = capsys.readouterr().err
+        assert (
+            err
+            == f"experiments.dummy: --out: {tmp_path / 'file'} is no folder; name one that is, or that can be made\n"
+        )
+
+
+def test_an_interrupt_ends_in_one_line(capsys, tmp_path):
+    def interrupted(settings):
+        raise KeyboardInterrupt
+
+    assert replace(EXPERIMENT, run=interrupted).main(["--out", str(tmp_path / "out")]) == 130
+    assert capsys.readouterr().err == "experiments.dummy: interrupted\n"
+    assert not (tmp_path / "out").exists()
+
+
+def test_help_says_what_quick_means(capsys):
+    with pytest.raises(SystemExit):
+        EXPERIMENT.main(["--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "how many (4; 2 if quick)" in text
+    assert "a look only: seeds 2" in text
+
+
+WAITS = """
+import os, time
+from pathlib import Path
+
+def work(name):
+    Path(name + "-").write_text(str(os.getpid()))
+    os.rename(name + "-", name)
+    time.sleep(60)
+"""
+WAITER = """
+import sys
+import waits
+
+if __name__ == "__main__":
+    from experiments.harness import Experiment, Settings, spread
+    run = lambda settings: list(spread(waits.work, sys.argv[1:], settings.processes))
+    experiment = Experiment("waiter", "Waits.", Settings(2), Settings(1), run, dict, str)
+    sys.exit(experiment.main(["--processes", "2"]))
+"""
+
+
+def test_an_interrupt_of_all_processes_ends_them_in_one_line(tmp_path):
+    """As a terminal sends it: to the whole group; the workers are at their jobs, the last of which has not begun."""
+    (tmp_path / "waits.py").write_text(WAITS)
+    (tmp_path / "waiter.py").write_text(WAITER)
+    begun = [tmp_path / "1", tmp_path / "2"]
+    command = [sys.executable, str(tmp_path / "waiter.py"), *map(str, begun), str(tmp_path / "3")]
+    paths = f"{Path(__file__).parents[1]}{os.pathsep}{tmp_path}"
+    with subprocess.Popen(
+        command, env=os.environ | {"PYTHONPATH": paths}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    ) as process:  # fmt: skip
+        late = threading.Timer(DEADLINE_S, os.killpg, (process.pid, signal.SIGKILL))
+        late.start()
+        try:
+            while not all(path.exists() for path in begun) and process.poll() is None:
+                time.sleep(0.05)
+            os.killpg(process.pid, signal.SIGINT)
+            out, err = process.communicate()
+        finally:
+            late.cancel()
+    assert (process.returncode, out, err) == (130, "", "experiments.waiter: interrupted\n")
+    assert not (tmp_path / "3").exists()
+    for path in begun:
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(path.read_text()), 0)
+
+
 def test_all_of_them_fail_where_one_fails(monkeypatch, capsys, tmp_path):
     """One is fine, one misses a figure, and one lacks the film that it needs."""
     asked = []
@@ -104,6 +210,33 @@ def test_all_of_them_fail_where_one_fails(monkeypatch, capsys, tmp_path):
     (tmp_path / "none.mp4").touch()
     assert everything.main([]) == 0
     assert asked[-1] == ("film", [])
+
+
+def test_some_of_them_by_name_and_an_interrupt_ends_all(monkeypatch, capsys, tmp_path):
+    asked = []
+    status = {"hand_eye": 0, "hold": 130, "speed": 0}
+
+    def module(name):
+        name = name.removeprefix("experiments.")
+        return SimpleNamespace(EXPERIMENT=SimpleNamespace(main=lambda _: asked.append(name) or status[name]))
+
+    monkeypatch.setattr(everything.importlib, "import_module", module)
+    assert everything.main(["hand_eye", "speed"]) == 0
+    assert everything.main(["hand_eye", "hold", "speed"]) == 130
+    assert asked == ["hand_eye", "speed", "hand_eye", "hold"]
+    capsys.readouterr()
+    (tmp_path / "file").touch()
+    for arguments, said in (
+        (["hand_eye", "by_hand"], "there is no experiment 'by_hand'; there are hand_eye, chain,"),
+        (["--out", str(tmp_path / "file")], f"--out: {tmp_path / 'file'} is no folder"),
+    ):
+        with pytest.raises(SystemExit) as caught:
+            everything.main(arguments)
+        err = capsys.readouterr().err
+        assert caught.value.code == 2
+        assert said in err
+        assert err.count("\n") == 1
+    assert len(asked) == 4
 
 
 def test_a_pipeline_that_is_too_slow_is_missed():

@@ -86,6 +86,14 @@ def test_nothing_labelled_and_nothing_found():
     assert (found.labelled_frames, found.on_target_ratio, found.false_tracks) == (0, None, 1)
     found = score_tracks([], LABELS, RATE, FRAMES)
     assert (found.on_target_ratio, found.offset_px_median, found.numbers) == (0.0, None, 0)
+    assert found.fragmentation_per_min is None
+
+
+def test_labels_beyond_the_end_are_counted_and_not_judged():
+    found = score_tracks(track(1, range(80)), LABELS, RATE, 80)
+    assert (found.labelled_frames, found.on_target_ratio, found.labels_beyond_end) == (50, 1.0, 20)
+    assert found.fragmentation_per_min == 0.0
+    assert score_tracks(track(1, range(FRAMES)), LABELS, RATE, FRAMES).labels_beyond_end == 0
 
 
 def write_labels(path, rows, head="frame,x_px,y_px,width_px,height_px"):
@@ -98,6 +106,12 @@ def test_labels_are_boxes_by_their_first_pixel(tmp_path):
     assert [each.center_px.tolist() for each in found[3]] == [[12.0, 20.5], [0.0, 0.0]]
 
 
+def test_labels_of_a_spreadsheet_begin_with_a_mark(tmp_path):
+    path = write_labels(tmp_path / "labels.csv", ["3,10,20,5,2"])
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert list(read_labels(path)) == [3]
+
+
 @pytest.mark.parametrize(
     ("rows", "head", "why"),
     [
@@ -106,13 +120,20 @@ def test_labels_are_boxes_by_their_first_pixel(tmp_path):
         (["1,2,3,x,5"], "frame,x_px,y_px,width_px,height_px", "could not convert"),
         (["1,2,3,0,5"], "frame,x_px,y_px,width_px,height_px", "above 0"),
         (["1.5,2,3,4,5"], "frame,x_px,y_px,width_px,height_px", "whole frame"),
+        (["-1,2,3,4,5"], "frame,x_px,y_px,width_px,height_px", "whole frame from 0"),
+        ([], "frame,x_px,y_px,width_px,height_px", r"labels\.csv: holds no label"),
     ],
 )
 def test_other_tables_are_refused_by_name(tmp_path, rows, head, why):
     with pytest.raises(ConfigError, match=why):
         read_labels(write_labels(tmp_path / "labels.csv", rows, head))
-    with pytest.raises(ConfigError, match=r"nothing\.csv"):
+
+
+def test_files_that_cannot_be_read_are_told_as_such(tmp_path):
+    with pytest.raises(ConfigError, match=r"nothing\.csv: no such file; give a csv with frame,x_px,y_px,width_px"):
         read_labels(tmp_path / "nothing.csv")
+    with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
+        read_labels(tmp_path)
 
 
 def test_the_command_scores_a_film(tmp_path, capsys):
@@ -133,6 +154,11 @@ def test_the_command_scores_a_film(tmp_path, capsys):
     assert found["false_tracks"] == 0
     assert found["offset_px_median"] < 1.5
     assert len(read_tracks(tmp_path / "tracks.csv")) >= 50
+    longer = write_labels(tmp_path / "longer.csv", [*rows, *(f"{i},1,1,5,5" for i in range(80, 90))])
+    assert main([*arguments, "--labels", str(longer)]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out) == found | {"labels_beyond_end": 10}
+    assert "longer.csv: 10 of 90 labelled frames are beyond the last one, 79, and are not counted" in err
     assert main([*arguments, "--labels", str(tmp_path / "none.csv")]) == 1
     assert "none.csv" in capsys.readouterr().err
 
@@ -160,5 +186,10 @@ def test_the_command_scores_a_recording(tmp_path, capsys, monkeypatch):
     assert main([*arguments, str(write_labels(tmp_path / "beside.csv", beside))]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["on_target_ratio"], found["false_tracks"]) == (0.0, 1)
+    longer = write_labels(tmp_path / "longer.csv", [*rows, f"{len(steps)},1,1,5,5"])
+    assert main([*arguments, str(longer)]) == 0
+    out, err = capsys.readouterr()
+    assert (json.loads(out)["on_target_ratio"], json.loads(out)["labels_beyond_end"]) == (1.0, 1)
+    assert f"1 of {len(steps) + 1} labelled frames are beyond the last one, {len(steps) - 1}," in err
     assert main([*arguments, str(tmp_path / "none.csv")]) == 1
     assert "none.csv" in capsys.readouterr().err

@@ -6,9 +6,13 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from cotarget.config import parse_config
+from cotarget.config import DEFAULT_TARGETS, parse_config
+from cotarget.film import COLUMNS as FILM_COLUMNS
+from cotarget.recording import COLUMNS as STEP_COLUMNS
+from cotarget.rig import Frame
 
 DEADLINE_S = 60.0  # for a command to say how it is used
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
@@ -53,3 +57,47 @@ def test_commands_and_their_options_exist(helps):
 
 def test_every_command_is_told_of(helps):
     assert known(asked()) <= set(helps)
+
+
+def row_of(beginning):
+    """The line of a table that begins so."""
+    (line,) = (line for line in README.splitlines() if line.startswith(beginning))
+    return line
+
+
+@pytest.mark.parametrize(
+    ("beginning", "columns"),
+    [("| `follow --csv`, `replay --csv`", STEP_COLUMNS), ("| `detect --csv`", FILM_COLUMNS)],
+)
+def test_every_column_is_told_of_in_its_order(beginning, columns):
+    told = re.findall(r"`(\w+)`", row_of(beginning))
+    assert tuple(told) == columns
+
+
+def test_what_is_known_of_each_target_is_told():
+    for name, target in DEFAULT_TARGETS.items():
+        size, dimension, wanted_px, detector, _ = (cell.strip() for cell in row_of(f"| {name} |").split("|")[2:-1])
+        assert (float(size.removesuffix(" m")), float(wanted_px)) == (target.size, target.wanted_px)
+        assert (dimension, detector.split(",")[0]) == (target.dimension, target.detector)
+
+
+def test_every_module_is_told_of_and_no_other():
+    package = Path(__file__).parents[1] / "cotarget"
+    modules = {path.stem for path in package.glob("*.py")} - {"__init__"}
+    packages = {f"{path.parent.name}/" for path in package.glob("*/__init__.py")}
+    parts = {path.stem for path in (package / "calibration").glob("*.py")} - {"__init__"}
+    told = re.findall(r"`([\w/]+)`", README[README.index("## For developers") :])
+    assert set(told) - parts - {"experiments/"} == modules | packages
+    assert parts <= set(told)
+
+
+def test_the_detector_of_ones_own_finds_what_it_says():
+    (example,) = (
+        block for block in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if "ExternalDetector" in block
+    )
+    names = {}
+    exec(example, names)
+    picture = np.full((60, 80, 3), 128, np.uint8)
+    picture[20:30, 50:65] = (0, 0, 255)
+    (found,) = names["detector"].detect(Frame(picture, 0.0))
+    assert (found.center_px.tolist(), found.size_px.tolist()) == ([57.0, 24.5], [15.0, 10.0])

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,18 +18,22 @@ import pytest
 
 from cotarget.calibration import load_calibration
 from cotarget.calibration.file import save_calibration
+from cotarget.cli.main import main
 from cotarget.config import parse_config
 from cotarget.detection import make_detector
 from cotarget.errors import ConfigError, CotargetError, DeviceError, StaleFrameError
 from cotarget.estimation import Estimate
 from cotarget.loop import FollowSettings, State, follow
+from cotarget.policies import Chosen
 from cotarget.recording import Recorder
 from cotarget.replay import Differences, RecordingEndedError, ReplayRig, open_recording, until_end
 from cotarget.rig import PanTiltState
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
+from cotarget.whom import Whom, parse_whom, whom_table
 from tests.recorded_run import (
     CONFIG,
+    RATE_HZ,
     SETTINGS,
     SIZE,
     STEP,
@@ -173,21 +178,109 @@ def test_commands_that_differ_are_counted_and_measured(recorded):
     assert (turned.moves, turned.moves_differing, turned.zooms_differing) == (same.moves, same.moves, 0)
     assert turned.largest_deg == pytest.approx(0.573, abs=0.0005)
     assert (turned.missing, turned.extra) == (0, 0)
+    moved = [step.index for step, before in zip(recorded[1][1:], recorded[1], strict=False)
+             if step.head_commands > before.head_commands]  # fmt: skip
+    assert (turned.frames, turned.frames_differing, turned.first_frame) == (len(recorded[1]), len(moved), moved[0])
+    assert turned.first_s == pytest.approx(recorded[1][moved[0]].fixed.t - recorded[1][0].fixed.t, abs=1 / RATE_HZ)
     zoomed = differences_of(recorded[0], focal_px=7.0)
     assert zoomed.zooms_differing > 0
     assert zoomed.largest_px >= 7.0
     halved = differences_of(recorded[0], every=2)
     assert (halved.moves, halved.missing) == (same.moves // 2, same.moves - same.moves // 2)
     assert not halved.same
+    assert halved.first_frame == moved[0]
+    others = halved.moves_differing + halved.zooms_differing + halved.extra  # by the time that the others took
+    assert len(moved[::2]) <= halved.frames_differing <= len(moved[::2]) + others
 
 
 def test_differences_in_words():
     assert str(Differences(moves=3, zooms=2)) == "all 5 commands as recorded"
-    text = str(Differences(9, 2, 0.5, 4, 1, 30.0, 7, 6))
+    text = str(Differences(9, 2, 0.5, 4, 1, 30.0, 7, 6, 50, 12, 3, 0.118))
     assert text == (
+        "the commands of 12 of 50 frames differ from those recorded, from frame 3 (0.12 s) on: "
         "2 of 9 moves differ, by 0.5 degrees at most; 1 of 4 focal lengths, by 30 px at most; "
         "7 commands missing, 6 more"
     )
+
+
+@pytest.fixture(scope="module")
+def of_track_2(tmp_path_factory):
+    """A recording of a run that follows nobody but the second track, which comes late, as the command runs it."""
+    folder = tmp_path_factory.mktemp("of_track_2")
+    path = calibration_file(folder)
+    settings = FollowSettings(
+        command_delay_s=CONFIG.command_delay_s, lens_delay_s=CONFIG.lens_delay_s, policy=partial(Chosen, number=2)
+    )
+    with Recorder(folder / "run", CONFIG, path, "bird", Whom(track=2)) as recorder:
+        steps = list(run(recorder.wrap(ToyRig()), load_calibration(path), SECONDS, settings))
+    assert {step.target.id for step in steps if step.target} == {2}
+    return folder / "run"
+
+
+@pytest.fixture
+def replayed(of_track_2, tmp_path, monkeypatch, capsys):
+    """Runs the command on a copy of it: status, result and what it says."""
+    monkeypatch.setattr("cotarget.detection.make_detector", lambda *_: Bright())
+    folder = shutil.copytree(of_track_2, tmp_path / "copy")
+
+    def command(*options):
+        status = main(["replay", str(folder), *options])
+        out, err = capsys.readouterr()
+        return status, json.loads(out) if out else None, err
+
+    command.folder = folder
+    return command
+
+
+def test_the_command_follows_whom_the_recorded_run_followed(replayed):
+    status, result, said = replayed("--check")
+    assert (status, result["differences"]["frames_differing"]) == (0, 0)
+    assert "differ" not in said
+    assert result["differences"]["frames"] == result["steps"] > 40
+
+
+def test_the_command_tells_of_other_commands_and_fails_where_that_is_asked_for(replayed):
+    status, result, said = replayed("--policy", "first-come")
+    found = result["differences"]
+    assert status == 0
+    line = f"cotarget replay: the commands of {found['frames_differing']} of {result['steps']} frames differ"
+    assert said.splitlines()[-1].startswith(line)
+    assert f"from frame {found['first_frame']} ({found['first_s']:.2f} s) on" in said
+    assert found["first_frame"] < 20  # the first bird is believed by then
+    assert replayed("--policy", "first-come", "--check")[:2] == (1, result)
+
+
+def test_a_recording_that_does_not_say_whom_replays_as_the_first_policy_does(replayed):
+    edit("whom", {})(replayed.folder)
+    then = replayed("--policy", "first-come")
+    table = json.loads((replayed.folder / "recording.json").read_text())
+    del table["whom"]
+    (replayed.folder / "recording.json").write_text(json.dumps(table))
+    assert replayed() == then
+
+
+@pytest.mark.parametrize(("whom", "said"), [
+    ({"policy": "by-name"}, "the recorded policy 'by-name' is unknown; give --policy, one of: first-come"),
+    ({"click": [500.0, 3.0]}, "--click: (500, 3) is not in the wide view's 96x72 image"),
+    ({"click": [float("nan"), 3.0]}, "is not in the wide view"),
+    ({"click": [10**400, 3.0]}, "recording.json: whom: int too large"),
+    ({"click": [1.0]}, "recording.json: whom: click [1.0] is no pixel"),
+    ({"track": 0}, "recording.json: whom: {'track': 0} is no"),
+    ({"policy": 3}, "recording.json: whom: {'policy': 3} is no"),
+    ({"track": 1, "policy": "first-come"}, "is not one of policy, click and track"),
+    (None, "recording.json: whom: None is not one of"),
+])  # fmt: skip
+def test_whom_nobody_can_follow_is_refused_in_one_line(replayed, whom, said):
+    edit("whom", whom)(replayed.folder)
+    status, _, err = replayed()
+    assert status == 1
+    assert said in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("whom", [Whom(), Whom("most-served"), Whom(click=(3.5, 7.0)), Whom(track=4)])
+def test_whom_is_written_and_read(whom):
+    assert parse_whom(json.loads(json.dumps(whom_table(whom)))) == whom
 
 
 def write_log(folder, rows, end="complete"):

@@ -1,12 +1,16 @@
 """Films written and read back, refused, and run through detector and tracker."""
 
 import csv
+import json
+import re
+from fractions import Fraction
 
 import av
 import cv2
 import numpy as np
 import pytest
 
+from cotarget.cli.main import main
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.errors import CotargetError
 from cotarget.film import COLUMNS, run_on_film
@@ -79,6 +83,90 @@ def test_films_that_cannot_be_read_name_the_file(tmp_path):
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
     assert not (tmp_path / "out.csv").exists()
+
+
+def other_film(path, codec, count=60, empty_from=None, **options):
+    """A film of noise in any container; from a frame on only every tenth is there."""
+    rng = np.random.default_rng(0)
+    with av.open(str(path), "w", options=options) as out:
+        stream = out.add_stream(codec, rate=25)
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        for i in range(count):
+            if empty_from is not None and i >= empty_from and i % 10:
+                continue
+            picture = av.VideoFrame.from_ndarray(rng.integers(0, 256, (120, 160, 3), np.uint8), format="bgr24")
+            picture.pts, picture.time_base = i, Fraction(1, 25)
+            out.mux(stream.encode(picture))
+        out.mux(stream.encode(None))
+
+
+KINDS = [
+    ("a.mp4", "libx264", {"movflags": "faststart"}),
+    ("b.mp4", "libx264", {"movflags": "frag_keyframe+empty_moov"}),
+    ("a.mkv", "libx264", {}),
+    ("a.avi", "mpeg4", {}),
+    ("b.avi", "mjpeg", {}),
+]
+
+
+@pytest.mark.parametrize(("name", "codec", "options"), KINDS)
+def test_a_film_that_is_cut_short_is_told(tmp_path, name, codec, options):
+    """Of 2.4 s; the frames up to the cut are those of the whole film."""
+    whole, cut = tmp_path / f"whole-{name}", tmp_path / name
+    other_film(whole, codec, **options)
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size * 6 // 10])
+    with Film(whole) as film:
+        frames = list(film)
+        assert (len(frames), film.shortfall) == (60, "")
+    with Film(cut) as film:
+        left = list(film)
+        assert 20 < len(left) < 45
+        ends = left[-1].t + 1 / RATE
+    assert re.fullmatch(r"the film says that it lasts 2\.4 s, and ends at 1\.\d s", film.shortfall)
+    assert float(film.shortfall[-5:-2]) == pytest.approx(ends, abs=0.25)  # a few frames are lost with the last piece
+    assert np.array_equal(left[10].image, frames[10].image)
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.ts", "a.mpg", "a.mov", "a.h264", "a.flv"])
+def test_a_whole_film_is_not_told_short(tmp_path, name):
+    """What says its length, and what does not or has it estimated; at a rate that slows down too."""
+    codec = {"a.mpg": "mpeg1video", "a.flv": "flv"}.get(name, "libx264")
+    for empty_from in (None, 30) if name in ("a.mp4", "a.mkv", "a.mov") else (None,):
+        other_film(tmp_path / name, codec, empty_from=empty_from)
+        with Film(tmp_path / name) as film:
+            assert len(list(film)) == (60 if empty_from is None else 33)
+            assert film.shortfall == ""
+
+
+def test_sound_that_goes_on_makes_no_film_short(tmp_path):
+    with av.open(str(tmp_path / "a.mkv"), "w") as out:
+        pictures, sound = out.add_stream("mjpeg", rate=25), out.add_stream("pcm_s16le", rate=8000)
+        pictures.width, pictures.height, pictures.pix_fmt = 64, 48, "yuvj420p"
+        for _ in range(25):
+            out.mux(pictures.encode(av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="bgr24")))
+        for _ in range(5):
+            block = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), format="s16", layout="mono")
+            block.sample_rate = 8000
+            out.mux(sound.encode(block))
+    with Film(tmp_path / "a.mkv") as film:
+        assert len(list(film)) == 25
+        assert film.shortfall == ""
+
+
+def test_detect_keeps_what_a_film_has_that_is_cut_short_and_says_so(tmp_path, capsys):
+    other_film(tmp_path / "whole.avi", "mjpeg")
+    data = (tmp_path / "whole.avi").read_bytes()
+    (tmp_path / "cut.avi").write_bytes(data[: len(data) * 6 // 10])
+    for name, least, most in (("whole.avi", 60, 60), ("cut.avi", 30, 36)):
+        assert main(["detect", str(tmp_path / name), "--target", "bird", "--csv", str(tmp_path / "a.csv")]) == 0
+        out, err = capsys.readouterr()
+        found = json.loads(out)
+        assert least <= found["frames"] <= most
+        assert (tmp_path / "a.csv").is_file()
+        if least == 60:
+            assert (found["shortfall"], err) == (None, "")
+    assert found["shortfall"].startswith("the film says that it lasts 2.4 s, and ends at 1.")
+    assert err == f"{tmp_path / 'cut.avi'}: is not whole: {found['shortfall']}; the results are of what there is\n"
 
 
 def test_a_size_that_changes_on_the_way_is_named(tmp_path):

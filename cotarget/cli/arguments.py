@@ -8,12 +8,16 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cotarget.errors import ConfigError
+from cotarget.outputs import behind_link
+
+if TYPE_CHECKING:
+    from cotarget.config import RigConfig
 
 REMARK_S = 30.0  # between lines of progress where stderr is no terminal [s]
 
@@ -77,21 +81,64 @@ def nothing() -> Iterator[None]:
     yield None
 
 
-def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None]) -> None:
-    """Refuse a result file that cannot be written, or that is an input too, before the long work and not after it."""
-    taken = {path.resolve() for path in inputs if path is not None}
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None], folder: Path | None = None) -> None:
+    """Refuse a result that cannot be written, or that would destroy an input, before the long work and not after it.
+
+    Args:
+        outputs: files to write.
+        inputs: files that are read, and folders of which nothing may be changed.
+        folder: a new one to write, in which no output may be.
+
+    Raises:
+        ConfigError: for the first one, in one line.
+    """
+    taken = {_real(path) for path in inputs if path is not None}
+    if folder is not None:
+        _refuse_taken(folder, taken)
+        taken.add(_real(folder))
     for path in outputs:
         if path is None:
             continue
         if path.is_dir():
             raise ConfigError(f"{path}: is a folder; name the file to write")
         if path.exists() and not path.is_file():
-            raise ConfigError(f"{path}: is a device, not a file; name the file to write")
-        if not path.absolute().parent.is_dir():
+            raise ConfigError(f"{path}: is a device or a pipe, not a file; name the file to write")
+        if _is_said_to(path):
+            raise ConfigError(f"{path}: is where this command's own words go; name another file to write")
+        if (goal := behind_link(path)).is_symlink():
+            raise ConfigError(f"{path}: is a link to itself; name the file to write")
+        if not goal.absolute().parent.is_dir():
             raise ConfigError(f"{path}: its folder does not exist; create it first")
-        if path.resolve() in taken:
+        _refuse_taken(path, taken)
+        taken.add(_real(path))
+
+
+def rig_files(rig: Path | None, config: "RigConfig") -> list[Path | None]:
+    """Files and folders that a rig is opened with, none of which may be a result too: rig.toml, and what it names."""
+    scene = Path(config.sim.scene)
+    templates = [target.template for target in config.targets.values()]
+    return [rig, config.safety.stop_file, config.recording, scene if scene.is_file() else None, *templates]
+
+
+def _real(path: Path) -> Path:
+    return Path(os.path.realpath(path))
+
+
+def _refuse_taken(path: Path, taken: Iterable[Path]) -> None:
+    """Refuse what is one of these files, or in one of these folders."""
+    for each in taken:
+        if _real(path) == each:
             raise ConfigError(f"{path}: is read or written for something else too; give another name for the result")
-        taken.add(path.resolve())
+        if _real(path).is_relative_to(each):
+            raise ConfigError(f"{path}: is in {each}, which is read or written as a whole; name a file outside of it")
+
+
+def _is_said_to(path: Path) -> bool:
+    """Whether a file is where stdout or stderr goes."""
+    with contextlib.suppress(OSError):
+        file = path.stat()
+        return any(os.path.samestat(file, os.fstat(stream)) for stream in (1, 2))
+    return False
 
 
 @contextmanager
@@ -103,7 +150,7 @@ def previous_kept(path: Path) -> Iterator[None]:
     Raises:
         CalibrationError: the earlier one cannot be kept.
     """
-    kept = _second_name(path)
+    kept = _second_name(behind_link(path))
     try:
         yield
     except BaseException:

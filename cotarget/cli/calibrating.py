@@ -9,8 +9,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cotarget.cli.arguments import check_outputs, previous_kept, print_json, progress_bar
+from cotarget.cli.arguments import check_outputs, previous_kept, print_json, progress_bar, rig_files
 from cotarget.errors import ConfigError
+from cotarget.outputs import behind_link
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 LARGEST_SQUARE = 2.0  # [m]; more is surely meant in millimetres
 PHOTOS = ("fixed", "zoom", "board", "square")  # options that plain photos need
+LISTS = ("index.json", "session.json", "commands.jsonl")  # beside the images of a session
 SESSION = ("placements", "stops")  # and those of a capture session
 
 
@@ -30,7 +32,10 @@ def calibrate(options: argparse.Namespace) -> None:
     from cotarget.safety import SafeRig, refuse_if_stopped
     from cotarget.stills import with_stills
 
-    check_outputs([options.out], [options.rig, options.source and options.source / "index.json"])
+    config = None if options.rig is None else load_config(options.rig)
+    inputs = _photos(options.source) if config is None else rig_files(options.rig, config)
+    check_outputs([], inputs, options.captures)
+    check_outputs([options.out], [*inputs, *_lists(options.captures)])
     _check_together(options)
     how = cal.Options(options.method, encoders=options.encoders, insist=options.insist)
     with _captures_kept(options.captures), progress_bar() as progress:
@@ -38,8 +43,7 @@ def calibrate(options: argparse.Namespace) -> None:
         def tell(done: int, total: int, text: str) -> None:
             progress(f"calibrating: {text}", done, total)
 
-        if options.rig is not None:
-            config = load_config(options.rig)
+        if config is not None:
             refuse_if_stopped(config.safety.stop_file)
             with SafeRig(open_rig(config), config.safety) as rig:
                 session = {name: getattr(options, name) for name in _given(options, SESSION)}
@@ -69,6 +73,17 @@ def calibrate(options: argparse.Namespace) -> None:
     for rejected in found.residuals.rejected:
         print(f"not used: {rejected.name}: {rejected.reason}", file=sys.stderr)
     print_json(summary(found, options.out))
+
+
+def _lists(directory: Path | None) -> list[Path]:
+    """Where a folder of captures says what is in it."""
+    return [] if directory is None else [directory / name for name in LISTS]
+
+
+def _photos(directory: Path) -> list[Path]:
+    """What is read of a folder of captures or photos; a calibration may lie beside them."""
+    files = directory.iterdir() if directory.is_dir() else ()
+    return [path for path in files if path.suffix != ".json" or path.name in LISTS]
 
 
 @contextlib.contextmanager
@@ -168,8 +183,9 @@ def report(options: argparse.Namespace) -> None:
 
     check_outputs([options.out], [options.calibration])
     calibration = load_calibration(options.calibration)
-    print(write_report(options.out, calibration, options.calibration.name).text)
-    print(f"the page is {options.out}, and its pictures are in {options.out.stem}_pictures beside it")
+    page = behind_link(options.out)
+    print(write_report(page, calibration, options.calibration.name).text)
+    print(f"the page is {page}, and its pictures are in {page.stem}_pictures beside it")
 
 
 def board(options: argparse.Namespace) -> None:

@@ -7,7 +7,7 @@ import time
 import tomllib
 from typing import Any
 
-from cotarget.cli.arguments import check_outputs
+from cotarget.cli.arguments import check_outputs, rig_files
 from cotarget.errors import ConfigError
 
 # Mesa's software renderer: one thread, which leaves the client a core. Read when OpenGL starts.
@@ -45,7 +45,7 @@ def emulate(options: argparse.Namespace) -> None:
     if options.rig is not None:
         beside = copied_tables(tomllib.loads(options.rig.read_text(encoding="utf-8")), options.rig.parent)
     beside["safety"] = {"stop_file": STOP_FILE} | beside.get("safety", {})
-    check_outputs([options.write], [options.rig])
+    check_outputs([options.write], rig_files(options.rig, config))
     for fault in options.fault:
         parse_fault(fault)
     ports = Ports(options.host, options.head, options.fixed, options.zoom, options.board, options.control)

@@ -1,6 +1,7 @@
 """The commands. Machine-readable output goes to stdout or the named file; a mistake ends in one line on stderr."""
 
 import argparse
+import contextlib
 import logging
 import signal
 import sys
@@ -19,7 +20,8 @@ from cotarget.errors import CotargetError
 
 USAGE = 2  # argparse's own exit status
 INTERRUPTED = 130  # a shell's exit status for Ctrl-C
-TERMINATED = 143  # and for SIGTERM
+TERMINATED = 143  # for SIGTERM,
+HUNG_UP = 129  # and for SIGHUP: a terminal that was closed, a connection that broke
 KINDS = ("chessboard", "charuco")  # of boards
 
 
@@ -27,8 +29,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit status."""
     parser = _parser()
     options = parser.parse_args(arguments)
-    # A polite end is an end: the rig halts and half-written files go, as on Ctrl-C.
+    # A polite end is an end: the rig halts and files are completed, as on Ctrl-C.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # and not where nohup has it ignored
+        signal.signal(signal.SIGHUP, lambda *_: sys.exit(HUNG_UP))
     logging.basicConfig(level=logging.INFO if options.verbose else logging.WARNING, format="%(message)s")
     logging.getLogger("httpx").setLevel(logging.WARNING)  # which tells of every request
     try:
@@ -36,17 +40,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except CotargetError as error:
-        print(f"cotarget {options.command}: {error}", file=sys.stderr)
+        _say(options.command, str(error), error)
         return 1
     except BrokenPipeError:
         return 1
     except OSError as error:  # a full disk, a folder without permission: whatever the commands' own checks missed
         where = "" if error.filename is None else f"{error.filename}: "
-        print(f"cotarget {options.command}: {where}{error.strerror or error}", file=sys.stderr)
+        _say(options.command, f"{where}{error.strerror or error}", error)
         return 1
-    except KeyboardInterrupt:
-        print(f"cotarget {options.command}: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as end:
+        _say(options.command, "interrupted", end)
         return INTERRUPTED
+    except SystemExit as end:
+        if _notes(end):
+            _say(options.command, "terminated", end)
+        raise
+
+
+def _say(command: str, text: str, end: BaseException) -> None:
+    """Say in one line how a command ended, and which of its files end early by that."""
+    with contextlib.suppress(OSError):  # a terminal that has gone
+        print("; ".join([f"cotarget {command}: {text}", *_notes(end)]), file=sys.stderr)
+
+
+def _notes(end: BaseException) -> list[str]:
+    return getattr(end, "__notes__", [])
 
 
 class _Parser(argparse.ArgumentParser):
@@ -159,8 +177,13 @@ def _parser() -> argparse.ArgumentParser:
     follow.add_argument("--record", type=Path, metavar="DIR", help="record everything, for cotarget replay")
 
     replay = command("replay", running.replay, "run the pipeline again on a recording of follow --record")
-    replay.add_argument("recording", type=Path, metavar="DIR")
-    add_choice(replay)
+    replay.add_argument("recording", type=Path, metavar="DIR", help="its folder")
+    add_choice(replay, "whom the recorded run followed")
+    replay.add_argument(
+        "--check",
+        action="store_true",
+        help="end with status 1 where the commands differ from the recorded ones, which are told in any case",
+    )
     replay.add_argument(
         "--labels",
         type=Path,
@@ -224,9 +247,16 @@ def _parser() -> argparse.ArgumentParser:
 
     detect = command("detect", running.detect, "run the fixed camera's detector and tracker on any film")
     detect.add_argument("film", type=Path, metavar="VIDEO")
-    detect.add_argument("--target", required=True, metavar="NAME", help="a target of rig.toml")
     detect.add_argument(
-        "--csv", type=Path, required=True, metavar="FILE", help="confirmed tracks, one line each a frame"
+        "--target", required=True, metavar="NAME", help="a target of rig.toml (without: book, person, bird)"
+    )
+    detect.add_argument(
+        "--csv",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="write the confirmed tracks, one line each a frame: u_px and v_px are the box's centre, the score is 0 "
+        "where it is only predicted",
     )
     detect.add_argument("--video", type=Path, metavar="OUT", help="write the film with the tracks drawn (.mp4)")
     detect.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml, for targets of your own")
@@ -234,7 +264,8 @@ def _parser() -> argparse.ArgumentParser:
         "--labels",
         type=Path,
         metavar="FILE",
-        help="score the tracks by these: a csv with frame,x_px,y_px,width_px,height_px, from 0 and the top-left pixel",
+        help="score the tracks by these boxes: a csv with frame,x_px,y_px,width_px,height_px, all from 0; x and y are "
+        "of the box's top-left pixel",
     )
 
     board = command("board", calibrating.board, "write a calibration board to print, to scale")

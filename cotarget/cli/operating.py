@@ -6,7 +6,7 @@ import sys
 import tomllib
 from pathlib import Path
 
-from cotarget.cli.arguments import check_outputs, check_within, previous_kept, print_json
+from cotarget.cli.arguments import check_outputs, check_within, previous_kept, print_json, rig_files
 from cotarget.errors import CalibrationError, ConfigError
 
 CONSENT = "yes"
@@ -76,7 +76,7 @@ def point(options: argparse.Namespace) -> None:
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
     shots = {} if options.pictures is None else {name: options.pictures / f"{name}.png" for name in ("fixed", "zoom")}
-    check_outputs(list(shots.values()), [options.rig])
+    check_outputs(shots.values(), rig_files(options.rig, config))
     with SafeRig(open_rig(config), config.safety) as rig:
         limits = rig.head.limits
         for option, angle, bounds in (

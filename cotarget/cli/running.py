@@ -2,23 +2,21 @@
 
 import argparse
 import dataclasses
-import json
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cotarget.cli.arguments import check_outputs, nothing, print_json, progress_bar
-from cotarget.cli.choosing import Choice
-from cotarget.errors import ConfigError
+from cotarget.cli.arguments import check_outputs, nothing, print_json, progress_bar, rig_files
+from cotarget.cli.choosing import Choice, check_shown
+from cotarget.cli.reasons import Reasons
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig
     from cotarget.loop import Step
     from cotarget.metrics import Label, Tracked
-    from cotarget.rig import Rig
+    from cotarget.safety import SafeRig
 
 
 def demo(options: argparse.Namespace) -> None:
@@ -41,27 +39,27 @@ def follow(options: argparse.Namespace) -> None:
 
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
-    target = config.target(options.target)
+    config.target(options.target)  # refused now
     calibration = load_calibration(options.calibration)
-    if config.backend == "sim" and options.target not in config.sim.targets:
-        raise ConfigError(
-            f"{options.rig}: the simulated scene has no {options.target}; add it: [sim] targets = "
-            f"{json.dumps([*config.sim.targets, options.target])}"
-        )
-    check_outputs([options.csv, options.video], [options.rig, options.calibration, target.template])
+    check_shown(config, options.target, options.rig)
+    inputs = [*rig_files(options.rig, config), options.calibration]
+    check_outputs([options.csv, options.video], inputs, options.record)
     choice = Choice(options, config.stream_sizes[0])
     with (
-        Recorder(options.record, config, options.calibration, options.target)
+        Recorder(options.record, config, options.calibration, options.target, choice.whom)
         if options.record
-        else nothing() as recorder,
-        SafeRig(recorder.wrap(open_rig(config)) if recorder else open_rig(config), config.safety) as rig,
+        else nothing() as recorder
     ):
-        states = _follow(rig, calibration, config, options.target, choice, options.seconds, options.csv, options.video)
+
+        def opened() -> SafeRig:
+            return SafeRig(recorder.wrap(open_rig(config)) if recorder else open_rig(config), config.safety)
+
+        states = _follow(opened, calibration, config, options, options.target, choice, options.seconds)
     _tell_if_nothing_was_seen("follow", options.target, states["states"], choice)
     print_json(states)
 
 
-def replay(options: argparse.Namespace) -> None:
+def replay(options: argparse.Namespace) -> int:
     """Cotarget replay."""
     from cotarget.calibration import load_calibration
     from cotarget.metrics import Tracked, read_labels
@@ -72,7 +70,8 @@ def replay(options: argparse.Namespace) -> None:
     for note in recording.notes:
         print(f"{options.recording}: {note}", file=sys.stderr)
     calibration = load_calibration(recording.calibration)
-    check_outputs([options.csv, options.video], [recording.calibration, options.labels])
+    inputs = [*rig_files(None, recording.config), options.recording, options.labels]
+    check_outputs([options.csv, options.video], inputs)
     labels = None if options.labels is None else read_labels(options.labels)
     pictures, tracks = recording.pictures, list[Tracked]()
 
@@ -81,28 +80,35 @@ def replay(options: argparse.Namespace) -> None:
         tracks.extend(Tracked(number, step.fixed.t, each.id, each.center_px) for each in step.tracks if each.confirmed)
 
     played = ReplayRig(recording)
-    choice = Choice(options, played.fixed.size)
-    with SafeRig(played, recording.config.safety) as rig:
-        config, name, steps = recording.config, recording.target, recording.steps
-        states = _follow(rig, calibration, config, name, choice, math.inf, options.csv, options.video, steps, see)
+    choice = Choice(options, played.fixed.size, recording.whom)
+    config, name, steps = recording.config, recording.target, recording.steps
+    states = _follow(
+        lambda: SafeRig(played, config.safety), calibration, config, options, name, choice, math.inf, steps, see
+    )
     _tell_if_nothing_was_seen("replay", recording.target, states["states"], choice)
-    scores = _scores(tracks, labels, config.rate_hz, states["steps"])
-    print_json(states | {"differences": dataclasses.asdict(played.differences)} | scores)
+    scores = _scores(options, tracks, labels, config.rate_hz, max(pictures.values(), default=-1) + 1)
+    differences = played.differences
+    print_json(states | {"differences": dataclasses.asdict(differences)} | scores)
+    if not differences.same:
+        print(f"cotarget replay: {differences}", file=sys.stderr)
+    return 1 if options.check and not differences.same else 0
 
 
 def _follow(
-    rig: "Rig",
+    opened: "Callable[[], SafeRig]",
     calibration: "Calibration",
     config: "RigConfig",
+    options: argparse.Namespace,
     name: str,
     choice: Choice,
     seconds: float,
-    csv: Path | None,
-    video: Path | None,
     frames: int | None = None,
     see: "Callable[[Step], None]" = lambda _: None,
 ) -> dict[str, Any]:
-    """Follow a target, show the progress, keep what is asked for; how many steps there were, and in which states."""
+    """Follow a target, show the progress, keep what is asked for; how many steps there were, in which states and why.
+
+    However it ends, the head is halted first and the files are completed after that, with what there is by then.
+    """
     from cotarget.detection import make_detector
     from cotarget.drawing import side_by_side
     from cotarget.loop import FollowSettings, State, follow
@@ -116,23 +122,26 @@ def _follow(
         command_delay_s=config.command_delay_s, lens_delay_s=config.lens_delay_s, policy=choice.policy
     )
     states: dict[str, int] = dict.fromkeys(State, 0)
+    reasons = Reasons()
     expected = math.ceil(seconds * config.rate_hz) if frames is None else frames
     with (
-        StepTable(csv) as table,
-        FilmWriter(video, config.rate_hz) if video else nothing() as film,
+        StepTable(options.csv, keep=True) as table,
+        FilmWriter(options.video, config.rate_hz, keep=True) if options.video else nothing() as film,
         progress_bar() as progress,
+        opened() as rig,
     ):
         for step in until_end(follow(rig, calibration, target, detector, seconds=seconds, settings=settings)):
             table.write(step)
             choice.see(step)
+            reasons.see(step)
             see(step)
             states[step.state] += 1
             if film is not None:
                 film.write(side_by_side(step, name))
             progress(f"following: {name}: {step.state}", min(step.index + 1, expected), expected)
-    if choice.unmet:
-        print(choice.unmet, file=sys.stderr)
-    return {"steps": sum(states.values()), "states": states}
+    for line in filter(None, (choice.unmet, reasons.warning and f"cotarget {options.command}: {reasons.warning}")):
+        print(line, file=sys.stderr)
+    return {"steps": sum(states.values()), "states": states, "reasons": reasons.table}
 
 
 def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int], choice: Choice) -> None:
@@ -156,7 +165,8 @@ def detect(options: argparse.Namespace) -> None:
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
     target = config.target(options.target)
-    check_outputs([options.csv, options.video], [options.film, options.rig, options.labels, target.template])
+    inputs = [options.film, options.labels, *rig_files(options.rig, config)]
+    check_outputs([options.csv, options.video], inputs)
     labels = None if options.labels is None else read_labels(options.labels)
     with progress_bar() as progress:
         found = run_on_film(
@@ -165,18 +175,34 @@ def detect(options: argparse.Namespace) -> None:
             options.csv,
             options.video,
             lambda done, total: progress(f"detecting: {options.target}", done, total or done),
+            keep=True,
         )
-    scores = _scores(read_tracks(options.csv), labels, found.rate_hz, found.frames)
+    scores = _scores(options, read_tracks(options.csv), labels, found.rate_hz, found.frames)
     print_json(dataclasses.asdict(found) | scores)
+    if found.shortfall is not None:
+        print(f"{options.film}: is not whole: {found.shortfall}; the results are of what there is", file=sys.stderr)
 
 
 def _scores(
-    tracks: "Iterable[Tracked]", labels: "Mapping[int, Sequence[Label]] | None", rate_hz: float, frames: int
+    options: argparse.Namespace,
+    tracks: "Iterable[Tracked]",
+    labels: "Mapping[int, Sequence[Label]] | None",
+    rate_hz: float,
+    frames: int,
 ) -> dict[str, Any]:
     """How well tracks keep to what is labelled; nothing where nobody gave labels."""
     from cotarget.metrics import score_tracks
 
-    return {} if labels is None else dataclasses.asdict(score_tracks(tracks, labels, rate_hz, frames))
+    if labels is None:
+        return {}
+    score = score_tracks(tracks, labels, rate_hz, frames)
+    if score.labels_beyond_end:
+        print(
+            f"{options.labels}: {score.labels_beyond_end} of {len(labels)} labelled frames are beyond the last one, "
+            f"{frames - 1}, and are not counted; are the labels of another film?",
+            file=sys.stderr,
+        )
+    return dataclasses.asdict(score)
 
 
 def doctor(options: argparse.Namespace) -> int:

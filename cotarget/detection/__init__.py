@@ -53,6 +53,8 @@ def make_detector(target: TargetConfig, rate_hz: float, template: Image | None =
     if template is None:
         if target.template is None:
             raise ConfigError('a target with detector = "colour" needs a template, a picture of the target')
+        if not target.template.exists():
+            raise ConfigError(f"{target.template}: no such file; a target's template is a PNG or JPEG of it")
         read = cv2.imread(str(target.template), cv2.IMREAD_COLOR) if target.template.is_file() else None
         if read is None:
             raise ConfigError(f"{target.template}: is not a picture; a target's template is a PNG or JPEG of it")

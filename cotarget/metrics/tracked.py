@@ -53,7 +53,7 @@ class TrackScore:
     A track is on a target when it is no farther from the label's middle than the label's larger side.
 
     Attributes:
-        labelled_frames: that are judged: those after LEARNING_FRAMES.
+        labelled_frames: that are judged: those after LEARNING_FRAMES, up to the film's last.
         on_target_ratio: of these, in how many a track is on a label.
         numbers: how many different tracks were on a label in them.
         offset_px_median: of the track on it, from the label's middle [px].
@@ -61,6 +61,7 @@ class TrackScore:
         false_tracks: tracks that were off every label for 0.5 s on end in frames that have labels, or that lived for
             0.5 s and were never on one.
         false_tracks_per_min: the same, a minute of the film.
+        labels_beyond_end: labelled frames that the film does not have; they are not judged, and of another film maybe.
     """
 
     labelled_frames: int
@@ -70,6 +71,7 @@ class TrackScore:
     fragmentation_per_min: float | None
     false_tracks: int
     false_tracks_per_min: float | None
+    labels_beyond_end: int = 0
 
 
 def score_tracks(
@@ -83,7 +85,7 @@ def score_tracks(
 
     Args:
         tracks: the confirmed ones of every frame.
-        labels: by the frame's number, from 0.
+        labels: by the frame's number, from 0; those of frames that the film does not have are left out, and counted.
         rate_hz: frames a second.
         frames: how many the film has.
         learning_frames: so many at its beginning are not judged.
@@ -98,7 +100,8 @@ def score_tracks(
                 on = offsets.setdefault(each.frame, {})
                 on[each.track] = min(offset, on.get(each.track, math.inf))
     false = sum(_is_false(life, labels, offsets) for life in lives.values())
-    judged = sorted(frame for frame, boxes in labels.items() if boxes and frame >= learning_frames)
+    labelled = sorted(frame for frame, boxes in labels.items() if boxes)
+    judged = [frame for frame in labelled if learning_frames <= frame < frames]
     hits = [offsets[frame] for frame in judged if frame in offsets]
     minutes, labelled_minutes = frames / rate_hz / 60, len(judged) / rate_hz / 60
     breaks = _breaks([frame in offsets for frame in judged], judged, rate_hz)
@@ -107,9 +110,10 @@ def score_tracks(
         on_target_ratio=len(hits) / len(judged) if judged else None,
         numbers=len({track for on in hits for track in on}),
         offset_px_median=float(np.median([min(on.values()) for on in hits])) if hits else None,
-        fragmentation_per_min=breaks / labelled_minutes if judged else None,
+        fragmentation_per_min=breaks / labelled_minutes if hits else None,
         false_tracks=false,
         false_tracks_per_min=false / minutes if frames else None,
+        labels_beyond_end=sum(frame >= frames for frame in labelled),
     )
 
 
@@ -149,16 +153,18 @@ def read_labels(path: Path) -> dict[int, list[Label]]:
     """Read labels: a csv with frame (from 0), x_px, y_px (of the top-left pixel, from 0), width_px and height_px.
 
     Raises:
-        ConfigError: the file is missing, or is no such table.
+        ConfigError: the file is missing, is no such table, or has no row.
     """
     labels: dict[int, list[Label]] = {}
     for row in _table(path, LABELS, "labels"):
         frame, x, y, width, height = (row[name] for name in LABELS)
-        if not (width > 0 and height > 0 and frame == int(frame)):
-            raise ConfigError(f"{path}: a label wants a whole frame and a width and height above 0, not {row}")
+        if not (width > 0 and height > 0 and frame >= 0 and frame == int(frame)):
+            raise ConfigError(f"{path}: a label wants a whole frame from 0 and a width and height above 0, not {row}")
         size = np.array([width, height])
         # A box of w pixels from column x covers columns x to x + w - 1.
         labels.setdefault(int(frame), []).append(Label(np.array([x, y]) + (size - 1) / 2, size))
+    if not labels:
+        raise ConfigError(f"{path}: holds no label, but for the names of its columns; it wants a row for each box")
     return labels
 
 
@@ -182,7 +188,7 @@ def _table(path: Path, names: Sequence[str], what: str) -> list[dict[str, float]
         ConfigError: the file is missing, lacks a column, or holds something else.
     """
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # as spreadsheets write it
             reader = csv.DictReader(file)
             if missing := [name for name in names if name not in (reader.fieldnames or ())]:
                 raise ValueError(f"it has no column '{missing[0]}'; it wants {', '.join(names)}")
@@ -190,5 +196,9 @@ def _table(path: Path, names: Sequence[str], what: str) -> list[dict[str, float]
         if any(not math.isfinite(value) for row in rows for value in row.values()):
             raise ValueError("a number is missing")
         return rows
-    except (OSError, csv.Error, ValueError, TypeError) as error:
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; give a csv with {','.join(names)}") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except (csv.Error, ValueError, TypeError) as error:
         raise ConfigError(f"{path}: is no table of {what}: {error}") from None

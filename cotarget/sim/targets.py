@@ -5,7 +5,6 @@ models in sim_assets/targets.
 """
 
 import math
-import re
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ import numpy as np
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.sim.paths import MOUNT, Path, bird_path, book_path, person_path, waypoint_path
-from cotarget.simconfig import Waypoint
+from cotarget.simconfig import TARGETS, Waypoint, split_name
 
 if TYPE_CHECKING:
     import mujoco
@@ -37,7 +36,6 @@ __all__ = [
     "waypoint_path",
 ]
 
-TARGETS = ("book", "person", "bird")
 # The markers that they carry, ids in DICT_4X4_50: those of the first of a kind, and what is added for each further one;
 # the models' textures are drawn for five of a kind, after which the ids repeat. All books carry the same.
 MARKERS = {"book": 1, "person": 2, "bird": 3}
@@ -182,13 +180,13 @@ def marker_of(name: str) -> int:
 @lru_cache(maxsize=256)
 def _place_of(name: str) -> tuple[int, int]:
     """Index of a target's kind in TARGETS, and its number among its kind, from 1 on."""
-    found = re.fullmatch(rf"({'|'.join(TARGETS)})([2-9]|[1-9]\d+)?", name)
-    if found is None:
+    kind, number = split_name(name)
+    if kind not in TARGETS:
         raise ConfigError(
             f"unknown target '{name}'; the simulation has: {choices(TARGETS)}, and further ones with a number, as "
             "'bird2'"
         )
-    return TARGETS.index(found[1]), int(found[2] or 1)
+    return TARGETS.index(kind), number
 
 
 def change_marker(spec: "mujoco.MjSpec", name: str) -> None:

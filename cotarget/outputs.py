@@ -1,0 +1,175 @@
+"""Files that appear under their name only when complete, and that one run at a time writes."""
+
+import contextlib
+import csv
+import fcntl
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+
+from cotarget.errors import ConfigError, CotargetError
+
+
+def behind_link(path: Path) -> Path:
+    """The file that a name stands for: a link's goal, which may not exist yet, or else the name itself."""
+    return Path(os.path.realpath(path)) if path.is_symlink() else path
+
+
+class PartFile:
+    """The file beside a result in which it is written, and which gets the result's name in one step.
+
+    It has the same name in every run and is locked as long as its run lives: a second run on the same result is
+    refused, and what a killed one has left is taken over.
+
+    Attributes:
+        path: what to write to.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Take the file; what is in it may be of a killed run.
+
+        Args:
+            path: the result; where it is a link, its goal is what is replaced in the end.
+
+        Raises:
+            ConfigError: another run is writing it, or it cannot be written.
+        """
+        self._name, self._final = path, behind_link(path)
+        self.path = self._final.with_name(f".{self._final.stem}.part{self._final.suffix}")
+        try:
+            self._lock = self._take()
+        except BlockingIOError:
+            raise ConfigError(f"{path}: is being written by another run; give another name, or wait for it") from None
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
+
+    def _take(self) -> int:
+        """A locked descriptor of the file; never of one that has just got its final name, or was removed."""
+        while True:
+            lock = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+            try:
+                with contextlib.suppress(FileNotFoundError):
+                    _lock(lock)
+                    if os.path.samestat(os.fstat(lock), self.path.stat()):
+                        return lock
+            except BaseException:
+                os.close(lock)
+                raise
+            os.close(lock)
+
+    @contextlib.contextmanager
+    def ending(self, *, keep: bool, error: BaseException | None = None) -> Iterator[None]:
+        """Stands around what completes and closes the file; after it the file has its name, or is gone.
+
+        Args:
+            keep: whether it is to have its name.
+            error: what the run ended in, if it did; it is told what becomes of the file.
+
+        Raises:
+            CotargetError: the file could not be completed, as on a full disk; after an error it only gets a note.
+        """
+        kept = False
+        try:
+            yield
+            if keep:
+                self.path.replace(self._final)
+                kept = True
+                if error is not None:
+                    error.add_note(f"{self._name} ends early")
+        except (OSError, CotargetError) as failure:
+            if error is None:
+                raise said(self._name, failure) from None
+            if keep:
+                error.add_note(f"{self._name} could not be completed")
+        finally:
+            if not kept:
+                self.path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                fcntl.flock(self._lock, fcntl.LOCK_UN)  # a child process may hold the descriptor too
+            os.close(self._lock)
+
+
+def _lock(descriptor: int) -> None:
+    """Lock a file, where its file system knows locks.
+
+    Raises:
+        BlockingIOError: somebody else has locked it.
+    """
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError:
+        pass
+
+
+def said(path: Path, failure: OSError | CotargetError) -> CotargetError:
+    """An error that names the file; a full disk's does not."""
+    return (
+        failure if isinstance(failure, CotargetError) else ConfigError(f"{path}: cannot be written: {failure.strerror}")
+    )
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Replace a file's content in one step, also when the program or the power fails half-way.
+
+    Raises:
+        ConfigError: the file cannot be written, or another run is writing it.
+    """
+    part = PartFile(path)
+    with part.ending(keep=True), part.path.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+class CsvFile:
+    """A table as csv; appears under its name only when complete. A context manager."""
+
+    def __init__(self, path: Path, columns: Sequence[str], *, keep: bool = False, line_end: str = "\r\n") -> None:
+        """Prepare to write.
+
+        Args:
+            path: the file.
+            columns: its first line.
+            keep: whether the rows so far are kept where the block ends in an error.
+            line_end: behind each line.
+
+        Raises:
+            ConfigError: the file cannot be written.
+        """
+        self._path, self._keep, self._rows, self._broken = path, keep, 0, False
+        self._part = PartFile(path)
+        self._file = self._part.path.open("w", newline="", encoding="utf-8")
+        self._writer = csv.writer(self._file, lineterminator=line_end)
+        self._writer.writerow(columns)
+
+    def write(self, row: Iterable[object]) -> None:
+        """Append a line.
+
+        Raises:
+            ConfigError: the disk is full.
+        """
+        try:
+            self._writer.writerow(row)
+        except OSError as error:
+            self._broken = True
+            raise said(self._path, error) from None
+        self._rows += 1
+
+    def __enter__(self) -> "CsvFile":
+        """Give the table itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Complete the file and give it its name; after an error, remove it or keep the rows that it has.
+
+        Raises:
+            ConfigError: the file could not be completed, as on a full disk.
+        """
+        keep = not self._broken and (error is None or (self._keep and self._rows > 0))
+        with self._part.ending(keep=keep, error=error):
+            self._file.close()  # which writes what is left, and may find the disk full

@@ -1,0 +1,166 @@
+"""Results: under their name only when complete, written by one run at a time, and through links."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cotarget import outputs
+from cotarget.drawing import write_picture
+from cotarget.errors import ConfigError
+from cotarget.outputs import CsvFile, PartFile, write_whole
+from cotarget.video import Film, FilmWriter
+from tests.full_disk import SAID, full_disk
+
+ROOT = Path(__file__).parents[1]
+IMAGE = np.full((48, 64, 3), 90, np.uint8)
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def write_table(path, rows, error=None, keep=False):
+    with CsvFile(path, ("n",), keep=keep) as table:
+        for row in range(rows):
+            table.write([row])
+        if error is not None:
+            raise error
+
+
+def write_film(path, frames, error=None, keep=False):
+    with FilmWriter(path, 25.0, keep=keep) as film:
+        for _ in range(frames):
+            film.write(IMAGE)
+        if error is not None:
+            raise error
+
+
+@pytest.mark.parametrize(("name", "write"), [("a.csv", write_table), ("a.mp4", write_film)])
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt(), SystemExit(143), ConfigError("the camera is gone"), ValueError()]
+)
+def test_what_there_is_can_be_kept_after_an_error_which_says_so(tmp_path, name, write, error):
+    error.__dict__.pop("__notes__", None)
+    path = tmp_path / name
+    path.write_text("old")
+    with pytest.raises(type(error)):
+        write(path, 3, error)
+    assert path.read_text() == "old"
+    with pytest.raises(type(error)) as caught:
+        write(path, 0, error, keep=True)  # nothing is worth no more than what was there
+    assert path.read_text() == "old"
+    assert not hasattr(caught.value, "__notes__")
+    with pytest.raises(type(error)) as caught:
+        write(path, 3, error, keep=True)
+    assert caught.value.__notes__ == [f"{path} ends early"]
+    assert names(tmp_path) == [name]
+    if name == "a.csv":
+        assert path.read_text().split() == ["n", "0", "1", "2"]
+    else:
+        with Film(path) as film:
+            assert len(list(film)) == 3
+
+
+@pytest.mark.parametrize("rows", [1, 10_000])  # found full at the end, and on the way
+@pytest.mark.parametrize("error", [None, KeyboardInterrupt()])
+def test_a_full_disk_keeps_no_half_table(tmp_path, rows, error):
+    path = tmp_path / "a.csv"
+    path.write_text("old")
+    with full_disk(), pytest.raises((ConfigError, KeyboardInterrupt)):
+        write_table(path, rows, error, keep=True)
+    assert path.read_text() == "old"
+    assert names(tmp_path) == ["a.csv"]
+
+
+def test_a_full_disk_keeps_no_half_film(tmp_path):
+    path = tmp_path / "a.mp4"
+    with full_disk(1000), pytest.raises(KeyboardInterrupt) as caught:
+        write_film(path, 3, KeyboardInterrupt(), keep=True)
+    assert caught.value.__notes__ == [f"{path} could not be completed"]
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize(("name", "make"), [
+    ("a.csv", lambda path: CsvFile(path, ("n",))),
+    ("a.mp4", lambda path: FilmWriter(path, 25.0)),
+])  # fmt: skip
+def test_a_second_run_on_the_same_result_is_refused(tmp_path, name, make):
+    path = tmp_path / name
+    (tmp_path / "link").symlink_to(path)
+    with make(path):
+        for other in (path, tmp_path / "link"):
+            with pytest.raises(ConfigError, match="is being written by another run") as caught:
+                make(other)
+            assert str(other) in str(caught.value)
+    with make(path):  # and not after that
+        pass
+
+
+def test_what_a_killed_run_has_left_is_taken_over(tmp_path):
+    path = tmp_path / "a.csv"
+    killed = (
+        "import os, pathlib\nfrom cotarget.outputs import CsvFile\n"
+        "table = CsvFile(pathlib.Path('a.csv'), ('much',) * 1000)\n"
+        "table._file.flush()\nos.kill(os.getpid(), 9)\n"
+    )
+    subprocess.run([sys.executable, "-c", killed], cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}, check=False)
+    assert names(tmp_path) == [".a.part.csv"]
+    write_table(path, 1)
+    assert names(tmp_path) == ["a.csv"]
+    assert path.read_text().split() == ["n", "0"]
+
+
+def test_a_result_that_has_just_got_its_name_is_not_taken_for_a_part(tmp_path, monkeypatch):
+    """A second run opens the part of the first, which is renamed before it can lock it."""
+    path = tmp_path / "a.csv"
+    first, opened = PartFile(path), []
+    first.path.write_text("first")
+
+    def lock(descriptor, plain=outputs._lock):
+        if not opened:
+            opened.append(descriptor)
+            with first.ending(keep=True):
+                pass
+        plain(descriptor)
+
+    monkeypatch.setattr("cotarget.outputs._lock", lock)
+    second = PartFile(path)
+    with pytest.raises(ConfigError, match="another run"):
+        PartFile(path)
+    second.path.write_text("second")
+    assert path.read_text() == "first"
+    with second.ending(keep=True):
+        pass
+    assert path.read_text() == "second"
+    assert names(tmp_path) == ["a.csv"]
+
+
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_link_stays_and_its_goal_is_written(tmp_path, exists):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "near").mkdir()
+    goal, link = tmp_path / "far" / "goal.csv", tmp_path / "near" / "a.csv"
+    link.symlink_to(goal)
+    if exists:
+        goal.write_text("old")
+    write_table(link, 1)
+    assert link.is_symlink()
+    assert goal.read_text().split() == ["n", "0"]
+    write_whole(link, b"whole")
+    assert link.is_symlink()
+    assert goal.read_bytes() == b"whole"
+    assert names(goal.parent) == ["goal.csv"]
+    assert names(link.parent) == ["a.csv"]
+
+
+def test_a_picture_is_the_old_or_the_new_one(tmp_path):
+    path = tmp_path / "a.png"
+    write_picture(path, IMAGE)
+    old = path.read_bytes()
+    with full_disk(10), pytest.raises(ConfigError, match=f"a.png: cannot be written: {SAID}"):
+        write_picture(path, np.zeros_like(IMAGE))
+    assert path.read_bytes() == old
+    assert names(tmp_path) == ["a.png"]
