@@ -35,6 +35,7 @@ import cotarget
 from cotarget.cli.arguments import count, not_negative
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array
+from cotarget.parallel import end_with_parent
 
 Row = dict[str, Any]
 Job = TypeVar("Job")
@@ -206,9 +207,10 @@ def spread(work: Callable[[Job], list[Row]], jobs: Iterable[Job], processes: int
         yield from progress(map(work, jobs))
         return
     context = multiprocessing.get_context("spawn")
+    begin = (functools.partial(cv2.setNumThreads, 1),)
     with (
         _one_thread_each(),
-        ProcessPoolExecutor(min(processes, len(jobs)), context, initializer=cv2.setNumThreads, initargs=(1,)) as pool,
+        ProcessPoolExecutor(min(processes, len(jobs)), context, initializer=end_with_parent, initargs=begin) as pool,
     ):
         try:
             with _interrupts_ignored():
