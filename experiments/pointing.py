@@ -27,7 +27,7 @@ from cotarget.servo import reach_of
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Method
 from experiments import harness
-from experiments.harness import Experiment, Row, over_seeds, seeds_of
+from experiments.harness import Experiment, Row, seeds_of
 
 RIGS = {
     "default": SimConfig(scene="indoor"),
@@ -55,13 +55,8 @@ class Settings(harness.Settings):
     targets: int = 400
 
 
-def run(settings: Settings) -> list[Row]:
-    """Calibrate every rig once a seed; one row for each model's error then [degrees]."""
-    return over_seeds(one, settings)
-
-
-def one(settings: Settings, seed: int) -> list[Row]:
-    """Calibrate every rig once."""
+def one(_: None, settings: Settings, seed: int) -> list[Row]:
+    """Calibrate every rig once; one row for each model's error then [degrees]."""
     rows: list[Row] = []
     for rig, sim in RIGS.items():
         config = RigConfig(sim=dataclasses.replace(sim, seed=seed))
@@ -135,10 +130,11 @@ EXPERIMENT = Experiment(
     "How well a rig points after it was calibrated from rendered boards, and what simpler models lose.",
     SETTINGS,
     dataclasses.replace(SETTINGS, seeds=1, targets=50),
-    run,
+    one,
     summarise,
     describe,
     plot,
+    cost_s=90.0,
 )
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import pytest
 
 from cotarget.config import parse_config
 from cotarget.errors import DeviceError
-from cotarget.sim.ahead import READ_IN_TURN, Ahead
+from cotarget.sim.ahead import READ_IN_TURN, Ahead, is_allowed
 from cotarget.sim.world import SimWorld
 
 FRAMES = READ_IN_TURN + 8
@@ -50,6 +50,14 @@ def test_frames_are_the_same_whether_rendered_ahead_or_not():
         assert a.t == b.t
         np.testing.assert_array_equal(a.image, b.image)
     assert len(workers()) == before
+
+
+def test_nothing_is_rendered_ahead_where_that_is_forbidden(monkeypatch):
+    assert is_allowed()
+    monkeypatch.setenv("COTARGET_AHEAD", "0")
+    assert not is_allowed()
+    monkeypatch.setattr("cotarget.sim.world.Ahead", lambda views: pytest.fail("another thread was asked for"))
+    world(rendered=("zoom",)).rig.close()
 
 
 @pytest.fixture
