@@ -185,8 +185,9 @@ def _do(sweep: Sweep, engine: Engine, what: str) -> int:
         why, status = "interrupted", INTERRUPTED
     except SystemExit:
         why, status = "ended", TERMINATED
-    kept = f"{sweep.done} of {sweep.total} jobs are done and kept in {sweep.folder}"
-    print(f"{PROGRAM}: {why}; {kept}, and the same command goes on from there", file=sys.stderr)
+    if sweep.done:
+        why += f"; {sweep.done} of {sweep.total} jobs are done and kept in {sweep.folder}, and the same command goes on"
+    print(f"{PROGRAM}: {why}", file=sys.stderr)
     return status
 
 

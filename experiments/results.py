@@ -87,7 +87,7 @@ def is_same_version(one: str, other: str, *, any_code: bool) -> bool:
 def identity(settings: Settings) -> dict[str, Any]:
     """The settings that a job's rows depend on, as JSON has them."""
     told = {key: value for key, value in dataclasses.asdict(settings).items() if key not in ONLY_HOW_MANY}
-    read: dict[str, Any] = json.loads(json.dumps(told))
+    read: dict[str, Any] = json.loads(json.dumps(told, default=str))
     return read
 
 

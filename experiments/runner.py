@@ -128,7 +128,9 @@ class Sweep:
             left -= self.cases[i].experiment.cost_s
             failures = f", {self.failed} failed" if self.failed else ""
             last = f"{self.cases[i].title} {number}"
-            show(f"{self.done} of {self.total} jobs{failures}; last {last}", total - left, total)
+            show(
+                f"{self.done} of {self.total} jobs{failures}; last {last}", min(total - left, total), total
+            )  # rounding
 
         def do(tasks: Sequence[Task], using: Engine) -> list[Task]:
             """Do tasks, the longest first; the jobs for which something was prepared."""
