@@ -226,7 +226,7 @@ def _all(engine: Engine, work: Callable[[Any], Any], jobs: Sequence[Any], proces
     found: dict[int, Any] = {}
     for number, result in tqdm(engine(work, jobs, processes), total=len(jobs), disable=None, leave=False):
         if result is Died:
-            raise DeviceError(f"the process that did number {number} of {len(jobs)} died; is there memory enough?")
+            raise DeviceError(f"the process of job {number + 1} of {len(jobs)} died; is there memory enough?")
         found[number] = result
     return [found[number] for number in sorted(found)]
 
@@ -262,11 +262,7 @@ def check_folder(out: Path) -> None:
 
 def versions() -> dict[str, str]:
     """Of what the figures depend on."""
-    return {
-        "cotarget": cotarget.__version__,
-        "opencv": cv2.__version__,
-        **{name: version(name) for name in PACKAGES},
-    }
+    return {"cotarget": cotarget.__version__, "opencv": cv2.__version__} | {name: version(name) for name in PACKAGES}
 
 
 def rms(values: "Iterable[float] | Array") -> float:

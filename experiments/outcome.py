@@ -60,6 +60,11 @@ class Outcome:
         return [record.seconds for record in self.records.values()]
 
     @property
+    def cpu_s(self) -> float:
+        """Processor time of the jobs [s]."""
+        return sum(record.cpu_s for record in self.records.values())
+
+    @property
     def renders(self) -> int:
         """How many pictures MuJoCo drew for the jobs."""
         return sum(record.renders for record in self.records.values())

@@ -192,7 +192,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _times(run: Run) -> Iterator[str]:
-    header = ("experiment", "jobs", "all together", "median", "longest", "renders", "beside others")
+    header = ("experiment", "jobs", "all together", "median", "longest", "processor", "renders", "beside others")
     rows = [
         (
             outcome.case.title,
@@ -200,6 +200,7 @@ def _times(run: Run) -> Iterator[str]:
             duration(sum(outcome.seconds)),
             duration(float(np.median(outcome.seconds))),
             duration(max(outcome.seconds)),
+            duration(outcome.cpu_s),
             str(outcome.renders),
             "no" if outcome.case.experiment.alone else "yes",
         )
@@ -207,10 +208,11 @@ def _times(run: Run) -> Iterator[str]:
         if outcome.seconds
     ]
     jobs, total = sum(len(o.seconds) for o in run.outcomes), sum(sum(o.seconds) for o in run.outcomes)
-    rows.append(("all", str(jobs), duration(total), "", "", str(sum(o.renders for o in run.outcomes)), ""))
+    cpu_s, renders = sum(o.cpu_s for o in run.outcomes), sum(o.renders for o in run.outcomes)
+    rows.append(("all", str(jobs), duration(total), "", "", duration(cpu_s), str(renders), ""))
     note = (
-        "The time of a job is that of its process. Renders are pictures that MuJoCo drew for the jobs there. Jobs that "
-        "are not done beside others measure times themselves."
+        "Processor time and renders, pictures that MuJoCo drew, are those of the jobs' own processes. Jobs that are "
+        "not done beside others measure times themselves."
     )
     yield markup.table(Table("", header, tuple(rows), note))
     sessions = tuple(

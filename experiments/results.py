@@ -44,6 +44,7 @@ class Record:
     Attributes:
         number: its seed.
         seconds: that it took [s].
+        cpu_s: processor time of it [s]; what it leaves to other processes does not count.
         version: of the code that did it, as `code_version` gives it.
         renders: pictures that MuJoCo drew for it, in its own process.
         rows: that it gave; None where it failed.
@@ -53,6 +54,7 @@ class Record:
 
     number: int
     seconds: float
+    cpu_s: float
     version: str
     renders: int
     rows: list[Row] | None
@@ -145,7 +147,7 @@ class Jobs:
                 raise ConfigError(f"{path}: is of cotarget {version}, this is {code_version()}; {REMEDY}{keep}")
             if settings != self._identity:
                 raise ConfigError(f"{path}: {self._differing(settings)}; {REMEDY}")
-            names = ("seconds", "version", "renders", "rows", "failed", "traceback")
+            names = [part.name for part in dataclasses.fields(Record) if part.name != "number"]
             yield Record(told["seed"], **{name: told[name] for name in names})
 
     def _differing(self, settings: dict[str, Any]) -> str:
@@ -162,16 +164,12 @@ class Jobs:
         self._folder.mkdir(parents=True, exist_ok=True)
         told = {"format": FORMAT, "experiment": self._name, "settings": self._identity, "seed": record.number}
         told |= {key: value for key, value in dataclasses.asdict(record).items() if key != "number"}
-        traceback = self.traceback(record.number)
+        traceback = self._folder / f"{record.number:06d}.traceback.txt"
         if record.failed:
             write_whole(traceback, record.traceback.encode())
         write_whole(self._folder / f"{record.number:06d}.json", (json.dumps(told) + "\n").encode())
         if not record.failed:
             traceback.unlink(missing_ok=True)
-
-    def traceback(self, number: int) -> Path:
-        """Where a failed job's traceback is."""
-        return self._folder / f"{number:06d}.traceback.txt"
 
     def forget(self) -> None:
         """Delete the files of all jobs."""

@@ -13,10 +13,11 @@ import os
 import platform
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from cotarget.errors import ConfigError
 from cotarget.outputs import write_whole
 from experiments.cases import Case
 from experiments.harness import versions
@@ -61,10 +62,10 @@ class Sweep:
             wanted = set(case.numbers)
             there = files.read(any_code=self.any_code)
             self.records.append({number: record for number, record in there.items() if number in wanted})
-
-    def traceback(self, case: int, number: int) -> Path:
-        """Where a failed job's traceback is."""
-        return self._files[case].traceback(number)
+        self._missing = [
+            {number for number in case.numbers if number not in records or records[number].failed}
+            for case, records in zip(self.cases, self.records, strict=True)
+        ]
 
     @property
     def total(self) -> int:
@@ -90,7 +91,7 @@ class Sweep:
             what: the engine in words, for the report.
 
         Raises:
-            CotargetError: a result cannot be written, or the engine fails.
+            CotargetError: a result cannot be written, the engine fails, or workers have other code.
         """
         began, since = datetime.datetime.now(datetime.UTC), time.perf_counter()
         self._now = []
@@ -115,75 +116,77 @@ class Sweep:
                 write_whole(self.folder / SESSIONS, told.encode())
 
     def _run(self, engine: Engine, show: Show) -> None:
-        missing = [
-            [number for number in case.numbers if number not in records or records[number].failed]
-            for case, records in zip(self.cases, self.records, strict=True)
-        ]
-        total = sum(case.experiment.cost_s * len(case.numbers) for case in self.cases)
-        left = sum(case.experiment.cost_s * len(todo) for case, todo in zip(self.cases, missing, strict=True))
-
-        def keep(i: int, number: int, done: Done) -> None:
-            nonlocal left
-            self._keep(i, number, done)
-            left -= self.cases[i].experiment.cost_s
-            failures = f", {self.failed} failed" if self.failed else ""
-            last = f"{self.cases[i].title} {number}"
-            show(
-                f"{self.done} of {self.total} jobs{failures}; last {last}", min(total - left, total), total
-            )  # rounding
-
-        def do(tasks: Sequence[Task], using: Engine) -> list[Task]:
-            """Do tasks, the longest first; the jobs for which something was prepared."""
-            jobs: list[Task] = []
-            if not tasks:
-                return jobs
-            tasks = sorted(tasks, key=self._order)
-            with contextlib.closing(using(perform, tasks, self.processes)) as outcomes:
-                for index, outcome in outcomes:
-                    i, number = tasks[index].case, tasks[index].number
-                    done = outcome if isinstance(outcome, Done) else Done(0.0, code_version(), failed=DIED)
-                    self._now.append((number is not None, done))
-                    if number is not None:
-                        keep(i, number, done)
-                    elif not done.failed:
-                        jobs += self._jobs(i, missing[i], done.result)
-                    else:
-                        for number in missing[i]:
-                            keep(i, number, done)
-            return jobs
-
-        show(f"{self.done} of {self.total} jobs", total - left, total)
+        self._tell(show)
         for alone in (False, True):
-            mine = [i for i, case in enumerate(self.cases) if case.experiment.alone == alone and missing[i]]
+            mine = [i for i, case in enumerate(self.cases) if case.experiment.alone == alone and self._missing[i]]
             using = here if alone else engine
-            do(do([task for i in mine for task in self._first(i, missing[i])], using), using)
+            jobs = self._do([task for i in mine for task in self._first(i)], using, show)
+            self._do(jobs, using, show)
 
-    def _first(self, i: int, numbers: Sequence[int]) -> list[Task]:
+    def _first(self, i: int) -> list[Task]:
         """What must be prepared for a case's jobs; where there is nothing to prepare, the jobs."""
         case = self.cases[i]
         if case.experiment.prepare is None:
-            return self._jobs(i, numbers)
+            return self._jobs(i)
         return [Task(i, None, functools.partial(case.experiment.prepare, case.settings))]
 
-    def _jobs(self, i: int, numbers: Sequence[int], shared: Any = None) -> list[Task]:
+    def _jobs(self, i: int, shared: Any = None) -> list[Task]:
+        """The jobs of a case that are missing."""
         case = self.cases[i]
         one = functools.partial(case.experiment.one, shared, case.settings)
-        return [Task(i, number, functools.partial(one, number)) for number in numbers]
+        return [Task(i, number, functools.partial(one, number)) for number in sorted(self._missing[i])]
+
+    def _do(self, tasks: Sequence[Task], using: Engine, show: Show) -> list[Task]:
+        """Do tasks, the longest first; the jobs for which something was prepared."""
+        jobs: list[Task] = []
+        if not tasks:
+            return jobs
+        tasks = sorted(tasks, key=self._order)
+        with contextlib.closing(using(perform, tasks, self.processes)) as outcomes:
+            for index, outcome in outcomes:
+                i, number = tasks[index].case, tasks[index].number
+                done = outcome if isinstance(outcome, Done) else Done(0.0, 0.0, code_version(), failed=DIED)
+                self._check_version(done)
+                self._now.append((number is not None, done))
+                if number is not None:
+                    self._keep(i, number, done)
+                elif not done.failed:
+                    jobs += self._jobs(i, done.result)
+                else:  # none of them can be done
+                    for each in tuple(self._missing[i]):
+                        self._keep(i, each, replace(done, seconds=0.0, cpu_s=0.0, renders=0))
+                self._tell(show, self.cases[i].title if number is None else f"{self.cases[i].title} {number}")
+        return jobs
 
     def _order(self, task: Task) -> tuple[bool, float]:
         """What others wait for comes first, then what takes long."""
         return task.number is not None, -self.cases[task.case].experiment.cost_s
 
+    def _check_version(self, done: Done) -> None:
+        """Refuse what other code has done: a program that was changed meanwhile, or a worker that is no copy of this.
+
+        Raises:
+            ConfigError: it has.
+        """
+        if not is_same_version(done.version, code_version(), any_code=self.any_code):
+            raise ConfigError(f"a worker has cotarget {done.version}, this is {code_version()}; was the code changed?")
+
     def _keep(self, i: int, number: int, done: Done) -> None:
-        failed = done.failed
-        if not failed and not is_same_version(done.version, code_version(), any_code=self.any_code):
-            failed = f"was done by cotarget {done.version}, this is {code_version()}; all must have the same code"
-        if failed:
-            record = Record(number, done.seconds, code_version(), done.renders, None, failed, done.traceback)
-        else:
-            record = Record(number, done.seconds, done.version, done.renders, done.result)
+        """Put what came of a job on disk."""
+        rows, told = None if done.failed else done.result, (done.failed, done.traceback)
+        record = Record(number, done.seconds, done.cpu_s, done.version, done.renders, rows, *told)
         self._files[i].write(record)
         self.records[i][number] = record
+        self._missing[i].discard(number)
+
+    def _tell(self, show: Show, last: str = "") -> None:
+        """Say how much is done, a long job counting for more than a short one."""
+        costs = [case.experiment.cost_s for case in self.cases]
+        total = sum(cost * len(case.numbers) for cost, case in zip(costs, self.cases, strict=True))
+        left = sum(cost * len(missing) for cost, missing in zip(costs, self._missing, strict=True))
+        failed = f", {self.failed} failed" if self.failed else ""
+        text = f"{self.done} of {self.total} jobs{failed}"
+        show(f"{text}; last {last}" if last else text, total - left, total)
 
 
 def sessions(folder: Path) -> list[dict[str, Any]]:

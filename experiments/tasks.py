@@ -31,9 +31,10 @@ class Task:
 
 @dataclass(frozen=True)
 class Done:
-    """What came of a task; `failed` and `traceback` where nothing did."""
+    """What came of a task; `failed` and `traceback` where nothing did. See `experiments.results.Record`."""
 
     seconds: float
+    cpu_s: float
     version: str
     renders: int = 0
     result: Any = None
@@ -43,7 +44,7 @@ class Done:
 
 def perform(task: Task) -> Done:
     """Do a task; whatever goes wrong is told, not raised."""
-    began, drawn = time.perf_counter(), _drawn()
+    began, cpu, drawn = time.perf_counter(), time.process_time(), _drawn()
     result, failed, where = None, "", ""
     try:
         result = task.call()
@@ -51,7 +52,8 @@ def perform(task: Task) -> Done:
             result = json.loads(json.dumps(result, default=_scalar))  # as it will be read from the file
     except Exception as error:
         failed, where = _in_one_line(error), traceback.format_exc()
-    return Done(time.perf_counter() - began, code_version(), _drawn() - drawn, result, failed, where)
+    took, used = time.perf_counter() - began, time.process_time() - cpu
+    return Done(took, used, code_version(), _drawn() - drawn, result, failed, where)
 
 
 def _drawn() -> int:

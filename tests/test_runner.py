@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -23,7 +24,8 @@ from experiments.cluster import on_dask
 from experiments.harness import Experiment, Settings
 from experiments.report import duration
 from experiments.results import code_version, taken
-from experiments.workers import LINEAR_ALGEBRA, Died, here, in_processes
+from experiments.tasks import perform
+from experiments.workers import LINEAR_ALGEBRA, ONE_THREAD, Died, here, in_processes
 from tests.tiny_experiments import ALONE, KNOWN, TINY, notes, pids
 
 DEADLINE_S = 120.0  # for a program to come as far as it is waited for
@@ -136,6 +138,7 @@ def test_a_seed_that_fails_is_recorded_and_the_rest_goes_on(run, tmp_path):
     assert not (folder / "jobs" / "000001.traceback.txt").exists()
 
 
+@pytest.mark.slow
 def test_a_job_that_kills_its_process_takes_no_other_along(run, tmp_path):
     status, told, complaints = run("tiny", "--set", "tiny.fatal=[1]", "--processes", "2", "--seeds", "2")
     assert (status, complaints.count("\n")) == (1, 1)
@@ -239,6 +242,20 @@ def test_two_runs_into_one_folder(run, tmp_path):
         assert (status, told, complaints.count("\n")) == (1, "", 1)
         assert "another run is writing its results there; wait for it, or take another folder" in complaints
         assert run("tiny", "--report")[0] == 1  # which only looks; nothing is done yet
+    assert run("tiny")[0] == 0
+
+
+def test_code_that_is_changed_meanwhile_ends_the_run(run, tmp_path, monkeypatch):
+    def changed(task):
+        return replace(perform(task), version="0.1.0+12345678")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("experiments.runner.perform", lambda task: (perform if task.number == 0 else changed)(task))
+        status, told, complaints = run("tiny")
+    assert (status, told, complaints.count("\n")) == (1, "", 1)
+    assert f"a worker has cotarget 0.1.0+12345678, this is {code_version()}; was the code changed?" in complaints
+    assert "1 of 4 jobs are done and kept" in complaints
+    assert len(list((tmp_path / "out" / "tiny" / "jobs").iterdir())) == 1
     assert run("tiny")[0] == 0
 
 
@@ -464,7 +481,9 @@ def test_all_experiments_are_of_one_shape(capsys):
 
 
 @pytest.fixture
-def cluster():
+def cluster(monkeypatch):
+    for name, value in ONE_THREAD.items():  # workers within this process leave it as it was
+        monkeypatch.setenv(name, value)
     distributed = pytest.importorskip("distributed", reason="Dask is not installed: pip install 'cotarget[sweeps]'")
 
     def start(threads=1, processes=True):
@@ -481,24 +500,26 @@ def cluster():
         )
         return made[-1].scheduler_address
 
-    made = []
+    made, threads = [], cv2.getNumThreads()
     yield start
+    cv2.setNumThreads(threads)
     for each in made:
         each.close()
 
 
-def test_the_same_sweep_on_a_cluster(run, tmp_path, cluster):
-    where = ("--backend", "dask", "--scheduler", cluster())
+@pytest.mark.parametrize("processes", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_same_sweep_on_a_cluster(run, tmp_path, cluster, processes):
+    where = ("--backend", "dask", "--scheduler", cluster(processes=processes))
     arguments = ("sharing", "alone", *noted(tmp_path, "sharing", "alone"), "--set", "sharing.wrong=[1]")
     status, _, complaints = run(*arguments, *where)
     assert (status, complaints.count("\n")) == (1, 1)
     assert "seed 1 failed: ValueError: seed 1 is wrong" in complaints
-    assert len(pids(tmp_path) - {os.getpid()}) == 2  # both workers had something to do
+    assert len(pids(tmp_path) - {os.getpid()}) == 2 * processes  # both workers had something to do
     (tmp_path / "mended").touch()
     before = len(notes(tmp_path))
     assert run(*arguments, *where)[0] == 0
     assert notes(tmp_path)[before:] == ["prepared", "job 1"]
-    assert run(*arguments, "--processes", "1", out="here")[0] == 0
+    assert run(*arguments, *(["--processes", "1"] if processes else []), out="here")[0] == 0
     ours, theirs = (sorted((tmp_path / out).glob("*/rows.csv")) for out in ("here", "out"))
     assert len(ours) == 2
     assert [path.read_bytes() for path in ours] == [path.read_bytes() for path in theirs]
@@ -533,6 +554,7 @@ def test_nobody_answers(run):
     assert "no Dask scheduler answers at nowhere" in complaints
 
 
+@pytest.mark.slow
 def test_a_cluster_of_ones_own():
     pytest.importorskip("distributed", reason="Dask is not installed: pip install 'cotarget[sweeps]'")
     assert dict(on_dask(math.sqrt, [4.0, 9.0], 1, version=code_version())) == {0: 2.0, 1: 3.0}
