@@ -17,6 +17,7 @@ from typing import Any
 
 from cotarget.cli.arguments import count, not_negative, progress_bar
 from cotarget.errors import ConfigError, CotargetError
+from cotarget.report.wording import count as number_of
 from experiments.bounds import EXPECTED, tighten
 from experiments.cases import Case, Known, choose, known_experiments
 from experiments.cluster import on_dask
@@ -156,11 +157,11 @@ def _engine(given: argparse.Namespace) -> tuple[Engine, str]:
     """Who does the jobs, and the same in words."""
     if given.backend == "dask":
         version = "" if given.any_code else code_version()
-        where = "a Dask cluster" if given.scheduler else f"a Dask cluster of {given.processes} workers on this machine"
+        where = "a Dask cluster" if given.scheduler else f"a Dask cluster on this machine, {given.processes} at most"
         return functools.partial(on_dask, scheduler=given.scheduler, version=version), where
     if given.scheduler is not None:
         raise ConfigError("--scheduler goes with --backend dask")
-    return in_processes, f"{given.processes} processes"
+    return in_processes, number_of(given.processes, "process", "processes")
 
 
 def _split(chosen: Sequence[Case], *, named: bool) -> tuple[list[Case], dict[str, str]]:

@@ -4,6 +4,7 @@ import concurrent.futures
 import contextlib
 import importlib
 import importlib.util
+import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -23,7 +24,7 @@ from experiments.workers import (
 
 EXTRA = "cotarget[sweeps]"
 ANSWER_S = 10.0  # for a scheduler to answer [s]
-QUIET = 60  # only what is worse than critical is logged by a cluster of our own
+QUIET = logging.CRITICAL + 10  # what is wrong is told in one line
 
 
 def on_dask(
@@ -78,6 +79,9 @@ def _needed(name: str) -> Any:
 def _client(distributed: Any, scheduler: str | None, processes: int) -> Iterator[Any]:
     """A client of the cluster at an address, or of one on this machine that ends with it."""
     with contextlib.ExitStack() as stack:
+        log = logging.getLogger("distributed.client")
+        stack.callback(log.setLevel, log.level)
+        log.setLevel(QUIET)
         if scheduler is None:
             with one_thread_each(), interrupts_kept_from_children():
                 cluster = distributed.LocalCluster(

@@ -111,13 +111,13 @@ def _summary(run: Run) -> Iterator[str]:
 
 def _wanted(outcome: Outcome) -> str:
     if outcome.missed is None:
-        return "none"
+        return "none asked for"
     return f"{len(outcome.missed)} missed" if outcome.missed else "all met"
 
 
 def _kept(outcome: Outcome) -> str:
     if not outcome.bounds:
-        return "none" if outcome.case.has_bounds else "of the quick run only"
+        return "none yet" if outcome.case.has_bounds else "of the quick run only"
     return (
         f"{len(outcome.worse)} of {len(outcome.bounds)} broken" if outcome.worse else f"all {len(outcome.bounds)} kept"
     )
