@@ -59,8 +59,8 @@ LOOKED_AT_DEG = 0.5
 # A book that was off the middle by less than the dead zone is centred a second after the last command; then it is seen
 # in the middle for as long as this.
 STANDS_S, END_S = "4", 0.5
-# What may be told of a good run where the machine does other things: frames that are late, or do not come at all; and as
-# the pictures of the zoom camera are then older than it is told, what its view of the book contradicts.
+# What may be told of a good run where the machine does other things: frames that are late, or do not come at all; and,
+# as the pictures of the zoom camera are then older than it is told, that its view of the book does not fit.
 BUSY = re.compile(
     "no frame|the newest frame is .* s old|this one is .* after the last|the zoom camera has shown nothing new"
     "|the views are too far apart in time|the told size or the calibration seems wrong"
