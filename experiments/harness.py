@@ -39,7 +39,8 @@ from cotarget.parallel import end_with_parent
 
 Row = dict[str, Any]
 Job = TypeVar("Job")
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # a process each is faster than threads
+# Threads of linear algebra and of rendering: a process each is faster.
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS")
 EXPECTED = Path(__file__).parent / "expected"
 USAGE, INTERRUPTED = 2, 130  # argparse's own exit status, and a shell's for Ctrl-C
 

@@ -7,7 +7,8 @@ import sys
 import tempfile
 
 # Tests run side by side: threads of their own in each would only get into each other's way.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+for _threads in ("OPENBLAS_NUM_THREADS", "LP_NUM_THREADS"):  # of linear algebra, of rendering
+    os.environ.setdefault(_threads, "1")
 # Tests of the wire wait in real time more than they work, so that two cores have room for a third process.
 FEWEST = 3
 

@@ -63,6 +63,7 @@ def test_progress_ends_where_it_said(session):
     assert all(b[0] >= a[0] for a, b in itertools.pairwise(told))
 
 
+@pytest.mark.slow
 def test_captures_give_the_same_calibration(session):
     _, calibration, directory, _ = session
     again = calibrate_captures(directory)

@@ -138,6 +138,7 @@ def test_what_the_simulation_does_not_show_is_not_followed(folder, capsys, name,
     assert len(err.splitlines()) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_follow_follows_what_was_chosen(folder, capsys):
     for arguments, state in ((("--track", "1"), "following"), (("--track", "9"), "searching")):

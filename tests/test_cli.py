@@ -461,6 +461,7 @@ def test_who_insists_is_heard_at_every_focal_length(folder, capsys, zooming):
     assert len(json.loads((folder / "out.json").read_text())["zoom"]["stops"]) == 2
 
 
+@pytest.mark.slow
 def test_the_sequential_method_leaves_other_focal_lengths_alone(folder, capsys, zooming, monkeypatch):
     def never(*_):
         raise AssertionError("the joint method was asked")

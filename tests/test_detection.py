@@ -212,6 +212,23 @@ def test_a_shadow_is_not_part_of_a_person():
         np.testing.assert_allclose(boxes[0].size_px, (25, 80), atol=3.0)
 
 
+@pytest.mark.parametrize("part", [1.0, 0.4])
+def test_a_person_is_seen_while_the_sun_comes_out(part):
+    """Over the whole picture or a part of its width, by a quarter within half a second."""
+    rng = np.random.default_rng(16)
+    ground = cv2.resize(rng.uniform(70, 120, (60, 80, 3)), (320, 240))
+    pictures = []
+    for i in range(120):
+        picture = ground.copy()
+        picture[100:180, 18 + 2 * (i - 20) : 43 + 2 * (i - 20)] = (150, 60, 30)
+        picture[:, : round(part * 320)] *= 1 + 0.25 * np.clip((i - 60) / 12, 0, 1)
+        pictures.append(np.clip(picture + rng.normal(0, NOISE, picture.shape), 0, 255).astype(np.uint8))
+    for i, boxes in list(enumerate(watch(motion("person"), pictures)))[25:]:
+        assert len(boxes) == 1
+        np.testing.assert_allclose(boxes[0].center_px, (30 + 2 * (i - 20), 139.5), atol=2.0)
+        np.testing.assert_allclose(boxes[0].size_px, (25, 80), atol=4.0)
+
+
 def test_light_that_changes_everywhere_is_no_target():
     rng = np.random.default_rng(7)
     pictures = [sky(rng) for _ in range(30)] + [np.clip(sky(rng) * 0.6, 0, 255).astype(np.uint8)]

@@ -153,7 +153,7 @@ def swings(values):
     return int(np.count_nonzero(np.diff(sides)))
 
 
-@pytest.mark.parametrize("delay_s", [0.2, pytest.param(0.4, marks=pytest.mark.slow), 0.6])
+@pytest.mark.parametrize("delay_s", [*(pytest.param(delay, marks=pytest.mark.slow) for delay in (0.2, 0.4)), 0.6])
 def test_the_whole_loop_does_not_oscillate_however_late_it_is(exact, monkeypatch, delay_s):
     """Corrections that come late add nothing to the offset of who walks, and come to rest when that stops."""
     wide, _ = offsets_of_who_stops(exact, monkeypatch, delay_s, closed_loop=False)

@@ -40,6 +40,7 @@ RATIO_TOLERANCE = 0.5
 MOST_WIDENED = 1  # of six, where the threshold of three standard deviations is passed by chance once in fifty
 
 
+@pytest.mark.slow
 def test_an_exact_model_predicts_what_it_has_not_seen(monkeypatch):
     # Then what is told is the ratio itself, below 1 too.
     monkeypatch.setattr(heldout, "CHANCE_SIGMAS", -np.inf)

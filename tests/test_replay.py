@@ -656,6 +656,7 @@ def test_a_run_that_is_killed_replays_up_to_shortly_before(tmp_path, steps):
     assert differences.same
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_a_simulated_run_is_replayed_to_the_last_bit(tmp_path):
     config = parse_config({"sim": {"scene": "indoor", "targets": ["book"], "seed": 3}})

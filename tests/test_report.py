@@ -358,6 +358,7 @@ def test_advice_follows_from_the_figures(plain):
     assert any("no number of them would halve it" in item for item in words)
 
 
+@pytest.mark.slow
 def test_more_placements_take_nothing_from_the_jitter_nor_from_a_lens_between_its_stops(plain, stops):
     (exact,) = pointing(plain)
     assert what_stays(plain, exact) == 0.0

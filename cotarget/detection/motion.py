@@ -50,13 +50,16 @@ class MotionSettings:
     largest: float
 
 
-# The background's range of colours is taken anew this often [s]; it costs a third of a frame's work.
-SWAY_UPDATE_S = 0.25
+# The background's colours are taken out of the mixture this often [s]; it costs a third of a frame's work.
+BACKGROUND_UPDATE_S = 0.25
 # Up to this part of the picture its foreground pixels are quicker looked up one by one than the picture is as a whole.
 FEW = 0.01
 WORD = np.dtype(np.uint64).itemsize  # so many pixels are looked at at once
-# Levels by which a pixel must leave that range: five standard deviations of the sensor's noise of 2, and coding.
-SWAY_MARGIN = 15
+# Levels by which a pixel must leave the background's range: five standard deviations of the sensor's noise of 2, and
+# coding.
+MARGIN = 15
+# The sun comes out: the mixture tells shadows, down to half the background's light, but nothing that is brighter.
+BRIGHTEST = 1.5
 
 # The plain mixture remembers 120 frames at 30 a second [s].
 PLAIN_HISTORY_S = 4.0
@@ -118,8 +121,8 @@ class MotionDetector:
         self._model.setBackgroundRatio(settings.background_part)
         self._t: float | None = None
         self._learnt = 0.0
+        self._known: tuple[Image, float] | None = None  # background, and when it was taken out of the mixture
         self._range: tuple[Image, Image] | None = None
-        self._range_learnt = 0.0
         self._shape: tuple[int, ...] | None = None
         self.mask: Image | None = None
 
@@ -133,7 +136,7 @@ class MotionDetector:
         self._shape = frame.image.shape
         mask = self._model.apply(frame.image, learningRate=self._rate(frame.t))
         if self._settings.shadows:
-            mask = cv2.compare(mask, FOREGROUND, cv2.CMP_EQ)
+            mask = self._unlit(cv2.compare(mask, FOREGROUND, cv2.CMP_EQ), frame.image)
         if self._settings.sway_px:
             mask = _outside(mask, frame.image, self._sway())
         if self._settings.opening_px:
@@ -152,16 +155,36 @@ class MotionDetector:
         self._learnt += dt
         return min(1.0, dt / min(self._settings.history_s, 2 * self._learnt))
 
+    def _background(self) -> tuple[Image, bool]:
+        """The background's colours, of a moment ago at most, and whether they were taken out of the mixture now."""
+        learnt, known = self._learnt, self._known
+        if known is None or not BACKGROUND_UPDATE_S <= learnt <= known[1] + BACKGROUND_UPDATE_S:
+            image = self._model.getBackgroundImage()
+            self._known = image, learnt
+            return image, True
+        return known[0], False
+
+    def _unlit(self, mask: Image, image: Image) -> Image:
+        """A mask without the background in a brighter light, where most of what changed is that."""
+        if cv2.countNonZero(mask) < FEW * mask.size:
+            return mask
+        there = np.flatnonzero(mask)
+        now, before = (each.reshape(-1, 3)[there].astype(np.float32) for each in (image, self._background()[0]))
+        light = np.einsum("ij,ij->i", now, before) / np.maximum(np.einsum("ij,ij->i", before, before), 1.0)
+        same = (np.abs(now - light[:, None] * before) < MARGIN).all(axis=1) & (light > 1.0) & (light < BRIGHTEST)
+        if 2 * np.count_nonzero(same) > len(there):
+            mask.ravel()[there[same]] = 0
+        return mask
+
     def _sway(self) -> tuple[Image, Image]:
         """The darkest and the brightest that the background has nearby: what sways does not leave that range."""
-        if self._range is None or self._learnt - self._range_learnt > SWAY_UPDATE_S or self._learnt < SWAY_UPDATE_S:
-            background = self._model.getBackgroundImage()
+        background, anew = self._background()
+        if anew or self._range is None:
             nearby = np.ones((2 * self._settings.sway_px + 1,) * 2, np.uint8)
-            margin = (SWAY_MARGIN,) * 3
+            margin = (MARGIN,) * 3
             darkest = cv2.subtract(cv2.erode(background, nearby), (*margin, 0))
             brightest = cv2.add(cv2.dilate(background, nearby), (*margin, 0))
             self._range = darkest, brightest
-            self._range_learnt = self._learnt
         return self._range
 
     def _boxes(self, mask: Image) -> list[Detection]:
