@@ -212,6 +212,33 @@ def test_a_shadow_is_not_part_of_a_person():
         np.testing.assert_allclose(boxes[0].size_px, (25, 80), atol=3.0)
 
 
+@pytest.mark.parametrize("length", [60, 120])
+def test_what_lies_flat_is_no_part_of_a_person(length):
+    """The edge of a shadow that drifts by behind, as far as the knees are high."""
+    rng = np.random.default_rng(17)
+    pictures = []
+    for i in range(60):
+        picture = rng.normal((90, 110, 100), NOISE, (240, 320, 3))
+        if i >= 20:
+            u = 30 + 2 * (i - 20)
+            picture[100:180, u - 12 : u + 13] = (150, 60, 30)
+            picture[160:165, u : u + length] = (125, 150, 140)
+        pictures.append(np.clip(picture, 0, 255).astype(np.uint8))
+    for i, boxes in list(enumerate(watch(motion("person"), pictures)))[25:]:
+        assert len(boxes) == 1
+        np.testing.assert_allclose(boxes[0].center_px, (30 + 2 * (i - 20), 139.5), atol=3.0)
+        np.testing.assert_allclose(boxes[0].size_px, (25, 80), atol=6.0)
+
+
+def test_two_side_by_side_are_in_one_box():
+    rng = np.random.default_rng(18)
+    picture = rng.normal((90, 110, 100), NOISE, (240, 320, 3)).clip(0, 255).astype(np.uint8)
+    there = picture.copy()
+    there[100:180, 100:125] = there[104:180, 123:150] = (150, 60, 30)
+    (box,) = watch(motion("person"), [picture] * 20 + [there])[-1]
+    np.testing.assert_allclose(box.size_px, (50, 80), atol=2.0)
+
+
 @pytest.mark.parametrize("part", [1.0, 0.4])
 def test_a_person_is_seen_while_the_sun_comes_out(part):
     """Over the whole picture or a part of its width, by a quarter within half a second."""

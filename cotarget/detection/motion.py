@@ -1,5 +1,6 @@
 """What moves: an adaptive Gaussian mixture of the background, morphology and connected pieces (person, bird)."""
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -60,6 +61,10 @@ WORD = np.dtype(np.uint64).itemsize  # so many pixels are looked at at once
 MARGIN = 15
 # The sun comes out: the mixture tells shadows, down to half the background's light, but nothing that is brighter.
 BRIGHTEST = 1.5
+# A piece wider than this part of its height may be a person and the edge of a shadow or of a patch of light, which lies
+# flat on the ground: thinner than this part of the height. What is left is no target if it is wider than high, such as
+# the middle of a cloud.
+WIDE, FLAT, UPRIGHT = 0.7, 0.1, 1.0
 
 # The plain mixture remembers 120 frames at 30 a second [s].
 PLAIN_HISTORY_S = 4.0
@@ -198,19 +203,32 @@ class MotionDetector:
         for contour in contours:
             x, y, w, h = cv2.boundingRect(contour)
             # The dilation only joined the pieces: the box is that of the mask's own pixels inside.
-            inside = mask[y : y + h, x : x + w]
-            area = cv2.countNonZero(inside)
-            if area < settings.smallest_area_px:
-                continue
-            dx, dy, w, h = cv2.boundingRect(inside)
-            x, y = x + dx, y + dy
-            if w < settings.smallest_px[0] or h < settings.smallest_px[1]:
-                continue
-            if w > settings.largest * width or h > settings.largest * height or w > settings.widest * h:
-                continue
-            found.append((area, box_detection(x, y, w, h, area / (area + settings.smallest_area_px), mask.shape)))
+            for first, last in self._upright(mask[y : y + h, x : x + w]):
+                inside = mask[y : y + h, x + first : x + last]
+                area = cv2.countNonZero(inside)
+                if area < settings.smallest_area_px:
+                    continue
+                dx, dy, box_w, box_h = cv2.boundingRect(inside)
+                if box_w < settings.smallest_px[0] or box_h < settings.smallest_px[1]:
+                    continue
+                largest_w, largest_h = settings.largest * width, settings.largest * height
+                widest = settings.widest if last - first == w else UPRIGHT
+                if box_w > largest_w or box_h > largest_h or box_w > widest * box_h:
+                    continue
+                score = area / (area + settings.smallest_area_px)
+                found.append((area, box_detection(x + first + dx, y + dy, box_w, box_h, score, mask.shape)))
         found.sort(key=lambda pair: -pair[0])
         return [detection for _, detection in found]
+
+    def _upright(self, piece: Image) -> list[tuple[int, int]]:
+        """From which column to which a piece of a mask is a target: where it is wide, without what lies flat."""
+        height, width = piece.shape
+        if math.isinf(self._settings.widest) or width <= WIDE * height:
+            return [(0, width)]
+        stands = cv2.morphologyEx(piece, cv2.MORPH_OPEN, np.ones((max(1, round(FLAT * height)), 1), np.uint8))
+        columns = cv2.dilate(stands, np.ones((1, self._settings.bridge_px[0]), np.uint8)).any(axis=0)
+        edges = np.flatnonzero(np.diff(columns, prepend=False, append=False)).tolist()
+        return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _outside(mask: Image, image: Image, colours: tuple[Image, Image]) -> Image:
