@@ -23,10 +23,11 @@ from cotarget.config import RigConfig, TargetConfig
 from cotarget.judging import observe
 from cotarget.loop import FollowSettings
 from cotarget.policies import POLICIES
+from cotarget.sim.fieldpaths import GROUP
 from cotarget.sim.truth import Truth
 from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, target_of, watched
-from experiments.hold_scenes import GROUP, five_targets_config
+from experiments.hold_scenes import five_targets_config
 from experiments.wide_view import WideView, record
 
 FIRST = "first-come"

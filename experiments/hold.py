@@ -25,13 +25,14 @@ from cotarget.judging import add_row
 from cotarget.loop import FollowSettings, Step, follow
 from cotarget.metrics import Row as Judged
 from cotarget.metrics import score
+from cotarget.oracle import true_calibration
 from cotarget.safety import SafeRig
+from cotarget.sim.fieldpaths import SECONDS
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments import harness
 from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
-from experiments.hold_scenes import SECONDS, hold_config
-from experiments.true_rig import true_calibration
+from experiments.hold_scenes import hold_config
 from experiments.wide_view import WideView, open_on
 
 # What is wanted of each figure's median: at least, or at most.

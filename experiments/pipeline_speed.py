@@ -24,6 +24,7 @@ from cotarget.calibration import Calibration
 from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetConfig
 from cotarget.detection import Detector, make_detector
 from cotarget.errors import CotargetError
+from cotarget.oracle import true_calibration
 from cotarget.policies import FirstCome
 from cotarget.pursuit import Pursuit
 from cotarget.rig import Frame, PanTiltLimits
@@ -32,7 +33,6 @@ from cotarget.targeting import Reach, aim
 from cotarget.tracking import Tracker, settings_for
 from cotarget.video import Film
 from experiments.harness import Experiment, Row, Settings, over_seeds, table
-from experiments.true_rig import true_calibration
 
 FILM = Path(__file__).resolve().parents[2] / "shared" / "data" / "birds" / "V_BIRD_036.mp4"
 ALONE = "MOG2 alone"

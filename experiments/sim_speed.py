@@ -28,6 +28,7 @@ from matplotlib.figure import Figure
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
 from cotarget.loop import FollowSettings, Step
+from cotarget.oracle import TruthDetector
 from cotarget.sim.model import RENDER_PITCH, RIG, build_model
 from cotarget.sim.opengl import make_renderer, mujoco
 from cotarget.sim.state import WorldState
@@ -35,7 +36,7 @@ from cotarget.sim.truth import Truth
 from cotarget.sim.world import CAMERAS, SimWorld
 from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, target_of, watched, watched_in
-from experiments.hold_scenes import TruthDetector, hold_config
+from experiments.hold_scenes import hold_config
 
 IMAGE_EFFECTS = ("noise", "jpeg", "distortion", "blur", "clutter")
 TARGET = "bird"

@@ -14,15 +14,15 @@ from cotarget.deadzone import SteeringSettings
 from cotarget.geometry import pose
 from cotarget.loop import FollowSettings
 from cotarget.metrics import score
+from cotarget.oracle import TruthDetector, TruthNoise, true_calibration
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
 from experiments import dead_zone, delay, first_shot, five_targets, hold, pipeline_speed, shots, sim_speed
 from experiments.__main__ import EXPERIMENTS
 from experiments.harness import EXPECTED
-from experiments.hold_scenes import TruthDetector, TruthNoise, hold_config
+from experiments.hold_scenes import hold_config
 from experiments.shots import CAUSES, Shot, budget
-from experiments.true_rig import true_calibration
 from experiments.wide_view import Seen, WideView, open_on, record
 from tests.true_finder import true_finder
 

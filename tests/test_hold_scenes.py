@@ -8,17 +8,12 @@ import pytest
 from cotarget.config import SimHead
 from cotarget.errors import ConfigError
 from cotarget.loop import follow
+from cotarget.oracle import TruthDetector, TruthNoise, true_calibration
 from cotarget.rig import Frame
+from cotarget.sim.fieldpaths import SECONDS
 from cotarget.sim.targets import marker_of
 from cotarget.sim.world import SimWorld
-from experiments.hold_scenes import (
-    SECONDS,
-    TruthDetector,
-    TruthNoise,
-    five_targets_config,
-    hold_config,
-)
-from experiments.true_rig import true_calibration
+from experiments.hold_scenes import five_targets_config, hold_config
 
 SEEDS = (0, 1, 2, 100, 101)
 NAMES = ("book", "person", "bird")
