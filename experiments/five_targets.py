@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, TargetConfig
-from cotarget.judging import observe
+from cotarget.judging import closeup_of
 from cotarget.loop import FollowSettings
 from cotarget.policies import POLICIES
 from cotarget.sim.fieldpaths import GROUP
@@ -92,7 +92,7 @@ def good_seconds(
         t = step.zoom.t
         if last is not None and t > last:  # a frame stands for the time since the one before
             for name in good:
-                if _near(truth, name, t) and observe(step, truth, name, target).good_closeup:
+                if _near(truth, name, t) and closeup_of(truth, name, target, t).good:
                     good[name] += t - last
         last = t
     return good
