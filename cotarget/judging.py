@@ -14,8 +14,9 @@ from cotarget.geometry import Array
 from cotarget.loop import Step
 from cotarget.metrics import WHOLLY_VISIBLE, Closeup, Row
 from cotarget.rig import Frame
+from cotarget.sim.appearances import Appearances, Silhouette
 from cotarget.sim.targets import marker_of
-from cotarget.sim.truth import Silhouette, Truth
+from cotarget.sim.truth import Truth
 from cotarget.targeting import Method, Reach, aim
 from cotarget.tracking import Track
 
@@ -93,7 +94,7 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
     )
 
 
-def closeup_of(truth: Truth, name: str, target: TargetConfig, t: float) -> Closeup:
+def closeup_of(truth: Appearances, name: str, target: TargetConfig, t: float) -> Closeup:
     """What the zoom camera shows of a target at a time.
 
     Args:
@@ -105,23 +106,23 @@ def closeup_of(truth: Truth, name: str, target: TargetConfig, t: float) -> Close
     return _closeup(truth, name, target, t, truth.silhouette(name, "zoom", t))
 
 
-def _closeup(truth: Truth, name: str, target: TargetConfig, t: float, outline: Silhouette | None) -> Closeup:
+def _closeup(truth: Appearances, name: str, target: TargetConfig, t: float, outline: Silhouette | None) -> Closeup:
     """The same by the target's outline."""
     lens = truth.lens("zoom", t)
-    u, v = truth.pixel("zoom", truth.center(name, t), t).tolist()
+    u, v = truth.center_px(name, "zoom", t).tolist()
     size = math.nan
     if outline is not None:
-        width, height = outline.size_px
+        width, height = outline.size_px.tolist()
         sides = {"width": width, "height": height}
         size = sides[target.dimension] if target.dimension in sides else truth.largest_side_px(name, "zoom", t)
-    longest = truth.zoom_lens_for(truth.focal_range[1])
+    longest = size * truth.longest_px / lens.focal_px[0]
     return Closeup(
         u_px=u,
         v_px=v,
         width_px=lens.size[0],
         height_px=lens.size[1],
-        size_px=float(size),
-        wanted_px=float(np.fmin(target.wanted_px, size * longest.focal_px[0] / lens.focal_px[0])),
+        size_px=size,
+        wanted_px=longest if longest < target.wanted_px else target.wanted_px,
         visible=0.0 if outline is None else outline.visible,
     )
 

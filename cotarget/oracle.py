@@ -3,21 +3,20 @@
 Detections without pictures, and a calibration without error: for runs that need neither rendering nor boards.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Protocol
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from numbers import Real
 
 import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.detection import Detection
-from cotarget.geometry import Array
+from cotarget.errors import ConfigError
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig import Frame, Image
-from cotarget.sim.lens import TrueLens
-from cotarget.sim.targets import Target
-from cotarget.sim.truth import CameraName
+from cotarget.sim.appearances import Appearances
 from cotarget.sim.world import SimWorld
 
 
@@ -40,19 +39,30 @@ def true_calibration(world: SimWorld, stops: int = 8) -> Calibration:
     )
 
 
-class Boxes(Protocol):
-    """Tells where the targets of a world appear; `Truth` does."""
+# Gives the random numbers of a time [s]; they are to be drawn before those of another time are asked for.
+NumbersAt = Callable[[float], np.random.Generator]
 
-    @property
-    def targets(self) -> Mapping[str, Target]:
-        """By name."""
 
-    @property
-    def fixed_lens(self) -> TrueLens:
-        """The wide camera's optics."""
+def seeded(seed: int) -> NumbersAt:
+    """Random numbers of each time, by a generator of its own."""
+    return lambda t: np.random.default_rng((seed, _microseconds(t)))
 
-    def box(self, name: str, camera: CameraName, t: float) -> tuple[Array, Array] | None:
-        """Top-left and bottom-right corner of a target's outline at a time [s], (2,) [px] each; None behind."""
+
+def counted(seed: int) -> NumbersAt:
+    """Others, ten times as quick: one generator that counts, and is told for each time where to begin."""
+    bits = np.random.Philox(key=seed)
+    rng, begin = np.random.Generator(bits), bits.state
+
+    def at(t: float) -> np.random.Generator:
+        begin["state"]["counter"][1] = _microseconds(t)  # it counts in [0], and never so far
+        bits.state = begin
+        return rng
+
+    return at
+
+
+def _microseconds(t: float) -> int:
+    return round(t * 1e6)
 
 
 @dataclass(frozen=True)
@@ -64,12 +74,23 @@ class TruthNoise:
         size: standard deviation of its sides, relative.
         miss: part of the frames in which a target is not found.
         smallest_px: a target whose larger side is smaller is not found [px].
+
+    Raises:
+        ConfigError: a number is below 0, or misses are more than all.
     """
 
     center_px: float = 0.5
     size: float = 0.08
     miss: float = 0.05
     smallest_px: float = 4.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is no noise."""
+        for name, value in asdict(self).items():
+            if not (isinstance(value, Real) and 0 <= float(value) < math.inf):
+                raise ConfigError(f"noise.{name}: {value!r} is not a number from 0 on")
+        if self.miss > 1:
+            raise ConfigError(f"noise.miss: {self.miss!r} is not within 0 to 1")
 
 
 class TruthDetector:
@@ -81,7 +102,12 @@ class TruthDetector:
     mask: Image | None = None
 
     def __init__(
-        self, truth: Boxes, seed: int, noise: TruthNoise = TruthNoise(), names: Iterable[str] | None = None
+        self,
+        truth: Appearances,
+        seed: int,
+        noise: TruthNoise = TruthNoise(),
+        names: Iterable[str] | None = None,
+        numbers: Callable[[int], NumbersAt] = seeded,
     ) -> None:
         """Begin.
 
@@ -90,25 +116,31 @@ class TruthDetector:
             seed: of the noise.
             noise: how it errs.
             names: the targets to find; all by default.
+            numbers: makes the random numbers of the seed.
         """
-        self._truth, self._seed, self._noise = truth, seed, noise
+        self._truth, self._noise, self._numbers_at = truth, noise, numbers(seed)
         self._names = tuple(truth.targets if names is None else names)
 
     def detect(self, frame: Frame) -> list[Detection]:
         """Find the targets, largest first."""
-        noise, size = self._noise, np.array(self._truth.fixed_lens.size)
-        rng = np.random.default_rng((self._seed, round(frame.t * 1e6)))
+        noise, size = self._noise, self._truth.fixed_lens.size
+        rng = self._numbers_at(frame.t)
         found = []
         for name in self._names:
             # Drawn whether the target is seen or not, so that none changes another's.
-            shift, scale, luck = rng.normal(size=2), rng.normal(size=2), rng.random()
+            draws, luck = rng.normal(size=4).tolist(), rng.random()
             box = self._truth.box(name, "fixed", frame.t)
             if box is None or luck < noise.miss:
                 continue
-            clipped = bool((box[0] < -0.5).any() or (box[1] > size - 0.5).any())
-            low, high = box[0].clip(-0.5, size - 0.5), box[1].clip(-0.5, size - 0.5)
-            sides = (high - low) * np.maximum(1 + noise.size * scale, 0.1)
-            if (high <= low).any() or sides.max() < noise.smallest_px:
+            middle, sides, clipped = [], [], False
+            corners = zip(*(corner.tolist() for corner in box), strict=True)
+            # In floats: numpy takes several times as long for so few numbers.
+            for (low, high), side, shift, scale in zip(corners, size, draws[:2], draws[2:], strict=True):
+                begin, end = max(low, -0.5), min(high, side - 0.5)
+                clipped |= low < begin or high > end
+                middle.append((begin + end) / 2 + noise.center_px * shift)
+                sides.append((end - begin) * max(1 + noise.size * scale, 0.1))
+            if min(sides) <= 0 or max(sides) < noise.smallest_px:
                 continue
-            found.append(Detection((low + high) / 2 + noise.center_px * shift, sides, 1.0, clipped))
-        return sorted(found, key=lambda detection: -float(np.prod(detection.size_px)))
+            found.append(Detection(np.array(middle), np.array(sides), 1.0, clipped))
+        return sorted(found, key=lambda detection: -math.prod(detection.size_px.tolist()))

@@ -30,6 +30,7 @@ __all__ = [
     "change_marker",
     "draw_size",
     "kind_of",
+    "limbs",
     "make_target",
     "marker_of",
     "scale_spec",
@@ -47,13 +48,15 @@ SCATTER = {"book": 0.0, "person": 0.04, "bird": 0.15}  # of the true sizes, rela
 SCATTER_SIGMA = 0.5  # the range above is two standard deviations
 GRAVITY = 9.81  # [m/s^2]
 STANDING = 1e-9  # [m/s]
-FLAT = np.array([1.0, 1.0, 0.0])  # of the way of whoever walks upright, the part along the ground
 
 STRIDE = 1.44  # length of two steps of a walking person 1.75 m tall [m]
 WALK_SPEED = 1.5  # [m/s]
 WING_BEAT_HZ = 4.0
 WING_SWING = np.radians(35.0)  # amplitude of the inner wing
 OUTER_SWING, OUTER_LAG = np.radians(24.0), np.radians(70.0)  # of the outer wing against the inner one
+
+Vector = tuple[float, float, float]
+Axes = tuple[Vector, Vector, Vector]  # forward, left and up, in the world: in floats, numpy takes several times as long
 
 
 @dataclass(frozen=True)
@@ -105,20 +108,37 @@ class Target:
     def pose(self, t: float) -> TargetPose:
         """Tell pose and joints at time ``t`` [s]."""
         if self.kind == "book":
-            position = self.path.position(t)
-            return TargetPose(position, _face_mount(position, t, self.phase), {})
+            place = self.path.position(t)
+            return TargetPose(place, Rotation.from_euler("ZYX", _face_mount(place, t, self.phase)), {})
+        position, axes, joints = self.stance(t, self.beat(t))
+        return TargetPose(np.array(position), Rotation.from_matrix(np.transpose(axes), assume_valid=True), joints)
+
+    def stance(self, t: float, beat: float) -> tuple[list[float], Axes, Mapping[str, float]]:
+        """The same in floats, which is quicker.
+
+        Args:
+            t: the time [s].
+            beat: of its limbs then, as `beat` tells it [rad].
+
+        Returns:
+            Its body's position [m], (3,); the body's axes in the world; each joint's angle [rad].
+        """
+        position, velocity, acceleration = self.path.motion(t)
+        kind = self.kind
+        if kind == "book":
+            return position, _turned(*_face_mount(position, t, self.phase)), {}
+        if kind == "bird":
+            return position, _bank(_heading(position, velocity), acceleration), _flap(beat)
+        joints, bob = _walk(beat, min(math.hypot(*velocity) / WALK_SPEED, 1.0))
+        axes = _heading(position, [*velocity[:2], 0.0 * velocity[2]])  # whoever walks stays upright
+        position[2] += bob * self.size + (0.5 * PERSON_HEIGHT * self.size if self.grounded else 0.0)
+        return position, axes, joints
+
+    def beat(self, t: float) -> float:
+        """Where its limbs are in their motion at time ``t`` [s], as an angle that grows without end [rad]."""
         if self.kind == "person":
-            step = self.phase + 2 * np.pi * self.path.travelled(t) / (STRIDE * self.size)
-            velocity = self.path.velocity(t)
-            joints, bob = _walk(step, min(math.hypot(*velocity.tolist()) / WALK_SPEED, 1.0))
-            position = self.path.position(t)
-            rotation = Rotation.from_matrix(_heading(position, velocity * FLAT), assume_valid=True)
-            position[2] += bob * self.size + (0.5 * PERSON_HEIGHT * self.size if self.grounded else 0.0)
-            return TargetPose(position, rotation, joints)
-        position = self.path.position(t)
-        axes = _bank(_heading(position, self.path.velocity(t)), self.path.acceleration(t))
-        rotation = Rotation.from_matrix(axes, assume_valid=True)
-        return TargetPose(position, rotation, _flap(self.phase + 2 * np.pi * WING_BEAT_HZ * t))
+            return self.phase + 2 * np.pi * self.path.travelled(t) / (STRIDE * self.size)
+        return self.phase + 2 * np.pi * WING_BEAT_HZ * t
 
 
 def make_target(
@@ -146,6 +166,11 @@ def make_target(
     beat_s = {"book": 0.0, "person": STRIDE / WALK_SPEED, "bird": 1 / WING_BEAT_HZ}[kind]
     grounded = kind == "person" and waypoints is None
     return Target(name, f"{kind}.xml", beat_s, size, path, phase, grounded)
+
+
+def limbs(kind: str, beat: float) -> Mapping[str, float]:
+    """Each joint's angle [rad] by name, of a bird that flies or a person who walks, at an angle of the beat [rad]."""
+    return _flap(beat) if kind == "bird" else _walk(beat, 1.0)[0] if kind == "person" else {}
 
 
 def target_rng(seed: int, name: str) -> np.random.Generator:
@@ -209,9 +234,9 @@ def scale_spec(spec: "mujoco.MjSpec", factor: float) -> None:
 # ---------------------------------------------------------------- attitude and gait
 
 
-def _heading(position: Array, velocity: Array) -> Array:
-    """Turn x along the way, z as far up as that allows; whoever stands still faces the camera. Columns, (3, 3)."""
-    x, y, z = velocity.tolist()
+def _heading(position: Sequence[float], velocity: Sequence[float]) -> Axes:
+    """Turn x along the way, z as far up as that allows; whoever stands still faces the camera."""
+    x, y, z = velocity
     if math.hypot(x, y, z) < STANDING:
         x, y, z = (MOUNT - position).tolist()
         z = 0.0
@@ -219,26 +244,38 @@ def _heading(position: Array, velocity: Array) -> Array:
         y -= 1e-6 * math.hypot(x, y, z)  # straight up or down: towards the camera, if anywhere
     ahead, whole = math.hypot(x, y), math.hypot(x, y, z)
     forward, left = (x / whole, y / whole, z / whole), (-y / ahead, x / ahead, 0.0)
-    up = (-forward[2] * left[1], forward[2] * left[0], forward[0] * left[1] - forward[1] * left[0])
-    return np.array([forward, left, up]).T
+    return forward, left, (-forward[2] * left[1], forward[2] * left[0], forward[0] * left[1] - forward[1] * left[0])
 
 
-def _face_mount(position: Array, t: float, phase: float) -> Rotation:
-    """Turn the book's cover to the camera, swinging a few degrees."""
+def _face_mount(position: Array | Sequence[float], t: float, phase: float) -> tuple[float, float, float]:
+    """Yaw, pitch and roll that turn the book's cover to the camera, swinging a few degrees [rad]."""
     x, y, z = MOUNT - position
     yaw = np.arctan2(y, x) + np.radians(7.0) * np.sin(0.55 * t + phase)
     pitch = -np.arctan2(z, np.hypot(x, y)) + np.radians(4.0) * np.sin(0.40 * t + 2.0 * phase)
     roll = np.radians(4.0) * np.sin(0.31 * t + 3.0 * phase)
-    return Rotation.from_euler("ZYX", [yaw, pitch, roll])
+    return yaw, pitch, roll
 
 
-def _bank(upright: Array, acceleration: Array) -> Array:
-    """Lean the bird into its turn, as far as the turn's acceleration asks for; columns, (3, 3)."""
-    lateral = float(acceleration @ upright[:, 1])
+def _turned(yaw: float, pitch: float, roll: float) -> Axes:
+    """The axes of what was turned about z, then about its own y and x [rad]."""
+    (cy, sy), (cp, sp), (cr, sr) = ((math.cos(angle), math.sin(angle)) for angle in (yaw, pitch, roll))
+    forward = cy * cp, sy * cp, -sp
+    left = cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, cp * sr
+    return forward, left, (cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr)
+
+
+def _bank(upright: Axes, acceleration: Sequence[float]) -> Axes:
+    """Lean the bird into its turn, as far as the turn's acceleration asks for."""
+    forward, left, up = upright
+    lateral = float(np.dot(acceleration, left))
     whole = math.hypot(lateral, GRAVITY)
     c, s = GRAVITY / whole, lateral / whole
-    forward, left, up = upright.T
-    return np.array([forward, c * left - s * up, s * left + c * up]).T
+    (lx, ly, lz), (ux, uy, uz) = left, up
+    return (
+        forward,
+        (c * lx - s * ux, c * ly - s * uy, c * lz - s * uz),
+        (s * lx + c * ux, s * ly + c * uy, s * lz + c * uz),
+    )
 
 
 def _walk(step: float, pace: float) -> tuple[dict[str, float], float]:

@@ -11,6 +11,7 @@ from cotarget.config import RigConfig, SimCamera
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Clock, Image
 from cotarget.sim.ahead import Ahead
+from cotarget.sim.appearances import CameraName
 from cotarget.sim.clutter import Clutter
 from cotarget.sim.devices import (
     SimBoard,
@@ -28,7 +29,7 @@ from cotarget.sim.portrait import Portrait, portrait
 from cotarget.sim.sensor import Sensor
 from cotarget.sim.state import WorldState
 from cotarget.sim.targets import Target, make_target, target_rng
-from cotarget.sim.truth import CameraName, Truth
+from cotarget.sim.truth import Truth
 from cotarget.sim.views import Views
 
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
