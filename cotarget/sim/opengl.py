@@ -73,7 +73,7 @@ class Canvas:
         Raises:
             DeviceError: the machine has no OpenGL that can do it.
         """
-        self._model, self._size, self._shadows = model, size, shadows
+        self._model, self._size, self._shadows, self._told = model, size, shadows, _told(model)
         self._renderer: Any = make_renderer(model, *size)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._option, self._untouched = mujoco.MjvOption(), mujoco.MjvPerturb()
@@ -82,13 +82,35 @@ class Canvas:
 
     def without_multisampling(self) -> "Canvas":
         """Another one that does not antialias, closed with this one."""
+        if self._others:
+            return self._others[0]
         quality = self._model.vis.quality
         before, quality.offsamples = quality.offsamples, 0
         try:
             self._others.append(Canvas(self._model, self._size, self._shadows))
         finally:
             quality.offsamples = before
-        return self._others[-1]
+        return self._others[0]
+
+    def turn_to(self, model: "mujoco.MjModel") -> bool:
+        """Draw another model from now on, if it differs from the one before in its meshes' measures at most.
+
+        To open OpenGL anew, with all textures, takes some hundred times as long.
+
+        Returns:
+            Whether it does; nothing is changed where not.
+        """
+        told = _told(model)
+        if told != self._told or not np.array_equal(model.tex_data, self._model.tex_data):
+            return False
+        for canvas in (self, *self._others):
+            renderer, canvas._model = canvas._renderer, model
+            renderer._model = model
+            if renderer._gl_context:
+                renderer._gl_context.make_current()
+            for mesh in range(model.nmesh):
+                mujoco.mjr_uploadMesh(model, renderer._mjr_context, mesh)
+        return True
 
     def look(self, data: "mujoco.MjData", camera_id: int, layers: int) -> None:
         """Take the scene as a camera of the model has it.
@@ -135,3 +157,13 @@ class Canvas:
         """Release OpenGL; more than once does no harm."""
         for canvas in (*self._others, self):
             canvas._renderer.close()
+
+
+def _told(model: "mujoco.MjModel") -> tuple[object, ...]:
+    """What OpenGL is told of a model once and for all, the textures aside: not where its meshes' vertices are."""
+    visual, planes = model.vis, model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    return (
+        *(model.ntex, model.nmesh, model.nhfield, model.nskin, model.stat.extent),
+        *(visual.global_.offwidth, visual.global_.offheight, visual.quality.offsamples, visual.quality.shadowsize),
+        *(model.geom_size[planes].tobytes(), model.mesh_vertnum.tobytes(), model.mesh_face.tobytes()),
+    )
