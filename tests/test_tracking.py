@@ -1,5 +1,6 @@
 """The tracker on drawn detections whose motion is known in closed form."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -371,3 +372,29 @@ def test_a_bird_that_turns_behind_foliage_is_found_again(gap_s, turn):
         hidden = 0 < i / RATE - 0.9 <= gap_s
         tracks = tracker.update([] if hidden else [seen(*(place + rng.normal(0, 1.5, 2)), 17, 9)], i / RATE)
     assert [(track.id, track.missed) for track in tracks if track.confirmed] == [(1, 0)]
+
+
+@pytest.mark.parametrize("name", [None, "book", "person", "bird"])
+def test_a_lone_pair_is_matched_as_any_other(monkeypatch, name):
+    """Whatever overlaps or does not, in all ways in which a lone detection is of a lone track, or of nothing known."""
+    shortcut, ways = tracking._belongs, Counter()
+
+    def both(state, detection, image_size):
+        pairs = tracking._Pairs([state], [detection], image_size)
+        matches = tracking._assign(pairs)
+        found = shortcut(state, detection, image_size)
+        assert tracking._overlap(state, detection) == pairs.overlap[0, 0]
+        assert (matches, tracking._crowds(pairs, matches)) == ({0: 0} if found else {}, {})
+        ways[found, bool(pairs.overlap[0, 0] > tracking.OVERLAP_ENOUGH), state.missed > 0] += 1
+        return found
+
+    monkeypatch.setattr(tracking, "_belongs", both)
+    rng = np.random.default_rng(5)
+    for _ in range(30):
+        tracker = Tracker(PLAIN if name is None else settings_for(DEFAULT_TARGETS[name]), SIZE)
+        for i in range(40):
+            place = np.array([100 + 6 * i, 200]) + rng.normal(0, 4, 2) * rng.choice([1, 4], p=[0.7, 0.3])
+            box = Seen(place, rng.uniform(8, 30, 2), rng.uniform(0.005, 1.0), bool(rng.random() < 0.1))
+            tracker.update([] if rng.random() < 0.2 else [box], i / RATE)
+    assert {way[:2] for way in ways} == {(True, True), (True, False), (False, False)}
+    assert {way[2] for way in ways} == {True, False}
