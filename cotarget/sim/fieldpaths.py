@@ -14,6 +14,7 @@ from cotarget.sim.targets import MOUNT, PERSON_HEIGHT, draw_size, target_rng
 from cotarget.simconfig import Waypoint
 
 SECONDS = 20.0  # of a run
+LONE, GROUPED = ("book", "person", "bird"), ("person", "bird")  # of whom there are paths
 PATHS = 10  # the stream of random numbers of the paths, apart from the world's own
 
 # Paths begin before and end after a run, because they are at rest at both ends [s].
@@ -40,13 +41,10 @@ def lone_path(name: str, seed: int) -> dict[str, tuple[Waypoint, ...]]:
     Raises:
         ConfigError: no such target.
     """
-    makers: dict[str, Callable[[np.random.Generator, float], list[Waypoint]]] = {
-        "book": _book,
-        "person": _person,
-        "bird": _bird,
-    }
-    if name not in makers:
-        raise ConfigError(f"unknown target '{name}'; the scenes to hold are: {choices(makers)}")
+    if name not in LONE:
+        raise ConfigError(f"unknown target '{name}'; the scenes to hold are: {choices(LONE)}")
+    makers: dict[str, Callable[[np.random.Generator, float], list[Waypoint]]]
+    makers = dict(zip(LONE, (_book, _person, _bird), strict=True))
     size = draw_size(name, target_rng(seed, name), scatter=True)
     return {name: tuple(makers[name](_rng(seed, name), size))}
 
@@ -64,9 +62,9 @@ def group_paths(kind: str, seed: int) -> dict[str, tuple[Waypoint, ...]]:
     Raises:
         ConfigError: another kind.
     """
-    makers = {"person": _passing_persons, "bird": _passing_birds}
-    if kind not in makers:
-        raise ConfigError(f"unknown kind '{kind}'; five at once there are of: {choices(makers)}")
+    if kind not in GROUPED:
+        raise ConfigError(f"unknown kind '{kind}'; five at once there are of: {choices(GROUPED)}")
+    makers = dict(zip(GROUPED, (_passing_persons, _passing_birds), strict=True))
     names = [kind, *(f"{kind}{i}" for i in range(2, GROUP + 1))]
     sizes = [draw_size(name, target_rng(seed, name), scatter=True) for name in names]
     paths = makers[kind](_rng(seed, f"five {kind}"), sizes)
