@@ -14,6 +14,7 @@ from experiments.harness import INTERRUPTED, Parser, check_folder
 EXPERIMENTS = (
     *("hand_eye", "chain", "random_rigs", "mismatch", "honesty", "speed", "pointing", "zoom_range", "wire"),
     *("hold", "first_shot", "delay", "five_targets", "dead_zone", "sim_speed", "pipeline_speed"),
+    *("env_score", "env_speed"),
 )
 
 
