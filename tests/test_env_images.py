@@ -11,6 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from cotarget.config import SimCamera
 from cotarget.env import FOLLOW, Follow, Schedule
 from cotarget.env.arguments import DEFAULT_RIG
+from cotarget.errors import DeviceError
 from cotarget.sim import opengl
 from tests.env_episodes import field_rig, run
 
@@ -114,4 +115,15 @@ def test_close_leaves_nothing_behind(monkeypatch, field):
     assert all(renderer._gl_context is not None for renderer in opened)
     env.close()
     assert all(renderer._gl_context is None and renderer._mjr_context is None for renderer in opened)
+    env.close()
+
+
+def test_a_process_that_inherits_an_opengl_is_told_so(monkeypatch, field):
+    """Forked ones would wait for ever."""
+    env = Follow("book", "images", rig=field, seconds=1.0)
+    env.reset(seed=0)
+    monkeypatch.setattr(opengl.os, "getpid", lambda: -1)
+    monkeypatch.setattr(opengl, "BACKEND", "egl")
+    with pytest.raises(DeviceError, match="start it with the method 'spawn'"):
+        Follow("book", "images", rig=field, seconds=1.0).reset(seed=0)
     env.close()

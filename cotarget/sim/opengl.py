@@ -3,6 +3,7 @@
 import ctypes.util
 import os
 import sys
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -48,8 +49,13 @@ def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.R
     """Open an offscreen renderer on this thread.
 
     Raises:
-        DeviceError: the machine has no OpenGL that can do it.
+        DeviceError: the machine has no OpenGL that can do it, or this process has inherited one.
     """
+    if _first_process() != os.getpid() and BACKEND != "osmesa":  # it would wait for threads that were not inherited
+        raise DeviceError(
+            "a process that was forked after something was rendered cannot render; start it with the method 'spawn', "
+            "as AsyncVectorEnv(..., context='spawn') does"
+        )
     try:
         return mujoco.Renderer(model, height, width)
     except Exception as error:  # PyOpenGL and the backends raise whatever they meet
@@ -57,6 +63,12 @@ def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.R
         raise DeviceError(
             f"OpenGL ({BACKEND}) cannot render without a screen: {reason}; {INSTALL.get(BACKEND, OTHERWISE)}"
         ) from None
+
+
+@cache
+def _first_process() -> int:
+    """The number of the first process that opens OpenGL, which those that it forks inherit."""
+    return os.getpid()
 
 
 class Canvas:
