@@ -14,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from cotarget.geometry import Array
 from cotarget.motionfilter import (
+    CUT,
     Measurement,
     TargetFilter,
     Track,
@@ -179,7 +180,8 @@ class _Pairs:
         spread = np.array([state.place_variance for state in states])[:, None]
         cut = np.array([detection.clipped for detection in detections], dtype=bool)
         lacks = missing(size[:, None], extent)
-        spread = spread + center_variance(states[0].settings, extent, cut[:, None], lacks)
+        settings = states[0].settings
+        spread = spread + center_variance(settings, extent, np.where(cut, CUT, settings.noise_of_size)[:, None], lacks)
         own, other = _area(size)[:, None], _area(extent)
         resized = np.log(other / own) / 2 / SIZE_SIGMA
         # Of what the border cuts there is more, and of a target that it cut nobody knows how much more.

@@ -8,6 +8,7 @@ import pytest
 
 from cotarget import tracking
 from cotarget.config import DEFAULT_TARGETS
+from cotarget.motionfilter import CUT, TargetFilter, center_variance, missing
 from cotarget.tracking import MOST_DETECTIONS, Tracker, TrackerSettings, settings_for
 
 RATE = 25.0
@@ -398,3 +399,18 @@ def test_a_lone_pair_is_matched_as_any_other(monkeypatch, name):
             tracker.update([] if rng.random() < 0.2 else [box], i / RATE)
     assert {way[:2] for way in ways} == {(True, True), (True, False), (False, False)}
     assert {way[2] for way in ways} == {True, False}
+
+
+def test_a_boxs_variance_is_the_same_in_floats_and_for_many():
+    rng = np.random.default_rng(3)
+    for settings in (PLAIN, *map(settings_for, DEFAULT_TARGETS.values())):
+        state = TargetFilter(1, Seen(np.zeros(2), np.array([20.0, 12.0])), 0.0, settings)
+        boxes = [Seen(np.zeros(2), rng.uniform(3, 40, 2), clipped=bool(rng.random() < 0.3)) for _ in range(50)]
+        sides = np.array([box.size_px for box in boxes])
+        part = np.where([[box.clipped] for box in boxes], CUT, settings.noise_of_size)
+        several = center_variance(settings, sides, part, missing(state.size, sides))
+        assert [state.variance(box) for box in boxes] == several.tolist()
+        # By hand: the first side that is a piece of the usual 20 px lacks the rest.
+        side, cut = next((box.size_px[0], box.clipped) for box in boxes if box.size_px[0] < 14)
+        off = settings.noise_px**2 + ((0.5 if cut else settings.noise_of_size) * side) ** 2 + ((20 - side) / 2) ** 2
+        assert off == pytest.approx(several[np.flatnonzero(sides[:, 0] == side)[0], 0])

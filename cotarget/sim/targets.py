@@ -49,6 +49,7 @@ SCATTER_SIGMA = 0.5  # the range above is two standard deviations
 GRAVITY = 9.81  # [m/s^2]
 STANDING = 1e-9  # [m/s]
 
+TURNS, NODS = np.radians(7.0), np.radians(4.0)  # of a book that is held out [rad]
 STRIDE = 1.44  # length of two steps of a walking person 1.75 m tall [m]
 WALK_SPEED = 1.5  # [m/s]
 WING_BEAT_HZ = 4.0
@@ -250,9 +251,9 @@ def _heading(position: Sequence[float], velocity: Sequence[float]) -> Axes:
 def _face_mount(position: Array | Sequence[float], t: float, phase: float) -> tuple[float, float, float]:
     """Yaw, pitch and roll that turn the book's cover to the camera, swinging a few degrees [rad]."""
     x, y, z = MOUNT - position
-    yaw = np.arctan2(y, x) + np.radians(7.0) * np.sin(0.55 * t + phase)
-    pitch = -np.arctan2(z, np.hypot(x, y)) + np.radians(4.0) * np.sin(0.40 * t + 2.0 * phase)
-    roll = np.radians(4.0) * np.sin(0.31 * t + 3.0 * phase)
+    yaw = np.arctan2(y, x) + TURNS * np.sin(0.55 * t + phase)
+    pitch = -np.arctan2(z, np.hypot(x, y)) + NODS * np.sin(0.40 * t + 2.0 * phase)
+    roll = NODS * np.sin(0.31 * t + 3.0 * phase)
     return yaw, pitch, roll
 
 
