@@ -78,7 +78,8 @@ class Follow(RigEnv[Any, Vector]):
             observation: "tracks" or "images".
             rig: a simulated one, or its rig.toml; the default one without noise, JPEG, distortion, blur and
                 antialiasing, where none is given. Which targets, paths and seed it names does not count, nor its
-                safety, but for the ranges of pan and tilt that -1 to 1 stand for.
+                safety, but for the ranges of pan and tilt that -1 to 1 stand for. The ways that targets go are made
+                for the outdoor scene: in another one they may lead through walls.
             calibration: that a policy may use, or its file; the true one by default.
             seconds: of an episode, at most 20 [s].
             image_size: (width, height) of the pictures [px].
