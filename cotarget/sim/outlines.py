@@ -15,10 +15,11 @@ import numpy as np
 from cotarget.assets import assets_dir
 from cotarget.geometry import Array
 from cotarget.sim.appearances import CameraName, Silhouette
+from cotarget.sim.gait import limbs
 from cotarget.sim.lens import TrueLens, fold
 from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, RIG, RIG_GROUP
 from cotarget.sim.opengl import mujoco
-from cotarget.sim.targets import Target, limbs
+from cotarget.sim.targets import Target
 from cotarget.sim.truth import Truth, sphere_points, surface_points
 
 PHASES = 48  # of a beat: from one to the next the tip of a wing moves by 2 % of the span at most

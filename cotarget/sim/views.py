@@ -102,7 +102,7 @@ class Views:
             DeviceError: the machine cannot render.
         """
         self._model, self._state, self._size, self._shadows = model, state, size, shadows
-        self.canvas = Canvas(model, size, shadows) if canvas is None else canvas
+        self.canvas = canvas or Canvas(model, size, shadows)
         self._plain = self.canvas  # without multisampling; made when first needed
         self._multisampling, self._soft = multisampling, soft
         corners = np.stack(np.meshgrid(*([-1, 1],) * 3), axis=-1).reshape(-1, 3)
@@ -110,8 +110,7 @@ class Views:
         self._endless = model.geom_rbound == 0  # planes
         self._groups = np.array(model.geom_group)
         self._shown = ~np.isin(self._groups, (BOARD_GROUP, RIG_GROUP, FRAME_GROUP))
-        self._blurs = self._shown.copy()
-        self._blurs[state.faint] = False
+        self._blurs = self._shown & ~np.isin(np.arange(model.ngeom), state.faint)
 
     def apart(self) -> "Views":
         """Another one of the same world, which shares nothing that either of them changes: for the calling thread."""
@@ -179,9 +178,9 @@ class Views:
 
     def _through(self, lens: TrueLens, view: Pinhole, image: Image) -> Image:
         """Bend a render, RGB, into a lens's image, BGR."""
-        image = np.ascontiguousarray(image)
-        bent = image if view == Pinhole(lens.size, lens.focal_px, lens.center_px) else bend(image, view, lens)
-        return np.asarray(cv2.cvtColor(bent, cv2.COLOR_RGB2BGR), dtype=np.uint8)
+        if view != Pinhole(lens.size, lens.focal_px, lens.center_px):
+            image = bend(np.ascontiguousarray(image), view, lens)
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), dtype=np.uint8)
 
     def _render(
         self, camera: str, lens: TrueLens, view: Pinhole, t: float, window: Window | None = None, plain: bool = False
