@@ -160,7 +160,7 @@ EXPERIMENT = Experiment(
     "first_shot",
     "How well a single shot from the wide view alone hits, and what a miss consists of.",
     SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=10.0, calibrated=False),
+    dataclasses.replace(SETTINGS, seeds=1, targets=("book", "bird"), seconds=10.0, calibrated=False),
     one,
     summarise,
     describe,

@@ -243,7 +243,7 @@ EXPERIMENT = Experiment(
     "hold",
     "How long and how well a target is held in the close-up.",
     SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=7.0, calibrated=False),
+    dataclasses.replace(SETTINGS, seeds=1, seconds=5.0, calibrated=False),
     one,
     summarise,
     describe,

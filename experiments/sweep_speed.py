@@ -126,7 +126,7 @@ EXPERIMENT = Experiment(
     "sweep_speed",
     "What a second process is worth to a sweep, and that it changes no row.",
     SETTINGS,
-    replace(SETTINGS, seeds=1, jobs=3, seconds=0.4),
+    replace(SETTINGS, seeds=1, jobs=2, seconds=0.2),
     one,
     summarise,
     describe,
