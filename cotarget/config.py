@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 from cotarget.assets import assets_dir
 from cotarget.errors import ConfigError, choices
 from cotarget.hwconfig import HardwareConfig, check_hardware
-from cotarget.simchecks import check_sim
+from cotarget.simchecks import check_numbers, check_sim
 from cotarget.simconfig import (
     Limits,
     Pair,
@@ -232,8 +232,13 @@ def load_config(path: Path) -> RigConfig:
     return dataclasses.replace(config, targets=beside, sim=sim, recording=recording, safety=safety)
 
 
-def parse_config(table: Mapping[str, Any]) -> RigConfig:
+def parse_config(table: Mapping[str, Any], *, recorded: bool = False) -> RigConfig:
     """Build the configuration from TOML's tables; what is not said keeps its default.
+
+    Args:
+        table: as TOML has it.
+        recorded: whether it is a recording's, which opens no simulated world: one that an earlier version had is not
+            refused then.
 
     Raises:
         ConfigError: an unknown key or an impossible value.
@@ -249,7 +254,7 @@ def parse_config(table: Mapping[str, Any]) -> RigConfig:
         table["sim"] = {**sim_table, "effects": expand_all(sim_table["effects"])}
     config = build(RigConfig, table, "")
     config = dataclasses.replace(config, targets=targets, sim=fit_sizes(config.sim, table.get("sim", {})))
-    _check(config)
+    _check(config, recorded)
     return config
 
 
@@ -265,9 +270,9 @@ def _overlap(own: Pair, soft: Pair | None, where: str) -> Pair:
     return both
 
 
-def _check(config: RigConfig) -> None:
+def _check(config: RigConfig, recorded: bool) -> None:
     """Refuse values of the right type that make no sense."""
-    check_sim(config.sim)
+    check_numbers(config.sim) if recorded else check_sim(config.sim)
     check_hardware(config.hardware)
     positive: dict[str, float] = {
         "board.square": config.board.square,

@@ -33,12 +33,13 @@ class FilmSummary:
     """What was found in a film.
 
     Attributes:
-        frames: how many it has.
+        frames: how many it has that can be decoded.
         frames_with_target: in how many of them there was a confirmed track.
         tracks: how many tracks were confirmed.
         duration_s: from the first frame to the last [s].
         rate_hz: frames a second, as the film says.
-        shortfall: why there are fewer frames than the film says it has; None where it is whole or does not say.
+        last_frame: number of the last one, from 0; there are fewer frames where some cannot be decoded.
+        shortfall: why there are fewer frames than the film has; None where it is whole, or that cannot be known.
     """
 
     frames: int
@@ -46,6 +47,7 @@ class FilmSummary:
     tracks: int
     duration_s: float
     rate_hz: float
+    last_frame: int
     shortfall: str | None = None
 
 
@@ -62,8 +64,8 @@ def run_on_film(
 
     The table has a row for each confirmed track in each frame; in a frame in which the target was not detected
     and its place is the motion filter's prediction, the score is 0, and in one in which several were seen as one, each
-    has the score of that. Files appear only when complete. A film that is cut short is gone through as far as it can be
-    decoded, and the summary says so.
+    has the score of that. Files appear only when complete. A film that is damaged or cut short is gone through where it
+    can be decoded, its frames under the numbers that they have in the whole film, and the summary says so.
 
     Args:
         video: the film.
@@ -104,19 +106,21 @@ def _run(
     numbers: set[int] = set()
     times = []
     with_target = 0
-    for index, frame in enumerate(film):
+    for frame in film:
         tracks = [t for t in tracker.update(detector.detect(frame), frame.t) if t.confirmed]
         for track in tracks:
-            write_row(_row(index, frame.t, track))
+            write_row(_row(film.number, frame.t, track))
         numbers.update(track.id for track in tracks)
         with_target += bool(tracks)
         times.append(frame.t)
         if write_image is not None:
             write_image(trails.draw(frame.image, tracks, frame.t))
         if progress is not None:
-            progress(index + 1, film.count)
+            progress(film.number + 1, film.count)
     duration = max(times) - min(times)
-    return FilmSummary(len(times), with_target, len(numbers), duration, film.rate_hz, film.shortfall or None)
+    return FilmSummary(
+        len(times), with_target, len(numbers), duration, film.rate_hz, film.number, film.shortfall or None
+    )
 
 
 def _row(index: int, t: float, track: Track) -> list[str]:

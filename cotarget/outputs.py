@@ -4,11 +4,17 @@ import contextlib
 import csv
 import fcntl
 import os
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
 from cotarget.errors import ConfigError, CotargetError
+from cotarget.heldsignals import HeldSignals
+
+# A small file is written in less, so that who finds it being written waits for it, for so long at most [s].
+PATIENCE_S = 5.0
+LOOK_S = 0.01  # between looks whether it is [s]
 
 
 def behind_link(path: Path) -> Path:
@@ -20,31 +26,32 @@ class PartFile:
     """The file beside a result in which it is written, and which gets the result's name in one step.
 
     It has the same name in every run and is locked as long as its run lives: a second run on the same result is
-    refused, and what a killed one has left is taken over.
+    refused, where it does not wait, and what a killed one has left is taken over.
 
     Attributes:
         path: what to write to.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, patience_s: float = 0.0) -> None:
         """Take the file; what is in it may be of a killed run.
 
         Args:
             path: the result; where it is a link, its goal is what is replaced in the end.
+            patience_s: how long to wait for another run that is writing it [s].
 
         Raises:
-            ConfigError: another run is writing it, or it cannot be written.
+            ConfigError: another run is writing it, and still is by then, or it cannot be written.
         """
         self._name, self._final = path, behind_link(path)
         self.path = self._final.with_name(f".{self._final.stem}.part{self._final.suffix}")
         try:
-            self._lock = self._take()
+            self._lock = self._take(time.monotonic() + patience_s)
         except BlockingIOError:
             raise ConfigError(f"{path}: is being written by another run; give another name, or wait for it") from None
         except OSError as error:
             raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
 
-    def _take(self) -> int:
+    def _take(self, until: float) -> int:
         """A locked descriptor of the file; never of one that has just got its final name, or was removed."""
         while True:
             lock = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
@@ -53,6 +60,12 @@ class PartFile:
                     _lock(lock)
                     if os.path.samestat(os.fstat(lock), self.path.stat()):
                         return lock
+            except BlockingIOError:
+                os.close(lock)
+                if time.monotonic() >= until:
+                    raise
+                time.sleep(LOOK_S)
+                continue
             except BaseException:
                 os.close(lock)
                 raise
@@ -62,6 +75,9 @@ class PartFile:
     def ending(self, *, keep: bool, error: BaseException | None = None) -> Iterator[None]:
         """Stands around what completes and closes the file; after it the file has its name, or is gone.
 
+        Signals are held back meanwhile, so that a second Ctrl-C loses nothing. Where the run has ended in an error
+        already, one says no more than that; else it acts afterwards.
+
         Args:
             keep: whether it is to have its name.
             error: what the run ended in, if it did; it is told what becomes of the file.
@@ -69,14 +85,16 @@ class PartFile:
         Raises:
             CotargetError: the file could not be completed, as on a full disk; after an error it only gets a note.
         """
-        kept = False
+        kept, held = False, HeldSignals()
+        held.let_hurry()
         try:
+            held.hold()
             yield
             if keep:
                 self.path.replace(self._final)
                 kept = True
                 if error is not None:
-                    error.add_note(f"{self._name} ends early")
+                    error.add_note(f"{self._name} holds what there was until then")
         except (OSError, CotargetError) as failure:
             if error is None:
                 raise said(self._name, failure) from None
@@ -88,6 +106,19 @@ class PartFile:
             with contextlib.suppress(OSError):
                 fcntl.flock(self._lock, fcntl.LOCK_UN)  # a child process may hold the descriptor too
             os.close(self._lock)
+            held.restore()
+        if error is None:
+            held.deliver()
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a result that could not be written, before the work and not after it.
+
+    Raises:
+        ConfigError: another run is writing it, or its folder may not be written to.
+    """
+    with PartFile(path).ending(keep=False):
+        pass
 
 
 def _lock(descriptor: int) -> None:
@@ -115,9 +146,9 @@ def write_whole(path: Path, data: bytes) -> None:
     """Replace a file's content in one step, also when the program or the power fails half-way.
 
     Raises:
-        ConfigError: the file cannot be written, or another run is writing it.
+        ConfigError: the file cannot be written, or another run is writing it for longer than a file takes.
     """
-    part = PartFile(path)
+    part = PartFile(path, PATIENCE_S)
     with part.ending(keep=True), part.path.open("wb") as file:
         file.write(data)
         file.flush()

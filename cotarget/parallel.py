@@ -1,7 +1,9 @@
 """Runs a few long jobs side by side, each in a process of its own, because an OpenGL context belongs to one thread."""
 
 import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
@@ -10,6 +12,7 @@ from cotarget.errors import CotargetError
 
 Result = TypeVar("Result")
 Report = Callable[[int, int], None]
+ORPHANED = 1  # exit status of a process whose parent has gone
 
 
 def run_side_by_side(
@@ -67,6 +70,7 @@ def run_side_by_side(
 
 def _work(job: Callable[..., Any], given: tuple[Any, ...], pipe: Connection) -> None:
     """One process: run the job, send its progress and its result."""
+    end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its jobs itself
 
     def report(done: int, total: int) -> None:
@@ -76,3 +80,21 @@ def _work(job: Callable[..., Any], given: tuple[Any, ...], pipe: Connection) -> 
         pipe.send(("done", job(*given, report)))
     except Exception as error:
         pipe.send(("error", error))
+
+
+def end_with_parent(*then: Callable[[], Any]) -> None:
+    """Let this process end as soon as its parent has gone, however that was ended; call it first of all.
+
+    Args:
+        then: what to call after that, where a process may have one first call alone, as one of a pool.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_after, args=(parent.sentinel,), name="end with parent", daemon=True).start()
+    for each in then:
+        each()
+
+
+def _end_after(parent: int) -> None:
+    wait([parent])
+    os._exit(ORPHANED)  # whatever the job is at; there is nobody to tell

@@ -67,13 +67,17 @@ class FirstCome:
         return self._id
 
 
+LONGEST_LOOKS = 2.5  # the longest that somebody is kept who is not seen, in looks
+
+
 @dataclass
 class Rounds:
     """Look at every target for a while and go on to the next; once all were seen, at whoever was seen least.
 
     Turning away costs the way, and the time until the lens has settled again: whoever turned before that would see
-    nobody. So each is kept for SETTLE_S unless it is gone or was seen for long enough; and once all were, until it has
-    been seen longer than another by a whole look.
+    nobody. So each is kept for SETTLE_S unless it is gone or was seen for long enough; and once all were, for a look
+    more, and until it has been seen longer than another by a whole look or that takes too long: it may be hidden from
+    the zoom camera alone.
 
     Attributes:
         next_of: gives the number of the next one; asked at every frame, and never without anybody waiting.
@@ -100,7 +104,7 @@ class Rounds:
                 pan, tilt = head.tolist()
                 self._turn(self.next_of(Outlook(waiting, self._id, (pan, tilt), limits, self.look_s)), t)
         else:
-            self._turn(self._least_seen(candidates), t)
+            self._turn(self._least_seen(candidates, t), t)
         return self._id
 
     def _turn(self, number: int | None, t: float) -> None:
@@ -108,13 +112,17 @@ class Rounds:
         if number != self._id:
             self._id, self._since = number, t
 
-    def _least_seen(self, candidates: Sequence[Candidate]) -> int | None:
-        """Whoever was seen least; the one followed before until it is a whole look ahead."""
-        least = min(candidates, key=lambda c: (c.seen_s, c.id), default=None)
-        current = next((c for c in candidates if c.id == self._id), least)
-        if current is None or least is None:
-            return None
-        return current.id if current.seen_s < least.seen_s + self.look_s else least.id
+    def _least_seen(self, candidates: Sequence[Candidate], t: float) -> int | None:
+        """Whoever was seen least; the one followed before until it is a whole look ahead, or that takes too long."""
+        others = [c for c in candidates if c.id != self._id]
+        current = next((c for c in candidates if c.id == self._id), None)
+        if not others:
+            return None if current is None else current.id
+        least, kept_s = min(others, key=lambda c: (c.seen_s, c.id)), t - self._since
+        if current is None or not 0 <= kept_s < LONGEST_LOOKS * self.look_s:
+            return least.id
+        behind = current.seen_s < least.seen_s + self.look_s
+        return current.id if behind or kept_s < SETTLE_S + self.look_s else least.id
 
 
 def nearest_deadline(outlook: Outlook) -> int:

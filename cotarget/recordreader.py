@@ -134,7 +134,7 @@ def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, Whom, Ri
         if not isinstance(name, str):
             raise ConfigError("target: is not a text")
         expect_table(table, "config")
-        config = parse_config(table)
+        config = parse_config(table, recorded=True)
         target = config.target(name)
         whom = parse_whom(meta.get("whom", {}))
     except ConfigError as error:

@@ -124,7 +124,8 @@ class Tape:
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._spans, self._frames = _cut(recording.events)
-        self._differing: set[int] = set()  # places of those frames
+        self._differing: set[int] = set()  # places of those frames,
+        self._first: int | None = None  # and the first of them
         self._broke_off = not recording.truncated and recording.ending != COMPLETE
         self._index = 0
         self._ended = False
@@ -253,7 +254,8 @@ class Tape:
         place = max(index - 1, 0)
         self._differing.add(place)
         found = replace(self.differences, frames_differing=len(self._differing))
-        if min(self._differing) == place and self._frames:
+        if self._frames and (self._first is None or place < self._first):
+            self._first = place
             frame, number = self._frames[place], sum(each.image is not None for each in self._frames[:place])
             if frame.image is not None:
                 number = int(Path(frame.image).stem)

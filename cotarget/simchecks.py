@@ -21,6 +21,25 @@ def check_sim(sim: SimConfig) -> None:
     Raises:
         ConfigError: with the key.
     """
+    check_numbers(sim)
+    for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
+        _check_center(f"sim.{name}", camera)
+        _check_frame_time(f"sim.{name}", camera)
+        _check_lens(f"sim.{name}", camera)
+    if sim.effects.optics:
+        _check_optics(sim.zoom)
+    for name, waypoints in sim.paths.items():
+        if len(waypoints) < 2 or any(b[0] <= a[0] for a, b in itertools.pairwise(waypoints)):
+            raise ConfigError(f"sim.paths.{name}: needs two or more waypoints [t, x, y, z] with increasing t")
+    _check_targets(sim)
+
+
+def check_numbers(sim: SimConfig) -> None:
+    """Refuse what no rig can be, simulated or of a recording: sizes, rates and limits.
+
+    Raises:
+        ConfigError: with the key.
+    """
     positive: dict[str, tuple[float, ...]] = {
         "sim.zoom.pitch_mm": (sim.zoom.pitch_mm,),
         "sim.zoom.lens_speed": (sim.zoom.lens_speed,),
@@ -42,9 +61,6 @@ def check_sim(sim: SimConfig) -> None:
         not_negative[f"sim.{name}.exposure_s"] = (camera.exposure_s,)
         if not 1 <= camera.jpeg_quality <= 100:
             raise ConfigError(f"sim.{name}.jpeg_quality: {camera.jpeg_quality} is not within 1 to 100")
-        _check_center(f"sim.{name}", camera)
-        _check_frame_time(f"sim.{name}", camera)
-        _check_lens(f"sim.{name}", camera)
     for where, values in positive.items():
         if min(values) <= 0:
             raise ConfigError(f"{where}: {min(values):g} is not greater than zero")
@@ -61,14 +77,8 @@ def check_sim(sim: SimConfig) -> None:
             raise ConfigError(f"{where}: {list(limits)} is not [lowest, highest]")
     if sim.zoom.focal_mm[0] <= 0:
         raise ConfigError(f"sim.zoom.focal_mm: {sim.zoom.focal_mm[0]:g} is not greater than zero")
-    if sim.effects.optics:
-        _check_optics(sim.zoom)
     if sim.zoom.lens_steps < 2:
         raise ConfigError(f"sim.zoom.lens_steps: {sim.zoom.lens_steps} is fewer than 2")
-    for name, waypoints in sim.paths.items():
-        if len(waypoints) < 2 or any(b[0] <= a[0] for a, b in itertools.pairwise(waypoints)):
-            raise ConfigError(f"sim.paths.{name}: needs two or more waypoints [t, x, y, z] with increasing t")
-    _check_targets(sim)
 
 
 def told_targets() -> str:

@@ -54,9 +54,9 @@ class SimCamera:
     exposure_s: float = 0.0
     jpeg_quality: int = 90
 
-    def enlarged(self, size: Size) -> dict[str, Any]:
-        """What else is other in pixels when the same view is seen in an image of another (width, height)."""
-        by = size[0] / self.size[0]
+    def fitted(self, size: Size, focal_px: Focal | None) -> dict[str, Any]:
+        """What else is other in pixels in an image of another size [px], with a focal length, or of the same view."""
+        by = self._gain(size, focal_px)
         return {
             "focal_px": tuple(by * focal for focal in self.focal_px),
             "center_px": tuple(
@@ -64,6 +64,10 @@ class SimCamera:
                 for at, old, new in zip(self.center_px, self.size, size, strict=True)
             ),
         }
+
+    def _gain(self, size: Size, focal_px: Focal | None) -> float:
+        """How many times as many pixels there are to an angle; more or fewer at its sides change nothing of that."""
+        return size[0] / self.size[0] if focal_px is None else focal_px[0] / self.focal_px[0]
 
 
 @dataclass(frozen=True)
@@ -106,11 +110,11 @@ class SimZoomCamera(SimCamera):
     distortion_drift: Curve = (0.4, 0.04, -0.88, 0.62, -0.05)
     pupil: Curve = (0.03, 0.06, -0.9, 1.17, -0.44)
 
-    def enlarged(self, size: Size) -> dict[str, Any]:
-        """The same of a zoom camera: with the sensor as large, its pixels are smaller."""
-        by = size[0] / self.size[0]
+    def fitted(self, size: Size, focal_px: Focal | None) -> dict[str, Any]:
+        """The same of a zoom camera: more pixels to an angle are smaller ones, as what it tells and does agree."""
+        by = self._gain(size, focal_px)
         return {
-            **super().enlarged(size),
+            **super().fitted(size, focal_px),
             "pitch_mm": self.pitch_mm / by,
             "center_drift_px": tuple(tuple(by * c for c in curve) for curve in self.center_drift_px),
         }
@@ -268,7 +272,7 @@ def expand_all(effects: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def fit_sizes(sim: SimConfig, given: Mapping[str, Any]) -> SimConfig:
-    """Let each camera's view stay what it is where another image size was given.
+    """Let a view stay what it is where another image size was given, and go with the focal length where that was.
 
     Args:
         sim: as it was read.
@@ -276,10 +280,11 @@ def fit_sizes(sim: SimConfig, given: Mapping[str, Any]) -> SimConfig:
     """
     cameras: dict[str, SimCamera] = {}
     for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
-        if min(camera.size) <= 0:
+        if min(*camera.size, *camera.focal_px) <= 0:
             continue  # refused elsewhere
         said = given.get(name, {})
-        follows = type(camera)().enlarged(camera.size)  # nothing changes where the size is the default's
+        # Nothing changes where size and focal length are the default's.
+        follows = type(camera)().fitted(camera.size, camera.focal_px if "focal_px" in said else None)
         cameras[name] = replace(camera, **{key: value for key, value in follows.items() if key not in said})
     return replace(sim, **cameras)  # type: ignore[arg-type]
 

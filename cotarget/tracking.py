@@ -38,8 +38,9 @@ LEAST_SCORE = 0.01
 # Objects that turn up anew somewhere in the image [1/s]: on real films of birds and of a dozen people up to 4. What
 # turns up while a track misses its target must more likely be this target than one of them, as after 0.8 s a gate of
 # four standard deviations reaches over 250 px. With 1 and more, tracks on these films jump to nobody else by more than
-# 100 px; with 8 and more, a bird that turns while it is hidden is not found again.
-NEWCOMERS_HZ = 2.0
+# 100 px; with 8 and more, a bird that turns while it is hidden is not found again. These films have 640x512 pixels; a
+# smaller image has no more of them on each pixel.
+NEWCOMERS_HZ, LEAST_AREA_PX = 2.0, 640 * 512
 # A box that overlaps a track's by this much may be its target even outside the gate: it grew into something else.
 OVERLAP_ENOUGH = 0.3
 # What perfect overlap of the boxes is worth against the Mahalanobis distance squared.
@@ -202,7 +203,7 @@ def _least_likely(states: Sequence[TargetFilter], image_size: tuple[int, int] | 
     """
     limits = np.full((len(states), 1), np.inf)
     if image_size is not None:
-        density = NEWCOMERS_HZ / math.prod(image_size)
+        density = NEWCOMERS_HZ / max(math.prod(image_size), LEAST_AREA_PX)
         for i, state in enumerate(states):
             if state.missed:
                 limits[i] = -2 * math.log(2 * math.pi * density * (state.t - state.seen))

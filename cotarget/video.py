@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from cotarget.errors import CotargetError
+from cotarget.filmplaces import Places, reason_of
 from cotarget.outputs import PartFile
 from cotarget.rig import Frame, Image
 
@@ -31,13 +32,21 @@ SHORT_S, SHORT_FRAMES = 0.5, 3
 class Film:
     """A film, opened; iterate over it for its frames. A context manager.
 
+    What cannot be decoded is left out, and `shortfall` says so. What is looked at for that: packets that the decoder
+    refuses, those without a frame once it has refused one, or behind the last frame; and where the film ends, against
+    what its header says.
+    Pictures that are decoded with faults are not found, nor are packets that a container has lost altogether, in the
+    middle of it.
+
     Attributes:
         path: its file.
         size: (width, height) [px].
         rate_hz: its mean frames a second.
         count: how many frames it says it has; None where it does not say.
-        shortfall: known after the last frame: why there are fewer than the film says it has; empty where it is whole,
-            and where it does not say.
+        number: of the newest frame given, from 0: its place in the film, where those that could not be decoded have
+            theirs too; so what is said of numbered frames, as labels are, stays true of a film that is damaged.
+        shortfall: known after the last frame: why there are fewer than the film has; empty where it is whole, and where
+            it cannot be known.
     """
 
     def __init__(self, path: Path) -> None:
@@ -55,7 +64,7 @@ class Film:
             self._container = av.open(str(path))
         except (av.error.FFmpegError, OSError, ValueError) as error:
             raise CotargetError(
-                f"{path}: cannot be read as a film ({_reason(error)}); give e.g. an mp4 or avi"
+                f"{path}: cannot be read as a film ({reason_of(error)}); give e.g. an mp4 or avi"
             ) from None
         if not self._container.streams.video:
             self._container.close()
@@ -65,6 +74,7 @@ class Film:
         self.size = (int(stream.width), int(stream.height))
         self.rate_hz = float(stream.average_rate or stream.guessed_rate or FALLBACK_RATE_HZ)
         self.count: int | None = stream.frames or None
+        self.number = -1
         self.shortfall = ""
         self._end = 0.0  # of what was read of pictures and sound, by the film's own time [s]
 
@@ -81,28 +91,33 @@ class Film:
     def __iter__(self) -> Iterator[Frame]:
         """Decode the frames in order; times are the film's own [s], or by the count where it has none.
 
-        Frames end where one cannot be decoded, or where the file is cut short; `shortfall` says so then.
+        Those that cannot be decoded are left out, and a file that is cut short ends early; `shortfall` says so then.
 
         Raises:
             CotargetError: nothing can be decoded, or the picture's size changes on the way.
         """
-        index, reason, damaged = 0, "", False
+        places = Places(self._container.streams.video[0])
+        reason, damaged, size = "", False, self.size
         try:
-            for index, picture in enumerate(self._pictures(), start=1):
+            for picture in self._pictures(places):
                 image, damaged = picture.to_ndarray(format="bgr24"), picture.is_corrupt
-                if (image.shape[1], image.shape[0]) != self.size:
+                if (image.shape[1], image.shape[0]) != size:
                     raise CotargetError(
-                        f"{self.path}: the picture's size changes from {self.size[0]}x{self.size[1]} to "
-                        f"{image.shape[1]}x{image.shape[0]} at frame {index - 1}; cut the film there"
+                        f"{self.path}: the picture's size changes from {size[0]}x{size[1]} to "
+                        f"{image.shape[1]}x{image.shape[0]} at frame {places.number}; cut the film there"
                     )
-                yield Frame(image, (index - 1) / self.rate_hz if picture.time is None else float(picture.time))
+                self.number = places.number
+                yield Frame(image, self.number / self.rate_hz if picture.time is None else float(picture.time))
         except av.error.FFmpegError as error:
-            reason = f" ({_reason(error)})"
-        if index == 0:
-            raise CotargetError(f"{self.path}: holds no frame that can be decoded{reason}; give a complete film")
-        self.shortfall = self._shortfall(damaged) or (f"what follows cannot be decoded{reason}" if reason else "")
+            reason = f" ({reason_of(error)})"
+        if self.number < 0:
+            raise CotargetError(
+                f"{self.path}: holds no frame that can be decoded{reason or places.reason}; give a complete film"
+            )
+        ending = self._shortfall(damaged) or (f"what follows cannot be decoded{reason}" if reason else "")
+        self.shortfall = "; ".join(filter(None, (places.told(ended=bool(ending)), ending)))
 
-    def _pictures(self) -> Iterator[av.VideoFrame]:
+    def _pictures(self, places: Places) -> Iterator[av.VideoFrame]:
         """What can be decoded of the first video stream; packets of all streams are looked at for where they end."""
         pictures = self._container.streams.video[0]
         for packet in self._container.demux():
@@ -110,7 +125,15 @@ class Film:
                 self._end = max(self._end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
             # An empty one stands for the frame before it, but for the last of all, which has no time and ends the work.
             if packet.stream is pictures and (packet.size or packet.dts is None):
-                yield from cast(list[av.VideoFrame], packet.decode())
+                places.expect(packet)
+                try:
+                    decoded = cast(list[av.VideoFrame], packet.decode())
+                except av.error.FFmpegError as error:
+                    places.refuse(error)
+                    continue
+                for picture in decoded:
+                    places.take(picture)
+                    yield picture
 
     def _shortfall(self, damaged: bool) -> str:
         """What the container says beyond what was read of it; and whether the last frame is damaged."""
@@ -172,7 +195,7 @@ class FilmWriter:
             raise self._said(error) from None
 
     def _said(self, error: Exception) -> CotargetError:
-        return CotargetError(f"{self._path}: cannot be written ({_reason(error)}); name e.g. an .mp4")
+        return CotargetError(f"{self._path}: cannot be written ({reason_of(error)}); name e.g. an .mp4")
 
     def __enter__(self) -> "FilmWriter":
         """Give the writer itself."""
@@ -193,7 +216,7 @@ class FilmWriter:
                     self._container.mux(self._stream.encode(None))
                     self._container.close()
             except (av.error.FFmpegError, OSError) as failed:
-                raise CotargetError(f"{self._path}: cannot be completed ({_reason(failed)})") from None
+                raise CotargetError(f"{self._path}: cannot be completed ({reason_of(failed)})") from None
             finally:
                 with contextlib.suppress(av.error.FFmpegError, OSError):
                     self._container.close()
@@ -218,8 +241,3 @@ def join_films(parts: Sequence[Path], path: Path) -> None:
                     packet.stream = stream
                     joined.mux(packet)
                 shift += end
-
-
-def _reason(error: Exception) -> str:
-    """The first line of an error, without the path that FFmpeg appends."""
-    return (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0]

@@ -50,7 +50,7 @@ def one(calibration: Calibration, settings: DeadZoneSettings, seed: int) -> list
     rows: list[Row] = []
     for name in settings.targets:
         config = hold_config(name, seed)
-        view = record(config, target_of(config, name), settings.seconds, pictures=settings.closed_loop)
+        view = record(config, target_of(config, name), settings.seconds)
         for way, steering in WAYS.items():
             how = FollowSettings(
                 command_delay_s=config.command_delay_s, steering=steering, closed_loop=settings.closed_loop

@@ -58,7 +58,7 @@ def one(calibration: Calibration, settings: DelaySettings, seed: int) -> list[Ro
     rows: list[Row] = []
     for name in settings.targets:
         config = hold_config(name, seed)
-        view = record(config, target_of(config, name), settings.seconds, pictures=settings.closed_loop)
+        view = record(config, target_of(config, name), settings.seconds)
         for delay, predict, closed_loop in cases:
             late = delayed(config, delay)
             how = FollowSettings(command_delay_s=late.command_delay_s, predict=predict, closed_loop=closed_loop)

@@ -53,7 +53,7 @@ def one(calibration: Calibration, settings: FiveSettings, seed: int) -> list[Row
     for kind in settings.kinds:
         config = five_targets_config(seed, kind)
         target = target_of(config, kind)
-        view = record(config, target, settings.seconds, pictures=settings.closed_loop)
+        view = record(config, target, settings.seconds)
         for policy, make in POLICIES.items():
             how = FollowSettings(command_delay_s=config.command_delay_s, policy=make, closed_loop=settings.closed_loop)
             seconds = good_seconds(calibration, config, target, settings.seconds, how, view)

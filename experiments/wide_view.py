@@ -24,7 +24,7 @@ class Seen:
 
     Attributes:
         detections: in it.
-        picture: as a PNG; None where pictures were not kept.
+        picture: as a PNG; None where nothing was rendered.
         mask: the detector's foreground, likewise.
     """
 
@@ -39,7 +39,7 @@ class WideView:
 
     Attributes:
         frames: by microseconds.
-        pictures: whether they were kept.
+        pictures: whether they are there.
     """
 
     frames: Mapping[int, Seen] = field(repr=False)
@@ -50,14 +50,13 @@ class WideView:
         return self.frames[_key(t)]
 
 
-def record(config: RigConfig, target: TargetConfig, seconds: float, *, pictures: bool = True) -> WideView:
+def record(config: RigConfig, target: TargetConfig, seconds: float) -> WideView:
     """Look through the wide camera alone, and search each frame.
 
     Args:
         config: the rig and its world.
         target: what is looked for.
         seconds: for how long [s].
-        pictures: whether frames and masks are kept, for who looks for the target in the zoom view too.
     """
     frames: dict[int, Seen] = {}
     detector = make_detector(target, config.rate_hz)
@@ -66,8 +65,8 @@ def record(config: RigConfig, target: TargetConfig, seconds: float, *, pictures:
         while t is None or t < seconds:
             frame = rig.fixed.read(newer_than=t)
             t, found = frame.t, tuple(detector.detect(frame))
-            frames[_key(t)] = Seen(found, _png(frame.image), _png(detector.mask)) if pictures else Seen(found)
-    return WideView(frames, pictures)
+            frames[_key(t)] = Seen(found, _png(frame.image), _png(detector.mask))
+    return WideView(frames, pictures=True)
 
 
 def open_on(view: WideView, config: RigConfig, *, closed_loop: bool) -> tuple[SimWorld, "RecordedDetector"]:
@@ -80,7 +79,7 @@ def open_on(view: WideView, config: RigConfig, *, closed_loop: bool) -> tuple[Si
     """
     assert view.pictures or not closed_loop, "the zoom view is searched for what the wide view shows"
     world = SimWorld(config, rendered=("zoom",) if closed_loop else ())
-    if closed_loop:
+    if view.pictures:  # the middle of a body is told by its outline, whoever looks at the zoom view
         world.rig.fixed = _RecordedCamera(world.rig.fixed, view)
     return world, RecordedDetector(view)
 

@@ -14,10 +14,11 @@ import signal
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 import cv2
+
+from cotarget.parallel import end_with_parent
 
 Job = TypeVar("Job")
 Results = Generator[tuple[int, Any], None, None]  # numbers of jobs, and what they gave, or `Died`
@@ -73,14 +74,9 @@ def _pool(
 ) -> Generator[tuple[int, Any], None, list[int]]:
     """Do jobs, which are taken from ``left`` as they are done; those in hand when a process died are returned."""
     context = multiprocessing.get_context("spawn")  # a forked process would share the parent's OpenGL
-    theirs, ours = context.Pipe(duplex=False)
     waiting = iter(list(left.items()))
     running: dict[concurrent.futures.Future[Any], int] = {}
-    with (
-        theirs,
-        concurrent.futures.ProcessPoolExecutor(min(processes, len(left)), context, _begin, (theirs,)) as pool,
-        ours,  # closed first: where jobs are still running then, their processes end at once
-    ):
+    with concurrent.futures.ProcessPoolExecutor(min(processes, len(left)), context, _begin) as pool, _ended_early():
         while True:
             try:
                 with one_thread_each(), interrupts_kept_from_children():
@@ -103,20 +99,26 @@ def _pool(
                 yield number, result
             if broken:
                 return sorted(running.values())
-        pool.shutdown()  # before the pipe is closed, so that they end in good order
     return []
 
 
-def _begin(alive: Connection) -> None:
-    """One process begins: one thread for OpenCV, deaf to Ctrl-C, and gone when the one that started it is."""
+def _begin() -> None:
+    """One process begins: gone when the one that started it is, deaf to Ctrl-C, and with one thread for OpenCV."""
+    end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
-    threading.Thread(target=_end_with, args=(alive,), daemon=True).start()
 
 
-def _end_with(alive: Connection) -> None:
-    alive.poll(None)  # nothing is ever sent: it returns when nobody is left who could
-    os._exit(1)
+@contextlib.contextmanager
+def _ended_early() -> Iterator[None]:
+    """Whatever ends this before its end ends the processes started meanwhile; nobody waits for what they are at."""
+    before = set(multiprocessing.active_children())
+    try:
+        yield
+    except BaseException:
+        for process in set(multiprocessing.active_children()) - before:
+            process.terminate()
+        raise
 
 
 @contextlib.contextmanager

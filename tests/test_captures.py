@@ -64,6 +64,14 @@ def test_an_unknown_kind_of_board_is_named(folder):
         read_index(folder)
 
 
+def test_what_a_killed_run_left_is_no_photo(folder):
+    for name in ("left1.png", "right1.png", ".left7.part.png", ".right1.part.png"):
+        cv2.imwrite(str(folder / name), np.zeros((9, 9, 3), np.uint8))
+    captures, unpaired = pair_photos(folder, "*left*.png", "*right*.png")
+    assert [capture.source for capture in captures] == ["left1.png", "right1.png"]
+    assert not unpaired
+
+
 def test_photos_of_two_sizes_are_refused(folder):
     for name, size in (
         ("left1.png", (48, 64)),

@@ -12,10 +12,12 @@ from cotarget import policies
 from cotarget.calibration import save_calibration
 from cotarget.cli.choosing import POLICIES, Choice, add_choice
 from cotarget.config import RigConfig
+from cotarget.errors import ConfigError
 from cotarget.motionfilter import Track
 from cotarget.planning import Candidate
 from cotarget.rig import PanTiltLimits
 from cotarget.sim.world import SimWorld
+from cotarget.whom import Whom
 from experiments.true_rig import true_calibration
 
 SIZE = (640, 480)
@@ -68,6 +70,21 @@ def test_what_was_never_there_is_told():
     assert choice.unmet == ""
     assert chosen("--click", "3", "4").unmet == ""  # nothing was there at all
     assert chosen().unmet == ""
+
+
+def test_what_a_recording_says_is_not_called_an_option():
+    parser = argparse.ArgumentParser(exit_on_error=False)
+    add_choice(parser)
+    plain = parser.parse_args([])
+    with pytest.raises(ConfigError, match=r"^the recorded click: \(640, 3\) is not in the wide view's 640x480 image"):
+        Choice(plain, SIZE, Whom(click=(640.0, 3.0)))
+    for whom, said in (
+        (Whom(click=(3.0, 4.0)), "the recorded click: no track came near (3, 4)"),
+        (Whom(track=9), "the recorded track: there was no track 9"),
+    ):
+        choice = Choice(plain, SIZE, whom)
+        choice.see(SimpleNamespace(target=None, tracks=[track(2, (1, 1))]))
+        assert choice.unmet == f"{said}; the tracks were: 2"
 
 
 @pytest.fixture

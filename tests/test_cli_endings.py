@@ -17,7 +17,7 @@ from tests.test_drawing import step
 
 FOLLOW = ("follow", "--rig", "rig.toml", "--calibration", "rig_calibration.json", "--target", "bird",
           "--csv", "out.csv", "--video", "out.mp4")  # fmt: skip
-EARLY = "; out.mp4 ends early; out.csv ends early\n"
+EARLY = "; out.mp4 holds what there was until then; out.csv holds what there was until then\n"
 FRAMES = 9  # before it ends
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
+from cotarget.outputs import PartFile
 from tests.recorded_run import ToyRig, calibration_file, record
 from tests.test_cli import OLD, call, draw_photo, true_calibration, write_index
 from tests.test_video import bird_film
@@ -42,7 +43,8 @@ def made(tmp_path_factory):
     (folder / "way").symlink_to("run")
     (folder / "captures").mkdir()
     (folder / "captures" / "a.png").write_bytes(b"a photo")
-    write_index(folder / "captures", [])
+    row = {"file": "a.png", "camera": "fixed", "board": 0, "pan": 0.0, "tilt": 0.0, "focal_px": None, "t": 0.0}
+    write_index(folder / "captures", [row])
     save_calibration(folder / "captures" / "calibration.json", true_calibration(RigConfig()))
     return folder
 
@@ -148,16 +150,45 @@ def test_a_calibration_through_a_link_keeps_the_one_of_before(tmp_path):
     assert goal.read_text() != OLD
 
 
-def test_a_calibration_may_lie_beside_the_captures_it_is_from(folder, capsys, tmp_path):
+@pytest.mark.parametrize("name", ["calibration.json", "calib", "left.txt"])
+def test_a_calibration_may_lie_beside_the_captures_it_is_from(folder, capsys, tmp_path, name):
     """There is one already, which is what is to be replaced; what is wrong here are the photos."""
     photos = tmp_path / "photos"
     photos.mkdir()
-    for name in ("left1.png", "right1.png"):
-        cv2.imwrite(str(photos / name), draw_photo())
-    (photos / "calibration.json").write_text(OLD)
+    for photo in ("left1.png", "right1.png"):
+        cv2.imwrite(str(photos / photo), draw_photo())
+    (photos / name).write_text(OLD)
     status, _, err = call(
         capsys, "calibrate", "--from", photos, "--fixed", "left*.png", "--zoom", "right*.png", "--board", "9x6",
-        "--square", "0.1", "--out", photos / "calibration.json",
+        "--square", "0.1", "--out", photos / name,
     )  # fmt: skip
     assert status == 1
     assert "at least 3" in err
+
+
+@pytest.mark.parametrize("name", ["left1.png", "calib"])
+def test_a_calibration_takes_the_place_of_no_photo_and_of_nothing_in_an_index(folder, capsys, tmp_path, name):
+    """Of captures with an index, what it lists is read."""
+    cv2.imwrite(str(tmp_path / "left1.png"), draw_photo())
+    row = {"file": "left1.png", "camera": "fixed", "board": 0, "pan": 0.0, "tilt": 0.0, "focal_px": None, "t": 0.0}
+    write_index(tmp_path, [row])
+    (tmp_path / "calib").write_text(OLD)
+    status, _, err = call(capsys, "calibrate", "--from", tmp_path, "--out", tmp_path / name)
+    assert (status, "is read or written" in err) == (1, name == "left1.png")
+    assert (tmp_path / "calib").read_text() == OLD
+
+
+def test_a_calibration_that_could_not_be_written_is_told_before_the_session(folder, capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("cotarget.rig.open_rig", lambda config: pytest.fail("opened"))
+    out = tmp_path / "c.json"
+    writing = PartFile(out)
+    try:
+        status, _, err = call(capsys, *CALIBRATE, "--out", out)
+    finally:
+        with writing.ending(keep=False):
+            pass
+    assert (status, err.count("\n")) == (1, 1)
+    assert "is being written by another run" in err
+    (tmp_path / ".c.part.json").mkdir()
+    status, _, err = call(capsys, *CALIBRATE, "--out", out)
+    assert (status, err) == (1, f"cotarget calibrate: {out}: cannot be written: Is a directory\n")

@@ -224,6 +224,28 @@ def test_what_is_said_beside_another_image_size_is_taken_as_it_is_said():
     assert (sim.zoom.pitch_mm, sim.zoom.center_drift_px) == (0.01, ((1.0,), ()))
 
 
+@pytest.mark.parametrize("said", [
+    {"size": [320, 240], "focal_px": [692, 693], "center_px": [160, 115]},  # a crop
+    {"size": [1280, 720], "focal_px": [692, 693]},
+    {"size": [320, 240], "focal_px": [500, 501]},
+    {"focal_px": [1384, 1386]},
+    {"size": [640, 480], "focal_px": [346, 346.5]},
+])  # fmt: skip
+def test_what_the_lens_tells_goes_with_its_true_focal_length(said):
+    """However large the picture is: 6 mm are told as by the default rig, and the centre drifts by as large an angle."""
+    plain, zoom = parse_config({}).sim.zoom, parse_config({"sim": {"zoom": said}}).sim.zoom
+    assert zoom.focal_px == tuple(map(float, said["focal_px"]))
+    by = zoom.focal_px[0] / plain.focal_px[0]
+    assert zoom.focal_mm[0] / zoom.pitch_mm == pytest.approx(by * 6.0 / 0.009)
+    for curve, before in zip(zoom.center_drift_px, plain.center_drift_px, strict=True):
+        assert curve == pytest.approx([by * c for c in before])
+
+
+def test_a_crop_leaves_the_centre_beside_the_middle_where_it_is():
+    fixed = parse_config({"sim": {"fixed": {"size": [320, 240], "focal_px": [686, 684]}}}).sim.fixed
+    assert fixed.center_px == pytest.approx((159.5 + 325 - 319.5, 119.5 + 239 - 239.5))
+
+
 def test_an_exposure_may_last_until_the_next_frame():
     assert parse_config({"sim": {"fixed": {"rate_hz": 25.0, "exposure_s": 0.04}}}).sim.fixed.exposure_s == 0.04
 

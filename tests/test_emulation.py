@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import re
 import signal
 import socket
 import time
@@ -58,6 +59,13 @@ LOOKED_AT_DEG = 0.5
 # A book that was off the middle by less than the dead zone is centred a second after the last command; then it is seen
 # in the middle for as long as this.
 STANDS_S, END_S = "4", 0.5
+# What may be told of a good run where the machine does other things: frames that are late, or do not come at all; and,
+# as the pictures of the zoom camera are then older than it is told, that its view of the book does not fit.
+BUSY = re.compile(
+    "no frame|the newest frame is .* s old|this one is .* after the last|the zoom camera has shown nothing new"
+    "|the views are too far apart in time|the told size or the calibration seems wrong"
+    "|for .* s not found where the zoom view should show it"
+)
 # Between the simulation opened directly and over the wire, a step; and what changes the book's width, of which a fifth
 # of a pixel is as much depth as 0.03 degrees: the coarser JPEG of the wire, and the book's sway, another in either run.
 ALIKE_DEG = HEAD.step_deg + 2 * 0.03
@@ -109,6 +117,16 @@ def end_of(path):
     return [median(float(row[name]) for row in late) for name in ("pan_commanded_deg", "tilt_commanded_deg")]
 
 
+def told(err, command):
+    """The reasons of a warning, which is all that is said; none where there is none."""
+    if not err:
+        return []
+    [line] = err.splitlines()
+    begin, *reasons = re.split(r"(?:^|(?<=: )|(?<=; ))\d+ of \d+ frames: ", line)
+    assert begin == f"cotarget {command}: "
+    return reasons
+
+
 def stays_within_limits(watch):
     return watch.stays_within(SOFT_PAN_DEG, HEAD.tilt_deg, HEAD.step_deg)
 
@@ -117,7 +135,8 @@ def stays_within_limits(watch):
 def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
     table, again, recording = (rig.folder / name for name in ("wire.csv", "again.csv", "recording"))
     status, out, err = run(capsys, *rig.follow("--seconds", STANDS_S, "--csv", table, "--record", recording))
-    assert (status, err.count("\n") <= 1) == (0, True)  # frames of a busy machine are late, of which it may be warned
+    assert status == 0
+    assert all(BUSY.match(reason) for reason in told(err, "follow")), err
     states = json.loads(out)["states"]
     assert states["following"] > 0.8 * sum(states.values())
 

@@ -1,12 +1,12 @@
 """The experiments' harness, and the synthetic rig's truth against what is worked by hand."""
 
+import contextlib
 import csv
 import json
 import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -148,7 +148,7 @@ def work(_, settings, seed):
     path = Path(__file__).with_name(str(seed))
     path.with_suffix(".new").write_text(str(os.getpid()))
     path.with_suffix(".new").rename(path)
-    time.sleep(60)
+    time.sleep(600)
 """
 WAITER = """
 import sys
@@ -161,31 +161,47 @@ if __name__ == "__main__":
 """
 
 
+@contextlib.contextmanager
+def waiter(folder):
+    """An experiment in two processes, both at their jobs, which are files to write and then to wait."""
+    (folder / "waits.py").write_text(WAITS)
+    (folder / "waiter.py").write_text(WAITER)
+    paths = f"{Path(__file__).parents[1]}{os.pathsep}{folder}"
+    command = [sys.executable, "waiter.py"]
+    with subprocess.Popen(
+        command, cwd=folder, env=os.environ | {"PYTHONPATH": paths}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True, start_new_session=True,
+    ) as process:  # fmt: skip
+        try:
+            deadline = time.monotonic() + DEADLINE_S
+            while not all((folder / job).exists() for job in ("0", "1")):
+                assert process.poll() is None, process.stderr.read()
+                assert time.monotonic() < deadline, "the jobs have not begun"
+                time.sleep(0.02)
+            yield process
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # whatever is left of it
+
+
 def test_an_interrupt_of_all_processes_ends_them_in_one_line(tmp_path):
     """As a terminal sends it: to the whole group; the workers are at their jobs, the last of which has not begun."""
-    (tmp_path / "waits.py").write_text(WAITS)
-    (tmp_path / "waiter.py").write_text(WAITER)
-    begun = [tmp_path / "0", tmp_path / "1"]
-    command = [sys.executable, str(tmp_path / "waiter.py")]
-    paths = f"{Path(__file__).parents[1]}{os.pathsep}{tmp_path}"
-    with subprocess.Popen(
-        command, env=os.environ | {"PYTHONPATH": paths}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        start_new_session=True,
-    ) as process:  # fmt: skip
-        late = threading.Timer(DEADLINE_S, os.killpg, (process.pid, signal.SIGKILL))
-        late.start()
-        try:
-            while not all(path.exists() for path in begun) and process.poll() is None:
-                time.sleep(0.05)
-            os.killpg(process.pid, signal.SIGINT)
-            out, err = process.communicate()
-        finally:
-            late.cancel()
+    with waiter(tmp_path) as process:
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=DEADLINE_S)
     assert (process.returncode, out, err) == (130, "", "experiments.waiter: interrupted\n")
     assert not (tmp_path / "2").exists()
-    for path in begun:
+    for job in ("0", "1"):
         with pytest.raises(ProcessLookupError):
-            os.kill(int(path.read_text()), 0)
+            os.kill(int((tmp_path / job).read_text()), 0)
+
+
+def test_workers_end_with_their_parent_however_it_ends(tmp_path):
+    """Its pipes are closed only when nobody holds them any more; the jobs would for minutes."""
+    with waiter(tmp_path) as process:
+        process.kill()
+        process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == -signal.SIGKILL
 
 
 def test_a_pipeline_that_is_too_slow_is_missed():

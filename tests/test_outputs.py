@@ -1,7 +1,9 @@
 """Results: under their name only when complete, written by one run at a time, and through links."""
 
+import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +57,7 @@ def test_what_there_is_can_be_kept_after_an_error_which_says_so(tmp_path, name, 
     assert not hasattr(caught.value, "__notes__")
     with pytest.raises(type(error)) as caught:
         write(path, 3, error, keep=True)
-    assert caught.value.__notes__ == [f"{path} ends early"]
+    assert caught.value.__notes__ == [f"{path} holds what there was until then"]
     assert names(tmp_path) == [name]
     if name == "a.csv":
         assert path.read_text().split() == ["n", "0", "1", "2"]
@@ -97,6 +99,108 @@ def test_a_second_run_on_the_same_result_is_refused(tmp_path, name, make):
             assert str(other) in str(caught.value)
     with make(path):  # and not after that
         pass
+
+
+def test_small_files_wait_for_each_other(tmp_path):
+    """Each of them is whole afterwards; a run that goes on writing is refused in the end."""
+    path = tmp_path / "a.json"
+    first = PartFile(path)
+    first.path.write_text("first")
+
+    def end():
+        with first.ending(keep=True):
+            pass
+
+    timer = threading.Timer(0.1, end)
+    timer.start()
+    write_whole(path, b"second")
+    timer.join()
+    assert path.read_text() == "second"
+    assert names(tmp_path) == ["a.json"]
+
+
+def test_who_waits_for_a_run_that_goes_on_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("cotarget.outputs.PATIENCE_S", 0.05)
+    with CsvFile(tmp_path / "a.csv", ("n",)), pytest.raises(ConfigError, match="is being written by another run"):
+        write_whole(tmp_path / "a.csv", b"whole")
+    assert (tmp_path / "a.csv").read_text().split() == ["n"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_while_a_film_is_completed_loses_nothing(tmp_path, number):
+    """The first has ended the run; what comes while the file is completed says no more."""
+
+    def leave(*_):
+        raise KeyboardInterrupt("second")
+
+    former = signal.signal(number, leave)
+    try:
+        with pytest.raises(KeyboardInterrupt, match="first") as caught:
+            write_and_end(_Signalled(tmp_path / "a.mp4", number), KeyboardInterrupt("first"))
+        assert signal.getsignal(number) is leave
+    finally:
+        signal.signal(number, former)
+    assert caught.value.__notes__ == [f"{tmp_path / 'a.mp4'} holds what there was until then"]
+    with Film(tmp_path / "a.mp4") as film:
+        assert len(list(film)) == 3
+
+
+@pytest.fixture
+def _ctrl_c():
+    """Whatever it does to the tests."""
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, former)
+
+
+@pytest.mark.usefixtures("_ctrl_c")
+def test_a_signal_while_a_file_is_completed_acts_afterwards(tmp_path):
+    path = tmp_path / "a.json"
+    with pytest.raises(KeyboardInterrupt):
+        complete(PartFile(path), signals=1)
+    assert path.read_text() == "whole"
+
+
+@pytest.mark.usefixtures("_ctrl_c")
+def test_one_who_insists_need_not_wait_for_a_file(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        complete(PartFile(tmp_path / "a.json"), signals=3)
+    assert names(tmp_path) == []
+
+
+def write_and_end(writer, error):
+    with writer as film:
+        for _ in range(3):
+            film.write(IMAGE)
+        raise error
+
+
+def complete(part, signals):
+    with part.ending(keep=True):
+        for _ in range(signals):
+            signal.raise_signal(signal.SIGINT)
+        part.path.write_text("whole")
+
+
+class _Signalled(FilmWriter):
+    """Is sent a signal while it is completed."""
+
+    def __init__(self, path, number):
+        super().__init__(path, 25.0, keep=True)
+        self._number = number
+
+    def __exit__(self, *error):
+        plain = self._container
+
+        class Container:
+            def mux(self, packets):
+                signal.raise_signal(number)
+                plain.mux(packets)
+
+            close = plain.close
+
+        number, self._container = self._number, Container()
+        super().__exit__(*error)
 
 
 def test_what_a_killed_run_has_left_is_taken_over(tmp_path):

@@ -1,11 +1,18 @@
 """Jobs side by side: results in order, progress over all, and mistakes that end the others."""
 
+import contextlib
 import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.parallel import run_side_by_side
+
+DEADLINE_S = 60.0  # for what should come at once
 
 
 def square(x, report):
@@ -53,3 +60,36 @@ def test_an_interrupt_ends_the_jobs():
     finally:
         os.close(reading)
         os.close(writing)
+
+
+WAITER = """
+import time
+from cotarget.parallel import run_side_by_side
+
+def work(name, report):
+    report(0, 1)
+    time.sleep(600)
+
+def tell(done, total):
+    print("begun", flush=True)
+
+if __name__ == "__main__":
+    run_side_by_side(work, [("a",), ("b",)], tell)
+"""
+
+
+def test_jobs_end_with_their_parent_however_it_ends(tmp_path):
+    """Its pipes are closed only when nobody holds them any more."""
+    (tmp_path / "waiter.py").write_text(WAITER)
+    with subprocess.Popen(
+        [sys.executable, "waiter.py"], cwd=tmp_path, stdout=subprocess.PIPE, start_new_session=True,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+    ) as process:  # fmt: skip
+        try:
+            assert [process.stdout.readline() for _ in range(2)] == [b"begun\n"] * 2
+            process.kill()
+            process.communicate(timeout=DEADLINE_S)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # whatever is left of it
+    assert process.returncode == -signal.SIGKILL

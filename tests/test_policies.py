@@ -134,6 +134,18 @@ def test_who_were_all_seen_are_looked_at_in_turn_and_for_long_enough(make, apart
     assert np.ptp(seen) <= LOOK_S + 0.041
 
 
+@pytest.mark.parametrize("make", [nearest_deadline, most_served])
+def test_who_cannot_be_seen_any_more_does_not_keep_the_head(make):
+    """The zoom camera's view of it is blocked, and the wide one's is not."""
+    policy, seen, hidden = make(), np.full(2, 2.0), 0
+    turned = [policy.select([candidate(i, 0.1 * i, seen=seen[i], t=0.0) for i in range(2)], np.zeros(2), LIMITS)]
+    for t in np.arange(0.04, 20, 0.04):
+        there = [candidate(i, 0.1 * i, seen=seen[i], t=t) for i in range(2)]
+        turned.append(policy.select(there, np.zeros(2), LIMITS))
+        seen[turned[-1]] += 0.04 * (turned[-1] != hidden)
+    assert np.mean(turned) > 0.3  # of the time number 1 is looked at
+
+
 def served_by_best_order(candidates, head):
     """How many the best of all orders serves, by trying every order of every subset."""
     best = 0

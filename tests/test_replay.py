@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,8 +26,10 @@ from cotarget.errors import ConfigError, CotargetError, DeviceError, StaleFrameE
 from cotarget.estimation import Estimate
 from cotarget.loop import FollowSettings, State, follow
 from cotarget.policies import Chosen
+from cotarget.recordformat import COMPLETE, Event
 from cotarget.recording import Recorder
 from cotarget.replay import Differences, RecordingEndedError, ReplayRig, open_recording, until_end
+from cotarget.replaytape import Tape
 from cotarget.rig import PanTiltState
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
@@ -261,7 +264,7 @@ def test_a_recording_that_does_not_say_whom_replays_as_the_first_policy_does(rep
 
 @pytest.mark.parametrize(("whom", "said"), [
     ({"policy": "by-name"}, "the recorded policy 'by-name' is unknown; give --policy, one of: first-come"),
-    ({"click": [500.0, 3.0]}, "--click: (500, 3) is not in the wide view's 96x72 image"),
+    ({"click": [500.0, 3.0]}, "the recorded click: (500, 3) is not in the wide view's 96x72 image"),
     ({"click": [float("nan"), 3.0]}, "is not in the wide view"),
     ({"click": [10**400, 3.0]}, "recording.json: whom: int too large"),
     ({"click": [1.0]}, "recording.json: whom: click [1.0] is no pixel"),
@@ -527,6 +530,40 @@ def edit(key, value):
 
 def put(name, data):
     return lambda folder: (folder / name).write_bytes(data)
+
+
+def test_a_simulated_world_that_would_be_refused_by_now_can_still_be_replayed(copy):
+    """As an earlier version wrote it; nothing of it is simulated again."""
+    config = json.loads((copy / "recording.json").read_text())["config"]
+    for camera in ("fixed", "zoom"):  # of which the principal point was not moved with the size, at that time
+        config["sim"][camera] |= {"size": [320, 240], "center_px": [326.0, 239.0], "exposure_s": 1.0}
+    with pytest.raises(ConfigError, match=r"center_px: \(326, 239\) is not in the 320x240 image"):
+        parse_config(config)
+    edit("config", config)(copy)
+    assert open_recording(copy).config.sim.zoom.center_px == (326.0, 239.0)
+    config["sim"]["fixed"]["rate_hz"] = 0.0  # by which a replay goes
+    edit("config", config)(copy)
+    with pytest.raises(ConfigError, match=r"sim\.fixed\.rate_hz: 0 is not greater than zero"):
+        open_recording(copy)
+
+
+def test_differences_take_no_longer_the_more_there_are():
+    """Those before are never gone through again."""
+
+    class Unwalked(set):
+        def __iter__(self):
+            pytest.fail("goes through all")
+
+    events = tuple(Event("fixed.read", 0.1 * i, (None, 1.0), (0.1 * i,), f"fixed/{i:06d}.png") for i in range(50))
+    tape = Tape(SimpleNamespace(directory=Path("run"), events=events, truncated=False, ending=COMPLETE))
+    tape._differing = Unwalked()
+    for i in range(50):
+        tape.next_frame(None, 1.0)
+        if i > 2:
+            tape.compare("head.move", None, (0.0, 0.0, None, False))
+    found = tape.differences
+    assert (found.extra, found.frames_differing, found.first_frame) == (47, 47, 3)
+    assert found.first_s == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(("spoil", "message"), [

@@ -169,6 +169,72 @@ def test_detect_keeps_what_a_film_has_that_is_cut_short_and_says_so(tmp_path, ca
     assert err == f"{tmp_path / 'cut.avi'}: is not whole: {found['shortfall']}; the results are of what there is\n"
 
 
+def damaged(whole, path, packets):
+    """Copy a film, with these packets of it overwritten by zeros."""
+    with av.open(str(whole)) as film:
+        places = [(packet.pos, packet.size) for packet in film.demux(video=0) if packet.size]
+    data = bytearray(whole.read_bytes())
+    for packet in packets:
+        at, size = places[packet]
+        data[at : at + size] = bytes(size)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(("name", "write", "reordered"), [
+    ("a.mp4", bird_film, True),
+    ("b.mp4", lambda path: other_film(path, "libx264"), False),
+    ("a.avi", lambda path: other_film(path, "mpeg4"), False),
+    ("b.avi", lambda path: other_film(path, "mjpeg"), False),
+])  # fmt: skip
+def test_what_follows_a_packet_that_cannot_be_decoded_is_read_under_its_own_number(tmp_path, name, write, reordered):
+    """One alone, two in a row, and the last; with B-frames a packet's number is not its frame's."""
+    whole = tmp_path / f"whole-{name}"
+    write(whole)
+    with av.open(str(whole)) as film:
+        times = [packet.pts for packet in film.demux(video=0) if packet.size]
+    assert (times != sorted(times)) == reordered
+    for lost in ((20,), (20, 40, 41), (20, 59)):
+        damaged(whole, tmp_path / name, lost)
+        numbers = sorted(sorted(times).index(times[packet]) for packet in lost)
+        with Film(tmp_path / name) as film:
+            read = [(film.number, frame.t) for frame in film]
+        missing = sorted(set(range(60)) - {number for number, _ in read})
+        assert missing == numbers or (59 in lost and missing[0] == numbers[0])  # some before the last go with it
+        begin = read[0][1]
+        assert all(t - begin == pytest.approx(number / RATE, abs=1e-3) for number, t in read)
+        packets = "1 packet" if len(lost) == 1 else r"\d packets"
+        assert re.match(rf"{packets} from frame {numbers[0]} on could not be decoded \(Invalid data", film.shortfall)
+        assert 59 in lost or len(lost) == 1 or film.shortfall.startswith(f"{len(lost)} packets")
+
+
+def test_a_damaged_film_that_ends_early_too_says_both(tmp_path):
+    other_film(tmp_path / "whole.avi", "mjpeg")
+    damaged(tmp_path / "whole.avi", tmp_path / "a.avi", [5])
+    data = (tmp_path / "a.avi").read_bytes()
+    (tmp_path / "a.avi").write_bytes(data[: len(data) * 6 // 10])
+    with Film(tmp_path / "a.avi") as film:
+        assert len(list(film)) > 20
+    damage, end = film.shortfall.split("; ")
+    assert damage.startswith("1 packet from frame 5 on could not be decoded")
+    assert end.startswith("the film says that it lasts 2.4 s, and ends at 1.")
+
+
+def test_detect_goes_on_behind_damage_and_blames_no_labels(tmp_path, capsys):
+    other_film(tmp_path / "whole.avi", "mjpeg")
+    labels = tmp_path / "labels.csv"
+    labels.write_text("frame,x_px,y_px,width_px,height_px\n" + "".join(f"{i},5,5,9,9\n" for i in (10, 59, 60)))
+    for name, lost, beyond in (("a.avi", [], 1), ("b.avi", [20], 1), ("c.avi", range(40, 60), 2)):
+        damaged(tmp_path / "whole.avi", tmp_path / name, lost)
+        command = ["detect", str(tmp_path / name), "--target", "bird", "--csv", str(tmp_path / "a.csv")]
+        assert main([*command, "--labels", str(labels)]) == 0
+        out, err = capsys.readouterr()
+        found = json.loads(out)
+        assert (found["frames"], found["last_frame"]) == (60 - len(lost), 39 if len(lost) > 1 else 59)
+        assert found["labels_beyond_end"] == beyond
+        assert ("another film" in err) == (not lost)
+        assert ("is not whole" in err) == bool(lost)
+
+
 def test_a_size_that_changes_on_the_way_is_named(tmp_path):
     path = tmp_path / "two.mjpeg"
     for width in (64, 96):

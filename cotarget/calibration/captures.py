@@ -188,12 +188,21 @@ def pair_photos(directory: Path, fixed_glob: str, zoom_glob: str) -> tuple[list[
     return captures, unpaired
 
 
-def _numbered(directory: Path, pattern: str) -> dict[int, str]:
-    """Files by the last number in their names."""
+def matching(directory: Path, pattern: str) -> list[Path]:
+    """Find the files that a pattern means, sorted; not hidden ones, as what is left of a file that was being written.
+
+    Raises:
+        CalibrationError: it is no pattern.
+    """
     try:
-        paths = sorted(path for path in directory.glob(pattern) if path.is_file())
+        return sorted(path for path in directory.glob(pattern) if path.is_file() and not path.name.startswith("."))
     except (ValueError, NotImplementedError):
         raise CalibrationError(f"'{pattern}': is not a pattern of file names; give one like 'left*.jpg'") from None
+
+
+def _numbered(directory: Path, pattern: str) -> dict[int, str]:
+    """Files by the last number in their names."""
+    paths = matching(directory, pattern)
     if not paths:
         raise CalibrationError(f"{directory}: no file matches '{pattern}'")
     names: dict[int, str] = {}

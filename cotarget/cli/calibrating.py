@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.arguments import check_outputs, previous_kept, print_json, progress_bar, rig_files
 from cotarget.errors import ConfigError
-from cotarget.outputs import behind_link
+from cotarget.outputs import behind_link, check_writable
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
@@ -33,10 +33,11 @@ def calibrate(options: argparse.Namespace) -> None:
     from cotarget.stills import with_stills
 
     config = None if options.rig is None else load_config(options.rig)
-    inputs = _photos(options.source) if config is None else rig_files(options.rig, config)
+    inputs = _photos(options) if config is None else rig_files(options.rig, config)
     check_outputs([], inputs, options.captures)
     check_outputs([options.out], [*inputs, *_lists(options.captures)])
     _check_together(options)
+    check_writable(options.out)
     how = cal.Options(options.method, encoders=options.encoders, insist=options.insist)
     with _captures_kept(options.captures), progress_bar() as progress:
 
@@ -80,10 +81,19 @@ def _lists(directory: Path | None) -> list[Path]:
     return [] if directory is None else [directory / name for name in LISTS]
 
 
-def _photos(directory: Path) -> list[Path]:
-    """What is read of a folder of captures or photos; a calibration may lie beside them."""
-    files = directory.iterdir() if directory.is_dir() else ()
-    return [path for path in files if path.suffix != ".json" or path.name in LISTS]
+def _photos(options: argparse.Namespace) -> list[Path]:
+    """What is read of a folder of captures or photos; whatever else lies beside them may be a result."""
+    from cotarget.calibration.captures import matching, read_index
+    from cotarget.errors import CalibrationError
+
+    directory, globs = options.source, [glob for glob in (options.fixed, options.zoom) if glob is not None]
+    found = _lists(directory)
+    with contextlib.suppress(CalibrationError):  # what cannot be read is told when it is to be
+        for glob in globs:
+            found += matching(directory, glob)
+        if not globs:
+            found += [directory / capture.source for capture in read_index(directory).captures if capture.source]
+    return found
 
 
 @contextlib.contextmanager

@@ -94,13 +94,15 @@ class Choice:
         self.whom = _whom(options, recorded)
         if self.whom.click is not None:
             u, v = self.whom.click
+            said = "the recorded click" if options.click is None else "--click"
             if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
-                raise ConfigError(f"--click: ({u:g}, {v:g}) is not in the wide view's {size[0]}x{size[1]} image")
+                raise ConfigError(f"{said}: ({u:g}, {v:g}) is not in the wide view's {size[0]}x{size[1]} image")
             self.policy = partial(Chosen, pixel=(u, v), width_px=size[0])
-            self._wish = f"--click: no track came near ({u:g}, {v:g})"
+            self._wish = f"{said}: no track came near ({u:g}, {v:g})"
         elif self.whom.track is not None:
             self.policy = partial(Chosen, number=self.whom.track)
-            self._wish = f"--track: there was no track {self.whom.track}"
+            said = "the recorded track" if options.track is None else "--track"
+            self._wish = f"{said}: there was no track {self.whom.track}"
         elif self.whom.policy is not None and self.whom.policy in MAKERS:
             self.policy = MAKERS[self.whom.policy]
         else:

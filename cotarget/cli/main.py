@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _say(command: str, text: str, end: BaseException) -> None:
-    """Say in one line how a command ended, and which of its files end early by that."""
+    """Say in one line how a command ended, and which of its files are what there was until then."""
     with contextlib.suppress(OSError):  # a terminal that has gone
         print("; ".join([f"cotarget {command}: {text}", *_notes(end)]), file=sys.stderr)
 

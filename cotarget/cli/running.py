@@ -177,9 +177,10 @@ def detect(options: argparse.Namespace) -> None:
             lambda done, total: progress(f"detecting: {options.target}", done, total or done),
             keep=True,
         )
-    scores = _scores(options, read_tracks(options.csv), labels, found.rate_hz, found.frames)
+    whole = found.shortfall is None
+    scores = _scores(options, read_tracks(options.csv), labels, found.rate_hz, found.last_frame + 1, whole=whole)
     print_json(dataclasses.asdict(found) | scores)
-    if found.shortfall is not None:
+    if not whole:
         print(f"{options.film}: is not whole: {found.shortfall}; the results are of what there is", file=sys.stderr)
 
 
@@ -189,6 +190,8 @@ def _scores(
     labels: "Mapping[int, Sequence[Label]] | None",
     rate_hz: float,
     frames: int,
+    *,
+    whole: bool = True,
 ) -> dict[str, Any]:
     """How well tracks keep to what is labelled; nothing where nobody gave labels."""
     from cotarget.metrics import score_tracks
@@ -199,7 +202,7 @@ def _scores(
     if score.labels_beyond_end:
         print(
             f"{options.labels}: {score.labels_beyond_end} of {len(labels)} labelled frames are beyond the last one, "
-            f"{frames - 1}, and are not counted; are the labels of another film?",
+            f"{frames - 1}, and are not counted{'; are the labels of another film?' if whole else ''}",
             file=sys.stderr,
         )
     return dataclasses.asdict(score)

@@ -6,11 +6,12 @@ from collections.abc import Callable
 from types import TracebackType
 
 from cotarget.config import SafetyConfig
+from cotarget.heldsignals import HeldSignals
 from cotarget.rig import Board, Camera, Clock, PanTilt, Rig, ZoomCamera
 from cotarget.safety.devices import SafeCamera, SafeClock, SafeHead, SafeZoomCamera
 from cotarget.safety.guard import Guard
 from cotarget.safety.limits import soft_limits
-from cotarget.safety.signals import HeldSignals, end_politely
+from cotarget.safety.signals import end_politely
 from cotarget.safety.stopfile import refuse_if_stopped
 from cotarget.safety.watcher import Watcher
 
@@ -119,7 +120,7 @@ class SafeRig:
                 interrupt = error
         errors: list[BaseException] = []
         self._closed = True
-        for act in (self._guard.shut, held.halted, self._leave, self._rig.close):
+        for act in (self._guard.shut, held.let_hurry, self._leave, self._rig.close):
             try:
                 act()
             except BaseException as error:

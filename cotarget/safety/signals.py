@@ -7,61 +7,14 @@ import sys
 import threading
 from collections.abc import Callable
 from types import FrameType
-from typing import Any
+
+from cotarget.heldsignals import ENDING
 
 log = logging.getLogger(__name__)
 
-# Signals that would end the process on the spot: a polite request, a terminal or connection that has gone, Ctrl-\.
-ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name))
-# And those that would freeze it, watchdog and all: Ctrl-Z, and use of a terminal that another program has.
+# Signals that would freeze the process, watchdog and all: Ctrl-Z, and use of a terminal that another program has.
 FREEZING = tuple(getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTTOU") if hasattr(signal, name))
-HELD = (signal.SIGINT, *ENDING)
 SHELL_STATUS = 128  # a shell's exit status for a signal is this and its number
-# So many signals, while the devices are released after the halt, end the wait for devices that do not answer.
-IMPATIENCE = 3
-
-
-class HeldSignals:
-    """Keeps Ctrl-C and SIGTERM back while the head is halted; they are delivered afterwards.
-
-    Only the main thread gets signals, so elsewhere there is nothing to hold.
-    """
-
-    def __init__(self) -> None:
-        self.pending: list[int] = []
-        self._previous: dict[int, Any] = {}
-        self._halted = False
-
-    def hold(self) -> None:
-        """From now on note signals; may be called again where a signal cut it short."""
-        if threading.current_thread() is not threading.main_thread():
-            return
-        for number in HELD:
-            previous = signal.getsignal(number)
-            if number not in self._previous and previous not in (None, signal.SIG_IGN, self._note):
-                self._previous[number] = previous
-                signal.signal(number, self._note)
-
-    def halted(self) -> None:
-        """The head is halted or cannot be; from now on enough signals end the wait for the devices."""
-        self._halted = True
-
-    def restore(self) -> None:
-        """Put the former handlers back."""
-        while self._previous:
-            number, previous = self._previous.popitem()
-            if signal.getsignal(number) == self._note:
-                signal.signal(number, previous)
-
-    def deliver(self) -> None:
-        """Let the signal act that was held back, if there was one."""
-        if self.pending:
-            signal.raise_signal(self.pending[0])
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self.pending.append(number)
-        if self._halted and len(self.pending) >= IMPATIENCE:
-            raise KeyboardInterrupt
 
 
 def end_politely(halt: Callable[[], None] | None = None) -> Callable[[], None]:

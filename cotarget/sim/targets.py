@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cotarget.errors import ConfigError, choices
+from cotarget.errors import ConfigError
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.sim.paths import MOUNT, Path, bird_path, book_path, person_path, waypoint_path
+from cotarget.simchecks import told_targets
 from cotarget.simconfig import TARGETS, Waypoint, split_name
 
 if TYPE_CHECKING:
@@ -182,10 +183,7 @@ def _place_of(name: str) -> tuple[int, int]:
     """Index of a target's kind in TARGETS, and its number among its kind, from 1 on."""
     kind, number = split_name(name)
     if kind not in TARGETS:
-        raise ConfigError(
-            f"unknown target '{name}'; the simulation has: {choices(TARGETS)}, and further ones with a number, as "
-            "'bird2'"
-        )
+        raise ConfigError(f"unknown target '{name}'; {told_targets()}")
     return TARGETS.index(kind), number
 
 
