@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from cotarget.errors import ConfigError
+from cotarget.sim.opengl import Canvas
 from experiments.__main__ import main
 from experiments.bounds import compare, tighten
 from experiments.cases import EXPERIMENTS, choose, known_experiments
@@ -24,7 +25,7 @@ from experiments.cluster import on_dask
 from experiments.harness import Experiment, Settings
 from experiments.report import duration
 from experiments.results import code_version, taken
-from experiments.tasks import perform
+from experiments.tasks import Task, perform
 from experiments.workers import LINEAR_ALGEBRA, ONE_THREAD, Died, here, in_processes
 from tests.tiny_experiments import ALONE, KNOWN, TINY, notes, pids
 
@@ -89,6 +90,20 @@ def test_each_job_once_what_is_shared_first_and_timings_last(run, tmp_path):
     assert run("tiny", "--processes", "1", out="one")[0] == 0
     one, two = (sorted((tmp_path / out).glob("tiny*/rows.csv")) for out in ("one", "out"))
     assert one[0].read_bytes() == two[0].read_bytes()
+
+
+def test_what_a_job_takes_is_told():
+    def call():
+        Canvas.drawn += 3  # as drawing does
+        end = time.process_time() + 0.02
+        while time.process_time() < end:
+            pass
+        return [{"seed": 0, "value": np.float32(0.5), "of": (1, 2)}]
+
+    done = perform(Task(0, 0, call))
+    assert (done.renders, done.result) == (3, [{"seed": 0, "value": 0.5, "of": [1, 2]}])
+    assert 0.02 <= done.cpu_s <= done.seconds + 0.01  # clocks of their own
+    assert "a row holds a set, which is no number" in perform(Task(0, 0, lambda: [{"seed": {0}}])).failed
 
 
 def test_more_seeds_are_added_to_those_that_are_there(run, tmp_path):

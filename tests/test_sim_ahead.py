@@ -11,6 +11,7 @@ import pytest
 from cotarget.config import parse_config
 from cotarget.errors import DeviceError
 from cotarget.sim.ahead import READ_IN_TURN, Ahead, is_allowed
+from cotarget.sim.opengl import Canvas
 from cotarget.sim.world import SimWorld
 
 FRAMES = READ_IN_TURN + 8
@@ -43,8 +44,9 @@ def watched(w):
 
 @pytest.mark.render
 def test_frames_are_the_same_whether_rendered_ahead_or_not():
-    before = len(workers())
+    before, drawn = len(workers()), Canvas.drawn
     (plain, without), (ahead, with_it) = watched(world(ahead=False)), watched(world())
+    assert Canvas.drawn - drawn >= len(plain) + len(ahead)
     assert (without - before, with_it - before) == (0, 1)
     for a, b in zip(plain, ahead, strict=True):
         assert a.t == b.t
