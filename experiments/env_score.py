@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from cotarget.env import FOLLOW, SCHEDULE, PipelinePolicy, SchedulingPolicy
 from cotarget.policies import POLICIES
 from cotarget.sim.fieldpaths import GROUPED, LONE, SECONDS
-from experiments.harness import Experiment, Row, Settings, over_seeds, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, seeds_of, table
 
 CHANCE, PIPELINE = "chance", "pipeline"
 
@@ -36,13 +36,8 @@ class ScoreSettings(Settings):
     seconds: float = SECONDS
 
 
-def run(settings: ScoreSettings) -> list[Row]:
-    """A row for each episode."""
-    return over_seeds(one, settings)
-
-
-def one(settings: ScoreSettings, seed: int) -> list[Row]:
-    """All episodes of a seed."""
+def one(shared: None, settings: ScoreSettings, seed: int) -> list[Row]:
+    """All episodes of a seed, a row each."""
     rows = []
     for target in LONE:
         env = gymnasium.make(FOLLOW, target=target, seconds=settings.seconds)
@@ -127,11 +122,12 @@ EXPERIMENT = Experiment(
     "What the pipeline earns in the environments, and what chance earns.",
     SETTINGS,
     replace(SETTINGS, seeds=1, seconds=8.0),
-    run,
+    one,
     summarise,
     describe,
     plot,
     missed,
+    cost_s=60.0,
 )
 
 if __name__ == "__main__":

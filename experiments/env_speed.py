@@ -25,7 +25,7 @@ from cotarget.env import Follow, PipelinePolicy
 from cotarget.env.units import Vector
 from cotarget.sim.opengl import mujoco
 from cotarget.sim.world import SimWorld
-from experiments.harness import Experiment, Row, Settings, over_seeds, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, seeds_of, table
 from experiments.plain_renderer import PlainRenderer
 
 SIZE = (64, 64)
@@ -76,12 +76,7 @@ class Alone:
             mujoco.mj_step(model, data)
 
 
-def run(settings: EnvSpeedSettings) -> list[Row]:
-    """All rows; in one process, whatever the settings say."""
-    return over_seeds(one, replace(settings, processes=1))
-
-
-def one(settings: EnvSpeedSettings, seed: int) -> list[Row]:
+def one(shared: None, settings: EnvSpeedSettings, seed: int) -> list[Row]:
     """Time everything once."""
     return [row for name in settings.targets for row in (*tracks(settings, name, seed), *images(settings, name, seed))]
 
@@ -196,11 +191,13 @@ EXPERIMENT = Experiment(
     "The environments' speed, beside MuJoCo alone.",
     SETTINGS,
     replace(SETTINGS, seeds=1, targets=("bird",), seconds=4.0, seconds_seen=0.4),
-    run,
+    one,
     summarise,
     describe,
     plot,
     missed,
+    alone=True,
+    cost_s=60.0,
 )
 
 if __name__ == "__main__":

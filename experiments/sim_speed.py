@@ -14,7 +14,6 @@ over the steps are given.
     python -m experiments.sim_speed [--seeds 2] [--seed-base 0] [--quick] [--out DIR]
 """
 
-import functools
 import math
 import sys
 import time
@@ -31,7 +30,7 @@ from cotarget.loop import FollowSettings, Step
 from cotarget.oracle import TruthDetector
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
-from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, target_of, watched, watched_in
 from experiments.hold_scenes import hold_config
 from experiments.plain_renderer import PlainRenderer
@@ -65,13 +64,8 @@ class SimSpeedSettings(FieldSettings):
     seconds_rendered: float = 6.0
 
 
-def run(settings: SimSpeedSettings) -> list[Row]:
-    """Calibrate the rig once, then time everything; in one process, whatever the settings say."""
-    return over_seeds(functools.partial(one, calibrated(settings)), replace(settings, processes=1))
-
-
 def one(calibration: Calibration, settings: SimSpeedSettings, seed: int) -> list[Row]:
-    """Time everything once."""
+    """Time everything once; a row for each step."""
     rows = _beside_renderer(settings, seed)
     for effects in (*((name,) for name in IMAGE_EFFECTS), IMAGE_EFFECTS):
         rows += _beside_none(settings, seed, effects)
@@ -256,11 +250,14 @@ EXPERIMENT = Experiment(
     "The simulation's speed, beside mujoco.Renderer, effect by effect and against real time.",
     SETTINGS,
     replace(SETTINGS, seeds=1, steps=3, seconds_rendered=0.4, seconds=2.0, calibrated=False),
-    run,
+    one,
     summarise,
     describe,
     plot,
     missed,
+    prepare=calibrated,
+    alone=True,
+    cost_s=120.0,
 )
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from experiments import env_score, env_speed
-from experiments.__main__ import EXPERIMENTS
+from experiments.cases import EXPERIMENTS
 
 BUSY = 0.5  # of the speed wanted is well within what a busy machine may give
 
@@ -50,7 +50,7 @@ def test_scores_are_rewards_a_step_and_means():
 @pytest.mark.slow
 @pytest.mark.render
 def test_a_quick_run_of_the_speeds():
-    summary = env_speed.summarise(env_speed.run(env_speed.EXPERIMENT.quick))
+    summary = env_speed.summarise(env_speed.EXPERIMENT.run(env_speed.EXPERIMENT.quick))
     for name, found in summary.items():
         assert found["ratio"] > BUSY * env_speed.WANTED[name.split(",")[0]]
 

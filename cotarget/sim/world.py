@@ -9,7 +9,7 @@ import numpy as np
 from cotarget.config import RigConfig, SimCamera
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Clock, Image
-from cotarget.sim.ahead import Ahead
+from cotarget.sim.ahead import Ahead, is_allowed
 from cotarget.sim.appearances import CameraName
 from cotarget.sim.clutter import Clutter
 from cotarget.sim.devices import (
@@ -59,7 +59,7 @@ class SimWorld:
             rendered: the cameras whose frames are rendered; the others' are black. All else is as ever: times,
                 latencies, head, lens and truth. Without any, no OpenGL is needed.
             ahead: whether the zoom camera's next frame may be rendered, on another thread, before it is asked for;
-                nothing but the speed depends on it.
+                nothing but the speed depends on it. COTARGET_AHEAD=0 in the environment forbids it.
 
         Raises:
             ConfigError: an unknown scene or target.
@@ -82,7 +82,8 @@ class SimWorld:
         self._opened: Views | None = None
         if self._rendered:
             self._views()
-        self._ahead = Ahead(self._views().apart) if ahead and "zoom" in self._rendered else None
+        ahead = ahead and is_allowed() and "zoom" in self._rendered
+        self._ahead = Ahead(self._views().apart) if ahead else None
         # The lens obeys as late as the head does.
         delay = sim.head.command_delay_s if effects.command_delay else 0.0
         self._black = {name: _black(self._camera(name)) for name in CAMERAS}
