@@ -488,7 +488,7 @@ def test_all_experiments_are_of_one_shape(capsys):
     assert main(["--list"]) == 0
     assert all(re.search(rf"^{name} +\S", capsys.readouterr().out, re.MULTILINE) for name in EXPERIMENTS[:1])
     assert {name for name, load in known.items() if load().alone} == {
-        *("speed", "wire", "sim_speed", "pipeline_speed", "sweep_speed"),
+        *("speed", "wire", "sim_speed", "env_speed", "pipeline_speed", "sweep_speed"),
     }
 
 
