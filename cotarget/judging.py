@@ -1,5 +1,6 @@
 """Puts Steps and calibrations beside a simulated world's truth, which the pipeline cannot see."""
 
+import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 
@@ -11,10 +12,11 @@ from cotarget.config import TargetConfig
 from cotarget.errors import UnreachableError
 from cotarget.geometry import Array
 from cotarget.loop import Step
-from cotarget.metrics import WHOLLY_VISIBLE, Row
+from cotarget.metrics import WHOLLY_VISIBLE, Closeup, Row
 from cotarget.rig import Frame
+from cotarget.sim.appearances import Appearances, Silhouette
 from cotarget.sim.targets import marker_of
-from cotarget.sim.truth import Silhouette, Truth
+from cotarget.sim.truth import Truth
 from cotarget.targeting import Method, Reach, aim
 from cotarget.tracking import Track
 
@@ -54,36 +56,21 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
         target: gives its dimension and the size wanted.
     """
     t, t_fixed = step.zoom.t, step.fixed.t
-    center = truth.center(name, t)
-    zoom_px = truth.pixel("zoom", center, t)
-    wide_px = truth.pixel("fixed", truth.center(name, t_fixed), t_fixed)
     outline = truth.silhouette(name, "zoom", t)
+    seen = _closeup(truth, name, target, t, outline)
+    wide_px = truth.pixel("fixed", truth.center(name, t_fixed), t_fixed)
     wide_outlines = {each: truth.silhouette(each, "fixed", t_fixed) for each in truth.targets}
     wide_outline = wide_outlines[name]
-    size = math.nan
-    if outline is not None:
-        width, height = outline.size_px
-        sides = {"width": width, "height": height}
-        size = sides[target.dimension] if target.dimension in sides else truth.largest_side_px(name, "zoom", t)
-    focal = truth.lens("zoom", t).focal_px[0]
-    longest = truth.zoom_lens_for(truth.focal_range[1]).focal_px[0]
     pan, tilt = truth.head_at(t)
     followed = step.target
     alone = followed is not None and not followed.missed and not followed.shared
     detected = followed.box.center_px if followed is not None and alone else (math.nan, math.nan)
-    height_px, width_px = step.zoom.image.shape[:2]
     return Row(
         t_s=t,
         t_fixed_s=t_fixed,
         state=str(step.state),
         track=-1 if step.target is None else step.target.id,
-        u_px=float(zoom_px[0]),
-        v_px=float(zoom_px[1]),
-        width_px=width_px,
-        height_px=height_px,
-        size_px=float(size),
-        wanted_px=float(np.fmin(target.wanted_px, size * longest / focal)),
-        visible=0.0 if outline is None else outline.visible,
+        **dataclasses.asdict(seen),
         in_wide=wide_outline is not None and wide_outline.visible >= WHOLLY_VISIBLE,
         u_wide_px=float(wide_px[0]),
         v_wide_px=float(wide_px[1]),
@@ -92,18 +79,51 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
         decoded=decodes(step.zoom, outline, marker_of(name)),
         decoded_wide=decodes(step.fixed, wide_outline, marker_of(name)),
         off_target=" ".join(str(i) for i in off_target(step.tracks, wide_outlines.values())),
-        range_m=float(np.linalg.norm(center - truth.T_world_camera("zoom", t).translation)),
+        range_m=float(np.linalg.norm(truth.center(name, t) - truth.T_world_camera("zoom", t).translation)),
         depth_m=math.nan if step.aim is None else step.aim.depth,
         pan_commanded_deg=math.degrees(step.commanded[0]),
         tilt_commanded_deg=math.degrees(step.commanded[1]),
         focal_commanded_px=step.commanded[2],
         pan_deg=math.degrees(pan),
         tilt_deg=math.degrees(tilt),
-        focal_px=focal,
+        focal_px=truth.lens("zoom", t).focal_px[0],
         target=name,
         head_commands=step.head_commands,
         lens_commands=step.lens_commands,
         on_target=" ".join(f"{i}:{each}" for i, each in on_target(step.tracks, wide_outlines)),
+    )
+
+
+def closeup_of(truth: Appearances, name: str, target: TargetConfig, t: float) -> Closeup:
+    """What the zoom camera shows of a target at a time.
+
+    Args:
+        truth: of the simulated world.
+        name: of the target.
+        target: gives its dimension and the size wanted.
+        t: the zoom frame's [s].
+    """
+    return _closeup(truth, name, target, t, truth.silhouette(name, "zoom", t))
+
+
+def _closeup(truth: Appearances, name: str, target: TargetConfig, t: float, outline: Silhouette | None) -> Closeup:
+    """The same by the target's outline."""
+    lens = truth.lens("zoom", t)
+    u, v = truth.center_px(name, "zoom", t).tolist()
+    size = math.nan
+    if outline is not None:
+        width, height = outline.size_px.tolist()
+        sides = {"width": width, "height": height}
+        size = sides[target.dimension] if target.dimension in sides else truth.largest_side_px(name, "zoom", t)
+    longest = size * truth.longest_px / lens.focal_px[0]
+    return Closeup(
+        u_px=u,
+        v_px=v,
+        width_px=lens.size[0],
+        height_px=lens.size[1],
+        size_px=size,
+        wanted_px=longest if longest < target.wanted_px else target.wanted_px,
+        visible=0.0 if outline is None else outline.visible,
     )
 
 

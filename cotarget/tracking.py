@@ -14,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from cotarget.geometry import Array
 from cotarget.motionfilter import (
+    CUT,
     Measurement,
     TargetFilter,
     Track,
@@ -96,7 +97,10 @@ class Tracker:
         detections = self._worth(detections)
         matches: dict[int, int] = {}
         crowds: dict[int, int] = {}
-        if self._tracks and detections:
+        if len(self._tracks) == len(detections) == 1:
+            if _belongs(self._tracks[0], detections[0], self._image_size):
+                matches = {0: 0}
+        elif self._tracks and detections:
             pairs = _Pairs(self._tracks, detections, self._image_size)
             matches = _assign(pairs)
             crowds = _crowds(pairs, matches)
@@ -176,7 +180,8 @@ class _Pairs:
         spread = np.array([state.place_variance for state in states])[:, None]
         cut = np.array([detection.clipped for detection in detections], dtype=bool)
         lacks = missing(size[:, None], extent)
-        spread = spread + center_variance(states[0].settings, extent, cut[:, None], lacks)
+        settings = states[0].settings
+        spread = spread + center_variance(settings, extent, np.where(cut, CUT, settings.noise_of_size)[:, None], lacks)
         own, other = _area(size)[:, None], _area(extent)
         resized = np.log(other / own) / 2 / SIZE_SIGMA
         # Of what the border cuts there is more, and of a target that it cut nobody knows how much more.
@@ -227,6 +232,26 @@ def _shared(at: Array, size: Array, center: Array, extent: Array) -> Array:
     low = np.maximum((at - size / 2)[:, None], center - extent / 2)
     high = np.minimum((at + size / 2)[:, None], center + extent / 2)
     return _area(np.maximum(0.0, high - low))
+
+
+def _belongs(state: TargetFilter, detection: Measurement, image_size: tuple[int, int] | None) -> bool:
+    """Whether a lone detection may be of a lone track, as `_Pairs` says it: mostly in a fifth of the time.
+
+    Where the boxes overlap enough, nothing that speaks against it counts.
+    """
+    if _overlap(state, detection) > OVERLAP_ENOUGH:
+        return True
+    return bool(_Pairs([state], [detection], image_size).possible[0, 0])
+
+
+def _overlap(state: TargetFilter, detection: Measurement) -> float:
+    """Intersection over union of a track's predicted box and a detection's, 0 to 1."""
+    shared = own = other = 1.0
+    boxes = state.center, state.size.tolist(), detection.center_px.tolist(), detection.size_px.tolist()
+    for at, side, center, extent in zip(*boxes, strict=True):
+        low, high = max(at - side / 2, center - extent / 2), min(at + side / 2, center + extent / 2)
+        shared, own, other = shared * max(0.0, high - low), own * side, other * extent
+    return shared / (own + other - shared)
 
 
 def _area(sides: Array) -> Array:

@@ -1,61 +1,223 @@
-"""Runs all experiments that need no photos, or those named, one after the other; fails where one misses a figure.
+"""Runs all experiments, or those named, over the cores or on a cluster; what is done is kept, and the rest goes on.
 
-python -m experiments [NAME ...] [--quick] [--out DIR]
+python -m experiments [NAME ...] [--quick] [--out DIR] [--seeds N] [--seed-base B] [--set NAME.KEY=VALUE] [--list]
 """
 
-import importlib
+import argparse
+import contextlib
+import functools
+import os
+import shlex
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-from cotarget.errors import ConfigError
-from experiments.harness import INTERRUPTED, Parser, check_folder
+from cotarget.cli.arguments import count, not_negative, progress_bar
+from cotarget.errors import ConfigError, CotargetError
+from cotarget.report.wording import count as number_of
+from experiments.bounds import EXPECTED, tighten
+from experiments.cases import Case, Known, choose, known_experiments
+from experiments.cluster import on_dask
+from experiments.harness import INTERRUPTED, TERMINATED, Parser, check_folder
+from experiments.outcome import Outcome, conclude
+from experiments.report import Run, duration, write_report
+from experiments.results import code_version, taken
+from experiments.runner import Sweep, forget, sessions
+from experiments.workers import Engine, in_processes
 
-EXPERIMENTS = (
-    *("hand_eye", "chain", "random_rigs", "mismatch", "honesty", "speed", "pointing", "zoom_range", "wire"),
-    *("hold", "first_shot", "delay", "five_targets", "dead_zone", "sim_speed", "pipeline_speed"),
-)
+PROGRAM = "python -m experiments"
+OUT, OUT_QUICK = Path("experiments-out"), Path("experiments-out-quick")
+LINES = 12  # of failed jobs that are told on stderr; the report tells all
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
-    parser = Parser(prog="python -m experiments", description=__doc__.splitlines()[0])
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"which ones (all): {', '.join(EXPERIMENTS)}")
-    parser.add_argument("--quick", action="store_true", help="less of each, as its own --help says")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write each one's files into a folder of its own there")
-    given = parser.parse_args(arguments)
-    if unknown := [name for name in given.names if name not in EXPERIMENTS]:
-        parser.error(f"there is no experiment '{unknown[0]}'; there are {', '.join(EXPERIMENTS)}")
+def main(arguments: Sequence[str] | None = None, known: Known | None = None, expected: Path = EXPECTED) -> int:
+    """The command.
+
+    Args:
+        arguments: what was typed.
+        known: the experiments there are.
+        expected: the folder of their bounds.
+
+    Returns:
+        The exit status: 1 where a job failed, a bound is broken or, but for a quick run, a wanted figure is missed.
+    """
+    typed = sys.argv[1:] if arguments is None else list(arguments)
+    known = known_experiments() if known is None else known
+    given = _parser().parse_args(typed)
     try:
-        if given.out is not None:
-            check_folder(given.out)
-        return _run(given.names or EXPERIMENTS, given.quick, given.out)
-    except ConfigError as error:
-        parser.error(str(error))
+        with _polite_ends():
+            return _list(known) if given.list else _run(given, typed, known, expected)
+    except CotargetError as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
-        print("experiments: interrupted", file=sys.stderr)
+        print(f"{PROGRAM}: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except OSError as error:
+        where = "" if error.filename is None else f"{error.filename}: "
+        print(f"{PROGRAM}: {where}{error.strerror or error}", file=sys.stderr)
+        return 1
 
 
-def _run(names: Sequence[str], quick: bool, out: Path | None) -> int:
-    """Run them one after the other, up to one that is interrupted; the exit status."""
-    failed = []
-    for name in names:
-        passed_on = ["--quick"] if quick else []
-        if out is not None:
-            passed_on += ["--out", str(out / name)]
-        print(f"\n{name}")
-        module = importlib.import_module(f"experiments.{name}")
-        film: Path | None = getattr(module, "FILM", None)
-        if film is not None and not film.is_file():
-            print(f"left out: needs {film}, which is not part of the project")
-        elif (status := module.EXPERIMENT.main(passed_on)) == INTERRUPTED:
-            return INTERRUPTED
-        elif status:
-            failed.append(name)
-    if failed:
-        print(f"\nnot what is wanted: {', '.join(failed)}")
-    return 1 if failed else 0
+@contextlib.contextmanager
+def _polite_ends() -> Iterator[None]:
+    """Whoever ends this program by SIGTERM ends what it has started too."""
+    if threading.current_thread() is not threading.main_thread():  # which alone may say so
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(prog=PROGRAM, description=(__doc__ or "").splitlines()[0])
+    processes = os.cpu_count() or 1
+    parser.add_argument("names", nargs="*", metavar="NAME", help="which ones; all by default")
+    parser.add_argument("--list", action="store_true", help="tell which there are")
+    parser.add_argument("--quick", action="store_true", help="less of each, as its own --help says")
+    parser.add_argument("--out", type=Path, metavar="DIR", help=f"results and report ({OUT}, or {OUT_QUICK} if quick)")
+    parser.add_argument("--seeds", type=count, metavar="N", help="of each; its own number by default")
+    parser.add_argument("--seed-base", type=not_negative, metavar="B", help="the first seed (0)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME.KEY=VALUE",
+        help="change a setting; given more than once with the same key, each value is a case of its own",
+    )
+    parser.add_argument(
+        "--processes",
+        type=count,
+        default=processes,
+        metavar="P",
+        help=f"jobs at a time, but one where time is measured ({processes})",
+    )
+    parser.add_argument(
+        "--backend",
+        choices=("processes", "dask"),
+        default="processes",
+        help="who does the jobs: processes of this machine, or a Dask cluster",
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of the Dask cluster, such as tcp://10.0.0.1:8786; one of this machine"
+    )
+    parser.add_argument("--fresh", action="store_true", help="forget what is in the folder of these experiments")
+    parser.add_argument("--any-code", action="store_true", help="keep results that other code or libraries gave")
+    parser.add_argument("--report", action="store_true", help="do nothing but report what is there")
+    parser.add_argument("--update-expected", action="store_true", help="tighten the bounds in experiments/expected")
+    return parser
+
+
+def _list(known: Known) -> int:
+    width = max(map(len, known))
+    for name, load in known.items():
+        print(f"{name:{width}}  {load().purpose}")
+    return 0
+
+
+def _run(given: argparse.Namespace, typed: Sequence[str], known: Known, expected: Path) -> int:
+    engine, what = _engine(given)
+    folder: Path = given.out or (OUT_QUICK if given.quick else OUT)
+    check_folder(folder)
+    chosen = choose(
+        known, given.names, quick=given.quick, seeds=given.seeds, seed_base=given.seed_base, changes=given.set
+    )
+    if given.update_expected and not all(case.has_bounds for case in chosen):
+        raise ConfigError("the bounds are of quick runs as they are: --update-expected goes with --quick alone")
+    cases, skipped = _split(chosen, named=bool(given.names))
+    if given.report:
+        sweep = Sweep(cases, folder, given.processes, given.any_code)
+    else:
+        with taken(folder):
+            if given.fresh:
+                forget(cases, folder)
+            sweep = Sweep(cases, folder, given.processes, given.any_code)
+            if status := _do(sweep, engine, what):
+                return status
+    outcomes = [
+        conclude(case, records, folder / case.folder, expected)
+        for case, records in zip(cases, sweep.records, strict=True)
+    ]
+    _tell(outcomes, skipped)
+    if given.update_expected:
+        _update(outcomes, expected)
+    page = folder / "report.html"
+    write_report(page, Run(outcomes, skipped, sessions(folder), shlex.join([*PROGRAM.split(), *typed])))
+    print(f"\n{page}")
+    return 0 if all(outcome.ok for outcome in outcomes) else 1
+
+
+def _engine(given: argparse.Namespace) -> tuple[Engine, str]:
+    """Who does the jobs, and the same in words."""
+    if given.backend == "dask":
+        version = "" if given.any_code else code_version()
+        where = "a Dask cluster" if given.scheduler else f"a Dask cluster on this machine, {given.processes} at most"
+        return functools.partial(on_dask, scheduler=given.scheduler, version=version), where
+    if given.scheduler is not None:
+        raise ConfigError("--scheduler goes with --backend dask")
+    return in_processes, number_of(given.processes, "process", "processes")
+
+
+def _split(chosen: Sequence[Case], *, named: bool) -> tuple[list[Case], dict[str, str]]:
+    """The cases that can be run, and why the others cannot; an experiment that was asked for by its name must."""
+    lacks = {case.title: "" if (needs := case.experiment.needs) is None else needs(case.settings) for case in chosen}
+    skipped = {title: lack for title, lack in lacks.items() if lack}
+    if named and skipped:
+        title, lack = next(iter(skipped.items()))
+        raise ConfigError(f"{title} {lack}")
+    return [case for case in chosen if case.title not in skipped], skipped
+
+
+def _do(sweep: Sweep, engine: Engine, what: str) -> int:
+    """Do the jobs that are missing; the exit status where that was broken off."""
+    try:
+        with progress_bar() as show:
+            sweep.run(engine, show, what)
+        return 0
+    except CotargetError as error:
+        why, status = str(error), 1
+    except KeyboardInterrupt:
+        why, status = "interrupted", INTERRUPTED
+    except SystemExit:
+        why, status = "ended", TERMINATED
+    if sweep.done:
+        why += f"; {sweep.done} of {sweep.total} jobs are done and kept in {sweep.folder}, and the same command goes on"
+    print(f"{PROGRAM}: {why}", file=sys.stderr)
+    return status
+
+
+def _tell(outcomes: Sequence[Outcome], skipped: dict[str, str]) -> None:
+    """Print each case's figures; on stderr what went wrong."""
+    for outcome in outcomes:
+        print(f"\n{outcome.case.title} ({duration(sum(outcome.seconds))})")
+        if outcome.text:
+            print(outcome.text)
+        remarks = [outcome.broken] if outcome.broken else []
+        remarks += [f"{outcome.undone} jobs are not done yet"] if outcome.undone else []
+        remarks += [f"missed: {name}" for name in outcome.missed or ()]
+        remarks += [f"worse than its bound: {b.name}, {b.reached} is not {b.text}" for b in outcome.worse]
+        print(*remarks, sep="\n", end="\n" if remarks else "")
+    for title, lack in skipped.items():
+        print(f"\n{title}\nnot run: {lack}")
+    failed = [(o.case.title, number, record.failed) for o in outcomes for number, record in o.failed.items()]
+    for title, number, why in failed[:LINES]:
+        print(f"{PROGRAM}: {title}, seed {number} failed: {why}", file=sys.stderr)
+    if len(failed) > LINES:
+        print(f"{PROGRAM}: and {len(failed) - LINES} more failed", file=sys.stderr)
+
+
+def _update(outcomes: Sequence[Outcome], expected: Path) -> None:
+    changed: list[Any] = []
+    for outcome in outcomes:
+        if outcome.summary is not None and not outcome.failed and not outcome.undone:
+            changed += tighten(outcome.case.experiment, outcome.summary, expected)
+    print("\nbounds that are tighter now:" if changed else "\nno bound is tighter now", *changed, sep="\n")
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from cotarget.calibration.placing import place_boards
 from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from cotarget.geometry import Array
-from experiments.harness import Experiment, Row, Settings, over_seeds, rms, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.synthetic import (
     LONGEST_PX,
     SIZES,
@@ -60,13 +60,8 @@ class ChainSettings(Settings):
     cases: tuple[str, ...] = tuple(CASES)
 
 
-def run(settings: ChainSettings) -> list[Row]:
-    """One row for each seed and case."""
-    return over_seeds(one, settings)
-
-
-def one(settings: ChainSettings, seed: int) -> list[Row]:
-    """Calibrate every case once."""
+def one(_: None, settings: ChainSettings, seed: int) -> list[Row]:
+    """Calibrate every case once; one row each."""
     return [_row(settings, seed, case) for case in settings.cases]
 
 
@@ -144,10 +139,11 @@ EXPERIMENT = Experiment(
     "Pointing of a rig calibrated from synthetic corners, beside the prediction and the Cramer-Rao bound.",
     SETTINGS,
     replace(SETTINGS, seeds=2, boards=10, looks=4, cases=("toed-in rig", "default rig, 9x6 board")),
-    run,
+    one,
     summarise,
     describe,
     plot,
+    cost_s=4.0,
 )
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ whole pipeline; all that differs is whether the head gets a new command with eve
 """
 
 import dataclasses
-import functools
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -21,7 +20,7 @@ from cotarget.calibration import Calibration
 from cotarget.deadzone import SteeringSettings
 from cotarget.loop import FollowSettings
 from cotarget.metrics import score
-from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, held, target_of
 from experiments.hold_scenes import hold_config
 from experiments.wide_view import record
@@ -46,13 +45,8 @@ class DeadZoneSettings(FieldSettings):
     closed_loop: bool = True
 
 
-def run(settings: DeadZoneSettings) -> list[Row]:
-    """Calibrate the rig once, then hold each target with the dead zone and without; one row each."""
-    return over_seeds(functools.partial(one, calibrated(settings)), settings)
-
-
 def one(calibration: Calibration, settings: DeadZoneSettings, seed: int) -> list[Row]:
-    """Hold each target both ways."""
+    """Hold each target with the dead zone and without; one row each."""
     rows: list[Row] = []
     for name in settings.targets:
         config = hold_config(name, seed)
@@ -128,11 +122,13 @@ EXPERIMENT = Experiment(
     "Commands and reversals a minute with the dead zone and without, and the offset it costs.",
     SETTINGS,
     dataclasses.replace(SETTINGS, seeds=1, seconds=10.0, calibrated=False, closed_loop=False),
-    run,
+    one,
     summarise,
     describe,
     plot,
     missed,
+    prepare=calibrated,
+    cost_s=180.0,
 )
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ rendered but its frames, once a seed. A run in which the target was never acquir
 """
 
 import dataclasses
-import functools
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -24,7 +23,7 @@ from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
 from cotarget.loop import FollowSettings
 from cotarget.metrics import score
-from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, held, target_of
 from experiments.hold_scenes import COMMAND_DELAY_S, LATENCY_S, hold_config
 from experiments.wide_view import record
@@ -51,13 +50,8 @@ class DelaySettings(FieldSettings):
     closed_loop: bool = True
 
 
-def run(settings: DelaySettings) -> list[Row]:
-    """Calibrate the rig once, then follow each target at each delay, with and without; one row each."""
-    return over_seeds(functools.partial(one, calibrated(settings)), settings)
-
-
 def one(calibration: Calibration, settings: DelaySettings, seed: int) -> list[Row]:
-    """All runs of a seed."""
+    """Follow each target at each delay, with prediction and without; one row each."""
     cases = [(delay, predict, False) for delay in settings.delays for predict in (True, False)]
     if settings.closed_loop:
         cases += [(FIELD_S, predict, True) for predict in (True, False)]
@@ -166,14 +160,14 @@ EXPERIMENT = Experiment(
     "delay",
     "The offset in the close-up with prediction and without, over the delay of cameras and head.",
     SETTINGS,
-    dataclasses.replace(
-        SETTINGS, seeds=1, delays=(0.0, FIELD_S, 0.6), seconds=10.0, calibrated=False, closed_loop=False
-    ),
-    run,
+    dataclasses.replace(SETTINGS, seeds=1, delays=(0.0, FIELD_S), seconds=10.0, calibrated=False, closed_loop=False),
+    one,
     summarise,
     describe,
     plot,
     missed,
+    prepare=calibrated,
+    cost_s=250.0,
 )
 
 if __name__ == "__main__":

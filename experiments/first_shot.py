@@ -12,7 +12,6 @@ could not be fired counts as one that missed.
 """
 
 import dataclasses
-import functools
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
-from experiments.harness import Experiment, Row, over_seeds, rms, seeds_of, table
+from experiments.harness import Experiment, Row, rms, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, target_of
 from experiments.hold_scenes import hold_config
 from experiments.shots import CAUSES, Fired, fire
@@ -49,13 +48,8 @@ class FirstShotSettings(FieldSettings):
     targets: tuple[str, ...] = ("book", "person", "bird")
 
 
-def run(settings: FirstShotSettings) -> list[Row]:
-    """Calibrate the rig once, then shoot at each target; a row for each chance."""
-    return over_seeds(functools.partial(one, calibrated(settings)), settings)
-
-
 def one(calibration: Calibration, settings: FirstShotSettings, seed: int) -> list[Row]:
-    """All chances of a seed."""
+    """Shoot at each target; a row for each chance."""
     rows: list[Row] = []
     for name in settings.targets:
         config = hold_config(name, seed)
@@ -166,12 +160,14 @@ EXPERIMENT = Experiment(
     "first_shot",
     "How well a single shot from the wide view alone hits, and what a miss consists of.",
     SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=10.0, calibrated=False),
-    run,
+    dataclasses.replace(SETTINGS, seeds=1, targets=("book", "bird"), seconds=10.0, calibrated=False),
+    one,
     summarise,
     describe,
     plot,
     missed,
+    prepare=calibrated,
+    cost_s=120.0,
 )
 
 if __name__ == "__main__":

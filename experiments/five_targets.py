@@ -8,7 +8,6 @@ second in all. What the wide camera sees is rendered and searched once a seed an
 """
 
 import dataclasses
-import functools
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -20,13 +19,14 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, TargetConfig
-from cotarget.judging import observe
+from cotarget.judging import closeup_of
 from cotarget.loop import FollowSettings
 from cotarget.policies import POLICIES
+from cotarget.sim.fieldpaths import GROUP
 from cotarget.sim.truth import Truth
-from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, target_of, watched
-from experiments.hold_scenes import GROUP, five_targets_config
+from experiments.hold_scenes import five_targets_config
 from experiments.wide_view import WideView, record
 
 FIRST = "first-come"
@@ -48,13 +48,8 @@ class FiveSettings(FieldSettings):
     closed_loop: bool = True
 
 
-def run(settings: FiveSettings) -> list[Row]:
-    """Calibrate the rig once, then follow five of each kind under each policy; one row each."""
-    return over_seeds(functools.partial(one, calibrated(settings)), settings)
-
-
 def one(calibration: Calibration, settings: FiveSettings, seed: int) -> list[Row]:
-    """All runs of a seed."""
+    """Follow five of each kind under each policy; one row each."""
     rows: list[Row] = []
     for kind in settings.kinds:
         config = five_targets_config(seed, kind)
@@ -91,7 +86,7 @@ def good_seconds(
         t = step.zoom.t
         if last is not None and t > last:  # a frame stands for the time since the one before
             for name in good:
-                if _near(truth, name, t) and observe(step, truth, name, target).good_closeup:
+                if _near(truth, name, t) and closeup_of(truth, name, target, t).good:
                     good[name] += t - last
         last = t
     return good
@@ -150,11 +145,13 @@ EXPERIMENT = Experiment(
     "Of five targets at once, how many get a good close-up under each policy.",
     SETTINGS,
     dataclasses.replace(SETTINGS, seeds=1, kinds=("person",), seconds=12.0, calibrated=False, closed_loop=False),
-    run,
+    one,
     summarise,
     describe,
     plot,
     missed,
+    prepare=calibrated,
+    cost_s=250.0,
 )
 
 if __name__ == "__main__":

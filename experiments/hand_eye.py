@@ -25,7 +25,7 @@ from cotarget.calibration.parameters import RigModel
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import base_head
-from experiments.harness import Experiment, Row, Settings, over_seeds, rms, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.synthetic import NOMINAL_PX, SIZE, Lens, Truth, noisy, seen_from
 
 LENS = Lens(693.0, 693.0, 319.5, 239.5)
@@ -46,13 +46,8 @@ class HandEyeSettings(Settings):
     noise_px: float = 0.2
 
 
-def run(settings: HandEyeSettings) -> list[Row]:
-    """One row for each seed and method."""
-    return over_seeds(one, settings)
-
-
-def one(settings: HandEyeSettings, seed: int) -> list[Row]:
-    """Draw poses and noise, solve by each method."""
+def one(_: None, settings: HandEyeSettings, seed: int) -> list[Row]:
+    """Draw poses and noise, solve by each method; one row each."""
     rng = np.random.default_rng((seed, 1))
     truth = Truth(zoom=LENS, dz=0.0, eps=0.0)
     v, u = np.mgrid[:ROWS, :COLUMNS]
@@ -150,10 +145,11 @@ EXPERIMENT = Experiment(
     "T from 20 poses of one board, by each method, beside the Cramer-Rao bound.",
     SETTINGS,
     replace(SETTINGS, seeds=5),
-    run,
+    one,
     summarise,
     describe,
     plot,
+    cost_s=0.3,
 )
 
 if __name__ == "__main__":

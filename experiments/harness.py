@@ -1,65 +1,66 @@
-"""What all experiments share: seeds spread over processes, a table, and the files of a run.
+"""What all experiments share: what they consist of, a command for each, a table, and the files of a run.
 
-An experiment is a module with a dataclass of settings, `run(settings) -> rows`, `summarise(rows)` and, where there is
-something to see, `plot(rows, figure)`. Rows are flat dictionaries; everything reported is made from them alone.
+An experiment is a module with a dataclass of settings and some functions: `one(shared, settings, seed)` gives the rows
+of one seed, whichever process does it and whatever was done before; `prepare(settings)`, where there is one, gives what
+all seeds share; `summarise(rows)` the figures, `describe` a text to print, `plot` a picture. Rows are flat dictionaries
+of numbers, texts and truth values; everything reported is made from them alone.
 
     python -m experiments.NAME [--seeds N] [--seed-base B] [--processes P] [--quick] [--out DIR]
+
+`python -m experiments` does many of them at once, and goes on where it was broken off: `experiments.runner`.
 """
 
 import argparse
 import csv
 import dataclasses
 import functools
+import io
 import json
 import math
-import multiprocessing
 import os
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Generic, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 import cotarget
 from cotarget.cli.arguments import count, not_negative
-from cotarget.errors import ConfigError
-from cotarget.geometry import Array
-from cotarget.parallel import end_with_parent
+from cotarget.errors import ConfigError, CotargetError, DeviceError
+from cotarget.outputs import write_whole
+from experiments.workers import Died, Engine, here, in_processes
+
+if TYPE_CHECKING:  # every worker imports this module, and few draw
+    from matplotlib.figure import Figure
+
+    from cotarget.geometry import Array
 
 Row = dict[str, Any]
-Job = TypeVar("Job")
-# Threads of linear algebra and of rendering: a process each is faster.
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS")
-EXPECTED = Path(__file__).parent / "expected"
-USAGE, INTERRUPTED = 2, 130  # argparse's own exit status, and a shell's for Ctrl-C
-
-
-class Parser(argparse.ArgumentParser):
-    """A parser whose mistakes end in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong, without the usage in front of it."""
-        self.exit(USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
+USAGE, INTERRUPTED, TERMINATED = 2, 130, 143  # exit status of wrong arguments, of Ctrl-C and of SIGTERM
+PACKAGES = ("numpy", "scipy", "mujoco", "matplotlib")
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How many seeds, from which on, and over how many processes."""
+    """How many seeds, from which on, and over how many processes.
+
+    Raises:
+        ConfigError: no seeds, no processes, or a seed below zero.
+    """
 
     seeds: int = 100
     seed_base: int = 0
     processes: int = 1
+
+    def __post_init__(self) -> None:
+        for name, least in (("seeds", 1), ("seed_base", 0), ("processes", 1)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"{name} = {getattr(self, name)}: at least {least} is needed")
 
 
 def seeds_of(settings: Settings) -> str:
@@ -67,34 +68,51 @@ def seeds_of(settings: Settings) -> str:
     return f"seeds {settings.seed_base} to {settings.seed_base + settings.seeds - 1}"
 
 
+def seeds_in(settings: Settings) -> Sequence[int]:
+    """The seeds."""
+    return range(settings.seed_base, settings.seed_base + settings.seeds)
+
+
 S = TypeVar("S", bound=Settings)
 
 
 @dataclass(frozen=True)
 class Experiment(Generic[S]):
-    """What an experiment consists of.
+    """What an experiment consists of; all functions that other processes call are at the top of a module.
 
     Attributes:
         name: of its module.
         purpose: one line, for --help.
         settings: as it is reported.
         quick: the same with less of everything.
-        run: gives the rows.
+        one: gives the rows of a seed: (what `prepare` gave, settings, seed) -> rows.
         summarise: gives the figures, from the rows alone; nan where nothing was measured.
         describe: gives settings and figures as a text to print.
         plot: draws the rows.
         missed: names the figures that are not what is wanted; the command fails where there is one.
+        prepare: gives what all seeds share, from the settings.
+        jobs: gives the numbers that `one` is called with, where these are not the seeds.
+        alone: whether it measures times: nothing else may be done meanwhile, and it may take all cores.
+        cost_s: about how long one seed takes on one core [s]; the longest are begun first.
+        bounded: gives the figures as the file of bounds names them, where these are not the summary.
+        needs: says what the experiment lacks to be done with these settings; nothing, if it lacks nothing.
     """
 
     name: str
     purpose: str
     settings: S
     quick: S
-    run: Callable[[S], list[Row]]
+    one: Callable[[Any, S, int], list[Row]]
     summarise: Callable[[Sequence[Row]], Mapping[str, Any]]
     describe: Callable[[S, Mapping[str, Any]], str]
-    plot: Callable[[Sequence[Row], Figure], None] | None = None
+    plot: "Callable[[Sequence[Row], Figure], None] | None" = None
     missed: Callable[[Mapping[str, Any]], Sequence[str]] | None = None
+    prepare: Callable[[S], Any] | None = None
+    jobs: Callable[[S], Sequence[int]] = seeds_in
+    alone: bool = False
+    cost_s: float = 1.0
+    bounded: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None
+    needs: Callable[[S], str] | None = None
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
         """The command: run, print the figures, and write the files where asked to."""
@@ -123,7 +141,8 @@ class Experiment(Generic[S]):
         """Run with these settings, print the figures, and write the files where there is a folder for them.
 
         Returns:
-            The exit status: 1 where a figure is missed or the folder cannot be written to, 130 on Ctrl-C.
+            The exit status: 1 where a figure is missed, something is lacking or the folder cannot be written to, 130
+            on Ctrl-C.
         """
         try:
             if out is not None:
@@ -132,8 +151,8 @@ class Experiment(Generic[S]):
             summary = self.summarise(rows)
             print(self.describe(settings, summary))
             if out is not None:
-                self.write(out, settings, rows, summary)
-        except ConfigError as error:
+                self.write(out, settings, rows, summary, self.picture(rows))
+        except CotargetError as error:
             print(f"experiments.{self.name}: {error}", file=sys.stderr)
             return 1
         except KeyboardInterrupt:
@@ -141,29 +160,91 @@ class Experiment(Generic[S]):
             return INTERRUPTED
         return 1 if self.missed is not None and self.missed(summary) else 0
 
-    def write(self, out: Path, settings: S, rows: Sequence[Row], summary: Mapping[str, Any]) -> None:
-        """Write result.json, rows.csv and, where there is a plot, figure.png."""
-        out.mkdir(parents=True, exist_ok=True)
+    def run(self, settings: S, engine: Engine = in_processes) -> list[Row]:
+        """All rows, in the order of the seeds.
+
+        Args:
+            settings: how many seeds, and over how many processes.
+            engine: does the jobs; those that measure times are done in this process, one after the other.
+
+        Raises:
+            ConfigError: something is missing that it needs.
+            DeviceError: a process died.
+        """
+        if self.needs is not None and (lack := self.needs(settings)):
+            raise ConfigError(lack)
+        engine = here if self.alone else engine
+        # By a worker too: whoever does it, it has one thread of linear algebra, and the same last digits.
+        shared = None if self.prepare is None else _all(engine, self.prepare, [settings], 1)[0]
+        rows = _all(engine, functools.partial(self.one, shared, settings), self.jobs(settings), settings.processes)
+        return [row for each in rows for row in each]
+
+    def write(
+        self, out: Path, settings: S, rows: Sequence[Row], summary: Mapping[str, Any], picture: bytes | None
+    ) -> None:
+        """Write result.json, rows.csv and, where there is a picture, figure.png.
+
+        Raises:
+            ConfigError: one of them cannot be written.
+        """
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"{out}: cannot be made: {error.strerror}") from None
         result = {
             "experiment": self.name,
             "settings": dataclasses.asdict(settings),
-            "versions": {
-                "cotarget": cotarget.__version__,
-                "opencv": cv2.__version__,
-                **{name: version(name) for name in ("numpy", "scipy")},
-            },
+            "versions": versions(),
             "summary": summary,
         }
-        (out / "result.json").write_text(json.dumps(_plain(result), indent=2) + "\n", encoding="utf-8")
-        with (out / "rows.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, fieldnames=list(dict.fromkeys(key for row in rows for key in row)))
-            writer.writeheader()
-            writer.writerows(rows)
-        if self.plot is not None:
-            figure = Figure(figsize=(8, 4.5), layout="constrained")
-            FigureCanvasAgg(figure)
-            self.plot(rows, figure)
-            figure.savefig(out / "figure.png", dpi=110)
+        write_whole(out / "result.json", (json.dumps(plain(result), indent=2) + "\n").encode())
+        table = io.StringIO(newline="")
+        writer = csv.DictWriter(table, fieldnames=list(dict.fromkeys(key for row in rows for key in row)))
+        writer.writeheader()
+        writer.writerows(rows)
+        write_whole(out / "rows.csv", table.getvalue().encode())
+        if picture is not None:
+            write_whole(out / "figure.png", picture)
+
+    def picture(self, rows: Sequence[Row]) -> bytes | None:
+        """The plot as a PNG, where there is one."""
+        if self.plot is None:
+            return None
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(8, 4.5), layout="constrained")
+        FigureCanvasAgg(figure)
+        self.plot(rows, figure)
+        png = io.BytesIO()
+        figure.savefig(png, format="png", dpi=110)
+        return png.getvalue()
+
+
+def _all(engine: Engine, work: Callable[[Any], Any], jobs: Sequence[Any], processes: int) -> list[Any]:
+    """What each job gives, in the order of the jobs."""
+    found: dict[int, Any] = {}
+    for number, result in tqdm(engine(work, jobs, processes), total=len(jobs), disable=None, leave=False):
+        if result is Died:
+            raise DeviceError(f"the process of job {number + 1} of {len(jobs)} died; is there memory enough?")
+        found[number] = result
+    return [found[number] for number in sorted(found)]
+
+
+def _less(settings: Settings, quick: Settings) -> str:
+    """What a quick run has other than the whole one, for --help."""
+    parts = {field.name: getattr(quick, field.name) for field in dataclasses.fields(quick)}
+    other = {name: value for name, value in parts.items() if value != getattr(settings, name)}
+    texts = (f"{name} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in other.items())
+    return ", ".join(texts).replace("%", "%%") or "the same"
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose mistakes end in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, without the usage in front of it."""
+        self.exit(USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
 def check_folder(out: Path) -> None:
@@ -179,79 +260,12 @@ def check_folder(out: Path) -> None:
         raise ConfigError(f"--out: {there} may not be written to; name another folder")
 
 
-def _less(settings: Settings, quick: Settings) -> str:
-    """What a quick run has other than the whole one, for --help."""
-    parts = {field.name: getattr(quick, field.name) for field in dataclasses.fields(quick)}
-    other = {name: value for name, value in parts.items() if value != getattr(settings, name)}
-    texts = (f"{name} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in other.items())
-    return ", ".join(texts).replace("%", "%%") or "the same"
+def versions() -> dict[str, str]:
+    """Of what the figures depend on."""
+    return {"cotarget": cotarget.__version__, "opencv": cv2.__version__} | {name: version(name) for name in PACKAGES}
 
 
-def over_seeds(one: Callable[[S, int], list[Row]], settings: S) -> list[Row]:
-    """All rows of ``one(settings, seed)``, in the order of the seeds; see `spread`."""
-    seeds = range(settings.seed_base, settings.seed_base + settings.seeds)
-    return [row for rows in spread(functools.partial(one, settings), seeds, settings.processes) for row in rows]
-
-
-def spread(work: Callable[[Job], list[Row]], jobs: Iterable[Job], processes: int) -> Iterator[list[Row]]:
-    """Do each job, in as many processes; what comes out has the jobs' order.
-
-    Args:
-        work: a function at the top of a module, or a partial one of it.
-        jobs: its arguments, one each.
-        processes: 1 for this one.
-    """
-    jobs = list(jobs)
-    before = set(multiprocessing.active_children())
-    progress = functools.partial(tqdm, total=len(jobs), disable=None, leave=False)
-    if processes == 1 or len(jobs) == 1:
-        yield from progress(map(work, jobs))
-        return
-    context = multiprocessing.get_context("spawn")
-    begin = (functools.partial(cv2.setNumThreads, 1),)
-    with (
-        _one_thread_each(),
-        ProcessPoolExecutor(min(processes, len(jobs)), context, initializer=end_with_parent, initargs=begin) as pool,
-    ):
-        try:
-            with _interrupts_ignored():
-                futures = [pool.submit(work, job) for job in jobs]
-            yield from progress(future.result() for future in futures)
-        except BaseException:  # whatever ends this ends them; nobody waits for what they were at
-            for process in set(multiprocessing.active_children()) - before:
-                process.terminate()
-            raise
-
-
-@contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    """Processes started meanwhile leave Ctrl-C, which a terminal sends to all, to this one."""
-    if threading.current_thread() is not threading.main_thread():  # which alone may say so
-        yield
-        return
-    kept = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, kept)
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Processes started meanwhile have linear algebra on one thread: it reads the environment when it is loaded."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def rms(values: Iterable[float] | Array) -> float:
+def rms(values: "Iterable[float] | Array") -> float:
     """Root mean square; nan values do not count."""
     squared = np.square(np.array(list(values), dtype=float))
     return float(np.sqrt(np.nanmean(squared))) if np.isfinite(squared).any() else math.nan
@@ -273,12 +287,14 @@ def _text(value: Any) -> str:
     return str(value)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """As JSON has it: null where nothing was measured."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(v) for key, v in value.items()}
+        return {str(key): plain(v) for key, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(value) else None
+        return [plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
     return value

@@ -25,13 +25,14 @@ from cotarget.judging import add_row
 from cotarget.loop import FollowSettings, Step, follow
 from cotarget.metrics import Row as Judged
 from cotarget.metrics import score
+from cotarget.oracle import true_calibration
 from cotarget.safety import SafeRig
+from cotarget.sim.fieldpaths import SECONDS
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments import harness
-from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
-from experiments.hold_scenes import SECONDS, hold_config
-from experiments.true_rig import true_calibration
+from experiments.harness import Experiment, Row, seeds_of, table
+from experiments.hold_scenes import hold_config
 from experiments.wide_view import WideView, open_on
 
 # What is wanted of each figure's median: at least, or at most.
@@ -96,23 +97,23 @@ class HoldSettings(FieldSettings):
     targets: tuple[str, ...] = tuple(WANTED)
 
 
-def run(settings: HoldSettings) -> list[Row]:
-    """Calibrate the rig once, then hold each target once a seed; one row each."""
-    return over_seeds(functools.partial(one, calibrated(settings)), settings)
-
-
 def calibrated(settings: FieldSettings) -> Calibration:
-    """The default rig's calibration, from rendered boards or exact."""
-    config = RigConfig(sim=SimConfig(scene="indoor", seed=settings.seed_base))
-    if not settings.calibrated:
+    """The default rig's calibration, from rendered boards or exact; the same for all experiments in the field."""
+    return _calibrated(settings.calibrated, settings.seed_base)
+
+
+@functools.cache
+def _calibrated(from_boards: bool, seed: int) -> Calibration:
+    config = RigConfig(sim=SimConfig(scene="indoor", seed=seed))
+    if not from_boards:
         return true_calibration(SimWorld(config, rendered=()))
     world = SimWorld(config)
     with SafeRig(world.rig, config.safety) as rig:
-        return calibrate_rig(rig, config.board, pitch_mm=config.pitch_mm, seed=settings.seed_base)
+        return calibrate_rig(rig, config.board, pitch_mm=config.pitch_mm, seed=seed)
 
 
 def one(calibration: Calibration, settings: HoldSettings, seed: int) -> list[Row]:
-    """Hold each target once."""
+    """Hold each target once; one row each."""
     return [
         {
             "seed": seed,
@@ -243,12 +244,14 @@ EXPERIMENT = Experiment(
     "hold",
     "How long and how well a target is held in the close-up.",
     SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=7.0, calibrated=False),
-    run,
+    dataclasses.replace(SETTINGS, seeds=1, seconds=5.0, calibrated=False),
+    one,
     summarise,
     describe,
     plot,
     missed,
+    prepare=calibrated,
+    cost_s=150.0,
 )
 
 if __name__ == "__main__":

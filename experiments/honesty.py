@@ -21,7 +21,7 @@ from cotarget.calibration import Calibration, Options, calibrate_views, predicte
 from cotarget.calibration.boards import board_points
 from cotarget.calibration.parameters import ALL_BLOCKS, parameter_names
 from cotarget.config import BoardConfig
-from experiments.harness import Experiment, Row, Settings, over_seeds, rms, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.synthetic import LONGEST_PX, SIZES, Placing, Truth, draw_targets, misses, other_rig, spread_views
 
 BOARD = BoardConfig()
@@ -47,13 +47,8 @@ class HonestySettings(Settings):
     targets: int = 20
 
 
-def run(settings: HonestySettings) -> list[Row]:
-    """One row for each seed and rig."""
-    return over_seeds(one, settings)
-
-
-def one(settings: HonestySettings, seed: int) -> list[Row]:
-    """Calibrate both rigs once."""
+def one(_: None, settings: HonestySettings, seed: int) -> list[Row]:
+    """Calibrate both rigs once; one row each."""
     return [_row(settings, seed, rig) for rig in RIGS]
 
 
@@ -151,10 +146,11 @@ EXPERIMENT = Experiment(
     "How many 90 % ellipses hold the truth.",
     SETTINGS,
     replace(SETTINGS, seeds=2, boards=8),
-    run,
+    one,
     summarise,
     describe,
     plot,
+    cost_s=1.0,
 )
 
 if __name__ == "__main__":

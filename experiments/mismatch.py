@@ -22,7 +22,7 @@ from cotarget.calibration.boards import board_points
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
-from experiments.harness import Experiment, Row, Settings, over_seeds, rms, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.synthetic import (
     LONGEST_PX,
     SIZES,
@@ -144,13 +144,8 @@ class MismatchSettings(Settings):
     cases: tuple[str, ...] = tuple(CASES)
 
 
-def run(settings: MismatchSettings) -> list[Row]:
-    """One row for each seed and case."""
-    return over_seeds(one, settings)
-
-
-def one(settings: MismatchSettings, seed: int) -> list[Row]:
-    """Calibrate every case once."""
+def one(_: None, settings: MismatchSettings, seed: int) -> list[Row]:
+    """Calibrate every case once; one row each."""
     return [_row(settings, seed, case) for case in settings.cases]
 
 
@@ -253,10 +248,11 @@ EXPERIMENT = Experiment(
     "Rigs that have what the model lacks: within twice the predicted error, or refused.",
     SETTINGS,
     replace(SETTINGS, seeds=1, boards=15, looks=3, targets=30, cases=QUICK_CASES),
-    run,
+    one,
     summarise,
     describe,
     plot,
+    cost_s=40.0,
 )
 
 if __name__ == "__main__":

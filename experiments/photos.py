@@ -1,13 +1,13 @@
 """Real stereo photos of a chessboard: rms of each camera and of the pair, the baseline, and each pair left out.
 
 For each pair, both cameras and Gamma are calibrated from all others; then they are held, and only the board's pose is
-fitted to the corners of both photos of the pair. All corners count.
+fitted to the corners of both photos of the pair. All corners count. The photos are OpenCV's samples, looked for in
+../shared/data/opencv_stereo beside the project, or one's own.
 
-    python -m experiments.photos DIR [--left 'left*.jpg'] [--right 'right*.jpg'] [--board 9x6] [--square 0.025]
+    python -m experiments.photos [DIR] [--left 'left*.jpg'] [--right 'right*.jpg'] [--board 9x6] [--square 0.025]
                                  [--processes P] [--quick] [--out DIR]
 """
 
-import functools
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -25,17 +25,17 @@ from cotarget.calibration.placing import place_boards
 from cotarget.calibration.uncertainty import model_of
 from cotarget.cli.arguments import corners, count, positive
 from cotarget.config import BoardConfig
-from cotarget.errors import CotargetError
-from experiments.harness import Experiment, Parser, Row, Settings, rms, spread, table
+from experiments.harness import Experiment, Parser, Row, Settings, rms, table
 
 NOT_HELD_OUT = Options(folds=0)
+PHOTOS = Path(__file__).resolve().parents[2] / "shared" / "data" / "opencv_stereo"
 
 
 @dataclass(frozen=True)
 class PhotosSettings(Settings):
     """Where the photos are, what they show, and how many of the pairs are left out in their turn (all, at most)."""
 
-    directory: str = ""
+    directory: str = str(PHOTOS)
     left: str = "left*.jpg"
     right: str = "right*.jpg"
     columns: int = 9
@@ -43,13 +43,35 @@ class PhotosSettings(Settings):
     square: float = 0.025
 
 
-def run(settings: PhotosSettings) -> list[Row]:
-    """One row for the whole, then one for each pair."""
+def needs(settings: PhotosSettings) -> str:
+    """Say what is missing."""
+    there = Path(settings.directory)
+    return "" if there.is_dir() else f"needs photos in {there}, which are not part of the project"
+
+
+def whole(settings: PhotosSettings) -> Calibration:
+    """Calibrate from all pairs."""
     board = BoardConfig(corners=(settings.columns, settings.rows), square=settings.square)
-    whole = calibrate_photos(Path(settings.directory), settings.left, settings.right, board, options=NOT_HELD_OUT)
+    return calibrate_photos(Path(settings.directory), settings.left, settings.right, board, options=NOT_HELD_OUT)
+
+
+def jobs(settings: PhotosSettings) -> Sequence[int]:
+    """Numbers of the pairs to be left out; one in which no board is found has a number and no row."""
+    pairs = len(list(Path(settings.directory).glob(settings.left)))
+    return range(min(settings.seeds, max(pairs, 1)))
+
+
+def one(calibration: Calibration, _: PhotosSettings, number: int) -> list[Row]:
+    """One row for each pair, and with the first one for the whole."""
+    pairs = sorted({view.board for view in calibration.views})
+    rows = [_all(calibration)] if number == 0 else []
+    return rows + [_without(calibration, pair) for pair in pairs[number : number + 1]]
+
+
+def _all(whole: Calibration) -> Row:
     residuals, gamma = whole.residuals, whole.T_zoom0_fixed
     assert residuals is not None
-    row = {
+    return {
         "pair": "all",
         "left_rms_px": residuals.fixed_rms_px,
         "right_rms_px": residuals.zoom_rms_px,
@@ -61,12 +83,9 @@ def run(settings: PhotosSettings) -> list[Row]:
         "outliers": residuals.outliers,
         "rejected": len(residuals.rejected),
     }
-    numbers = sorted({view.board for view in whole.views})[settings.seed_base :][: settings.seeds]
-    work = functools.partial(_without, whole)
-    return [row, *(r for rows in spread(work, numbers, settings.processes) for r in rows)]
 
 
-def _without(whole: Calibration, pair: int) -> list[Row]:
+def _without(whole: Calibration, pair: int) -> Row:
     """Calibrate without a pair, then fit its board alone."""
     assert whole.board is not None
     points = board_points(whole.board)
@@ -78,7 +97,7 @@ def _without(whole: Calibration, pair: int) -> list[Row]:
     name = ", ".join(str(view.source) for view in mine)
     baseline = float(1e3 * np.linalg.norm(calibration.T_zoom0_fixed.translation))
     corners = int(sum(view.seen.sum() for view in mine))
-    return [{"pair": name, "left_out_rms_px": left.rms_px, "baseline_mm": baseline, "corners": corners}]
+    return {"pair": name, "left_out_rms_px": left.rms_px, "baseline_mm": baseline, "corners": corners}
 
 
 def _baseline_sigma(calibration: Calibration) -> float:
@@ -126,17 +145,20 @@ EXPERIMENT = Experiment(
     "Real stereo photos: rms, baseline, and each pair left out.",
     SETTINGS,
     replace(SETTINGS, seeds=2),
-    run,
+    one,
     summarise,
     describe,
     plot,
+    prepare=whole,
+    jobs=jobs,
+    needs=needs,
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command."""
     parser = Parser(prog="python -m experiments.photos", description=EXPERIMENT.purpose)
-    parser.add_argument("directory", metavar="DIR", help="the photos")
+    parser.add_argument("directory", nargs="?", default=SETTINGS.directory, metavar="DIR", help="the photos")
     parser.add_argument("--left", default=SETTINGS.left, metavar="GLOB")
     parser.add_argument("--right", default=SETTINGS.right, metavar="GLOB")
     board = (SETTINGS.columns, SETTINGS.rows)
@@ -159,11 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         square=given.square,
         processes=given.processes,
     )
-    try:
-        return EXPERIMENT.report(settings, given.out)
-    except CotargetError as error:
-        print(f"experiments.photos: {error}", file=sys.stderr)
-        return 1
+    return EXPERIMENT.report(settings, given.out)
 
 
 if __name__ == "__main__":

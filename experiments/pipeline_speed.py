@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from cotarget.calibration import Calibration
 from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetConfig
 from cotarget.detection import Detector, make_detector
-from cotarget.errors import CotargetError
+from cotarget.oracle import true_calibration
 from cotarget.policies import FirstCome
 from cotarget.pursuit import Pursuit
 from cotarget.rig import Frame, PanTiltLimits
@@ -31,8 +31,7 @@ from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim
 from cotarget.tracking import Tracker, settings_for
 from cotarget.video import Film
-from experiments.harness import Experiment, Row, Settings, over_seeds, table
-from experiments.true_rig import true_calibration
+from experiments.harness import Experiment, Row, Settings, table
 
 FILM = Path(__file__).resolve().parents[2] / "shared" / "data" / "birds" / "V_BIRD_036.mp4"
 ALONE = "MOG2 alone"
@@ -97,19 +96,13 @@ def calibration_of(size: tuple[int, int]) -> Calibration:
     return replace(calibration, fixed=replace(calibration.fixed, size=size, center_px=middle))
 
 
-def run(settings: PipelineSpeedSettings) -> list[Row]:
-    """One row for each frame and way; in one process, whatever the settings say.
-
-    Raises:
-        CotargetError: the film is not there.
-    """
-    if not FILM.is_file():
-        raise CotargetError(f"needs {FILM}, which is not part of the project")
-    return over_seeds(one, replace(settings, processes=1))
+def needs(_: PipelineSpeedSettings) -> str:
+    """Say what is missing."""
+    return "" if FILM.is_file() else f"needs {FILM}, which is not part of the project"
 
 
-def one(settings: PipelineSpeedSettings, seed: int) -> list[Row]:
-    """Go through the film once."""
+def one(_: None, settings: PipelineSpeedSettings, seed: int) -> list[Row]:
+    """Go through the film once; one row for each frame and way."""
     rows: list[Row] = []
     with Film(FILM) as film:
         subtractor = cv2.createBackgroundSubtractorMOG2()
@@ -175,22 +168,16 @@ EXPERIMENT = Experiment(
     "Milliseconds of detect, track and aim for a frame, beside MOG2 alone.",
     SETTINGS,
     replace(SETTINGS, seeds=1, frames=120),
-    run,
+    one,
     summarise,
     describe,
     plot,
     missed,
+    alone=True,
+    cost_s=60.0,
+    needs=needs,
 )
 
 
-def main() -> int:
-    """The command."""
-    try:
-        return EXPERIMENT.main()
-    except CotargetError as error:
-        print(f"experiments.pipeline_speed: {error}", file=sys.stderr)
-        return 1
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(EXPERIMENT.main())

@@ -29,7 +29,7 @@ from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
-from experiments.harness import Experiment, Row, Settings, over_seeds, rms, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.synthetic import (
     BOARD_DEPTHS,
     HEAD_LIMITS,
@@ -77,13 +77,8 @@ class Drawn:
     redrawn: int
 
 
-def run(settings: RigsSettings) -> list[Row]:
-    """One row a rig."""
-    return over_seeds(one, settings)
-
-
-def one(settings: RigsSettings, seed: int) -> list[Row]:
-    """Draw a rig, calibrate it, and judge it."""
+def one(_: None, settings: RigsSettings, seed: int) -> list[Row]:
+    """Draw a rig, calibrate it, and judge it; one row."""
     rng = np.random.default_rng((seed, 4))
     rig = draw_rig(rng)
     truth = rig.truth
@@ -268,10 +263,11 @@ EXPERIMENT = Experiment(
     "Random rigs: each calibrated within twice its own predicted error, or refused with the reason.",
     SETTINGS,
     replace(SETTINGS, seeds=3, boards=12, targets=50),
-    run,
+    one,
     summarise,
     describe,
     plot,
+    cost_s=5.0,
 )
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from cotarget.geometry import Array
 from cotarget.judging import observe
 from cotarget.loop import State, Step
 from cotarget.metrics import Row as Judged
+from cotarget.oracle import true_calibration
 from cotarget.pursuit import Pursuit
 from cotarget.rig import Frame, Rig
 from cotarget.safety import SafeRig
@@ -30,7 +31,6 @@ from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Aim, Reach, aim
 from cotarget.tracking import Track, Tracker, settings_for
-from experiments.true_rig import true_calibration
 
 # A head and a lens that are wherever they are sent within a millisecond.
 QUICK_DEG_S, QUICK_DEG_S2, QUICK_STEPS_S = 1e6, 1e9, 1e6

@@ -14,7 +14,6 @@ over the steps are given.
     python -m experiments.sim_speed [--seeds 2] [--seed-base 0] [--quick] [--out DIR]
 """
 
-import functools
 import math
 import sys
 import time
@@ -28,14 +27,13 @@ from matplotlib.figure import Figure
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
 from cotarget.loop import FollowSettings, Step
-from cotarget.sim.model import RENDER_PITCH, RIG, build_model
-from cotarget.sim.opengl import make_renderer, mujoco
-from cotarget.sim.state import WorldState
+from cotarget.oracle import TruthDetector
 from cotarget.sim.truth import Truth
-from cotarget.sim.world import CAMERAS, SimWorld
-from experiments.harness import Experiment, Row, over_seeds, seeds_of, table
+from cotarget.sim.world import SimWorld
+from experiments.harness import Experiment, Row, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, target_of, watched, watched_in
-from experiments.hold_scenes import TruthDetector, hold_config
+from experiments.hold_scenes import hold_config
+from experiments.plain_renderer import PlainRenderer
 
 IMAGE_EFFECTS = ("noise", "jpeg", "distortion", "blur", "clutter")
 TARGET = "bird"
@@ -66,13 +64,8 @@ class SimSpeedSettings(FieldSettings):
     seconds_rendered: float = 6.0
 
 
-def run(settings: SimSpeedSettings) -> list[Row]:
-    """Calibrate the rig once, then time everything; in one process, whatever the settings say."""
-    return over_seeds(functools.partial(one, calibrated(settings)), replace(settings, processes=1))
-
-
 def one(calibration: Calibration, settings: SimSpeedSettings, seed: int) -> list[Row]:
-    """Time everything once."""
+    """Time everything once; a row for each step."""
     rows = _beside_renderer(settings, seed)
     for effects in (*((name,) for name in IMAGE_EFFECTS), IMAGE_EFFECTS):
         rows += _beside_none(settings, seed, effects)
@@ -114,36 +107,6 @@ class Stepper:
         rig.head.move(swing, 0.3 * swing)
         rig.zoom.zoom(ZOOMED * rig.zoom.focal_range[0])
         return time.perf_counter() - began
-
-
-class PlainRenderer:
-    """mujoco.Renderer on the frames of a world whose image effects are off."""
-
-    def __init__(self, world: SimWorld) -> None:
-        sim, self._truth = world.config.sim, world.truth()
-        self._sizes = {"fixed": sim.fixed.size, "zoom": sim.zoom.size}
-        size = sim.fixed.size
-        self._model = build_model(world.config, tuple(world.targets.values()), size)
-        self._state = WorldState(self._model, world.targets, world.head_drive, self._truth.T_world_fixed, None)
-        self._renderer = make_renderer(self._model, *size)
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = sim.effects.shadows
-
-    def draw(self, t: float) -> float:
-        """Draw both cameras' frames of time t; how long that took, but for bringing the world to its pose [s]."""
-        data, option, took = self._state.lit(t), mujoco.MjvOption(), 0.0
-        option.geomgroup[3:] = 0  # neither the board nor the rig itself
-        for camera in CAMERAS:
-            number, focal = self._model.camera(RIG + camera).id, self._truth.lens(camera, t).focal_px
-            self._model.cam_intrinsic[number] = (focal[0] * RENDER_PITCH, focal[1] * RENDER_PITCH, 0.0, 0.0)
-            began = time.perf_counter()
-            self._renderer.update_scene(data, number, option)
-            self._renderer.render()
-            took += time.perf_counter() - began
-        return took
-
-    def close(self) -> None:
-        """Release OpenGL."""
-        self._renderer.close()
 
 
 def _beside_renderer(settings: SimSpeedSettings, seed: int) -> list[Row]:
@@ -287,11 +250,14 @@ EXPERIMENT = Experiment(
     "The simulation's speed, beside mujoco.Renderer, effect by effect and against real time.",
     SETTINGS,
     replace(SETTINGS, seeds=1, steps=3, seconds_rendered=0.4, seconds=2.0, calibrated=False),
-    run,
+    one,
     summarise,
     describe,
     plot,
     missed,
+    prepare=calibrated,
+    alone=True,
+    cost_s=120.0,
 )
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from cotarget.calibration import Options, View, calibrate_views
 from cotarget.calibration.boards import board_points
 from cotarget.config import BoardConfig
-from experiments.harness import Experiment, Row, Settings, over_seeds, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, seeds_of, table
 from experiments.synthetic import SIZE, SIZES, Truth, synthetic_views
 
 BOARD = BoardConfig()
@@ -39,13 +39,8 @@ class SpeedSettings(Settings):
     noise_px: float = 0.2
 
 
-def run(settings: SpeedSettings) -> list[Row]:
-    """One row for each seed and way; in one process, whatever the settings say."""
-    return over_seeds(one, replace(settings, processes=1))
-
-
-def one(settings: SpeedSettings, seed: int) -> list[Row]:
-    """Time each way once."""
+def one(_: None, settings: SpeedSettings, seed: int) -> list[Row]:
+    """Time each way once; one row each."""
     views = synthetic_views(
         TRUTH,
         POINTS,
@@ -128,10 +123,12 @@ EXPERIMENT = Experiment(
     "Seconds of the joint fit of 40 views of two cameras, beside OpenCV's.",
     SETTINGS,
     replace(SETTINGS, seeds=1, pairs=8),
-    run,
+    one,
     summarise,
     describe,
     plot,
+    alone=True,
+    cost_s=5.0,
 )
 
 if __name__ == "__main__":

@@ -20,15 +20,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from tqdm import tqdm
-
 from cotarget.cli.arguments import count, not_negative
-from cotarget.errors import CotargetError
 from experiments import wire_age, wire_command, wire_faults, wire_latency, wire_parity, wire_polls
-from experiments.harness import Experiment, Parser, Row, Settings, table
-from experiments.wire_figures import FAULT_COLUMNS, PART_COLUMNS, missed, summarise
-
-INTERRUPTED, TERMINATED = 130, 143  # exit status of who was ended by Ctrl-C, or by kill
+from experiments.harness import TERMINATED, Experiment, Parser, Row, Settings, table
+from experiments.wire_figures import FAULT_COLUMNS, PART_COLUMNS, bounded, missed, summarise
 
 
 @dataclass(frozen=True)
@@ -62,13 +57,15 @@ class WireSettings(Settings):
     still_s: float = 6.0
 
 
-def run(settings: WireSettings) -> list[Row]:
-    """All rows of the figures asked for; one after the other, whatever the settings say of processes."""
-    rows: list[Row] = []
+def jobs(settings: WireSettings) -> Sequence[int]:
+    """A job for each figure, by its number among those asked for."""
+    return range(len(settings.only))
+
+
+def one(_: None, settings: WireSettings, number: int) -> list[Row]:
+    """All rows of one of the figures."""
     with TemporaryDirectory(prefix="cotarget-wire-") as name:
-        for figure in tqdm(settings.only, disable=None, leave=False):
-            rows += RUNS[figure](settings, Path(name))
-    return rows
+        return RUNS[settings.only[number]](settings, Path(name))
 
 
 RUNS: Mapping[str, Callable[[WireSettings, Path], list[Row]]] = {
@@ -107,20 +104,25 @@ EXPERIMENT = Experiment(
     SETTINGS,
     replace(
         SETTINGS,
-        poll_s=3.0,
-        age_s=10.0,
+        poll_s=2.0,
+        age_s=6.0,
+        targets=("book",),
         command_s=6.0,
-        faults=("head.silence", "fixed.stall", "zoom.gone"),
+        faults=("head.silence", "fixed.stall"),
         repetitions=1,
         wiggle_s=5.0,
         swing_s=6.0,
         places=1,
         still_s=4.0,
     ),
-    run,
+    one,
     summarise,
     describe,
     missed=missed,
+    jobs=jobs,
+    alone=True,
+    cost_s=300.0,
+    bounded=bounded,
 )
 
 
@@ -140,13 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.repetitions is not None:
         settings = replace(settings, repetitions=given.repetitions)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))  # so that the emulated devices end too
-    try:
-        return EXPERIMENT.report(settings, given.out)
-    except CotargetError as error:
-        print(f"experiments.wire: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return INTERRUPTED
+    return EXPERIMENT.report(settings, given.out)
 
 
 if __name__ == "__main__":

@@ -65,6 +65,14 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     return [name for name, figure in summary["figures"].items() if not figure["reached"]]
 
 
+def bounded(summary: Mapping[str, Any]) -> dict[str, float]:
+    """What was measured, under names that do not tell what it was measured to be."""
+    return {
+        name.partition(":")[0] if name.startswith("latency") else name: figure["measured"]
+        for name, figure in summary["figures"].items()
+    }
+
+
 def at_most(measured: float, wanted: float, unit: str) -> Figure:
     """A figure that shall not be larger."""
     return {"measured": measured, "wanted": f"<= {wanted:g}", "unit": unit, "reached": bool(measured <= wanted)}

@@ -21,8 +21,8 @@ from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, load_config
 from cotarget.errors import DeviceError
 from cotarget.hardware import line
+from cotarget.oracle import true_calibration
 from cotarget.sim.world import SimWorld
-from experiments.true_rig import true_calibration
 
 READY, CONTROL = "connects to them", "control "  # what the command says when it is up, and where its faults are
 LONGEST_S = 3600  # an emulator whose parent was killed outright ends by itself then [s]

@@ -29,7 +29,7 @@ from cotarget.servo import reach_of
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments import harness
-from experiments.harness import Experiment, Row, over_seeds, rms, seeds_of, table
+from experiments.harness import Experiment, Row, rms, seeds_of, table
 
 STREAM = 6  # of random numbers, apart from the world's own
 FOCAL_LENGTHS = 15  # over the range, evenly in the logarithm: every stop and the middle between any two
@@ -47,13 +47,8 @@ class Settings(harness.Settings):
     heads: tuple[str, ...] = tuple(HEADS)
 
 
-def run(settings: Settings) -> list[Row]:
-    """Calibrate once a seed and head; one row for each focal length."""
-    return over_seeds(one, settings)
-
-
-def one(settings: Settings, seed: int) -> list[Row]:
-    """Calibrate with each head."""
+def one(_: None, settings: Settings, seed: int) -> list[Row]:
+    """Calibrate with each head; one row for each focal length."""
     rows: list[Row] = []
     for head in settings.heads:
         sim = SimConfig(scene="indoor", seed=seed, effects=SimEffects(steps=HEADS[head]))
@@ -189,10 +184,11 @@ EXPERIMENT = Experiment(
     "How well a rig points over its whole zoom range, calibrated from rendered boards.",
     SETTINGS,
     dataclasses.replace(SETTINGS, seeds=1, targets=20, heads=("steps",)),
-    run,
+    one,
     summarise,
     describe,
     plot,
+    cost_s=120.0,
 )
 
 if __name__ == "__main__":

@@ -14,11 +14,11 @@ from cotarget.cli.choosing import POLICIES, Choice, add_choice
 from cotarget.config import RigConfig
 from cotarget.errors import ConfigError
 from cotarget.motionfilter import Track
+from cotarget.oracle import true_calibration
 from cotarget.planning import Candidate
 from cotarget.rig import PanTiltLimits
 from cotarget.sim.world import SimWorld
 from cotarget.whom import Whom
-from experiments.true_rig import true_calibration
 
 SIZE = (640, 480)
 LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), 2.6, 3.6, 0.0)

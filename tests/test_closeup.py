@@ -16,10 +16,10 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.demo import SCENES, sim_config
 from cotarget.detection import Detection
 from cotarget.geometry import pose
+from cotarget.oracle import true_calibration
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim
-from experiments.true_rig import true_calibration
 
 SIZE = (640, 480)
 FINE = 8  # scenes are drawn with this many bits of sub-pixel, and antialiased

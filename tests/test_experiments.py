@@ -10,16 +10,15 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
+from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, pose
-from experiments import __main__ as everything
 from experiments import photos, pipeline_speed, random_rigs
-from experiments.harness import Experiment, Settings, over_seeds, rms, spread, table
+from experiments.harness import Experiment, Settings, rms, table
 from experiments.synthetic import (
     SIZE,
     Lens,
@@ -32,6 +31,7 @@ from experiments.synthetic import (
     views_at_stops,
     with_lever_shifted,
 )
+from tests.tiny_experiments import TINY
 
 PHOTOS = Path(__file__).parents[2] / "shared" / "data" / "opencv_stereo"
 STILL = RigidTransform.identity()
@@ -47,8 +47,12 @@ class DummySettings(Settings):
     factor: float = 2.0
 
 
-def dummy(settings, seed):
-    return [{"seed": seed, "value": settings.factor * seed, "missing": None}, {"seed": seed, "extra": "a"}]
+def shared(settings):
+    return "a"
+
+
+def dummy(extra, settings, seed):
+    return [{"seed": seed, "value": settings.factor * seed, "missing": None}, {"seed": seed, "extra": extra}]
 
 
 def summed(rows):
@@ -60,34 +64,36 @@ EXPERIMENT = Experiment(
     "Sums.",
     DummySettings(seeds=4),
     DummySettings(seeds=2),
-    lambda settings: over_seeds(dummy, settings),
+    dummy,
     summed,
     lambda _, summary: f"sum {summary['sum']}",
     lambda rows, figure: figure.subplots().plot([row.get("value", 0.0) for row in rows]),
+    prepare=shared,
 )
+HERE = replace(EXPERIMENT, alone=True)  # which spares the start of a process
 
 
 def test_a_run_writes_its_files(tmp_path, capsys):
     out = tmp_path / "new" / "folder"
-    assert EXPERIMENT.main(["--seeds", "3", "--seed-base", "10", "--processes", "1", "--out", str(out)]) == 0
+    assert HERE.main(["--seeds", "3", "--seed-base", "10", "--processes", "1", "--out", str(out)]) == 0
     assert capsys.readouterr().out == "sum 66.0\n"
     result = json.loads((out / "result.json").read_text())
     assert result["settings"] == {"seeds": 3, "seed_base": 10, "processes": 1, "factor": 2.0}
     assert result["summary"] == {"sum": 66.0, "nothing": None, "by": {"1": 2.5}}
-    assert set(result["versions"]) == {"cotarget", "opencv", "numpy", "scipy"}
+    assert set(result["versions"]) == {"cotarget", "opencv", "numpy", "scipy", "mujoco", "matplotlib"}
     rows = list(csv.DictReader((out / "rows.csv").read_text().splitlines()))
     assert [row["seed"] for row in rows] == ["10", "10", "11", "11", "12", "12"]
     assert (rows[0]["value"], rows[0]["extra"], rows[1]["extra"]) == ("20.0", "", "a")
     assert cv2.imread(str(out / "figure.png")) is not None
-    assert EXPERIMENT.main(["--quick", "--processes", "1"]) == 0
+    assert HERE.main(["--quick", "--processes", "1"]) == 0
     assert capsys.readouterr().out == "sum 2.0\n"
 
 
-def never(settings):
+def never(extra, settings, seed):
     raise AssertionError("nothing is run before the arguments are looked at")
 
 
-UNRUN = replace(EXPERIMENT, run=never)
+UNRUN = replace(HERE, one=never, prepare=None)
 
 
 @pytest.mark.parametrize(("arguments", "said"), [
@@ -118,10 +124,10 @@ def test_a_file_in_the_way_of_the_results_is_told_before_any_work(tmp_path, caps
 
 
 def test_an_interrupt_ends_in_one_line(capsys, tmp_path):
-    def interrupted(settings):
+    def interrupted(extra, settings, seed):
         raise KeyboardInterrupt
 
-    assert replace(EXPERIMENT, run=interrupted).main(["--out", str(tmp_path / "out")]) == 130
+    assert replace(HERE, one=interrupted).main(["--out", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err == "experiments.dummy: interrupted\n"
     assert not (tmp_path / "out").exists()
 
@@ -138,9 +144,10 @@ WAITS = """
 import os, time
 from pathlib import Path
 
-def work(name):
-    Path(name + "-").write_text(str(os.getpid()))
-    os.rename(name + "-", name)
+def work(_, settings, seed):
+    path = Path(__file__).with_name(str(seed))
+    path.with_suffix(".new").write_text(str(os.getpid()))
+    path.with_suffix(".new").rename(path)
     time.sleep(600)
 """
 WAITER = """
@@ -148,27 +155,26 @@ import sys
 import waits
 
 if __name__ == "__main__":
-    from experiments.harness import Experiment, Settings, spread
-    run = lambda settings: list(spread(waits.work, sys.argv[1:], settings.processes))
-    experiment = Experiment("waiter", "Waits.", Settings(2), Settings(1), run, dict, str)
+    from experiments.harness import Experiment, Settings
+    experiment = Experiment("waiter", "Waits.", Settings(3), Settings(1), waits.work, dict, str)
     sys.exit(experiment.main(["--processes", "2"]))
 """
 
 
 @contextlib.contextmanager
-def waiter(folder, *jobs):
+def waiter(folder):
     """An experiment in two processes, both at their jobs, which are files to write and then to wait."""
     (folder / "waits.py").write_text(WAITS)
     (folder / "waiter.py").write_text(WAITER)
     paths = f"{Path(__file__).parents[1]}{os.pathsep}{folder}"
-    command = [sys.executable, "waiter.py", *jobs]
+    command = [sys.executable, "waiter.py"]
     with subprocess.Popen(
         command, cwd=folder, env=os.environ | {"PYTHONPATH": paths}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True, start_new_session=True,
     ) as process:  # fmt: skip
         try:
             deadline = time.monotonic() + DEADLINE_S
-            while not all((folder / job).exists() for job in jobs[:2]):
+            while not all((folder / job).exists() for job in ("0", "1")):
                 assert process.poll() is None, process.stderr.read()
                 assert time.monotonic() < deadline, "the jobs have not begun"
                 time.sleep(0.02)
@@ -180,79 +186,22 @@ def waiter(folder, *jobs):
 
 def test_an_interrupt_of_all_processes_ends_them_in_one_line(tmp_path):
     """As a terminal sends it: to the whole group; the workers are at their jobs, the last of which has not begun."""
-    with waiter(tmp_path, "1", "2", "3") as process:
+    with waiter(tmp_path) as process:
         os.killpg(process.pid, signal.SIGINT)
         out, err = process.communicate(timeout=DEADLINE_S)
     assert (process.returncode, out, err) == (130, "", "experiments.waiter: interrupted\n")
-    assert not (tmp_path / "3").exists()
-    for job in ("1", "2"):
+    assert not (tmp_path / "2").exists()
+    for job in ("0", "1"):
         with pytest.raises(ProcessLookupError):
             os.kill(int((tmp_path / job).read_text()), 0)
 
 
 def test_workers_end_with_their_parent_however_it_ends(tmp_path):
     """Its pipes are closed only when nobody holds them any more; the jobs would for minutes."""
-    with waiter(tmp_path, "1", "2") as process:
+    with waiter(tmp_path) as process:
         process.kill()
         process.communicate(timeout=DEADLINE_S)
     assert process.returncode == -signal.SIGKILL
-
-
-def test_all_of_them_fail_where_one_fails(monkeypatch, capsys, tmp_path):
-    """One is fine, one misses a figure, and one lacks the film that it needs."""
-    asked = []
-
-    def module(name, status, **more):
-        def main(arguments):
-            asked.append((name, arguments))
-            return status
-
-        return SimpleNamespace(EXPERIMENT=SimpleNamespace(main=main), **more)
-
-    modules = {
-        "fine": module("fine", 0),
-        "bad": module("bad", 1),
-        "film": module("film", 0, FILM=tmp_path / "none.mp4"),
-    }
-    monkeypatch.setattr(everything, "EXPERIMENTS", ("bad", "fine", "film"))
-    monkeypatch.setattr(everything.importlib, "import_module", lambda name: modules[name.removeprefix("experiments.")])
-    assert everything.main(["--quick", "--out", "there"]) == 1
-    assert asked == [(name, ["--quick", "--out", f"there/{name}"]) for name in ("bad", "fine")]
-    out = capsys.readouterr().out
-    assert "none.mp4, which is not part of the project" in out
-    assert out.endswith("not what is wanted: bad\n")
-    monkeypatch.setattr(everything, "EXPERIMENTS", ("fine", "film"))
-    assert everything.main([]) == 0
-    (tmp_path / "none.mp4").touch()
-    assert everything.main([]) == 0
-    assert asked[-1] == ("film", [])
-
-
-def test_some_of_them_by_name_and_an_interrupt_ends_all(monkeypatch, capsys, tmp_path):
-    asked = []
-    status = {"hand_eye": 0, "hold": 130, "speed": 0}
-
-    def module(name):
-        name = name.removeprefix("experiments.")
-        return SimpleNamespace(EXPERIMENT=SimpleNamespace(main=lambda _: asked.append(name) or status[name]))
-
-    monkeypatch.setattr(everything.importlib, "import_module", module)
-    assert everything.main(["hand_eye", "speed"]) == 0
-    assert everything.main(["hand_eye", "hold", "speed"]) == 130
-    assert asked == ["hand_eye", "speed", "hand_eye", "hold"]
-    capsys.readouterr()
-    (tmp_path / "file").touch()
-    for arguments, said in (
-        (["hand_eye", "by_hand"], "there is no experiment 'by_hand'; there are hand_eye, chain,"),
-        (["--out", str(tmp_path / "file")], f"--out: {tmp_path / 'file'} is no folder"),
-    ):
-        with pytest.raises(SystemExit) as caught:
-            everything.main(arguments)
-        err = capsys.readouterr().err
-        assert caught.value.code == 2
-        assert said in err
-        assert err.count("\n") == 1
-    assert len(asked) == 4
 
 
 def test_a_pipeline_that_is_too_slow_is_missed():
@@ -268,7 +217,29 @@ def test_a_pipeline_that_is_too_slow_is_missed():
 
 
 def test_processes_change_nothing():
-    assert list(spread(str, range(3), 2)) == list(spread(str, range(3), 1)) == ["0", "1", "2"]
+    settings = TINY.quick  # seeds 0 and 1
+    rows = replace(TINY, prepare=None).run(replace(settings, processes=2))
+    assert [row["seed"] for row in rows] == [0, 0, 1, 1]
+    assert [row["value"] for row in rows[::2]] == [0.0, 1.0]
+    assert str(rows) == str(replace(TINY, prepare=None).run(settings))  # nan is nan
+
+
+def test_what_is_lacking_or_cannot_be_ends_in_one_line(capsys):
+    lacking = replace(UNRUN, needs=lambda settings: "needs the moon")
+    assert lacking.main([]) == 1
+    assert capsys.readouterr().err == "experiments.dummy: needs the moon\n"
+    with pytest.raises(ConfigError, match="seeds = 0: at least 1 is needed"):
+        DummySettings(seeds=0)
+
+
+def test_a_pair_is_left_out_for_each_photo(tmp_path):
+    for number in range(3):
+        (tmp_path / f"left{number}.jpg").touch()
+    settings = replace(photos.SETTINGS, directory=str(tmp_path))
+    assert list(photos.jobs(settings)) == [0, 1, 2]
+    assert list(photos.jobs(replace(settings, seeds=2))) == [0, 1]
+    assert photos.needs(settings) == ""
+    assert "which are not part of the project" in photos.needs(replace(settings, directory=str(tmp_path / "none")))
 
 
 def test_tables_and_rms():

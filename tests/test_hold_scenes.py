@@ -8,17 +8,11 @@ import pytest
 from cotarget.config import SimHead
 from cotarget.errors import ConfigError
 from cotarget.loop import follow
-from cotarget.rig import Frame
+from cotarget.oracle import TruthDetector, true_calibration
+from cotarget.sim.fieldpaths import SECONDS
 from cotarget.sim.targets import marker_of
 from cotarget.sim.world import SimWorld
-from experiments.hold_scenes import (
-    SECONDS,
-    TruthDetector,
-    TruthNoise,
-    five_targets_config,
-    hold_config,
-)
-from experiments.true_rig import true_calibration
+from experiments.hold_scenes import five_targets_config, hold_config
 
 SEEDS = (0, 1, 2, 100, 101)
 NAMES = ("book", "person", "bird")
@@ -156,46 +150,6 @@ def test_other_names_are_refused():
         hold_config("dragon", 0)
     with pytest.raises(ConfigError, match="five at once there are of: bird, person"):
         five_targets_config(0, "book")
-
-
-def test_the_truth_detector_errs_as_it_is_told():
-    noise = TruthNoise(center_px=0.7, size=0.1, miss=0.2)
-    with (w := blind(hold_config("bird", 3))).rig:
-        truth, image = w.truth(), np.zeros((480, 640, 3), np.uint8)
-        detector, again = TruthDetector(truth, 5, noise), TruthDetector(truth, 5, noise)
-        offs, sides, missed = [], [], 0
-        for t in TIMES:
-            low, high = truth.box("bird", "fixed", t)
-            found = detector.detect(Frame(image, t))
-            if t < 2:
-                later = again.detect(Frame(image, t))  # whatever was asked before
-                assert [d.center_px.tolist() for d in later] == [d.center_px.tolist() for d in found]
-            if not found:
-                missed += 1
-                continue
-            (one,) = found
-            offs.append(one.center_px - (low + high) / 2)
-            sides.append(one.size_px / (high - low) - 1)
-            assert not one.clipped
-        assert missed / len(TIMES) == pytest.approx(0.2, abs=0.06)  # 500 tell it to 2 %
-        assert np.std(offs, axis=0) == pytest.approx([0.7, 0.7], rel=0.15)
-        assert np.std(sides, axis=0) == pytest.approx([0.1, 0.1], rel=0.15)
-        exact = TruthDetector(truth, 5, TruthNoise(0.0, 0.0, 0.0)).detect(Frame(image, 1.0))[0]
-        low, high = truth.box("bird", "fixed", 1.0)
-        assert exact.center_px == pytest.approx((low + high) / 2)
-        assert exact.size_px == pytest.approx(high - low)
-
-
-def test_the_truth_detector_sees_what_the_picture_cuts():
-    with (w := blind(five_targets_config(0))).rig:
-        detector = TruthDetector(w.truth(), 0, TruthNoise(0.0, 0.0, 0.0))
-        image = np.zeros((480, 640, 3), np.uint8)
-        assert detector.detect(Frame(image, 0.0)) == []  # nobody there yet
-        found = [d for t in TIMES[::5] for d in detector.detect(Frame(image, t))]
-        assert any(d.clipped for d in found)
-        for d in found:
-            assert (d.center_px - d.size_px / 2 >= -0.5 - 1e-9).all()
-            assert (d.center_px + d.size_px / 2 <= [639.5 + 1e-9, 479.5 + 1e-9]).all()
 
 
 def test_the_pipeline_runs_without_a_picture():

@@ -12,11 +12,11 @@ from cotarget.detection import Detection
 from cotarget.geometry import pose
 from cotarget.judging import add_row, decodes, observe, pointing_errors
 from cotarget.loop import State, Step
+from cotarget.oracle import true_calibration
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
 from cotarget.tracking import Track
-from experiments.true_rig import true_calibration
 
 pytestmark = pytest.mark.render
 

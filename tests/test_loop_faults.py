@@ -17,14 +17,13 @@ from cotarget.detection import Detection
 from cotarget.errors import CotargetError, DeviceError, StaleFrameError
 from cotarget.eyes import BLIND_S, FROZEN_S, GONE_S, ZOOM_WAIT_S
 from cotarget.loop import FollowSettings, State, follow
+from cotarget.oracle import TruthDetector, true_calibration
 from cotarget.policies import POLICIES, Chosen
 from cotarget.pursuit import MOST_FILTERS
 from cotarget.replay import ReplayRig, open_recording, until_end
 from cotarget.rig import Frame
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
-from experiments.hold_scenes import TruthDetector
-from experiments.true_rig import true_calibration
 from tests.recorded_run import ToyRig, calibration_file, record
 from tests.recorded_run import run as recorded
 from tests.test_loop import (

@@ -9,9 +9,9 @@ import pytest
 from cotarget import pursuit
 from cotarget.closeup import CloseupFinder, Found
 from cotarget.loop import FollowSettings, State, follow
+from cotarget.oracle import TruthDetector, TruthNoise, true_calibration
 from cotarget.sim.world import SimWorld
-from experiments.hold_scenes import TruthDetector, TruthNoise, hold_config
-from experiments.true_rig import true_calibration
+from experiments.hold_scenes import hold_config
 
 SIGMA_PX = 1.0  # of what is found in the zoom view
 GATE_SIGMAS = 3.0  # as that of the real finder

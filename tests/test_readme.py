@@ -9,15 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cotarget.cli import main
+from cotarget import cli
 from cotarget.config import DEFAULT_TARGETS, parse_config
 from cotarget.film import COLUMNS as FILM_COLUMNS
 from cotarget.recording import COLUMNS as STEP_COLUMNS
 from cotarget.rig import Frame
+from experiments.__main__ import main
+from experiments.cases import choose, known_experiments
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 # `cotarget NAME ... --option ...` up to where a line of code or of a shell ends.
 COMMANDS = re.findall(r"cotarget ([a-z-]+)((?: [^`\n]*)?)", README)
+# `python -m experiments[.name] ...`, of which one line of code follows the other.
+EXPERIMENTS = re.findall(r"python -m experiments((?:\.[a-z_]+)?)((?: (?:(?!python -m)[^`#])*)?)", README)
 
 
 def test_there_are_examples():
@@ -33,7 +37,7 @@ def test_configurations_are_read(block):
 def asked(*arguments):
     """What a command's --help says."""
     with redirect_stdout(io.StringIO()) as out, pytest.raises(SystemExit) as ended:
-        main([*arguments, "--help"])
+        cli.main([*arguments, "--help"])
     assert ended.value.code == 0
     return out.getvalue()
 
@@ -55,6 +59,21 @@ def test_commands_and_their_options_exist(helps):
             continue
         for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", rest):
             assert option in helps[name], f"cotarget {name} {option}"
+
+
+def test_experiments_and_their_options_exist():
+    assert len(EXPERIMENTS) > 8
+    known = known_experiments()
+    with pytest.raises(SystemExit), redirect_stdout(io.StringIO()) as said:
+        main(["--help"])
+    for name, rest in EXPERIMENTS:
+        if name:
+            assert name.removeprefix(".") in known
+            continue
+        for option in re.findall(r"(?<![\w-])--[a-z][a-z-]*", rest):
+            assert option in said.getvalue(), f"python -m experiments {option}"
+        names = [word for word in re.findall(r"^ ([a-z_ ]+)(?= |$)", rest) for word in word.split()]
+        assert choose(known, names, changes=re.findall(r"--set (\S+)", rest))
 
 
 def test_every_command_is_told_of(helps):

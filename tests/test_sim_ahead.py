@@ -10,7 +10,8 @@ import pytest
 
 from cotarget.config import parse_config
 from cotarget.errors import DeviceError
-from cotarget.sim.ahead import READ_IN_TURN, Ahead
+from cotarget.sim.ahead import READ_IN_TURN, Ahead, is_allowed
+from cotarget.sim.opengl import Canvas
 from cotarget.sim.world import SimWorld
 
 FRAMES = READ_IN_TURN + 8
@@ -43,13 +44,22 @@ def watched(w):
 
 @pytest.mark.render
 def test_frames_are_the_same_whether_rendered_ahead_or_not():
-    before = len(workers())
+    before, drawn = len(workers()), Canvas.drawn
     (plain, without), (ahead, with_it) = watched(world(ahead=False)), watched(world())
+    assert Canvas.drawn - drawn >= len(plain) + len(ahead)
     assert (without - before, with_it - before) == (0, 1)
     for a, b in zip(plain, ahead, strict=True):
         assert a.t == b.t
         np.testing.assert_array_equal(a.image, b.image)
     assert len(workers()) == before
+
+
+def test_nothing_is_rendered_ahead_where_that_is_forbidden(monkeypatch):
+    assert is_allowed()
+    monkeypatch.setenv("COTARGET_AHEAD", "0")
+    assert not is_allowed()
+    monkeypatch.setattr("cotarget.sim.world.Ahead", lambda views: pytest.fail("another thread was asked for"))
+    world(rendered=("zoom",)).rig.close()
 
 
 @pytest.fixture

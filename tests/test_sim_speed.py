@@ -83,7 +83,7 @@ def test_only_the_effects_asked_for_are_on():
 @pytest.mark.slow
 @pytest.mark.render
 def test_a_quick_run():
-    summary = sim_speed.summarise(sim_speed.run(sim_speed.EXPERIMENT.quick))
+    summary = sim_speed.summarise(sim_speed.EXPERIMENT.run(sim_speed.EXPERIMENT.quick))
     assert summary["loop_over_renderer"] < BUSY
     assert all(math.isfinite(v["more_ms"]) for v in summary["effects"].values())
     assert summary["real_time_rendered"] > 0

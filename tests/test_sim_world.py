@@ -152,6 +152,10 @@ def test_a_scene_of_ones_own(tmp_path):
     [
         ("<mujoco><worldbody/></mujoco>", "has no site 'fixed_mount'"),
         ("<mujoco><world/></mujoco>", "is not a valid MJCF scene"),
+        (
+            "<mujoco><asset><mesh file='none.stl'/></asset><worldbody><site name='fixed_mount'/></worldbody></mujoco>",
+            "does not compile",
+        ),
     ],
 )
 def test_a_scene_that_cannot_serve_is_named(tmp_path, text, said):

@@ -241,3 +241,23 @@ def test_refuses_what_it_does_not_know():
         waypoint_path(((1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0)))
     with pytest.raises(ConfigError, match="at least one"):
         waypoint_path(())
+
+
+@pytest.mark.parametrize(("name", "scene"), CASES)
+def test_a_stance_is_the_pose_in_floats(name, scene):
+    target = make(name, scene)
+    for t in SECONDS[::7]:
+        pose = target.pose(t)
+        position, axes, joints = target.stance(t, target.beat(t))
+        assert position == list(pose.position)
+        assert joints == pose.joints
+        np.testing.assert_allclose(np.transpose(axes), pose.rotation.as_matrix(), atol=1e-14)
+
+
+@pytest.mark.parametrize("waypoints", [None, [[5, 1, 9, 2], [6, 2, 9, 3], [8, 2, 7, 2]]], ids=["loop", "waypoints"])
+def test_a_paths_motion_is_position_velocity_and_acceleration_to_the_last_bit(waypoints):
+    path = make("bird", "outdoor", waypoints=waypoints).path
+    ends = (5.0, 5.001, 5.002, 5.004, 7.996, 7.998, 8.0)
+    for t in (-1.0, *ends, *SECONDS, 700.3):
+        x, v, a = path.motion(t)
+        assert (x, v, a) == (path.position(t).tolist(), path.velocity(t).tolist(), path.acceleration(t).tolist())

@@ -1,5 +1,6 @@
 """The tracker on drawn detections whose motion is known in closed form."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from cotarget import tracking
 from cotarget.config import DEFAULT_TARGETS
+from cotarget.motionfilter import CUT, TargetFilter, center_variance, missing
 from cotarget.tracking import MOST_DETECTIONS, Tracker, TrackerSettings, settings_for
 
 RATE = 25.0
@@ -371,3 +373,44 @@ def test_a_bird_that_turns_behind_foliage_is_found_again(gap_s, turn):
         hidden = 0 < i / RATE - 0.9 <= gap_s
         tracks = tracker.update([] if hidden else [seen(*(place + rng.normal(0, 1.5, 2)), 17, 9)], i / RATE)
     assert [(track.id, track.missed) for track in tracks if track.confirmed] == [(1, 0)]
+
+
+@pytest.mark.parametrize("name", [None, "book", "person", "bird"])
+def test_a_lone_pair_is_matched_as_any_other(monkeypatch, name):
+    """Whatever overlaps or does not, in all ways in which a lone detection is of a lone track, or of nothing known."""
+    shortcut, ways = tracking._belongs, Counter()
+
+    def both(state, detection, image_size):
+        pairs = tracking._Pairs([state], [detection], image_size)
+        matches = tracking._assign(pairs)
+        found = shortcut(state, detection, image_size)
+        assert tracking._overlap(state, detection) == pairs.overlap[0, 0]
+        assert (matches, tracking._crowds(pairs, matches)) == ({0: 0} if found else {}, {})
+        ways[found, bool(pairs.overlap[0, 0] > tracking.OVERLAP_ENOUGH), state.missed > 0] += 1
+        return found
+
+    monkeypatch.setattr(tracking, "_belongs", both)
+    rng = np.random.default_rng(5)
+    for _ in range(30):
+        tracker = Tracker(PLAIN if name is None else settings_for(DEFAULT_TARGETS[name]), SIZE)
+        for i in range(40):
+            place = np.array([100 + 6 * i, 200]) + rng.normal(0, 4, 2) * rng.choice([1, 4], p=[0.7, 0.3])
+            box = Seen(place, rng.uniform(8, 30, 2), rng.uniform(0.005, 1.0), bool(rng.random() < 0.1))
+            tracker.update([] if rng.random() < 0.2 else [box], i / RATE)
+    assert {way[:2] for way in ways} == {(True, True), (True, False), (False, False)}
+    assert {way[2] for way in ways} == {True, False}
+
+
+def test_a_boxs_variance_is_the_same_in_floats_and_for_many():
+    rng = np.random.default_rng(3)
+    for settings in (PLAIN, *map(settings_for, DEFAULT_TARGETS.values())):
+        state = TargetFilter(1, Seen(np.zeros(2), np.array([20.0, 12.0])), 0.0, settings)
+        boxes = [Seen(np.zeros(2), rng.uniform(3, 40, 2), clipped=bool(rng.random() < 0.3)) for _ in range(50)]
+        sides = np.array([box.size_px for box in boxes])
+        part = np.where([[box.clipped] for box in boxes], CUT, settings.noise_of_size)
+        several = center_variance(settings, sides, part, missing(state.size, sides))
+        assert [state.variance(box) for box in boxes] == several.tolist()
+        # By hand: the first side that is a piece of the usual 20 px lacks the rest.
+        side, cut = next((box.size_px[0], box.clipped) for box in boxes if box.size_px[0] < 14)
+        off = settings.noise_px**2 + ((0.5 if cut else settings.noise_of_size) * side) ** 2 + ((20 - side) / 2) ** 2
+        assert off == pytest.approx(several[np.flatnonzero(sides[:, 0] == side)[0], 0])

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from experiments import wire, wire_age, wire_command, wire_faults
-from experiments.harness import EXPECTED
+from experiments.bounds import compare
 from experiments.wire_command import Turn
-from experiments.wire_figures import missed, summarise
+from experiments.wire_figures import bounded, missed, summarise
 from experiments.wire_rig import Tap
 
 # Nothing here is a figure: the machine may be busy, and experiments/expected/wire.json is as patient. What is a third
@@ -83,6 +83,14 @@ def test_figures_from_rows():
     assert "NO" in wire.describe(SHORT, told)
     assert len(missed(told)) == 4
     assert missed(summarise(rows[:1])) == []
+    assert bounded(told)["latency, zoom"] == pytest.approx(11.0)
+
+
+def test_each_figure_is_a_job(monkeypatch):
+    monkeypatch.setitem(wire.RUNS, "age", lambda settings, folder: [{"figure": "age", "in": folder.is_dir()}])
+    settings = replace(SHORT, only=("polls", "age"))
+    assert list(wire.jobs(settings)) == [0, 1]
+    assert wire.one(None, settings, 1) == [{"figure": "age", "in": True}]
 
 
 def test_where_the_book_is():
@@ -110,11 +118,11 @@ def test_a_short_run(tmp_path, capsys):
     wire.EXPERIMENT.report(settings, tmp_path)
     figures = json.loads((tmp_path / "result.json").read_text())["summary"]["figures"]
     told = capsys.readouterr().out
-    bounds = json.loads((EXPECTED / "wire.json").read_text())
-    for name, bound in bounds.items():
-        (measured,) = [figure["measured"] for known, figure in figures.items() if known.startswith(name)]
-        assert measured <= bound, name
-        assert name in told
+    bounds = compare(wire.EXPERIMENT, {"figures": figures})
+    assert bounds
+    for bound in bounds:
+        assert bound.kept, f"{bound.name} is {bound.reached}, not {bound.text}"
+        assert bound.name in told
 
 
 @pytest.mark.wire

@@ -20,7 +20,7 @@ from cotarget.emulators.plant import Feed, Picture
 from cotarget.errors import CotargetError, DeviceError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Image
-from cotarget.sim.truth import CameraName
+from cotarget.sim.appearances import CameraName
 from cotarget.sim.world import SimWorld
 
 log = logging.getLogger(__name__)

@@ -8,13 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cotarget.errors import ConfigError
-
-# In frame: at least half of the silhouette visible, and at least half as large as wanted.
-VISIBLE_IN_FRAME = 0.5
-SIZE_IN_FRAME = 0.5
-# A close-up is good with the whole target visible at 0.8 to 1.25 of the wanted size.
-GOOD_SIZE = (0.8, 1.25)
-WHOLLY_VISIBLE = 0.999  # the silhouette's area is counted on a grid; a rim of less is rounding
+from cotarget.metrics.closeup import Closeup
 
 
 @dataclass(frozen=True)
@@ -91,31 +85,34 @@ class Row:
     on_target: str = ""
 
     @property
+    def closeup(self) -> Closeup:
+        """What the zoom frame shows."""
+        return Closeup(self.u_px, self.v_px, self.width_px, self.height_px, self.size_px, self.wanted_px, self.visible)
+
+    @property
     def inside(self) -> bool:
         """Whether the body centre is inside the zoom image."""
-        return -0.5 <= self.u_px <= self.width_px - 0.5 and -0.5 <= self.v_px <= self.height_px - 0.5
+        return self.closeup.inside
 
     @property
     def size_ratio(self) -> float:
         """True size over the size wanted; 0 for a target behind the camera, which shows nothing of it."""
-        return 0.0 if math.isnan(self.size_px) else self.size_px / self.wanted_px
+        return self.closeup.size_ratio
 
     @property
     def in_frame(self) -> bool:
-        """Whether the target is in the close-up, by the definition above."""
-        return self.inside and self.visible >= VISIBLE_IN_FRAME and self.size_ratio >= SIZE_IN_FRAME
+        """Whether the target is in the close-up."""
+        return self.closeup.in_frame
 
     @property
     def good_closeup(self) -> bool:
         """Whether the whole target is visible at about the wanted size."""
-        return self.inside and self.visible >= WHOLLY_VISIBLE and GOOD_SIZE[0] <= self.size_ratio <= GOOD_SIZE[1]
+        return self.closeup.good
 
     @property
     def tpo_px(self) -> float:
         """Target point offset: distance from the image's centre; half the diagonal for a frame without it [px]."""
-        if not self.inside:
-            return math.hypot(self.width_px, self.height_px) / 2
-        return math.hypot(self.u_px - (self.width_px - 1) / 2, self.v_px - (self.height_px - 1) / 2)
+        return self.closeup.tpo_px
 
     @property
     def tpo_deg(self) -> float:

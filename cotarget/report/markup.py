@@ -38,6 +38,32 @@ def section(anchor: str, title: str, parts: Iterable[str]) -> str:
     return f'<section id="{escape(anchor)}">\n<h2>{escape(title)}</h2>\n{body}\n</section>'
 
 
+def header(title: str, about: Sequence[str]) -> str:
+    """Write the page's title, and what it is about."""
+    return f"<header><h1>{escape(title)}</h1>{paragraph(' · '.join(about))}</header>"
+
+
+def verdict(level: str, label: str, text: str) -> str:
+    """Write what it all comes to; the level is good, care, bad or unknown."""
+    return f'<div class="verdict {escape(level)}" id="verdict">{paragraph(label, "label")}{paragraph(text)}</div>'
+
+
+def contents(entries: Sequence[tuple[str, str]]) -> str:
+    """Write links to sections: anchor and title."""
+    links = "".join(f'<li><a href="#{escape(anchor)}">{escape(title)}</a></li>' for anchor, title in entries)
+    return f"<nav><ul>{links}</ul></nav>"
+
+
+def subheading(text: str) -> str:
+    """Write a heading within a section."""
+    return f"<h3>{escape(text)}</h3>"
+
+
+def preformatted(text: str) -> str:
+    """Write text as a terminal shows it."""
+    return f"<pre>{escape(text)}</pre>"
+
+
 def bullets(items: Sequence[str], ordered: bool = False) -> str:
     """Write a list."""
     tag = "ol" if ordered else "ul"

@@ -114,11 +114,8 @@ def _key_figures(calibration: Calibration) -> Iterator[str]:
 def _header(calibration: Calibration, source: str, found: Verdict) -> str:
     when, method = (calibration.provenance.get(key) for key in ("when", "method"))
     about = [source, *([f"{method} method"] if method else []), *([str(when)] if when else [])]
-    said = markup.paragraph(LABELS[found.level], "label") + markup.paragraph(found.text)
-    return (
-        f"<header><h1>Calibration report</h1>{markup.paragraph(' · '.join(about))}</header>\n"
-        f'<div class="verdict {found.level}" id="verdict">{said}</div>'
-    )
+    header = markup.header("Calibration report", about)
+    return f"{header}\n{markup.verdict(found.level, LABELS[found.level], found.text)}"
 
 
 def _pointing(
@@ -143,7 +140,7 @@ def _pointing(
     rows = [
         (part.group, 1 - part.left / total, f"{percent(1 - part.left / total)} less") for part in parts if total > 0
     ]
-    yield "<h3>Where it comes from</h3>"
+    yield markup.subheading("Where it comes from")
     yield markup.bars(
         [(name, max(share, 0.0), text) for name, share, text in rows],
         "By how much the error would fall if these were known exactly, each by itself. They need not add up, because "

@@ -5,6 +5,7 @@ often already exposed when that one is read, and can be rendered while the reade
 not depend on it.
 """
 
+import os
 import queue
 import threading
 import weakref
@@ -20,6 +21,13 @@ Jobs = queue.SimpleQueue[tuple[Job, "Future[Image]"] | None]
 # So many frames must have been read one after the other, none left out, before the next one is expected to be: opening
 # another OpenGL takes as long as it saves in some 20 frames.
 READ_IN_TURN = 10
+# An environment variable; "0" where every core has work of its own, such as one of many runs side by side.
+ALLOWED = "COTARGET_AHEAD"
+
+
+def is_allowed() -> bool:
+    """Whether frames may be rendered on another thread at all."""
+    return os.environ.get(ALLOWED) != "0"
 
 
 class Ahead:

@@ -3,6 +3,8 @@
 Written apart from `cotarget.camera`, so that a mistake shared between the simulation and the fit cannot hide.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -18,6 +20,7 @@ MAP_STRIDE = 4
 REAL_ROOT = 1e-9  # imaginary over absolute value of a root that is real but for rounding
 # Fields and maps are kept for the lens positions in use: the fixed camera's one and the zoom camera's latest.
 KEPT_MAPS = 8
+KEPT_FIELDS = 128  # a few numbers each; a rig that is built again and again asks for all its focal lengths
 # A fixed point: every round shrinks the error by about 3 |k1| r^2, less than 0.3.
 UNDISTORT_ROUNDS = 60
 UNDISTORTED = 1e-14  # step of the normalised coordinates at which it has converged
@@ -48,21 +51,22 @@ class TrueLens:
         """
         depth = np.where(x_camera[..., 2:] > 0, x_camera[..., 2:], np.nan)
         xy = x_camera[..., :2] / depth
-        seen = np.hypot(xy[..., 0], xy[..., 1]) < _fold(self.distortion)
-        return np.where(seen[..., None], self._bend(xy) * self.focal_px + self.center_px, np.nan)
+        seen = np.hypot(xy[..., 0], xy[..., 1]) < fold(self.distortion)
+        return np.where(seen[..., None], self.bend(xy) * self.focal_px + self.center_px, np.nan)
 
     def directions(self, pixels: Array) -> Array:
         """Undistorted image-plane coordinates (x / z, y / z) of pixels, (..., 2)."""
         bent = (pixels - self.center_px) / self.focal_px
         xy = bent
         for _ in range(UNDISTORT_ROUNDS):
-            step = bent - self._bend(xy)
+            step = bent - self.bend(xy)
             xy = xy + step
             if np.abs(step).max() < UNDISTORTED:
                 break
         return xy
 
-    def _bend(self, xy: Array) -> Array:
+    def bend(self, xy: Array) -> Array:
+        """Image-plane coordinates (x / z, y / z) as the lens distorts them, (..., 2)."""
         k1, k2, p1, p2, k3 = self.distortion
         x, y = xy[..., 0], xy[..., 1]
         r2 = x**2 + y**2
@@ -74,7 +78,7 @@ class TrueLens:
 
 
 @lru_cache(maxsize=KEPT_MAPS)
-def _fold(distortion: tuple[float, float, float, float, float]) -> float:
+def fold(distortion: tuple[float, float, float, float, float]) -> float:
     """Tangent of the angle off the axis where the radial distortion begins to shrink; infinite if it never does."""
     k1, k2, _, _, k3 = distortion
     if k2 == k3 == 0.0:
@@ -85,7 +89,7 @@ def _fold(distortion: tuple[float, float, float, float, float]) -> float:
     return float(np.sqrt(turns.min())) if len(turns) else np.inf
 
 
-@lru_cache(maxsize=KEPT_MAPS)
+@lru_cache(maxsize=KEPT_FIELDS)
 def covering_half_field(lens: TrueLens) -> tuple[float, float]:
     """Tangents of the half field (horizontal, vertical) of a centred pinhole view that covers the whole image."""
     w, h = lens.size
@@ -95,6 +99,15 @@ def covering_half_field(lens: TrueLens) -> tuple[float, float]:
     sides += [np.column_stack([np.full_like(v, x), v]) for x in (-1, w)]
     reach = np.abs(lens.directions(np.concatenate(sides))).max(axis=0)
     return float(reach[0]), float(reach[1])
+
+
+def covering_size(lenses: Sequence[TrueLens], least: tuple[int, int]) -> tuple[int, int]:
+    """A size at which renders are as fine as each lens's image, (width, height) [px], somewhat above the least."""
+    fields = [covering_half_field(lens) for lens in lenses]
+    width, height = (
+        max(2 * field[i] * lens.focal_px[i] + 2 for field, lens in zip(fields, lenses, strict=True)) for i in range(2)
+    )
+    return max(math.ceil(width), least[0] + 3), max(math.ceil(height), least[1] + 3)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The compiled MuJoCo model of a configuration: scene, rig, targets and board, edited through MjSpec."""
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +69,7 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
             f"{path}: has no site '{MOUNT_SITE}', which says where the fixed camera is (looking along -z)"
         )
     rig = mujoco.MjSpec.from_file(str(assets_dir() / "rig.xml"))
-    _edit_rig(rig, config.sim, _site_pose(spec), render_size)
+    _edit_rig(rig, config.sim, _site_pose(path.absolute(), path.stat().st_mtime_ns), render_size)
     _attach(spec, rig, RIG)
     for target in targets:
         asset = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / target.asset))
@@ -118,8 +119,21 @@ def _attach(scene: "mujoco.MjSpec", part: "mujoco.MjSpec", prefix: str) -> None:
     scene.attach(part, frame=scene.worldbody.add_frame(), prefix=prefix)
 
 
-def _site_pose(scene: "mujoco.MjSpec") -> RigidTransform:
-    return mount_pose(scene.copy().compile())
+@lru_cache(maxsize=4)
+def _site_pose(scene: Path, changed: int) -> RigidTransform:
+    """T_world_fixed of a scene's file; worked out once, because to compile it takes as long as the whole world.
+
+    Args:
+        scene: the file.
+        changed: when it was changed last; of a file that it includes no change is noticed.
+
+    Raises:
+        ConfigError: it does not compile.
+    """
+    try:
+        return mount_pose(mujoco.MjSpec.from_file(str(scene)).compile())
+    except ValueError as error:
+        raise ConfigError(f"{scene}: does not compile: {' '.join(str(error).split())}") from None
 
 
 def _place(body: "mujoco.MjsBody", T: RigidTransform) -> None:

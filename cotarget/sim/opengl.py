@@ -3,7 +3,8 @@
 import ctypes.util
 import os
 import sys
-from typing import Any
+from functools import cache
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -48,8 +49,13 @@ def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.R
     """Open an offscreen renderer on this thread.
 
     Raises:
-        DeviceError: the machine has no OpenGL that can do it.
+        DeviceError: the machine has no OpenGL that can do it, or this process has inherited one.
     """
+    if _first_process() != os.getpid() and BACKEND != "osmesa":  # it would wait for threads that were not inherited
+        raise DeviceError(
+            "a process that was forked after something was rendered cannot render; start it with the method 'spawn', "
+            "as AsyncVectorEnv(..., context='spawn') does"
+        )
     try:
         return mujoco.Renderer(model, height, width)
     except Exception as error:  # PyOpenGL and the backends raise whatever they meet
@@ -59,8 +65,20 @@ def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.R
         ) from None
 
 
+@cache
+def _first_process() -> int:
+    """The number of the first process that opens OpenGL, which those that it forks inherit."""
+    return os.getpid()
+
+
 class Canvas:
-    """An offscreen renderer that draws any pinhole view, or a part of one, of a size up to its own."""
+    """An offscreen renderer that draws any pinhole view, or a part of one, of a size up to its own.
+
+    Attributes:
+        drawn: how many pictures all canvases of this process have drawn so far, for those who count the cost.
+    """
+
+    drawn: ClassVar[int] = 0
 
     def __init__(self, model: "mujoco.MjModel", size: tuple[int, int], shadows: bool) -> None:
         """Open OpenGL on this thread.
@@ -73,7 +91,7 @@ class Canvas:
         Raises:
             DeviceError: the machine has no OpenGL that can do it.
         """
-        self._model, self._size, self._shadows = model, size, shadows
+        self._model, self._size, self._shadows, self._told = model, size, shadows, _told(model)
         self._renderer: Any = make_renderer(model, *size)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._option, self._untouched = mujoco.MjvOption(), mujoco.MjvPerturb()
@@ -82,13 +100,35 @@ class Canvas:
 
     def without_multisampling(self) -> "Canvas":
         """Another one that does not antialias, closed with this one."""
+        if self._others:
+            return self._others[0]
         quality = self._model.vis.quality
         before, quality.offsamples = quality.offsamples, 0
         try:
             self._others.append(Canvas(self._model, self._size, self._shadows))
         finally:
             quality.offsamples = before
-        return self._others[-1]
+        return self._others[0]
+
+    def turn_to(self, model: "mujoco.MjModel") -> bool:
+        """Draw another model from now on, if it differs from the one before in its meshes' measures at most.
+
+        To open OpenGL anew, with all textures, takes some hundred times as long.
+
+        Returns:
+            Whether it does; nothing is changed where not.
+        """
+        told = _told(model)
+        if told != self._told or not np.array_equal(model.tex_data, self._model.tex_data):
+            return False
+        for canvas in (self, *self._others):
+            renderer, canvas._model = canvas._renderer, model
+            renderer._model = model
+            if renderer._gl_context:
+                renderer._gl_context.make_current()
+            for mesh in range(model.nmesh):
+                mujoco.mjr_uploadMesh(model, renderer._mjr_context, mesh)
+        return True
 
     def look(self, data: "mujoco.MjData", camera_id: int, layers: int) -> None:
         """Take the scene as a camera of the model has it.
@@ -129,9 +169,20 @@ class Canvas:
             renderer._gl_context.make_current()
         mujoco.mjr_render(rect, renderer.scene, renderer._mjr_context)
         mujoco.mjr_readPixels(image, None, rect, renderer._mjr_context)
+        Canvas.drawn += 1
         return image[::-1]  # OpenGL's rows begin at the bottom
 
     def close(self) -> None:
         """Release OpenGL; more than once does no harm."""
         for canvas in (*self._others, self):
             canvas._renderer.close()
+
+
+def _told(model: "mujoco.MjModel") -> tuple[object, ...]:
+    """What OpenGL is told of a model once and for all, the textures aside: not where its meshes' vertices are."""
+    visual, planes = model.vis, model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    return (
+        *(model.ntex, model.nmesh, model.nhfield, model.nskin, model.stat.extent),
+        *(visual.global_.offwidth, visual.global_.offheight, visual.quality.offsamples, visual.quality.shadowsize),
+        *(model.geom_size[planes].tobytes(), model.mesh_vertnum.tobytes(), model.mesh_face.tobytes()),
+    )

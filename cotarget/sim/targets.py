@@ -15,6 +15,7 @@ import numpy as np
 
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.sim.gait import STRIDE, WALK_SPEED, WING_BEAT_HZ, Axes, bank, face_mount, flap, heading, turned, walk
 from cotarget.sim.paths import MOUNT, Path, bird_path, book_path, person_path, waypoint_path
 from cotarget.simchecks import told_targets
 from cotarget.simconfig import TARGETS, Waypoint, split_name
@@ -45,15 +46,6 @@ RANDOM = 3  # the stream of random numbers of the targets, apart from the world'
 PERSON_HEIGHT = 1.75  # of the model [m]
 SCATTER = {"book": 0.0, "person": 0.04, "bird": 0.15}  # of the true sizes, relative; all within this
 SCATTER_SIGMA = 0.5  # the range above is two standard deviations
-GRAVITY = 9.81  # [m/s^2]
-STANDING = 1e-9  # [m/s]
-FLAT = np.array([1.0, 1.0, 0.0])  # of the way of whoever walks upright, the part along the ground
-
-STRIDE = 1.44  # length of two steps of a walking person 1.75 m tall [m]
-WALK_SPEED = 1.5  # [m/s]
-WING_BEAT_HZ = 4.0
-WING_SWING = np.radians(35.0)  # amplitude of the inner wing
-OUTER_SWING, OUTER_LAG = np.radians(24.0), np.radians(70.0)  # of the outer wing against the inner one
 
 
 @dataclass(frozen=True)
@@ -105,20 +97,37 @@ class Target:
     def pose(self, t: float) -> TargetPose:
         """Tell pose and joints at time ``t`` [s]."""
         if self.kind == "book":
-            position = self.path.position(t)
-            return TargetPose(position, _face_mount(position, t, self.phase), {})
+            place = self.path.position(t)
+            return TargetPose(place, Rotation.from_euler("ZYX", face_mount(place, t, self.phase)), {})
+        position, axes, joints = self.stance(t, self.beat(t))
+        return TargetPose(np.array(position), Rotation.from_matrix(np.transpose(axes), assume_valid=True), joints)
+
+    def stance(self, t: float, beat: float) -> tuple[list[float], Axes, Mapping[str, float]]:
+        """The same in floats, which is quicker.
+
+        Args:
+            t: the time [s].
+            beat: of its limbs then, as `beat` tells it [rad].
+
+        Returns:
+            Its body's position [m], (3,); the body's axes in the world; each joint's angle [rad].
+        """
+        position, velocity, acceleration = self.path.motion(t)
+        kind = self.kind
+        if kind == "book":
+            return position, turned(*face_mount(position, t, self.phase)), {}
+        if kind == "bird":
+            return position, bank(heading(position, velocity), acceleration), flap(beat)
+        joints, bob = walk(beat, min(math.hypot(*velocity) / WALK_SPEED, 1.0))
+        axes = heading(position, [*velocity[:2], 0.0 * velocity[2]])  # whoever walks stays upright
+        position[2] += bob * self.size + (0.5 * PERSON_HEIGHT * self.size if self.grounded else 0.0)
+        return position, axes, joints
+
+    def beat(self, t: float) -> float:
+        """Where its limbs are in their motion at time ``t`` [s], as an angle that grows without end [rad]."""
         if self.kind == "person":
-            step = self.phase + 2 * np.pi * self.path.travelled(t) / (STRIDE * self.size)
-            velocity = self.path.velocity(t)
-            joints, bob = _walk(step, min(math.hypot(*velocity.tolist()) / WALK_SPEED, 1.0))
-            position = self.path.position(t)
-            rotation = Rotation.from_matrix(_heading(position, velocity * FLAT), assume_valid=True)
-            position[2] += bob * self.size + (0.5 * PERSON_HEIGHT * self.size if self.grounded else 0.0)
-            return TargetPose(position, rotation, joints)
-        position = self.path.position(t)
-        axes = _bank(_heading(position, self.path.velocity(t)), self.path.acceleration(t))
-        rotation = Rotation.from_matrix(axes, assume_valid=True)
-        return TargetPose(position, rotation, _flap(self.phase + 2 * np.pi * WING_BEAT_HZ * t))
+            return self.phase + 2 * np.pi * self.path.travelled(t) / (STRIDE * self.size)
+        return self.phase + 2 * np.pi * WING_BEAT_HZ * t
 
 
 def make_target(
@@ -204,66 +213,3 @@ def scale_spec(spec: "mujoco.MjSpec", factor: float) -> None:
         geom.fromto = np.asarray(geom.fromto) * factor  # nan where it is not used
     for element in [*spec.bodies[1:], *spec.sites, *spec.joints]:
         element.pos = np.asarray(element.pos) * factor
-
-
-# ---------------------------------------------------------------- attitude and gait
-
-
-def _heading(position: Array, velocity: Array) -> Array:
-    """Turn x along the way, z as far up as that allows; whoever stands still faces the camera. Columns, (3, 3)."""
-    x, y, z = velocity.tolist()
-    if math.hypot(x, y, z) < STANDING:
-        x, y, z = (MOUNT - position).tolist()
-        z = 0.0
-    if math.hypot(x, y) < STANDING * math.hypot(x, y, z):
-        y -= 1e-6 * math.hypot(x, y, z)  # straight up or down: towards the camera, if anywhere
-    ahead, whole = math.hypot(x, y), math.hypot(x, y, z)
-    forward, left = (x / whole, y / whole, z / whole), (-y / ahead, x / ahead, 0.0)
-    up = (-forward[2] * left[1], forward[2] * left[0], forward[0] * left[1] - forward[1] * left[0])
-    return np.array([forward, left, up]).T
-
-
-def _face_mount(position: Array, t: float, phase: float) -> Rotation:
-    """Turn the book's cover to the camera, swinging a few degrees."""
-    x, y, z = MOUNT - position
-    yaw = np.arctan2(y, x) + np.radians(7.0) * np.sin(0.55 * t + phase)
-    pitch = -np.arctan2(z, np.hypot(x, y)) + np.radians(4.0) * np.sin(0.40 * t + 2.0 * phase)
-    roll = np.radians(4.0) * np.sin(0.31 * t + 3.0 * phase)
-    return Rotation.from_euler("ZYX", [yaw, pitch, roll])
-
-
-def _bank(upright: Array, acceleration: Array) -> Array:
-    """Lean the bird into its turn, as far as the turn's acceleration asks for; columns, (3, 3)."""
-    lateral = float(acceleration @ upright[:, 1])
-    whole = math.hypot(lateral, GRAVITY)
-    c, s = GRAVITY / whole, lateral / whole
-    forward, left, up = upright.T
-    return np.array([forward, c * left - s * up, s * left + c * up]).T
-
-
-def _walk(step: float, pace: float) -> tuple[dict[str, float], float]:
-    """Swing limbs at a phase of the stride; ``pace`` from 0, standing, to 1.
-
-    Returns:
-        Joint angles [rad], and how far the hips rise or sink [m].
-    """
-    joints = {}
-    for side, phase in (("left", step), ("right", step + np.pi)):
-        swing = 0.5 - 0.5 * np.cos(phase + 0.5 * np.pi)  # 1 while the leg comes forward
-        joints[f"hip_{side}"] = pace * (0.06 + 0.42 * np.sin(phase))
-        joints[f"knee_{side}"] = pace * (0.08 + 0.85 * swing**2 * (0.5 + 0.5 * np.cos(phase + 0.2)))
-        joints[f"shoulder_{side}"] = pace * -0.40 * np.sin(phase) + 0.02
-        joints[f"elbow_{side}"] = 0.15 + pace * (0.25 - 0.18 * np.sin(phase))
-    return joints, pace * (-0.028 + 0.018 * np.cos(2 * step))
-
-
-def _flap(beat: float) -> dict[str, float]:
-    """Beat the wings; the outer part follows late."""
-    inner = 0.10 + WING_SWING * np.sin(beat)
-    outer = -0.06 + OUTER_SWING * np.sin(beat - OUTER_LAG)
-    return {
-        "wing_inner_left": inner,
-        "wing_inner_right": inner,
-        "wing_outer_left": outer,
-        "wing_outer_right": outer,
-    }

@@ -6,7 +6,6 @@ with the pipeline's geometry.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -14,6 +13,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull
 
 from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.sim.appearances import CameraName, Silhouette
 from cotarget.sim.lens import TrueLens
 from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, RIG, RIG_GROUP
 from cotarget.sim.opengl import mujoco
@@ -22,32 +22,6 @@ from cotarget.sim.targets import Target
 SURFACE_POINTS = 64  # samples on a round geom: its outline is then good to about 1 %
 SILHOUETTE_GRID = 96  # a silhouette is painted this large to compare areas [px]
 BEAT_PHASES = 8  # samples of one wing beat
-
-CameraName = Literal["fixed", "zoom"]
-
-
-@dataclass(frozen=True)
-class Silhouette:
-    """A target's true outline in one image, not clipped to it.
-
-    Attributes:
-        low_px: top-left corner of its box, (2,).
-        high_px: bottom-right corner, (2,).
-        visible: fraction of the target that shows: of its outline's area, the fraction inside the image, times, of
-            its parts (geoms, each counting the same whatever its size), the fraction whose middle a ray from the
-            camera reaches with nothing but the target itself in the way. Hence exact for a target that is cut by the
-            image's border only; for one behind something it goes in steps of a part, and the two fractions are
-            taken to be independent. A board shown to the cameras and the rig itself hide nothing.
-    """
-
-    low_px: Array
-    high_px: Array
-    visible: float
-
-    @property
-    def size_px(self) -> Array:
-        """(width, height) of the box."""
-        return self.high_px - self.low_px
 
 
 @dataclass(frozen=True)
@@ -104,6 +78,11 @@ class Truth:
         """A camera's optics at time t."""
         return self.fixed_lens if camera == "fixed" else self.zoom_lens_for(self.nominal_at(t))
 
+    @property
+    def longest_px(self) -> float:
+        """The zoom camera's true focal length at its longest, in pixels along the rows."""
+        return self.zoom_lens_for(self.focal_range[1]).focal_px[0]
+
     def T_world_camera(self, camera: CameraName, t: float) -> RigidTransform:
         """Pose of a camera's optical centre at time t, in OpenCV's axes."""
         eye, axes = self._camera(self.set_bodies(t), camera, self.lens(camera, t))
@@ -118,6 +97,10 @@ class Truth:
         lens = self.lens(camera, t)
         eye, axes = self._camera(self.set_bodies(t), camera, lens)
         return lens.project((np.asarray(x_world, dtype=float) - eye) @ axes)
+
+    def center_px(self, name: str, camera: CameraName, t: float) -> Array:
+        """A target's body centre in a camera at time t, (2,) [px]; nan behind it."""
+        return self.pixel(camera, self.center(name, t), t)
 
     def line_of_sight_miss(self, pan: float, tilt: float, nominal_px: float, x_world: Array) -> float:
         """Angle between the ray through the middle of the zoom image and a point, with the head at pan, tilt [rad].
@@ -151,6 +134,11 @@ class Truth:
             parts = np.split(pixels, self._surface(name).starts[1:])
             inside = _fraction_inside(parts, low, high, lens.size)
         return Silhouette(low, high, inside * self._unhidden(name, data, view[0]))
+
+    def unhidden(self, name: str, camera: CameraName, t: float) -> float:
+        """The fraction of a target's parts that nothing but the target itself hides from a camera at time t."""
+        data = self.set_state(t)
+        return self._unhidden(name, data, self._camera(data, camera, self.lens(camera, t))[0])
 
     def box(self, name: str, camera: CameraName, t: float) -> tuple[Array, Array] | None:
         """Top-left and bottom-right corner of a target's outline, (2,) [px] each, whatever hides it.
@@ -208,7 +196,7 @@ class Truth:
         if name not in self._surfaces:
             root = self.model.body(self.targets[name].body).id
             geoms = np.flatnonzero(self.model.body_rootid[self.model.geom_bodyid] == root)
-            points = [_surface_points(self.model, int(geom)) for geom in geoms]
+            points = [surface_points(self.model, int(geom)) for geom in geoms]
             counts = [len(each) for each in points]
             self._surfaces[name] = Surface(
                 geoms, np.repeat(np.arange(len(geoms)), counts), np.cumsum([0, *counts[:-1]]), np.concatenate(points)
@@ -245,7 +233,7 @@ def _fraction_inside(outlines: list[Array], low: Array, high: Array, size: tuple
     return float(np.count_nonzero(canvas & within) / np.count_nonzero(canvas))
 
 
-def _surface_points(model: "mujoco.MjModel", geom: int) -> Array:
+def surface_points(model: "mujoco.MjModel", geom: int) -> Array:
     """Points on a geom's surface in its own frame, (n, 3)."""
     size, kind = model.geom_size[geom], mujoco.mjtGeom(model.geom_type[geom])
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
@@ -255,7 +243,7 @@ def _surface_points(model: "mujoco.MjModel", geom: int) -> Array:
         start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         vertices = np.asarray(model.mesh_vert[start : start + count], dtype=float)
         return vertices[np.unique(ConvexHull(vertices).simplices)]  # the others cannot be on an outline
-    ball = _sphere_points(SURFACE_POINTS)
+    ball = sphere_points(SURFACE_POINTS)
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         return ball * size[0]
     if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
@@ -270,7 +258,7 @@ def _surface_points(model: "mujoco.MjModel", geom: int) -> Array:
     raise ValueError(f"a target may not contain a geom of type {kind.name}")
 
 
-def _sphere_points(count: int) -> Array:
+def sphere_points(count: int) -> Array:
     """Evenly spread points on the unit sphere (Fibonacci's lattice), (count, 3)."""
     i = np.arange(count) + 0.5
     z, around = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i

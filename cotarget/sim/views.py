@@ -27,6 +27,7 @@ BLUR_RENDERS = 4
 SHARP_PX = 0.3
 # Where those renders look beside the middle of a pixel [px]: the rotated grid that multisampling uses too.
 JITTER = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
+SOFT_MARGIN_PX = 3  # of a render that is resampled half a pixel aside
 WINDOW_MARGIN_PX = 4  # around what moves
 LARGEST_WINDOWS = 0.3  # of the picture; where more of it moves, all of it is rendered four times
 NEAREST = 3.0  # nothing is nearer to a camera than this, for what its own shifts do to the picture [m]
@@ -74,10 +75,17 @@ class Moment:
 
 
 class Views:
-    """Renders both cameras of a world."""
+    """Renders both cameras of a world; ``canvas`` draws."""
 
     def __init__(
-        self, model: "mujoco.MjModel", state: WorldState, size: tuple[int, int], shadows: bool, multisampling: bool
+        self,
+        model: "mujoco.MjModel",
+        state: WorldState,
+        size: tuple[int, int],
+        shadows: bool,
+        multisampling: bool,
+        canvas: Canvas | None = None,
+        soft: bool = True,
     ) -> None:
         """Open OpenGL.
 
@@ -87,33 +95,34 @@ class Views:
             size: (width, height) of the largest render [px].
             shadows: whether lights cast them.
             multisampling: whether a single render is antialiased.
+            canvas: that draws this model; its own by default.
+            soft: whether a lens without distortion is resampled like every other.
 
         Raises:
             DeviceError: the machine cannot render.
         """
         self._model, self._state, self._size, self._shadows = model, state, size, shadows
-        self._canvas = Canvas(model, size, shadows)
-        self._plain = self._canvas  # without multisampling; made when first needed
-        self._multisampling = multisampling
+        self.canvas = canvas or Canvas(model, size, shadows)
+        self._plain = self.canvas  # without multisampling; made when first needed
+        self._multisampling, self._soft = multisampling, soft
         corners = np.stack(np.meshgrid(*([-1, 1],) * 3), axis=-1).reshape(-1, 3)
         self._corners = model.geom_aabb[:, None, :3] + corners * model.geom_aabb[:, None, 3:]
         self._endless = model.geom_rbound == 0  # planes
         self._groups = np.array(model.geom_group)
         self._shown = ~np.isin(self._groups, (BOARD_GROUP, RIG_GROUP, FRAME_GROUP))
-        self._blurs = self._shown.copy()
-        self._blurs[state.faint] = False
+        self._blurs = self._shown & ~np.isin(np.arange(model.ngeom), state.faint)
 
     def apart(self) -> "Views":
         """Another one of the same world, which shares nothing that either of them changes: for the calling thread."""
         model = copy.copy(self._model)
         other = Views(model, self._state.apart(model), self._size, self._shadows, self._multisampling)
         if self._multisampling:
-            other._plain = other._canvas.without_multisampling()
+            other._plain = other.canvas.without_multisampling()
         return other
 
     def close(self) -> None:
         """Release OpenGL; more than once does no harm."""
-        self._canvas.close()
+        self.canvas.close()
 
     def sharp(self, camera: str, lens: TrueLens, t: float) -> Image:
         """What a lens sees in an instant, BGR."""
@@ -157,11 +166,11 @@ class Views:
     def _view(self, lens: TrueLens) -> Pinhole:
         """The render that a lens's image is made from, as fine as it is in the middle and no larger than that needs.
 
-        It is resampled as softly whether the lens distorts or not.
+        Where softness is wanted, it is resampled as softly whether the lens distorts or not.
         """
         if not any(lens.distortion):
-            (w, h), (cx, cy) = lens.size, lens.center_px
-            return Pinhole((w + 3, h + 3), lens.focal_px, (cx + 1.5, cy + 1.5))
+            (w, h), (cx, cy), margin = lens.size, lens.center_px, SOFT_MARGIN_PX * self._soft
+            return Pinhole((w + margin, h + margin), lens.focal_px, (cx + margin / 2, cy + margin / 2))
         half = np.array(covering_half_field(lens))
         width, height = np.minimum(np.ceil(2 * half * lens.focal_px + 2), self._size).astype(int).tolist()
         focal = float(min((width / 2 - 1) / half[0], (height / 2 - 1) / half[1]))
@@ -169,8 +178,9 @@ class Views:
 
     def _through(self, lens: TrueLens, view: Pinhole, image: Image) -> Image:
         """Bend a render, RGB, into a lens's image, BGR."""
-        bent = bend(np.ascontiguousarray(image), view, lens)
-        return np.asarray(cv2.cvtColor(bent, cv2.COLOR_RGB2BGR), dtype=np.uint8)
+        if view != Pinhole(lens.size, lens.focal_px, lens.center_px):
+            image = bend(np.ascontiguousarray(image), view, lens)
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), dtype=np.uint8)
 
     def _render(
         self, camera: str, lens: TrueLens, view: Pinhole, t: float, window: Window | None = None, plain: bool = False
@@ -178,9 +188,9 @@ class Views:
         """Render a view, or a window of it, RGB."""
         moment = self._moment(camera, lens, t, view)
         data = self._state.lit(t)
-        if plain and self._plain is self._canvas:
-            self._plain = self._canvas.without_multisampling()
-        canvas = self._plain if plain else self._canvas
+        if plain and self._plain is self.canvas:
+            self._plain = self.canvas.without_multisampling()
+        canvas = self._plain if plain else self.canvas
         shown = window or Window(0, 0, *view.size)
         self._model.geom_group[:] = self._layers(moment, shown, self._visible(t))
         try:

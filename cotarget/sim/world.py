@@ -1,6 +1,5 @@
 """The simulated world: time -> poses -> images, with the rig's devices in front and the truth behind."""
 
-import math
 from collections.abc import Collection
 from dataclasses import replace
 from functools import partial
@@ -10,7 +9,8 @@ import numpy as np
 from cotarget.config import RigConfig, SimCamera
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Clock, Image
-from cotarget.sim.ahead import Ahead
+from cotarget.sim.ahead import Ahead, is_allowed
+from cotarget.sim.appearances import CameraName
 from cotarget.sim.clutter import Clutter
 from cotarget.sim.devices import (
     SimBoard,
@@ -22,13 +22,14 @@ from cotarget.sim.devices import (
     head_drive,
     lens_drive,
 )
-from cotarget.sim.lens import TrueLens, covering_half_field
+from cotarget.sim.lens import TrueLens, covering_size
 from cotarget.sim.model import base_pose, build_model, has_clutter, mount_pose
+from cotarget.sim.pictures import Pictures
 from cotarget.sim.portrait import Portrait, portrait
 from cotarget.sim.sensor import Sensor
 from cotarget.sim.state import WorldState
 from cotarget.sim.targets import Target, make_target, target_rng
-from cotarget.sim.truth import CameraName, Truth
+from cotarget.sim.truth import Truth
 from cotarget.sim.views import Views
 
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
@@ -58,7 +59,7 @@ class SimWorld:
             rendered: the cameras whose frames are rendered; the others' are black. All else is as ever: times,
                 latencies, head, lens and truth. Without any, no OpenGL is needed.
             ahead: whether the zoom camera's next frame may be rendered, on another thread, before it is asked for;
-                nothing but the speed depends on it.
+                nothing but the speed depends on it. COTARGET_AHEAD=0 in the environment forbids it.
 
         Raises:
             ConfigError: an unknown scene or target.
@@ -71,7 +72,8 @@ class SimWorld:
         self._fixed_lens = self._lens(sim.fixed)
         self._zoom_lens = self._lens(sim.zoom)
         self.head_drive, self.lens_drive = head_drive(sim.head, effects), lens_drive(sim.zoom, effects)
-        self._render_size = self._common_render_size()
+        width, height = np.max([sim.fixed.size, sim.zoom.size], axis=0).tolist()
+        self._render_size = covering_size(self._lenses(), (width, height))
         self._model = build_model(config, tuple(self.targets.values()), self._render_size)
         self._T_world_fixed = mount_pose(self._model)
         clutter = Clutter(self._model, sim.seed) if has_clutter(sim) else None
@@ -80,7 +82,8 @@ class SimWorld:
         self._opened: Views | None = None
         if self._rendered:
             self._views()
-        self._ahead = Ahead(self._views().apart) if ahead and "zoom" in self._rendered else None
+        ahead = ahead and is_allowed() and "zoom" in self._rendered
+        self._ahead = Ahead(self._views().apart) if ahead else None
         # The lens obeys as late as the head does.
         delay = sim.head.command_delay_s if effects.command_delay else 0.0
         self._black = {name: _black(self._camera(name)) for name in CAMERAS}
@@ -131,6 +134,15 @@ class SimWorld:
         """The perfect image that a lens sees at time t, without sensor effects, BGR."""
         return self._views().sharp(camera, lens, t)
 
+    def pictures(self, size: tuple[int, int], before: Pictures | None = None) -> Pictures:
+        """What both cameras see, at another size (width, height) [px]; whoever asks for them closes them.
+
+        Args:
+            size: of each picture.
+            before: those of a world before, as large; they are over, which saves to open OpenGL anew.
+        """
+        return Pictures(self.config.sim, self._model, self._state, self._lens_at, self._lenses(), size, before)
+
     def portrait(self, azimuth_deg: float, axes: bool) -> Portrait:
         """A picture of the rig as it is now, seen in a direction [degrees], with or without its frames' axes."""
         return portrait(self._model, self._state.lit(self._clock.now()), azimuth_deg, axes)
@@ -163,27 +175,22 @@ class SimWorld:
         rng = target_rng(sim.seed, name)
         return make_target(name, sim.scene, rng, sim.effects.scatter, sim.paths.get(name))
 
-    def _common_render_size(self) -> tuple[int, int]:
-        """A size at which the render of either camera is as fine as its image, over all of its focal lengths."""
+    def _lenses(self) -> list[TrueLens]:
+        """Of both cameras, over all focal lengths."""
         drive, count = self.lens_drive, SIZED_FOCALS if self.config.sim.effects.optics else 1
         zooms = [self.zoom_lens_for(float(f)) for f in np.geomspace(drive.shortest_px, drive.longest_px, count)]
-        sizes = [
-            tuple(2 * half * focal + 2 for half, focal in zip(covering_half_field(lens), lens.focal_px, strict=True))
-            for lens in (self._fixed_lens, *zooms)
-        ]
-        least_width, least_height = np.max(
-            [camera.size for camera in (self.config.sim.fixed, self.config.sim.zoom)], axis=0
-        )
-        width, height = max(s[0] for s in sizes), max(s[1] for s in sizes)
-        return max(math.ceil(width), int(least_width) + 3), max(math.ceil(height), int(least_height) + 3)
+        return [self._fixed_lens, *zooms]
+
+    def _lens_at(self, name: CameraName, t: float) -> TrueLens:
+        return self.zoom_lens_at(t) if name == "zoom" else self._fixed_lens
 
     def expose(self, name: CameraName, index: int, t: float) -> Image:
         """Gather light around time t, up to now, then add the sensor's effects to frame number ``index``."""
         return self._exposed(self._views(), name, index, t) if name in self._rendered else self._black[name]
 
     def _exposed(self, views: Views, name: CameraName, index: int, t: float) -> Image:
-        lens_at = self.zoom_lens_at if name == "zoom" else lambda _: self._fixed_lens
-        return self._sensors[name].expose(views.exposed(name, lens_at, t, self._exposure(name)), index)
+        seen = views.exposed(name, partial(self._lens_at, name), t, self._exposure(name))
+        return self._sensors[name].expose(seen, index)
 
     def _exposure(self, name: CameraName) -> float:
         return self._camera(name).exposure_s if self.config.sim.effects.blur else 0.0

@@ -1,0 +1,192 @@
+"""`cotarget/Follow-v0`: hold a target in the close-up, by commands of pan, tilt and focal length."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from cotarget.calibration import Calibration
+from cotarget.config import RigConfig
+from cotarget.detection import Detection
+from cotarget.env.arguments import told
+from cotarget.env.base import DETECTOR_NOISE, IMAGE_SIZE, Kind, RigEnv, corners
+from cotarget.env.units import LONGEST_AGE_S, RIG_FEATURES, Vector, box, rig_numbers, within
+from cotarget.errors import ConfigError, choices
+from cotarget.judging import closeup_of
+from cotarget.metrics import Closeup
+from cotarget.oracle import TruthNoise
+from cotarget.sim.fieldpaths import LONE, SECONDS, lone_path
+from cotarget.simconfig import Size
+from cotarget.tracking import Tracker, settings_for
+
+# What the tracker knows of the target, and the range of each number; 0 where it knows of none.
+TRACK_FEATURES = {
+    "known": (0.0, 1.0),  # whether there is a confirmed track
+    "detected": (0.0, 1.0),  # whether the newest frame had it
+    "confidence": (0.0, 1.0),  # 1 / (1 + (s / d)^2): s of the middle's standard deviation, d of the larger side
+    "u": (-1.0, 1.0),  # its middle, from the left to the right edge of the wide image
+    "v": (-1.0, 1.0),  # from the top to the bottom
+    "du": (-4.0, 4.0),  # how fast that changes [1/s]
+    "dv": (-4.0, 4.0),
+    "width": (0.0, 1.0),  # of its box, as a part of the image's
+    "height": (0.0, 1.0),
+    "larger_side": (0.0, 1.0),  # over the last wing beats, as a part of the image's width
+    "unseen_s": (0.0, LONGEST_AGE_S),  # since a detection
+}
+
+
+class Follow(RigEnv[Any, Vector]):
+    """Hold a target in the close-up.
+
+    A step is a frame of the wide camera. The world, the target's way and size, and the noise are an episode's own, by
+    the seed; an episode ends by truncation after its seconds.
+
+    Action: `Box(-1, 1, (3,))`, of pan and tilt within the head's limits and of the focal length within the lens's
+    range, evenly in its logarithm. The head goes there as fast as it can, the lens as well, and both comes into effect
+    after the rig's delay.
+
+    Observation: with "tracks" a `Box` of TRACK_FEATURES and then RIG_FEATURES, of detections from the truth with a
+    detector's noise; with "images" a `Dict` of the pictures `wide` and `closeup`, RGB, and `rig`, the RIG_FEATURES.
+
+    Reward: 1 for a step whose new zoom frame is a good close-up (`cotarget.metrics.Closeup.good`): the whole target is
+    in it, at 0.8 to 1.25 times the size wanted; else 0. Actions show in it as late as the rig is.
+
+    `info`, which alone tells the truth, of that zoom frame unless it says otherwise: `t` and `t_closeup`, when the
+    newest frames were exposed [s]; `good`; `in_frame`; `offset_px`, from the middle; `size_ratio`, over the size
+    wanted; `center_px`; `box_closeup` and, of the wide frame, `box_wide`, as left, top, right, bottom [px];
+    `direction` from the wide camera, in its own axes, a unit vector. What is behind a camera is at infinity, and 0 of
+    the size wanted.
+    """
+
+    def __init__(
+        self,
+        target: str = "bird",
+        observation: Kind = "tracks",
+        rig: RigConfig | Path | str | None = None,
+        calibration: Calibration | Path | str | None = None,
+        seconds: float = SECONDS,
+        image_size: Size = IMAGE_SIZE,
+        noise: TruthNoise = DETECTOR_NOISE,
+        render_mode: str | None = None,
+    ) -> None:
+        """Make the environment; a world there is from the first reset on.
+
+        Args:
+            target: book, person or bird.
+            observation: "tracks" or "images".
+            rig: a simulated one, or its rig.toml; the default one without noise, JPEG, distortion, blur and
+                antialiasing, where none is given. Which targets, paths and seed it names does not count, nor its
+                safety, but for the ranges of pan and tilt that -1 to 1 stand for. The ways that targets go are made
+                for the outdoor scene: in another one they may lead through walls.
+            calibration: that a policy may use, or its file; the true one by default.
+            seconds: of an episode, at most 20 [s].
+            image_size: (width, height) of the pictures [px].
+            noise: of the detections.
+            render_mode: "rgb_array", or None for no `render`.
+
+        Raises:
+            ConfigError: an argument makes no sense.
+        """
+        if target not in LONE:
+            raise ConfigError(f"target: unknown {told(target)}; there are: {choices(LONE)}")
+        super().__init__(observation, rig, calibration, seconds, image_size, noise, render_mode)
+        self.name, self.target = target, self.config.target(target)
+        self._rig_space = box(RIG_FEATURES.values())
+        self._track_space = box([*TRACK_FEATURES.values(), *RIG_FEATURES.values()])
+        self.action_space = box([(-1.0, 1.0)] * 3)  # type: ignore[assignment]
+        self.observation_space = (
+            self._track_space
+            if observation == "tracks"
+            else gymnasium.spaces.Dict({**self._picture_spaces(), "rig": self._rig_space})
+        )
+
+    @property
+    def times(self) -> tuple[float, float]:
+        """When the newest frame of the wide camera was exposed, and of the zoom camera [s]."""
+        return self.wide.t, self.closeup.t
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode: another at every time, the same one after the same seed."""
+        seed = self._begin(seed, options)
+        rig = self._open(lone_path(self.name, seed), seed).rig
+        self._tracker = Tracker(settings_for(self.target), rig.fixed.size)
+        self._index = 0
+        state = rig.head.state()
+        self._commanded = state.pan, state.tilt, rig.zoom.state().focal_px
+        self.wide, self.closeup = rig.fixed.read(), rig.zoom.read()
+        self._detect()
+        return self._observe(), self._info(self._judge())
+
+    def step(self, action: Vector) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Command head and lens, and wait for the next frame of the wide camera."""
+        rig = self.episode.rig
+        pan, tilt, focal_px = self.units.command(action)
+        self._commanded = *rig.head.move(pan, tilt), rig.zoom.zoom(focal_px)
+        before = self.closeup.t
+        self.wide, self.closeup = rig.fixed.read(newer_than=self.wide.t), rig.zoom.read()
+        self._index += 1
+        self._detect()
+        judged = self._judge()
+        reward = float(judged.good and self.closeup.t > before)
+        return self._observe(), reward, False, self._index >= self._last, self._info(judged)
+
+    def _detect(self) -> None:
+        """Search the newest frame of the wide camera."""
+        self.detections: list[Detection] = self.episode.detector.detect(self.wide)
+        tracks = self._tracker.update(self.detections, self.wide.t)
+        self._track = tracks[0] if tracks and tracks[0].confirmed else None
+
+    def _judge(self) -> Closeup:
+        """What the newest zoom frame truly shows of the target."""
+        return closeup_of(self.episode.outlines, self.name, self.target, self.closeup.t)
+
+    def _observe(self) -> Any:
+        rig = self.episode.rig
+        now = rig.clock.now()
+        ages = now - self.wide.t, now - self.closeup.t
+        numbers = rig_numbers(
+            self.units, rig.head.state(), rig.zoom.state(), self._commanded, ages, self._index / self._last
+        )
+        if self._observation == "images":
+            return {**self._pictures(), "rig": within(numbers, self._rig_space)}
+        return within([*self._track_numbers(), *numbers], self._track_space)
+
+    def _track_numbers(self) -> list[float]:
+        """Those of TRACK_FEATURES."""
+        track = self._track
+        if track is None:
+            return [0.0] * len(TRACK_FEATURES)
+        width, height = self.config.sim.fixed.size
+        (u, v), (du, dv), (across, down) = (a.tolist() for a in (track.center_px, track.velocity_px, track.size_px))
+        variance = float(track.covariance[0, 0] + track.covariance[1, 1])
+        return [
+            1.0,
+            float(track.missed == 0),
+            1 / (1 + variance / max(track.larger_side_px, 1.0) ** 2),
+            (2 * u + 1) / width - 1,
+            (2 * v + 1) / height - 1,
+            2 * du / width,
+            2 * dv / height,
+            across / width,
+            down / height,
+            track.larger_side_px / width,
+            track.missed / self.config.rate_hz,
+        ]
+
+    def _info(self, judged: Closeup) -> dict[str, Any]:
+        """The truth."""
+        (t, t_closeup), outlines = self.times, self.episode.outlines
+        return {
+            "t": t,
+            "t_closeup": t_closeup,
+            "good": judged.good,
+            "in_frame": judged.in_frame,
+            "offset_px": judged.tpo_px,
+            "size_ratio": judged.size_ratio,
+            "center_px": np.full(2, np.inf) if math.isnan(judged.u_px) else np.array([judged.u_px, judged.v_px]),
+            "box_closeup": corners(outlines.box(self.name, "zoom", t_closeup)),
+            "box_wide": corners(outlines.box(self.name, "fixed", t)),
+            "direction": self.episode.direction(self.name, t),
+        }

@@ -1,0 +1,256 @@
+"""`cotarget/Schedule-v0`: choose whom of several targets to look at; the pipeline does the rest."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from cotarget.calibration import Calibration
+from cotarget.config import RigConfig
+from cotarget.env.arguments import reward_of, told
+from cotarget.env.base import DETECTOR_NOISE, IMAGE_SIZE, Kind, RigEnv, corners
+from cotarget.env.units import RIG_FEATURES, box, rig_numbers, within
+from cotarget.errors import ConfigError, choices
+from cotarget.geometry import Array
+from cotarget.judging import closeup_of
+from cotarget.loop import FollowSettings, follow
+from cotarget.motionfilter import Track
+from cotarget.oracle import TruthNoise
+from cotarget.planning import LOOK_S, Candidate
+from cotarget.rig import PanTiltLimits
+from cotarget.sim.fieldpaths import GROUPED, SECONDS, group_paths
+from cotarget.simconfig import Size
+
+SLOTS = 8  # for tracks: five targets, and those that were lost and found under another number
+ROUNDING_S = 1e-6  # frame times are sums and differences of binary fractions
+SERVED_S = 1.0  # of good close-up, and a target counts as served
+SERVED_REWARD = 5.0  # for each: as much as looking on at one of them is worth in as many seconds
+
+# What a policy knows of a track (`cotarget.policies.Candidate`), and the range of each number; 0 in an empty slot.
+CANDIDATE_FEATURES = {
+    "there": (0.0, 1.0),  # whether the slot has a track
+    "followed": (0.0, 1.0),  # whether it is the one looked at
+    "detected": (0.0, 1.0),  # whether the newest frame had it
+    "pan": (-1.0, 1.0),  # where the head points at it, as a part of its range
+    "tilt": (-1.0, 1.0),
+    "pan_rate": (-1.0, 1.0),  # how fast that changes [1/s]
+    "tilt_rate": (-1.0, 1.0),
+    "leaves_in": (0.0, 1.0),  # until it leaves the wide view, as a part of the longest episode
+    "seen": (0.0, 1.0),  # how long it has been well in the close-up, as a part of what policies look at each
+    "reachable": (0.0, 1.0),  # whether the head can point at it
+}
+
+
+class Asked:
+    """The policy that the pipeline is given: it does what the action says.
+
+    Attributes:
+        candidates: the newest.
+        number: of the track to look at.
+    """
+
+    unmet = "nobody is asked for"
+
+    def __init__(self) -> None:
+        self.candidates: Sequence[Candidate] = ()
+        self.number: int | None = None
+
+    def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
+        """The one asked for, while it is there."""
+        self.candidates = tuple(candidates)
+        return self.number if self.number in {candidate.id for candidate in candidates} else None
+
+    def favours(self, track: Track) -> bool:
+        """Whether it is the one asked for."""
+        return track.id == self.number
+
+
+class Schedule(RigEnv[dict[str, Any], int]):
+    """Choose whom of five targets to look at; the project's own pipeline does everything else.
+
+    A step is a frame of the wide camera. Five persons or birds come into the wide view, cross it and leave; their ways
+    and sizes, and the noise, are an episode's own, by the seed. An episode ends by truncation after its seconds.
+
+    Action: `Discrete(8)`, the slot of the track to look at, which the pipeline heeds from the next frame on. A track
+    keeps its slot for as long as it is confirmed. Whoever chooses an empty slot looks at nobody: the head waits and
+    the lens zooms out. `info["action_mask"]` has 1 for each slot that is not empty.
+
+    Observation: a `Dict` of `tracks`, the CANDIDATE_FEATURES of each slot, (8, 10), with 0 everywhere in an empty one;
+    `rig`, the RIG_FEATURES; and with "images" the pictures `wide` and `closeup`, RGB, besides. The detections are from
+    the truth, with a detector's noise.
+
+    Reward: the seconds for which each target was well in the close-up since the zoom frame before
+    (`cotarget.metrics.Closeup.good`), and `served_reward` for each that has been so for a second in all by now.
+
+    `info`, which alone tells the truth: `t` and `t_closeup`, when the newest frames were exposed [s]; of the targets,
+    which are `kind`, `kind2` to `kind5`, `good` in that zoom frame, (5,); `good_s` so far [s]; `box_closeup` and
+    `box_wide` as left, top, right, bottom [px], (5, 4), at infinity behind the camera; `direction` from the wide
+    camera, unit vectors, (5, 3); and how many are `served`.
+    """
+
+    def __init__(
+        self,
+        kind: str = "person",
+        observation: Kind = "tracks",
+        rig: RigConfig | Path | str | None = None,
+        calibration: Calibration | Path | str | None = None,
+        seconds: float = SECONDS,
+        image_size: Size = IMAGE_SIZE,
+        noise: TruthNoise = DETECTOR_NOISE,
+        served_reward: float = SERVED_REWARD,
+        render_mode: str | None = None,
+    ) -> None:
+        """Make the environment; a world there is from the first reset on.
+
+        Args:
+            kind: of the targets: person or bird.
+            observation: "tracks", or "images" to see both views besides.
+            rig: as in `cotarget.env.Follow`.
+            calibration: that the pipeline uses, or its file; the true one by default.
+            seconds: of an episode, at most 20 [s].
+            image_size: (width, height) of the pictures [px].
+            noise: of the detections.
+            served_reward: for each target served.
+            render_mode: "rgb_array", or None for no `render`.
+
+        Raises:
+            ConfigError: an argument makes no sense.
+        """
+        if kind not in GROUPED:
+            raise ConfigError(f"kind: unknown {told(kind)}; there are: {choices(GROUPED)}")
+        super().__init__(observation, rig, calibration, seconds, image_size, noise, render_mode)
+        self.kind, self.target, self._served_reward = kind, self.config.target(kind), reward_of(served_reward)
+        self._rig_space, self._track_space = box(RIG_FEATURES.values()), box(CANDIDATE_FEATURES.values(), SLOTS)
+        self.action_space = gymnasium.spaces.Discrete(SLOTS)  # type: ignore[assignment]  # its numbers are numpy's
+        pictures = self._picture_spaces() if observation == "images" else {}
+        self.observation_space = gymnasium.spaces.Dict(
+            {"tracks": self._track_space, "rig": self._rig_space, **pictures}
+        )
+
+    @property
+    def times(self) -> tuple[float, float]:
+        """When the newest frame of the wide camera was exposed, and of the zoom camera [s]."""
+        return self._step.fixed.t, self._step.zoom.t
+
+    @property
+    def candidates(self) -> Sequence[Candidate]:
+        """The confirmed tracks, as a policy of the pipeline sees them."""
+        return self._asked.candidates
+
+    @property
+    def head(self) -> Array:
+        """Pan and tilt now, (2,) [rad]."""
+        return np.array([self._step.head.pan, self._step.head.tilt])
+
+    @property
+    def limits(self) -> PanTiltLimits:
+        """The head's."""
+        return self.episode.rig.head.limits
+
+    def slot_of(self, number: int | None) -> int:
+        """The slot of a track; the first where it has none."""
+        return self._slots.index(number) if number is not None and number in self._slots else 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode: another at every time, the same one after the same seed."""
+        seed = self._begin(seed, options)
+        paths = group_paths(self.kind, seed)
+        episode, self._asked = self._open(paths, seed), Asked()
+        asked = self._asked
+        settings = FollowSettings(
+            command_delay_s=self.config.command_delay_s,
+            closed_loop=False,
+            policy=lambda: asked,
+        )
+        self._steps = follow(
+            episode.rig, self.calibration, self.target, episode.detector, seconds=math.inf, settings=settings
+        )
+        self._slots: list[int | None] = [None] * SLOTS
+        self._index, self._good_s = 0, dict.fromkeys(paths, 0.0)
+        self._turn()
+        return self._observe(), self._info(self._good())
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Look at whom a slot has, and wait for the next frame of the wide camera."""
+        self.episode  # noqa: B018  whether there is one
+        if not self.action_space.contains(action):
+            raise ConfigError(f"action: {told(action)} is not the number of a slot, 0 to {SLOTS - 1}")
+        self._asked.number = self._slots[action]
+        before = self._step.zoom.t
+        self._index += 1
+        self._turn()
+        passed, good = self._step.zoom.t - before, self._good()
+        reward = 0.0
+        before_served = self._served()
+        for name, well in good.items():
+            self._good_s[name] += passed * well
+            reward += passed * well
+        reward += self._served_reward * (self._served() - before_served)
+        return self._observe(), reward, False, self._index >= self._last, self._info(good)
+
+    def _turn(self) -> None:
+        """One turn of the pipeline; tracks come into slots and leave them."""
+        self._step = next(self._steps)
+        numbers = [candidate.id for candidate in self.candidates]
+        self._slots = [number if number in numbers else None for number in self._slots]
+        for number in numbers:
+            if number not in self._slots and None in self._slots:
+                self._slots[self._slots.index(None)] = number
+
+    def _good(self) -> dict[str, bool]:
+        """Which targets are well in the newest zoom frame."""
+        outlines, t = self.episode.outlines, self._step.zoom.t
+        return {name: closeup_of(outlines, name, self.target, t).good for name in self._good_s}
+
+    def _served(self) -> int:
+        """How many targets have been well in the close-up for long enough."""
+        return sum(seconds >= SERVED_S - ROUNDING_S for seconds in self._good_s.values())
+
+    def _observe(self) -> dict[str, Any]:
+        step = self._step
+        ages = step.t - step.fixed.t, step.t - step.zoom.t
+        numbers = rig_numbers(self.units, step.head, step.lens, step.commanded, ages, self._index / self._last)
+        candidates = {candidate.id: candidate for candidate in self.candidates}
+        rows = [self._candidate_numbers(candidates.get(number or 0)) for number in self._slots]
+        seen = {"tracks": within(rows, self._track_space), "rig": within(numbers, self._rig_space)}
+        return {**seen, **self._pictures()} if self._observation == "images" else seen
+
+    def _candidate_numbers(self, candidate: Candidate | None) -> list[float]:
+        """Those of CANDIDATE_FEATURES."""
+        if candidate is None:
+            return [0.0] * len(CANDIDATE_FEATURES)
+        followed = self._step.target is not None and self._step.target.id == candidate.id
+        (at_pan, at_tilt), shortest_px = candidate.at.tolist(), self.units.focal_px[0]
+        pan, tilt, _ = self.units.numbers(at_pan, at_tilt, shortest_px)
+        ranges = [high - low for low, high in (self.units.pan, self.units.tilt)]
+        rates = [2 * rate / length for rate, length in zip(candidate.rate.tolist(), ranges, strict=True)]
+        return [
+            1.0,
+            float(followed),
+            float(candidate.track.missed == 0),
+            pan,
+            tilt,
+            *rates,
+            candidate.leaves_in / SECONDS,
+            candidate.seen_s / LOOK_S,
+            float(candidate.reachable),
+        ]
+
+    def _info(self, good: dict[str, bool]) -> dict[str, Any]:
+        """The truth."""
+        (t, t_closeup), episode, names = self.times, self.episode, list(good)
+        outlines = episode.outlines
+        return {
+            "t": t,
+            "t_closeup": t_closeup,
+            "good": np.array(list(good.values())),
+            "good_s": np.array(list(self._good_s.values())),
+            "box_closeup": np.array([corners(outlines.box(name, "zoom", t_closeup)) for name in names]),
+            "box_wide": np.array([corners(outlines.box(name, "fixed", t)) for name in names]),
+            "direction": np.array([episode.direction(name, t) for name in names]),
+            "served": self._served(),
+            "action_mask": np.array([number is not None for number in self._slots], dtype=np.int8),
+        }

@@ -1,0 +1,147 @@
+"""What is to be run: experiments by name, each with its settings, or with several choices of them to be compared."""
+
+import dataclasses
+import difflib
+import hashlib
+import importlib
+import itertools
+import re
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from cotarget.errors import ConfigError, choices
+from cotarget.tables import build
+from experiments.harness import Experiment, Settings
+from experiments.results import identity
+
+EXPERIMENTS = (
+    *("hand_eye", "chain", "random_rigs", "mismatch", "honesty", "speed", "photos", "pointing", "zoom_range", "wire"),
+    *("hold", "first_shot", "delay", "five_targets", "dead_zone", "sim_speed", "pipeline_speed", "sweep_speed"),
+    *("env_score", "env_speed"),
+)
+SHORT = 6  # digits that tell folders apart whose names cannot be written in full
+
+Known = Mapping[str, Callable[[], Experiment[Any]]]
+
+
+def _load(name: str) -> Experiment[Any]:
+    experiment: Experiment[Any] = importlib.import_module(f"experiments.{name}").EXPERIMENT
+    return experiment
+
+
+def known_experiments() -> Known:
+    """All there are; each is loaded when it is called for."""
+    return {name: lambda name=name: _load(name) for name in EXPERIMENTS}  # type: ignore[misc]
+
+
+@dataclass(frozen=True)
+class Case:
+    """An experiment with settings of its own.
+
+    Attributes:
+        experiment: what is done.
+        settings: how.
+        changes: what differs from the experiment's own settings, as it was typed.
+        quick: whether it takes seconds only, too few for what is wanted.
+    """
+
+    experiment: Experiment[Any]
+    settings: Settings
+    changes: tuple[str, ...] = ()
+    quick: bool = False
+
+    @property
+    def title(self) -> str:
+        """How it is called."""
+        return ", ".join([self.experiment.name, *self.changes])
+
+    @property
+    def folder(self) -> str:
+        """The same, as the name of a folder."""
+        plain = re.sub(r"[^\w.=,-]+", "_", self.title.replace(", ", ","))
+        if plain == self.title.replace(", ", ","):
+            return plain
+        return f"{plain}-{hashlib.sha256(self.title.encode()).hexdigest()[:SHORT]}"
+
+    @property
+    def numbers(self) -> Sequence[int]:
+        """Of its jobs."""
+        return self.experiment.jobs(self.settings)
+
+    @property
+    def has_bounds(self) -> bool:
+        """Whether this is the experiment's quick run as it is, whose figures have bounds."""
+        quick = self.experiment.quick
+        return identity(self.settings) == identity(quick) and self.settings.seeds == quick.seeds
+
+
+def choose(
+    known: Known,
+    names: Sequence[str],
+    *,
+    quick: bool = False,
+    seeds: int | None = None,
+    seed_base: int | None = None,
+    changes: Sequence[str] = (),
+) -> list[Case]:
+    """Experiments with their settings.
+
+    Args:
+        known: those there are.
+        names: of those to run; all, where none is named.
+        quick: whether each does what takes seconds only.
+        seeds: how many; each experiment's own number by default.
+        seed_base: the first; each experiment's own by default.
+        changes: settings as NAME.KEY=VALUE, the value as TOML has it; where a key comes more than once, there is a case
+            for each of its values, and for each combination with those of other keys.
+
+    Raises:
+        ConfigError: an unknown experiment or setting, or a value that it cannot have.
+    """
+    chosen = list(dict.fromkeys(_checked(name, known) for name in names)) or list(known)
+    values = _parsed(changes, known, chosen)
+    cases = []
+    for name in chosen:
+        experiment = known[name]()
+        base = experiment.quick if quick else experiment.settings
+        told = {"seeds": seeds, "seed_base": seed_base}
+        base = dataclasses.replace(base, **{key: value for key, value in told.items() if value is not None})
+        mine = values.get(name, {})
+        for picked in itertools.product(*([(key, text) for text in texts] for key, texts in mine.items())):
+            tables = {key: _value(text) for key, text in picked}
+            settings = build(type(base), tables, name, base=base)
+            cases.append(Case(experiment, settings, tuple(f"{key}={text}" for key, text in picked), quick))
+    return cases
+
+
+def _checked(name: str, known: Known) -> str:
+    if name in known:
+        return name
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
+    raise ConfigError(f"unknown experiment '{name}', the nearest is '{near[0]}'; there are: {choices(known)}")
+
+
+def _parsed(changes: Sequence[str], known: Known, chosen: Sequence[str]) -> dict[str, dict[str, list[str]]]:
+    """The texts of each experiment's keys."""
+    values: dict[str, dict[str, list[str]]] = {}
+    for change in changes:
+        path, equals, text = change.partition("=")
+        name, dot, key = path.partition(".")
+        if not (equals and dot and key):
+            raise ConfigError(f"'{change}' is not like NAME.KEY=VALUE, such as chain.noise_px=0.1")
+        if _checked(name, known) not in chosen:
+            raise ConfigError(f"'{change}': {name} is not among those to run: {choices(chosen)}")
+        texts = values.setdefault(name, {}).setdefault(key, [])
+        if text not in texts:
+            texts.append(text)
+    return values
+
+
+def _value(text: str) -> Any:
+    """A value as TOML has it; what is none is a text."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

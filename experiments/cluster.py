@@ -1,0 +1,143 @@
+"""The jobs of a sweep on a Dask cluster: a laboratory's own, or one on this machine."""
+
+import concurrent.futures
+import contextlib
+import importlib
+import importlib.util
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import cv2
+
+from cotarget.errors import ConfigError, DeviceError
+from experiments.workers import (
+    LINEAR_ALGEBRA,
+    ONE_THREAD,
+    Died,
+    Job,
+    Results,
+    interrupts_kept_from_children,
+    one_thread_each,
+)
+
+EXTRA = "cotarget[sweeps]"
+ANSWER_S = 10.0  # for a scheduler to answer [s]
+QUIET = logging.CRITICAL + 10  # what is wrong is told in one line
+
+
+def on_dask(
+    work: Callable[[Job], Any], jobs: Sequence[Job], processes: int, *, scheduler: str | None = None, version: str = ""
+) -> Results:
+    """Do jobs on a Dask cluster, begun in their order; what each gives as it comes, with its number.
+
+    A job whose worker dies is tried by others; whose workers die again and again, that is what came of it. (joblib's
+    dask backend, which stands on the same client, waits for such a job for ever.)
+
+    Args:
+        work: a function at the top of a module that the cluster's workers find too, or a partial one of it.
+        jobs: its arguments, one each.
+        processes: how many workers a cluster on this machine has, where none is named.
+        scheduler: the cluster's address, such as tcp://10.0.0.1:8786.
+        version: of the code that all workers must have; any by default.
+
+    Raises:
+        ConfigError: Dask is missing, nobody answers there, or the workers are not fit for the work.
+        DeviceError: the scheduler is gone.
+        Exception: what a job raised.
+    """
+    distributed = _needed("distributed")
+    with _client(distributed, scheduler, min(processes, len(jobs))) as client:
+        where = client.scheduler.address
+        _check_workers(client, where, version)
+        numbers = {
+            client.submit(_held_to_one_thread, work, job, pure=False, priority=-number): number
+            for number, job in enumerate(jobs)
+        }
+        try:
+            for future in distributed.as_completed(list(numbers)):
+                try:
+                    result = future.result()
+                except distributed.KilledWorker:
+                    result = Died
+                except concurrent.futures.CancelledError:
+                    raise DeviceError(f"the Dask scheduler at {where} is gone") from None
+                yield numbers.pop(future), result
+        finally:
+            client.cancel(list(numbers))  # those that a worker has in hand it still finishes, for nobody
+
+
+def _needed(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ConfigError(f"a Dask cluster needs {name}, which is not installed: pip install '{EXTRA}'") from None
+
+
+@contextlib.contextmanager
+def _client(distributed: Any, scheduler: str | None, processes: int) -> Iterator[Any]:
+    """A client of the cluster at an address, or of one on this machine that ends with it."""
+    with contextlib.ExitStack() as stack:
+        log = logging.getLogger("distributed.client")
+        stack.callback(log.setLevel, log.level)
+        log.setLevel(QUIET)
+        if scheduler is None:
+            with one_thread_each(), interrupts_kept_from_children():
+                cluster = distributed.LocalCluster(
+                    n_workers=processes,
+                    threads_per_worker=1,
+                    host="127.0.0.1",
+                    dashboard_address="127.0.0.1:0",
+                    silence_logs=QUIET,
+                )
+            stack.enter_context(cluster)
+            yield stack.enter_context(distributed.Client(cluster))
+            return
+        try:
+            client = distributed.Client(scheduler, timeout=ANSWER_S)
+        except (OSError, ValueError, TypeError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise ConfigError(f"no Dask scheduler answers at {scheduler}: {reason}") from None
+        yield stack.enter_context(client)
+
+
+def _check_workers(client: Any, scheduler: str, version: str) -> None:
+    """Refuse workers that could not do the work, or not one job at a time each, on one thread."""
+    threads: dict[str, int] = client.nthreads()
+    if not threads:
+        raise ConfigError(f"the Dask scheduler at {scheduler} has no workers; start some with dask worker")
+    for worker, count in threads.items():
+        if count > 1:  # an OpenGL context belongs to one thread
+            raise ConfigError(
+                f"the Dask worker at {worker} has {count} threads; start workers with --nthreads 1 (and --nworkers N)"
+            )
+
+    def about() -> tuple[str, bool]:  # sent as it stands: there may be nothing there to find it in
+        held = any(os.environ.get(name) == "1" for name in LINEAR_ALGEBRA)
+        if not (importlib.util.find_spec("experiments") and importlib.util.find_spec("cotarget")):
+            return "", held
+        return str(importlib.import_module("experiments.results").code_version()), held
+
+    for worker, (code, held) in client.run(about).items():
+        if not code:
+            raise ConfigError(
+                f"the Dask worker at {worker} does not find the packages cotarget and experiments; start it with "
+                "PYTHONPATH set to a clone of this repository"
+            )
+        if version and code != version:
+            raise ConfigError(
+                f"the Dask worker at {worker} has cotarget {code}, this is {version}; give both the same code and "
+                "libraries, or keep the difference with --any-code"
+            )
+        if not held:
+            raise ConfigError(
+                f"the Dask worker at {worker} has linear algebra on several threads; start it with OMP_NUM_THREADS=1"
+            )
+
+
+def _held_to_one_thread(work: Callable[[Job], Any], job: Job) -> Any:
+    for name, value in ONE_THREAD.items():
+        os.environ.setdefault(name, value)  # heeded by rendering; linear algebra is loaded already
+    cv2.setNumThreads(1)
+    return work(job)

@@ -1,0 +1,253 @@
+"""The report on all experiments: one HTML page that needs nothing beside it, with every picture, figure and bound."""
+
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cotarget.outputs import write_whole
+from cotarget.report import markup
+from cotarget.report.markup import Picture
+from cotarget.report.page import STYLE
+from cotarget.report.tables import Table
+from cotarget.report.wording import count, digits, listed
+from experiments.bounds import WORSE, leaves
+from experiments.harness import plain
+from experiments.outcome import Outcome
+
+MINUTE_S, HOUR_S = 60.0, 3600.0
+FEW = 8  # failed jobs that a summary names
+
+
+@dataclass(frozen=True)
+class Run:
+    """All that a report is about.
+
+    Attributes:
+        outcomes: of the cases.
+        skipped: experiments that were not run, and why.
+        sessions: when jobs were done, by whom and for how long.
+        command: how to get the same again.
+    """
+
+    outcomes: Sequence[Outcome]
+    skipped: Mapping[str, str]
+    sessions: Sequence[Mapping[str, Any]]
+    command: str
+
+
+def write_report(path: Path, run: Run) -> None:
+    """Write the page.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    anchored = [(f"case-{i}", outcome) for i, outcome in enumerate(run.outcomes)]
+    links = [(anchor, outcome.case.title) for anchor, outcome in anchored]
+    compared = list(_comparisons(run.outcomes))
+    sections = [
+        markup.section("summary", "All at a glance", _summary(run)),
+        *(markup.section(anchor, outcome.case.title, _case(outcome)) for anchor, outcome in anchored),
+        *([markup.section("compared", "Settings compared", compared)] if compared else []),
+        markup.section("times", "Times", _times(run)),
+        markup.section("made", "How this was made", _made(run)),
+    ]
+    more = [("compared", "settings compared")] if compared else []
+    links += [*more, ("times", "times"), ("made", "how this was made")]
+    head = markup.header("The experiments of cotarget", [run.command]) + "\n" + _verdict(run)
+    body = "\n".join([head, markup.contents(links), *sections])
+    page = markup.document("The experiments of cotarget", STYLE.read_text(encoding="utf-8"), body)
+    write_whole(path, page.encode())
+
+
+def _verdict(run: Run) -> str:
+    failed = sum(len(outcome.failed) for outcome in run.outcomes)
+    undone = sum(outcome.undone for outcome in run.outcomes)
+    parts = {
+        f"{count(failed, 'job')} failed": failed,
+        f"{count(undone, 'job')} not done yet": undone,
+        "no figures of " + listed([o.case.title for o in run.outcomes if o.broken]): any(
+            outcome.broken for outcome in run.outcomes
+        ),
+        "worse than a bound: " + listed([o.case.title for o in run.outcomes if o.worse]): any(
+            outcome.worse for outcome in run.outcomes
+        ),
+    }
+    wrong = [text for text, is_so in parts.items() if is_so]
+    short = [outcome.case.title for outcome in run.outcomes if outcome.missed and not outcome.case.quick]
+    ran = f"{count(len(run.outcomes), 'experiment')}, {count(sum(len(o.records) for o in run.outcomes), 'job')}"
+    if wrong:
+        return markup.verdict("bad", "Something is wrong", f"{ran}: {'; '.join(wrong)}.")
+    if short:
+        return markup.verdict("care", "Some figures are not what is wanted", f"{ran}: {listed(short)}.")
+    if not run.outcomes:
+        return markup.verdict("unknown", "Nothing was run", "There is nothing to tell.")
+    return markup.verdict("good", "All as it should be", f"{ran}; none failed, no bound is broken.")
+
+
+def _summary(run: Run) -> Iterator[str]:
+    header = ("experiment", "wanted figures", "bounds", "jobs", "failed", "time of all jobs")
+    rows = tuple(
+        (
+            outcome.case.title,
+            outcome.broken or _wanted(outcome),
+            _kept(outcome),
+            f"{len(outcome.records)} of {len(outcome.case.numbers)}",
+            _named(outcome.failed),
+            duration(sum(outcome.seconds)),
+        )
+        for outcome in run.outcomes
+    )
+    yield markup.table(Table("", header, rows))
+    if any(outcome.case.quick and outcome.missed for outcome in run.outcomes):
+        yield markup.paragraph("A quick run is too short for what is wanted; it is held to its bounds.", "note")
+    if run.skipped:
+        yield markup.table(Table("Not run", ("experiment", "why"), tuple(run.skipped.items())))
+
+
+def _wanted(outcome: Outcome) -> str:
+    if outcome.missed is None:
+        return "none asked for"
+    return f"{len(outcome.missed)} missed" if outcome.missed else "all met"
+
+
+def _kept(outcome: Outcome) -> str:
+    if not outcome.bounds:
+        return "none yet" if outcome.case.has_bounds else "of the quick run only"
+    return (
+        f"{len(outcome.worse)} of {len(outcome.bounds)} broken" if outcome.worse else f"all {len(outcome.bounds)} kept"
+    )
+
+
+def _named(numbers: Mapping[int, Any]) -> str:
+    text = ", ".join(map(str, list(numbers)[:FEW]))
+    return f"{text} and {len(numbers) - FEW} more" if len(numbers) > FEW else text or "none"
+
+
+def _case(outcome: Outcome) -> Iterator[str]:
+    case = outcome.case
+    yield markup.paragraph(case.experiment.purpose)
+    if outcome.broken:
+        yield markup.paragraph(outcome.broken[:1].upper() + outcome.broken[1:] + ".")
+    if outcome.text:
+        yield markup.preformatted(outcome.text)
+    if outcome.picture is not None:
+        name = case.experiment.name
+        yield markup.figure(Picture(name, outcome.picture, None, f"{name}: {outcome.caption}", outcome.caption))
+    if outcome.missed is not None:
+        lost = outcome.missed
+        yield markup.subheading("Wanted figures")
+        yield markup.bullets(lost) if lost else markup.paragraph("All are met.")
+    if outcome.bounds:
+        yield markup.subheading("Bounds")
+        rows = tuple(
+            (bound.name, bound.text, _figure(bound.reached), "yes" if bound.kept else "NO") for bound in outcome.bounds
+        )
+        note = f"The best that was reached before; what is up to {WORSE:g} times as bad is kept."
+        yield markup.table(Table("", ("figure", "bound", "reached", "kept"), rows, note))
+    if outcome.failed:
+        yield markup.subheading("Failed jobs")
+        why = tuple((str(number), record.failed) for number, record in outcome.failed.items())
+        yield markup.table(Table("", ("seed", "why"), why, "The next run tries them again."))
+        tracebacks = {record.traceback: number for number, record in reversed(outcome.failed.items())}
+        for text, number in reversed(tracebacks.items()):
+            if text:
+                yield markup.folded(f"Traceback of seed {number}", markup.preformatted(text))
+    told = {key: value for key, value in dataclasses.asdict(case.settings).items() if key != "processes"}
+    settings = tuple((key, json.dumps(plain(value))) for key, value in told.items())
+    done_by = sorted({record.version for record in outcome.records.values()})
+    facts = (*settings, ("done by cotarget", listed(done_by)))
+    yield markup.folded("Settings and versions", markup.table(Table("", ("setting", "value"), facts)))
+    if outcome.summary is not None:
+        figures = tuple((" / ".join(trail), json.dumps(value)) for trail, value in leaves(plain(outcome.summary)))
+        yield markup.folded("Every figure", markup.table(Table("", ("figure", "value"), figures)))
+
+
+def _figure(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def _comparisons(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """For each experiment that was run with several choices of settings, its figures side by side."""
+    for name in dict.fromkeys(outcome.case.experiment.name for outcome in outcomes):
+        mine = [o for o in outcomes if o.case.experiment.name == name and o.summary is not None]
+        if len(mine) < 2:
+            continue
+        columns = [dict(leaves(plain(outcome.summary))) for outcome in mine]
+        trails = dict.fromkeys(trail for column in columns for trail, value in column.items() if _is_number(value))
+        rows = tuple(
+            (" / ".join(trail), *(_figure(v) if _is_number(v := column.get(trail)) else "-" for column in columns))
+            for trail in trails
+        )
+        header = ("figure", *(", ".join(outcome.case.changes) for outcome in mine))
+        yield markup.table(Table(name, header, rows))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _times(run: Run) -> Iterator[str]:
+    header = ("experiment", "jobs", "all together", "median", "longest", "processor", "renders", "beside others")
+    rows = [
+        (
+            outcome.case.title,
+            str(len(outcome.seconds)),
+            duration(sum(outcome.seconds)),
+            duration(float(np.median(outcome.seconds))),
+            duration(max(outcome.seconds)),
+            duration(outcome.cpu_s),
+            str(outcome.renders),
+            "no" if outcome.case.experiment.alone else "yes",
+        )
+        for outcome in run.outcomes
+        if outcome.seconds
+    ]
+    jobs, total = sum(len(o.seconds) for o in run.outcomes), sum(sum(o.seconds) for o in run.outcomes)
+    cpu_s, renders = sum(o.cpu_s for o in run.outcomes), sum(o.renders for o in run.outcomes)
+    rows.append(("all", str(jobs), duration(total), "", "", duration(cpu_s), str(renders), ""))
+    note = (
+        "Processor time and renders, pictures that MuJoCo drew, are those of the jobs' own processes. Jobs that are "
+        "not done beside others measure times themselves."
+    )
+    yield markup.table(Table("", header, tuple(rows), note))
+    sessions = tuple(
+        (
+            str(each["began"]),
+            str(each["workers"]),
+            str(each["jobs"]),
+            duration(each["wall_s"]),
+            duration(each["job_s"]),
+            duration(each["shared_s"]),
+            str(each["renders"]),
+            f"{(each['job_s'] + each['shared_s']) / each['wall_s']:.2f}",
+        )
+        for each in run.sessions
+    )
+    heads = ("begun", "workers", "jobs", "took", "jobs", "what they share", "renders", "at a time")
+    note = "Renders are those of jobs and of what they share. A session that was killed has left no line."
+    yield markup.table(Table("Sessions", heads, sessions, note))
+
+
+def _made(run: Run) -> Iterator[str]:
+    yield markup.preformatted(run.command)
+    for each in run.sessions[-1:]:
+        facts = {key: each[key] for key in ("cotarget", "python", "machine")}
+        facts |= {name: version for name, version in each["versions"].items() if name != "cotarget"}
+        rows = tuple((name, str(value)) for name, value in facts.items())
+        yield markup.table(Table("Of the last session", ("what", "value"), rows))
+
+
+def duration(seconds: float) -> str:
+    """Write a time: 0.21 s, 34 s, 5 min 10 s, 2 h 3 min."""
+    if seconds < MINUTE_S:
+        return f"{digits(seconds)} s"
+    if seconds < HOUR_S:
+        minutes, rest = divmod(round(seconds), 60)
+        return f"{minutes} min {rest} s"
+    hours, rest = divmod(round(seconds / MINUTE_S), 60)
+    return f"{hours} h {rest} min"
