@@ -381,7 +381,7 @@ def test_a_target_that_is_never_acquired_is_missed():
 
 # ---------------------------------------------------------------- quick runs, rendered
 
-BOUNDED = (first_shot, five_targets, dead_zone, env_score)
+BOUNDED = (hold, first_shot, delay, five_targets, dead_zone, env_score)
 HELD_S = 6.0  # two seconds to learn the background, four to hold
 
 
