@@ -13,7 +13,7 @@ from experiments.workers import here
 EXPERIMENTS = {
     module.EXPERIMENT.name: module.EXPERIMENT for module in (chain, hand_eye, honesty, mismatch, random_rigs)
 }
-SLOW = ("chain", "mismatch", "random_rigs")
+SLOW = ("chain", "honesty", "mismatch", "random_rigs")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in EXPERIMENTS])

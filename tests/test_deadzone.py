@@ -124,7 +124,8 @@ EVERY_FRAME = SteeringSettings(zone=0.0)
 LESS_SMEAR = 0.7
 
 
-@pytest.mark.parametrize("name", [pytest.param("book", marks=pytest.mark.slow), "person"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["book", "person"])
 def test_half_the_commands_and_reversals_at_the_same_offset(name):
     commands, reversals, offset, _ = over_seeds(name, SteeringSettings())
     before = over_seeds(name, EVERY_FRAME)

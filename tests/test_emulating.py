@@ -34,6 +34,7 @@ def test_it_tells_who_is_there_to_be_followed(folder, capsys, rig, there):
     assert f"\ntargets  {there}\n" in out
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_a_run_that_saw_nothing_says_what_would_be_right(folder, capsys):
     """Nobody is in the wide view in the first seconds of a person's way."""

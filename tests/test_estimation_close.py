@@ -98,7 +98,8 @@ def test_a_box_that_is_cut_brings_a_target_nearer_and_never_moves_it_away():
     assert 0.9 * depth / 1.4 < found[1.4] < 1.01 * depth / 1.4  # it comes on a little, as it was seen to have come
 
 
-@pytest.mark.parametrize("speed", [1.0, pytest.param(1.4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", [1.0, 1.4])
 def test_the_head_stands_before_a_person_who_has_come_close(speed):
     way, rig = Approach("person", speed, waits_s=3.0), Rig()
     settings = FollowSettings(command_delay_s=DELAY)

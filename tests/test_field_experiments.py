@@ -209,6 +209,7 @@ def test_the_best_policy_is_put_over_the_first():
 # ---------------------------------------------------------------- dead zone
 
 
+@pytest.mark.slow
 def test_a_dead_zone_spares_the_head_that_looks_at_a_book(exact, monkeypatch):
     monkeypatch.setattr(dead_zone, "record", seen_well)
     settings = dead_zone.DeadZoneSettings(targets=("book",), seconds=6.0, closed_loop=False)

@@ -160,6 +160,7 @@ def test_independent_motions_give_an_honest_covariance():
     check_honest(from_motions(arm(rng, 20), arm(rng, 20)), from_motions(pan_tilt(rng, 20), pan_tilt(rng, 20)))
 
 
+@pytest.mark.slow
 def test_it_is_no_worse_than_park_and_martin():
     rng = np.random.default_rng(1)
     hands = arm(rng, 20)

@@ -114,6 +114,7 @@ def test_what_the_head_seems_to_do_becomes_jitter(truth):
     assert calibrate_views(drawn(truth, 0), BOARD, SIZES, options=QUICK).jitter > 0
 
 
+@pytest.mark.slow
 def test_a_fixed_lens_of_another_kind_widens_the_uncertainty():
     """No turn of the head is an excuse for the fixed camera."""
     truth = replace(Truth(), fixed=Lens(686.0, 684.0, 325.0, 239.0, THIN_PRISM))

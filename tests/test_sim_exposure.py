@@ -91,6 +91,7 @@ def test_a_turning_zoom_camera_blurs_everything():
     assert error(image, truth) < min(PART * error(sharp, truth), LEVELS)
 
 
+@pytest.mark.slow
 def test_a_zooming_lens_blurs_from_the_middle_out():
     with (w := world(targets=())).rig as rig:
         rig.zoom.zoom(rig.zoom.focal_range[1])
