@@ -22,11 +22,11 @@ from matplotlib.figure import Figure
 from cotarget.calibration import Options, calibrate_views
 from cotarget.calibration.boards import board_points
 from cotarget.config import BoardConfig
-from cotarget.simconfig import SimHead
 from cotarget.geometry import Array
+from cotarget.simconfig import SimHead
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.mounted import MOUNTED_DEG, at, mounted, off_px, wanted_focal_px
-from experiments.simpler import FULL, IGNORED, MODELS, SIMPLER, models_of
+from experiments.simpler import FULL, IGNORED, MODELS, models_of
 from experiments.synthetic import SIZE, SIZES, Placing, looking_off, spread_views
 
 BOARD = BoardConfig()
@@ -118,15 +118,20 @@ def regime(rows: Sequence[Row], condition: str) -> tuple[float, float]:
         The smallest depth over baseline measured, and the largest up to which the median over the seeds of every
         depth and baseline says so; both nan where even the smallest does not.
     """
-    by_reach = sorted(
-        (depth / baseline, float(np.median(v))) for (depth, baseline), v in ratios(rows, condition).items()
-    )
+    by_cell = ratios(rows, condition)
+    by_reach = [(_reach(cell), float(np.median(by_cell[cell]))) for cell in sorted(by_cell, key=_reach)]
     within: list[float] = []
     for reach, ratio in by_reach:
         if ratio < FACTOR:
             break
         within.append(reach)
     return (within[0], within[-1]) if within else (float("nan"), float("nan"))
+
+
+def _reach(cell: tuple[float, float]) -> float:
+    """Depth over baseline."""
+    depth, baseline = cell
+    return depth / baseline
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
@@ -218,11 +223,10 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
     middle.sharey(left)
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=len(MODELS), frameon=False)
     for condition, colour in zip(CONDITIONS, ("C0", "C1"), strict=True):
-        found = sorted(
-            (depth / base, np.percentile(v, [25, 50, 75])) for (depth, base), v in ratios(rows, condition).items()
-        )
-        reach, values = [r for r, _ in found], np.array([v for _, v in found])
-        low, mid, high = values.T
+        by_cell = ratios(rows, condition)
+        cells = sorted(by_cell, key=_reach)
+        reach, values = [_reach(cell) for cell in cells], [np.percentile(by_cell[cell], [25, 50, 75]) for cell in cells]
+        low, mid, high = np.array(values).T
         right.errorbar(reach, mid, [mid - low, high - mid], fmt="o", ms=4, capsize=2, color=colour, label=condition)
         begin, end = regime(rows, condition)
         if np.isfinite(end):

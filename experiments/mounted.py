@@ -43,9 +43,10 @@ def mounted(rng: np.random.Generator, baseline: float, mounted_deg: float = MOUN
     )
 
 
-def with_ideal_head(truth: Truth) -> Truth:
-    """The same rig on a head whose axes cross at a right angle."""
-    return replace(truth, dz=0.0, eps=0.0)
+def idealised(truth: Truth) -> Truth:
+    """The same rig on a head whose axes cross at a right angle, the zoom camera's axis in the middle of its image."""
+    cx, cy = (np.array(SIZE) - 1) / 2
+    return replace(truth, dz=0.0, eps=0.0, zoom=replace(truth.zoom, cx=float(cx), cy=float(cy)))
 
 
 def exact_calibration(truth: Truth) -> Calibration:
@@ -72,7 +73,7 @@ def at(truth: Truth, pixels: Array, depths: Array | float) -> Array:
 def wanted_focal_px(
     truth: Truth, x_fixed: Array, size: float = TARGET.size, wanted_px: float = TARGET.wanted_px
 ) -> Array:
-    """The focal length at which targets (n, 3) [m] of a size [m] are as large as wanted, within the lens's range, (n,)."""
+    """Focal lengths (n,) that show targets (n, 3) [m] of a size [m] as large as wanted, within the lens's range."""
     reach = np.linalg.norm(truth.gamma.apply(x_fixed), axis=1)
     return np.clip(wanted_px * reach / size, truth.zoom.fx, LONGEST_PX)
 
