@@ -7,6 +7,8 @@ a lone camera's detector misses while the picture moves, because head or lens do
 cases: 5 %, as of a camera that stands, a half, and nine of ten.
 
 Both are judged by the truth, and the clock starts when the target is wholly in the wide view, after the first 2 s.
+What a lone camera costs besides is the view of all else: `watched` is how much of the wide camera's field its own view
+is as large as, where the pair always sees all of it.
 
     python -m experiments.single_ptz [--seeds 10] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -34,15 +36,17 @@ from cotarget.sim.fieldpaths import LONE, SECONDS
 from cotarget.sim.outlines import Outlines
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
+from cotarget.simconfig import SimConfig
 from experiments.harness import Experiment, Row, Settings, seeds_of, table
 from experiments.hold_scenes import hold_config
 from experiments.lone_camera import LoneCamera, scan_of
 
 NOISE = TruthNoise()
 PAIR = "pair"
+WIDE_PX = SimConfig().fixed.focal_px[0]
 MOVED_PX, MOVED_S = 1.0, 0.02  # the picture moves that shifts so far within so long before and after its exposure
 STREAM = 25  # of random numbers
-FIGURES = ("closeup_yield", "in_frame_ratio", "in_frame_of_all", "time_to_acquire_s", "tpo_width_median")
+FIGURES = ("closeup_yield", "in_frame_ratio", "in_frame_of_all", "time_to_acquire_s", "tpo_width_median", "watched")
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,11 @@ def one(_: None, settings: SingleSettings, seed: int) -> list[Row]:
     """Each target held by the pair and by the lone camera; a row each."""
     rows: list[Row] = []
     for name in settings.targets:
-        rows.append({"seed": seed, "target": name, "way": PAIR} | figures(by_pair(name, seed, settings.seconds)))
+        rows.append(
+            {"seed": seed, "target": name, "way": PAIR}
+            | figures(by_pair(name, seed, settings.seconds))
+            | {"watched": 1.0}
+        )
         for miss in settings.misses:
             judged = by_lone(name, seed, settings.seconds, miss)
             rows.append({"seed": seed, "target": name, "way": lone(miss)} | figures(judged))
@@ -92,6 +100,7 @@ def figures(judged: Sequence[Judged]) -> Row:
         "in_frame_of_all": _in_frame(judged, found.frames),
         "time_to_acquire_s": found.time_to_acquire_s,
         "tpo_width_median": found.tpo_width_median,
+        "watched": float(np.mean([min(1.0, (WIDE_PX / row.focal_px) ** 2) for row in judged])),
     }
 
 
@@ -203,13 +212,19 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
     summary: dict[str, dict[str, dict[str, float]]] = {}
     for name, way in dict.fromkeys((row["target"], row["way"]) for row in rows):
         mine = [row for row in rows if (row["target"], row["way"]) == (name, way)]
-        found = {key: float(np.nanmean(_floats(mine, key))) for key in FIGURES if key != "time_to_acquire_s"}
+        found = {key: _mean(_floats(mine, key)) for key in FIGURES if key != "time_to_acquire_s"}
         yields = _floats(mine, "closeup_yield")
         times = [math.inf if row["time_to_acquire_s"] is None else row["time_to_acquire_s"] for row in mine]
         scatter = float(np.nanstd(yields, ddof=1) / np.sqrt(len(yields))) if len(yields) > 1 else math.nan
         found |= {"closeup_yield_error": scatter, "time_to_acquire_s": float(np.median(times))}
         summary.setdefault(name, {})[way] = found | {"never_acquired": float(np.mean(np.isinf(times)))}
     return summary
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Of those there are."""
+    there = [value for value in values if math.isfinite(value)]
+    return float(np.mean(there)) if there else math.nan
 
 
 def _floats(rows: Sequence[Row], key: str) -> list[float]:
@@ -223,10 +238,10 @@ def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 def describe(settings: SingleSettings, summary: Mapping[str, Any]) -> str:
     """A line for each target and way."""
-    head = ("", "close-up yield", "+-", "in frame", "of all", "to acquire [s]", "offset / width")
+    head = ("", "close-up yield", "+-", "in frame", "of all", "to acquire [s]", "offset / width", "watched")
     keys = ("closeup_yield", "closeup_yield_error", "in_frame_ratio", "in_frame_of_all", "time_to_acquire_s")
     lines = [
-        [f"{name}, {way}", *(f"{found[key]:.2f}" for key in keys), found["tpo_width_median"]]
+        [f"{name}, {way}", *(f"{found[key]:.2f}" for key in keys), found["tpo_width_median"], found["watched"]]
         for name, ways in summary.items()
         for way, found in ways.items()
     ]
