@@ -173,14 +173,6 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Every cause's error [degrees]."""
-    return {
-        cause: {cell: values["reached_deg"] for cell, values in found["cells"].items()}
-        for cause, found in summary.items()
-    }
-
-
 def describe(settings: DepthSettings, summary: Mapping[str, Any]) -> str:
     """A line for each cause, depth and baseline; then how well first order agrees."""
     lines = [
@@ -246,7 +238,6 @@ EXPERIMENT = Experiment(
     plot,
     missed,
     cost_s=3.0,
-    bounded=bounded,
 )
 
 if __name__ == "__main__":

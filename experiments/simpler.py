@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
+from scipy.interpolate import RectBivariateSpline
 
 from cotarget.calibration import Calibration
 from cotarget.geometry import Array, RigidTransform, Rotation
@@ -134,7 +134,5 @@ def learnt(truth: Truth, rng: np.random.Generator, centring: Centring = CENTRING
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     q = aimed(truth, at(truth, pixels, centring.depth), np.append(middle_of(truth.zoom), 1.0))
     q = q + rng.normal(0, centring.scatter, q.shape)
-    table = RegularGridInterpolator(
-        (rows, columns), q.reshape(len(rows), len(columns), 2), method="cubic", bounds_error=False, fill_value=None
-    )
-    return lambda pixels, depths: np.asarray(table(pixels[:, ::-1]))
+    splines = [RectBivariateSpline(rows, columns, each.reshape(len(rows), len(columns))) for each in q.T]
+    return lambda pixels, depths: np.stack([spline.ev(pixels[:, 1], pixels[:, 0]) for spline in splines], axis=-1)

@@ -76,6 +76,10 @@ def one(_: None, settings: SingleSettings, seed: int) -> list[Row]:
         )
         for miss in settings.misses:
             judged = by_lone(name, seed, settings.seconds, miss)
+            pair = figures(by_pair(name, seed, settings.seconds)) | {"watched": 1.0}
+        rows.append({"seed": seed, "target": name, "way": PAIR} | pair)
+        for miss in settings.misses:
+            judged = by_lone(name, seed, settings.seconds, miss)
             rows.append({"seed": seed, "target": name, "way": lone(miss)} | figures(judged))
     return rows
 
