@@ -136,7 +136,11 @@ class Course:
 
 
 class LoneCamera:
-    """The camera, its head and its lens, after one target."""
+    """The camera, its head and its lens, after one target.
+
+    Attributes:
+        mode: what it does: "scanning", "following" or "searching".
+    """
 
     def __init__(
         self,
@@ -170,7 +174,7 @@ class LoneCamera:
         self._course = Course(target, noise_px)
         self._focal = rig.zoom.zoom(rig.zoom.focal_range[0])
         self._next, self._round, self._set_out = 0, self._field, -math.inf
-        self._mode = ""
+        self.mode = ""
 
     def run(self, seconds: float) -> Iterator[Frame]:
         """Each frame of the zoom camera, after what it led to."""
@@ -189,7 +193,7 @@ class LoneCamera:
             else:
                 mode = "searching" if unseen <= SEARCH_S else "scanning"
                 self._look_around(mode, frame.t)
-            self._mode = mode
+            self.mode = mode
             yield frame
 
     def _sighting(self, t: float, found: Detection) -> tuple[Sighting, float]:
@@ -250,7 +254,7 @@ class LoneCamera:
         shortest = rig.zoom.focal_range[0]
         if self._focal > shortest:
             self._focal = rig.zoom.zoom(shortest)
-        if mode != self._mode:
+        if mode != self.mode:
             self._round = self._field if mode == "scanning" else self._about(frame_t)
             self._next, self._set_out = 0, -math.inf
             self._go(self._round[0])
