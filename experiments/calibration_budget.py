@@ -4,8 +4,8 @@ Boards of 9 x 6 corners hang at 2.5 to 8 m all over the wide view, each looked a
 unknown. The default rig, calibrated once for each noise and each number of placements, every seed with boards, poses
 and noise of its own. The pointing error is the angle between the line of sight and the true target, for targets all
 over the wide view at 4 to 30 m, pixel and depth given exactly; times 7155 it is what the longest focal length makes of
-it in pixels. The error should grow as the noise does, and shrink as one over the root of the placements; reached are
-the exponents of a plane fitted to the logarithms.
+it in pixels. The error should grow as the noise does, and shrink as one over the root of the placements, or faster
+where few of them leave parts of the view unseen; what it does are the exponents of a plane fitted to the logarithms.
 
     python -m experiments.calibration_budget [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -145,7 +145,8 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
         ax.set(xscale="log", yscale="log", xlabel=label)
         ax.set_xticks(xs, [f"{x:g}" for x in xs], minor=False)
         ax.minorticks_off()
-        ax.legend(frameon=False, fontsize="small", title="points: reached, quartiles\nlines: predicted")
+        place = "upper left" if x_key == "noise_px" else "lower left"
+        ax.legend(loc=place, frameon=False, fontsize="small", title="points: reached, quartiles\nlines: predicted")
     figure.axes[0].set_ylabel(f"rms pointing error [px at f = {LONGEST_PX:g} px]")
 
 

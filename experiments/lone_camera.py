@@ -8,9 +8,8 @@ head and lens were when a frame's light fell it is told exactly, which makes it 
 """
 
 import math
-from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,7 +36,7 @@ RING = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1
 # A manoeuvre, which outlasts what the camera leads by, counts as white acceleration of so long [s], by the dimension of
 # what is wanted. Of 0.1 to 2 s these gave the most close-ups, each for its target: a book is carried at times, and then
 # speeds up more than its own motion has it.
-LASTS_S = {"width": 2.0, "height": 0.25, "wingspan": 0.1}
+LASTS_S = {"width": 2.0, "height": 0.25, "wingspan": 0.15}
 CLIPPED = 9.0  # times the variance of a middle of which a part is outside the image
 
 
@@ -73,8 +72,9 @@ class Course:
         self._target, self._noise_px = target, noise_px
         self._settings = estimation_settings_for(target)
         self._axes: list[AxisFilter] = []
-        self._sizes: deque[tuple[float, tuple[float, float]]] = deque()
+        self._sizes: list[Sighting] = []
         self.seen_t = -math.inf
+        self.whole = False  # whether the last sighting was
 
     @property
     def known(self) -> bool:
@@ -84,7 +84,7 @@ class Course:
     @property
     def sides(self) -> tuple[float, float]:
         """Its width and height as tangents: the largest of the last moment for wings, else the median."""
-        sides = np.array([each for _, each in self._sizes])
+        sides = np.array([each.sides for each in self._sizes])
         w, h = sides.max(axis=0) if self._target.dimension == "wingspan" else np.median(sides, axis=0)
         return float(w), float(h)
 
@@ -101,10 +101,13 @@ class Course:
 
     def saw(self, seen: Sighting, focal_px: float) -> None:
         """Take a sighting into account; one after a long time begins anew."""
-        if not seen.clipped or not self._sizes:
-            self._sizes.append((seen.t, seen.sides))
-        while self._sizes[0][0] < seen.t - SIZES_S and len(self._sizes) > 1:
-            self._sizes.popleft()
+        self.whole = not seen.clipped
+        if self.whole:
+            past = [each for each in self._sizes if each.t >= seen.t - SIZES_S and not each.clipped]
+            self._sizes = [*past, seen]
+        else:  # it is at least as large as what shows of it
+            w, h = seen.sides if not self._sizes else map(max, zip(seen.sides, self.sides, strict=True))
+            self._sizes = [replace(seen, sides=(w, h))]
         motion, distance = self._settings.motion, self.range
         by_size = self._settings.noise_of_size * max(seen.sides)
         variance = (self._noise_px / focal_px) ** 2 + by_size**2 * (CLIPPED if seen.clipped else 1.0)
@@ -244,7 +247,10 @@ class LoneCamera:
             SIZE_SIGMA,
         )
         now_px = self._zoom.at(rig.zoom.state().focal_px).focal_px[0]
-        choice = self._policy.choose(expected, self._target.wanted_px / course.size, true_px, now, now_px)
+        wanted_px = self._target.wanted_px / course.size
+        if not course.whole:  # not nearer, before all of it was seen
+            wanted_px = min(wanted_px, true_px)
+        choice = self._policy.choose(expected, wanted_px, true_px, now, now_px)
         if abs(choice.focal_px / true_px - 1) > 1e-6:
             self._focal = rig.zoom.zoom(self._zoom.nominal_for(choice.focal_px))
 

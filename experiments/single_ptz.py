@@ -69,14 +69,7 @@ def one(_: None, settings: SingleSettings, seed: int) -> list[Row]:
     """Each target held by the pair and by the lone camera; a row each."""
     rows: list[Row] = []
     for name in settings.targets:
-        rows.append(
-            {"seed": seed, "target": name, "way": PAIR}
-            | figures(by_pair(name, seed, settings.seconds))
-            | {"watched": 1.0}
-        )
-        for miss in settings.misses:
-            judged = by_lone(name, seed, settings.seconds, miss)
-            pair = figures(by_pair(name, seed, settings.seconds)) | {"watched": 1.0}
+        pair = figures(by_pair(name, seed, settings.seconds)) | {"watched": 1.0}
         rows.append({"seed": seed, "target": name, "way": PAIR} | pair)
         for miss in settings.misses:
             judged = by_lone(name, seed, settings.seconds, miss)
