@@ -22,6 +22,7 @@ from cotarget.calibration import Options, calibrate_views, predicted_pointing
 from cotarget.calibration.boards import board_points
 from cotarget.config import BoardConfig
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
+from experiments.mounted import check_above
 from experiments.synthetic import LONGEST_PX, SIZES, Placing, Truth, draw_targets, misses, spread_views
 
 BOARD = BoardConfig()
@@ -44,6 +45,11 @@ class BudgetSettings(Settings):
     placements: tuple[int, ...] = (6, 12, 24, 48)
     looks: int = 4
     targets: int = 100
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_above(0, self, "noises_px", "placements", "looks", "targets")
 
 
 def one(_: None, settings: BudgetSettings, seed: int) -> list[Row]:

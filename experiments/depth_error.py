@@ -29,7 +29,7 @@ from cotarget.calibration import Calibration
 from cotarget.camera import depth_from_size
 from cotarget.geometry import Array
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.mounted import TARGET, at, exact_calibration, mounted, off_px, wanted_focal_px
+from experiments.mounted import TARGET, at, check_above, exact_calibration, mounted, off_px, wanted_focal_px
 from experiments.synthetic import SIZE, Truth, aim, looking_off
 
 CAUSES = ("wrong size", "scatter", "pixels", "together")
@@ -58,6 +58,12 @@ class DepthSettings(Settings):
     wrong: float = 0.1
     scatter: float = 0.1
     noise_px: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_above(0, self, "baselines", "depths", "targets", "scatter", "noise_px")
+        check_above(-1, self, "wrong")
 
 
 def one(_: None, settings: DepthSettings, seed: int) -> list[Row]:

@@ -25,7 +25,7 @@ from cotarget.config import BoardConfig
 from cotarget.geometry import Array
 from cotarget.simconfig import SimHead
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.mounted import MOUNTED_DEG, at, mounted, off_px, wanted_focal_px
+from experiments.mounted import MOUNTED_DEG, at, check_above, mounted, off_px, wanted_focal_px
 from experiments.simpler import FULL, IGNORED, MODELS, models_of
 from experiments.synthetic import SIZE, SIZES, Placing, looking_off, spread_views
 
@@ -62,6 +62,12 @@ class ModelsSettings(Settings):
     corner_px: float = 0.2
     pixel_px: float = 0.5
     depth_error: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_above(0, self, "baselines", "depths", "targets", "boards", "looks")
+        check_above(0, self, "mounted_deg", "corner_px", "pixel_px", "depth_error")
 
 
 def one(_: None, settings: ModelsSettings, seed: int) -> list[Row]:

@@ -24,7 +24,7 @@ from cotarget.errors import UnreachableError
 from cotarget.geometry import Array
 from cotarget.targeting import METHODS, Method, Reach, aim
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.mounted import at, exact_calibration, idealised, mounted, off_px, wanted_focal_px
+from experiments.mounted import at, check_above, exact_calibration, idealised, mounted, off_px, wanted_focal_px
 from experiments.synthetic import LONGEST_PX, NOMINAL_PX, SIZE, looking_off
 
 BOOK = DEFAULT_TARGETS["book"]
@@ -52,6 +52,12 @@ class ShortcutSettings(Settings):
     baseline: float = 0.4
     depths: tuple[float, ...] = (5.0, 10.0, 20.0, 50.0)
     grid: tuple[int, int] = (13, 9)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_above(0, self, "baseline", "depths")
+        check_above(1, self, "grid")
 
 
 def one(_: None, settings: ShortcutSettings, seed: int) -> list[Row]:

@@ -40,6 +40,7 @@ from cotarget.simconfig import SimConfig
 from experiments.harness import Experiment, Row, Settings, seeds_of, table
 from experiments.hold_scenes import hold_config
 from experiments.lone_camera import LoneCamera, scan_of
+from experiments.mounted import check_above
 
 NOISE = TruthNoise()
 PAIR = "pair"
@@ -63,6 +64,11 @@ class SingleSettings(Settings):
     seconds: float = SECONDS
     targets: tuple[str, ...] = LONE
     misses: tuple[float, ...] = (0.05, 0.5, 0.9)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_above(0, self, "seconds")
 
 
 def one(_: None, settings: SingleSettings, seed: int) -> list[Row]:

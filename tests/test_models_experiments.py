@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, pose
 from cotarget.tables import build
 from experiments import calibration_budget, depth_error, models, shortcut
@@ -201,6 +202,18 @@ def test_a_calibration_of_less_noise_points_better():
     fine, coarse = calibration_budget.one(None, settings, 0)
     assert fine["reached_px"] < 0.2 * coarse["reached_px"]
     assert (fine["placements"], fine["poses"]) == (6, 24)
+
+
+@pytest.mark.parametrize(("module", "given", "said"), [
+    (models, {"baselines": []}, "baselines: at least one number is needed"),
+    (depth_error, {"depths": [5.0, -1.0]}, "depths: -1 is not above 0"),
+    (shortcut, {"grid": [1, 5]}, "grid: 1 is not above 1"),
+    (calibration_budget, {"placements": [0]}, "placements: 0 is not above 0"),
+])  # fmt: skip
+def test_settings_that_cannot_be_are_refused(module, given, said):
+    settings = module.EXPERIMENT.settings
+    with pytest.raises(ConfigError, match=said):
+        build(type(settings), given, module.EXPERIMENT.name, base=settings)
 
 
 BOUNDED = (shortcut, models, depth_error, calibration_budget)
