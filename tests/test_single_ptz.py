@@ -13,7 +13,8 @@ from cotarget.sim.outlines import Outlines
 from cotarget.sim.world import SimWorld
 from experiments import single_ptz
 from experiments.bounds import compare
-from experiments.lone_camera import COAST_S, SEARCH_S, Course, LoneCamera, Sighting, scan_of
+from experiments.lone_camera import COAST_S, LoneCamera, scan_of
+from experiments.lone_course import SEARCH_S, Course, Sighting
 from experiments.workers import here
 
 BOOK = DEFAULT_TARGETS["book"]
