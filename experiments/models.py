@@ -223,7 +223,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
             values = [[row[f"{condition}_deg"] for row in mine if row["depth_m"] == depth] for depth in depths]
             low, mid, high = np.array([np.percentile(v, [25, 50, 75]) for v in values]).T
             style = {"color": "k", "lw": 2} if model == FULL else {}
-            ax.errorbar(depths, mid, [mid - low, high - mid], capsize=2, label=model, **style)  # type: ignore[arg-type]
+            ax.errorbar(depths, mid, [mid - low, high - mid], capsize=2, label=model, **style)
         ax.set(xscale="log", yscale="log", xlabel="depth [m]", title=f"{condition}, baseline {near:g} m")
     left.set_ylabel("rms pointing error [degrees]")
     middle.sharey(left)
@@ -231,8 +231,8 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
     for condition, colour in zip(CONDITIONS, ("C0", "C1"), strict=True):
         by_cell = ratios(rows, condition)
         cells = sorted(by_cell, key=_reach)
-        reach, values = [_reach(cell) for cell in cells], [np.percentile(by_cell[cell], [25, 50, 75]) for cell in cells]
-        low, mid, high = np.array(values).T
+        reach = [_reach(cell) for cell in cells]
+        low, mid, high = np.array([np.percentile(by_cell[cell], [25, 50, 75]) for cell in cells]).T
         right.errorbar(reach, mid, [mid - low, high - mid], fmt="o", ms=4, capsize=2, color=colour, label=condition)
         begin, end = regime(rows, condition)
         if np.isfinite(end):
