@@ -16,7 +16,7 @@ from cotarget.detection import Detection
 from cotarget.errors import ConfigError
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig import Frame, Image
-from cotarget.sim.appearances import Appearances
+from cotarget.sim.appearances import Appearances, CameraName
 from cotarget.sim.world import SimWorld
 
 
@@ -94,7 +94,7 @@ class TruthNoise:
 
 
 class TruthDetector:
-    """Finds the targets where they truly are in the fixed camera, with noise; needs no picture and sees no clutter.
+    """Finds the targets where they truly are in a camera, with noise; needs no picture and sees no clutter.
 
     What it finds in a frame depends on the seed and on the frame's time alone. What hides a target is not considered.
     """
@@ -108,6 +108,7 @@ class TruthDetector:
         noise: TruthNoise = TruthNoise(),
         names: Iterable[str] | None = None,
         numbers: Callable[[int], NumbersAt] = seeded,
+        camera: CameraName = "fixed",
     ) -> None:
         """Begin.
 
@@ -117,19 +118,21 @@ class TruthDetector:
             noise: how it errs.
             names: the targets to find; all by default.
             numbers: makes the random numbers of the seed.
+            camera: whose frames are searched; the fixed one's by default.
         """
+        self._camera = camera
         self._truth, self._noise, self._numbers_at = truth, noise, numbers(seed)
         self._names = tuple(truth.targets if names is None else names)
 
     def detect(self, frame: Frame) -> list[Detection]:
         """Find the targets, largest first."""
-        noise, size = self._noise, self._truth.fixed_lens.size
+        noise, size = self._noise, self._truth.lens(self._camera, frame.t).size
         rng = self._numbers_at(frame.t)
         found = []
         for name in self._names:
             # Drawn whether the target is seen or not, so that none changes another's.
             draws, luck = rng.normal(size=4).tolist(), rng.random()
-            box = self._truth.box(name, "fixed", frame.t)
+            box = self._truth.box(name, self._camera, frame.t)
             if box is None or luck < noise.miss:
                 continue
             middle, sides, clipped = [], [], False

@@ -19,7 +19,7 @@ from experiments.results import identity
 EXPERIMENTS = (
     *("hand_eye", "chain", "random_rigs", "mismatch", "honesty", "speed", "photos", "pointing", "zoom_range", "wire"),
     *("hold", "first_shot", "delay", "five_targets", "dead_zone", "sim_speed", "pipeline_speed", "sweep_speed"),
-    *("env_score", "env_speed"),
+    *("env_score", "env_speed", "shortcut", "models", "depth_error", "calibration_budget", "single_ptz"),
 )
 SHORT = 6  # digits that tell folders apart whose names cannot be written in full
 

@@ -168,16 +168,15 @@ def draw_rig(rng: np.random.Generator) -> Drawn:
     while True:
         redrawn += 1
         baseline = float(np.exp(rng.uniform(*np.log(BASELINES))))
-        direction = rng.normal(0, 1, 3)
-        direction /= np.linalg.norm(direction)
+        direction = any_direction(rng)
         if abs(direction[2]) > OUT_OF_PLANE:
             continue
-        lever = rng.normal(0, 1, 3)
-        lever *= LEVER * rng.uniform() / np.linalg.norm(lever)
+        lever = any_direction(rng)
+        lever *= LEVER * rng.uniform()
         T_fixed_zoom0 = RigidTransform.from_components(baseline * direction, _any_turn(rng, TURNED))
         truth = Truth(
-            fixed=_any_lens(rng, -0.2),
-            zoom=_any_lens(rng, -0.1),
+            fixed=any_lens(rng, -0.2),
+            zoom=any_lens(rng, -0.1),
             gamma=T_fixed_zoom0.inv(),
             hand=RigidTransform.from_components(lever, _any_turn(rng, ON_HEAD)),
             dz=float(rng.uniform(-0.01, 0.01)),
@@ -205,14 +204,19 @@ def _target_depths(grown: float) -> tuple[float, float]:
     return TARGET_DEPTHS[0] * grown, TARGET_DEPTHS[1] * grown
 
 
+def any_direction(rng: np.random.Generator) -> Array:
+    """A unit vector, (3,)."""
+    v = rng.normal(0, 1, 3)
+    return np.asarray(v / np.linalg.norm(v))
+
+
 def _any_turn(rng: np.random.Generator, largest: float) -> Rotation:
     """About any axis, by any angle up to the largest, after any roll about z."""
-    axis = rng.normal(0, 1, 3)
-    turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(0, largest))
+    turn = Rotation.from_rotvec(any_direction(rng) * rng.uniform(0, largest))
     return turn * Rotation.from_rotvec([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
 
 
-def _any_lens(rng: np.random.Generator, k1: float) -> Lens:
+def any_lens(rng: np.random.Generator, k1: float) -> Lens:
     """One like the default ones, within a few per cent."""
     focal = rng.uniform(650, 730)
     cx, cy = rng.uniform([309, 229], [329, 249])

@@ -568,9 +568,29 @@ def misses(
     x_believed = calibration.fixed.ray(pixels) * depths[:, None]
     if by_distance:
         x_believed *= np.linalg.norm(x_true, axis=1, keepdims=True) / np.linalg.norm(x_believed, axis=1, keepdims=True)
-    q = aim(calibration, x_believed)
+    return looking_off(truth, x_true, aim(calibration, x_believed), rng)
+
+
+def looking_off(truth: Truth, x_fixed: Array, q: Array, rng: np.random.Generator | None = None) -> Array:
+    """Angles between where the true zoom camera looks and points, one after the other [rad], (n,).
+
+    Args:
+        truth: the rig; its camera looks along the true ray through the middle of its image, at its shortest focal
+            length.
+        x_fixed: the points in the fixed camera's frame [m], (n, 3).
+        q: pan and tilt told to the head for each of them [rad], (n, 2).
+        rng: for the head's jitter.
+
+    Returns:
+        nan where q is.
+    """
     before = np.concatenate([np.zeros((1, 2)), q[:-1]])
     stood = np.array([truth.stands(*pair, rng) for pair in zip(q, before, strict=True)])
-    x = truth.in_zoom(x_true, stood[:, 0], stood[:, 1])
-    look = np.append(undistorted((np.array(SIZE) - 1) / 2, truth.zoom), 1.0)
+    x = truth.in_zoom(x_fixed, stood[:, 0], stood[:, 1])
+    look = np.append(middle_of(truth.zoom), 1.0)
     return np.asarray(np.arctan2(np.linalg.norm(np.cross(x, look), axis=1), x @ look))
+
+
+def middle_of(lens: Lens) -> Array:
+    """Image-plane coordinates of the middle of a camera's image, (2,)."""
+    return undistorted((np.array(SIZE) - 1) / 2, lens)

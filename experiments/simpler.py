@@ -1,0 +1,138 @@
+"""The models of the related work: where each would send the head for a pixel of the wide view and a depth.
+
+All but the look-up table are calibrations of which something is left out or known crudely; what is not said to be so is
+as in the full model. Each is taken at its best, as its users could have it.
+
+    offset ignored             the cameras' turns are known, and all of the rig is in one place
+    parallel axes              the offset is known, every axis taken as parallel, the head's axes through its camera
+                               (Choi)
+    planar translation         the same, with an offset in the wide camera's image plane alone
+                               (Bodor, Dinh, Lalonde, Marchesotti)
+    planar, turns known        that offset, with the cameras' turns known: what the plane alone costs
+    crude known offset         both mountings by tape measure and protractor, with the scatter of CRUDE
+                               (Hampapur, Stillman, Zhou)
+    look-up table              pan and tilt learnt at pixels of a grid from targets at one depth, each centred with a
+                               scatter of `Centring`, and interpolated
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import RectBivariateSpline
+
+from cotarget.calibration import Calibration
+from cotarget.geometry import Array, RigidTransform, Rotation
+from experiments.mounted import at
+from experiments.pointing import without_offsets
+from experiments.synthetic import SIZE, Truth, aim, aimed, middle_of
+
+Model = Callable[[Array, Array], Array]  # pixels (n, 2) and depths (n,) [m] -> pan and tilt (n, 2) [rad]
+
+FULL, IGNORED, PARALLEL, PLANAR = "full model", "offset ignored", "parallel axes", "planar translation"
+PLANAR_TURNED, CRUDE_OFFSET, TABLE = "planar, turns known", "crude known offset", "look-up table"
+MODELS = (FULL, IGNORED, PARALLEL, PLANAR, PLANAR_TURNED, CRUDE_OFFSET, TABLE)
+SIMPLER = MODELS[1:]
+
+
+@dataclass(frozen=True)
+class Crude:
+    """What tape measure and protractor scatter by, one standard deviation along or about each axis.
+
+    Attributes:
+        between: of the offset between the cameras [m].
+        lever: of the camera's place on the head [m].
+        turn: of either's turn [rad].
+    """
+
+    between: float = 0.02
+    lever: float = 0.01
+    turn: float = np.radians(1.0)
+
+
+@dataclass(frozen=True)
+class Centring:
+    """How a look-up table is learnt.
+
+    Attributes:
+        grid: columns and rows of pixels, from edge to edge of the wide image.
+        depth: of the targets [m].
+        scatter: of each axis when a target is brought to the middle [rad]; a person's, or a servo's, about one step
+            of the head.
+    """
+
+    grid: tuple[int, int] = (9, 7)
+    depth: float = 10.0
+    scatter: float = np.radians(0.05)
+
+
+CRUDE = Crude()
+CENTRING = Centring()
+
+
+def models_of(
+    truth: Truth,
+    calibration: Calibration,
+    rng: np.random.Generator,
+    crude: Crude = CRUDE,
+    centring: Centring = CENTRING,
+) -> Mapping[str, Model]:
+    """Every model of a rig.
+
+    Args:
+        truth: the rig, on which the table is learnt and which is measured crudely.
+        calibration: of that rig; the full model, and what the others know.
+        rng: draws the scatter.
+        crude: how the offsets are measured.
+        centring: how the table is learnt.
+    """
+    T = calibration.T_base_fixed
+    still = RigidTransform.identity()
+    planar = replace(
+        calibration,
+        T_zoom0_fixed=RigidTransform.from_translation([*T.translation[:2], 0.0]),
+        T_head_zoom=still,
+    )
+    believed = {
+        FULL: calibration,
+        IGNORED: without_offsets(calibration),
+        PARALLEL: replace(calibration, T_zoom0_fixed=RigidTransform.from_translation(T.translation), T_head_zoom=still),
+        PLANAR: planar,
+        PLANAR_TURNED: in_plane(calibration),
+        CRUDE_OFFSET: replace(
+            calibration,
+            T_zoom0_fixed=scattered(truth.gamma, crude.between, crude.turn, rng),
+            T_head_zoom=scattered(truth.hand, crude.lever, crude.turn, rng),
+        ),
+    }
+    models: dict[str, Model] = {name: _by(found) for name, found in believed.items()}
+    return models | {TABLE: learnt(truth, rng, centring)}
+
+
+def _by(calibration: Calibration) -> Model:
+    return lambda pixels, depths: aim(calibration, calibration.fixed.ray(pixels) * depths[:, None])
+
+
+def in_plane(calibration: Calibration) -> Calibration:
+    """The calibration with the head's centre in the wide camera's image plane, and its camera there too."""
+    fixed_base = calibration.T_base_fixed.inv()
+    centre = fixed_base.translation * [1.0, 1.0, 0.0]
+    base_fixed = RigidTransform.from_components(centre, fixed_base.rotation).inv()
+    hand = RigidTransform.from_rotation(calibration.hand_eye().rotation)
+    return replace(calibration, T_zoom0_fixed=hand.inv() * base_fixed, T_head_zoom=hand)
+
+
+def scattered(T: RigidTransform, shift: float, turn: float, rng: np.random.Generator) -> RigidTransform:
+    """A transform as it is measured, with a scatter of each axis [m] and of the turn about each [rad]."""
+    wrong = Rotation.from_rotvec(rng.normal(0, turn, 3))
+    return RigidTransform.from_components(T.translation + rng.normal(0, shift, 3), wrong * T.rotation)
+
+
+def learnt(truth: Truth, rng: np.random.Generator, centring: Centring = CENTRING) -> Model:
+    """A look-up table over the wide image, learnt on the rig itself; cubic between the pixels of its grid."""
+    columns, rows = (np.linspace(0.0, side - 1.0, count) for side, count in zip(SIZE, centring.grid, strict=True))
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    q = aimed(truth, at(truth, pixels, centring.depth), np.append(middle_of(truth.zoom), 1.0))
+    q = q + rng.normal(0, centring.scatter, q.shape)
+    splines = [RectBivariateSpline(rows, columns, each.reshape(len(rows), len(columns))) for each in q.T]
+    return lambda pixels, depths: np.stack([spline.ev(pixels[:, 1], pixels[:, 0]) for spline in splines], axis=-1)

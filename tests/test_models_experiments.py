@@ -1,0 +1,231 @@
+"""The experiments on simpler models: hand-worked rigs, on which each model's error is known."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cotarget.errors import ConfigError
+from cotarget.geometry import RigidTransform, pose
+from cotarget.tables import build
+from experiments import calibration_budget, depth_error, models, shortcut
+from experiments.bounds import compare
+from experiments.mounted import MOUNTED_DEG, at, exact_calibration, idealised, mounted, off_px, wanted_focal_px
+from experiments.simpler import (
+    CRUDE_OFFSET,
+    FULL,
+    IGNORED,
+    MODELS,
+    PARALLEL,
+    PLANAR,
+    PLANAR_TURNED,
+    TABLE,
+    Centring,
+    Crude,
+    models_of,
+    scattered,
+)
+from experiments.synthetic import Lens, Truth, looking_off
+from experiments.workers import here
+
+STILL = RigidTransform.identity()
+PLAIN = Lens(500.0, 500.0, 319.5, 239.5)
+B = 0.5  # baseline [m]
+# The zoom camera beside the fixed one, on the axes of its head, all axes parallel.
+BESIDE = Truth(fixed=PLAIN, zoom=PLAIN, gamma=pose([-B, 0, 0], [0, 0, 0]), hand=STILL, dz=0.0, eps=0.0)
+MIDDLE = np.array([[319.5, 239.5]])
+ANYWHERE = np.array([[40.0, 30.0], [600.0, 100.0], [300.0, 450.0], [500.0, 400.0]])
+ROUNDING = 1e-9  # [rad]; Newton's iteration ends within 1e-10
+NO_SCATTER = (Crude(0.0, 0.0, 0.0), Centring(scatter=0.0))
+
+
+def errors(truth, pixels, depth, crude=NO_SCATTER[0], centring=NO_SCATTER[1]):
+    """Of every model, which know the rig exactly but for what they leave out [rad]."""
+    found = models_of(truth, exact_calibration(truth), np.random.default_rng(0), crude, centring)
+    depths = np.full(len(pixels), depth)
+    return {name: looking_off(truth, at(truth, pixels, depth), model(pixels, depths)) for name, model in found.items()}
+
+
+def test_every_model_is_there():
+    assert tuple(errors(BESIDE, MIDDLE, 10.0)) == MODELS
+
+
+@pytest.mark.parametrize("depth", [5.0, 20.0])
+def test_ignoring_the_offset_errs_by_the_baseline_over_the_depth(depth):
+    assert errors(BESIDE, MIDDLE, depth)[IGNORED][0] == pytest.approx(math.atan(B / depth), abs=ROUNDING)
+
+
+def test_models_are_exact_on_the_rigs_that_they_assume():
+    parallel_and_in_plane = errors(BESIDE, ANYWHERE, 7.0)
+    for name in (FULL, PARALLEL, PLANAR, PLANAR_TURNED, CRUDE_OFFSET):
+        assert parallel_and_in_plane[name] == pytest.approx(0.0, abs=ROUNDING), name
+    turn = pose([0, 0, 0], [2.0, 10.0, 3.0])
+    turned = errors(replace(BESIDE, gamma=turn * BESIDE.gamma), ANYWHERE, 7.0)
+    assert turned[PLANAR_TURNED] == pytest.approx(0.0, abs=ROUNDING)
+    assert (np.degrees(turned[PLANAR]) > 5.0).all()  # what it takes for parallel is turned by more than that
+    ahead = errors(replace(BESIDE, gamma=pose([-B, 0, -B], [0, 0, 0])), ANYWHERE, 7.0)
+    assert ahead[PARALLEL] == pytest.approx(0.0, abs=ROUNDING)
+    assert (ahead[PLANAR] > 1e-3).all()
+    nowhere = replace(BESIDE, gamma=turn, hand=pose([0, 0, 0], [1.0, -2.0, 1.0]))
+    assert errors(nowhere, ANYWHERE, 7.0)[IGNORED] == pytest.approx(0.0, abs=ROUNDING)
+
+
+def test_the_look_up_table_is_exact_at_its_own_depth_and_pixels():
+    centring = Centring(grid=(5, 5), depth=8.0, scatter=0.0)
+    corners = np.array([[0.0, 0.0], [639.0, 479.0], [319.5, 239.5]])
+    truth = mounted(np.random.default_rng(3), B)
+    assert errors(truth, corners, 8.0, centring=centring)[TABLE] == pytest.approx(0.0, abs=ROUNDING)
+    # Elsewhere it is off by the angle between both depths, as seen from the zoom camera.
+    off = errors(BESIDE, MIDDLE, 32.0, centring=centring)[TABLE][0]
+    assert off == pytest.approx(math.atan(B / 8.0) - math.atan(B / 32.0), abs=ROUNDING)
+
+
+def test_scatter_is_as_large_as_it_is_told():
+    rng = np.random.default_rng(1)
+    off = [scattered(BESIDE.gamma, 0.02, np.radians(1.0), rng) for _ in range(500)]  # which tell it to 3 %
+    shifts = np.array([T.translation - BESIDE.gamma.translation for T in off])
+    turns = np.degrees([(T.rotation * BESIDE.gamma.rotation.inv()).as_rotvec() for T in off])
+    assert shifts.std(axis=0) == pytest.approx([0.02] * 3, rel=0.12)
+    assert turns.std(axis=0) == pytest.approx([1.0] * 3, rel=0.12)
+    many = errors(BESIDE, ANYWHERE, 1000.0, centring=Centring(depth=1000.0, scatter=1e-3))[TABLE]
+    assert 2e-4 < np.sqrt(np.mean(many**2)) < 4e-3
+
+
+def test_rigs_are_mounted_as_told():
+    rigs = [mounted(np.random.default_rng(seed), 1.5) for seed in range(100)]
+    baselines = np.array([np.linalg.norm(rig.gamma.inv().translation) for rig in rigs])
+    assert baselines == pytest.approx(1.5)
+    angles = np.degrees([rig.gamma.rotation.as_rotvec() for rig in rigs])
+    assert angles.std(axis=0) == pytest.approx([MOUNTED_DEG] * 3, rel=0.25)  # 100 tell it to 7 %
+    plain = idealised(rigs[0])
+    assert (plain.dz, plain.eps, plain.zoom.cx, plain.zoom.cy) == (0.0, 0.0, 319.5, 239.5)
+
+
+def test_an_error_in_the_close_up():
+    x = np.array([[B, 0.0, 8.0], [B, 0.0, 1.0], [B, 0.0, 100.0]])  # 8 m before the zoom camera, too near, too far
+    assert wanted_focal_px(BESIDE, x, size=0.8, wanted_px=160.0) == pytest.approx([1600.0, 500.0, 7155.0])
+    assert off_px(np.array([math.atan(0.1)]), np.array([2000.0])) == pytest.approx([200.0])
+
+
+def error_rows(ratios):
+    """Of one seed, "offset ignored" so many times worse than the full model at each depth over a baseline of 1 m."""
+    return [
+        {"seed": 0, "depth_m": depth, "baseline_m": 1.0, "model": name}
+        | {f"{c}_{key}": error for c in models.CONDITIONS for key in ("deg", "width")}
+        for depth, ratio in ratios.items()
+        for name in MODELS
+        for error in [0.01 * (ratio if name == IGNORED else 1.0)]
+    ]
+
+
+def test_the_regime_reaches_as_far_as_the_full_model_is_five_times_better():
+    rows = error_rows({5.0: 40.0, 10.0: 20.0, 50.0: 5.0, 100.0: 4.9, 200.0: 6.0})
+    assert models.regime(rows, "seen") == (5.0, 50.0)
+    summary = models.summarise(rows)
+    assert summary["exact"]["smallest_ratio"] == pytest.approx(4.9)
+    assert models.missed(summary) == []
+    assert "depth over baseline 5 to 50" in models.describe(models.SETTINGS, summary)
+    none = models.missed(models.summarise(error_rows({5.0: 4.0, 10.0: 20.0})))
+    assert none == [f"{c}: full model 5 times better than offset ignored" for c in models.CONDITIONS]
+
+
+def test_a_depth_error_turns_the_line_of_sight_by_the_baseline_over_the_depth():
+    x = np.array([[0.0, 0.0, 10.0]])
+    calibration = exact_calibration(BESIDE)
+    arm = depth_error.turned_by(calibration, BESIDE, x)[0]
+    assert arm == pytest.approx(10.0 * B / (10.0**2 + B**2))
+    # And it is the derivative of what really happens.
+    off = looking_off(BESIDE, x, depth_error.aim(calibration, x * 1.001))[0]
+    assert off == pytest.approx(1e-3 * arm, rel=2e-3)
+
+
+def test_depths_are_measured_by_the_size():
+    x = np.array([[0.0, 0.0, 10.0], [1.0, 0.5, 10.0]])
+    px, sizes = PLAIN.project(x), np.full(2, depth_error.TARGET.size)
+    calibration = exact_calibration(BESIDE)
+    exact = depth_error.measured_depths(calibration, BESIDE, px, x, sizes, np.zeros(2))
+    assert exact == pytest.approx([10.0, 10.0])
+    smaller = depth_error.measured_depths(calibration, BESIDE, px, x, sizes / 1.1, np.zeros(2))
+    assert smaller == pytest.approx([11.0, 11.0])
+    # 0.8 m at 10 m is 40 px: one more is 1/41 nearer.
+    noisy = depth_error.measured_depths(calibration, BESIDE, px, x, sizes, np.ones(2))
+    assert noisy == pytest.approx([10.0 * 40 / 41] * 2)
+
+
+def test_first_order_agrees_with_monte_carlo():
+    settings = replace(depth_error.SETTINGS, baselines=(0.4,), depths=(10.0,), targets=100, scatter=0.02, wrong=0.01)
+    rows = {row["cause"]: row for row in depth_error.one(None, settings, 0)}
+    for cause in depth_error.CAUSES:  # 100 normal numbers tell their rms to 7 %
+        assert rows[cause]["reached_deg"] == pytest.approx(rows[cause]["first_order_deg"], rel=0.25), cause
+    summary = depth_error.summarise(list(rows.values()))
+    assert depth_error.missed(summary) == []
+    for row in rows.values():
+        row["reached_deg"] *= 2
+    assert len(depth_error.missed(depth_error.summarise(list(rows.values())))) == len(depth_error.CAUSES)
+
+
+def test_the_exact_range_is_exact_and_the_shortcut_worse_the_farther_off_the_axis():
+    settings = replace(shortcut.SETTINGS, depths=(10.0,), grid=(5, 3))
+    rows = shortcut.one(None, settings, 0)
+    assert len(rows) == 15
+    assert max(row["exact_deg"] for row in rows) < shortcut.ROUNDING_DEG
+    by_angle = sorted(rows, key=lambda row: row["off_axis_deg"])
+    for method in ("paper-table", "paper-example"):
+        assert by_angle[0][f"{method}_deg"] < 0.2 < 1.0 < by_angle[-1][f"{method}_deg"]
+    summary = shortcut.summarise(rows)
+    assert shortcut.missed(summary) == []
+    assert summary["paper-table"]["near the axis"]["10 m"]["deg"] < summary["paper-table"]["whole view"]["10 m"]["deg"]
+    wrong = shortcut.missed(
+        shortcut.summarise([*rows, rows[0] | {"exact_deg": 0.1}, rows[0] | {"exact_deg": math.nan}])
+    )
+    assert len(wrong) == 2
+
+
+def test_how_the_error_grows_is_read_from_the_rows():
+    rows = [
+        {"noise_px": noise, "placements": n, "reached_px": 3.0 * noise * n**-0.5}
+        for noise in (0.02, 0.1, 0.5)
+        for n in (6, 12, 48)
+    ]
+    assert calibration_budget.exponents(rows) == pytest.approx((1.0, -0.5))
+
+
+@pytest.mark.slow
+def test_a_calibration_of_less_noise_points_better():
+    settings = build(
+        calibration_budget.BudgetSettings,
+        {"noises_px": [0.02, 0.5], "placements": [6]},
+        "",
+        base=replace(calibration_budget.SETTINGS, targets=20),
+    )
+    fine, coarse = calibration_budget.one(None, settings, 0)
+    assert fine["reached_px"] < 0.2 * coarse["reached_px"]
+    assert (fine["placements"], fine["poses"]) == (6, 24)
+
+
+@pytest.mark.parametrize(("module", "given", "said"), [
+    (models, {"baselines": []}, "baselines: at least one number is needed"),
+    (depth_error, {"depths": [5.0, -1.0]}, "depths: -1 is not above 0"),
+    (shortcut, {"grid": [1, 5]}, "grid: 1 is not above 1"),
+    (calibration_budget, {"placements": [0]}, "placements: 0 is not above 0"),
+])  # fmt: skip
+def test_settings_that_cannot_be_are_refused(module, given, said):
+    settings = module.EXPERIMENT.settings
+    with pytest.raises(ConfigError, match=said):
+        build(type(settings), given, module.EXPERIMENT.name, base=settings)
+
+
+BOUNDED = (shortcut, models, depth_error, calibration_budget)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", BOUNDED, ids=lambda module: module.EXPERIMENT.name)
+def test_no_figure_gets_worse(module):
+    experiment = module.EXPERIMENT
+    summary = experiment.summarise(experiment.run(experiment.quick, engine=here))
+    assert not experiment.missed or not experiment.missed(summary)
+    bounds = compare(experiment, summary)
+    assert bounds
+    for bound in bounds:
+        assert bound.kept, f"{bound.name} is {bound.reached}, not {bound.text}"

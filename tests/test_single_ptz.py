@@ -1,0 +1,153 @@
+"""A lone pan-tilt-zoom camera: where it looks, what it expects, and that it finds what it lost."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cotarget.config import DEFAULT_TARGETS
+from cotarget.oracle import TruthDetector, TruthNoise, true_calibration
+from cotarget.rig import Frame
+from cotarget.sim.outlines import Outlines
+from cotarget.sim.world import SimWorld
+from experiments import single_ptz
+from experiments.bounds import compare
+from experiments.lone_camera import COAST_S, LoneCamera, scan_of
+from experiments.lone_course import SEARCH_S, Course, Sighting
+from experiments.workers import here
+
+BOOK = DEFAULT_TARGETS["book"]
+STEP = 0.04
+
+
+def test_a_course_leads_by_its_velocity():
+    course = Course(BOOK, 0.5)
+    assert not course.known
+    side = BOOK.size / 10
+    for i in range(25):
+        t = i * STEP
+        course.saw(Sighting(t, 0.2 * t, 0.1 - 0.1 * t, (side, side / 2), False), 700.0)
+    (pan, tilt), variances = course.at(1.2)
+    assert (pan, tilt) == pytest.approx((0.24, -0.02), abs=2e-3)
+    assert course.rates == pytest.approx((0.2, -0.1), abs=5e-3)
+    assert (course.size, course.range) == (side, pytest.approx(10.0))
+    assert min(variances) > 0
+    assert course.at(2.0)[1][0] > 10 * variances[0]
+    course.saw(Sighting(9.0, 1.0, 0.0, (side, side / 2), False), 700.0)  # after that long, begun anew
+    assert course.at(9.0)[0] == pytest.approx((1.0, 0.0))
+
+
+def test_a_piece_of_a_target_tells_no_size():
+    course = Course(BOOK, 0.5)
+    course.saw(Sighting(0.0, 0.0, 0.0, (0.02, 0.01), False), 700.0)
+    course.saw(Sighting(STEP, 0.0, 0.0, (0.005, 0.01), True), 700.0)
+    assert course.sides == (0.02, 0.01)
+
+
+@pytest.fixture
+def world():
+    with (w := SimWorld(single_ptz.config_of("book", 0), rendered=())).rig:
+        yield w
+
+
+def test_a_scan_sees_all_that_the_wide_camera_does(world):
+    calibration = true_calibration(world)
+    poses = np.array(scan_of(world.rig, calibration))
+    rim = np.array([[u, v] for u in (0.0, 319.5, 639.0) for v in (0.0, 239.5, 479.0)])
+    far = calibration.fixed.ray(rim) * 1000.0  # where the cameras' offset does not count
+    x = calibration.T_base_fixed.apply(far)
+    pans, tilts = np.arctan2(x[:, 0], x[:, 2]), np.arctan2(-x[:, 1], np.hypot(x[:, 0], x[:, 2]))
+    f = calibration.zoom.stops[0].focal_px[0]
+    across, down = math.atan(320 / f), math.atan(240 / f)
+    for pan, tilt in zip(pans, tilts, strict=True):
+        near = (np.abs(poses[:, 0] - pan) < across) & (np.abs(poses[:, 1] - tilt) < down)
+        assert near.any(), np.degrees([pan, tilt])
+
+
+class Blind:
+    """Finds the book as the truth has it, until a time; then nothing."""
+
+    mask = None
+
+    def __init__(self, truth, until):
+        self._finder, self._until = TruthDetector(truth, 0, TruthNoise(0.0, 0.0, 0.0), camera="zoom"), until
+
+    def detect(self, frame):
+        return self._finder.detect(frame) if frame.t < self._until else []
+
+
+def looked(world, until, seconds):
+    """Where a camera's head was sent that sees its book until a time, by what it was doing; and its focal lengths."""
+    truth, calibration = world.truth(), true_calibration(world)
+    detector = Blind(Outlines(truth, still=True), until)
+    delay = world.config.command_delay_s
+    field = scan_of(world.rig, calibration)
+    camera = LoneCamera(world.rig, truth, calibration, BOOK, detector, delay, 0.5, field)
+    sent, move = [], world.rig.head.move
+    world.rig.head.move = lambda pan, tilt, speed=None: sent.append((pan, tilt)) or move(pan, tilt, speed)
+    modes = [(frame.t, camera.mode, truth.lens("zoom", frame.t).focal_px[0]) for frame in camera.run(seconds)]
+    return modes, sent, field
+
+
+def test_who_sees_nothing_scans_all_the_field_again_and_again(world):
+    modes, sent, field = looked(world, 0.0, 8.0)
+    assert {mode for _, mode, _ in modes} == {"scanning"}
+    assert sent[: len(field)] == field
+    assert sent[len(field)] == field[0]
+
+
+def test_who_loses_its_target_zooms_out_searches_there_and_then_scans(world):
+    lost = 3.0
+    modes, sent, field = looked(world, lost, lost + SEARCH_S + 2.0)
+    by_time = {t: mode for t, mode, _ in modes}
+    assert {mode for t, mode in by_time.items() if t < lost} == {"following"}
+    after = [mode for t, mode in by_time.items() if lost + COAST_S < t < lost + SEARCH_S - STEP]
+    assert set(after) == {"searching"}
+    assert modes[-1][1] == "scanning"
+    assert field[0] in sent
+    close = max(focal for t, _, focal in modes if t < lost)
+    assert close > 3 * modes[-1][2]
+
+
+def test_a_lone_camera_holds_a_book():
+    found = single_ptz.figures(single_ptz.by_lone("book", 1, 5.0, 0.0))
+    assert found["closeup_yield"] > 0.9
+    assert found["in_frame_of_all"] > 0.95
+    assert found["watched"] < 0.2  # of the field, all the while that it looks at a book
+
+
+def test_the_picture_moves_when_the_head_does(world):
+    truth = world.truth()
+    shaken = single_ptz.Shaken(Outlines(truth, still=True), truth, 0, 1.0)
+    image = np.zeros((480, 640, 3), np.uint8)
+    world.rig.clock.sleep_until(1.0)
+    assert not shaken.moves(0.5)
+    world.rig.head.move(0.5, 0.0)
+    world.rig.clock.sleep_until(1.6)
+    assert shaken.moves(1.3)
+    assert shaken.detect(Frame(image, 1.3)) == []
+
+
+def run_row(way, value, seconds):
+    return {"seed": 0, "target": "book", "way": way, "time_to_acquire_s": seconds, "watched": 0.1} | dict.fromkeys(
+        ("closeup_yield", "in_frame_ratio", "in_frame_of_all", "tpo_width_median"), value
+    )
+
+
+def test_summaries_are_means_and_a_run_without_acquisition_counts():
+    rows = [run_row("pair", 0.8, 1.0), run_row("pair", 1.0, 3.0), run_row("lone", 0.5, None)]
+    summary = single_ptz.summarise(rows)
+    assert summary["book"]["pair"]["closeup_yield"] == pytest.approx(0.9)
+    assert summary["book"]["pair"]["closeup_yield_error"] == pytest.approx(0.1)
+    assert (summary["book"]["pair"]["time_to_acquire_s"], summary["book"]["lone"]["never_acquired"]) == (2.0, 1.0)
+    assert "book, lone" in single_ptz.describe(replace(single_ptz.SETTINGS), summary)
+
+
+@pytest.mark.slow
+def test_no_figure_gets_worse():
+    experiment = single_ptz.EXPERIMENT
+    bounds = compare(experiment, experiment.summarise(experiment.run(experiment.quick, engine=here)))
+    assert bounds
+    for bound in bounds:
+        assert bound.kept, f"{bound.name} is {bound.reached}, not {bound.text}"
