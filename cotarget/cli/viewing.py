@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.choosing import check_shown
@@ -32,8 +33,9 @@ def view(options: argparse.Namespace) -> None:
     if options.calibration is not None and options.target is None:
         raise ConfigError("--calibration: is for following a target; name it: --target NAME")
     config = _config(options)
+    opened = _opener(options)  # which refuses what cannot be before the world is made, as that takes a while
     world = SimWorld(config)
-    with closing(world), closing(_window(options, world.truth())) as window:
+    with closing(world), closing(opened(world.truth())) as window:
         print(f"{window.where} shows the scene; Ctrl-C ends it", file=sys.stderr, flush=True)
         try:
             watch(_sights(options, config, world), window, time.monotonic, time.sleep)
@@ -79,14 +81,20 @@ def _config(options: argparse.Namespace) -> "RigConfig":
     return config
 
 
-def _window(options: argparse.Namespace, truth: "Truth") -> Any:
+def _opener(options: argparse.Namespace) -> "Callable[[Truth], Any]":
+    """What opens the window on a world's truth.
+
+    Raises:
+        DeviceError: there is no display, no web viewer, or the port is taken.
+    """
     if options.browser:
-        from cotarget.sim.browser import BrowserWindow
+        from cotarget.sim.browser import BrowserWindow, listen
 
-        return BrowserWindow(truth, PORT if options.port is None else options.port)
-    from cotarget.sim.desktop import DesktopWindow
+        return partial(BrowserWindow, listener=listen(PORT if options.port is None else options.port))
+    from cotarget.sim.desktop import DesktopWindow, check_display
 
-    return DesktopWindow(truth)
+    check_display()
+    return DesktopWindow
 
 
 def _sights(options: argparse.Namespace, config: "RigConfig", world: "SimWorld") -> "Iterator[Sight]":

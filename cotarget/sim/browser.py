@@ -35,25 +35,25 @@ TITLE = "cotarget"
 START_S = 20.0  # for the viewer to come up [s]
 PICTURE_PX = 400  # width of a camera's picture in the page
 MARGIN_PX = 12
-FONT_PX = 28  # a window's title bar, and its border
+TITLE_PX = 30  # a window's title bar
+AFTER_ALL = messages.Priority.INTERNAL - 1  # of handlers: after the viewer's own
 NAMES = {"fixed": "wide camera", "zoom": "zoom camera"}
 
 
 class BrowserWindow:
     """MuJoCo's web viewer, with the frusta in the scene and both cameras' pictures in windows of their own."""
 
-    def __init__(self, truth: Truth, port: int) -> None:
+    def __init__(self, truth: Truth, listener: socket.socket) -> None:
         """Begin to serve the page.
 
         Args:
             truth: of the world that is shown.
-            port: to serve it at, on this machine alone; 0 for any that is free.
+            listener: where to serve it; closed with the window.
 
         Raises:
-            DeviceError: the port is taken, or the viewer does not start.
+            DeviceError: the viewer does not start.
         """
         logging.getLogger("WebServer").setLevel(logging.WARNING)  # who comes and goes is nobody's business
-        listener = _listen(port)
         self.where = f"http://{HOST}:{listener.getsockname()[1]}/"
         self._onlooker = Onlooker(truth)
         self._overlay = Overlay(self._onlooker.aim)
@@ -69,7 +69,6 @@ class BrowserWindow:
             started.put(None)
             viewer_protocol.run_viewer_loop(viewer)
 
-        self._quiet = contextlib.ExitStack()
         with contextlib.redirect_stdout(io.StringIO()):  # its banner; the command says where the page is
             self._handle = launch_thread.launch_thread(serve)
             if (failed := started.get(timeout=START_S)) is not None:
@@ -125,7 +124,7 @@ class Overlay:
         self._uploaded: Sight | None = None
         self._textures: dict[str, tuple[int, int, int]] = {}
 
-    @messages.handler  # type: ignore[untyped-decorator]
+    @messages.handler(priority=AFTER_ALL)  # type: ignore[untyped-decorator]
     def on_model(self, _: messages.PostModelEvent) -> None:
         """Look at a model that is new."""
         self._aim(self.viewer.camera, self.viewer.vis_options)
@@ -155,7 +154,7 @@ class Overlay:
             if name == "zoom" and self.sight is not None:
                 imgui.TextUnformatted(self.sight.caption)
             imgui.End()
-            top += height + FONT_PX + MARGIN_PX
+            top += height + TITLE_PX + MARGIN_PX
 
     def _upload(self, name: str, picture: Any) -> None:
         """Send a camera's picture to the browser."""
@@ -167,8 +166,15 @@ class Overlay:
         self._textures[name] = (texture, *size)
 
 
-def _listen(port: int) -> socket.socket:
-    """A socket that only this machine reaches."""
+def listen(port: int) -> socket.socket:
+    """A socket that only this machine reaches.
+
+    Args:
+        port: 0 for any that is free.
+
+    Raises:
+        DeviceError: the port is taken, or not this user's.
+    """
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:

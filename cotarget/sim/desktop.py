@@ -23,15 +23,14 @@ class DesktopWindow:
     """MuJoCo's passive viewer, with the frusta in the scene and both cameras' pictures at the window's right."""
 
     def __init__(self, truth: Truth) -> None:
-        """Open the window.
+        """Open the window; `check_display` has been asked before the world was made.
 
         Args:
             truth: of the world that is shown.
 
         Raises:
-            DeviceError: the machine has no display that can show it.
+            DeviceError: the viewer does not open.
         """
-        _check_display()
         import mujoco.viewer  # which needs GLFW
 
         self._onlooker = Onlooker(truth)
@@ -81,8 +80,10 @@ def _placed(pictures: list[Image], width: int, height: int) -> "list[tuple[mujoc
     return placed
 
 
-def _check_display() -> None:
-    """Refuse a machine on which the viewer would wait for ever.
+def check_display() -> None:
+    """Refuse a machine on which the viewer would wait for ever; to be asked before anything is rendered.
+
+    A window of GLFW's that is opened and closed after that leaves Mesa with a context that no thread can take.
 
     Raises:
         DeviceError: there is no display, or it has no OpenGL.

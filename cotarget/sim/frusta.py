@@ -11,7 +11,8 @@ from cotarget.sim.appearances import CameraName
 from cotarget.sim.lens import TrueLens
 from cotarget.sim.truth import Truth
 
-FAR = 12.0  # where a frustum ends that nobody says better of, along the camera's axis [m]
+# Where a frustum ends that nobody says better of, along the axis [m]; the wide one's before it meets the floor.
+FAR: Mapping[CameraName, float] = {"fixed": 4.0, "zoom": 8.0}
 SIDE_POINTS = 8  # segments of each side of a frustum's end, which distortion bends
 
 
@@ -66,10 +67,7 @@ def frusta_of(truth: Truth, t: float, depths: Mapping[CameraName, float] | None 
     Args:
         truth: of the world.
         t: up to now [s].
-        depths: where they end, along each camera's axis [m]; 12 m unless said.
+        depths: where they end, along each camera's axis [m].
     """
-    cameras: tuple[CameraName, ...] = ("fixed", "zoom")
-    return {
-        name: frustum_lines(truth.T_world_camera(name, t), truth.lens(name, t), (depths or {}).get(name, FAR))
-        for name in cameras
-    }
+    ends = {**FAR, **(depths or {})}
+    return {name: frustum_lines(truth.T_world_camera(name, t), truth.lens(name, t), end) for name, end in ends.items()}

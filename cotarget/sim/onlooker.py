@@ -67,6 +67,7 @@ def line_geoms(sight: Sight, geoms: "Iterator[mujoco.MjvGeom]") -> int:
         colour = np.array(COLOURS[name], dtype=np.float32)
         for (begin, end), geom in zip(lines, geoms, strict=False):
             mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), colour)
+            geom.emission = 1.0  # as bright in the shade
             mujoco.mjv_connector(geom, kind, LINE_PX, begin, end)
             drawn += 1
     return drawn
