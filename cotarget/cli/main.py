@@ -88,7 +88,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="cotarget", description=cotarget.__doc__)
+    parser = _Parser(prog="cotarget", description=(cotarget.__doc__ or "").partition("\n")[0])
     parser.add_argument("--version", action="version", version=f"cotarget {cotarget.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
