@@ -1,11 +1,11 @@
 """Two cameras that cooperate: a wide one finds a small target, a zoom camera on a pan-tilt unit shows it large.
 
 The pipeline: a rig is calibrated from pictures of a board (`cotarget.calibration`). Then, for each frame of the wide
-camera, a detector finds the target (`cotarget.detection`), a tracker keeps its identity (`cotarget.tracking`), a filter
-estimates where it is in 3D from its known size and from both views (`cotarget.estimation`, `cotarget.closeup`), the exact
-inverse gives pan, tilt and focal length (`cotarget.targeting`, `cotarget.pantilt`), and a servo sends head and lens
-there, ahead of all delays (`cotarget.servo`). `cotarget.loop.follow` does all that and yields one `cotarget.loop.Step` a
-frame; whatever draws, scores or records reads Steps.
+camera, a detector finds the target (`cotarget.detection`), a tracker keeps its identity (`cotarget.tracking`), a
+filter estimates where it is in 3D from its known size and from both views (`cotarget.estimation`,
+`cotarget.closeup`), the exact inverse gives pan, tilt and focal length (`cotarget.targeting`, `cotarget.pantilt`),
+and a servo sends head and lens there, ahead of all delays (`cotarget.servo`). `cotarget.loop.follow` does all that
+and yields one `cotarget.loop.Step` a frame; whatever draws, scores or records reads Steps.
 
 The pipeline sees only a `cotarget.rig.Rig`: two cameras, a pan-tilt unit, a clock, and a board for calibration. Whether
 that is simulated, real or a recording is up to the rig.toml (`cotarget.config`) that `cotarget.rig.open_rig` opens.
