@@ -14,6 +14,7 @@ from cotarget.cli.choosing import check_shown
 from cotarget.errors import ConfigError
 
 if TYPE_CHECKING:
+    from cotarget.calibration import Calibration
     from cotarget.config import RigConfig
     from cotarget.rig import Rig
     from cotarget.sim.frusta import Sight
@@ -26,6 +27,7 @@ LOOKED_AT = ("person", "bird")  # who is there, where nobody says who
 
 def view(options: argparse.Namespace) -> None:
     """Cotarget view."""
+    from cotarget.calibration import load_calibration
     from cotarget.sim.world import SimWorld
 
     if options.port is not None and not options.browser:
@@ -33,12 +35,13 @@ def view(options: argparse.Namespace) -> None:
     if options.calibration is not None and options.target is None:
         raise ConfigError("--calibration: is for following a target; name it: --target NAME")
     config = _config(options)
+    calibration = None if options.calibration is None else load_calibration(options.calibration)
     opened = _opener(options)  # which refuses what cannot be before the world is made, as that takes a while
     world = SimWorld(config)
     with closing(world), closing(opened(world.truth())) as window:
         print(f"{window.where} shows the scene; Ctrl-C ends it", file=sys.stderr, flush=True)
         try:
-            watch(_sights(options, config, world), window, time.monotonic, time.sleep)
+            watch(_sights(options, config, world, calibration), window, time.monotonic, time.sleep)
         except KeyboardInterrupt:
             print("", file=sys.stderr)
 
@@ -97,8 +100,11 @@ def _opener(options: argparse.Namespace) -> "Callable[[Truth], Any]":
     return DesktopWindow
 
 
-def _sights(options: argparse.Namespace, config: "RigConfig", world: "SimWorld") -> "Iterator[Sight]":
+def _sights(
+    options: argparse.Namespace, config: "RigConfig", world: "SimWorld", calibration: "Calibration | None"
+) -> "Iterator[Sight]":
     """What there is to see: the pipeline at work where there is a target, else the rig at rest."""
+    from cotarget.oracle import true_calibration
     from cotarget.safety import SafeRig
 
     seconds = math.inf if options.seconds is None else options.seconds
@@ -106,7 +112,7 @@ def _sights(options: argparse.Namespace, config: "RigConfig", world: "SimWorld")
         if options.target is None:
             yield from _at_rest(rig, world.truth(), seconds)
         else:
-            yield from _followed(options, config, world, rig, seconds)
+            yield from _followed(options.target, config, calibration or true_calibration(world), world, rig, seconds)
 
 
 def _at_rest(rig: "Rig", truth: "Truth", seconds: float) -> "Iterator[Sight]":
@@ -123,22 +129,19 @@ def _at_rest(rig: "Rig", truth: "Truth", seconds: float) -> "Iterator[Sight]":
 
 
 def _followed(
-    options: argparse.Namespace, config: "RigConfig", world: "SimWorld", rig: "Rig", seconds: float
+    name: str, config: "RigConfig", calibration: "Calibration", world: "SimWorld", rig: "Rig", seconds: float
 ) -> "Iterator[Sight]":
-    from cotarget.calibration import load_calibration
     from cotarget.detection import make_detector
     from cotarget.drawing import draw_wide, draw_zoom
     from cotarget.loop import FollowSettings, follow
-    from cotarget.oracle import true_calibration
     from cotarget.sim.frusta import Sight, frusta_of
 
     truth = world.truth()
-    calibration = true_calibration(world) if options.calibration is None else load_calibration(options.calibration)
-    target = config.target(options.target)
+    target = config.target(name)
     settings = FollowSettings(command_delay_s=config.command_delay_s, lens_delay_s=config.lens_delay_s)
     detector = make_detector(target, config.rate_hz)
     for step in follow(rig, calibration, target, detector, seconds=seconds, settings=settings):
         depths = {} if step.aim is None else {"zoom": step.aim.range}
-        caption = f"t = {step.t:.1f} s   {options.target}: {step.state}"
+        caption = f"t = {step.t:.1f} s   {name}: {step.state}"
         pictures = {"fixed": draw_wide(step), "zoom": draw_zoom(step)}
         yield Sight(step.t, caption, pictures, frusta_of(truth, step.t, depths))  # type: ignore[arg-type]
