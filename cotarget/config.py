@@ -225,6 +225,7 @@ def load_config(path: Path) -> RigConfig:
     }
     scene = path.parent / config.sim.scene
     sim = dataclasses.replace(config.sim, scene=str(scene)) if scene.is_file() else config.sim
+    sim = dataclasses.replace(sim, models={name: path.parent / model for name, model in sim.models.items()})
     recording = config.recording and path.parent / config.recording
     safety = dataclasses.replace(
         config.safety, stop_file=config.safety.stop_file and path.parent / config.safety.stop_file

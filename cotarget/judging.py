@@ -17,6 +17,7 @@ from cotarget.rig import Frame
 from cotarget.sim.appearances import Appearances, Silhouette
 from cotarget.sim.targets import marker_of
 from cotarget.sim.truth import Truth
+from cotarget.simconfig import TARGETS, split_name
 from cotarget.targeting import Method, Reach, aim
 from cotarget.tracking import Track
 
@@ -61,6 +62,7 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
     wide_px = truth.pixel("fixed", truth.center(name, t_fixed), t_fixed)
     wide_outlines = {each: truth.silhouette(each, "fixed", t_fixed) for each in truth.targets}
     wide_outline = wide_outlines[name]
+    marker = marker_of(name) if split_name(name)[0] in TARGETS else None  # a user's own carries none
     pan, tilt = truth.head_at(t)
     followed = step.target
     alone = followed is not None and not followed.missed and not followed.shared
@@ -76,8 +78,8 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
         v_wide_px=float(wide_px[1]),
         u_detected_px=float(detected[0]),
         v_detected_px=float(detected[1]),
-        decoded=decodes(step.zoom, outline, marker_of(name)),
-        decoded_wide=decodes(step.fixed, wide_outline, marker_of(name)),
+        decoded=marker is not None and decodes(step.zoom, outline, marker),
+        decoded_wide=marker is not None and decodes(step.fixed, wide_outline, marker),
         off_target=" ".join(str(i) for i in off_target(step.tracks, wide_outlines.values())),
         range_m=float(np.linalg.norm(truth.center(name, t) - truth.T_world_camera("zoom", t).translation)),
         depth_m=math.nan if step.aim is None else step.aim.depth,

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from cotarget.simconfig import TARGETS, SimCamera, SimConfig, SimZoomCamera, spl
 CHECKED_FOCALS = 33
 # Farther than any lens is long: an entrance pupil that moves so far was given in millimetres [m].
 FARTHEST_PUPIL = 1.0
+MODEL_SUFFIXES = (".obj", ".stl", ".xml")  # of what a target of one's own is made of
 
 
 def check_sim(sim: SimConfig) -> None:
@@ -31,7 +33,13 @@ def check_sim(sim: SimConfig) -> None:
     for name, waypoints in sim.paths.items():
         if len(waypoints) < 2 or any(b[0] <= a[0] for a, b in itertools.pairwise(waypoints)):
             raise ConfigError(f"sim.paths.{name}: needs two or more waypoints [t, x, y, z] with increasing t")
+    _check_models(sim)
     _check_targets(sim)
+    for name in sim.targets:
+        if split_name(name)[0] in sim.models and name not in sim.paths:
+            raise ConfigError(
+                f"sim.targets: a {name} of your own needs a way: [sim.paths] {name} = [[t, x, y, z], ...]"
+            )
 
 
 def check_numbers(sim: SimConfig) -> None:
@@ -81,17 +89,31 @@ def check_numbers(sim: SimConfig) -> None:
         raise ConfigError(f"sim.zoom.lens_steps: {sim.zoom.lens_steps} is fewer than 2")
 
 
-def told_targets() -> str:
-    """Which targets the simulation has, for messages."""
-    return f"the simulation has: {choices(TARGETS)}, and further ones with a number, as 'bird2'"
+def told_targets(own: Iterable[str] = ()) -> str:
+    """Which targets the simulation has, with those of [sim.models], for messages."""
+    return (
+        f"the simulation has: {choices([*TARGETS, *own])}, and further ones with a number, as 'bird2'; others need a "
+        "model: [sim.models]"
+    )
+
+
+def _check_models(sim: SimConfig) -> None:
+    """Refuse models of targets that the simulation has, and files that can be none."""
+    for name, path in sim.models.items():
+        if name in TARGETS:
+            raise ConfigError(f"sim.models.{name}: the simulation has a {name} of its own; give yours another name")
+        if split_name(name)[1] > 1:
+            raise ConfigError(f"sim.models.{name}: a model is of a kind; give its name without the number")
+        if path.suffix not in MODEL_SUFFIXES:
+            raise ConfigError(f"sim.models.{name}: {path} is not one of: {choices(MODEL_SUFFIXES)}")
 
 
 def _check_targets(sim: SimConfig) -> None:
     """Refuse targets of which there is no model, and two of a name."""
     for where, names in (("sim.targets", sim.targets), ("sim.paths", tuple(sim.paths))):
         for at, name in enumerate(names):
-            if split_name(name)[0] not in TARGETS:
-                raise ConfigError(f"{where}: unknown target '{name}'; {told_targets()}")
+            if split_name(name)[0] not in (*TARGETS, *sim.models):
+                raise ConfigError(f"{where}: unknown target '{name}'; {told_targets(sim.models)}")
             if name in names[:at]:
                 raise ConfigError(f"{where}: '{name}' is named twice; a further one has a number, as 'bird2'")
 

@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 from cotarget.errors import ConfigError
@@ -236,6 +237,8 @@ class SimConfig:
         zoom: the zoom camera.
         head: the pan-tilt unit.
         effects: switches.
+        models: for targets of one's own, by name: a mesh in metres (.obj, .stl), x forward and z up, or an MJCF file
+            with one body; a relative path is relative to rig.toml.
         paths: for a target of that name, waypoints [t, x, y, z] (seconds, metres in the world) of a smooth path
             that replaces the built-in one.
     """
@@ -249,6 +252,7 @@ class SimConfig:
     zoom: SimZoomCamera = SimZoomCamera()
     head: SimHead = SimHead()
     effects: SimEffects = SimEffects()
+    models: Mapping[str, Path] = field(default_factory=dict)
     paths: Mapping[str, tuple[Waypoint, ...]] = field(default_factory=dict)
 
 

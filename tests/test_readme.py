@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from cotarget import cli
-from cotarget.config import DEFAULT_TARGETS, parse_config
+from cotarget.calibration import load_calibration
+from cotarget.config import DEFAULT_TARGETS, load_config, parse_config
 from cotarget.film import COLUMNS as FILM_COLUMNS
+from cotarget.oracle import true_calibration
 from cotarget.recording import COLUMNS as STEP_COLUMNS
 from cotarget.rig import Frame
+from cotarget.sim.world import SimWorld
 from experiments.__main__ import main
 from experiments.cases import choose, known_experiments
 
@@ -112,12 +115,55 @@ def test_every_module_is_told_of_and_no_other():
     assert parts <= set(told)
 
 
+def block_after(mark, language):
+    """The block of code after a comment."""
+    (found,) = re.findall(rf"<!-- {mark} -->\n```{language}\n(.*?)```", README, re.DOTALL)
+    return found
+
+
+def python_with(word):
+    """The one block of Python in which a word stands."""
+    (found,) = (block for block in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if word in block)
+    return found
+
+
+def test_target_and_scene_of_ones_own_are_there_as_shown(tmp_path):
+    from tests.test_own_models import BOX
+
+    (tmp_path / "rig.toml").write_text(block_after("own", "toml"))
+    (tmp_path / "yard.xml").write_text(block_after("yard", "xml"))
+    (tmp_path / "dog.obj").write_text(BOX)
+    world = SimWorld(load_config(tmp_path / "rig.toml"), rendered=())
+    truth = world.truth()
+    assert not 0 <= truth.center_px("dog", "fixed", 4.0)[0] < 640  # while the background is learnt
+    assert truth.silhouette("dog", "fixed", 9.0).visible == 1.0
+    world.close()
+
+
+@pytest.mark.render
+def test_the_library_in_ten_lines_runs(capsys):
+    block = python_with("true_calibration")
+    assert len(block.strip().splitlines()) <= 11  # with the empty one
+    exec(block.replace("seconds=8.0", "seconds=0.2"), {})
+    *_, last = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"0\.\d\d s: following, \[[\d. ]+\] px", last)
+
+
+@pytest.mark.render
+def test_the_library_on_any_rig_runs(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text('[sim]\nscene = "indoor"\ntargets = ["book"]\n')
+    world = SimWorld(load_config(tmp_path / "rig.toml"), rendered=())
+    # To calibrate takes half a minute, and has tests of its own.
+    monkeypatch.setattr("cotarget.calibration.calibrate_rig", lambda rig, board: true_calibration(world))
+    exec(python_with("SafeRig").replace("seconds=8.0", "seconds=0.1"), {})
+    assert "searching" in capsys.readouterr().out
+    assert load_calibration(tmp_path / "calibration.json").T_head_zoom is not None
+
+
 def test_the_detector_of_ones_own_finds_what_it_says():
-    (example,) = (
-        block for block in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if "ExternalDetector" in block
-    )
     names = {}
-    exec(example, names)
+    exec(python_with("ExternalDetector"), names)
     picture = np.full((60, 80, 3), 128, np.uint8)
     picture[20:30, 50:65] = (0, 0, 255)
     (found,) = names["detector"].detect(Frame(picture, 0.0))

@@ -117,7 +117,8 @@ def rig_files(rig: Path | None, config: "RigConfig") -> list[Path | None]:
     """Files and folders that a rig is opened with, none of which may be a result too: rig.toml, and what it names."""
     scene = Path(config.sim.scene)
     templates = [target.template for target in config.targets.values()]
-    return [rig, config.safety.stop_file, config.recording, scene if scene.is_file() else None, *templates]
+    own = scene if scene.is_file() else None
+    return [rig, config.safety.stop_file, config.recording, own, *config.sim.models.values(), *templates]
 
 
 def _real(path: Path) -> Path:

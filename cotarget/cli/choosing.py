@@ -56,10 +56,14 @@ def check_shown(config: "RigConfig", name: str, rig: Path) -> None:
     from cotarget.simchecks import told_targets
     from cotarget.simconfig import TARGETS, split_name
 
+    own = config.sim.models
+
     if config.backend != "sim" or name in config.sim.targets:
         return
-    if split_name(name)[0] not in TARGETS:
-        raise ConfigError(f"--target: a simulated {name} cannot be, whatever [targets.{name}] says; {told_targets()}")
+    if split_name(name)[0] not in (*TARGETS, *own):
+        raise ConfigError(
+            f"--target: a simulated {name} cannot be, whatever [targets.{name}] says; {told_targets(own)}"
+        )
     raise ConfigError(
         f"{rig}: the simulated scene has no {name}; add it: [sim] targets = {json.dumps([*config.sim.targets, name])}"
     )

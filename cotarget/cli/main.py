@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import cotarget
-from cotarget.cli import aiming, calibrating, emulating, operating, running
+from cotarget.cli import aiming, calibrating, emulating, operating, running, viewing
 from cotarget.cli.arguments import corners, count, not_negative, number, port, positive
 from cotarget.cli.choosing import add_choice
 from cotarget.errors import CotargetError
@@ -88,7 +88,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="cotarget", description=cotarget.__doc__)
+    parser = _Parser(prog="cotarget", description=(cotarget.__doc__ or "").partition("\n")[0])
     parser.add_argument("--version", action="version", version=f"cotarget {cotarget.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -244,6 +244,14 @@ def _parser() -> argparse.ArgumentParser:
     )
     emulate.more = emulating.fault_names
     emulate.add_argument("--seconds", type=positive, metavar="S", help="for how long (until Ctrl-C)")
+
+    view = command("view", viewing.view, "show the simulated scene, both cameras' frusta and what they see")
+    view.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml of the simulated rig (the default rig)")
+    view.add_argument("--target", metavar="NAME", help="follow this target of rig.toml meanwhile")
+    view.add_argument("--calibration", type=Path, metavar="FILE", help="to follow by (the simulation's true one)")
+    view.add_argument("--browser", action="store_true", help="in a web browser, on this machine alone")
+    view.add_argument("--port", type=port, metavar="P", help=f"of the page; 0: any that is free ({viewing.PORT})")
+    view.add_argument("--seconds", type=positive, metavar="S", help="for how long (until it is closed, or Ctrl-C)")
 
     detect = command("detect", running.detect, "run the fixed camera's detector and tracker on any film")
     detect.add_argument("film", type=Path, metavar="VIDEO")

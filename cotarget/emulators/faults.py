@@ -15,7 +15,7 @@ class Faults:
 
     def __init__(self, known: Iterable[str]) -> None:
         self._known = frozenset(known)
-        self._active: set[str] = set()
+        self._active = set[str]()  # no annotation: a method is named as the type
         self._changed = threading.Condition()
 
     @property

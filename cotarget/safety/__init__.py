@@ -31,5 +31,6 @@ def __getattr__(name: str) -> Any:
     if name == "SafeRig":
         from cotarget.safety.saferig import SafeRig
 
+        globals()[name] = SafeRig  # found without asking from now on, by documentation tools too
         return SafeRig
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

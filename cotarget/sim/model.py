@@ -12,6 +12,7 @@ from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pattern import tiles
 from cotarget.sim.clutter import INDOORS, add_clutter
 from cotarget.sim.opengl import mujoco
+from cotarget.sim.ownmodels import own_model
 from cotarget.sim.targets import Target, change_marker, scale_spec
 
 # The only place where MuJoCo's camera axes (x right, y up, z back) become OpenCV's (x right, y down, z forward).
@@ -72,10 +73,7 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
     _edit_rig(rig, config.sim, _site_pose(path.absolute(), path.stat().st_mtime_ns), render_size)
     _attach(spec, rig, RIG)
     for target in targets:
-        asset = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / target.asset))
-        scale_spec(asset, target.size)
-        change_marker(asset, target.name)
-        _attach(spec, asset, f"{target.name}/")
+        _attach(spec, _target_spec(target), f"{target.name}/")
     _add_board(spec, config.board)
     if has_clutter(config.sim):
         add_clutter(spec, config.sim.seed)
@@ -88,6 +86,16 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
         return spec.compile()
     except ValueError as error:
         raise ConfigError(f"{path}: does not compile with the rig: {' '.join(str(error).split())}") from None
+
+
+def _target_spec(target: Target) -> "mujoco.MjSpec":
+    """A target's model."""
+    if target.own is not None:
+        return own_model(target.own, target.kind)
+    asset = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / f"{target.kind}.xml"))
+    scale_spec(asset, target.size)
+    change_marker(asset, target.name)
+    return asset
 
 
 def has_clutter(sim: SimConfig) -> bool:

@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -68,26 +69,26 @@ class Target:
 
     Attributes:
         name: its kind, and a number where it is not the first of its kind.
-        asset: file in sim_assets/targets.
         beat_s: period of its limbs' motion [s]; 0 for a rigid target.
         size: true size over the model's.
         path: where it goes.
         phase: where in its limbs' motion it starts [rad].
         grounded: whether its height follows from its size, because it stands on the ground.
+        own: file of a user's own model; it has no moving parts, and its true size is the model's.
     """
 
     name: str
-    asset: str
     beat_s: float
     size: float
     path: Path = field(repr=False)
     phase: float = 0.0
     grounded: bool = False
+    own: FilePath | None = None
 
     @property
     def kind(self) -> str:
-        """One of TARGETS; also the name of the model's body."""
-        return kind_of(self.name)
+        """One of TARGETS, or of a user's own; also the name of the model's body."""
+        return split_name(self.name)[0]
 
     @property
     def body(self) -> str:
@@ -118,6 +119,8 @@ class Target:
             return position, turned(*face_mount(position, t, self.phase)), {}
         if kind == "bird":
             return position, bank(heading(position, velocity), acceleration), flap(beat)
+        if self.own is not None:
+            return position, heading(position, velocity), {}
         joints, bob = walk(beat, min(math.hypot(*velocity) / WALK_SPEED, 1.0))
         axes = heading(position, [*velocity[:2], 0.0 * velocity[2]])  # whoever walks stays upright
         position[2] += bob * self.size + (0.5 * PERSON_HEIGHT * self.size if self.grounded else 0.0)
@@ -131,7 +134,12 @@ class Target:
 
 
 def make_target(
-    name: str, scene: str, rng: np.random.Generator, scatter: bool, waypoints: Sequence[Waypoint] | None = None
+    name: str,
+    scene: str,
+    rng: np.random.Generator,
+    scatter: bool,
+    waypoints: Sequence[Waypoint] | None = None,
+    own: FilePath | None = None,
 ) -> Target:
     """Make one target.
 
@@ -142,10 +150,15 @@ def make_target(
         rng: source of the small differences between one run and the next; same seed, same path.
         scatter: whether the true size differs from what the pipeline is told.
         waypoints: [t, x, y, z] of the body's centre in the world [s, m] to go through instead.
+        own: file of a user's own model, which needs waypoints.
 
     Raises:
         ConfigError: no such target, or waypoints that do not advance in time.
     """
+    if own is not None:
+        if waypoints is None:
+            raise ConfigError(f"sim.targets: a {name} of your own needs a way: [sim.paths] {name}")
+        return Target(name, 0.0, 1.0, waypoint_path(waypoints, f"sim.paths.{name}"), own=own)
     kind = kind_of(name)
     # Drawn whether used or not, so that no switch changes the path.
     size = draw_size(name, rng, scatter)
@@ -154,7 +167,7 @@ def make_target(
     path = make(scene, rng) if waypoints is None else waypoint_path(waypoints, f"sim.paths.{name}")
     beat_s = {"book": 0.0, "person": STRIDE / WALK_SPEED, "bird": 1 / WING_BEAT_HZ}[kind]
     grounded = kind == "person" and waypoints is None
-    return Target(name, f"{kind}.xml", beat_s, size, path, phase, grounded)
+    return Target(name, beat_s, size, path, phase, grounded)
 
 
 def target_rng(seed: int, name: str) -> np.random.Generator:

@@ -31,6 +31,7 @@ from cotarget.sim.state import WorldState
 from cotarget.sim.targets import Target, make_target, target_rng
 from cotarget.sim.truth import Truth
 from cotarget.sim.views import Views
+from cotarget.simconfig import split_name
 
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -173,7 +174,8 @@ class SimWorld:
     def _make_target(self, name: str) -> Target:
         sim = self.config.sim
         rng = target_rng(sim.seed, name)
-        return make_target(name, sim.scene, rng, sim.effects.scatter, sim.paths.get(name))
+        own = sim.models.get(split_name(name)[0])
+        return make_target(name, sim.scene, rng, sim.effects.scatter, sim.paths.get(name), own)
 
     def _lenses(self) -> list[TrueLens]:
         """Of both cameras, over all focal lengths."""
