@@ -11,7 +11,7 @@ class Pictured:
 
     Attributes:
         rows: as without pictures.
-        pictures: PNGs by the names of their files, without ending. Like the rows they depend on settings and seed alone.
+        pictures: PNGs by the names of their files, without ending; like the rows of settings and seed alone.
     """
 
     rows: list[dict[str, Any]]

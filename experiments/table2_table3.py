@@ -115,6 +115,7 @@ def _parameter(rows: Sequence[Row]) -> dict[str, float]:
     return {
         "true": rows[0]["true"],
         "first": rows[0]["found"],
+        "first_sigma": rows[0]["sigma"],
         "found": float(np.mean([row["found"] for row in rows])),
         "sigma": rms(row["sigma"] for row in rows),
         "error": rms(row["error"] for row in rows),
@@ -144,11 +145,16 @@ def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
     """Both tables in the paper's layout, then error and standard deviation of each parameter."""
     return "\n\n".join(
         [
-            f"Table 2, intrinsics: found (mean of {seeds_of(settings)}) ± predicted standard deviation of one run\n"
-            + table(("rows are [v, u]", "focal length, px", "mm", "centre, px", "CCD, mm", "pitch, mm"), _lens(summary)),
-            *(_matrices(words, summary[name]) for name, words in TRANSFORMS.items()),
-            f"error of one run (rms over {settings.seeds}) beside the standard deviation that it predicts\n"
-            + table(("px, mm, degrees", "parameter", "true", "found", "error", "sigma", "error / sigma"), _errors(summary)),
+            f"Table 2: as the run of seed {settings.seed_base} has it, ± the standard deviation that it predicts\n"
+            + table(
+                ("rows are [v, u]", "focal length, px", "mm", "centre, px", "CCD, mm", "pitch, mm"), _lens(summary)
+            ),
+            *(_matrices(words, summary[name], settings) for name, words in TRANSFORMS.items()),
+            f"error of one run (rms over {seeds_of(settings)}) beside the standard deviation that it predicts\n"
+            + table(
+                ("px, mm, degrees", "parameter", "true", "mean found", "error", "sigma", "error / sigma"),
+                _errors(summary),
+            ),
             f"all parameters: error / sigma {summary['all']['error over sigma']:.2f} rms (wanted: <= {HONEST:g})",
         ]
     )
@@ -158,8 +164,8 @@ def _lens(summary: Mapping[str, Any]) -> Iterator[list[str]]:
     """The rows of Table 2, each camera's truth, which is what the paper printed, under what was found."""
     for camera, words in CAMERAS.items():
         parameters, pitch = summary[camera], PITCH_MM[camera]
-        for title, key in ((words, "found"), ("  true, as printed", "true")):
-            sigmas = {name: each["sigma"] if key == "found" else None for name, each in parameters.items()}
+        for title, key in ((words, "first"), ("  true, as printed", "true")):
+            sigmas = {name: each["first_sigma"] if key == "first" else None for name, each in parameters.items()}
             cells = {name: value_and_sigma(each[key], sigmas[name]) for name, each in parameters.items()}
             focal_mm = [
                 value_and_sigma(parameters[name][key] * pitch, sigmas[name] and sigmas[name] * pitch)
@@ -176,17 +182,17 @@ def _lens(summary: Mapping[str, Any]) -> Iterator[list[str]]:
             ]
 
 
-def _matrices(words: str, parameters: Mapping[str, Any]) -> str:
+def _matrices(words: str, parameters: Mapping[str, Any], settings: Settings) -> str:
     """A transform as Table 3 has it, found beside true, in millimetres."""
-    found, true = (_matrix(parameters, key) for key in ("found", "true"))
+    found, true = (_matrix(parameters, key) for key in ("first", "true"))
     lines = [
         "   ".join(" ".join(f"{value:10.4f}" for value in row) for row in (mine, other))
         for mine, other in zip(found, true, strict=True)
     ]
-    spread = {axis: parameters[axis]["sigma"] for axis in (*PLACES, *TURNS)}
+    spread = {axis: parameters[axis]["first_sigma"] for axis in (*PLACES, *TURNS)}
     told = [f"±{', '.join(f'{spread[axis]:.2g}' for axis in axes)}" for axes in (PLACES, TURNS)]
-    head = f"{'found, ' + told[0] + ' mm and ' + told[1] + ' degrees':43}   true (stands in for the lost one)"
-    return f"Table 3, {words} [mm]\n{head}\n" + "\n".join(lines)
+    title = f"Table 3, {words} of seed {settings.seed_base} [mm], {told[0]} mm and {told[1]} degrees"
+    return f"{title}\n{'found':43}   true (stands in for the lost one)\n" + "\n".join(lines)
 
 
 def _matrix(parameters: Mapping[str, Any], key: str) -> Array:

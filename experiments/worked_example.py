@@ -119,11 +119,27 @@ def _exactly() -> list[Line]:
     nan = math.nan
     lines: list[Line] = [
         ("exact", "range = |x_zoom0|", "mm", 10464.0, 1.0, nearly, "the depth after centring; 10510 where cut"),
-        ("exact", "f at 10510 mm", "px", 7155.0, 1.0, focal_for_size(BOOK_MM, WANTED_PX, 10510.0), "what the exact method asks for"),
+        (
+            "exact",
+            "f at 10510 mm",
+            "px",
+            7155.0,
+            1.0,
+            focal_for_size(BOOK_MM, WANTED_PX, 10510.0),
+            "what the exact method asks for",
+        ),
         ("stand-in T", "pan", "deg", nan, 0.01, math.degrees(pan), "exact"),
         ("stand-in T", "tilt", "deg", nan, 0.01, math.degrees(tilt), "exact; down is negative"),
         ("stand-in T", "range", "mm", 10464.0, 1.0, reach, "exact; the turned camera has moved too"),
-        ("stand-in T", "f", "px", 7155.0, 1.0, focal_for_size(BOOK_MM, WANTED_PX, reach), "what the exact method asks for"),
+        (
+            "stand-in T",
+            "f",
+            "px",
+            7155.0,
+            1.0,
+            focal_for_size(BOOK_MM, WANTED_PX, reach),
+            "what the exact method asks for",
+        ),
     ]
     gamma = RigidTransform.from_translation(x_zoom0 - np.array(X_FIXED_MM))  # for the depth in x_fixed alone
     for words, reading in (("Table 1", "table"), ("Section 4.2", "example")):
@@ -154,7 +170,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def agrees(row: Row) -> bool | None:
-    """Whether a printed number is the one that follows, cut or rounded to its last digit; None where none is printed."""
+    """Whether a printed number is what follows, cut or rounded to its last digit; None where none is printed."""
     if math.isnan(row["printed"]):
         return None
     return bool(abs(row["difference"]) < row["last_digit"])
@@ -185,7 +201,9 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
     ax.barh(range(len(told)), units, color=["#1f6f8b" if agrees(row) else "#d9534f" for row in told])
     ax.set_yticks(range(len(told)), [f"{row['step']}: {row['quantity']} [{row['unit']}]" for row in told])
     ax.invert_yaxis()
-    ax.set(xscale="symlog", xlabel="what follows - what is printed [units of the last digit]")
+    ax.set_xscale("symlog")
+    ax.set_xticks([-1, 0, 1, 10], ["-1", "0", "1", "10"])
+    ax.set(xlabel="what follows - what is printed [units of the last digit]")
 
 
 SETTINGS = Settings()
