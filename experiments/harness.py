@@ -3,7 +3,8 @@
 An experiment is a module with a dataclass of settings and some functions: `one(shared, settings, seed)` gives the rows
 of one seed, whichever process does it and whatever was done before; `prepare(settings)`, where there is one, gives what
 all seeds share; `summarise(rows)` the figures, `describe` a text to print, `plot` a picture. Rows are flat dictionaries
-of numbers, texts and truth values; everything reported is made from them alone.
+of numbers, texts and truth values; everything reported is made from them alone, but for pictures that `one` may give
+beside them (`experiments.pictured`).
 
     python -m experiments.NAME [--seeds N] [--seed-base B] [--processes P] [--quick] [--out DIR]
 

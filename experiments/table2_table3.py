@@ -2,7 +2,8 @@
 
 A simulated rig whose true lenses are the paper's Table 2 is calibrated from rendered boards with all effects on, once a
 seed, at the shortest focal length as in the paper. The values of the paper's Table 3 are lost: offsets of that kind
-stand in for them. One run of the calibration gives both tables, which is why they are one experiment.
+stand in for them. One calibration gives both tables, and rendering takes most of the time, which is
+why they are one experiment.
 
 The error over the seeds stands beside the standard deviation that each calibration predicts for itself; rotations err
 by the components of the rotation vector from the true orientation to the one found.
@@ -239,7 +240,7 @@ EXPERIMENT = Experiment(
     describe,
     plot,
     missed,
-    cost_s=15.0,
+    cost_s=20.0,
     bounded=bounded,
 )
 
