@@ -23,6 +23,7 @@ from cotarget.calibration import Calibration
 from cotarget.demo import sim_config
 from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
+from cotarget.errors import ConfigError
 from cotarget.judging import observe
 from cotarget.loop import FollowSettings, Step, follow
 from cotarget.metrics import Row as Judged
@@ -37,6 +38,7 @@ from experiments.pictured import Pictured
 NAME = "book"
 TURN_S = 1.2  # that the head is given to turn to the book, all latencies included [s]
 ARRIVES_S = (0.0, BOOK_MOVED_AT[1] + BOOK_TAKES[1])  # the book is at either place from then on, at the latest [s]
+LEAST_S = 0.2  # of a run, in which both cameras give several frames [s]
 # So small that the lens never leaves its shortest focal length for it [px].
 SPECK_PX = 1.0
 STAGES = ("before", "centred", "close up")
@@ -53,11 +55,23 @@ class BookSettings(FieldSettings):
     Attributes:
         seconds: from centred to close up [s].
         places: one or two of the book.
+
+    Raises:
+        ConfigError: more places, or no time to see anything.
     """
 
     seeds: int = 3
     seconds: float = 2.0
     places: int = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.places <= len(ARRIVES_S):
+            raise ConfigError(f"places = {self.places}: the book is at 1 or {len(ARRIVES_S)}")
+        if self.seconds < LEAST_S:
+            raise ConfigError(
+                f"seconds = {self.seconds:g}: at least {LEAST_S:g} are needed for a frame of both cameras"
+            )
 
 
 def one(calibration: Calibration, settings: BookSettings, seed: int) -> Pictured:

@@ -20,6 +20,7 @@ from cotarget.calibration import Calibration
 from cotarget.demo import sim_config
 from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
+from cotarget.errors import ConfigError
 from cotarget.judging import add_row
 from cotarget.loop import FollowSettings, Step
 from cotarget.metrics import Row as Judged
@@ -58,11 +59,21 @@ class PersonSettings(FieldSettings):
 
     Attributes:
         detector: mog2 or motion.
+
+    Raises:
+        ConfigError: it ends before there is anything to be shown.
     """
 
     seeds: int = 4
-    seconds: float = 6.0
+    seconds: float = 7.0
     detector: Literal["mog2", "motion"] = "mog2"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.seconds <= FIRST_S:
+            raise ConfigError(
+                f"seconds = {self.seconds:g}: more than {FIRST_S:g} are needed, when the person has come in"
+            )
 
 
 def one(calibration: Calibration, settings: PersonSettings, seed: int) -> Pictured:

@@ -109,7 +109,7 @@ def one(calibration: Calibration, settings: OutdoorSettings, seed: int) -> Pictu
     for step, truth in watched_in(SimWorld(config), detector, calibration, target, settings.seconds, how):
         watch.see(step, truth, target)
     row = {"seed": seed, "detector": settings.detector, **figures(watch.moments)}
-    return Pictured([row], {"fig6": _picture(watch.shown)} if seed == settings.seed_base else {})
+    return Pictured([row], {"fig6": _picture(watch.shown)} if seed == settings.seed_base and watch.shown else {})
 
 
 def outdoors(seed: int) -> RigConfig:
@@ -153,7 +153,7 @@ class Watch:
         present = frozenset(name for name, each in outlines.items() if each is not None and each.visible >= PRESENT)
         name, tpe_px, closeup = None, math.nan, None
         if step.target is not None:
-            self._names |= dict(reversed(on_target([step.target], outlines)))  # of one that is on several, the nearest
+            self._name(step.target.id, [each for _, each in on_target([step.target], outlines)])
             name = self._names.get(step.target.id)
         if step.target is not None and name is not None:
             closeup = closeup_of(truth, name, target, t_zoom)
@@ -162,6 +162,11 @@ class Watch:
                 tpe_px = float(np.linalg.norm(away))
         self.moments.append(Moment(t_zoom, name, step.target is not None, present, tpe_px, closeup))
         self._choose(step, name)
+
+    def _name(self, track: int, on: Sequence[str]) -> None:
+        """A track's target is the one that it was on before, as long as it is, or else the nearest that it is on."""
+        if on and self._names.get(track) not in on:
+            self._names[track] = on[0]
 
     def _choose(self, step: Step, name: str | None) -> None:
         """Keep a Step of each target close up, and the last one before it leaves."""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from cotarget.errors import ConfigError
 from cotarget.metrics import Closeup
 from cotarget.pantilt import base_head, solve
 from experiments import fig4_book, fig5_person, fig6_outdoors, table2_table3, worked_example
@@ -193,6 +194,15 @@ def test_fig_6_notices_who_is_left_too_early():
     assert fig6_outdoors.figures(run[:2])["handover_s"] is None
 
 
+def test_fig_6_a_track_stays_whose_it_was_while_it_is_on_them():
+    """`b` passes `a`, and is nearer for a while; when it has taken the track along, that is `b`'s."""
+    watch, told = fig6_outdoors.Watch(), []
+    for on in (["a"], ["b", "a"], [], ["b"], ["a", "b"]):
+        watch._name(5, on)
+        told.append(watch._names[5])
+    assert told == ["a", "a", "a", "b", "b"]
+
+
 def test_panels_stand_in_rows_with_gaps():
     grey, blue = np.full((240, 320), 128, np.uint8), np.full((480, 640, 3), (200, 0, 0), np.uint8)
     picture = cv2.imdecode(np.frombuffer(laid_out([[(grey, "a"), (blue, "b")]] * 2), np.uint8), cv2.IMREAD_COLOR)
@@ -202,6 +212,19 @@ def test_panels_stand_in_rows_with_gaps():
     assert picture[height // 2, WIDTH_PX // 2].tolist() == [128, 128, 128]
     assert picture[height // 2, WIDTH_PX + GAP_PX + WIDTH_PX // 2].tolist() == [200, 0, 0]
     assert picture[height // 2, WIDTH_PX + GAP_PX // 2].min() > 200
+
+
+@pytest.mark.parametrize(
+    ("experiment", "change", "words"),
+    [
+        (fig4_book, {"places": 3}, "places = 3: the book is at 1 or 2"),
+        (fig4_book, {"seconds": 0.0}, "seconds = 0: at least 0.2"),
+        (fig5_person, {"seconds": 4.0}, "seconds = 4: more than 4.4"),
+    ],
+)
+def test_settings_that_show_nothing_are_refused(experiment, change, words):
+    with pytest.raises(ConfigError, match=words):
+        replace(experiment.SETTINGS, **change)
 
 
 # ---------------------------------------------------------------- pictures beside rows
