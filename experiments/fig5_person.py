@@ -36,7 +36,7 @@ MOMENTS, FIRST_S = 3, 4.4  # in the picture, the first of them then and the last
 FIGURES = {  # of a run, with words
     "tpe_px_median": "detection's error in the fixed view, px",
     "tpo_px_median": "target point offset in the close-up, px",
-    "tpo_percent_median": "the same, % of the width",
+    "tpo_percent_median": "target point offset in the close-up, % of width",
     "size_ratio_median": "size / wanted size",
     "in_frame_ratio": "in frame, after acquisition",
     "time_to_acquire_s": "time to acquire, s",

@@ -51,7 +51,7 @@ FIGURES = {  # of a run, with words
     "followed": "targets followed for a second or more, of three",
     "tpe_px": "detection's error in the fixed view, px",
     "tpo_px": "target point offset in the close-up, px",
-    "tpo_percent": "the same, % of the width",
+    "tpo_percent": "target point offset in the close-up, % of width",
     "size_ratio": "size / wanted size",
     "in_frame": "in frame, while somebody is followed",
     "handover_s": "from one's leaving to the next in frame, s",
