@@ -25,11 +25,11 @@ from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
 from cotarget.judging import closeup_of, on_target
 from cotarget.loop import FollowSettings, Step
-from cotarget.metrics import Closeup
 from cotarget.sim.targets import PERSON_HEIGHT, draw_size, target_rng
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from cotarget.simconfig import Waypoint
+from experiments.handover import Moment, figures
 from experiments.harness import Experiment, Row, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, watched_in
 from experiments.panels import laid_out
@@ -43,10 +43,9 @@ NEAREST_M, APART_M, EDGE = 9.6, 0.7, 0.52  # of their ways, of which that many t
 SPEED = (1.6, 2.0)  # [m/s]
 KNOT_S = 0.5  # of their paths; they set out and stop so long outside the view that its ends do not matter
 STREAM = 11  # of random numbers, apart from the world's own
-CLOSE_S = 1.5  # so long after a target was taken up it is shown close up [s]
+CLOSE_S = 1.0  # so long after a target was taken up it is shown close up [s]
 MOMENTS = 3  # in the picture: the first close up, as it leaves, and the next one close up
 PRESENT = 0.5  # of a target's outline in the wide view; with less it has as good as left
-FOLLOWED_S = 1.0  # who was followed for so long counts [s]
 FIGURES = {  # of a run, with words
     "followed": "targets followed for a second or more, of three",
     "tpe_px": "detection's error in the fixed view, px",
@@ -77,27 +76,6 @@ class OutdoorSettings(FieldSettings):
     seeds: int = 3
     seconds: float = 12.0
     detector: Literal["motion", "mog2"] = "motion"
-
-
-@dataclass(frozen=True)
-class Moment:
-    """What is so in one Step.
-
-    Attributes:
-        t: of the zoom frame [s].
-        followed: the target that the followed track is on; None where it is on none, or there is none.
-        is_following: whether anybody is followed.
-        present: targets of which half or more is in the wide view.
-        tpe_px: from its detection to it in the wide view; nan where it is not seen alone [px].
-        closeup: what the zoom view shows of it.
-    """
-
-    t: float
-    followed: str | None
-    is_following: bool
-    present: frozenset[str]
-    tpe_px: float = math.nan
-    closeup: Closeup | None = None
 
 
 def one(calibration: Calibration, settings: OutdoorSettings, seed: int) -> Pictured:
@@ -187,58 +165,6 @@ class Watch:
 
     def _number(self, name: str) -> int:
         return list(dict.fromkeys(each.followed for each in self.moments if each.followed)).index(name) + 1
-
-
-def figures(moments: Sequence[Moment]) -> dict[str, float | int | None]:
-    """The figures of a run; None where there is nothing to measure."""
-    t = np.array([each.t for each in moments])
-    took = np.diff(t, append=t[-1])
-    names = [each.followed for each in moments]
-    seconds = {name: float(sum(d for d, each in zip(took, names, strict=True) if each == name)) for name in set(names)}
-    closeups = [each.closeup for each in moments if each.closeup is not None]
-    handovers = [(old, new) for old, new in turns(names) if old is not None]
-    gaps = [gap for old, new in handovers if (gap := _gap(moments, names, old, new)) is not None]
-    lost = sum(d for d, each in zip(took, moments, strict=True) if each.is_following and each.followed is None)
-    return {
-        "followed": sum(seconds[name] >= FOLLOWED_S for name in seconds if name is not None),
-        "tpe_px": _median(each.tpe_px for each in moments),
-        "tpo_px": _median(each.tpo_px for each in closeups),
-        "tpo_percent": _median(100 * each.tpo_px / each.width_px for each in closeups),
-        "size_ratio": _median(each.size_ratio for each in closeups),
-        "in_frame": float(np.mean([each.in_frame for each in closeups])) if closeups else None,
-        "handover_s": _median(gaps),
-        "too_early": sum(names[old] in moments[new].present for old, new in handovers),
-        "off_target_s": float(lost),
-    }
-
-
-def turns(names: Sequence[str | None]) -> list[tuple[int | None, int]]:
-    """Where somebody else is followed than before: the last moment of the one, and the first of the other."""
-    found: list[tuple[int | None, int]] = []
-    last: int | None = None
-    for i, name in enumerate(names):
-        if name is None:
-            continue
-        if last is None or names[last] != name:
-            found.append((last, i))
-        last = i
-    return found
-
-
-def _gap(moments: Sequence[Moment], names: Sequence[str | None], old: int, new: int) -> float | None:
-    """From the one's leaving the wide view to the other's being in frame [s]; None where either never was."""
-    name = names[old]
-    there = [i for i, each in enumerate(moments[:new]) if name in each.present]
-    came = next(
-        (i for i in range(new, len(moments)) if names[i] == names[new] and (c := moments[i].closeup) and c.in_frame),
-        None,
-    )
-    return None if came is None or not there else max(0.0, moments[came].t - moments[there[-1]].t)
-
-
-def _median(values: Any) -> float | None:
-    finite = [value for value in values if math.isfinite(value)]
-    return float(np.median(finite)) if finite else None
 
 
 def _picture(shown: Sequence[tuple[Step, str]]) -> bytes:

@@ -17,7 +17,7 @@ from cotarget.pantilt import base_head, solve
 from experiments import fig4_book, fig5_person, fig6_outdoors, table2_table3, worked_example
 from experiments.__main__ import main
 from experiments.bounds import compare
-from experiments.fig6_outdoors import Moment
+from experiments.handover import Moment, figures
 from experiments.panels import GAP_PX, WIDTH_PX, laid_out
 from experiments.pictured import Pictured
 from experiments.workers import here
@@ -175,7 +175,7 @@ def test_fig_6_hands_over_when_the_first_has_left():
     run = [moment(0.5 * k, None, "") for k in range(2)]
     run += [moment(0.5 * k, "a", "ab" if k < 8 else "b", u=351.5) for k in range(2, 8)]
     run += [moment(4.0, "b", "b", size=100.0), *(moment(0.5 * k, "b", "b", u=351.5) for k in range(9, 13))]
-    found = fig6_outdoors.figures(run)
+    found = figures(run)
     assert (found["followed"], found["too_early"], found["off_target_s"]) == (2, 0, 0.0)
     assert found["handover_s"] == pytest.approx(1.0)  # from 3.5 s, when it was last there
     assert found["tpo_percent"] == pytest.approx(5.0)  # 32 px of 640
@@ -189,9 +189,9 @@ def test_fig_6_hands_over_when_the_first_has_left():
 def test_fig_6_notices_who_is_left_too_early():
     run = [moment(0.5 * k, "a" if k < 4 else "b", "ab") for k in range(8)]
     run.insert(4, Moment(1.75, None, True, frozenset("ab")))  # a track on nobody, for a quarter of a second
-    found = fig6_outdoors.figures(run)
+    found = figures(run)
     assert (found["too_early"], found["off_target_s"]) == (1, 0.25)
-    assert fig6_outdoors.figures(run[:2])["handover_s"] is None
+    assert figures(run[:2])["handover_s"] is None
 
 
 def test_fig_6_a_track_stays_whose_it_was_while_it_is_on_them():
