@@ -18,10 +18,11 @@ from typing import Any
 from cotarget.cli.arguments import count, not_negative, progress_bar
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.report.wording import count as number_of
+from experiments.arguments import Parser, check_folder
 from experiments.bounds import EXPECTED, tighten
 from experiments.cases import Case, Known, choose, known_experiments
 from experiments.cluster import on_dask
-from experiments.harness import INTERRUPTED, TERMINATED, Parser, check_folder
+from experiments.harness import INTERRUPTED, TERMINATED
 from experiments.outcome import Outcome, conclude
 from experiments.report import Run, duration, write_report
 from experiments.results import code_version, taken

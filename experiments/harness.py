@@ -3,14 +3,14 @@
 An experiment is a module with a dataclass of settings and some functions: `one(shared, settings, seed)` gives the rows
 of one seed, whichever process does it and whatever was done before; `prepare(settings)`, where there is one, gives what
 all seeds share; `summarise(rows)` the figures, `describe` a text to print, `plot` a picture. Rows are flat dictionaries
-of numbers, texts and truth values; everything reported is made from them alone.
+of numbers, texts and truth values; everything reported is made from them alone, but for pictures that `one` may give
+beside them (`experiments.pictured`).
 
     python -m experiments.NAME [--seeds N] [--seed-base B] [--processes P] [--quick] [--out DIR]
 
 `python -m experiments` does many of them at once, and goes on where it was broken off: `experiments.runner`.
 """
 
-import argparse
 import csv
 import dataclasses
 import functools
@@ -23,7 +23,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeVar
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -33,6 +34,8 @@ import cotarget
 from cotarget.cli.arguments import count, not_negative
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.outputs import write_whole
+from experiments.arguments import Parser, check_folder
+from experiments.pictured import Pictured, parted, shown
 from experiments.workers import Died, Engine, here, in_processes
 
 if TYPE_CHECKING:  # every worker imports this module, and few draw
@@ -41,7 +44,8 @@ if TYPE_CHECKING:  # every worker imports this module, and few draw
     from cotarget.geometry import Array
 
 Row = dict[str, Any]
-USAGE, INTERRUPTED, TERMINATED = 2, 130, 143  # exit status of wrong arguments, of Ctrl-C and of SIGTERM
+INTERRUPTED, TERMINATED = 130, 143  # exit status of Ctrl-C and of SIGTERM
+FIGURE = "figure"  # the plot's file
 PACKAGES = ("numpy", "scipy", "mujoco", "matplotlib")
 
 
@@ -85,7 +89,7 @@ class Experiment(Generic[S]):
         purpose: one line, for --help.
         settings: as it is reported.
         quick: the same with less of everything.
-        one: gives the rows of a seed: (what `prepare` gave, settings, seed) -> rows.
+        one: gives the rows of a seed: (what `prepare` gave, settings, seed) -> rows, or rows with pictures.
         summarise: gives the figures, from the rows alone; nan where nothing was measured.
         describe: gives settings and figures as a text to print.
         plot: draws the rows.
@@ -102,7 +106,7 @@ class Experiment(Generic[S]):
     purpose: str
     settings: S
     quick: S
-    one: Callable[[Any, S, int], list[Row]]
+    one: Callable[[Any, S, int], list[Row] | Pictured]
     summarise: Callable[[Sequence[Row]], Mapping[str, Any]]
     describe: Callable[[S, Mapping[str, Any]], str]
     plot: "Callable[[Sequence[Row], Figure], None] | None" = None
@@ -128,7 +132,7 @@ class Experiment(Generic[S]):
             help=f"jobs at a time, but one where time is measured ({processes})",
         )
         parser.add_argument("--quick", action="store_true", help=f"a look only: {_less(self.settings, self.quick)}")
-        files = "result.json and rows.csv" if self.plot is None else "result.json, rows.csv and figure.png"
+        files = "result.json and rows.csv" if self.plot is None else "result.json, rows.csv and pictures"
         parser.add_argument("--out", type=Path, metavar="DIR", help=f"write {files} there")
         given = parser.parse_args(arguments)
         settings = self.quick if given.quick else self.settings
@@ -147,11 +151,11 @@ class Experiment(Generic[S]):
         try:
             if out is not None:
                 check_folder(out)
-            rows = self.run(settings)
+            rows, pictures = parted(self.run_pictured(settings))
             summary = self.summarise(rows)
             print(self.describe(settings, summary))
             if out is not None:
-                self.write(out, settings, rows, summary, self.picture(rows))
+                self.write(out, settings, rows, summary, self.picture(rows), pictures)
         except CotargetError as error:
             print(f"experiments.{self.name}: {error}", file=sys.stderr)
             return 1
@@ -161,7 +165,11 @@ class Experiment(Generic[S]):
         return 1 if self.missed is not None and self.missed(summary) else 0
 
     def run(self, settings: S, engine: Engine = in_processes) -> list[Row]:
-        """All rows, in the order of the seeds.
+        """All rows, in the order of the seeds; see `run_pictured`."""
+        return self.run_pictured(settings, engine).rows
+
+    def run_pictured(self, settings: S, engine: Engine = in_processes) -> Pictured:
+        """All rows, in the order of the seeds, and the pictures of the first seed that has any.
 
         Args:
             settings: how many seeds, and over how many processes.
@@ -176,13 +184,20 @@ class Experiment(Generic[S]):
         engine = here if self.alone else engine
         # By a worker too: whoever does it, it has one thread of linear algebra, and the same last digits.
         shared = None if self.prepare is None else _all(engine, self.prepare, [settings], 1)[0]
-        rows = _all(engine, functools.partial(self.one, shared, settings), self.jobs(settings), settings.processes)
-        return [row for each in rows for row in each]
+        jobs = functools.partial(self.one, shared, settings)
+        found = [parted(each) for each in _all(engine, jobs, self.jobs(settings), settings.processes)]
+        return Pictured([row for rows, _ in found for row in rows], shown(pictures for _, pictures in found))
 
     def write(
-        self, out: Path, settings: S, rows: Sequence[Row], summary: Mapping[str, Any], picture: bytes | None
+        self,
+        out: Path,
+        settings: S,
+        rows: Sequence[Row],
+        summary: Mapping[str, Any],
+        picture: bytes | None,
+        pictures: Mapping[str, bytes] = MappingProxyType({}),
     ) -> None:
-        """Write result.json, rows.csv and, where there is a picture, figure.png.
+        """Write result.json, rows.csv and, where there is a plot, figure.png; and the pictures of the jobs.
 
         Raises:
             ConfigError: one of them cannot be written.
@@ -203,8 +218,8 @@ class Experiment(Generic[S]):
         writer.writeheader()
         writer.writerows(rows)
         write_whole(out / "rows.csv", table.getvalue().encode())
-        if picture is not None:
-            write_whole(out / "figure.png", picture)
+        for name, png in {**({} if picture is None else {FIGURE: picture}), **pictures}.items():
+            write_whole(out / f"{name}.png", png)
 
     def picture(self, rows: Sequence[Row]) -> bytes | None:
         """The plot as a PNG, where there is one."""
@@ -237,27 +252,6 @@ def _less(settings: Settings, quick: Settings) -> str:
     other = {name: value for name, value in parts.items() if value != getattr(settings, name)}
     texts = (f"{name} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in other.items())
     return ", ".join(texts).replace("%", "%%") or "the same"
-
-
-class Parser(argparse.ArgumentParser):
-    """A parser whose mistakes end in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong, without the usage in front of it."""
-        self.exit(USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
-
-
-def check_folder(out: Path) -> None:
-    """Refuse a folder for results that cannot be made or written to, before the work and not after it.
-
-    Raises:
-        ConfigError: it, or what it would be in, is a file or may not be written to.
-    """
-    there = next(path for path in (out.absolute(), *out.absolute().parents) if os.path.lexists(path))
-    if not there.is_dir():
-        raise ConfigError(f"--out: {there} is no folder; name one that is, or that can be made")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise ConfigError(f"--out: {there} may not be written to; name another folder")
 
 
 def versions() -> dict[str, str]:

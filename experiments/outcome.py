@@ -3,13 +3,14 @@
 import inspect
 import traceback
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from experiments.bounds import EXPECTED, Bound, compare
 from experiments.cases import Case
 from experiments.harness import Row
+from experiments.pictured import shown
 from experiments.results import Record
 
 
@@ -26,6 +27,7 @@ class Outcome:
         bounds: the figures that have bounds, beside them; of other settings than the quick ones there are none.
         picture: the plot as a PNG.
         caption: what it shows.
+        pictures: of the first job that has any, PNGs by name.
         broken: why there are no figures, or no picture.
     """
 
@@ -38,11 +40,17 @@ class Outcome:
     picture: bytes | None = None
     caption: str = ""
     broken: str = ""
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
 
     @property
     def failed(self) -> dict[int, Record]:
         """The jobs that failed."""
         return {number: record for number, record in sorted(self.records.items()) if record.failed}
+
+    @property
+    def pictured(self) -> int | None:
+        """The first job that has pictures."""
+        return next((number for number, record in sorted(self.records.items()) if record.pictures), None)
 
     @property
     def undone(self) -> int:
@@ -80,7 +88,7 @@ class Outcome:
 
 
 def conclude(case: Case, records: Mapping[int, Record], folder: Path, expected: Path = EXPECTED) -> Outcome:
-    """Work out a case's figures from its rows, and write result.json, rows.csv and figure.png.
+    """Work out a case's figures from its rows, and write result.json, rows.csv, figure.png and other pictures.
 
     Args:
         case: that was run.
@@ -102,10 +110,11 @@ def conclude(case: Case, records: Mapping[int, Record], folder: Path, expected: 
     except Exception as error:  # of an incomplete run, which lacks what the figures are made of
         return Outcome(case, records, broken=f"the rows give no figures: {_where(error)}")
     picture, broken = _draw(case, rows)
-    experiment.write(folder, case.settings, rows, summary, picture)
+    pictures = shown(record.pictures for _, record in sorted(records.items()))
+    experiment.write(folder, case.settings, rows, summary, picture, pictures)
     bounds = tuple(compare(experiment, summary, expected)) if case.has_bounds else ()
     caption = (inspect.getdoc(experiment.plot) or "").partition("\n")[0]
-    return Outcome(case, records, summary, text, missed, bounds, picture, caption, broken)
+    return Outcome(case, records, summary, text, missed, bounds, picture, caption, broken, pictures)
 
 
 def _draw(case: Case, rows: list[Row]) -> tuple[bytes | None, str]:

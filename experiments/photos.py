@@ -25,7 +25,8 @@ from cotarget.calibration.placing import place_boards
 from cotarget.calibration.uncertainty import model_of
 from cotarget.cli.arguments import corners, count, positive
 from cotarget.config import BoardConfig
-from experiments.harness import Experiment, Parser, Row, Settings, rms, table
+from experiments.arguments import Parser
+from experiments.harness import Experiment, Row, Settings, rms, table
 
 NOT_HELD_OUT = Options(folds=0)
 PHOTOS = Path(__file__).resolve().parents[2] / "shared" / "data" / "opencv_stereo"

@@ -135,6 +135,9 @@ def _case(outcome: Outcome) -> Iterator[str]:
         yield markup.paragraph(outcome.broken[:1].upper() + outcome.broken[1:] + ".")
     if outcome.text:
         yield markup.preformatted(outcome.text)
+    for name, png in outcome.pictures.items():
+        caption = f"{name}.png, of seed {outcome.pictured}"
+        yield markup.figure(Picture(name, png, None, f"{case.experiment.name}: {caption}", caption))
     if outcome.picture is not None:
         name = case.experiment.name
         yield markup.figure(Picture(name, outcome.picture, None, f"{name}: {outcome.caption}", outcome.caption))

@@ -1,22 +1,24 @@
 """Results on disk: a file a job, written at once and whole, so that a sweep that was broken off goes on.
 
-    DIR/NAME/jobs/000007.json            what one job gave, with its settings, its seed and the version of the code
+    DIR/NAME/jobs/000007.json            what one job gave, with its settings, its seed and the version of the code;
+                                         pictures as PNG in base64
     DIR/NAME/jobs/000007.traceback.txt   where one failed
-    DIR/NAME/result.json, rows.csv, figure.png
+    DIR/NAME/result.json, rows.csv, figure.png, and the pictures of the first job that has any
     DIR/sessions.json                    when jobs were done, by whom and for how long
     DIR/report.html
 
 Numbers are written so that they are read back as they were; NaN and Infinity stand as Python writes them.
 """
 
+import base64
 import contextlib
 import dataclasses
 import fcntl
 import functools
 import hashlib
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,7 @@ from cotarget.errors import ConfigError
 from cotarget.outputs import write_whole
 from experiments.harness import Row, Settings, versions
 
-FORMAT = 1  # of the files
+FORMAT = 2  # of the files
 JOBS = "jobs"  # their folder
 JOB_FILES = "[0-9]*.json"  # what a killed run has left half-written begins with a dot
 LOCK = ".lock"  # held by the run that writes
@@ -50,6 +52,7 @@ class Record:
         rows: that it gave; None where it failed.
         failed: why, in one line.
         traceback: where.
+        pictures: that it made, PNGs by name.
     """
 
     number: int
@@ -60,6 +63,7 @@ class Record:
     rows: list[Row] | None
     failed: str = ""
     traceback: str = ""
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
 
 
 @functools.cache
@@ -148,6 +152,7 @@ class Jobs:
             if settings != self._identity:
                 raise ConfigError(f"{path}: {self._differing(settings)}; {REMEDY}")
             names = [part.name for part in dataclasses.fields(Record) if part.name != "number"]
+            told["pictures"] = {name: base64.b64decode(png) for name, png in told["pictures"].items()}
             yield Record(told["seed"], **{name: told[name] for name in names})
 
     def _differing(self, settings: dict[str, Any]) -> str:
@@ -164,6 +169,7 @@ class Jobs:
         self._folder.mkdir(parents=True, exist_ok=True)
         told = {"format": FORMAT, "experiment": self._name, "settings": self._identity, "seed": record.number}
         told |= {key: value for key, value in dataclasses.asdict(record).items() if key != "number"}
+        told["pictures"] = {name: base64.b64encode(png).decode() for name, png in record.pictures.items()}
         traceback = self._folder / f"{record.number:06d}.traceback.txt"
         if record.failed:
             write_whole(traceback, record.traceback.encode())

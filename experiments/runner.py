@@ -173,7 +173,7 @@ class Sweep:
 
     def _keep(self, i: int, number: int, done: Done) -> None:
         """Put what came of a job on disk."""
-        rows, told = None if done.failed else done.result, (done.failed, done.traceback)
+        rows, told = None if done.failed else done.result, (done.failed, done.traceback, done.pictures)
         record = Record(number, done.seconds, done.cpu_s, done.version, done.renders, rows, *told)
         self._files[i].write(record)
         self.records[i][number] = record

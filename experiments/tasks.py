@@ -4,13 +4,14 @@ import json
 import sys
 import time
 import traceback
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from cotarget.errors import CotargetError
+from experiments.pictured import parted
 from experiments.results import code_version
 
 
@@ -40,20 +41,22 @@ class Done:
     result: Any = None
     failed: str = ""
     traceback: str = ""
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
 
 
 def perform(task: Task) -> Done:
     """Do a task; whatever goes wrong is told, not raised."""
     began, cpu, drawn = time.perf_counter(), time.process_time(), _drawn()
-    result, failed, where = None, "", ""
+    result, pictures, failed, where = None, dict[str, bytes](), "", ""
     try:
         result = task.call()
         if task.number is not None:
-            result = json.loads(json.dumps(result, default=_scalar))  # as it will be read from the file
+            rows, seen = parted(result)
+            result, pictures = json.loads(json.dumps(rows, default=_scalar)), dict(seen)  # as read from the file
     except Exception as error:
         failed, where = _in_one_line(error), traceback.format_exc()
     took, used = time.perf_counter() - began, time.process_time() - cpu
-    return Done(took, used, code_version(), _drawn() - drawn, result, failed, where)
+    return Done(took, used, code_version(), _drawn() - drawn, result, failed, where, pictures)
 
 
 def _drawn() -> int:

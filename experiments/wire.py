@@ -22,7 +22,8 @@ from typing import Any
 
 from cotarget.cli.arguments import count, not_negative
 from experiments import wire_age, wire_command, wire_faults, wire_latency, wire_parity, wire_polls
-from experiments.harness import TERMINATED, Experiment, Parser, Row, Settings, table
+from experiments.arguments import Parser
+from experiments.harness import TERMINATED, Experiment, Row, Settings, table
 from experiments.wire_figures import FAULT_COLUMNS, PART_COLUMNS, bounded, missed, summarise
 
 

@@ -1,0 +1,166 @@
+"""Fig. 5 of the paper: indoors, a person who walks, found by an adaptive Gaussian mixture and connected components.
+
+The detector is the paper's plain one, `mog2`; `--set fig5_person.detector=motion` takes this project's. The person
+walks in after the background was learnt for some two seconds and goes to and fro about 10 m away. Figures are medians
+over the seeds of what `cotarget.metrics` defines, by the simulation's truth.
+
+    python -m experiments.fig5_person [--seeds 4] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration
+from cotarget.demo import sim_config
+from cotarget.detection import make_detector
+from cotarget.drawing import draw_wide, draw_zoom
+from cotarget.errors import ConfigError
+from cotarget.judging import add_row
+from cotarget.loop import FollowSettings, Step
+from cotarget.metrics import Row as Judged
+from cotarget.metrics import score
+from cotarget.sim.world import SimWorld
+from experiments.harness import Experiment, Row, seeds_of, table
+from experiments.hold import FieldSettings, calibrated, watched_in
+from experiments.panels import laid_out
+from experiments.pictured import Pictured
+
+NAME = "person"
+MOMENTS, FIRST_S = 3, 4.4  # in the picture, the first of them then and the last at the end; he is there from 3 s on [s]
+FIGURES = {  # of a run, with words
+    "tpe_px_median": "detection's error in the fixed view, px",
+    "tpo_px_median": "target point offset in the close-up, px",
+    "tpo_percent_median": "target point offset in the close-up, % of width",
+    "size_ratio_median": "size / wanted size",
+    "in_frame_ratio": "in frame, after acquisition",
+    "time_to_acquire_s": "time to acquire, s",
+    "closeup_yield": "close-up yield, acquisition included",
+    "identification": "marker decoded in the close-up",
+    "identification_wide": "marker decoded in the fixed view",
+    "false_tracks_per_min": "false tracks a minute",
+}
+WANTED: Mapping[str, tuple[float, float]] = {
+    "tpo_percent_median": (0.0, 4.0),
+    "size_ratio_median": (0.85, 1.15),
+    "in_frame_ratio": (0.99, 1.0),
+    "time_to_acquire_s": (0.0, 2.0),
+}
+
+
+@dataclass(frozen=True)
+class PersonSettings(FieldSettings):
+    """How many seeds, for how long, and how the person is found.
+
+    Attributes:
+        detector: mog2 or motion.
+
+    Raises:
+        ConfigError: it ends before there is anything to be shown.
+    """
+
+    seeds: int = 4
+    seconds: float = 7.0
+    detector: Literal["mog2", "motion"] = "mog2"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.seconds <= FIRST_S:
+            raise ConfigError(
+                f"seconds = {self.seconds:g}: more than {FIRST_S:g} are needed, when the person has come in"
+            )
+
+
+def one(calibration: Calibration, settings: PersonSettings, seed: int) -> Pictured:
+    """Follow a person; one row, and pictures of the first seed."""
+    config = sim_config("indoor", (NAME,), seed)
+    target = dataclasses.replace(config.target(NAME), detector=settings.detector)
+    how = FollowSettings(command_delay_s=config.command_delay_s)
+    judged: list[Judged] = []
+    moments: list[Step] = []
+    # The last step is done a frame before the end, or later.
+    due = np.linspace(FIRST_S, settings.seconds - 1 / config.rate_hz, MOMENTS).tolist()
+    detector = make_detector(target, config.rate_hz)
+    for step, truth in watched_in(SimWorld(config), detector, calibration, target, settings.seconds, how):
+        add_row(judged, step, truth, NAME, target)
+        if due and step.t >= due[0]:
+            moments.append(step)
+            due.pop(0)
+    found = dataclasses.asdict(score(judged))
+    offset = found["tpo_width_median"]
+    found["tpo_percent_median"] = None if offset is None else 100 * offset
+    row = {"seed": seed, "detector": settings.detector, **{key: found[key] for key in FIGURES}}
+    return Pictured([row], {"fig5": _picture(moments)} if seed == settings.seed_base else {})
+
+
+def _picture(moments: Sequence[Step]) -> bytes:
+    """As Fig. 5 of the paper, for some moments: (a) above (b)."""
+    return laid_out(
+        [
+            [(draw_wide(step), f"(a) stationary camera, t = {step.fixed.t:.1f} s") for step in moments],
+            [(draw_zoom(step), f"(b) moving camera, at {step.lens.focal_px:.0f} px") for step in moments],
+        ]
+    )
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Of each figure the median over the seeds, the least and the largest; a run without it is told apart."""
+    found = {}
+    for key in FIGURES:
+        values = [float(row[key]) for row in rows if row[key] is not None]
+        three = (np.median(values), min(values), max(values)) if values else (np.nan,) * 3
+        numbers = dict(zip(("median", "least", "largest"), map(float, three), strict=True))
+        found[key] = numbers | {"not measured": float(len(rows) - len(values))}
+    return found
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The figures that are not what is wanted, or were not measured in some run."""
+    return [
+        key
+        for key, (low, high) in WANTED.items()
+        if summary[key]["not measured"] or not low <= summary[key]["median"] <= high
+    ]
+
+
+def describe(settings: PersonSettings, summary: Mapping[str, Any]) -> str:
+    """A line a figure."""
+    lines = [
+        [FIGURES[key], *(found[each] for each in ("median", "least", "largest"))] for key, found in summary.items()
+    ]
+    head = (f"a person at 10 m, {settings.detector}, {seeds_of(settings)}", "median", "least", "largest")
+    return table(head, lines)
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Each seed's detection error in the fixed view, and offset and size in the close-up."""
+    keys = ("tpe_px_median", "tpo_percent_median", "size_ratio_median")
+    for ax, key in zip(figure.subplots(1, len(keys)), keys, strict=True):
+        told = [row for row in rows if row[key] is not None]
+        ax.bar(range(len(told)), [row[key] for row in told], tick_label=[row["seed"] for row in told])
+        ax.set(title=FIGURES[key], xlabel="seed")
+        ax.title.set_size(8)
+
+
+SETTINGS = PersonSettings()
+EXPERIMENT = Experiment(
+    "fig5_person",
+    "Fig. 5: a person who walks indoors, found by an adaptive Gaussian mixture: fixed view, close-up.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, seconds=5.0, calibrated=False),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    prepare=calibrated,
+    cost_s=15.0,
+)
+
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

@@ -1,0 +1,85 @@
+"""Who of several is followed from moment to moment, and how one is handed over to the next: figures by the truth."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cotarget.metrics import Closeup
+
+FOLLOWED_S = 1.0  # who was followed for so long counts [s]
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What is so in one Step.
+
+    Attributes:
+        t: of the zoom frame [s].
+        followed: the target that the followed track is on; None where it is on none, or there is none.
+        is_following: whether anybody is followed.
+        present: targets of which half or more is in the wide view.
+        tpe_px: from its detection to it in the wide view; nan where it is not seen alone [px].
+        closeup: what the zoom view shows of it.
+    """
+
+    t: float
+    followed: str | None
+    is_following: bool
+    present: frozenset[str]
+    tpe_px: float = math.nan
+    closeup: Closeup | None = None
+
+
+def figures(moments: Sequence[Moment]) -> dict[str, float | int | None]:
+    """The figures of a run; None where there is nothing to measure."""
+    t = np.array([each.t for each in moments])
+    took = np.diff(t, append=t[-1])
+    names = [each.followed for each in moments]
+    seconds = {name: float(sum(d for d, each in zip(took, names, strict=True) if each == name)) for name in set(names)}
+    closeups = [each.closeup for each in moments if each.closeup is not None]
+    handovers = [(old, new) for old, new in turns(names) if old is not None]
+    gaps = [gap for old, new in handovers if (gap := _gap(moments, names, old, new)) is not None]
+    lost = sum(d for d, each in zip(took, moments, strict=True) if each.is_following and each.followed is None)
+    return {
+        "followed": sum(seconds[name] >= FOLLOWED_S for name in seconds if name is not None),
+        "tpe_px": _median(each.tpe_px for each in moments),
+        "tpo_px": _median(each.tpo_px for each in closeups),
+        "tpo_percent": _median(100 * each.tpo_px / each.width_px for each in closeups),
+        "size_ratio": _median(each.size_ratio for each in closeups),
+        "in_frame": float(np.mean([each.in_frame for each in closeups])) if closeups else None,
+        "handover_s": _median(gaps),
+        "too_early": sum(names[old] in moments[new].present for old, new in handovers),
+        "off_target_s": float(lost),
+    }
+
+
+def turns(names: Sequence[str | None]) -> list[tuple[int | None, int]]:
+    """Where somebody else is followed than before: the last moment of the one, and the first of the other."""
+    found: list[tuple[int | None, int]] = []
+    last: int | None = None
+    for i, name in enumerate(names):
+        if name is None:
+            continue
+        if last is None or names[last] != name:
+            found.append((last, i))
+        last = i
+    return found
+
+
+def _gap(moments: Sequence[Moment], names: Sequence[str | None], old: int, new: int) -> float | None:
+    """From the one's leaving the wide view to the other's being in frame [s]; None where either never was."""
+    name = names[old]
+    there = [i for i, each in enumerate(moments[:new]) if name in each.present]
+    came = next(
+        (i for i in range(new, len(moments)) if names[i] == names[new] and (c := moments[i].closeup) and c.in_frame),
+        None,
+    )
+    return None if came is None or not there else max(0.0, moments[came].t - moments[there[-1]].t)
+
+
+def _median(values: Any) -> float | None:
+    finite = [value for value in values if math.isfinite(value)]
+    return float(np.median(finite)) if finite else None
