@@ -160,7 +160,7 @@ EXPERIMENT = Experiment(
     "delay",
     "The offset in the close-up with prediction and without, over the delay of cameras and head.",
     SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, delays=(0.0, FIELD_S), seconds=10.0, calibrated=False, closed_loop=False),
+    dataclasses.replace(SETTINGS, seeds=1, delays=(FIELD_S,), seconds=10.0, calibrated=False, closed_loop=False),
     one,
     summarise,
     describe,

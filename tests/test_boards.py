@@ -73,7 +73,10 @@ def test_a_board_that_looks_the_same_upside_down_is_refused(corners):
         check_board(BoardConfig(corners=corners))
 
 
-@pytest.mark.parametrize("corners", [(6, 5), (7, 4), (8, 5), (9, 4), (10, 7), (9, 8)])
+LARGER = [(6, 5), (7, 4), *(pytest.param(it, marks=pytest.mark.slow) for it in ((8, 5), (9, 4), (10, 7), (9, 8)))]
+
+
+@pytest.mark.parametrize("corners", LARGER)
 def test_part_of_a_larger_board_is_no_board(corners):
     """OpenCV's finders do report the inner part of one, which would be numbered differently in every picture."""
     board = BoardConfig(corners=corners)

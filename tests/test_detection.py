@@ -54,7 +54,7 @@ def book_picture(center, size, turn, rng):
     return photograph(cv2.GaussianBlur(small, (0, 0), 0.5), rng)
 
 
-@pytest.mark.parametrize("turn_deg", [0.0, 6.0])
+@pytest.mark.parametrize("turn_deg", [pytest.param(0.0, marks=pytest.mark.slow), 6.0])
 def test_colour_is_located_to_a_fraction_of_a_pixel(turn_deg):
     rng = np.random.default_rng(0)
     detector = ColourDetector(cover())

@@ -191,7 +191,7 @@ def test_the_covariance_is_honest_where_targets_move_as_assumed():
 FACTORS = {"person": (3.0, 1.4), "bird": (9.0, 2.0)}
 
 
-@pytest.mark.parametrize("name", FACTORS)
+@pytest.mark.parametrize("name", [pytest.param("person", marks=pytest.mark.slow), "bird"])
 def test_prediction_beats_none_and_constant_velocity_in_the_image(name):
     found = [errors(Flight(name, seed)) for seed in range(3)]
     others = [baselines(Flight(name, seed)) for seed in range(3)]
