@@ -329,6 +329,7 @@ def test_a_board_seen_in_part_through_a_longer_lens():
         assert 12 <= view.seen.sum() < 54
 
 
+@pytest.mark.slow
 def test_random_rigs_are_within_what_is_promised():
     rigs = [random_rigs.draw_rig(np.random.default_rng(i)) for i in range(20)]
     for rig in rigs:

@@ -442,6 +442,7 @@ def test_mistakes_end_in_one_line_and_leave_the_page(plain, tmp_path, capsys):
         write_report(page, bare(plain, covariance=negative))
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_nothing_of_a_report(plain, tmp_path):
     """There is room for some of its pictures, and none for the page."""
     page = tmp_path / "page.html"

@@ -24,7 +24,7 @@ from experiments.cases import EXPERIMENTS, choose, known_experiments
 from experiments.cluster import on_dask
 from experiments.harness import Experiment, Settings
 from experiments.report import duration
-from experiments.results import code_version, taken
+from experiments.results import FORMAT, code_version, taken
 from experiments.tasks import Task, perform
 from experiments.workers import LINEAR_ALGEBRA, ONE_THREAD, Died, here, in_processes
 from tests.tiny_experiments import ALONE, KNOWN, TINY, notes, pids
@@ -221,7 +221,7 @@ def test_what_cannot_be_done_is_left_out_unless_it_is_named(run, tmp_path):
     [
         ({"version": "0.0.9+12345678"}, "is of cotarget 0.0.9+12345678, this is"),
         ({"version": code_version().partition("+")[0] + "+12345678"}, "keep it all the same with --any-code"),
-        ({"format": 0}, "is of format 0, this is format 1"),
+        ({"format": 0}, f"is of format 0, this is format {FORMAT}"),
         ({"settings": None}, "is of tiny with"),
     ],
     ids=["version", "code", "format", "settings"],

@@ -75,6 +75,7 @@ def test_a_flying_bird_is_blurred_in_the_wide_view_and_only_it_is_rendered_again
     assert max(drawn[1:]) < 0.05 * drawn[0]
 
 
+@pytest.mark.slow
 def test_a_turning_zoom_camera_blurs_everything():
     with (w := world(targets=())).rig as rig:
         rig.zoom.zoom(2000.0)

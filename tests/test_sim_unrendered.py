@@ -37,6 +37,7 @@ def test_times_head_lens_and_truth_are_as_ever():
         assert not frame.image.flags.writeable
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_one_camera_alone():
     _, fixed, zoom = drive(SimWorld(config(), rendered=("fixed",)))
