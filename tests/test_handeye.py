@@ -236,6 +236,7 @@ def test_several_placements_are_one_answer():
         assert np.abs((board.inv() * boards[number]).as_matrix() - np.eye(4)).max() < EXACT
 
 
+@pytest.mark.slow
 def test_a_board_seen_best_in_its_middle():
     """Noise turns the board about its middle, 0.5 m from its origin: knowing where helps."""
     rng = np.random.default_rng(6)

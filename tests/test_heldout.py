@@ -65,6 +65,7 @@ PLACEMENTS = 24
 NOISE_TOLERANCE = 0.6
 
 
+@pytest.mark.slow
 def test_of_a_rig_that_is_known_only_the_boards_noise_is_left(monkeypatch):
     """Then every miss comes from the board's pose, as one view of the fixed camera tells it."""
     monkeypatch.setattr(heldout, "CHANCE_SIGMAS", -np.inf)
