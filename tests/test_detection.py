@@ -212,9 +212,8 @@ def test_a_shadow_is_not_part_of_a_person():
         np.testing.assert_allclose(boxes[0].size_px, (25, 80), atol=3.0)
 
 
-@pytest.mark.parametrize("length", [60, 120])
-def test_what_lies_flat_is_no_part_of_a_person(length):
-    """The edge of a shadow that drifts by behind, as far as the knees are high."""
+def with_a_shadows_edge(length):
+    """Pictures of a person and of something thin behind."""
     rng = np.random.default_rng(17)
     pictures = []
     for i in range(60):
@@ -224,10 +223,24 @@ def test_what_lies_flat_is_no_part_of_a_person(length):
             picture[100:180, u - 12 : u + 13] = (150, 60, 30)
             picture[160:165, u : u + length] = (125, 150, 140)
         pictures.append(np.clip(picture, 0, 255).astype(np.uint8))
-    for i, boxes in list(enumerate(watch(motion("person"), pictures)))[25:]:
+    return pictures
+
+
+@pytest.mark.parametrize("length", [60, 120])
+def test_what_lies_flat_is_no_part_of_a_person(length):
+    """The edge of a shadow that drifts by behind, as far as the knees are high."""
+    for i, boxes in list(enumerate(watch(motion("person"), with_a_shadows_edge(length))))[25:]:
         assert len(boxes) == 1
         np.testing.assert_allclose(boxes[0].center_px, (30 + 2 * (i - 20), 139.5), atol=3.0)
         np.testing.assert_allclose(boxes[0].size_px, (25, 80), atol=6.0)
+
+
+@pytest.mark.parametrize(("kind", "width"), [("mog2", 72), ("motion", 25)])
+def test_the_papers_detector_is_the_mixture_alone(kind, width):
+    """It takes what lies flat for a part of the person, where both are new."""
+    target = dataclasses.replace(DEFAULT_TARGETS["person"], detector=kind)
+    (box,) = watch(make_detector(target, RATE), with_a_shadows_edge(60)[:21])[-1]
+    np.testing.assert_allclose(box.size_px, (width, 80), atol=3.0)
 
 
 def test_two_side_by_side_are_in_one_box():

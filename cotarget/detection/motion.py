@@ -1,6 +1,5 @@
 """What moves: an adaptive Gaussian mixture of the background, morphology and connected pieces (person, bird)."""
 
-import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -27,6 +26,8 @@ class MotionSettings:
         warm_up_s: no detection before the background has been learnt for this long [s].
         threshold: squared distance to the background, in variances, from which a pixel counts as foreground.
         shadows: whether to tell shadows apart from the target.
+        brightest: the background in a light up to so many times brighter, when the sun comes out, is no target where
+            most of what changed is that: the mixture tells shadows, but nothing that is brighter; 1 for not at all.
         sway_px: how far the background itself sways [px]: a pixel is no target where its colour lies between the
             darkest and the brightest that the background has within this distance; 0 for a rigid background.
         opening_px: specks thinner than this are removed; 0 for none.
@@ -35,6 +36,8 @@ class MotionSettings:
         smallest_area_px: fewest foreground pixels of a target.
         widest: largest width as a multiple of the height.
         largest: largest side of a target as a fraction of the image's.
+        flat: what is thinner than this part of the height of a wide piece lies on the ground, such as the edge of a
+            shadow, and is no part of the target; 0 for nothing.
     """
 
     history_s: float
@@ -42,6 +45,7 @@ class MotionSettings:
     warm_up_s: float
     threshold: float
     shadows: bool
+    brightest: float
     sway_px: int
     opening_px: int
     bridge_px: tuple[int, int]
@@ -49,6 +53,7 @@ class MotionSettings:
     smallest_area_px: int
     widest: float
     largest: float
+    flat: float
 
 
 # The background's colours are taken out of the mixture this often [s]; it costs a third of a frame's work.
@@ -59,12 +64,9 @@ WORD = np.dtype(np.uint64).itemsize  # so many pixels are looked at at once
 # Levels by which a pixel must leave the background's range: five standard deviations of the sensor's noise of 2, and
 # coding.
 MARGIN = 15
-# The sun comes out: the mixture tells shadows, down to half the background's light, but nothing that is brighter.
-BRIGHTEST = 1.5
-# A piece wider than this part of its height may be a person and the edge of a shadow or of a patch of light, which lies
-# flat on the ground: thinner than this part of the height. What is left is no target if it is wider than high, such as
-# the middle of a cloud.
-WIDE, FLAT, UPRIGHT = 0.7, 0.1, 1.0
+# A piece wider than this part of its height may be a target and what lies flat. Without that it is none if it is wider
+# than high, such as the middle of a cloud.
+WIDE, UPRIGHT = 0.7, 1.0
 
 # The plain mixture remembers 120 frames at 30 a second [s].
 PLAIN_HISTORY_S = 4.0
@@ -75,6 +77,7 @@ BIRD = MotionSettings(
     warm_up_s=0.5,
     threshold=25.0,
     shadows=False,
+    brightest=1.0,
     sway_px=3,
     opening_px=0,
     bridge_px=(5, 5),
@@ -82,6 +85,7 @@ BIRD = MotionSettings(
     smallest_area_px=5,
     widest=np.inf,
     largest=0.3,
+    flat=0.0,
 )
 # A person stops at times, casts a shadow, falls apart into limbs and trunk one above the other, and stands upright
 # (1.3 still lets two or three side by side pass, but not a patch of light on the ground).
@@ -91,6 +95,7 @@ PERSON = MotionSettings(
     warm_up_s=0.5,
     threshold=16.0,
     shadows=True,
+    brightest=1.5,
     sway_px=0,
     opening_px=3,
     bridge_px=(5, 15),
@@ -98,12 +103,21 @@ PERSON = MotionSettings(
     smallest_area_px=150,
     widest=1.3,
     largest=0.9,
+    flat=0.1,
 )
 
 
 def plain(settings: MotionSettings) -> MotionSettings:
-    """The paper's detector: the mixture alone, with OpenCV's part of the background and nothing against sway."""
-    return replace(settings, history_s=PLAIN_HISTORY_S, background_part=0.9, threshold=25.0, sway_px=0)
+    """The paper's detector: the mixture alone, with OpenCV's part of the background; nothing against sway or light."""
+    return replace(
+        settings,
+        history_s=PLAIN_HISTORY_S,
+        background_part=0.9,
+        threshold=25.0,
+        brightest=1.0,
+        sway_px=0,
+        flat=0.0,
+    )
 
 
 class MotionDetector:
@@ -128,6 +142,7 @@ class MotionDetector:
         self._learnt = 0.0
         self._known: tuple[Image, float] | None = None  # background, and when it was taken out of the mixture
         self._range: tuple[Image, Image] | None = None
+        self._range_of: Image | None = None
         self._shape: tuple[int, ...] | None = None
         self.mask: Image | None = None
 
@@ -141,7 +156,9 @@ class MotionDetector:
         self._shape = frame.image.shape
         mask = self._model.apply(frame.image, learningRate=self._rate(frame.t))
         if self._settings.shadows:
-            mask = self._unlit(cv2.compare(mask, FOREGROUND, cv2.CMP_EQ), frame.image)
+            mask = cv2.compare(mask, FOREGROUND, cv2.CMP_EQ)
+        if self._settings.brightest > 1.0:
+            mask = self._unlit(mask, frame.image)
         if self._settings.sway_px:
             mask = _outside(mask, frame.image, self._sway())
         if self._settings.opening_px:
@@ -160,36 +177,38 @@ class MotionDetector:
         self._learnt += dt
         return min(1.0, dt / min(self._settings.history_s, 2 * self._learnt))
 
-    def _background(self) -> tuple[Image, bool]:
-        """The background's colours, of a moment ago at most, and whether they were taken out of the mixture now."""
+    def _background(self) -> Image:
+        """The background's colours, of a moment ago at most."""
         learnt, known = self._learnt, self._known
         if known is None or not BACKGROUND_UPDATE_S <= learnt <= known[1] + BACKGROUND_UPDATE_S:
-            image = self._model.getBackgroundImage()
-            self._known = image, learnt
-            return image, True
-        return known[0], False
+            known = self._known = self._model.getBackgroundImage(), learnt
+        return known[0]
 
     def _unlit(self, mask: Image, image: Image) -> Image:
         """A mask without the background in a brighter light, where most of what changed is that."""
         if cv2.countNonZero(mask) < FEW * mask.size:
             return mask
         there = np.flatnonzero(mask)
-        now, before = (each.reshape(-1, 3)[there].astype(np.float32) for each in (image, self._background()[0]))
+        now, before = (each.reshape(-1, 3)[there].astype(np.float32) for each in (image, self._background()))
         light = np.einsum("ij,ij->i", now, before) / np.maximum(np.einsum("ij,ij->i", before, before), 1.0)
-        same = (np.abs(now - light[:, None] * before) < MARGIN).all(axis=1) & (light > 1.0) & (light < BRIGHTEST)
+        same = (
+            (np.abs(now - light[:, None] * before) < MARGIN).all(axis=1)
+            & (light > 1.0)
+            & (light < self._settings.brightest)
+        )
         if 2 * np.count_nonzero(same) > len(there):
             mask.ravel()[there[same]] = 0
         return mask
 
     def _sway(self) -> tuple[Image, Image]:
         """The darkest and the brightest that the background has nearby: what sways does not leave that range."""
-        background, anew = self._background()
-        if anew or self._range is None:
+        background = self._background()
+        if self._range is None or self._range_of is not background:
             nearby = np.ones((2 * self._settings.sway_px + 1,) * 2, np.uint8)
             margin = (MARGIN,) * 3
             darkest = cv2.subtract(cv2.erode(background, nearby), (*margin, 0))
             brightest = cv2.add(cv2.dilate(background, nearby), (*margin, 0))
-            self._range = darkest, brightest
+            self._range, self._range_of = (darkest, brightest), background
         return self._range
 
     def _boxes(self, mask: Image) -> list[Detection]:
@@ -223,9 +242,11 @@ class MotionDetector:
     def _upright(self, piece: Image) -> list[tuple[int, int]]:
         """From which column to which a piece of a mask is a target: where it is wide, without what lies flat."""
         height, width = piece.shape
-        if math.isinf(self._settings.widest) or width <= WIDE * height:
+        if not self._settings.flat or width <= WIDE * height:
             return [(0, width)]
-        stands = cv2.morphologyEx(piece, cv2.MORPH_OPEN, np.ones((max(1, round(FLAT * height)), 1), np.uint8))
+        stands = cv2.morphologyEx(
+            piece, cv2.MORPH_OPEN, np.ones((max(1, round(self._settings.flat * height)), 1), np.uint8)
+        )
         columns = cv2.dilate(stands, np.ones((1, self._settings.bridge_px[0]), np.uint8)).any(axis=0)
         edges = np.flatnonzero(np.diff(columns, prepend=False, append=False)).tolist()
         return list(zip(edges[::2], edges[1::2], strict=True))
