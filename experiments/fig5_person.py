@@ -30,6 +30,7 @@ from experiments.harness import Experiment, Row, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, watched_in
 from experiments.panels import laid_out
 from experiments.pictured import Pictured
+from experiments.spread import bars, spread
 
 NAME = "person"
 MOMENTS, FIRST_S = 3, 4.4  # in the picture, the first of them then and the last at the end; he is there from 3 s on [s]
@@ -110,13 +111,7 @@ def _picture(moments: Sequence[Step]) -> bytes:
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """Of each figure the median over the seeds, the least and the largest; a run without it is told apart."""
-    found = {}
-    for key in FIGURES:
-        values = [float(row[key]) for row in rows if row[key] is not None]
-        three = (np.median(values), min(values), max(values)) if values else (np.nan,) * 3
-        numbers = dict(zip(("median", "least", "largest"), map(float, three), strict=True))
-        found[key] = numbers | {"not measured": float(len(rows) - len(values))}
-    return found
+    return {key: spread(rows, key) | {"not measured": float(sum(row[key] is None for row in rows))} for key in FIGURES}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
@@ -140,11 +135,7 @@ def describe(settings: PersonSettings, summary: Mapping[str, Any]) -> str:
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Each seed's detection error in the fixed view, and offset and size in the close-up."""
     keys = ("tpe_px_median", "tpo_percent_median", "size_ratio_median")
-    for ax, key in zip(figure.subplots(1, len(keys)), keys, strict=True):
-        told = [row for row in rows if row[key] is not None]
-        ax.bar(range(len(told)), [row[key] for row in told], tick_label=[row["seed"] for row in told])
-        ax.set(title=FIGURES[key], xlabel="seed")
-        ax.title.set_size(8)
+    bars(figure.subplots(1, len(keys)), rows, {key: FIGURES[key] for key in keys})
 
 
 SETTINGS = PersonSettings()

@@ -34,6 +34,7 @@ from experiments.harness import Experiment, Row, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, watched_in
 from experiments.panels import laid_out
 from experiments.pictured import Pictured
+from experiments.spread import bars, spread
 
 KIND = "person"
 NAMES = (KIND, f"{KIND}2", f"{KIND}3")
@@ -184,12 +185,7 @@ def _picture(shown: Sequence[tuple[Step, str]]) -> bytes:
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """Of each figure the median over the seeds, the least and the largest, of the runs that have it."""
-    found = {}
-    for key in FIGURES:
-        values = [float(row[key]) for row in rows if row[key] is not None]
-        three = (np.median(values), min(values), max(values)) if values else (np.nan,) * 3
-        found[key] = dict(zip(("median", "least", "largest"), map(float, three), strict=True))
-    return found
+    return {key: spread(rows, key) for key in FIGURES}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
@@ -210,11 +206,7 @@ def describe(settings: OutdoorSettings, summary: Mapping[str, Any]) -> str:
 def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Of each seed how many were followed, and offset and size in the close-up."""
     keys = ("followed", "tpe_px", "tpo_percent", "size_ratio")
-    for ax, key in zip(np.ravel(figure.subplots(2, 2)), keys, strict=True):
-        told = [row for row in rows if row[key] is not None]
-        ax.bar(range(len(told)), [row[key] for row in told], tick_label=[row["seed"] for row in told])
-        ax.set(title=FIGURES[key], xlabel="seed")
-        ax.title.set_size(8)
+    bars(np.ravel(figure.subplots(2, 2)), rows, {key: FIGURES[key] for key in keys})
 
 
 SETTINGS = OutdoorSettings()
