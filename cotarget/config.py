@@ -44,6 +44,7 @@ __all__ = [
     "SimHead",
     "SimZoomCamera",
     "TargetConfig",
+    "check_config",
     "load_config",
     "parse_config",
 ]
@@ -132,15 +133,20 @@ class RigConfig:
     recording: Path | None = None
     board: BoardConfig = field(default_factory=BoardConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
-    targets: Mapping[str, TargetConfig] = field(default_factory=lambda: DEFAULT_TARGETS)
+    targets: Mapping[str, TargetConfig] = field(default_factory=lambda: dict(DEFAULT_TARGETS))
 
     @property
     def head_limits(self) -> tuple[Pair, Pair]:
         """Pan and tilt limits [rad]: the device's, and the soft ones where they are tighter."""
+        pan, tilt = self.head_limits_deg
+        return (math.radians(pan[0]), math.radians(pan[1])), (math.radians(tilt[0]), math.radians(tilt[1]))
+
+    @property
+    def head_limits_deg(self) -> tuple[Pair, Pair]:
+        """The same [degrees]."""
         head, soft = self.sim.head if self.backend == "sim" else self.hardware.head, self.safety
         pan = _overlap(head.pan_deg, soft.pan_deg, "safety.pan_deg")
-        tilt = _overlap(head.tilt_deg, soft.tilt_deg, "safety.tilt_deg")
-        return (math.radians(pan[0]), math.radians(pan[1])), (math.radians(tilt[0]), math.radians(tilt[1]))
+        return pan, _overlap(head.tilt_deg, soft.tilt_deg, "safety.tilt_deg")
 
     @property
     def head_step(self) -> float:
@@ -255,7 +261,7 @@ def parse_config(table: Mapping[str, Any], *, recorded: bool = False) -> RigConf
         table["sim"] = {**sim_table, "effects": expand_all(sim_table["effects"])}
     config = build(RigConfig, table, "")
     config = dataclasses.replace(config, targets=targets, sim=fit_sizes(config.sim, table.get("sim", {})))
-    _check(config, recorded)
+    check_config(config, recorded)
     return config
 
 
@@ -271,8 +277,16 @@ def _overlap(own: Pair, soft: Pair | None, where: str) -> Pair:
     return both
 
 
-def _check(config: RigConfig, recorded: bool) -> None:
-    """Refuse values of the right type that make no sense."""
+def check_config(config: RigConfig, recorded: bool = False) -> None:
+    """Refuse values of the right type that make no sense.
+
+    Args:
+        config: of a rig.
+        recorded: as in `parse_config`.
+
+    Raises:
+        ConfigError: with the key.
+    """
     check_numbers(config.sim) if recorded else check_sim(config.sim)
     check_hardware(config.hardware)
     positive: dict[str, float] = {

@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.closeup import Found
+from cotarget.closeup import CloseupFinder, Found
 from cotarget.config import TargetConfig
 from cotarget.detection import Detection, Detector
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
 from cotarget.eyes import Eyes
 from cotarget.policies import FirstCome, Policy
-from cotarget.pursuit import Pursuit
+from cotarget.pursuit import MakeFinder, Pursuit
 from cotarget.rig import Frame, Image, PanTiltState, Rig, ZoomState
 from cotarget.servo import Predict, Servo, ServoSettings
 from cotarget.targeting import Aim
@@ -45,11 +45,13 @@ class FollowSettings(ServoSettings):
     Attributes:
         zoom_out_after_s: how long a target may be out of sight before the lens zooms out [s].
         closed_loop: whether the target is looked for in the zoom view too.
+        finder: makes what looks for it there.
         policy: makes, for each run, what decides which of several targets is followed; the first by default.
     """
 
     zoom_out_after_s: float = 0.4
     closed_loop: bool = True
+    finder: MakeFinder = CloseupFinder
     policy: Callable[[], Policy] = FirstCome
 
 
@@ -140,7 +142,9 @@ class _Loop:
     ) -> None:
         self._rig, self._detector, self._settings = rig, detector, settings
         self._tracker = Tracker(settings_for(target), rig.fixed.size)
-        self._pursuit = Pursuit(calibration, target, rig.fixed.size, closed_loop=settings.closed_loop)
+        self._pursuit = Pursuit(
+            calibration, target, rig.fixed.size, closed_loop=settings.closed_loop, finder=settings.finder
+        )
         self._servo = Servo(rig, calibration, settings)
         self._eyes = Eyes(rig.fixed, rig.zoom, rig.clock)
         self._beyond: set[int] = set()  # tracks that could not be aimed at

@@ -1,6 +1,6 @@
 """What a pipeline may be told by the simulation's truth, where it shall not find out by itself.
 
-Detections without pictures, and a calibration without error: for runs that need neither rendering nor boards.
+Detections and finds without pictures, and a calibration without error: for runs that need neither rendering nor boards.
 """
 
 import math
@@ -12,6 +12,8 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.closeup import CloseupFinder, Expected, Found
+from cotarget.config import TargetConfig
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError
 from cotarget.pantilt import HeadGeometry
@@ -147,3 +149,57 @@ class TruthDetector:
                 continue
             found.append(Detection(np.array(middle), np.array(sides), 1.0, clipped))
         return sorted(found, key=lambda detection: -math.prod(detection.size_px.tolist()))
+
+
+class TruthFinder:
+    """Finds a target in the zoom view where it truly is, with noise, if it is looked for there; needs no picture.
+
+    To be given to the loop as `FollowSettings.finder`. What it finds is the middle of the body, as the real one means
+    to. What hides a target is not considered.
+    """
+
+    SIGMA_PX = 1.0  # of the noise; the real finder assumes that lens, head and the times of frames leave as much
+    GATE_SIGMAS = 3.0  # as that of the real finder
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        target: TargetConfig,
+        truth: Appearances,
+        name: str,
+        seed: int,
+        missed: Callable[[float], bool] = lambda t: False,
+    ) -> None:
+        """Begin.
+
+        Args:
+            calibration: of the rig.
+            target: what is told of the target.
+            truth: of the world whose frames are asked about.
+            name: of the target.
+            seed: of the noise.
+            missed: whether it is not found in a frame, by the time when that was exposed [s].
+        """
+        self._view = CloseupFinder(calibration, target).view
+        self._truth, self._name, self._missed, self._numbers_at = truth, name, missed, counted(seed)
+
+    def see_wide(self, frame: Frame, detection: Detection, mask: Image | None = None) -> None:
+        """Nothing of it is remembered."""
+
+    def sight_at(self, t: float) -> bool:
+        """The truth is there at any time."""
+        return True
+
+    def find(self, frame: Frame, expected: Expected) -> Found | None:
+        """Find the target; None where its middle is not in the frame, or not where it is expected."""
+        view, box = self._view(expected), self._truth.box(self._name, "zoom", frame.t)
+        if view is None or box is None or self._missed(frame.t):
+            return None
+        at = self._truth.center_px(self._name, "zoom", frame.t) + self.SIGMA_PX * self._numbers_at(frame.t).normal(
+            size=2
+        )
+        off = at - view.center_px
+        inside = (at >= 0).all() and (at <= np.array(frame.image.shape[1::-1]) - 1).all()
+        if not inside or off @ np.linalg.solve(view.covariance, off) > self.GATE_SIGMAS**2:
+            return None
+        return Found(at, self.SIGMA_PX, np.full(2, self.SIGMA_PX), 1.0, 1.0, np.ptp(box, axis=0), frame.t)

@@ -1,10 +1,11 @@
 """Runs a few long jobs side by side, each in a process of its own, because an OpenGL context belongs to one thread."""
 
+import contextlib
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
@@ -41,7 +42,8 @@ def run_side_by_side(
         for given in arguments:
             ours, theirs = context.Pipe(duplex=False)
             process = context.Process(target=_work, args=(job, given, theirs), daemon=True)
-            process.start()
+            with interrupts_kept_from_children():
+                process.start()
             theirs.close()
             processes.append(process)
             pipes.append(ours)
@@ -80,6 +82,19 @@ def _work(job: Callable[..., Any], given: tuple[Any, ...], pipe: Connection) -> 
         pipe.send(("done", job(*given, report)))
     except Exception as error:
         pipe.send(("error", error))
+
+
+@contextlib.contextmanager
+def interrupts_kept_from_children() -> Iterator[None]:
+    """Processes started meanwhile never hear Ctrl-C, which reaches all of them; the one that started them ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def end_with_parent(*then: Callable[[], Any]) -> None:

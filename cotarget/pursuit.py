@@ -6,14 +6,14 @@ triangulates its depth and shows any error of head or calibration.
 
 import math
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.closeup import LATEST_S, CloseupFinder, Expected, Found
+from cotarget.closeup import LATEST_S, CloseupFinder, Expected, Finder, Found
 from cotarget.config import TargetConfig
 from cotarget.detection import Detection
 from cotarget.estimation import Appearance, Estimate, SpatialFilter, estimation_settings_for
@@ -47,6 +47,8 @@ JUST_SEEN_S = 0.2
 # Of more zoom frames than these the oldest wait no longer for the wide view of their time.
 MOST_WAITING = 30
 
+MakeFinder = Callable[[Calibration, TargetConfig], Finder]
+
 
 class Pursuit:
     """The filters of all tracks, from one frame to the next.
@@ -56,20 +58,27 @@ class Pursuit:
         target: what is followed.
         size: (width, height) of the wide view [px].
         closed_loop: whether the target is looked for in the zoom view too.
+        finder: makes what looks for it there, anew for each target that is followed.
     """
 
     def __init__(
-        self, calibration: Calibration, target: TargetConfig, size: tuple[int, int], *, closed_loop: bool = True
+        self,
+        calibration: Calibration,
+        target: TargetConfig,
+        size: tuple[int, int],
+        *,
+        closed_loop: bool = True,
+        finder: MakeFinder = CloseupFinder,
     ) -> None:
         self._calibration, self._target, self._size = calibration, target, size
-        self._closed_loop = closed_loop
+        self._closed_loop, self._make_finder = closed_loop, finder
         self._assumed = estimation_settings_for(target, calibration)
         self._filters: dict[int, SpatialFilter] = {}
         self._seen_s: dict[int, float] = {}
         self._followed: int | None = None
         self._zoom_t = math.inf
         self._unfound_s = 0.0
-        self._finder = CloseupFinder(calibration, target)
+        self._finder = finder(calibration, target)
         self._waiting: deque[Frame] = deque(maxlen=MOST_WAITING)  # zoom frames without a wide view of their time
         self._apart_s = 0.0  # by which the newest zoom frame was newer than the newest wide one
         self._to_base = calibration.hand_eye() * calibration.T_zoom0_fixed
@@ -227,7 +236,7 @@ class Pursuit:
         """Look for another track in the zoom view from now on."""
         if number != self._followed:
             self._followed, self._unfound_s = number, 0.0
-            self._finder = CloseupFinder(self._calibration, self._target)
+            self._finder = self._make_finder(self._calibration, self._target)
 
     def count_seen_well(self, track: Track, seconds: float, longest_px: float) -> None:
         """Note whether a track was well in the close-up, by where head and lens have told that they were at its time.

@@ -11,7 +11,7 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,13 @@ from cotarget.report.wording import count as number_of
 from experiments.arguments import Parser, check_folder
 from experiments.bounds import EXPECTED, tighten
 from experiments.cases import Case, Known, choose, known_experiments
-from experiments.cluster import on_dask
+from experiments.cluster import check_cluster, on_dask
 from experiments.harness import INTERRUPTED, TERMINATED
 from experiments.outcome import Outcome, conclude
-from experiments.report import Run, duration, write_report
+from experiments.report import Run, duration, used, write_report
 from experiments.results import code_version, taken
-from experiments.runner import Sweep, forget, sessions
+from experiments.runner import Sweep, forget
+from experiments.sessions import sessions
 from experiments.workers import Engine, in_processes
 
 PROGRAM = "python -m experiments"
@@ -123,7 +124,7 @@ def _list(known: Known) -> int:
 
 
 def _run(given: argparse.Namespace, typed: Sequence[str], known: Known, expected: Path) -> int:
-    engine, what = _engine(given)
+    engine, what, check = _engine(given)
     folder: Path = given.out or (OUT_QUICK if given.quick else OUT)
     check_folder(folder)
     chosen = choose(
@@ -132,37 +133,43 @@ def _run(given: argparse.Namespace, typed: Sequence[str], known: Known, expected
     if given.update_expected and not all(case.has_bounds for case in chosen):
         raise ConfigError("the bounds are of quick runs as they are: --update-expected goes with --quick alone")
     cases, skipped = _split(chosen, named=bool(given.names))
-    if given.report:
-        sweep = Sweep(cases, folder, given.processes, given.any_code)
+    if given.report:  # which tells what is of other code, instead of refusing it
+        sweep = Sweep(cases, folder, any_code=True)
     else:
         with taken(folder):
             if given.fresh:
+                check()
                 forget(cases, folder)
             sweep = Sweep(cases, folder, given.processes, given.any_code)
-            if status := _do(sweep, engine, what):
+            if status := _do(sweep, engine, what, given.fresh):
                 return status
     outcomes = [
-        conclude(case, records, folder / case.folder, expected)
-        for case, records in zip(cases, sweep.records, strict=True)
+        conclude(case, records, folder / case.folder, expected, shared)
+        for case, records, shared in zip(cases, sweep.records, sweep.shared, strict=True)
     ]
     _tell(outcomes, skipped)
     if given.update_expected:
         _update(outcomes, expected)
-    page = folder / "report.html"
-    write_report(page, Run(outcomes, skipped, sessions(folder), shlex.join([*PROGRAM.split(), *typed])))
-    print(f"\n{page}")
+    page, mine = folder / "report.html", {case.folder for case in cases}
+    took = [part for each in sessions(folder) if (part := each.of(mine)).cases]
+    does = [word for word in typed if not (word.startswith("--r") and "--report".startswith(word))]
+    is_full = not (given.names or given.quick or given.seeds or given.set)
+    run = Run(outcomes, skipped, took, shlex.join([*PROGRAM.split(), *does]), is_full)
+    write_report(page, run)
+    print(f"\nin all: {used(run)}\n{page}")
     return 0 if all(outcome.ok for outcome in outcomes) else 1
 
 
-def _engine(given: argparse.Namespace) -> tuple[Engine, str]:
-    """Who does the jobs, and the same in words."""
+def _engine(given: argparse.Namespace) -> tuple[Engine, str, Callable[[], None]]:
+    """Who does the jobs, the same in words, and what finds out whether they can."""
     if given.backend == "dask":
-        version = "" if given.any_code else code_version()
         where = "a Dask cluster" if given.scheduler else f"a Dask cluster on this machine, {given.processes} at most"
-        return functools.partial(on_dask, scheduler=given.scheduler, version=version), where
+        told = {"scheduler": given.scheduler, "version": code_version(), "any_libraries": given.any_code}
+        check = functools.partial(check_cluster, given.processes, **told)
+        return functools.partial(on_dask, **told), where, check
     if given.scheduler is not None:
         raise ConfigError("--scheduler goes with --backend dask")
-    return in_processes, number_of(given.processes, "process", "processes")
+    return in_processes, number_of(given.processes, "process", "processes"), lambda: None
 
 
 def _split(chosen: Sequence[Case], *, named: bool) -> tuple[list[Case], dict[str, str]]:
@@ -175,7 +182,7 @@ def _split(chosen: Sequence[Case], *, named: bool) -> tuple[list[Case], dict[str
     return [case for case in chosen if case.title not in skipped], skipped
 
 
-def _do(sweep: Sweep, engine: Engine, what: str) -> int:
+def _do(sweep: Sweep, engine: Engine, what: str, fresh: bool) -> int:
     """Do the jobs that are missing; the exit status where that was broken off."""
     try:
         with progress_bar() as show:
@@ -188,7 +195,8 @@ def _do(sweep: Sweep, engine: Engine, what: str) -> int:
     except SystemExit:
         why, status = "ended", TERMINATED
     if sweep.done:
-        why += f"; {sweep.done} of {sweep.total} jobs are done and kept in {sweep.folder}, and the same command goes on"
+        same = f"the same command{' without --fresh' if fresh else ''} goes on"
+        why += f"; {sweep.done} of {sweep.total} jobs are done and kept in {sweep.folder}, and {same}"
     print(f"{PROGRAM}: {why}", file=sys.stderr)
     return status
 
@@ -201,6 +209,7 @@ def _tell(outcomes: Sequence[Outcome], skipped: dict[str, str]) -> None:
             print(outcome.text)
         remarks = [outcome.broken] if outcome.broken else []
         remarks += [f"{outcome.undone} jobs are not done yet"] if outcome.undone else []
+        remarks += [f"done by cotarget {each}, this is {code_version()}" for each in outcome.other_code]
         remarks += [f"missed: {name}" for name in outcome.missed or ()]
         remarks += [f"worse than its bound: {b.name}, {b.reached} is not {b.text}" for b in outcome.worse]
         print(*remarks, sep="\n", end="\n" if remarks else "")

@@ -67,7 +67,8 @@ class Bound:
             return self.bound[0] <= self.reached <= self.bound[1]
         if self.bound is None:
             return True
-        return self.reached <= WORSE * self.bound if self.kind == AT_MOST else self.bound <= WORSE * self.reached
+        worst = (self.bound * WORSE, self.bound / WORSE)  # which is which depends on the sign
+        return self.reached <= max(worst) if self.kind == AT_MOST else self.reached >= min(worst)
 
     @property
     def tighter(self) -> float | None:

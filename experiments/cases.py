@@ -22,6 +22,8 @@ EXPERIMENTS = (
     *("env_score", "env_speed", "shortcut", "models", "depth_error", "calibration_budget", "single_ptz"),
     *("table2_table3", "worked_example", "fig4_book", "fig5_person", "fig6_outdoors"),
 )
+PROCESSES = "processes"
+SIGNED = ("depth_error.wrong",)  # settings that may be below zero
 SHORT = 6  # digits that tell folders apart whose names cannot be written in full
 
 Known = Mapping[str, Callable[[], Experiment[Any]]]
@@ -113,8 +115,35 @@ def choose(
         for picked in itertools.product(*([(key, text) for text in texts] for key, texts in mine.items())):
             tables = {key: _value(text) for key, text in picked}
             settings = build(type(base), tables, name, base=base)
+            for key in tables:
+                _check(settings, key, f"{name}.{key}")
             cases.append(Case(experiment, settings, tuple(f"{key}={text}" for key, text in picked), quick))
     return cases
+
+
+def _check(settings: Settings, key: str, where: str) -> None:
+    """Refuse a value that no seed can be done with, before all seeds fail one by one.
+
+    Whole numbers count something, other numbers measure it, and times last; names are among those of the usual value,
+    which are all there are.
+
+    Raises:
+        ConfigError: it is one.
+    """
+    usual = next(field.default for field in dataclasses.fields(settings) if field.name == key)
+    value = getattr(settings, key)
+    if value == () and usual:
+        raise ConfigError(f"{where}: is empty; at least one is needed")
+    for each in value if isinstance(value, tuple) else (value,):
+        if isinstance(each, str):
+            if isinstance(usual, tuple) and usual and each not in usual:
+                raise ConfigError(f"{where}: {each!r} is not one of: {choices(usual)}")
+        elif not isinstance(each, bool):
+            least = 1 if isinstance(each, int) and usual else 0
+            if each < least and where not in SIGNED:
+                raise ConfigError(f"{where}: {each:g} is below {least}")
+            if each == 0 and (key.startswith("seconds") or key.endswith("_s")):
+                raise ConfigError(f"{where}: lasts no time")
 
 
 def _checked(name: str, known: Known) -> str:
@@ -134,6 +163,8 @@ def _parsed(changes: Sequence[str], known: Known, chosen: Sequence[str]) -> dict
             raise ConfigError(f"'{change}' is not like NAME.KEY=VALUE, such as chain.noise_px=0.1")
         if _checked(name, known) not in chosen:
             raise ConfigError(f"'{change}': {name} is not among those to run: {choices(chosen)}")
+        if key == PROCESSES:
+            raise ConfigError(f"'{change}': how many processes there are changes no row; say --processes")
         texts = values.setdefault(name, {}).setdefault(key, [])
         if text not in texts:
             texts.append(text)

@@ -12,23 +12,29 @@ from typing import Any
 import cv2
 
 from cotarget.errors import ConfigError, DeviceError
-from experiments.workers import (
-    LINEAR_ALGEBRA,
-    ONE_THREAD,
-    Died,
-    Job,
-    Results,
-    interrupts_kept_from_children,
-    one_thread_each,
-)
+from cotarget.parallel import interrupts_kept_from_children
+from experiments.results import differing
+from experiments.workers import LINEAR_ALGEBRA, ONE_THREAD, Died, Job, Results, one_thread_each
 
 EXTRA = "cotarget[sweeps]"
 ANSWER_S = 10.0  # for a scheduler to answer [s]
+HEEDED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")  # by the linear algebra of numpy and scipy as they are published
+START_SO = "start workers with --nthreads 1 (and --nworkers N)"
+WITHOUT_PACKAGES = (
+    "does not find the packages cotarget and experiments; start it with PYTHONPATH set to a clone of this repository"
+)
+SEVERAL_THREADS = "has linear algebra on several threads; start it with OMP_NUM_THREADS=1"
 QUIET = logging.CRITICAL + 10  # what is wrong is told in one line
 
 
 def on_dask(
-    work: Callable[[Job], Any], jobs: Sequence[Job], processes: int, *, scheduler: str | None = None, version: str = ""
+    work: Callable[[Job], Any],
+    jobs: Sequence[Job],
+    processes: int,
+    *,
+    scheduler: str | None = None,
+    version: str = "",
+    any_libraries: bool = False,
 ) -> Results:
     """Do jobs on a Dask cluster, begun in their order; what each gives as it comes, with its number.
 
@@ -40,17 +46,19 @@ def on_dask(
         jobs: its arguments, one each.
         processes: how many workers a cluster on this machine has, where none is named.
         scheduler: the cluster's address, such as tcp://10.0.0.1:8786.
-        version: of the code that all workers must have; any by default.
+        version: of the code that all workers must have, as `code_version` gives it; any by default.
+        any_libraries: whether the libraries' versions may be others.
 
     Raises:
-        ConfigError: Dask is missing, nobody answers there, or the workers are not fit for the work.
+        ConfigError: Dask is missing, nobody answers there, or the workers are not fit for the work, those included that
+            join later.
         DeviceError: the scheduler is gone.
         Exception: what a job raised.
     """
     distributed = _needed("distributed")
     with _client(distributed, scheduler, min(processes, len(jobs))) as client:
         where = client.scheduler.address
-        _check_workers(client, where, version)
+        _check_workers(client, where, version, any_libraries)
         numbers = {
             client.submit(_held_to_one_thread, work, job, pure=False, priority=-number): number
             for number, job in enumerate(jobs)
@@ -63,9 +71,25 @@ def on_dask(
                     result = Died
                 except concurrent.futures.CancelledError:
                     raise DeviceError(f"the Dask scheduler at {where} is gone") from None
+                except ImportError:
+                    raise ConfigError(f"a Dask worker that joined {where} {WITHOUT_PACKAGES}") from None
                 yield numbers.pop(future), result
         finally:
             client.cancel(list(numbers))  # those that a worker has in hand it still finishes, for nobody
+
+
+def check_cluster(processes: int, scheduler: str | None, version: str, any_libraries: bool) -> None:
+    """Refuse a cluster that could not do the work, before anything is done for its sake; see `on_dask`.
+
+    One on this machine is as fit as this program is.
+
+    Raises:
+        ConfigError: as of `on_dask`.
+    """
+    distributed = _needed("distributed")
+    if scheduler is not None:
+        with _client(distributed, scheduler, processes) as client:
+            _check_workers(client, client.scheduler.address, version, any_libraries)
 
 
 def _needed(name: str) -> Any:
@@ -102,42 +126,46 @@ def _client(distributed: Any, scheduler: str | None, processes: int) -> Iterator
         yield stack.enter_context(client)
 
 
-def _check_workers(client: Any, scheduler: str, version: str) -> None:
+def _check_workers(client: Any, scheduler: str, version: str, any_libraries: bool) -> None:
     """Refuse workers that could not do the work, or not one job at a time each, on one thread."""
     threads: dict[str, int] = client.nthreads()
     if not threads:
         raise ConfigError(f"the Dask scheduler at {scheduler} has no workers; start some with dask worker")
     for worker, count in threads.items():
         if count > 1:  # an OpenGL context belongs to one thread
-            raise ConfigError(
-                f"the Dask worker at {worker} has {count} threads; start workers with --nthreads 1 (and --nworkers N)"
-            )
+            raise ConfigError(f"the Dask worker at {worker} has {count} threads; {START_SO}")
 
     def about() -> tuple[str, bool]:  # sent as it stands: there may be nothing there to find it in
-        held = any(os.environ.get(name) == "1" for name in LINEAR_ALGEBRA)
+        held = any(os.environ.get(name) == "1" for name in HEEDED)
         if not (importlib.util.find_spec("experiments") and importlib.util.find_spec("cotarget")):
             return "", held
         return str(importlib.import_module("experiments.results").code_version()), held
 
     for worker, (code, held) in client.run(about).items():
         if not code:
+            raise ConfigError(f"the Dask worker at {worker} {WITHOUT_PACKAGES}")
+        other = differing(code, version) if version else ""
+        if other and not (any_libraries and other == "libraries"):
+            keep = ", or keep the difference with --any-code" if other == "libraries" else ""
             raise ConfigError(
-                f"the Dask worker at {worker} does not find the packages cotarget and experiments; start it with "
-                "PYTHONPATH set to a clone of this repository"
-            )
-        if version and code != version:
-            raise ConfigError(
-                f"the Dask worker at {worker} has cotarget {code}, this is {version}; give both the same code and "
-                "libraries, or keep the difference with --any-code"
+                f"the Dask worker at {worker} has cotarget {code}, this is {version}; give both the same {other}{keep}"
             )
         if not held:
-            raise ConfigError(
-                f"the Dask worker at {worker} has linear algebra on several threads; start it with OMP_NUM_THREADS=1"
-            )
+            raise ConfigError(f"the Dask worker at {worker} {SEVERAL_THREADS}")
 
 
 def _held_to_one_thread(work: Callable[[Job], Any], job: Job) -> Any:
-    for name, value in ONE_THREAD.items():
-        os.environ.setdefault(name, value)  # heeded by rendering; linear algebra is loaded already
+    """Do a job; a worker that has joined since the others were looked at may be unfit for it.
+
+    Raises:
+        ConfigError: it is.
+    """
+    worker: Any = importlib.import_module("distributed").get_worker()
+    if worker.state.nthreads > 1:
+        raise ConfigError(f"the Dask worker at {worker.address} has {worker.state.nthreads} threads; {START_SO}")
+    if not any(os.environ.get(name) == "1" for name in HEEDED):
+        raise ConfigError(f"the Dask worker at {worker.address} {SEVERAL_THREADS}")
+    for name in ONE_THREAD.keys() - set(LINEAR_ALGEBRA):  # heeded by rendering; linear algebra is loaded already
+        os.environ.setdefault(name, ONE_THREAD[name])
     cv2.setNumThreads(1)
     return work(job)

@@ -3,7 +3,7 @@
 A book that is put elsewhere once and a person who walks are held in the field of `experiments.hold_scenes`, by the
 whole pipeline; all that differs is whether the head gets a new command with every frame that asks for one.
 
-    python -m experiments.dead_zone [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.dead_zone [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
@@ -23,6 +22,7 @@ from cotarget.metrics import score
 from experiments.harness import Experiment, Row, seeds_of, table
 from experiments.hold import FieldSettings, calibrated, held, target_of
 from experiments.hold_scenes import hold_config
+from experiments.spread import in_words, spread_of
 from experiments.wide_view import record
 
 WAYS = {"with": SteeringSettings(), "without": SteeringSettings(zone=0.0)}
@@ -40,7 +40,7 @@ class DeadZoneSettings(FieldSettings):
         closed_loop: whether the offset is corrected from the zoom view too.
     """
 
-    seeds: int = 5
+    seeds: int = 2
     targets: tuple[str, ...] = ("book", "person")
     closed_loop: bool = True
 
@@ -60,20 +60,20 @@ def one(calibration: Calibration, settings: DeadZoneSettings, seed: int) -> list
     return rows
 
 
-def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """Of each target and figure the medians over the seeds, and the one over the other."""
-    found: dict[str, dict[str, dict[str, float]]] = {}
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Of each target and figure median, least and largest over the seeds, and the one median over the other."""
+    found: dict[str, dict[str, dict[str, Any]]] = {}
     for name in dict.fromkeys(row["target"] for row in rows):
         found[name] = {}
         for key in FIGURES:
-            medians = {way: _median([r[key] for r in rows if (r["target"], r["way"]) == (name, way)]) for way in WAYS}
-            found[name][key] = medians | {"over": _over(medians["with"], medians["without"])}
+            ways = {way: _spread([r[key] for r in rows if (r["target"], r["way"]) == (name, way)]) for way in WAYS}
+            found[name][key] = ways | {"over": _over(ways["with"]["median"], ways["without"]["median"])}
     return found
 
 
-def _median(values: Sequence[float | None]) -> float:
-    """The median; nan where a run never acquired its target."""
-    return float(np.median([math.nan if value is None else value for value in values]))
+def _spread(values: Sequence[float | None]) -> dict[str, float]:
+    """Over the seeds; nan where a run never acquired its target."""
+    return spread_of([] if None in values else [float(value) for value in values if value is not None])
 
 
 def _over(value: float, other: float) -> float:
@@ -94,26 +94,30 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 def describe(settings: DeadZoneSettings, summary: Mapping[str, Any]) -> str:
     """A line for each target and figure."""
     lines = [
-        [f"{name}, {key}", found["with"], found["without"], found["over"], f"<= {WANTED[key]:g}"]
+        [f"{name}, {key}", *(in_words(found[way]) for way in WAYS), found["over"], f"<= {WANTED[key]:g}"]
         for name, figures in summary.items()
         for key, found in figures.items()
     ]
-    return f"the head with a dead zone and without, medians of {seeds_of(settings)}\n" + table(
+    return f"the head with a dead zone and without, median (least to largest) of {seeds_of(settings)}\n" + table(
         ("", "with", "without", "with / without", "wanted"), lines
     )
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Each seed's figures, with against without."""
+    """With against without: each seed a point, its median a cross with arms from the least to the largest."""
     for ax, key in zip(figure.subplots(1, len(FIGURES)), FIGURES, strict=True):
         highest = 0.0
         for name in dict.fromkeys(row["target"] for row in rows):
             of_way = [[r[key] or 0.0 for r in rows if (r["target"], r["way"]) == (name, way)] for way in WAYS]
-            ax.plot(of_way[1], of_way[0], "o", label=name)
+            (dots,) = ax.plot(of_way[1], of_way[0], ".", alpha=0.6)
+            told = [spread_of(each) for each in (of_way[1], of_way[0])]
+            x, y = (each["median"] for each in told)
+            arms = [[[each["median"] - each["least"]], [each["largest"] - each["median"]]] for each in told]
+            ax.errorbar([x], [y], xerr=arms[0], yerr=arms[1], fmt="o", color=dots.get_color(), label=name)
             highest = max([highest, *of_way[0], *of_way[1]])
         ax.plot([0, highest], [0, WANTED[key] * highest], "k:", label="wanted: below")
         ax.set(title=key, xlabel="without", ylabel="with")
-    ax.legend(frameon=False)
+    ax.legend(frameon=False, loc="lower right")
 
 
 SETTINGS = DeadZoneSettings()
@@ -121,7 +125,8 @@ EXPERIMENT = Experiment(
     "dead_zone",
     "Commands and reversals a minute with the dead zone and without, and the offset it costs.",
     SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=10.0, calibrated=False, closed_loop=False),
+    # By the wide view alone the zone costs more offset than with the zoom view's corrections: no bound for their ratio.
+    dataclasses.replace(SETTINGS, seeds=1, targets=("person",), seconds=10.0, calibrated=False, closed_loop=False),
     one,
     summarise,
     describe,

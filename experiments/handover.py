@@ -40,6 +40,8 @@ def figures(moments: Sequence[Moment]) -> dict[str, float | int | None]:
     names = [each.followed for each in moments]
     seconds = {name: float(sum(d for d, each in zip(took, names, strict=True) if each == name)) for name in set(names)}
     closeups = [each.closeup for each in moments if each.closeup is not None]
+    # Where the track that is followed is on nobody, nobody is in frame.
+    in_frame = [each.closeup is not None and each.closeup.in_frame for each in moments if each.is_following]
     handovers = [(old, new) for old, new in turns(names) if old is not None]
     gaps = [gap for old, new in handovers if (gap := _gap(moments, names, old, new)) is not None]
     lost = sum(d for d, each in zip(took, moments, strict=True) if each.is_following and each.followed is None)
@@ -49,7 +51,7 @@ def figures(moments: Sequence[Moment]) -> dict[str, float | int | None]:
         "tpo_px": _median(each.tpo_px for each in closeups),
         "tpo_percent": _median(100 * each.tpo_px / each.width_px for each in closeups),
         "size_ratio": _median(each.size_ratio for each in closeups),
-        "in_frame": float(np.mean([each.in_frame for each in closeups])) if closeups else None,
+        "in_frame": float(np.mean(in_frame)) if in_frame else None,
         "handover_s": _median(gaps),
         "too_early": sum(names[old] in moments[new].present for old, new in handovers),
         "off_target_s": float(lost),

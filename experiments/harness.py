@@ -16,37 +16,34 @@ import dataclasses
 import functools
 import io
 import json
-import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-import cv2
-import numpy as np
 from tqdm import tqdm
 
-import cotarget
 from cotarget.cli.arguments import count, not_negative
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.outputs import write_whole
 from experiments.arguments import Parser, check_folder
 from experiments.pictured import Pictured, parted, shown
+from experiments.texts import in_one_line, plain
+from experiments.texts import rms as rms
+from experiments.texts import table as table
+from experiments.versions import versions
 from experiments.workers import Died, Engine, here, in_processes
 
 if TYPE_CHECKING:  # every worker imports this module, and few draw
     from matplotlib.figure import Figure
 
-    from cotarget.geometry import Array
 
 Row = dict[str, Any]
 INTERRUPTED, TERMINATED = 130, 143  # exit status of Ctrl-C and of SIGTERM
 FIGURE = "figure"  # the plot's file
-PACKAGES = ("numpy", "scipy", "mujoco", "matplotlib")
 
 
 @dataclass(frozen=True)
@@ -81,6 +78,23 @@ S = TypeVar("S", bound=Settings)
 
 
 @dataclass(frozen=True)
+class Preparation:
+    """What seeds share, told by less than all settings, so that it is made once for all who share it.
+
+    Attributes:
+        make: a function at the top of a module.
+        arguments: gives its arguments, from the settings; at the top of a module too.
+    """
+
+    make: Callable[..., Any]
+    arguments: Callable[[Any], tuple[Any, ...]]
+
+    def __call__(self, settings: Any) -> Any:
+        """Make it."""
+        return self.make(*self.arguments(settings))
+
+
+@dataclass(frozen=True)
 class Experiment(Generic[S]):
     """What an experiment consists of; all functions that other processes call are at the top of a module.
 
@@ -94,7 +108,7 @@ class Experiment(Generic[S]):
         describe: gives settings and figures as a text to print.
         plot: draws the rows.
         missed: names the figures that are not what is wanted; the command fails where there is one.
-        prepare: gives what all seeds share, from the settings.
+        prepare: gives what all seeds share, from the settings; a `Preparation` where several experiments share it.
         jobs: gives the numbers that `one` is called with, where these are not the seeds.
         alone: whether it measures times: nothing else may be done meanwhile, and it may take all cores.
         cost_s: about how long one seed takes on one core [s]; the longest are begun first.
@@ -139,19 +153,24 @@ class Experiment(Generic[S]):
         settings = dataclasses.replace(settings, seed_base=given.seed_base, processes=given.processes)
         if given.seeds is not None:
             settings = dataclasses.replace(settings, seeds=given.seeds)
-        return self.report(settings, given.out)
+        return self.report(settings, given.out, quick=given.quick)
 
-    def report(self, settings: S, out: Path | None) -> int:
+    def report(self, settings: S, out: Path | None, *, quick: bool = False) -> int:
         """Run with these settings, print the figures, and write the files where there is a folder for them.
 
         Returns:
-            The exit status: 1 where a figure is missed, something is lacking or the folder cannot be written to, 130
-            on Ctrl-C.
+            The exit status: 1 where a seed failed, a figure is missed (but for a quick run, which is too short for
+            that), something is lacking or the folder cannot be written to, 130 on Ctrl-C.
         """
+        failed: dict[int, str] = {}
         try:
             if out is not None:
                 check_folder(out)
-            rows, pictures = parted(self.run_pictured(settings))
+            rows, pictures = parted(self.run_pictured(settings, failed=failed))
+            for number, why in failed.items():
+                print(f"experiments.{self.name}: seed {number} failed: {why}", file=sys.stderr)
+            if failed and not rows:
+                return 1
             summary = self.summarise(rows)
             print(self.describe(settings, summary))
             if out is not None:
@@ -162,18 +181,28 @@ class Experiment(Generic[S]):
         except KeyboardInterrupt:
             print(f"experiments.{self.name}: interrupted", file=sys.stderr)
             return INTERRUPTED
-        return 1 if self.missed is not None and self.missed(summary) else 0
+        lost = not quick and self.missed is not None and self.missed(summary)
+        return 1 if failed or lost else 0
+
+    def shares(self, settings: S) -> tuple[Callable[..., Any], tuple[Any, ...]] | None:
+        """The function that makes what all seeds share, and its arguments; None where they share nothing."""
+        if isinstance(self.prepare, Preparation):
+            return self.prepare.make, self.prepare.arguments(settings)
+        return None if self.prepare is None else (self.prepare, (settings,))
 
     def run(self, settings: S, engine: Engine = in_processes) -> list[Row]:
         """All rows, in the order of the seeds; see `run_pictured`."""
         return self.run_pictured(settings, engine).rows
 
-    def run_pictured(self, settings: S, engine: Engine = in_processes) -> Pictured:
+    def run_pictured(
+        self, settings: S, engine: Engine = in_processes, failed: dict[int, str] | None = None
+    ) -> Pictured:
         """All rows, in the order of the seeds, and the pictures of the first seed that has any.
 
         Args:
             settings: how many seeds, and over how many processes.
             engine: does the jobs; those that measure times are done in this process, one after the other.
+            failed: gets, of each seed that fails, why; the others go on. Without it the first that fails ends all.
 
         Raises:
             ConfigError: something is missing that it needs.
@@ -185,7 +214,14 @@ class Experiment(Generic[S]):
         # By a worker too: whoever does it, it has one thread of linear algebra, and the same last digits.
         shared = None if self.prepare is None else _all(engine, self.prepare, [settings], 1)[0]
         jobs = functools.partial(self.one, shared, settings)
-        found = [parted(each) for each in _all(engine, jobs, self.jobs(settings), settings.processes)]
+        if failed is not None:
+            jobs = functools.partial(_tried, jobs)
+        numbers, found = self.jobs(settings), []
+        for number, each in zip(numbers, _all(engine, jobs, numbers, settings.processes), strict=True):
+            if isinstance(each, Exception) and failed is not None:
+                failed[number] = in_one_line(each)
+            else:
+                found.append(parted(each))
         return Pictured([row for rows, _ in found for row in rows], shown(pictures for _, pictures in found))
 
     def write(
@@ -236,6 +272,14 @@ class Experiment(Generic[S]):
         return png.getvalue()
 
 
+def _tried(one: Callable[[int], Any], number: int) -> Any:
+    """What a seed gives, or why it gives nothing."""
+    try:
+        return one(number)
+    except Exception as error:
+        return error.with_traceback(None)
+
+
 def _all(engine: Engine, work: Callable[[Any], Any], jobs: Sequence[Any], processes: int) -> list[Any]:
     """What each job gives, in the order of the jobs."""
     found: dict[int, Any] = {}
@@ -252,43 +296,3 @@ def _less(settings: Settings, quick: Settings) -> str:
     other = {name: value for name, value in parts.items() if value != getattr(settings, name)}
     texts = (f"{name} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in other.items())
     return ", ".join(texts).replace("%", "%%") or "the same"
-
-
-def versions() -> dict[str, str]:
-    """Of what the figures depend on."""
-    return {"cotarget": cotarget.__version__, "opencv": cv2.__version__} | {name: version(name) for name in PACKAGES}
-
-
-def rms(values: "Iterable[float] | Array") -> float:
-    """Root mean square; nan values do not count."""
-    squared = np.square(np.array(list(values), dtype=float))
-    return float(np.sqrt(np.nanmean(squared))) if np.isfinite(squared).any() else math.nan
-
-
-def table(head: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
-    """A table as text: the first column to the left, numbers to the right with three significant digits or more."""
-    cells = [list(head), *([_text(cell) for cell in line] for line in lines)]
-    widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
-    return "\n".join(
-        "  ".join(cell.rjust(w) if i else cell.ljust(w) for i, (cell, w) in enumerate(zip(line, widths, strict=True)))
-        for line in cells
-    )
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, float):
-        return "-" if math.isnan(value) else f"{value:#.3g}" if abs(value) < 100 else f"{value:.0f}"
-    return str(value)
-
-
-def plain(value: Any) -> Any:
-    """As JSON has it: null where nothing was measured."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value

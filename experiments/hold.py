@@ -2,10 +2,11 @@
 
 The rig is the default one, calibrated from rendered boards, under the field's conditions (`experiments.hold_scenes`):
 exposure blur, clutter, 120 ms from light to frame, 80 ms from command to motion, true sizes that nobody knows. Each
-seed is another path, another size and other noise. Figures are medians over the seeds of the field's terms, which
-`cotarget.metrics` defines; everything is judged by the simulation's truth, which the pipeline cannot see.
+seed is another path, another size and other noise. Figures are medians over the seeds of the field's terms, with the
+least and the largest, as `cotarget.metrics` defines them; everything is judged by the simulation's truth, which the
+pipeline cannot see.
 
-    python -m experiments.hold [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.hold [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
@@ -19,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration, calibrate_rig
-from cotarget.config import RigConfig, SimConfig, TargetConfig
+from cotarget.config import RigConfig, TargetConfig
 from cotarget.detection import Detector, make_detector
 from cotarget.judging import add_row
 from cotarget.loop import FollowSettings, Step, follow
@@ -33,6 +34,9 @@ from cotarget.sim.world import SimWorld
 from experiments import harness
 from experiments.harness import Experiment, Row, seeds_of, table
 from experiments.hold_scenes import hold_config
+from experiments.own_rig import OwnRig
+from experiments.paper_loop import Follow
+from experiments.spread import in_words, points, spread_of
 from experiments.wide_view import WideView, open_on
 
 # What is wanted of each figure's median: at least, or at most.
@@ -93,23 +97,32 @@ class HoldSettings(FieldSettings):
         targets: book, person, bird.
     """
 
-    seeds: int = 20
+    seeds: int = 3
     targets: tuple[str, ...] = tuple(WANTED)
 
 
-def calibrated(settings: FieldSettings) -> Calibration:
-    """The default rig's calibration, from rendered boards or exact; the same for all experiments in the field."""
-    return _calibrated(settings.calibrated, settings.seed_base)
+@dataclass(frozen=True)
+class OwnRigInField(OwnRig, FieldSettings):
+    """The same for an experiment that takes a rig of one's own."""
+
+
+def _of_calibration(settings: FieldSettings) -> tuple[bool, int, OwnRig]:
+    rig = OwnRig(rig=settings.rig) if isinstance(settings, OwnRig) else OwnRig()
+    return settings.calibrated, settings.seed_base, rig
 
 
 @functools.cache
-def _calibrated(from_boards: bool, seed: int) -> Calibration:
-    config = RigConfig(sim=SimConfig(scene="indoor", seed=seed))
+def _calibrated(from_boards: bool, seed: int, rig: OwnRig) -> Calibration:
+    config = rig.config("indoor", (), seed)
     if not from_boards:
         return true_calibration(SimWorld(config, rendered=()))
     world = SimWorld(config)
     with SafeRig(world.rig, config.safety) as rig:
-        return calibrate_rig(rig, config.board, pitch_mm=config.pitch_mm, seed=seed)
+        return calibrate_rig(rig, config.board, pitch_mm=config.pitch_mm, seed=config.sim.seed)
+
+
+# A rig's calibration, from rendered boards or exact; the same for all experiments in the field with that rig.
+calibrated = harness.Preparation(_calibrated, _of_calibration)
 
 
 def one(calibration: Calibration, settings: HoldSettings, seed: int) -> list[Row]:
@@ -172,11 +185,12 @@ def watched_in(
     target: TargetConfig,
     seconds: float,
     settings: FollowSettings,
+    how: Follow = follow,
 ) -> Iterator[tuple[Step, Truth]]:
-    """The same in a world that is open, with a detector of one's own."""
+    """The same in a world that is open, with a detector and perhaps a loop of one's own."""
     truth = world.truth()
     with SafeRig(world.rig, world.config.safety) as rig:
-        for step in follow(rig, calibration, target, detector, seconds=seconds, settings=settings):
+        for step in how(rig, calibration, target, detector, seconds=seconds, settings=settings):
             yield step, truth
 
 
@@ -186,19 +200,19 @@ def target_of(config: RigConfig, name: str) -> TargetConfig:
     return dataclasses.replace(target, detector="speck") if target.dimension == "wingspan" else target
 
 
-def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Medians over the seeds of each target's figures; one that was never measured counts as missed."""
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
+    """Of each target's figures the median over the seeds, the least and the largest."""
     return {
-        name: {key: _median(row[key] for row in rows if row["target"] == name) for key in (*wanted, *ALSO)}
+        name: {key: _spread([row[key] for row in rows if row["target"] == name]) for key in (*wanted, *ALSO)}
         for name, wanted in WANTED.items()
         if any(row["target"] == name for row in rows)
     }
 
 
-def _median(values: Any) -> float:
-    """The median, where a run without the figure counts as the worst there is: as infinite."""
-    found = [np.inf if value is None else float(value) for value in values]
-    return float(np.median(found))
+def _spread(values: Sequence[float | None]) -> dict[str, float]:
+    """In the median a run without the figure counts as the worst there is, as infinite; the others are nan then."""
+    found = spread_of(np.inf if value is None else float(value) for value in values)
+    return found if None not in values else {**dict.fromkeys(found, np.nan), "median": found["median"]}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
@@ -207,26 +221,26 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
         f"{name}: {key}"
         for name, figures in summary.items()
         for key, (low, high) in WANTED[name].items()
-        if not low <= figures[key] <= high
+        if not low <= figures[key]["median"] <= high
     ]
 
 
 def describe(settings: HoldSettings, summary: Mapping[str, Any]) -> str:
-    """A line a figure, a column a target, what is wanted beside it."""
+    """A line a figure, a column a target with least and largest, what is wanted of the median beside it."""
     lines = []
     for key in (*WANTED["book"], *ALSO):
         cells: list[Any] = [key]
         for name, figures in summary.items():
             low, high = WANTED[name].get(key, (-np.inf, np.inf))
-            mark = "" if low <= figures[key] <= high else " NO"
-            cells += [f"{figures[key]:.3g}{mark}", f"{low:g}-{high:g}" if key in WANTED[name] else ""]
+            mark = "" if low <= figures[key]["median"] <= high else " NO"
+            cells += [in_words(figures[key]) + mark, f"{low:g}-{high:g}" if key in WANTED[name] else ""]
         lines.append(cells)
-    head = ["median", *(column for name in summary for column in (name, "wanted"))]
+    head = ["median (least to largest)", *(column for name in summary for column in (name, "wanted"))]
     return f"holding a target, {seeds_of(settings)}\n" + table(head, lines)
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Close-up yield and offset of each seed, by target."""
+    """Close-up yield and offset by target: medians with bars from the least seed to the largest, a point a seed."""
     names = [name for name in WANTED if any(row["target"] == name for row in rows)]
     for ax, (key, label) in zip(
         figure.subplots(1, 2),
@@ -234,8 +248,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
         strict=True,
     ):
         for i, name in enumerate(names):
-            values = [row[key] for row in rows if row["target"] == name and row[key] is not None]
-            ax.plot([i] * len(values), values, "o", alpha=0.5)
+            points(ax, i, [row[key] for row in rows if row["target"] == name and row[key] is not None], color=f"C{i}")
         ax.set(ylabel=label, xticks=range(len(names)), xticklabels=names)
 
 

@@ -1,8 +1,10 @@
 """A single pan-tilt-zoom camera that finds a target, follows it and finds it again by itself, after Cai and Dinh.
 
-It scans the field of view that it is given with the lens at its shortest, until it detects the target in its own view;
-then it centres it, leads it by a constant velocity, and zooms in as far as it is sure of it. A target out of sight is
-expected where it would be for a moment, then sought with the lens out, about that place, and then everywhere again.
+It scans the field of view that it is given with the lens at its shortest, until it detects something in its own view.
+That is believed by the rule by which the pair believes what its wide view shows, the pipeline's own tracker; until then
+it waits, or turns back to what it saw in passing. Then it centres it, leads it by a constant velocity, and zooms in as
+far as it is sure of it. A target out of sight is expected where it would be for a moment, then sought with the lens
+out, about that place, and then everywhere again; while it is sought there, whatever turns up is believed at once.
 Head and lens are driven as the pair's are: by the same steering and the same zoom policy, with the same delays. Where
 head and lens were when a frame's light fell it is told exactly, which makes it better than a real one.
 """
@@ -17,9 +19,11 @@ from cotarget.config import TargetConfig
 from cotarget.deadzone import Steering
 from cotarget.detection import Detection, Detector
 from cotarget.errors import UnreachableError
+from cotarget.geometry import Array
 from cotarget.pantilt import base_head, nearest, solve
 from cotarget.rig import Frame, Rig
 from cotarget.sim.truth import Truth
+from cotarget.tracking import Tracker, settings_for
 from cotarget.zoompolicy import Expected, ZoomPolicy
 from experiments.lone_course import SEARCH_S, Angles, Course, Sighting
 
@@ -33,7 +37,7 @@ class LoneCamera:
     """The camera, its head and its lens, after one target.
 
     Attributes:
-        mode: what it does: "scanning", "following" or "searching".
+        mode: what it does: "scanning", "waiting", "following" or "searching".
     """
 
     def __init__(
@@ -46,8 +50,9 @@ class LoneCamera:
         delay_s: float,
         noise_px: float,
         field: Sequence[Angles],
+        lasts_s: float | None = None,
     ) -> None:
-        """Begin with a scan.
+        """Begin with a scan, at the pose that is nearest to where it looks.
 
         Args:
             rig: of which its fixed camera is not used.
@@ -58,6 +63,7 @@ class LoneCamera:
             delay_s: from a command to motion [s].
             noise_px: standard deviation of the detector's middle [px].
             field: poses of the scan [rad]; see `scan_of`.
+            lasts_s: see `Course`.
         """
         self._rig, self._truth, self._calibration, self._target = rig, truth, calibration, target
         self._detector, self._delay_s, self._field = detector, delay_s, list(field)
@@ -65,7 +71,7 @@ class LoneCamera:
         self._shortest, longest = (self._zoom.at(f).focal_px[0] for f in rig.zoom.focal_range)
         self._policy = ZoomPolicy((self._shortest, longest), rig.zoom.size)
         self._steering = Steering(rig.head.limits)
-        self._course = Course(target, noise_px)
+        self._course, self._tracker = Course(target, noise_px, lasts_s), Tracker(settings_for(target))
         self._focal = rig.zoom.zoom(rig.zoom.focal_range[0])
         self._next, self._round, self._set_out = 0, self._field, -math.inf
         self.mode = ""
@@ -77,18 +83,37 @@ class LoneCamera:
             frame = self._rig.zoom.read(newer_than=last)
             interval = 0.04 if last is None else frame.t - last
             last = frame.t
-            found = self._detector.detect(frame)
-            if found:
-                self._course.saw(*self._sighting(frame.t, found[0]))
+            found = [self._sighting(frame.t, each) for each in self._detector.detect(frame)]
+            doubted = self._take(frame.t, found)
             unseen = frame.t - self._course.seen_t
             if self._course.known and unseen <= COAST_S:
                 mode = "following"
                 self._follow(interval)
+            elif doubted is not None:
+                mode = "waiting"
+                if self._rig.head.state().moving and self.mode != mode:
+                    self._go((doubted.pan, doubted.tilt))
             else:
                 mode = "searching" if unseen <= SEARCH_S else "scanning"
                 self._look_around(mode, frame.t)
             self.mode = mode
             yield frame
+
+    def _take(self, t: float, found: Sequence[tuple[Sighting, float]]) -> Sighting | None:
+        """Take a frame's sightings into account; the one that is not believed yet, if there is one."""
+        boxes = [Detection(*self._at_shortest(seen), 1.0, seen.clipped) for seen, _ in found]
+        tracks = self._tracker.update(boxes, t)
+        if not found:
+            return None
+        believed = any(track.confirmed and not track.missed for track in tracks)
+        if believed or t - self._course.seen_t <= SEARCH_S:
+            self._course.saw(*found[0])
+            return None
+        return found[0][0]
+
+    def _at_shortest(self, seen: Sighting) -> tuple[Array, Array]:
+        """Middle and sides as a view of all directions at the shortest focal length would have them [px], (2,) each."""
+        return self._shortest * np.array([seen.pan, -seen.tilt]), self._shortest * np.array(seen.sides)
 
     def _sighting(self, t: float, found: Detection) -> tuple[Sighting, float]:
         """A detection as directions, and the focal length then [px]."""
@@ -154,7 +179,10 @@ class LoneCamera:
         if mode != self.mode:
             self._round = self._field if mode == "scanning" else self._about(frame_t)
             self._next, self._set_out = 0, -math.inf
-            self._go(self._round[0])
+            if mode == "scanning":
+                away = np.subtract(self._round, (rig.head.state().pan, rig.head.state().tilt))
+                self._next = int(np.argmin(np.abs(away).max(axis=1)))
+            self._go(self._round[self._next])
             return
         now, state = rig.clock.now(), rig.head.state()
         if now <= self._set_out + self._delay_s or state.moving:

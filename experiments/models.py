@@ -1,7 +1,9 @@
 """What the models of the related work lose beside the full one, over depth and baseline.
 
 Rigs are mounted by eye (`experiments.mounted`), their baselines given; each is calibrated from synthetic corners, and
-that calibration is the full model. The others (`experiments.simpler`) know less. Targets lie all over the wide view.
+that calibration is the full model. The others (`experiments.simpler` says which) know less; those that leave out or
+misjudge a turn are there as they are and `zeroed`, with pan and tilt set on one target. Targets lie all over the wide
+view.
 The pointing error is the angle between the line of sight and the true target; in the close-up it is a part of the
 image's width at the focal length at which a bird of 0.8 m is 160 px wide, within the lens's range.
 
@@ -11,10 +13,11 @@ pixel with 0.5 px of noise, the depth with 5 %, the head in steps of 0.0514 degr
     python -m experiments.models [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -26,13 +29,17 @@ from cotarget.geometry import Array
 from cotarget.simconfig import SimHead
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.mounted import MOUNTED_DEG, at, check_above, mounted, off_px, wanted_focal_px
-from experiments.simpler import FULL, IGNORED, MODELS, models_of
+from experiments.regimes import FACTOR, ratios, reach, regime
+from experiments.simpler import CENTRING, FULL, IGNORED, MODELS, TABLE, TURNED, ZEROED, models_of
 from experiments.synthetic import SIZE, SIZES, Placing, looking_off, spread_views
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 BOARD = BoardConfig()
 STEP = np.radians(SimHead().step_deg)
 CONDITIONS = ("exact", "seen")
-FACTOR = 5.0  # by which the full model is to beat "offset ignored" somewhere
+OPPONENTS = (IGNORED, ZEROED[IGNORED])
 SHOWN = ((10.0, 0.4), (20.0, 1.5), (50.0, 0.4))  # depth and baseline [m] of the printed table
 
 
@@ -50,6 +57,7 @@ class ModelsSettings(Settings):
         corner_px: noise of corners [px].
         pixel_px: noise of the target's pixel [px].
         depth_error: relative error of its depth.
+        zero_depth: of the target on which pan and tilt are set [m].
     """
 
     seeds: int = 20
@@ -62,12 +70,13 @@ class ModelsSettings(Settings):
     corner_px: float = 0.2
     pixel_px: float = 0.5
     depth_error: float = 0.05
+    zero_depth: float = CENTRING.zero_depth
 
     def __post_init__(self) -> None:
         """Refuse what cannot be."""
         super().__post_init__()
         check_above(0, self, "baselines", "depths", "targets", "boards", "looks")
-        check_above(0, self, "mounted_deg", "corner_px", "pixel_px", "depth_error")
+        check_above(0, self, "mounted_deg", "corner_px", "pixel_px", "depth_error", "zero_depth")
 
 
 def one(_: None, settings: ModelsSettings, seed: int) -> list[Row]:
@@ -81,7 +90,8 @@ def _of_rig(settings: ModelsSettings, seed: int, number: int) -> list[Row]:
     truth = mounted(rng, baseline, settings.mounted_deg)
     placing = Placing(boards=settings.boards, looks=settings.looks)
     views = spread_views(truth, board_points(BOARD), rng, settings.corner_px, placing)
-    models = models_of(truth, calibrate_views(views, BOARD, SIZES, options=Options(folds=0)), rng)
+    calibration = calibrate_views(views, BOARD, SIZES, options=Options(folds=0))
+    models = models_of(truth, calibration, rng, centring=replace(CENTRING, zero_depth=settings.zero_depth))
     rows: list[Row] = []
     for depth in settings.depths:
         pixels, depths = rng.uniform(0, np.array(SIZE) - 1.0, (settings.targets, 2)), np.full(settings.targets, depth)
@@ -89,10 +99,12 @@ def _of_rig(settings: ModelsSettings, seed: int, number: int) -> list[Row]:
         seen_px = pixels + rng.normal(0, settings.pixel_px, pixels.shape)
         seen_depths = depths * np.exp(rng.normal(0, settings.depth_error, depths.shape))
         focal_px = wanted_focal_px(truth, x_fixed)
-        for name, model in models.items():
-            exact = looking_off(truth, x_fixed, model(pixels, depths))
-            seen = looking_off(truth, x_fixed, np.round(model(seen_px, seen_depths) / STEP) * STEP)
+        exactly, as_seen = models.poses(pixels, depths), models.poses(seen_px, seen_depths)
+        for name in MODELS:
+            exact = looking_off(truth, x_fixed, exactly[name])
+            seen = looking_off(truth, x_fixed, np.round(as_seen[name] / STEP) * STEP)
             row = {"seed": seed, "baseline_m": baseline, "depth_m": depth, "model": name}
+            row["reach"] = reach(depth, baseline, settings.zero_depth if name in ZEROED.values() else math.inf)
             rows.append(row | _figures("exact", exact, focal_px) | _figures("seen", seen, focal_px))
     return rows
 
@@ -107,39 +119,6 @@ def _figures(condition: str, angles: Array, focal_px: Array) -> Row:
     }
 
 
-def ratios(rows: Sequence[Row], condition: str, model: str = IGNORED) -> dict[tuple[float, float], Array]:
-    """By how much a model's rms error is larger than the full model's: of each seed, by (depth, baseline) [m]."""
-    errors = {(r["seed"], r["depth_m"], r["baseline_m"], r["model"]): r[f"{condition}_deg"] for r in rows}
-    found: dict[tuple[float, float], list[float]] = {}
-    for (seed, depth, baseline, name), error in errors.items():
-        if name == model:
-            found.setdefault((depth, baseline), []).append(error / errors[seed, depth, baseline, FULL])
-    return {cell: np.array(values) for cell, values in found.items()}
-
-
-def regime(rows: Sequence[Row], condition: str) -> tuple[float, float]:
-    """The depths over baselines up to which the full model's error is FACTOR times smaller than "offset ignored".
-
-    Returns:
-        The smallest depth over baseline measured, and the largest up to which the median over the seeds of every
-        depth and baseline says so; both nan where even the smallest does not.
-    """
-    by_cell = ratios(rows, condition)
-    by_reach = [(_reach(cell), float(np.median(by_cell[cell]))) for cell in sorted(by_cell, key=_reach)]
-    within: list[float] = []
-    for reach, ratio in by_reach:
-        if ratio < FACTOR:
-            break
-        within.append(reach)
-    return (within[0], within[-1]) if within else (float("nan"), float("nan"))
-
-
-def _reach(cell: tuple[float, float]) -> float:
-    """Depth over baseline."""
-    depth, baseline = cell
-    return depth / baseline
-
-
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """Medians over the seeds of each model's error by condition, depth and baseline, and the regime."""
     summary: dict[str, Any] = {}
@@ -151,11 +130,11 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
                 name: {key: float(np.median(_of(mine, name, f"{condition}_{key}"))) for key in ("deg", "width")}
                 for name in MODELS
             }
-        low, high = regime(rows, condition)
         summary[condition] = {
             "errors": cells,
-            "regime": {"depth_over_baseline_from": low, "depth_over_baseline_to": high},
-            "smallest_ratio": min(float(np.median(v)) for v in ratios(rows, condition).values()),
+            "regime": {
+                name: dict(zip(("from", "to"), regime(rows, condition, name), strict=True)) for name in OPPONENTS
+            },
         }
     summary["of"] = {"seeds": len({row["seed"] for row in rows})}
     return summary
@@ -171,16 +150,19 @@ def _cell(depth: float, baseline: float) -> str:
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """The conditions in which no regime was found where the full model beats "offset ignored" as wanted."""
-    lacking = [c for c in CONDITIONS if not np.isfinite(summary[c]["regime"]["depth_over_baseline_to"])]
-    return [f"{condition}: full model {FACTOR:g} times better than {IGNORED}" for condition in lacking]
+    return [
+        f"{condition}: full model {FACTOR:g} times better than {name}"
+        for condition in CONDITIONS
+        for name in OPPONENTS
+        if math.isnan(summary[condition]["regime"][name]["to"])
+    ]
 
 
 def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """The full model's errors, and the regimes."""
+    """Each model's errors: one that gets worse makes the full model look better."""
     return {
         condition: {
-            "full_deg": {cell: found[FULL]["deg"] for cell, found in summary[condition]["errors"].items()},
-            "regime_to": summary[condition]["regime"]["depth_over_baseline_to"],
+            name: {cell: found[name]["deg"] for cell, found in summary[condition]["errors"].items()} for name in MODELS
         }
         for condition in CONDITIONS
     }
@@ -200,48 +182,74 @@ def describe(settings: ModelsSettings, summary: Mapping[str, Any]) -> str:
             "model",
             *(text for cell in cells for text in (cell.replace("depth ", "").replace("baseline ", ""), "% width")),
         ]
-        found = summary[condition]["regime"]
         texts += [
             f"{condition}: rms pointing error [degrees] and median offset in the close-up [% of its width]",
             table(head, lines),
-            f"at least {FACTOR:g} times better than with the offset ignored: depth over baseline "
-            f"{found['depth_over_baseline_from']:.3g} to {found['depth_over_baseline_to']:.4g}",
         ]
-    return "\n".join([f"medians over {seeds_of(settings)}", *texts])
+        for name in OPPONENTS:
+            found = summary[condition]["regime"][name]
+            off = "" if name == IGNORED else f" - 1 / {settings.zero_depth:g} m"
+            texts.append(
+                f"at least {FACTOR:g} times better than with the {name}: 1 / (baseline |1 / depth{off}|) of "
+                f"{found['from']:.3g} {_up_to(found['to'])}"
+            )
+    zeros = f"zeroed on a target at {settings.zero_depth:g} m"
+    return "\n".join([f"medians over {seeds_of(settings)}; {zeros}", *texts])
+
+
+def _up_to(reach: float) -> str:
+    return "on" if math.isinf(reach) else f"to {reach:.4g}"
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Each model's error over depth at one baseline, and the ratio over depth / baseline, quartiles over the seeds."""
-    figure.set_size_inches(14, 5.5)
+    """Each model's error over depth at one baseline, as they are and zeroed; and the regimes."""
+    figure.set_size_inches(14, 10)
     baselines = sorted({row["baseline_m"] for row in rows})
     near = min(baselines, key=lambda b: abs(b - SHOWN[0][1]))
-    left, middle, right = figure.subplots(1, 3)
-    for ax, condition in ((left, "exact"), (middle, "seen")):
-        for model in MODELS:
-            mine = [row for row in rows if row["model"] == model and row["baseline_m"] == near]
-            depths = sorted({row["depth_m"] for row in mine})
-            values = [[row[f"{condition}_deg"] for row in mine if row["depth_m"] == depth] for depth in depths]
-            low, mid, high = np.array([np.percentile(v, [25, 50, 75]) for v in values]).T
-            style = {"color": "k", "lw": 2} if model == FULL else {}
-            ax.errorbar(depths, mid, [mid - low, high - mid], capsize=2, label=model, **style)
-        ax.set(xscale="log", yscale="log", xlabel="depth [m]", title=f"{condition}, baseline {near:g} m")
-    left.set_ylabel("rms pointing error [degrees]")
-    middle.sharey(left)
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=len(MODELS), frameon=False)
+    axes = figure.subplots(2, 3)
+    colours = {name: f"C{i}" for i, name in enumerate((*TURNED, TABLE))} | {FULL: "k"}
+    for line, names, words in (
+        (axes[0], {name: name for name in (FULL, *TURNED, TABLE)}, ""),
+        (axes[1], {FULL: FULL} | ZEROED, ", zeroed"),
+    ):
+        for ax, condition in zip(line, CONDITIONS, strict=False):
+            for i, (name, model) in enumerate(names.items()):
+                mine = [row for row in rows if row["model"] == model and row["baseline_m"] == near]
+                _over_depth(ax, mine, f"{condition}_deg", i, color=colours[name], label=model)
+            ax.set(xscale="log", yscale="log", xlabel="depth [m]", title=f"{condition}{words}, baseline {near:g} m")
+            ax.sharey(axes[0, 0])
+        line[0].set_ylabel("rms pointing error [degrees]")
+        line[1].legend(loc="lower left", frameon=False, fontsize="small")
+    for ax, model in zip(axes[:, 2], OPPONENTS, strict=True):
+        _regimes(ax, rows, model)
+    axes[0, 2].set_xlabel("depth / baseline")
+    axes[1, 2].set_xlabel("1 / (baseline |1 / depth - 1 / depth of the zero|)")
+
+
+def _over_depth(ax: "Axes", rows: Sequence[Row], key: str, number: int, **style: Any) -> None:
+    """One model's medians and quartiles over the seeds; a little aside, and smaller, the later it is drawn."""
+    depths = sorted({row["depth_m"] for row in rows})
+    values = [[row[key] for row in rows if row["depth_m"] == depth] for depth in depths]
+    low, mid, high = np.array([np.percentile(v, [25, 50, 75]) for v in values]).T
+    dashes = "-" if number % 2 == 0 else "--"
+    aside = np.array(depths) * 1.03 ** (number - 3)
+    ax.errorbar(aside, mid, [mid - low, high - mid], fmt="o", ls=dashes, lw=3 - number / 3, ms=4, capsize=2, **style)
+
+
+def _regimes(ax: "Axes", rows: Sequence[Row], model: str) -> None:
+    """By how much a model's error is larger than the full one's, quartiles over the seeds, and where it is FACTOR."""
     for condition, colour in zip(CONDITIONS, ("C0", "C1"), strict=True):
-        by_cell = ratios(rows, condition)
-        cells = sorted(by_cell, key=_reach)
-        reach = [_reach(cell) for cell in cells]
-        low, mid, high = np.array([np.percentile(by_cell[cell], [25, 50, 75]) for cell in cells]).T
-        right.errorbar(reach, mid, [mid - low, high - mid], fmt="o", ms=4, capsize=2, color=colour, label=condition)
-        begin, end = regime(rows, condition)
-        if np.isfinite(end):
-            right.axvspan(begin, end, color=colour, alpha=0.12, label=f"{condition}: 5 x and more up to {end:.4g}")
-    right.axhline(FACTOR, color="k", lw=0.8)
-    right.set(
-        xscale="log", yscale="log", xlabel="depth / baseline", ylabel=f"error with the {IGNORED} / of the full model"
-    )
-    right.legend(frameon=False, fontsize="small")
+        by_reach = {far: values for far, values in ratios(rows, condition, model).items() if math.isfinite(far)}
+        low, mid, high = np.array([np.percentile(values, [25, 50, 75]) for values in by_reach.values()]).T
+        error = [mid - low, high - mid]
+        ax.errorbar(list(by_reach), mid, error, fmt="o", ms=4, capsize=2, color=colour, label=condition)
+        begin, end = regime(rows, condition, model)
+        if end >= begin:
+            label = f"{condition}: {FACTOR:g} x and more from {begin:.3g} {_up_to(end)}"
+            ax.axvspan(begin, min(end, max(by_reach)), color=colour, alpha=0.12, label=label)
+    ax.axhline(FACTOR, color="k", lw=0.8)
+    ax.set(xscale="log", yscale="log", ylabel="times the error of the full model", title=model)
+    ax.legend(frameon=False, fontsize="small")
 
 
 SETTINGS = ModelsSettings()
@@ -255,7 +263,7 @@ EXPERIMENT = Experiment(
     describe,
     plot,
     missed,
-    cost_s=6.0,
+    cost_s=10.0,
     bounded=bounded,
 )
 

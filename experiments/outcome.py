@@ -11,7 +11,7 @@ from experiments.bounds import EXPECTED, Bound, compare
 from experiments.cases import Case
 from experiments.harness import Row
 from experiments.pictured import shown
-from experiments.results import Record
+from experiments.results import NOTHING, Record, Spent, code_version
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,9 @@ class Outcome:
         bounds: the figures that have bounds, beside them; of other settings than the quick ones there are none.
         picture: the plot as a PNG.
         caption: what it shows.
-        pictures: of the first job that has any, PNGs by name.
         broken: why there are no figures, or no picture.
+        pictures: of the first job that has any, PNGs by name.
+        shared: what it took to prepare what its jobs share.
     """
 
     case: Case
@@ -41,6 +42,7 @@ class Outcome:
     caption: str = ""
     broken: str = ""
     pictures: Mapping[str, bytes] = field(default_factory=dict)
+    shared: Spent = NOTHING
 
     @property
     def failed(self) -> dict[int, Record]:
@@ -69,13 +71,18 @@ class Outcome:
 
     @property
     def cpu_s(self) -> float:
-        """Processor time of the jobs [s]."""
-        return sum(record.cpu_s for record in self.records.values())
+        """Processor time of the jobs and of what they share [s]."""
+        return self.shared.cpu_s + sum(record.cpu_s for record in self.records.values())
 
     @property
     def renders(self) -> int:
-        """How many pictures MuJoCo drew for the jobs."""
-        return sum(record.renders for record in self.records.values())
+        """How many pictures MuJoCo drew for the jobs and for what they share."""
+        return self.shared.renders + sum(record.renders for record in self.records.values())
+
+    @property
+    def other_code(self) -> tuple[str, ...]:
+        """Versions of the code that jobs were done by, where that is not this one."""
+        return tuple(sorted({record.version for record in self.records.values()} - {code_version()}))
 
     @property
     def ok(self) -> bool:
@@ -87,7 +94,9 @@ class Outcome:
         return not (self.failed or self.undone or self.broken or lost or self.worse)
 
 
-def conclude(case: Case, records: Mapping[int, Record], folder: Path, expected: Path = EXPECTED) -> Outcome:
+def conclude(
+    case: Case, records: Mapping[int, Record], folder: Path, expected: Path = EXPECTED, shared: Spent = NOTHING
+) -> Outcome:
     """Work out a case's figures from its rows, and write result.json, rows.csv, figure.png and other pictures.
 
     Args:
@@ -95,26 +104,27 @@ def conclude(case: Case, records: Mapping[int, Record], folder: Path, expected: 
         records: what came of its jobs.
         folder: for the files.
         expected: where the bounds are.
+        shared: what it took to prepare what the jobs share.
 
     Raises:
         ConfigError: a file of bounds cannot be read.
     """
     rows = [row for _, record in sorted(records.items()) for row in record.rows or ()]
     if not rows:
-        return Outcome(case, records, broken="no job has given any rows")
+        return Outcome(case, records, broken="no job has given any rows", shared=shared)
     experiment = case.experiment
     try:
         summary = experiment.summarise(rows)
         text = experiment.describe(case.settings, summary)
         missed = None if experiment.missed is None else tuple(experiment.missed(summary))
     except Exception as error:  # of an incomplete run, which lacks what the figures are made of
-        return Outcome(case, records, broken=f"the rows give no figures: {_where(error)}")
+        return Outcome(case, records, broken=f"the rows give no figures: {_where(error)}", shared=shared)
     picture, broken = _draw(case, rows)
     pictures = shown(record.pictures for _, record in sorted(records.items()))
     experiment.write(folder, case.settings, rows, summary, picture, pictures)
     bounds = tuple(compare(experiment, summary, expected)) if case.has_bounds else ()
     caption = (inspect.getdoc(experiment.plot) or "").partition("\n")[0]
-    return Outcome(case, records, summary, text, missed, bounds, picture, caption, broken, pictures)
+    return Outcome(case, records, summary, text, missed, bounds, picture, caption, broken, pictures, shared)
 
 
 def _draw(case: Case, rows: list[Row]) -> tuple[bytes | None, str]:

@@ -182,7 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         square=given.square,
         processes=given.processes,
     )
-    return EXPERIMENT.report(settings, given.out)
+    return EXPERIMENT.report(settings, given.out, quick=given.quick)
 
 
 if __name__ == "__main__":

@@ -18,8 +18,10 @@ from cotarget.report.wording import count, digits, listed
 from experiments.bounds import WORSE, leaves
 from experiments.harness import plain
 from experiments.outcome import Outcome
+from experiments.sessions import Session
 
 MINUTE_S, HOUR_S = 60.0, 3600.0
+WANTED_MIN, WANTED_RENDERS = 60, 80_000  # of all experiments as they are reported, on two cores
 FEW = 8  # failed jobs that a summary names
 
 
@@ -32,12 +34,14 @@ class Run:
         skipped: experiments that were not run, and why.
         sessions: when jobs were done, by whom and for how long.
         command: how to get the same again.
+        is_full: whether these are all experiments as they are reported.
     """
 
     outcomes: Sequence[Outcome]
     skipped: Mapping[str, str]
-    sessions: Sequence[Mapping[str, Any]]
+    sessions: Sequence[Session]
     command: str
+    is_full: bool = False
 
 
 def write_report(path: Path, run: Run) -> None:
@@ -80,6 +84,8 @@ def _verdict(run: Run) -> str:
     wrong = [text for text, is_so in parts.items() if is_so]
     short = [outcome.case.title for outcome in run.outcomes if outcome.missed and not outcome.case.quick]
     ran = f"{count(len(run.outcomes), 'experiment')}, {count(sum(len(o.records) for o in run.outcomes), 'job')}"
+    others = [outcome.case.title for outcome in run.outcomes if outcome.other_code]
+    ran += f"; done by other code than this: {listed(others)}" if others else ""
     if wrong:
         return markup.verdict("bad", "Something is wrong", f"{ran}: {'; '.join(wrong)}.")
     if short:
@@ -195,7 +201,8 @@ def _is_number(value: Any) -> bool:
 
 
 def _times(run: Run) -> Iterator[str]:
-    header = ("experiment", "jobs", "all together", "median", "longest", "processor", "renders", "beside others")
+    yield markup.paragraph(f"In all: {used(run)}.")
+    header = ("experiment", "jobs", "all together", "median", "longest", "shared", "processor", "renders", "alone")
     rows = [
         (
             outcome.case.title,
@@ -203,46 +210,66 @@ def _times(run: Run) -> Iterator[str]:
             duration(sum(outcome.seconds)),
             duration(float(np.median(outcome.seconds))),
             duration(max(outcome.seconds)),
+            duration(outcome.shared.seconds) if outcome.shared.seconds else "",
             duration(outcome.cpu_s),
             str(outcome.renders),
-            "no" if outcome.case.experiment.alone else "yes",
+            "yes" if outcome.case.experiment.alone else "no",
         )
         for outcome in run.outcomes
         if outcome.seconds
     ]
     jobs, total = sum(len(o.seconds) for o in run.outcomes), sum(sum(o.seconds) for o in run.outcomes)
     cpu_s, renders = sum(o.cpu_s for o in run.outcomes), sum(o.renders for o in run.outcomes)
-    rows.append(("all", str(jobs), duration(total), "", "", duration(cpu_s), str(renders), ""))
+    shared = duration(sum(o.shared.seconds for o in run.outcomes))
+    rows.append(("all", str(jobs), duration(total), "", "", shared, duration(cpu_s), str(renders), ""))
     note = (
-        "Processor time and renders, pictures that MuJoCo drew, are those of the jobs' own processes. Jobs that are "
-        "not done beside others measure times themselves."
+        "Shared is the time for what the jobs share; where several experiments share it, it stands at the first. "
+        "Processor time and renders, pictures that MuJoCo drew (a part of one counts as that part), are those of jobs "
+        "and of what they share, processes that these start included. Jobs done alone measure times themselves."
     )
     yield markup.table(Table("", header, tuple(rows), note))
     sessions = tuple(
         (
-            str(each["began"]),
-            str(each["workers"]),
-            str(each["jobs"]),
-            duration(each["wall_s"]),
-            duration(each["job_s"]),
-            duration(each["shared_s"]),
-            str(each["renders"]),
-            f"{(each['job_s'] + each['shared_s']) / each['wall_s']:.2f}",
+            each.began,
+            each.workers,
+            str(did.jobs),
+            duration(each.wall_s),
+            duration(did.job_s),
+            duration(did.shared_s),
+            str(did.renders),
+            f"{(did.job_s + did.shared_s) / each.wall_s:.2f}" if each.wall_s else "",
         )
-        for each in run.sessions
+        for each, did in ((each, each.whole) for each in run.sessions)
     )
-    heads = ("begun", "workers", "jobs", "took", "jobs", "what they share", "renders", "at a time")
-    note = "Renders are those of jobs and of what they share. A session that was killed has left no line."
+    heads = ("begun", "workers", "jobs", "took", "time of all jobs", "what they share", "renders", "at a time")
+    note = (
+        "Without what was forgotten or belongs to experiments that are not reported here. Of a session that was killed "
+        "the last seconds are missing."
+    )
     yield markup.table(Table("Sessions", heads, sessions, note))
+
+
+def used(run: Run) -> str:
+    """What all took, in words, beside what a full run may take."""
+    wall_s, renders = sum(each.wall_s for each in run.sessions), sum(outcome.renders for outcome in run.outcomes)
+    took, wanted = f"{duration(wall_s)} and {renders} renders", f"{WANTED_MIN} min and {WANTED_RENDERS} renders"
+    if not run.is_full:
+        return f"{took}; a full run may take {wanted}"
+    over = {"time": wall_s > WANTED_MIN * MINUTE_S, "renders": renders > WANTED_RENDERS}
+    lost = [what for what, is_over in over.items() if is_over]
+    return f"{took}, of {wanted} that a full run may take" + (f": too much {listed(lost)}" if lost else "")
 
 
 def _made(run: Run) -> Iterator[str]:
     yield markup.preformatted(run.command)
-    for each in run.sessions[-1:]:
-        facts = {key: each[key] for key in ("cotarget", "python", "machine")}
-        facts |= {name: version for name, version in each["versions"].items() if name != "cotarget"}
-        rows = tuple((name, str(value)) for name, value in facts.items())
-        yield markup.table(Table("Of the last session", ("what", "value"), rows))
+    made: dict[tuple[tuple[str, str], ...], list[str]] = {}
+    for each in run.sessions:
+        facts = {**each.versions, "cotarget": each.cotarget, "machine": each.machine}
+        made.setdefault(tuple(facts.items()), []).append(each.began)
+    for rows, began in made.items():
+        yield markup.table(
+            Table(f"Of the {count(len(began), 'session')} begun {listed(began)}", ("what", "value"), rows)
+        )
 
 
 def duration(seconds: float) -> str:

@@ -3,6 +3,7 @@
     DIR/NAME/jobs/000007.json            what one job gave, with its settings, its seed and the version of the code;
                                          pictures as PNG in base64
     DIR/NAME/jobs/000007.traceback.txt   where one failed
+    DIR/NAME/jobs/shared.json            what it took to prepare what the jobs share
     DIR/NAME/result.json, rows.csv, figure.png, and the pictures of the first job that has any
     DIR/sessions.json                    when jobs were done, by whom and for how long
     DIR/report.html
@@ -27,7 +28,8 @@ import experiments
 from cotarget.assets import assets_dir
 from cotarget.errors import ConfigError
 from cotarget.outputs import write_whole
-from experiments.harness import Row, Settings, versions
+from experiments.harness import Row, Settings
+from experiments.versions import versions
 
 FORMAT = 2  # of the files
 JOBS = "jobs"  # their folder
@@ -37,6 +39,9 @@ ONLY_HOW_MANY = ("seeds", "processes")  # settings that change no job, only how 
 SHORT = 8  # digits of a fingerprint
 REMEDY = "take another folder with --out, or begin anew with --fresh"
 KEEP = ", or keep it all the same with --any-code"
+SHARED = "shared.json"
+# Modules of the experiments on which no row depends: they choose what is done, record it and tell it.
+NO_ROWS = ("__main__", "arguments", "bounds", "cases", "outcome", "report", "runner", "sessions")
 
 
 @dataclass(frozen=True)
@@ -46,9 +51,9 @@ class Record:
     Attributes:
         number: its seed.
         seconds: that it took [s].
-        cpu_s: processor time of it [s]; what it leaves to other processes does not count.
+        cpu_s: processor time of it [s]; see `Spent`.
         version: of the code that did it, as `code_version` gives it.
-        renders: pictures that MuJoCo drew for it, in its own process.
+        renders: pictures that MuJoCo drew for it; see `Spent`.
         rows: that it gave; None where it failed.
         failed: why, in one line.
         traceback: where.
@@ -66,28 +71,48 @@ class Record:
     pictures: Mapping[str, bytes] = field(default_factory=dict)
 
 
-@functools.cache
-def code_version() -> str:
-    """The package's version and a fingerprint of what rows depend on: the code and the libraries' versions.
+@dataclass(frozen=True)
+class Spent:
+    """What something took.
+
+    Attributes:
+        seconds: by the clock [s].
+        cpu_s: processor time, that of processes included which it has started and waited for [s].
+        renders: pictures that MuJoCo drew, in whatever process.
+    """
+
+    seconds: float = 0.0
+    cpu_s: float = 0.0
+    renders: int = 0
+
+
+NOTHING = Spent()
+
+
+def fingerprint() -> str:
+    """The package's version, and fingerprints of what rows depend on: the code, and the libraries' versions.
 
     Of the scenes and targets the descriptions count; their meshes and pictures are made by a program that does.
     """
-    found = hashlib.sha256(json.dumps(versions()).encode())
-    for folder in (*(Path(module.__file__ or "").parent for module in (cotarget, experiments)), assets_dir()):
+    found, here = hashlib.sha256(), Path(experiments.__file__ or "").parent
+    for folder in (Path(cotarget.__file__ or "").parent, here, assets_dir()):
         for path in sorted(path for kind in ("*.py", "*.xml") for path in folder.rglob(kind)):
-            found.update(path.relative_to(folder.parent).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return f"{cotarget.__version__}+{found.hexdigest()[:SHORT]}"
+            if folder != here or path.stem not in NO_ROWS:
+                found.update(path.relative_to(folder.parent).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    libraries = hashlib.sha256(json.dumps(versions()).encode())
+    return f"{cotarget.__version__}+{found.hexdigest()[:SHORT]}.{libraries.hexdigest()[:SHORT]}"
 
 
-def is_same_version(one: str, other: str, *, any_code: bool) -> bool:
-    """Whether results of two versions may stand side by side.
+@functools.cache
+def code_version() -> str:
+    """The `fingerprint` when this was first called: to be called before a process loads what it is of."""
+    return fingerprint()
 
-    Args:
-        one: what `code_version` gave.
-        other: likewise.
-        any_code: whether the fingerprints may differ.
-    """
-    return one.partition("+")[0] == other.partition("+")[0] if any_code else one == other
+
+def differing(one: str, other: str) -> str:
+    """What two fingerprints differ in: "version" of the package, "code", "libraries"; empty where in nothing."""
+    parts = {"version": lambda v: v.partition("+")[0], "code": lambda v: v.rpartition(".")[0], "libraries": str}
+    return next((what for what, part in parts.items() if part(one) != part(other)), "")
 
 
 def identity(settings: Settings) -> dict[str, Any]:
@@ -146,9 +171,11 @@ class Jobs:
                 raise ConfigError(f"{path}: cannot be read ({type(error).__name__}); delete it, or {REMEDY}") from None
             if kind != FORMAT:
                 raise ConfigError(f"{path}: is of format {kind}, this is format {FORMAT}; {REMEDY}")
-            if not is_same_version(version, code_version(), any_code=any_code):
-                keep = "" if any_code or not is_same_version(version, code_version(), any_code=True) else KEEP
-                raise ConfigError(f"{path}: is of cotarget {version}, this is {code_version()}; {REMEDY}{keep}")
+            other = differing(version, code_version())
+            if other == "version" or (other and not any_code):
+                keep = "" if other == "version" else KEEP
+                told = f"is of cotarget {version}, this is {code_version()}, of other {other}"
+                raise ConfigError(f"{path}: {told}; {REMEDY}{keep}")
             if settings != self._identity:
                 raise ConfigError(f"{path}: {self._differing(settings)}; {REMEDY}")
             names = [part.name for part in dataclasses.fields(Record) if part.name != "number"]
@@ -167,7 +194,7 @@ class Jobs:
             ConfigError: it cannot be written.
         """
         self._folder.mkdir(parents=True, exist_ok=True)
-        told = {"format": FORMAT, "experiment": self._name, "settings": self._identity, "seed": record.number}
+        told = {**self._head, "seed": record.number}
         told |= {key: value for key, value in dataclasses.asdict(record).items() if key != "number"}
         told["pictures"] = {name: base64.b64encode(png).decode() for name, png in record.pictures.items()}
         traceback = self._folder / f"{record.number:06d}.traceback.txt"
@@ -177,8 +204,29 @@ class Jobs:
         if not record.failed:
             traceback.unlink(missing_ok=True)
 
+    @property
+    def _head(self) -> dict[str, Any]:
+        return {"format": FORMAT, "experiment": self._name, "settings": self._identity}
+
+    def write_shared(self, spent: Spent) -> None:
+        """Note what it took to prepare what the jobs share.
+
+        Raises:
+            ConfigError: it cannot be written.
+        """
+        self._folder.mkdir(parents=True, exist_ok=True)
+        write_whole(self._folder / SHARED, (json.dumps({**self._head, **dataclasses.asdict(spent)}) + "\n").encode())
+
+    def read_shared(self) -> Spent:
+        """What it took; nothing where that is not known."""
+        try:
+            told = json.loads((self._folder / SHARED).read_text(encoding="utf-8"))
+            return Spent(**{part.name: told[part.name] for part in dataclasses.fields(Spent)})
+        except (OSError, ValueError, KeyError, TypeError):
+            return NOTHING
+
     def forget(self) -> None:
         """Delete the files of all jobs."""
-        for pattern in (JOB_FILES, "[0-9]*.traceback.txt"):
+        for pattern in (JOB_FILES, "[0-9]*.traceback.txt", SHARED):
             for path in self._folder.glob(pattern):
                 path.unlink()

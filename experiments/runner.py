@@ -1,32 +1,25 @@
 """Does the jobs of many experiments, each job at most once: what is on disk is not done again, what is done is on disk.
 
-A job is one seed of one case. What the seeds of a case share is prepared first, by a worker as well; jobs that measure
-times come last, one after the other, in this process, with nothing beside them. Elsewhere the longest are begun first,
-so that at the end nobody waits long for the last.
+A job is one seed of one case. What seeds share is prepared first, by a worker as well, and once where several cases
+share it; then come all jobs, the longest first, so that at the end nobody waits long for the last; those that measure
+times come last, one after the other, in a process that nothing is beside.
 """
 
 import contextlib
-import datetime
 import functools
-import json
-import os
-import platform
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from cotarget.errors import ConfigError
-from cotarget.outputs import write_whole
+from experiments import sessions
 from experiments.cases import Case
-from experiments.harness import versions
-from experiments.results import JOB_FILES, JOBS, Jobs, Record, code_version, is_same_version
+from experiments.results import Jobs, Record, Spent, code_version, differing
 from experiments.tasks import Done, Task, perform
-from experiments.workers import Engine, here
+from experiments.workers import Engine, in_turn
 
 DIED = "its process died; is there memory enough?"
-SESSIONS = "sessions.json"
 
 Show = Callable[[str, float, float], None]  # what, how much is done, of how much
 
@@ -39,7 +32,7 @@ class Sweep:
         cases: what is to be run.
         folder: for the results.
         processes: how many jobs at a time.
-        any_code: whether results of other code of the same version are kept.
+        any_code: whether results of other code of the same version are kept, and workers may have other libraries.
 
     Attributes:
         records: of each case, what came of its jobs, by number.
@@ -53,9 +46,9 @@ class Sweep:
     processes: int = 1
     any_code: bool = False
     records: list[dict[int, Record]] = field(init=False)
-    _now: list[tuple[bool, Done]] = field(init=False, default_factory=list)  # of this session: whether a job, what came
 
     def __post_init__(self) -> None:
+        code_version()  # as it is when the sweep begins
         self._files = [Jobs(self.folder / case.folder, case.title, case.settings) for case in self.cases]
         self.records = []
         for case, files in zip(self.cases, self._files, strict=True):
@@ -82,6 +75,11 @@ class Sweep:
         """How many have failed."""
         return sum(bool(record.failed) for records in self.records for record in records.values())
 
+    @property
+    def shared(self) -> list[Spent]:
+        """What it took to prepare what each case's jobs share; nothing where another case's share it too."""
+        return [files.read_shared() for files in self._files]
+
     def run(self, engine: Engine, show: Show, what: str) -> None:
         """Do what is missing, and once more what failed.
 
@@ -93,74 +91,57 @@ class Sweep:
         Raises:
             CotargetError: a result cannot be written, the engine fails, or workers have other code.
         """
-        began, since = datetime.datetime.now(datetime.UTC), time.perf_counter()
-        self._now = []
+        self._log = sessions.Log(self.folder, what)
         try:
-            self._run(engine, show)
+            self._tell(show)
+            shared = self._prepare(engine, show)
+            for alone, using in ((False, engine), (True, in_turn)):
+                mine = [i for i, case in enumerate(self.cases) if case.experiment.alone == alone]
+                tasks = [task for i in mine for task in self._jobs(i, shared.get(i))]
+                self._do(tasks, using, show, lambda task, done: self._keep(task.case, task.number, done))
         finally:
-            if self._now:
-                session = {
-                    "began": began.isoformat(timespec="seconds"),
-                    "wall_s": time.perf_counter() - since,
-                    "jobs": sum(is_job for is_job, _ in self._now),
-                    "job_s": sum(done.seconds for is_job, done in self._now if is_job),
-                    "shared_s": sum(done.seconds for is_job, done in self._now if not is_job),
-                    "renders": sum(done.renders for _, done in self._now),
-                    "workers": what,
-                    "cotarget": code_version(),
-                    "python": platform.python_version(),
-                    "machine": f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}",
-                    "versions": versions(),
-                }
-                told = json.dumps([*sessions(self.folder), session], indent=2) + "\n"
-                write_whole(self.folder / SESSIONS, told.encode())
+            self._log.write()
 
-    def _run(self, engine: Engine, show: Show) -> None:
-        self._tell(show)
-        for alone in (False, True):
-            mine = [i for i, case in enumerate(self.cases) if case.experiment.alone == alone and self._missing[i]]
-            using = here if alone else engine
-            jobs = self._do([task for i in mine for task in self._first(i)], using, show)
-            self._do(jobs, using, show)
+    def _prepare(self, engine: Engine, show: Show) -> dict[int, Any]:
+        """What the jobs of each case share, by its number; where that cannot be had, the jobs have failed."""
+        wanted: dict[Any, list[int]] = {}
+        for i, case in enumerate(self.cases):
+            if self._missing[i] and (key := case.experiment.shares(case.settings)) is not None:
+                wanted.setdefault(key, []).append(i)
+        shared: dict[int, Any] = {}
 
-    def _first(self, i: int) -> list[Task]:
-        """What must be prepared for a case's jobs; where there is nothing to prepare, the jobs."""
-        case = self.cases[i]
-        if case.experiment.prepare is None:
-            return self._jobs(i)
-        return [Task(i, None, functools.partial(case.experiment.prepare, case.settings))]
+        def keep(task: Task, done: Done) -> None:
+            self._files[task.case].write_shared(Spent(done.seconds, done.cpu_s, done.renders))
+            for i in sharing[task.case]:
+                shared[i] = done.result
+                for number in tuple(self._missing[i]) if done.failed else ():
+                    self._keep(i, number, replace(done, seconds=0.0, cpu_s=0.0, renders=0))
 
-    def _jobs(self, i: int, shared: Any = None) -> list[Task]:
+        sharing = {cases[0]: cases for cases in wanted.values()}  # counted as the first one's
+        tasks = [Task(cases[0], None, functools.partial(make, *given)) for (make, given), cases in wanted.items()]
+        self._do(tasks, engine, show, keep)
+        return shared
+
+    def _jobs(self, i: int, shared: Any) -> list[Task]:
         """The jobs of a case that are missing."""
         case = self.cases[i]
         one = functools.partial(case.experiment.one, shared, case.settings)
         return [Task(i, number, functools.partial(one, number)) for number in sorted(self._missing[i])]
 
-    def _do(self, tasks: Sequence[Task], using: Engine, show: Show) -> list[Task]:
-        """Do tasks, the longest first; the jobs for which something was prepared."""
-        jobs: list[Task] = []
+    def _do(self, tasks: Sequence[Task], using: Engine, show: Show, keep: Callable[[Task, Done], None]) -> None:
+        """Do tasks, the longest first; what comes of each is kept at once."""
         if not tasks:
-            return jobs
-        tasks = sorted(tasks, key=self._order)
+            return
+        tasks = sorted(tasks, key=lambda task: -self.cases[task.case].experiment.cost_s)
         with contextlib.closing(using(perform, tasks, self.processes)) as outcomes:
             for index, outcome in outcomes:
-                i, number = tasks[index].case, tasks[index].number
+                task, case = tasks[index], self.cases[tasks[index].case]
                 done = outcome if isinstance(outcome, Done) else Done(0.0, 0.0, code_version(), failed=DIED)
                 self._check_version(done)
-                self._now.append((number is not None, done))
-                if number is not None:
-                    self._keep(i, number, done)
-                elif not done.failed:
-                    jobs += self._jobs(i, done.result)
-                else:  # none of them can be done
-                    for each in tuple(self._missing[i]):
-                        self._keep(i, each, replace(done, seconds=0.0, cpu_s=0.0, renders=0))
-                self._tell(show, self.cases[i].title if number is None else f"{self.cases[i].title} {number}")
-        return jobs
-
-    def _order(self, task: Task) -> tuple[bool, float]:
-        """What others wait for comes first, then what takes long."""
-        return task.number is not None, -self.cases[task.case].experiment.cost_s
+                keep(task, done)
+                took = (0, 0.0, done.seconds) if task.number is None else (1, done.seconds, 0.0)
+                self._log.add(case.folder, sessions.Share(*took, done.renders))
+                self._tell(show, case.title if task.number is None else f"{case.title} {task.number}")
 
     def _check_version(self, done: Done) -> None:
         """Refuse what other code has done: a program that was changed meanwhile, or a worker that is no copy of this.
@@ -168,7 +149,8 @@ class Sweep:
         Raises:
             ConfigError: it has.
         """
-        if not is_same_version(done.version, code_version(), any_code=self.any_code):
+        other = differing(done.version, code_version())
+        if other and not (self.any_code and other == "libraries"):
             raise ConfigError(f"a worker has cotarget {done.version}, this is {code_version()}; was the code changed?")
 
     def _keep(self, i: int, number: int, done: Done) -> None:
@@ -189,18 +171,8 @@ class Sweep:
         show(f"{text}; last {last}" if last else text, total - left, total)
 
 
-def sessions(folder: Path) -> list[dict[str, Any]]:
-    """When jobs were done in a folder, by whom and for how long; sessions that were killed have left no word."""
-    try:
-        found = json.loads((folder / SESSIONS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return []
-    return found if isinstance(found, list) else []
-
-
 def forget(cases: Sequence[Case], folder: Path) -> None:
-    """Delete what some cases' jobs have left in a folder, whatever it is of; with the last of them the sessions."""
+    """Delete what some cases' jobs have left in a folder, whatever it is of."""
     for case in cases:
         Jobs(folder / case.folder, case.title, case.settings).forget()
-    if next(folder.glob(f"*/{JOBS}/{JOB_FILES}"), None) is None:
-        (folder / SESSIONS).unlink(missing_ok=True)
+    sessions.forget(folder, {case.folder for case in cases})

@@ -1,18 +1,23 @@
 """The models of the related work: where each would send the head for a pixel of the wide view and a depth.
 
-All but the look-up table are calibrations of which something is left out or known crudely; what is not said to be so is
-as in the full model. Each is taken at its best, as its users could have it.
+All but the look-up table are calibrations of which something is left out or known crudely. Lenses, the head's axes and
+the depth are known to all as to the full model; of the two mountings, of the zoom camera beside the wide one and on its
+head, each knows
 
-    offset ignored             the cameras' turns are known, and all of the rig is in one place
-    parallel axes              the offset is known, every axis taken as parallel, the head's axes through its camera
-                               (Choi)
-    planar translation         the same, with an offset in the wide camera's image plane alone
-                               (Bodor, Dinh, Lalonde, Marchesotti)
-    planar, turns known        that offset, with the cameras' turns known: what the plane alone costs
-    crude known offset         both mountings by tape measure and protractor, with the scatter of CRUDE
-                               (Hampapur, Stillman, Zhou)
-    look-up table              pan and tilt learnt at pixels of a grid from targets at one depth, each centred with a
-                               scatter of `Centring`, and interpolated
+                               turns          places
+    offset ignored             as calibrated  none: all of the rig is in one place
+    parallel axes              none           as calibrated between the wide camera and the head, whose axes go through
+                                              the zoom camera (Choi)
+    planar translation         none           the same without its part along the wide camera's axis
+                                              (Bodor, Dinh, Lalonde, Marchesotti)
+    planar, turns known        as calibrated  that: what the plane alone costs
+    crude known offset         by protractor  by tape measure, with the scatter of CRUDE (Hampapur, Stillman, Zhou)
+    look-up table              pan and tilt are learnt at pixels of a grid from targets at one depth, each centred with
+                               the scatter of `Centring`, and interpolated; it ignores the depth
+
+Whoever has such a rig can look at one target and set pan and tilt to zero there. Each model but the full one, and the
+table, which is learnt that way, is therefore there twice: as it is, and `zeroed` on a target in the middle of the wide
+view, which takes away the most of unknown turns, and of an unknown offset at that depth.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,8 +36,9 @@ Model = Callable[[Array, Array], Array]  # pixels (n, 2) and depths (n,) [m] -> 
 
 FULL, IGNORED, PARALLEL, PLANAR = "full model", "offset ignored", "parallel axes", "planar translation"
 PLANAR_TURNED, CRUDE_OFFSET, TABLE = "planar, turns known", "crude known offset", "look-up table"
-MODELS = (FULL, IGNORED, PARALLEL, PLANAR, PLANAR_TURNED, CRUDE_OFFSET, TABLE)
-SIMPLER = MODELS[1:]
+TURNED = (IGNORED, PARALLEL, PLANAR, PLANAR_TURNED, CRUDE_OFFSET)  # which may be right but for two angles
+ZEROED = {name: f"{name}, zeroed" for name in TURNED}
+MODELS = (FULL, *TURNED, TABLE, *ZEROED.values())
 
 
 @dataclass(frozen=True)
@@ -52,18 +58,38 @@ class Crude:
 
 @dataclass(frozen=True)
 class Centring:
-    """How a look-up table is learnt.
+    """How a look-up table is learnt, and pan and tilt are set to zero.
 
     Attributes:
         grid: columns and rows of pixels, from edge to edge of the wide image.
-        depth: of the targets [m].
+        depth: of the table's targets [m].
+        zero_depth: of the target for the zeros [m].
         scatter: of each axis when a target is brought to the middle [rad]; a person's, or a servo's, about one step
             of the head.
     """
 
     grid: tuple[int, int] = (9, 7)
     depth: float = 10.0
+    zero_depth: float = 50.0
     scatter: float = np.radians(0.05)
+
+
+@dataclass(frozen=True)
+class Models:
+    """All models of a rig.
+
+    Attributes:
+        models: as they are.
+        zeros: what is added to pan and tilt of those that are zeroed besides, (2,) [rad].
+    """
+
+    models: Mapping[str, Model]
+    zeros: Mapping[str, Array]
+
+    def poses(self, pixels: Array, depths: Array) -> dict[str, Array]:
+        """Pan and tilt of every one of MODELS for pixels (n, 2) and depths (n,) [m], (n, 2) [rad]."""
+        found = {name: model(pixels, depths) for name, model in self.models.items()}
+        return found | {ZEROED[name]: found[name] + zero for name, zero in self.zeros.items()}
 
 
 CRUDE = Crude()
@@ -76,7 +102,7 @@ def models_of(
     rng: np.random.Generator,
     crude: Crude = CRUDE,
     centring: Centring = CENTRING,
-) -> Mapping[str, Model]:
+) -> Models:
     """Every model of a rig.
 
     Args:
@@ -84,7 +110,7 @@ def models_of(
         calibration: of that rig; the full model, and what the others know.
         rng: draws the scatter.
         crude: how the offsets are measured.
-        centring: how the table is learnt.
+        centring: how the table is learnt, and the zeros are set.
     """
     T = calibration.T_base_fixed
     still = RigidTransform.identity()
@@ -106,7 +132,10 @@ def models_of(
         ),
     }
     models: dict[str, Model] = {name: _by(found) for name, found in believed.items()}
-    return models | {TABLE: learnt(truth, rng, centring)}
+    models[TABLE] = learnt(truth, rng, centring)
+    others = rng.spawn(len(TURNED))  # which leave the numbers that the caller draws as they are
+    zeros = {name: zero_of(models[name], truth, each, centring) for name, each in zip(TURNED, others, strict=True)}
+    return Models(models, zeros)
 
 
 def _by(calibration: Calibration) -> Model:
@@ -132,7 +161,19 @@ def learnt(truth: Truth, rng: np.random.Generator, centring: Centring = CENTRING
     """A look-up table over the wide image, learnt on the rig itself; cubic between the pixels of its grid."""
     columns, rows = (np.linspace(0.0, side - 1.0, count) for side, count in zip(SIZE, centring.grid, strict=True))
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    q = aimed(truth, at(truth, pixels, centring.depth), np.append(middle_of(truth.zoom), 1.0))
-    q = q + rng.normal(0, centring.scatter, q.shape)
+    q = centred(truth, pixels, centring.depth, rng, centring.scatter)
     splines = [RectBivariateSpline(rows, columns, each.reshape(len(rows), len(columns))) for each in q.T]
     return lambda pixels, depths: np.stack([spline.ev(pixels[:, 1], pixels[:, 0]) for spline in splines], axis=-1)
+
+
+def zero_of(model: Model, truth: Truth, rng: np.random.Generator, centring: Centring = CENTRING) -> Array:
+    """What a model's pan and tilt lack at one target in the middle of the wide view of the rig itself, (2,) [rad]."""
+    middle = (np.array([SIZE]) - 1.0) / 2
+    q = centred(truth, middle, centring.zero_depth, rng, centring.scatter)
+    return np.asarray(q - model(middle, np.array([centring.zero_depth])))[0]
+
+
+def centred(truth: Truth, pixels: Array, depth: float, rng: np.random.Generator, scatter: float) -> Array:
+    """Pan and tilt at which targets at these pixels (n, 2) and a depth [m] were brought to the middle, (n, 2) [rad]."""
+    q = aimed(truth, at(truth, pixels, depth), np.append(middle_of(truth.zoom), 1.0))
+    return np.asarray(q + rng.normal(0, scatter, q.shape))

@@ -21,6 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from cotarget.cli.arguments import count, not_negative
+from cotarget.errors import ConfigError, choices
 from experiments import wire_age, wire_command, wire_faults, wire_latency, wire_parity, wire_polls
 from experiments.arguments import Parser
 from experiments.harness import TERMINATED, Experiment, Row, Settings, table
@@ -56,6 +57,12 @@ class WireSettings(Settings):
     swing_s: float = 10.0
     places: int = 3
     still_s: float = 6.0
+
+    def __post_init__(self) -> None:
+        """Refuse a fault that there is not."""
+        super().__post_init__()
+        if unknown := sorted(set(self.faults) - set(wire_faults.all_faults())):
+            raise ConfigError(f"faults: {unknown[0]!r} is not one of: {choices(wire_faults.all_faults())}")
 
 
 def jobs(settings: WireSettings) -> Sequence[int]:
@@ -143,7 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.repetitions is not None:
         settings = replace(settings, repetitions=given.repetitions)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))  # so that the emulated devices end too
-    return EXPERIMENT.report(settings, given.out)
+    return EXPERIMENT.report(settings, given.out, quick=given.quick)
 
 
 if __name__ == "__main__":

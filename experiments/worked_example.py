@@ -6,7 +6,8 @@ what they do to a point cannot be; what survives of their results can still be c
 because T and P move points rigidly.
 
 Beside it stands the exact method, with a T that gives every printed digit with the least rotation: one of many that do,
-as the printed results leave T's rotation about the line of sight, and its first translation, open.
+as the printed results leave T's rotation about the line of sight, and its first translation, open. What it says is not
+held against the paper, which does not claim it.
 
     python -m experiments.worked_example [--out DIR]
 """
@@ -15,16 +16,19 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.camera import Intrinsics, focal_for_size
-from cotarget.geometry import Array, RigidTransform, angle_between, rot_y
+from cotarget.geometry import Array, RigidTransform, Rotation, angle_between
 from cotarget.pantilt import base_head, shortcut, solve
 from experiments import harness
 from experiments.harness import Experiment, Row, table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Table 2 as (u, v); the paper lists [v, u].
 FIXED = Intrinsics((640, 480), (686.0, 684.0), (325.0, 239.0))
@@ -39,6 +43,10 @@ ANGLE_DEG = 3.08
 BOOK_MM, WANTED_PX = 234.0, 160.0
 ZOOM_FACTOR, LARGEST_ZOOM = 10.3, 12.0
 CLOSEUP_PX = 7155.0  # the focal length of the paper's close-up, at which misses are told in pixels
+OFF_MM = 20.0  # by so much and more both norms of a rigid motion differ
+KNOWN = "x_fixed: y [mm]"  # what does not follow from the paper's own numbers
+BESIDE = ("exact", "stand-in T")  # steps that the paper does not have
+RIGHT, WRONG, OTHER = "#1f6f8b", "#d9534f", "#999999"
 
 
 @dataclass(frozen=True)
@@ -103,9 +111,12 @@ def _norms() -> list[Line]:
 
 def stand_in() -> RigidTransform:
     """The T of least rotation that gives all the printed digits of x_head and x_base [mm]."""
-    # T takes (811, 563, 0), what x_zoom0 is beside the axis, to x_base - x_head, whose z is 2 mm.
-    turn = rot_y(-math.asin((X_BASE_MM[2] - X_HEAD_MM[2]) / X_ZOOM0_MM[0]))
-    beside = turn.apply([*X_ZOOM0_MM[:2], 0.0])
+    # T takes (811, 563, 0), what x_zoom0 is beside the axis, to x_base - x_head, whose z is 2 mm: about what is across.
+    x, y, _ = X_ZOOM0_MM
+    aside = math.hypot(x, y)
+    angle = math.asin((X_BASE_MM[2] - X_HEAD_MM[2]) / aside)
+    turn = Rotation.from_rotvec(angle * np.array([y, -x, 0.0]) / aside)
+    beside = turn.apply([x, y, 0.0])
     head = np.array([X_BASE_MM[0] - beside[0], *X_HEAD_MM[1:]])
     return RigidTransform.from_components(head - turn.apply([0.0, 0.0, X_ZOOM0_MM[2]]), turn)
 
@@ -176,11 +187,22 @@ def agrees(row: Row) -> bool | None:
     return bool(abs(row["difference"]) < row["last_digit"])
 
 
+def _is_beside(key: str) -> bool:
+    """Whether a figure is one that the paper does not have."""
+    return any(f". {step}: " in key for step in BESIDE)
+
+
 def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
     """A line a number."""
     words = {True: "as printed", False: "NOT as printed", None: ""}
     lines = [
-        [key, _number(line["printed"], line), _number(line["found"], line), words[line["agrees"]], line["remark"]]
+        (
+            key,
+            _number(line["printed"], line),
+            _number(line["found"], line),
+            "" if _is_beside(key) else words[line["agrees"]],
+            line["remark"],
+        )
         for key, line in summary.items()
     ]
     return "Section 4.2, step by step\n" + table(("", "printed", "follows", "", "remark"), lines)
@@ -192,18 +214,62 @@ def _number(value: float, line: Mapping[str, Any]) -> str:
     return "-" if math.isnan(value) else f"{value:.{decimals}f}"
 
 
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """What follows from the paper otherwise than is said of it here."""
+    own = {key: line for key, line in summary.items() if not _is_beside(key)}
+    wrong = [
+        key for key, line in own.items() if line["agrees"] is not (KNOWN not in key) and line["agrees"] is not None
+    ]
+    short = [line["found"] for key, line in summary.items() if "short of |x_base|" in key]
+    off = [line["found"] for key, line in summary.items() if ": misses" in key]
+    texts = [f"{key}: {'not ' * (not own[key]['agrees'])}as printed" for key in wrong]
+    if min(short) < OFF_MM:
+        texts.append(f"|x_head| is only {min(short):.1f} mm short of |x_base|")
+    if min(off) < 1:
+        texts.append(f"the shortcut misses by only {min(off):.2f} px")
+    return texts
+
+
 def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """What follows, less what the paper prints, in units of the last digit printed; within the band both agree."""
-    told = [row for row in rows if not math.isnan(row["printed"])]
-    ax = figure.subplots()
+    """The printed numbers beside what follows, what a rigid motion may not change, and what the shortcut misses by."""
+    figure.set_size_inches(13, 4.8)
+    printed, rigid, misses = figure.subplots(1, 3, width_ratios=(2, 1, 1))
+    _printed(printed, [row for row in rows if not math.isnan(row["printed"])])
+    norms = [row for row in rows if row["quantity"].startswith("|x_")]
+    for i, row in enumerate(norms):
+        rigid.plot([norms[0]["found"], row["found"]], [i, i], color=WRONG)
+        rigid.plot(row["found"], i, "o", color="k")
+        rigid.annotate(f"{row['found']:.1f}", (row["found"], i), (0, 8), textcoords="offset points", ha="center")
+    rigid.axvline(norms[0]["found"], color="k", lw=0.8)
+    rigid.set_yticks(range(len(norms)), [row["quantity"].replace(", ", ",\n") for row in norms])
+    rigid.set(xlabel="[mm]", xticks=[10420, 10450], xlim=(10410, 10460), ylim=(-0.7, len(norms) - 0.5))
+    rigid.set_title("a rotation takes one to the other", size="medium")
+    off = [row for row in rows if row["quantity"].startswith("misses")]
+    bars = misses.bar([row["quantity"].split(" of ")[1] for row in off], [row["found"] for row in off], color=WRONG)
+    misses.bar_label(bars, fmt="%.1f")
+    misses.set(ylabel=f"[px at f = {CLOSEUP_PX:g} px]", xlabel="the depth taken for the range")
+    misses.set_title("shortcut's miss, stand-in T", size="medium")
+    for ax in (rigid, printed):
+        ax.invert_yaxis()
+
+
+def _printed(ax: "Axes", rows: Sequence[Row]) -> None:
+    """What follows, less what is printed, in units of the last digit printed; within the band both agree."""
     ax.axvspan(-1, 1, color="#dddddd", lw=0)
-    units = [row["difference"] / row["last_digit"] for row in told]
-    ax.barh(range(len(told)), units, color=["#1f6f8b" if agrees(row) else "#d9534f" for row in told])
-    ax.set_yticks(range(len(told)), [f"{row['step']}: {row['quantity']} [{row['unit']}]" for row in told])
-    ax.invert_yaxis()
+    colours = [OTHER if row["step"] in BESIDE else RIGHT if agrees(row) else WRONG for row in rows]
+    for colour, words in (
+        (RIGHT, "as printed"),
+        (WRONG, "not as printed"),
+        (OTHER, "exact, where the paper has a depth"),
+    ):
+        at = [i for i, each in enumerate(colours) if each == colour]
+        units = [rows[i]["difference"] / rows[i]["last_digit"] for i in at]
+        ax.barh(at, units, color=colour, label=words)
+    ax.set_yticks(range(len(rows)), [f"{row['step']}: {row['quantity']} [{row['unit']}]" for row in rows])
     ax.set_xscale("symlog")
     ax.set_xticks([-1, 0, 1, 10], ["-1", "0", "1", "10"])
     ax.set(xlabel="what follows - what is printed [units of the last digit]")
+    ax.legend(frameon=False, fontsize="small")
 
 
 SETTINGS = Settings()
@@ -216,6 +282,7 @@ EXPERIMENT = Experiment(
     summarise,
     describe,
     plot,
+    missed,
     jobs=once,
     cost_s=0.1,
 )

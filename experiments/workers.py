@@ -7,18 +7,19 @@ way, and sums that threads share come out differently in their last digits.
 
 import concurrent.futures
 import contextlib
-import itertools
+import importlib
 import multiprocessing
 import os
 import signal
-import threading
+import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
 import cv2
 
-from cotarget.parallel import end_with_parent
+from cotarget.parallel import end_with_parent, interrupts_kept_from_children
 
 Job = TypeVar("Job")
 Results = Generator[tuple[int, Any], None, None]  # numbers of jobs, and what they gave, or `Died`
@@ -48,8 +49,8 @@ def here(work: Callable[[Job], Any], jobs: Sequence[Job], processes: int = 1) ->
 def in_processes(work: Callable[[Job], Any], jobs: Sequence[Job], processes: int) -> Results:
     """Do jobs in as many processes of this machine, in their order; what each gives as it comes, with its number.
 
-    A process that dies (out of memory, say) takes nobody else's job along: those that it may have died of are tried
-    once more, one at a time. All processes end with this one, however it ends.
+    A process that dies (out of memory, say) takes nobody else's job along, and another takes its place. All processes
+    end with this one, however it ends.
 
     Args:
         work: a function at the top of a module, or a partial one of it.
@@ -59,54 +60,78 @@ def in_processes(work: Callable[[Job], Any], jobs: Sequence[Job], processes: int
     Raises:
         Exception: what a job raised.
     """
-    left = dict(enumerate(jobs))
-    while left:
-        suspects = yield from _pool(work, left, processes)
-        for number in suspects:
-            alone = {number: left.pop(number)}
-            yield from _pool(work, alone, 1)
-            if alone:
-                yield number, Died
+    return _in_pools(work, jobs, processes, _begin, one_thread_each)
 
 
-def _pool(
-    work: Callable[[Job], Any], left: dict[int, Job], processes: int
-) -> Generator[tuple[int, Any], None, list[int]]:
-    """Do jobs, which are taken from ``left`` as they are done; those in hand when a process died are returned."""
+def in_turn(work: Callable[[Job], Any], jobs: Sequence[Job], processes: int = 1) -> Results:
+    """Do jobs one after the other, as `in_processes` does, on as many threads and processes of its own as each takes.
+
+    Args:
+        work: a function at the top of a module, or a partial one of it.
+        jobs: its arguments, one each.
+        processes: is not heeded.
+
+    Raises:
+        Exception: what a job raised.
+    """
+    del processes
+    return _in_pools(work, jobs, 1, _begin_in_turn, contextlib.nullcontext)
+
+
+def _in_pools(
+    work: Callable[[Job], Any],
+    jobs: Sequence[Job],
+    processes: int,
+    begin: Callable[[], None],
+    limits: Callable[[], contextlib.AbstractContextManager[None]],
+) -> Results:
+    """Do jobs in pools of one process each: when one dies it is known which job it had in hand."""
     context = multiprocessing.get_context("spawn")  # a forked process would share the parent's OpenGL
-    waiting = iter(list(left.items()))
-    running: dict[concurrent.futures.Future[Any], int] = {}
-    with concurrent.futures.ProcessPoolExecutor(min(processes, len(left)), context, _begin) as pool, _ended_early():
+    waiting, running = enumerate(jobs), dict[concurrent.futures.Future[Any], tuple[int, ProcessPoolExecutor]]()
+    with contextlib.ExitStack() as pools, _ended_early():
+
+        def opened() -> ProcessPoolExecutor:
+            return pools.enter_context(ProcessPoolExecutor(1, context, begin))
+
+        idle = [opened() for _ in range(min(processes, len(jobs)))]
         while True:
-            try:
-                with one_thread_each(), interrupts_kept_from_children():
-                    for number, job in itertools.islice(waiting, processes - len(running)):
-                        running[pool.submit(work, job)] = number
-            except BrokenProcessPool:  # one has died since
-                return sorted(running.values())
+            with limits(), interrupts_kept_from_children():
+                for pool, (number, job) in zip(idle, waiting, strict=False):
+                    try:
+                        running[pool.submit(work, job)] = number, pool
+                    except BrokenProcessPool:  # it has died since its last job
+                        another = opened()
+                        running[another.submit(work, job)] = number, another
             if not running:
-                break
-            done, _ = concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED)
-            broken = []
-            for future in done:
+                return
+            idle = []
+            for future in concurrent.futures.wait(running, return_when=concurrent.futures.FIRST_COMPLETED).done:
+                number, pool = running.pop(future)
                 try:
                     result = future.result()
                 except BrokenProcessPool:
-                    broken.append(running[future])
-                    continue
-                number = running.pop(future)
-                del left[number]
+                    result, pool = Died, opened()
+                idle.append(pool)
                 yield number, result
-            if broken:
-                return sorted(running.values())
-    return []
 
 
 def _begin() -> None:
     """One process begins: gone when the one that started it is, deaf to Ctrl-C, and with one thread for OpenCV."""
+    _begin_any()
+    cv2.setNumThreads(1)
+
+
+def _begin_in_turn() -> None:
+    """As `_begin`, with as many threads as it likes; where it is ended, it ends what it has started itself."""
+    _begin_any()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+
+
+def _begin_any() -> None:
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    cv2.setNumThreads(1)
+    # Before any job brings its experiment along; `experiments.results` needs this module.
+    importlib.import_module("experiments.results").code_version()
 
 
 @contextlib.contextmanager
@@ -134,16 +159,3 @@ def one_thread_each() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-@contextlib.contextmanager
-def interrupts_kept_from_children() -> Iterator[None]:
-    """Processes started meanwhile never hear Ctrl-C, which reaches all of them; the one that started them ends them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -58,16 +58,21 @@ def test_both_are_registered():
     env.close()
 
 
-def assert_agrees_with_one(vector, alone):
+def flat(observation, *index):
+    """All numbers of an observation, or of one of those of a vector of environments."""
+    return np.concatenate([np.ravel(each[index]).astype(float) for each in values(observation)])
+
+
+def assert_agrees_with_one(vector, alone, action=STILL):
     """The first of two environments does in a vector what it does alone, and the second something else."""
     observations, _ = vector.reset(seed=[7, 8])
-    np.testing.assert_array_equal(observations[0], alone[0][0])
+    np.testing.assert_array_equal(flat(observations, 0), flat(alone[0][0]))
     for observation, reward, info in alone[1:]:
-        observations, rewards, _, _, infos = vector.step(np.stack([STILL, STILL]))
-        np.testing.assert_array_equal(observations[0], observation)
+        observations, rewards, _, _, infos = vector.step(np.stack([action, action]))
+        np.testing.assert_array_equal(flat(observations, 0), flat(observation))
         assert rewards[0] == reward
         np.testing.assert_array_equal(infos["box_wide"][0], info["box_wide"])
-    assert np.abs(observations[1] - observations[0]).max() > 0.01
+    assert np.abs(flat(observations, 1) - flat(observations, 0)).max() > 0.01
     vector.close()
 
 
@@ -77,6 +82,25 @@ def make_book():
 
 def test_a_vector_of_environments_agrees_with_one():
     assert_agrees_with_one(SyncVectorEnv([make_book] * 2), run(make_book(), lambda _: STILL, seed=7, seconds=0.4))
+
+
+def test_a_vector_of_schedules_agrees_with_one(field):
+    def make():
+        return gymnasium.make(SCHEDULE, kind="bird", rig=field, seconds=4.0)
+
+    alone = run(make(), lambda _: 0, seed=7, seconds=2.0)
+    assert alone[-1][0]["tracks"].any()
+    assert_agrees_with_one(SyncVectorEnv([make] * 2), alone, np.int64(0))
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_a_rig_and_pictures_in_processes_of_their_own(field):
+    chosen = {"target": "book", "observation": "images", "rig": field, "seconds": 1.0}
+    vector = gymnasium.make_vec(
+        FOLLOW, num_envs=2, vectorization_mode="async", vector_kwargs={"context": "spawn"}, **chosen
+    )
+    assert_agrees_with_one(vector, run(gymnasium.make(FOLLOW, **chosen), lambda _: STILL, seed=7, seconds=0.4))
 
 
 @pytest.mark.slow
@@ -106,7 +130,7 @@ def test_the_same_seed_gives_the_same_episode_and_no_seed_another(field, make):
     def told(**seed):
         observation, info = env.reset(**seed)
         steps = [env.step(action) for action in actions]
-        arrays = [np.concatenate([np.ravel(a) for a in values(o)]) for o in (observation, *(s[0] for s in steps))]
+        arrays = [flat(each) for each in (observation, *(step[0] for step in steps))]
         return np.array(arrays), [s[1] for s in steps], info["direction"]
 
     first, again, other, another = told(seed=3), told(seed=3), told(), told()
@@ -121,7 +145,7 @@ def test_the_same_seed_gives_the_same_episode_and_no_seed_another(field, make):
 
 
 def values(observation):
-    return observation.values() if isinstance(observation, dict) else [observation]
+    return [observation[key] for key in sorted(observation)] if isinstance(observation, dict) else [observation]
 
 
 # ---------------------------------------------------------------- actions and observations
@@ -194,23 +218,30 @@ def test_a_target_that_is_missed_is_still_known_for_a_while(field):
     env.close()
 
 
-def test_the_truth_is_in_info_alone(field):
+@pytest.mark.parametrize(("make", "name", "action", "steps"), [
+    (Follow, "book", STILL, 20), (Schedule, "bird", 0, 70),
+])  # fmt: skip
+def test_the_truth_is_in_info_alone(field, make, name, action, steps):
     """The same detections of another true size: the same observations, and another truth."""
     told = []
     for stretch in (1.0, 0.7):
-        env = Follow("book", rig=field, seconds=1.0)
+        env = make(name, rig=field, seconds=4.0)
         env.reset(seed=4)
         detector, outlines = env.episode.detector, env.episode.outlines
-        found = {k: detector.detect(dataclasses.replace(env.wide, t=k * FRAME_S)) for k in range(30)}
+        frame = env.episode.rig.fixed.read()
+        found = {k: detector.detect(dataclasses.replace(frame, t=k * FRAME_S)) for k in range(steps + 10)}
         detector.detect = lambda frame, found=found: found[round(frame.t / FRAME_S)]
-        outlines._points = {name: points * stretch for name, points in outlines._points.items()}
+        outlines._points = {each: points * stretch for each, points in outlines._points.items()}
         outlines._t = math.nan  # what it has worked out is of the other size
-        told.append([env.step(STILL) for _ in range(20)])
+        told.append([env.step(action) for _ in range(steps)])
         env.close()
     for one, other in zip(*told, strict=True):
-        np.testing.assert_array_equal(one[0], other[0])
-        sizes = [each[4]["box_wide"][2:] - each[4]["box_wide"][:2] for each in (one, other)]
-        assert sizes[1] == pytest.approx(0.7 * sizes[0], rel=0.01)  # it is far away
+        np.testing.assert_array_equal(flat(one[0]), flat(other[0]))
+        boxes = [each[4]["box_wide"].reshape(-1, 2, 2) for each in (one, other)]
+        sizes = [box[:, 1] - box[:, 0] for box in boxes]
+        assert sizes[1] == pytest.approx(0.7 * sizes[0], rel=0.03)  # it is far away
+    known = one[0]["tracks"] if make is Schedule else one[0]
+    assert known.any()
 
 
 # ---------------------------------------------------------------- what is refused
@@ -220,6 +251,8 @@ def test_the_truth_is_in_info_alone(field):
     (lambda: Follow("dragon"), "target: unknown 'dragon'; there are: bird, book, person"),
     (lambda: Schedule("book"), "kind: unknown 'book'; there are: bird, person"),
     (lambda: Follow(observation="smell"), "observation: unknown 'smell'; there are: images, tracks"),
+    (lambda: Follow(observation=np.zeros(3)), "observation: unknown array([0., 0., 0.]); there are: images, tracks"),
+    (lambda: Schedule(["bird"]), "kind: unknown ['bird']; there are: bird, person"),
     (lambda: Follow(seconds=21), "seconds: 21 is not above 0 and up to 20"),
     (lambda: Follow(seconds=math.nan), "seconds: nan is not"),
     (lambda: Follow(image_size=(4, 64)), "image_size: (4, 64) is not (width, height) of at least 8 pixels each"),
@@ -236,9 +269,11 @@ def test_the_truth_is_in_info_alone(field):
     (lambda: Schedule(served_reward="much"), "served_reward: 'much' is not a finite number"),
     (lambda: PipelinePolicy(Schedule()), "the pipeline is a policy of cotarget/Follow-v0"),
     (lambda: SchedulingPolicy(Follow()), "policies choose in cotarget/Schedule-v0"),
+    (lambda: SchedulingPolicy(Schedule(), ["best"]), "policy: unknown ['best']; there are: first-come, most-served"),
     (lambda: SchedulingPolicy(Schedule(), "best"), "policy: unknown 'best'; there are: first-come, most-served"),
     (lambda: Follow().reset(options={"wind": 3}), "options: reset knows no 'wind'"),
     (lambda: Follow().reset(options=3), "options: reset knows no 3"),
+    (lambda: Follow().reset(options=np.zeros(3)), "options: reset knows no array([0., 0., 0.])"),
 ])  # fmt: skip
 def test_what_makes_no_sense_is_refused_in_a_line(make, said):
     with pytest.raises(CotargetError, match=re.escape(said)) as caught:

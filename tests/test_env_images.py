@@ -2,6 +2,7 @@
 
 import dataclasses
 import threading
+import weakref
 
 import gymnasium
 import numpy as np
@@ -13,7 +14,7 @@ from cotarget.env import FOLLOW, Follow, Schedule
 from cotarget.env.arguments import DEFAULT_RIG
 from cotarget.errors import DeviceError
 from cotarget.sim import opengl
-from tests.env_episodes import field_rig, run
+from tests.env_episodes import field_rig, run, uncollected
 
 pytestmark = pytest.mark.render
 STILL = np.zeros(3, np.float32)
@@ -106,10 +107,14 @@ def test_close_leaves_nothing_behind(monkeypatch, field):
     monkeypatch.setattr(opengl, "make_renderer", noting)
     threads = threading.active_count()
     env = Follow("bird", "images", rig=field, seconds=1.0, render_mode="rgb_array")
-    for seed in (0, 1):
-        env.reset(seed=seed)
-        env.step(STILL)
-        env.render()
+    with uncollected():
+        for seed in (0, 1):
+            env.reset(seed=seed)
+            env.step(STILL)
+            env.render()
+        last = weakref.ref(env.episode.world)
+        env.reset(seed=2)  # though nobody renders now
+        assert last() is None
     assert len(opened) == 2  # one a size, and the second episode opened none
     assert threading.active_count() == threads
     assert all(renderer._gl_context is not None for renderer in opened)

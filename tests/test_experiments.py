@@ -80,7 +80,8 @@ def test_a_run_writes_its_files(tmp_path, capsys):
     result = json.loads((out / "result.json").read_text())
     assert result["settings"] == {"seeds": 3, "seed_base": 10, "processes": 1, "factor": 2.0}
     assert result["summary"] == {"sum": 66.0, "nothing": None, "by": {"1": 2.5}}
-    assert set(result["versions"]) == {"cotarget", "opencv", "numpy", "scipy", "mujoco", "matplotlib"}
+    libraries = {"opencv", "numpy", "scipy", "mujoco", "matplotlib", "gymnasium", "av", "opengl"}
+    assert set(result["versions"]) == {"cotarget", "python", *libraries}
     rows = list(csv.DictReader((out / "rows.csv").read_text().splitlines()))
     assert [row["seed"] for row in rows] == ["10", "10", "11", "11", "12", "12"]
     assert (rows[0]["value"], rows[0]["extra"], rows[1]["extra"]) == ("20.0", "", "a")
@@ -130,6 +131,24 @@ def test_an_interrupt_ends_in_one_line(capsys, tmp_path):
     assert replace(HERE, one=interrupted).main(["--out", str(tmp_path / "out")]) == 130
     assert capsys.readouterr().err == "experiments.dummy: interrupted\n"
     assert not (tmp_path / "out").exists()
+
+
+def wrong_once(extra, settings, seed):
+    if seed == 1:
+        raise ValueError("seed 1\nis wrong")
+    return dummy(extra, settings, seed)
+
+
+def test_a_seed_that_fails_loses_no_other(tmp_path, capsys):
+    assert replace(HERE, one=wrong_once).main(["--seeds", "3", "--out", str(tmp_path)]) == 1
+    told = capsys.readouterr()
+    assert (told.out, told.err) == ("sum 4.0\n", "experiments.dummy: seed 1 failed: ValueError: seed 1 is wrong\n")
+    assert json.loads((tmp_path / "result.json").read_text())["summary"]["sum"] == 4.0
+
+
+def test_a_quick_run_is_not_held_to_what_is_wanted():
+    lost = replace(HERE, missed=lambda summary: ["sum"])
+    assert [lost.main(given) for given in ([], ["--quick"])] == [1, 0]
 
 
 def test_help_says_what_quick_means(capsys):

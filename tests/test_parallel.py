@@ -78,6 +78,23 @@ if __name__ == "__main__":
 """
 
 
+class Hearing:
+    """In another process, what that does with Ctrl-C as soon as it lives."""
+
+    def __reduce__(self):
+        return signal.getsignal, (signal.SIGINT,)
+
+
+def is_deaf(heard, report):
+    return heard == signal.SIG_IGN
+
+
+def test_jobs_that_begin_do_not_hear_an_interrupt():
+    before = signal.getsignal(signal.SIGINT)
+    assert run_side_by_side(is_deaf, [(Hearing(),)], lambda *_: None) == [True]
+    assert signal.getsignal(signal.SIGINT) == before
+
+
 def test_jobs_end_with_their_parent_however_it_ends(tmp_path):
     """Its pipes are closed only when nobody holds them any more."""
     (tmp_path / "waiter.py").write_text(WAITER)

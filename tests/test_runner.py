@@ -19,15 +19,17 @@ import pytest
 from cotarget.errors import ConfigError
 from cotarget.sim.opengl import Canvas
 from experiments.__main__ import main
-from experiments.bounds import compare, tighten
+from experiments.bounds import Bound, compare, tighten
 from experiments.cases import EXPERIMENTS, choose, known_experiments
 from experiments.cluster import on_dask
 from experiments.harness import Experiment, Settings
-from experiments.report import duration
-from experiments.results import FORMAT, code_version, taken
+from experiments.outcome import Outcome
+from experiments.report import Run, duration, used, write_report
+from experiments.results import FORMAT, LOCK, Record, Spent, code_version, taken
+from experiments.sessions import Session, Share, sessions
 from experiments.tasks import Task, perform
 from experiments.workers import LINEAR_ALGEBRA, ONE_THREAD, Died, here, in_processes
-from tests.tiny_experiments import ALONE, KNOWN, TINY, notes, pids
+from tests.tiny_experiments import ALONE, KNOWN, TINY, knows_its_code, notes, pids
 
 DEADLINE_S = 120.0  # for a program to come as far as it is waited for
 QUICKLY_S = 60.0  # for a program to end that is interrupted, on a busy machine; its jobs would take for ever
@@ -46,6 +48,7 @@ def run(tmp_path, capsys, monkeypatch):
             patched.setattr("cotarget.cli.arguments.REMARK_S", math.inf)  # a busy machine is no complaint
             if "--processes" not in arguments:
                 patched.setattr("experiments.__main__.in_processes", here)
+                patched.setattr("experiments.runner.in_turn", here)
             status = main([*arguments, "--out", str(tmp_path / out)], KNOWN, expected)
         told = capsys.readouterr()
         return status, told.out, told.err
@@ -75,9 +78,12 @@ def test_each_job_once_what_is_shared_first_and_timings_last(run, tmp_path):
     assert sorted(notes(shared)[1:]) == [f"job {seed}" for seed in range(4)]
     assert sorted(notes(others)[:4]) == [f"job {seed}" for seed in range(4)]
     assert notes(others)[4:] == [f"alone {seed}" for seed in range(4)]
-    assert os.getpid() not in pids(shared)
-    assert os.getpid() in pids(others)  # the timings
+    assert os.getpid() not in pids(shared) | pids(others)
+    timing = pids(others, "alone")
+    assert len(timing) == 1  # one process for all of them, which has done nothing else
+    assert not timing & (pids(shared) | pids(others, "job"))
     (folder,) = (path for path in (tmp_path / "out").iterdir() if path.name.startswith("sharing"))
+    assert json.loads((folder / "jobs" / "shared.json").read_text())["seconds"] > 0
     record = json.loads((folder / "jobs" / "000003.json").read_text())
     assert record["rows"][0] == {"seed": 3, "value": 3.0, "sum": record["rows"][0]["sum"], "shared": "given to all"} | {
         "odd": True
@@ -154,11 +160,22 @@ def test_a_seed_that_fails_is_recorded_and_the_rest_goes_on(run, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_job_that_kills_its_process_takes_no_other_along(run, tmp_path):
-    status, told, complaints = run("tiny", "--set", "tiny.fatal=[1]", "--processes", "2", "--seeds", "2")
+@pytest.mark.parametrize(("name", "total"), [("tiny", "<total> 5"), ("alone", "<total> 3")])
+def test_a_job_that_kills_its_process_takes_no_other_along(run, tmp_path, name, total):
+    fatal = (*noted(tmp_path, name), "--set", f"{name}.fatal=[1]", "--processes", "2")
+    status, told, complaints = run(name, *fatal)
     assert (status, complaints.count("\n")) == (1, 1)
     assert "seed 1 failed: its process died" in complaints
-    assert "<total> 0" in told
+    assert total in told
+    assert len(notes(tmp_path)) == 4  # each once
+
+
+def test_what_is_shared_by_several_is_prepared_once(run, tmp_path):
+    both = ("--set", "sharing.factor=1", "--set", "sharing.factor=2")
+    assert run("sharing", *noted(tmp_path, "sharing"), *both, "--seeds", "1")[0] == 0
+    assert notes(tmp_path) == ["prepared", "job 0", "job 0"]
+    taken_by = [json.loads(path.read_text())["seconds"] for path in (tmp_path / "out").glob("*/jobs/shared.json")]
+    assert len(taken_by) == 1  # counted once too
 
 
 def test_what_is_shared_fails(run, tmp_path):
@@ -184,6 +201,8 @@ def test_figures_that_cannot_be_made_are_told(run, monkeypatch):
         (["tiny", "--set", "tiny.facto=1"], "unknown key 'tiny.facto'; valid here: factor, fatal, gated"),
         (["tiny", "--set", "tiny.factor=high"], "tiny.factor: 'high' is not a finite number"),
         (["tiny", "--set", "tiny.seeds=0"], "seeds = 0: at least 1 is needed"),
+        (["tiny", "--set", "tiny.factor=-1"], "tiny.factor: -1 is below 0"),
+        (["tiny", "--set", "tiny.processes=2"], "how many processes there are changes no row; say --processes"),
         (["tiny", "--set", "vain.factor=1"], "vain is not among those to run: tiny"),
         (["tiny", "--set", "factor"], "'factor' is not like NAME.KEY=VALUE"),
         (["lacking"], "lacking needs the moon"),
@@ -237,8 +256,11 @@ def test_results_of_another_version_are_refused(run, tmp_path, change, message):
     assert message in complaints
     assert "another folder with --out, or begin anew with --fresh" in complaints
     assert path.read_bytes() == kept
-    any_code = run("tiny", "--seeds", "1", "--any-code")[0]
-    assert any_code == (0 if "--any-code" in message else 1)
+    is_code = "--any-code" in message
+    assert run("tiny", "--seeds", "1", "--any-code")[0] == (0 if is_code else 1)
+    status, said, _ = run("tiny", "--seeds", "1", "--report")
+    assert status == (0 if is_code else 1)
+    assert not is_code or f"done by cotarget {change['version']}, this is {code_version()}" in said
     assert run("tiny", "--seeds", "1", "--fresh")[0] == 0
     assert json.loads(path.read_text())["version"] == code_version()
 
@@ -267,9 +289,13 @@ def test_code_that_is_changed_meanwhile_ends_the_run(run, tmp_path, monkeypatch)
     with monkeypatch.context() as patched:
         patched.setattr("experiments.runner.perform", lambda task: (perform if task.number == 0 else changed)(task))
         status, told, complaints = run("tiny")
+        assert run("tiny", "--any-code")[0] == 1  # is for what is there, not for who does more
+        afresh = run("tiny", "--fresh")[2]
     assert (status, told, complaints.count("\n")) == (1, "", 1)
+    assert afresh.endswith("and the same command without --fresh goes on\n")
     assert f"a worker has cotarget 0.1.0+12345678, this is {code_version()}; was the code changed?" in complaints
     assert "1 of 4 jobs are done and kept" in complaints
+    assert complaints.endswith("and the same command goes on\n")
     assert len(list((tmp_path / "out" / "tiny" / "jobs").iterdir())) == 1
     assert run("tiny")[0] == 0
 
@@ -343,7 +369,7 @@ def test_a_killed_run_goes_on_where_it_was(started, tmp_path):
     program.send_signal(signal.SIGKILL)
     program.wait()
     until(lambda: all(map(is_gone, workers)), "no process outlives the one that started it")
-    assert not [path for path in (tmp_path / "out").rglob("*") if path.suffix == ".tmp"]
+    assert not [path for path in (tmp_path / "out").rglob(".*") if path.name != LOCK]  # none half-written
     (tmp_path / "gate").unlink()
     (tmp_path / "gate").touch()
     again = started()
@@ -374,7 +400,7 @@ def test_a_polite_end_is_quick_and_says_how_to_go_on(started, tmp_path, end, sta
 
 
 def test_an_engine_that_is_left_ends_its_processes(tmp_path):
-    results = in_processes(os.path.exists, [str(tmp_path)] * 3, 1)
+    results = in_processes(knows_its_code, [str(tmp_path)] * 3, 1)
     assert next(results) == (0, True)
     results.close()
     with pytest.raises(ValueError, match="invalid literal"):
@@ -410,6 +436,7 @@ def test_the_report_has_everything_and_needs_nothing(run, tmp_path):
         assert version in text
     times = text[text.index('id="times"') : text.index('id="made"')]
     assert times.count("<tr>") == 2 + 4 + 1 + 1  # two heads, four experiments with jobs and all of them, one session
+    assert re.search(r"In all: .+ s and 0 renders; a full run may take 60 min and 80000 renders\.", times)
 
 
 def test_a_wanted_figure_that_is_missed_is_told(run, tmp_path):
@@ -428,6 +455,11 @@ def test_bounds_only_tighten(run, tmp_path):
     assert json.loads(path.read_text()) == {"total": 0.5, "by": {"worst": {"at_most": 1.0}}, "rows": {"at_least": 4.0}}
     assert "tiny: by / worst: at most 3 -> 1\ntiny: rows: at least - -> 4\n" in told
     assert "no bound is tighter now" in run("tiny", "--quick", "--update-expected")[1]
+    assert [Bound((), kind, -1.0, reached).kept for kind, reached in (("at_most", -1.0), ("at_most", -0.95))] == [
+        True
+    ] * 2
+    assert [Bound((), "at_least", -1.0, reached).kept for reached in (-1.05, -1.15)] == [True, False]
+    assert not Bound((), "at_most", -1.0, -0.9).kept  # which is more than 10 % worse
     assert tighten(ALONE, {"total": 0.0}, tmp_path) == []  # times
 
 
@@ -466,6 +498,62 @@ def test_a_bound_whose_figure_is_gone_is_broken(tmp_path):
             compare(TINY, {}, tmp_path)
 
 
+def test_a_report_of_what_is_there_says_how_it_was_made(run, tmp_path):
+    assert run("tiny", "--seeds", "1")[0] == 0
+    assert run("tiny", "--seeds", "1", "--report")[0] == 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "python -m experiments tiny --seeds 1 --out" in page
+    assert "--report" not in page
+
+
+def test_sessions_are_told_without_what_was_forgotten(run, tmp_path):
+    path = tmp_path / "out" / "sessions.json"
+    assert run("tiny", "sharing", "--seeds", "1")[0] == 0
+    (before,) = sessions(path.parent)
+    assert set(before.cases) == {"tiny", "sharing"}
+    assert before.cases["sharing"].shared_s > 0
+    assert run("tiny", "--fresh", "--seeds", "1")[0] == 0
+    first, second = sessions(path.parent)
+    assert (set(first.cases), set(second.cases)) == ({"sharing"}, {"tiny"})
+    assert 0 < first.wall_s < before.wall_s
+    page = (path.parent / "report.html").read_text()
+    assert page.count(f"<td>{second.workers}</td>") == 1  # the other is of what is not reported here
+    told = json.loads(path.read_text())
+    path.write_text(json.dumps([{"began": 1}, 2, *told, told[0] | {"wall_s": "long"}]))
+    assert sessions(path.parent) == [first, second]
+    assert run("tiny", "--seeds", "1")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("is_full", "wall_s", "said"),
+    [
+        (True, 3500.0, "58 min 20 s and 70000 renders, of 60 min and 80000 renders that a full run may take"),
+        (
+            True,
+            3700.0,
+            "1 h 2 min and 70000 renders, of 60 min and 80000 renders that a full run may take: too much time",
+        ),
+        (False, 3700.0, "1 h 2 min and 70000 renders; a full run may take 60 min and 80000 renders"),
+    ],
+)
+def test_what_all_took_is_told_beside_what_it_may(is_full, wall_s, said):
+    (case,) = choose(KNOWN, ["sharing"])
+    outcome = Outcome(case, {0: Record(0, 9.0, 8.0, "", 20_000, [])}, shared=Spent(2.0, 1.0, 50_000))
+    session = Session("", wall_s, "", "", "", {}, {"sharing": Share(1, 9.0, 2.0, 70_000)})
+    assert used(Run([outcome], {}, [session], "", is_full)) == said
+    assert outcome.cpu_s == 9.0
+
+
+def test_every_version_that_has_a_part_is_told(tmp_path):
+    """One after the other by two machines, the first of which did more later."""
+    session = Session("2026-01-01", 1.0, "", "0.1.0+a.b", "small", {"numpy": "2.1.0"}, {"tiny": Share(1)})
+    others = [replace(session, began="2026-01-02", versions={"numpy": "2.2.0"}), replace(session, began="2026-01-03")]
+    write_report(tmp_path / "report.html", Run([], {}, [session, *others], ""))
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("2.1.0") == page.count("2.2.0") == 1
+    assert "2026-01-01 and 2026-01-03" in page
+
+
 def test_times_in_words():
     told = [duration(seconds) for seconds in (0.0123, 59.0, 310.0, 7380.0)]
     assert told == ["0.012 s", "59 s", "5 min 10 s", "2 h 3 min"]
@@ -486,7 +574,8 @@ def test_all_experiments_are_of_one_shape(capsys):
         assert len(experiment.jobs(experiment.quick)) <= len(experiment.jobs(experiment.settings))
         assert experiment.plot is None or experiment.plot.__doc__  # the picture's caption
     assert main(["--list"]) == 0
-    assert all(re.search(rf"^{name} +\S", capsys.readouterr().out, re.MULTILINE) for name in EXPERIMENTS[:1])
+    told = capsys.readouterr().out
+    assert [name for name in EXPERIMENTS if not re.search(rf"^{name} +\S", told, re.MULTILINE)] == []
     assert {name for name, load in known.items() if load().alone} == {
         *("speed", "wire", "sim_speed", "env_speed", "pipeline_speed", "sweep_speed"),
     }
@@ -550,14 +639,19 @@ def test_a_job_that_kills_its_workers_on_a_cluster(run, cluster):
 
 
 def test_a_cluster_that_is_not_fit(run, tmp_path, cluster, monkeypatch):
-    where = ("--backend", "dask", "--scheduler", cluster(threads=2, processes=False))
-    status, _, complaints = run("tiny", *where)
+    two = ("--backend", "dask", "--scheduler", cluster(threads=2, processes=False))
+    status, _, complaints = run("tiny", *two)
     assert (status, complaints.count("\n")) == (1, 1)
     assert "has 2 threads; start workers with --nthreads 1" in complaints
     where = ("--backend", "dask", "--scheduler", cluster(processes=False))
     for name in LINEAR_ALGEBRA:
         monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("MKL_NUM_THREADS", "1")  # which what pip installs does not heed
     assert "start it with OMP_NUM_THREADS=1" in run("tiny", *where)[2]
+    with monkeypatch.context() as patched:
+        patched.setattr("experiments.cluster._check_workers", lambda *_: None)  # as if they had joined later
+        assert "start it with OMP_NUM_THREADS=1" in run("tiny", *where)[2]
+        assert "has 2 threads; start workers with --nthreads 1" in run("tiny", *two)[2]
     monkeypatch.setattr("experiments.__main__.code_version", lambda: "0.0.9+12345678")
     assert f"has cotarget {code_version()}, this is 0.0.9+12345678; give both the same" in run("tiny", *where)[2]
     assert not list((tmp_path / "out").glob("*/jobs/*"))
@@ -573,6 +667,15 @@ def test_nobody_answers(run):
 def test_a_cluster_of_ones_own():
     pytest.importorskip("distributed", reason="Dask is not installed: pip install 'cotarget[sweeps]'")
     assert dict(on_dask(math.sqrt, [4.0, 9.0], 1, version=code_version())) == {0: 2.0, 1: 3.0}
+
+
+def test_results_are_kept_where_nobody_can_begin_anew(run, tmp_path, monkeypatch):
+    assert run("tiny")[0] == 0
+    dask = ("tiny", "--fresh", "--backend", "dask")
+    assert "no Dask scheduler answers" in run(*dask, "--scheduler", "nowhere")[2]
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert "needs distributed" in run(*dask)[2]
+    assert len(list((tmp_path / "out" / "tiny" / "jobs").iterdir())) == 4
 
 
 def test_a_missing_engine_is_named_with_what_brings_it(run, monkeypatch):

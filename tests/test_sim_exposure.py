@@ -52,9 +52,9 @@ def draws(monkeypatch):
     """Counts the pixels of every render."""
     drawn, draw = [], Canvas.draw
 
-    def counted(self, eye, axes, tangents, size):
+    def counted(self, eye, axes, tangents, size, part):
         drawn.append(size[0] * size[1])
-        return draw(self, eye, axes, tangents, size)
+        return draw(self, eye, axes, tangents, size, part)
 
     monkeypatch.setattr(Canvas, "draw", counted)
     return drawn
@@ -66,13 +66,14 @@ def test_a_flying_bird_is_blurred_in_the_wide_view_and_only_it_is_rendered_again
         low, high = w.truth().box("bird", "fixed", t)
         box = (slice(int(low[1]) - 4, int(high[1]) + 6), slice(int(low[0]) - 6, int(high[0]) + 8))
         truth, four, sharp = (mean_of(w, "fixed", t, n) for n in (INSTANTS, FOUR, 1))
-        drawn = draws(monkeypatch)
+        drawn, before = draws(monkeypatch), Canvas.drawn
         image = w.expose("fixed", 0, t)
     assert error(sharp[box], truth[box]) > 2 * error(four[box], truth[box])  # there is a blur
     assert error(image[box], truth[box]) < AS_GOOD * error(four[box], truth[box]) + 0.5  # half a level is rounding
     assert error(image, truth) < WHOLLY_RIGHT
     assert len(drawn) == 1 + FOUR
     assert max(drawn[1:]) < 0.05 * drawn[0]
+    assert Canvas.drawn - before == pytest.approx(sum(drawn) / drawn[0])  # a part of a picture counts as that
 
 
 @pytest.mark.slow

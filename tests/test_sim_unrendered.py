@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from cotarget.config import parse_config
+from cotarget.config import SafetyConfig, parse_config
+from cotarget.errors import DeviceError
+from cotarget.geometry import pose
+from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
 
 
@@ -51,6 +54,27 @@ def test_no_opengl_is_opened_for_no_picture(monkeypatch):
 
     monkeypatch.setattr("cotarget.sim.opengl.make_renderer", refuse)
     drive(SimWorld(config(), rendered=()))
+
+
+def test_a_closed_rig_shows_nothing_more_and_can_be_closed_again():
+    w = SimWorld(config(), rendered=())
+    with SafeRig(w.rig, SafetyConfig()) as rig:
+        rig.head.move(0.1, 0.0)
+        seen = rig.fixed.read()
+    for _ in range(2):
+        rig.close()
+        w.rig.close()
+        w.close()
+    for ask in (
+        lambda: rig.fixed.read(newer_than=seen.t),
+        lambda: w.rig.zoom.read(newer_than=seen.t),
+        lambda: w.rig.board.present(pose([0, 0, 3], [0, 0, 0])),
+    ):
+        with pytest.raises(DeviceError, match="the simulated rig is closed"):
+            ask()
+    w.rig.clock.sleep_until(9.0)
+    assert not w.rig.head.state().moving
+    assert np.isfinite(w.truth().center_px("person", "fixed", seen.t)).all()
 
 
 def test_a_box_is_that_of_the_silhouette():

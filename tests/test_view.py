@@ -14,6 +14,8 @@ import pytest
 
 from cotarget.cli import viewing
 from cotarget.config import RigConfig, SimConfig
+from cotarget.errors import DeviceError
+from cotarget.sim import browser, desktop
 from cotarget.sim.frusta import FAR, SIDE_POINTS, Sight, frusta_of, frustum_rim
 from cotarget.sim.onlooker import Onlooker, line_geoms
 from cotarget.sim.opengl import mujoco
@@ -199,15 +201,68 @@ def test_the_command_shows_the_rig_at_rest_or_the_pipeline_at_work(folder, capsy
     assert sights[-1].caption.endswith("book: searching" if target else f"{sights[-1].t:.1f} s")
 
 
+@pytest.fixture
+def unserved(monkeypatch):
+    """A web viewer whose thread ends at once; it notes what was closed."""
+    closed = []
+
+    def launch(serve):
+        if serves:
+            serve(None)
+        return SimpleNamespace(close=lambda: closed.append("viewer"))
+
+    serves = []
+    monkeypatch.setattr(browser.launch_thread, "launch_thread", launch)
+    monkeypatch.setattr(browser, "START_S", 0.0)
+    return serves, closed
+
+
+@pytest.mark.parametrize(("fails", "said"), [
+    (None, "MuJoCo's web viewer does not start within 0 s; try again"),
+    (OSError("no more threads"), "MuJoCo's web viewer does not start: no more threads"),
+])  # fmt: skip
+def test_a_page_that_does_not_come_up_leaves_nothing_behind(world, monkeypatch, unserved, fails, said):
+    serves, closed = unserved
+
+    def refuse(*_):
+        raise fails
+
+    if fails:
+        serves.append(True)
+        monkeypatch.setattr(browser.BrowserWindow, "_viewer", refuse)
+    listener = browser.listen(0)
+    with pytest.raises(DeviceError, match=said):
+        browser.BrowserWindow(world.truth(), listener)
+    assert closed == ["viewer"]
+    assert listener.fileno() == -1
+
+
+@pytest.mark.parametrize("window", [(1200, 900), (333, 777), (90, 70)])
+def test_pictures_in_a_window_are_as_large_as_their_places_and_one_above_the_other(window):
+    """MuJoCo draws as many pixels as the place has, whatever the picture's own size."""
+    blue, red = np.zeros((480, 640, 3), np.uint8), np.zeros((200, 320, 3), np.uint8)
+    blue[..., 0] = red[..., 2] = 255
+    placed = desktop._placed([blue, red], *window)
+    for (place, picture), shape, colour in zip(
+        placed, ((480, 640), (200, 320)), ((0, 0, 255), (255, 0, 0)), strict=True
+    ):
+        assert picture.shape == (place.height, place.width, 3)
+        assert place.width / place.height == pytest.approx(shape[1] / shape[0], rel=2 / place.height)  # whole pixels
+        assert (picture == colour).all()  # RGB
+        assert place.left + place.width <= window[0]
+        assert place.bottom >= 0
+    (above, _), (below, _) = placed
+    assert window[1] >= above.bottom + above.height
+    assert above.bottom >= below.bottom + below.height
+
+
 @pytest.mark.wire
 def test_the_page_is_served_to_this_machine_alone_with_the_model_and_ends_with_the_window(world):
     from mujoco.studio.web import state_payload
 
-    from cotarget.sim.browser import HOST, BrowserWindow, listen
-
-    listener = listen(0)
-    assert listener.getsockname()[0] == HOST
-    window = BrowserWindow(world.truth(), listener)
+    listener = browser.listen(0)
+    assert listener.getsockname()[0] == browser.HOST
+    window = browser.BrowserWindow(world.truth(), listener)
     try:
         window.show(Sight(5.0, "", {}, frusta_of(world.truth(), 5.0)))
         assert window.is_open()
@@ -228,8 +283,6 @@ def test_the_page_is_served_to_this_machine_alone_with_the_model_and_ends_with_t
 
 
 def test_the_overlay_hands_over_lines_and_pictures_that_are_new(world):
-    from cotarget.sim.browser import PICTURE_PX, Overlay
-
     sent = []
 
     def upload(texture, pixels, width, height, bytes_a_pixel):
@@ -237,7 +290,7 @@ def test_the_overlay_hands_over_lines_and_pictures_that_are_new(world):
         assert len(pixels) == width * height * bytes_a_pixel
         return texture or len(sent)
 
-    overlay = Overlay(lambda *_: None)
+    overlay = browser.Overlay(lambda *_: None)
     overlay.viewer = SimpleNamespace(extra_geoms=[], upload_image=upload)
     overlay.on_update(None)
     assert not sent
@@ -248,7 +301,7 @@ def test_the_overlay_hands_over_lines_and_pictures_that_are_new(world):
     for _ in range(2):
         overlay.on_update(None)
         assert len(overlay.viewer.extra_geoms) == sum(map(len, lines.values()))
-    assert sent == [(0, b"\xff\0\0\xff", PICTURE_PX, 300)] * 2
+    assert sent == [(0, b"\xff\0\0\xff", browser.PICTURE_PX, 300)] * 2
     overlay.sight = Sight(5.1, "", {"fixed": red}, lines)
     overlay.on_update(None)
     assert [texture for texture, *_ in sent] == [0, 0, 1]

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.harness import Experiment, Settings, seeds_of
+from experiments.harness import Experiment, Preparation, Settings, seeds_of
+from experiments.results import code_version
 
 SIZE = 300  # of matrices that are large enough for linear algebra to share its sums among threads
 
@@ -36,8 +37,9 @@ def notes(folder):
     return [line.rpartition(" ")[0] for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def pids(folder):
-    return {int(line.rpartition(" ")[2]) for line in (folder / "done").read_text().splitlines()}
+def pids(folder, what=""):
+    lines = (folder / "done").read_text().splitlines()
+    return {int(line.rpartition(" ")[2]) for line in lines if line.startswith(what)}
 
 
 def one(shared, settings, seed):
@@ -55,9 +57,18 @@ def one(shared, settings, seed):
     return [row, {"seed": seed, "value": float("nan")}]
 
 
-def prepare(settings):
-    note(settings, "prepared")
+def prepare(notes):
+    note(TinySettings(notes=notes), "prepared")
     return "given to all"
+
+
+def for_notes(settings):
+    return (settings.notes,)
+
+
+def knows_its_code(_):
+    """Whether this process knew which code it has before it was told what to do."""
+    return code_version.cache_info().currsize == 1
 
 
 def prepare_in_vain(settings):
@@ -66,6 +77,8 @@ def prepare_in_vain(settings):
 
 def alone(shared, settings, seed):
     note(settings, f"alone {seed}")
+    if seed in settings.fatal:
+        os._exit(3)
     return [{"seed": seed, "value": 1.0}]
 
 
@@ -90,7 +103,9 @@ def missed(summary):
 SETTINGS = TinySettings()
 QUICK = replace(SETTINGS, seeds=2)
 TINY = Experiment("tiny", "Adds up.", SETTINGS, QUICK, one, summarise, describe, plot, missed)
-SHARING = replace(TINY, name="sharing", purpose="Shares.", prepare=prepare, cost_s=5.0, missed=None)
+SHARING = replace(
+    TINY, name="sharing", purpose="Shares.", prepare=Preparation(prepare, for_notes), cost_s=5.0, missed=None
+)
 VAIN = replace(TINY, name="vain", purpose="Cannot be prepared.", prepare=prepare_in_vain)
 ALONE = replace(TINY, name="alone", purpose="Takes the time.", one=alone, alone=True, plot=None)
 LACKING = replace(TINY, name="lacking", purpose="Lacks something.", needs=lambda _: "needs the moon")

@@ -56,10 +56,9 @@ def check_shown(config: "RigConfig", name: str, rig: Path) -> None:
     from cotarget.simchecks import told_targets
     from cotarget.simconfig import TARGETS, split_name
 
-    own = config.sim.models
-
     if config.backend != "sim" or name in config.sim.targets:
         return
+    own = config.sim.models
     if split_name(name)[0] not in (*TARGETS, *own):
         raise ConfigError(
             f"--target: a simulated {name} cannot be, whatever [targets.{name}] says; {told_targets(own)}"

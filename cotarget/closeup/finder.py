@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -75,6 +76,19 @@ class Found:
     t: float
 
 
+class Finder(Protocol):
+    """Finds the target that is followed in the zoom view; the docstrings of `CloseupFinder` say what is what."""
+
+    def see_wide(self, frame: Frame, detection: Detection, mask: Image | None = None) -> Sight | None:
+        """Remember the target as a wide frame shows it."""
+
+    def sight_at(self, t: float) -> object | None:
+        """What the wide view showed of the target at about a time [s]; None where it did not, or has not yet."""
+
+    def find(self, frame: Frame, expected: Expected) -> Found | None:
+        """Find the target in a zoom frame."""
+
+
 class CloseupFinder:
     """Finds in the zoom view what the wide view's detector has found; one for each target that is followed."""
 
@@ -130,7 +144,7 @@ class CloseupFinder:
         Returns:
             None where it is not there, or not for sure.
         """
-        sight, view = self.sight_at(frame.t), self._view(expected)
+        sight, view = self.sight_at(frame.t), self.view(expected)
         if sight is None or view is None:
             return None
         place = register(frame.image, sight, view)
@@ -160,8 +174,8 @@ class CloseupFinder:
         self._last_t, self._last_offset = t, offset
         return True
 
-    def _view(self, expected: Expected) -> View | None:
-        """Project what is expected; None where that is behind a camera or beyond its lens."""
+    def view(self, expected: Expected) -> View | None:
+        """Where in the zoom frame the target is expected; None behind a camera or beyond its lens."""
         x, covariance = np.asarray(expected.x_fixed, dtype=float), np.asarray(expected.covariance, dtype=float)
         if not (np.isfinite(x).all() and np.isfinite(covariance).all() and x[2] > 0):
             return None

@@ -219,6 +219,7 @@ class MotionDetector:
         closed = cv2.dilate(mask, np.ones((bridge_h, bridge_w), np.uint8))
         contours = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]
         found = []
+        largest_w, largest_h = settings.largest * width, settings.largest * height
         for contour in contours:
             x, y, w, h = cv2.boundingRect(contour)
             # The dilation only joined the pieces: the box is that of the mask's own pixels inside.
@@ -230,7 +231,6 @@ class MotionDetector:
                 dx, dy, box_w, box_h = cv2.boundingRect(inside)
                 if box_w < settings.smallest_px[0] or box_h < settings.smallest_px[1]:
                     continue
-                largest_w, largest_h = settings.largest * width, settings.largest * height
                 widest = settings.widest if last - first == w else UPRIGHT
                 if box_w > largest_w or box_h > largest_h or box_w > widest * box_h:
                     continue

@@ -2,20 +2,25 @@
 
 import math
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from numbers import Real
 from pathlib import Path
 
 import numpy as np
 
 from cotarget.calibration import Calibration, load_calibration
-from cotarget.config import RigConfig, load_config
-from cotarget.errors import ConfigError
+from cotarget.config import RigConfig, check_config, load_config
+from cotarget.errors import ConfigError, choices
+from cotarget.eyes import PATIENCE_S
 from cotarget.oracle import TruthNoise
-from cotarget.sim.fieldpaths import SECONDS
-from cotarget.simconfig import SimConfig, SimEffects, Size
+from cotarget.sim.fieldpaths import SECONDS, in_view
+from cotarget.sim.room import part_seen
+from cotarget.simconfig import SimConfig, SimEffects, Size, Waypoint
 
 SMALLEST_PX = 8
+# Of the ways of a few episodes, this part at least is to be seen in another scene than the one that they are made for.
+TRIED_SEEDS, LEAST_SEEN, EVERY_KNOT = range(3), 0.5, 5
 # The rig where none is given: the default one, without what makes pictures costly.
 DEFAULT_RIG = RigConfig(
     sim=SimConfig(effects=SimEffects(noise=False, jpeg=False, distortion=False, blur=False, multisampling=False))
@@ -27,11 +32,24 @@ def told(given: object) -> str:
     return " ".join(reprlib.repr(given).split())
 
 
+def name_of(what: str, given: object, known: Collection[str]) -> str:
+    """A name of those that there are.
+
+    Raises:
+        ConfigError: it is another.
+    """
+    if isinstance(given, str) and given in known:
+        return given
+    raise ConfigError(f"{what}: unknown {told(given)}; there {'are' if len(known) > 1 else 'is'}: {choices(known)}")
+
+
 def rig_of(given: object) -> RigConfig:
     """The simulated rig that is meant: one, or its rig.toml; the default one for None.
 
+    Its head goes no farther than the soft limits.
+
     Raises:
-        ConfigError: it is none, or not simulated.
+        ConfigError: it is none, not simulated, impossible, or too slow.
     """
     if isinstance(given, Path | str):
         given = load_config(Path(given))
@@ -40,7 +58,45 @@ def rig_of(given: object) -> RigConfig:
         raise ConfigError(f"rig: {told(given)} is neither a cotarget.config.RigConfig nor the path of a rig.toml")
     if config.backend != "sim":
         raise ConfigError(f"rig: its backend is '{config.backend}'; environments are on 'sim' alone")
-    return config
+    if given is not None:
+        check_config(config)  # one made in Python was not
+        _check_waits(config.sim)
+    pan_deg, tilt_deg = config.head_limits_deg
+    head = replace(config.sim.head, pan_deg=pan_deg, tilt_deg=tilt_deg)
+    return replace(config, sim=replace(config.sim, head=head))
+
+
+def _check_waits(sim: SimConfig) -> None:
+    """Refuse cameras whose frames are longer in coming than anybody waits."""
+    waits_s = {"fixed.rate_hz": 1 / sim.fixed.rate_hz}
+    if sim.effects.latency:
+        waits_s |= {"fixed.latency_s": sim.fixed.latency_s, "zoom.latency_s": sim.zoom.latency_s}
+    for name, wait_s in waits_s.items():
+        if wait_s > PATIENCE_S:
+            raise ConfigError(f"rig: sim.{name}: makes a frame {wait_s:g} s late; nobody waits above {PATIENCE_S:g} s")
+
+
+def check_scene(sim: SimConfig, name: str, paths: Callable[[str, int], Mapping[str, Sequence[Waypoint]]]) -> None:
+    """Refuse a scene in which a target is seldom to be seen, where it would be in the outdoor one.
+
+    Args:
+        sim: its scene.
+        name: of the target.
+        paths: the ways of an episode, by name and seed.
+
+    Raises:
+        ConfigError: it is such a scene.
+    """
+    if sim.scene == SimConfig.scene:
+        return
+    ways = [way[::EVERY_KNOT] for seed in TRIED_SEEDS for way in paths(name, seed).values()]
+    places = np.array([x for way in ways for t, *x in way if 0 <= t <= SECONDS])
+    seen = part_seen(sim, places[in_view(places)])
+    if seen < LEAST_SEEN:
+        raise ConfigError(
+            f"rig: in the scene '{sim.scene}' {seen:.0%} of a {name}'s ways can be seen; they are made for "
+            f"'{SimConfig.scene}': fixed_mount at (0, 0, 1.6), looking along +y and 9 degrees up, over open ground"
+        )
 
 
 def calibration_of(given: object) -> Calibration | None:
@@ -109,6 +165,6 @@ def check_options(given: object) -> None:
     Raises:
         ConfigError: there is one.
     """
-    if given:
+    if given is not None and not (isinstance(given, Mapping) and not given):
         first = next(iter(given)) if isinstance(given, Mapping) else given
         raise ConfigError(f"options: reset knows no {told(first)}; it takes a seed only")

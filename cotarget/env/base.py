@@ -12,9 +12,8 @@ import numpy.typing as npt
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
-from cotarget.env.arguments import calibration_of, check_options, noise_of, rig_of, seconds_of, size_of, told
+from cotarget.env.arguments import calibration_of, check_options, name_of, noise_of, rig_of, seconds_of, size_of
 from cotarget.env.units import Units
-from cotarget.errors import ConfigError, choices
 from cotarget.geometry import Array
 from cotarget.oracle import TruthDetector, TruthNoise, counted, true_calibration
 from cotarget.sim.appearances import CameraName
@@ -84,11 +83,9 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         Raises:
             ConfigError: an argument makes no sense.
         """
-        modes: list[str] = self.metadata["render_modes"]
-        if observation not in KINDS:
-            raise ConfigError(f"observation: unknown {told(observation)}; there are: {choices(KINDS)}")
-        if render_mode is not None and render_mode not in modes:
-            raise ConfigError(f"render_mode: unknown {told(render_mode)}; there is: {choices(modes)}")
+        name_of("observation", observation, KINDS)
+        if render_mode is not None:
+            name_of("render_mode", render_mode, self.metadata["render_modes"])
         self.config = rig_of(rig)
         self.units = Units.of(self.config)
         self.render_mode = render_mode
@@ -97,7 +94,7 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         self._observation, self._size = observation, size_of(image_size)
         self._last = max(round(seconds_of(seconds) * self.config.rate_hz), 1)
         self._episode: Episode | None = None
-        self._opened: dict[Size, tuple[Episode, Pictures]] = {}
+        self._opened: dict[Size, Pictures] = {}  # of the episode
 
     @property
     def episode(self) -> Episode:
@@ -128,12 +125,10 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
 
     def close(self) -> None:
         """Release everything; more than once does no harm."""
-        for _, pictures in self._opened.values():
+        for pictures in self._opened.values():
             pictures.close()
         self._opened.clear()
-        if self._episode is not None:
-            self._episode.rig.close()
-            self._episode = None
+        self._end()
 
     def _begin(self, seed: int | None, options: Mapping[str, Any] | None) -> int:
         """End the episode before; the seed of the next one's world.
@@ -146,12 +141,19 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         return int(self.np_random.integers(2**31))
 
     def _open(self, paths: Mapping[str, tuple[Waypoint, ...]], seed: int) -> Episode:
-        """Begin an episode with targets on these paths."""
-        if self._episode is not None:
-            self._episode.rig.close()
+        """Begin an episode with targets on these paths, drawn by what drew the one before."""
+        self._end()
         sim = replace(self.config.sim, seed=seed, targets=tuple(paths), paths=paths)
         self._episode = Episode(replace(self.config, sim=sim), self._noise)
+        for size, before in self._opened.items():
+            self._opened[size] = self._episode.world.pictures(size, before)
         return self._episode
+
+    def _end(self) -> None:
+        """Let go of the episode, if there is one."""
+        if self._episode is not None:
+            self._episode.rig.close()
+            self._episode = None
 
     def _picture_spaces(self) -> dict[str, gymnasium.Space[Any]]:
         """Of the pictures in an observation."""
@@ -164,10 +166,10 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
 
     def _look(self, size: Size) -> list[Picture]:
         """Through the wide camera and through the zoom camera, RGB."""
-        episode, pictures = self._opened.get(size, (None, None))
-        if pictures is None or episode is not self.episode:
-            pictures = self.episode.world.pictures(size, pictures)
-            self._opened[size] = self.episode, pictures
+        episode = self.episode
+        if size not in self._opened:
+            self._opened[size] = episode.world.pictures(size)
+        pictures = self._opened[size]
         names: tuple[CameraName, ...] = ("fixed", "zoom")
         images = [pictures.take(name, t) for name, t in zip(names, self.times, strict=True)]
         return [np.ascontiguousarray(image[:, :, ::-1]) for image in images]

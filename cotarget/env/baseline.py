@@ -10,12 +10,13 @@ from typing import Any
 
 import gymnasium
 
+from cotarget.env.arguments import name_of
 from cotarget.env.base import Episode
 from cotarget.env.desk import Desk
 from cotarget.env.follow import Follow
 from cotarget.env.schedule import Schedule
 from cotarget.env.units import Vector
-from cotarget.errors import ConfigError, choices
+from cotarget.errors import ConfigError
 from cotarget.loop import FollowSettings, Step, follow
 from cotarget.policies import POLICIES
 from cotarget.rig import Frame
@@ -69,9 +70,7 @@ class SchedulingPolicy:
         """
         if not isinstance(env.unwrapped, Schedule):
             raise ConfigError(f"env: policies choose in cotarget/Schedule-v0, and not in {env.unwrapped}")
-        if policy not in POLICIES:
-            raise ConfigError(f"policy: unknown '{policy}'; there are: {choices(POLICIES)}")
-        self._env, self._make = env.unwrapped, POLICIES[policy]
+        self._env, self._make = env.unwrapped, POLICIES[name_of("policy", policy, POLICIES)]
         self._episode: Episode | None = None
 
     def __call__(self, observation: object) -> int:

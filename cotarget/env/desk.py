@@ -13,6 +13,7 @@ from cotarget.env.follow import Follow
 from cotarget.env.units import Command
 from cotarget.headmodel import HeadCommand, HeadModel, axis_at
 from cotarget.rig import Board, Clock, Frame, Image, PanTiltLimits, PanTiltState, Speed
+from cotarget.safety.limits import clipped
 
 NEAR = 1e-6  # of an angle [rad]
 
@@ -45,13 +46,14 @@ class Desk:
         state, wish = self.head.state(), self.head.wish
         self._model.saw(state)
         if wish is None:
-            return state.pan, state.tilt, self.zoom.wish
+            return *clipped(state.pan, state.tilt, self.head.limits), self.zoom.wish
         pan, tilt = wish.pan, wish.tilt
         effect = self.clock.now() + self._env.config.command_delay_s
         if wish.speed is not None:
             speeds = self.head.limits.capped(wish.speed)
             axes = zip(self._model.at(effect), (pan, tilt), speeds, strict=True)
             pan, tilt = (self._hurried(x, v, goal, speed) for (x, v), goal, speed in axes)
+            pan, tilt = clipped(pan, tilt, self.head.limits)
         self._model.obeys(effect, HeadCommand(pan, tilt, None))
         return pan, tilt, self.zoom.wish
 
@@ -108,8 +110,9 @@ class WishedLens(Eye):
 
     def zoom(self, focal_px: float) -> float:
         """Note the wish."""
-        self.wish = focal_px
-        return focal_px
+        shortest, longest = self.focal_range
+        self.wish = min(max(focal_px, shortest), longest)
+        return self.wish
 
     def capture(self) -> Frame:
         """The newest frame."""
@@ -124,7 +127,8 @@ class WishedHead:
         self.wish: HeadCommand | None = None
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
-        """Note the wish."""
+        """Note the wish, within the limits."""
+        pan, tilt = clipped(pan, tilt, self.limits)
         self.wish = HeadCommand(pan, tilt, speed)
         return pan, tilt
 

@@ -10,10 +10,9 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
 from cotarget.detection import Detection
-from cotarget.env.arguments import told
+from cotarget.env.arguments import check_scene, name_of
 from cotarget.env.base import DETECTOR_NOISE, IMAGE_SIZE, Kind, RigEnv, corners
 from cotarget.env.units import LONGEST_AGE_S, RIG_FEATURES, Vector, box, rig_numbers, within
-from cotarget.errors import ConfigError, choices
 from cotarget.judging import closeup_of
 from cotarget.metrics import Closeup
 from cotarget.oracle import TruthNoise
@@ -54,10 +53,10 @@ class Follow(RigEnv[Any, Vector]):
     in it, at 0.8 to 1.25 times the size wanted; else 0. Actions show in it as late as the rig is.
 
     `info`, which alone tells the truth, of that zoom frame unless it says otherwise: `t` and `t_closeup`, when the
-    newest frames were exposed [s]; `good`; `in_frame`; `offset_px`, from the middle; `size_ratio`, over the size
-    wanted; `center_px`; `box_closeup` and, of the wide frame, `box_wide`, as left, top, right, bottom [px];
-    `direction` from the wide camera, in its own axes, a unit vector. What is behind a camera is at infinity, and 0 of
-    the size wanted.
+    newest frames were exposed [s]; `good`; `in_frame`; `offset_px`, from the picture's middle to the target's, and half
+    the picture's diagonal (400 px of 640x480) where that is not in it; `size_ratio`, over the size wanted;
+    `center_px`; `box_closeup` and, of the wide frame, `box_wide`, as left, top, right, bottom [px]; `direction` from
+    the wide camera, in its own axes, a unit vector. What is behind a camera is at infinity, and 0 of the size wanted.
     """
 
     def __init__(
@@ -77,9 +76,10 @@ class Follow(RigEnv[Any, Vector]):
             target: book, person or bird.
             observation: "tracks" or "images".
             rig: a simulated one, or its rig.toml; the default one without noise, JPEG, distortion, blur and
-                antialiasing, where none is given. Which targets, paths and seed it names does not count, nor its
-                safety, but for the ranges of pan and tilt that -1 to 1 stand for. The ways that targets go are made
-                for the outdoor scene: in another one they may lead through walls.
+                antialiasing, where none is given. Its `[sim]` counts without targets, models, paths and seed, of its
+                `[targets]` the one of this name without its detector, of its `[safety]` the ranges of pan and tilt.
+                The ways that targets go are made for the outdoor scene; one in which less than half of them can be
+                seen is refused.
             calibration: that a policy may use, or its file; the true one by default.
             seconds: of an episode, at most 20 [s].
             image_size: (width, height) of the pictures [px].
@@ -89,10 +89,10 @@ class Follow(RigEnv[Any, Vector]):
         Raises:
             ConfigError: an argument makes no sense.
         """
-        if target not in LONE:
-            raise ConfigError(f"target: unknown {told(target)}; there are: {choices(LONE)}")
+        self.name = name_of("target", target, LONE)
         super().__init__(observation, rig, calibration, seconds, image_size, noise, render_mode)
-        self.name, self.target = target, self.config.target(target)
+        check_scene(self.config.sim, target, lone_path)
+        self.target = self.config.target(target)
         self._rig_space = box(RIG_FEATURES.values())
         self._track_space = box([*TRACK_FEATURES.values(), *RIG_FEATURES.values()])
         self.action_space = box([(-1.0, 1.0)] * 3)  # type: ignore[assignment]

@@ -1,7 +1,7 @@
 """`cotarget/Schedule-v0`: choose whom of several targets to look at; the pipeline does the rest."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +10,13 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
-from cotarget.env.arguments import reward_of, told
+from cotarget.env.arguments import check_scene, name_of, reward_of, told
 from cotarget.env.base import DETECTOR_NOISE, IMAGE_SIZE, Kind, RigEnv, corners
 from cotarget.env.units import RIG_FEATURES, box, rig_numbers, within
-from cotarget.errors import ConfigError, choices
+from cotarget.errors import ConfigError
 from cotarget.geometry import Array
 from cotarget.judging import closeup_of
-from cotarget.loop import FollowSettings, follow
+from cotarget.loop import FollowSettings, Step, follow
 from cotarget.motionfilter import Track
 from cotarget.oracle import TruthNoise
 from cotarget.planning import LOOK_S, Candidate
@@ -119,10 +119,10 @@ class Schedule(RigEnv[dict[str, Any], int]):
         Raises:
             ConfigError: an argument makes no sense.
         """
-        if kind not in GROUPED:
-            raise ConfigError(f"kind: unknown {told(kind)}; there are: {choices(GROUPED)}")
+        self.kind = name_of("kind", kind, GROUPED)
         super().__init__(observation, rig, calibration, seconds, image_size, noise, render_mode)
-        self.kind, self.target, self._served_reward = kind, self.config.target(kind), reward_of(served_reward)
+        check_scene(self.config.sim, kind, group_paths)
+        self.target, self._served_reward = self.config.target(kind), reward_of(served_reward)
         self._rig_space, self._track_space = box(RIG_FEATURES.values()), box(CANDIDATE_FEATURES.values(), SLOTS)
         self.action_space = gymnasium.spaces.Discrete(SLOTS)  # type: ignore[assignment]  # its numbers are numpy's
         pictures = self._picture_spaces() if observation == "images" else {}
@@ -165,7 +165,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
             closed_loop=False,
             policy=lambda: asked,
         )
-        self._steps = follow(
+        self._steps: Iterator[Step] = follow(
             episode.rig, self.calibration, self.target, episode.detector, seconds=math.inf, settings=settings
         )
         self._slots: list[int | None] = [None] * SLOTS
@@ -190,6 +190,11 @@ class Schedule(RigEnv[dict[str, Any], int]):
             reward += passed * well
         reward += self._served_reward * (self._served() - before_served)
         return self._observe(), reward, False, self._index >= self._last, self._info(good)
+
+    def _end(self) -> None:
+        """Let go of the episode, and of the pipeline in it."""
+        super()._end()
+        self._steps = iter(())
 
     def _turn(self) -> None:
         """One turn of the pipeline; tracks come into slots and leave them."""

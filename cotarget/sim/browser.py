@@ -71,10 +71,18 @@ class BrowserWindow:
 
         with contextlib.redirect_stdout(io.StringIO()):  # its banner; the command says where the page is
             self._handle = launch_thread.launch_thread(serve)
-            if (failed := started.get(timeout=START_S)) is not None:
-                raise DeviceError(f"MuJoCo's web viewer does not start: {failed}") from None
-            self._handle.set_model(self._onlooker.model, data=self._onlooker.data)
-            self._overlay.ready.get(timeout=START_S)
+            try:
+                if (failed := started.get(timeout=START_S)) is not None:
+                    raise DeviceError(f"MuJoCo's web viewer does not start: {failed}")
+                self._handle.set_model(self._onlooker.model, data=self._onlooker.data)
+                self._overlay.ready.get(timeout=START_S)
+            except BaseException as error:
+                with contextlib.suppress(Exception):  # what it fails of is told already
+                    self.close()
+                listener.close()
+                if isinstance(error, queue.Empty):
+                    raise DeviceError(f"MuJoCo's web viewer does not start within {START_S:g} s; try again") from None
+                raise
 
     def _viewer(self, endpoint: Any, listener: socket.socket) -> Any:
         """MuJoCo's web viewer on a socket of ours; on the thread that runs it."""

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from types import TracebackType
+from typing import NoReturn
 
 from cotarget.config import SimCamera, SimEffects, SimHead, SimZoomCamera
 from cotarget.errors import DeviceError, StaleFrameError
@@ -14,6 +15,11 @@ from cotarget.sim.motion import Axis, HeadDrive, LensDrive
 ROUNDING = 1e-6
 # How many images a camera keeps: a frame asked for twice is rendered once.
 KEPT_FRAMES = 2
+
+
+def _closed(*_: object) -> NoReturn:
+    """What the devices of a closed rig ask instead of its world, which they would keep alive."""
+    raise DeviceError("the simulated rig is closed; open it again")
 
 
 class SimClock:
@@ -55,11 +61,16 @@ class SimStream:
         """(width, height) [px]."""
         return self._camera.size
 
+    def leave(self) -> None:
+        """Expose nothing from now on, and let go of the world."""
+        self._expose = _closed
+
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
         """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
 
         Raises:
             StaleFrameError: no such frame arrived within ``timeout`` [s].
+            DeviceError: the rig is closed.
         """
         now, rate = self._clock.now(), self._camera.rate_hz
         index = max(math.floor((now - self._latency) * rate + ROUNDING), 0)
@@ -218,6 +229,10 @@ class SimBoard:
         """Put the board there, in the true fixed camera's frame, from now on; None takes it away."""
         self._place(T_fixed_board, False)
 
+    def leave(self) -> None:
+        """Put it nowhere from now on, and let go of the world."""
+        self._place = _closed
+
     def swing(self, T_fixed_board: RigidTransform) -> None:
         """Swing the board about that pose from now on."""
         self._place(T_fixed_board, True)
@@ -236,12 +251,19 @@ class SimRig:
         release: Callable[[], None],
     ) -> None:
         self.fixed, self.zoom, self.head, self.clock, self.board = fixed, zoom, head, clock, board
+        self._of_world = (fixed, zoom, board)  # whatever is put in their places
         self._release = release
 
     def close(self) -> None:
-        """Halt the head and release the renderer."""
+        """Halt the head and release the renderer; more than once does no harm."""
         self.head.halt()
         self._release()
+
+    def leave(self) -> None:
+        """Let go of the world: without images and board, head and clock still go on."""
+        for part in self._of_world:
+            part.leave()
+        self._release = lambda: None
 
     def __enter__(self) -> "SimRig":
         """Give the rig itself."""

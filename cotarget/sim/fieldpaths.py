@@ -7,6 +7,7 @@ They last a little longer than the SECONDS that a run is meant to take. The worl
 from collections.abc import Callable
 
 import numpy as np
+import numpy.typing as npt
 
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import Array
@@ -152,7 +153,7 @@ def _bird(rng: np.random.Generator, size: float) -> list[Waypoint]:
             return np.stack([x, y, height + rise * np.sin(a + rise_phase)], axis=1)  # noqa: B023
 
         x = _along(line, start, speed, t)
-        if _turns_wide(x) and _in_view(x, 0.5):
+        if _turns_wide(x) and in_view(x, 0.5).all():
             return _waypoints(t, x)
     raise RuntimeError("no such path was drawn; the ranges above do not fit together")
 
@@ -164,11 +165,11 @@ def _turns_wide(x: Array) -> bool:
     return bool((np.linalg.norm(v, axis=1)[3:-3] ** 3 > 1.01 * BIRD_RADIUS * turning).all())
 
 
-def _in_view(x: Array, half_size: float) -> bool:
-    """Whether points (n, 3), and so much about them [m], are within the wide view."""
+def in_view(x: Array, half_size: float = 0.0) -> npt.NDArray[np.bool_]:
+    """Whether each of some points (n, 3), and so much about it [m], is within the wide view."""
     across, ahead, up = _in_camera(x)
     inside = (np.abs(across) + half_size < VIEW_TAN[0] * ahead) & (np.abs(up) + half_size < VIEW_TAN[1] * ahead)
-    return bool(inside.all())
+    return np.asarray(inside)
 
 
 def _in_camera(x: Array) -> tuple[Array, Array, Array]:

@@ -19,6 +19,7 @@ from cotarget.sim.targets import Target, change_marker, scale_spec
 T_OPENCV_MUJOCO = RigidTransform.from_rotation(Rotation.from_rotvec([np.pi, 0.0, 0.0]))
 MOUNT_SITE = "fixed_mount"
 RIG = "rig/"  # before the names of the rig's parts; a target's stand behind its own name and a slash
+BOARD = RIG + "board"
 # Geoms by purpose: MuJoCo draws a group when the view's option says so.
 BOARD_GROUP, RIG_GROUP, FRAME_GROUP = 3, 4, 5
 BOARD_THICKNESS = 0.004  # [m]
@@ -48,6 +49,24 @@ def scene_path(scene: str) -> Path:
     )
 
 
+def scene_spec(scene: str) -> "mujoco.MjSpec":
+    """Read a scene, by its name or its path.
+
+    Raises:
+        ConfigError: it is not MJCF, or has no mount for the rig.
+    """
+    path = scene_path(scene)
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ConfigError(f"{path}: is not a valid MJCF scene: {' '.join(str(error).split())}") from None
+    if all(site.name != MOUNT_SITE for site in spec.sites):
+        raise ConfigError(
+            f"{path}: has no site '{MOUNT_SITE}', which says where the fixed camera is (looking along -z)"
+        )
+    return spec
+
+
 def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tuple[int, int]) -> "mujoco.MjModel":
     """Compile scene, rig, targets and board.
 
@@ -59,16 +78,7 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
     Raises:
         ConfigError: the scene is not MJCF, or has no mount for the rig.
     """
-    path = scene_path(config.sim.scene)
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise ConfigError(f"{path}: is not a valid MJCF scene: {' '.join(str(error).split())}") from None
-    mount = next((s for s in spec.sites if s.name == MOUNT_SITE), None)
-    if mount is None:
-        raise ConfigError(
-            f"{path}: has no site '{MOUNT_SITE}', which says where the fixed camera is (looking along -z)"
-        )
+    path, spec = scene_path(config.sim.scene), scene_spec(config.sim.scene)
     rig = mujoco.MjSpec.from_file(str(assets_dir() / "rig.xml"))
     _edit_rig(rig, config.sim, _site_pose(path.absolute(), path.stat().st_mtime_ns), render_size)
     _attach(spec, rig, RIG)
@@ -91,7 +101,7 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
 def _target_spec(target: Target) -> "mujoco.MjSpec":
     """A target's model."""
     if target.own is not None:
-        return own_model(target.own, target.kind)
+        return own_model(target.own, target.kind, BOARD_GROUP)
     asset = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / f"{target.kind}.xml"))
     scale_spec(asset, target.size)
     change_marker(asset, target.name)
@@ -171,7 +181,7 @@ def _edit_rig(
 
 def _add_board(spec: "mujoco.MjSpec", board: BoardConfig) -> None:
     """A board whose tiles are flush: its frame is the first inner corner's, x along the columns, z away."""
-    body = spec.worldbody.add_body(name="board", mocap=True)
+    body = spec.worldbody.add_body(name=BOARD, mocap=True)
     columns, rows = (n + 1 for n in board.corners)
 
     def tile(x0: float, y0: float, x1: float, y1: float, colour: tuple[float, ...]) -> None:

@@ -1,9 +1,12 @@
 """MuJoCo with an offscreen OpenGL that works without a screen; import mujoco from here before anything renders."""
 
+import contextlib
 import ctypes.util
+import importlib
 import os
 import sys
 from functools import cache
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,13 +15,16 @@ from cotarget.errors import DeviceError
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
-__all__ = ["BACKEND", "Canvas", "make_renderer", "mujoco"]
+__all__ = ["BACKEND", "TALLY", "Canvas", "make_renderer", "mujoco", "renderer_version"]
 
 INSTALL = {
     "egl": "install it: apt-get install -y libegl1 libgl1-mesa-dri libgl1",
     "osmesa": "install it: apt-get install -y libosmesa6, or unset MUJOCO_GL",
 }
 OTHERWISE = "unset MUJOCO_GL to render without a screen"
+# An environment variable: a file that each picture makes longer by a byte, drawn by whatever process. It counts what a
+# program's processes draw, those included that are killed.
+TALLY = "COTARGET_TALLY"
 
 
 def choose_backend() -> str:
@@ -71,14 +77,29 @@ def _first_process() -> int:
     return os.getpid()
 
 
+@cache
+def renderer_version() -> str:
+    """Who draws, and its version, as OpenGL names them: pictures differ with it; empty where there is none."""
+    with contextlib.suppress(Exception):  # PyOpenGL and the backends raise whatever they meet
+        context = mujoco.GLContext(8, 8)
+        try:
+            context.make_current()
+            gl = importlib.import_module("OpenGL.GL")
+            return ", ".join(gl.glGetString(name).decode() for name in (gl.GL_RENDERER, gl.GL_VERSION))
+        finally:
+            context.free()
+    return ""
+
+
 class Canvas:
     """An offscreen renderer that draws any pinhole view, or a part of one, of a size up to its own.
 
     Attributes:
-        drawn: how many pictures all canvases of this process have drawn so far, for those who count the cost.
+        drawn: how many pictures all canvases of this process have drawn so far, for those who count the cost; a part of
+            a picture counts as that part.
     """
 
-    drawn: ClassVar[int] = 0
+    drawn: ClassVar[float] = 0.0
 
     def __init__(self, model: "mujoco.MjModel", size: tuple[int, int], shadows: bool) -> None:
         """Open OpenGL on this thread.
@@ -146,7 +167,12 @@ class Canvas:
             mujoco.mjv_addGeoms(self._model, data, self._option, self._untouched, everything, self._renderer.scene)
 
     def draw(
-        self, eye: Array, axes: Array, tangents: tuple[float, float, float, float], size: tuple[int, int]
+        self,
+        eye: Array,
+        axes: Array,
+        tangents: tuple[float, float, float, float],
+        size: tuple[int, int],
+        part: float = 1.0,
     ) -> Image:
         """Draw the scene, RGB.
 
@@ -155,6 +181,7 @@ class Canvas:
             axes: the world's coordinates of right, down and forward, as columns, (3, 3).
             tangents: of the picture's borders: left, right, bottom, top; right and up are positive.
             size: (width, height) [px].
+            part: as how much of a picture it counts.
         """
         renderer, (left, right, bottom, top) = self._renderer, tangents
         for camera in renderer.scene.camera:  # two for stereo; their mean is the view
@@ -169,7 +196,11 @@ class Canvas:
             renderer._gl_context.make_current()
         mujoco.mjr_render(rect, renderer.scene, renderer._mjr_context)
         mujoco.mjr_readPixels(image, None, rect, renderer._mjr_context)
-        Canvas.drawn += 1
+        before = int(Canvas.drawn)
+        Canvas.drawn += part
+        if (tally := os.environ.get(TALLY)) and (more := int(Canvas.drawn) - before):
+            with Path(tally).open("ab", buffering=0) as file:
+                file.write(b"." * more)
         return image[::-1]  # OpenGL's rows begin at the bottom
 
     def close(self) -> None:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from cotarget.geometry import RigidTransform
 from cotarget.sim.clutter import Clutter
-from cotarget.sim.model import RIG, quaternion
+from cotarget.sim.model import BOARD, RIG, quaternion
 from cotarget.sim.motion import HeadDrive
 from cotarget.sim.opengl import mujoco
 from cotarget.sim.targets import Target
@@ -44,7 +44,7 @@ class WorldState:
             (target, self._mocap(target.body), [self._address(f"{name}/{joint}") for joint in target.pose(0.0).joints])
             for name, target in targets.items()
         ]
-        self._board = self._mocap("board")
+        self._board = self._mocap(BOARD)
         self._boards: list[tuple[float, RigidTransform | None, bool]] = [(-math.inf, None, False)]
         self._shown: tuple[float, float, float, int] | None = None
         self._cluttered = False

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.sim.appearances import CameraName, Silhouette
@@ -242,7 +242,10 @@ def surface_points(model: "mujoco.MjModel", geom: int) -> Array:
         mesh = model.geom_dataid[geom]
         start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         vertices = np.asarray(model.mesh_vert[start : start + count], dtype=float)
-        return vertices[np.unique(ConvexHull(vertices).simplices)]  # the others cannot be on an outline
+        try:
+            return vertices[np.unique(ConvexHull(vertices).simplices)]  # the others cannot be on an outline
+        except QhullError:  # it is flat
+            return vertices
     ball = sphere_points(SURFACE_POINTS)
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         return ball * size[0]

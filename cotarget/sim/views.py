@@ -7,6 +7,7 @@ around it. At rest it is a single render.
 """
 
 import copy
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -16,7 +17,7 @@ import numpy.typing as npt
 
 from cotarget.geometry import Array
 from cotarget.rig import Image
-from cotarget.sim.lens import Pinhole, TrueLens, bend, covering_half_field
+from cotarget.sim.lens import Pinhole, TrueLens, bend, covering_view
 from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, RIG, RIG_GROUP
 from cotarget.sim.opengl import Canvas, mujoco
 from cotarget.sim.state import WorldState
@@ -164,17 +165,14 @@ class Views:
         return self._through(lens, view, image)
 
     def _view(self, lens: TrueLens) -> Pinhole:
-        """The render that a lens's image is made from, as fine as it is in the middle and no larger than that needs.
+        """The render that a lens's image is made from.
 
         Where softness is wanted, it is resampled as softly whether the lens distorts or not.
         """
         if not any(lens.distortion):
             (w, h), (cx, cy), margin = lens.size, lens.center_px, SOFT_MARGIN_PX * self._soft
             return Pinhole((w + margin, h + margin), lens.focal_px, (cx + margin / 2, cy + margin / 2))
-        half = np.array(covering_half_field(lens))
-        width, height = np.minimum(np.ceil(2 * half * lens.focal_px + 2), self._size).astype(int).tolist()
-        focal = float(min((width / 2 - 1) / half[0], (height / 2 - 1) / half[1]))
-        return Pinhole((width, height), (focal, focal), ((width - 1) / 2, (height - 1) / 2))
+        return covering_view(lens, self._size)
 
     def _through(self, lens: TrueLens, view: Pinhole, image: Image) -> Image:
         """Bend a render, RGB, into a lens's image, BGR."""
@@ -200,7 +198,8 @@ class Views:
         (fx, fy), (cx, cy) = view.focal_px, view.center_px
         left, top = shown.left - 0.5 - cx, shown.top - 0.5 - cy
         tangents = (left / fx, (left + shown.width) / fx, -(top + shown.height) / fy, -top / fy)
-        return canvas.draw(moment.eye, moment.axes, tangents, (shown.width, shown.height))
+        size = (shown.width, shown.height)
+        return canvas.draw(moment.eye, moment.axes, tangents, size, math.prod(size) / math.prod(view.size))
 
     def _moment(self, camera: str, lens: TrueLens, t: float, view: Pinhole) -> Moment:
         data = self._state.at(t)

@@ -149,11 +149,12 @@ class SimWorld:
         return portrait(self._model, self._state.lit(self._clock.now()), azimuth_deg, axes)
 
     def close(self) -> None:
-        """Release the renderers; more than once does no harm."""
+        """Release the renderers, and the rig, which shows nothing from now on; more than once does no harm."""
         if self._ahead is not None:
             self._ahead.close()
         if self._opened is not None:
             self._opened.close()
+        self.rig.leave()  # or each would keep the other, and the model's memory, until Python looks for cycles
 
     def _views(self) -> Views:
         """The renderer of both cameras, opened when first needed."""

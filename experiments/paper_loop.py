@@ -1,0 +1,105 @@
+"""The paper's own way to follow, beside this project's: one open-loop command from the wide view at a time.
+
+As in its Table 1: detect, depth from the size, pan and tilt by its shortcut, focal length for the size wanted, command
+head and lens. Nothing is predicted, filtered or corrected by the zoom view, and no policy holds the lens back; the next
+command comes when head and lens stand again, and the first target is kept until it disappears. What the paper does not
+say is this project's: the calibration, and which connected component is the one that was there before (`Tracker`).
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+
+from cotarget.calibration import Calibration
+from cotarget.config import TargetConfig
+from cotarget.detection import Detector
+from cotarget.errors import UnreachableError
+from cotarget.eyes import Eyes
+from cotarget.loop import FollowSettings, State, Step, follow
+from cotarget.rig import Rig
+from cotarget.servo import reach_of
+from cotarget.targeting import Aim, Closeup, Method, aim, depth_of, point_at
+from cotarget.tracking import Track, Tracker, settings_for
+
+METHOD: Method = "paper-table"  # the depth as Table 1 has it
+Follow = Callable[..., Iterator[Step]]  # with the arguments of `follow`
+
+
+def follow_as_the_paper(
+    rig: Rig,
+    calibration: Calibration,
+    target: TargetConfig,
+    detector: Detector,
+    *,
+    seconds: float,
+    settings: FollowSettings,
+) -> Iterator[Step]:
+    """Follow a target as the paper does; takes, gives and raises what `follow` does.
+
+    Of the settings only the delay of commands counts, by which the head's standing is told from its not having begun.
+    """
+    calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
+    eyes, tracker = Eyes(rig.fixed, rig.zoom, rig.clock), Tracker(settings_for(target), rig.fixed.size)
+    head = rig.head.state()
+    commanded = (head.pan, head.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
+    mine: Track | None = None
+    index, sent, begun = 0, 0, rig.clock.now()  # when what was commanded last has begun [s]
+    end = begun + seconds
+    while rig.clock.now() < end:
+        frame = eyes.look_wide()
+        detections = detector.detect(frame)
+        tracks = tracker.update(detections, frame.t)
+        zoom = eyes.look_close()
+        mine = _first(tracks, mine)
+        head, lens, now, found = rig.head.state(), rig.zoom.state(), rig.clock.now(), None
+        if mine is not None and not mine.missed and now >= begun and not head.moving and not lens.moving:
+            found = _aim(calibration, target, mine, rig)
+        if found is not None:
+            commanded = (*rig.head.move(found.pan, found.tilt), rig.zoom.zoom(found.nominal_px))
+            begun, sent = now + settings.command_delay_s + eyes.interval, sent + 1
+        yield Step(
+            index=index,
+            t=now,
+            state=State.SEARCHING if mine is None else State.FOLLOWING,
+            reason="",
+            fixed=frame,
+            zoom=zoom,
+            mask=detector.mask,
+            detections=tuple(detections),
+            tracks=tuple(tracks),
+            target=mine,
+            aim=found,
+            commanded=commanded,
+            head=head,
+            lens=lens,
+            head_commands=sent,
+            lens_commands=sent,
+        )
+        index += 1
+
+
+def _first(tracks: list[Track], before: Track | None) -> Track | None:
+    """The one that was followed before until it disappears, then the eldest."""
+    confirmed = {track.id: track for track in tracks if track.confirmed}
+    if before is not None and before.id in confirmed:
+        return confirmed[before.id]
+    return confirmed[min(confirmed)] if confirmed else None
+
+
+def _aim(calibration: Calibration, target: TargetConfig, track: Track, rig: Rig) -> Aim | None:
+    """By the track's last box alone; None where the shortcut has no solution, or none that can be reached."""
+    vertical = target.dimension == "height"
+    size_px, center_px = float(track.box.size_px[int(vertical)]), track.box.center_px
+    try:
+        x_fixed = point_at(calibration, center_px, depth_of(calibration, target, size_px, center_px))
+        closeup = Closeup(target.size, target.wanted_px, vertical)
+        return aim(calibration, x_fixed, reach_of(rig), closeup=closeup, method=METHOD)
+    except UnreachableError:
+        return None
+
+
+WAYS: Mapping[str, Follow] = {"this project": follow, "as the paper": follow_as_the_paper}
+OURS = "this project"
+
+
+def picture_name(figure: str, way: str) -> str:
+    """Name of the picture of a figure that follows in one of `WAYS`, without ending; this project's is the figure's."""
+    return figure if way == OURS else f"{figure}_{way.replace(' ', '_')}"
