@@ -130,6 +130,8 @@ def _run(given: argparse.Namespace, typed: Sequence[str], known: Known, expected
     chosen = choose(
         known, given.names, quick=given.quick, seeds=given.seeds, seed_base=given.seed_base, changes=given.set
     )
+    if given.report and given.fresh:
+        raise ConfigError("--report reports what is there, which --fresh would forget: say one of them")
     if given.update_expected and not all(case.has_bounds for case in chosen):
         raise ConfigError("the bounds are of quick runs as they are: --update-expected goes with --quick alone")
     cases, skipped = _split(chosen, named=bool(given.names))
@@ -225,7 +227,7 @@ def _tell(outcomes: Sequence[Outcome], skipped: dict[str, str]) -> None:
 def _update(outcomes: Sequence[Outcome], expected: Path) -> None:
     changed: list[Any] = []
     for outcome in outcomes:
-        if outcome.summary is not None and not outcome.failed and not outcome.undone:
+        if outcome.summary is not None and not (outcome.failed or outcome.undone or outcome.other_code):
             changed += tighten(outcome.case.experiment, outcome.summary, expected)
     print("\nbounds that are tighter now:" if changed else "\nno bound is tighter now", *changed, sep="\n")
 

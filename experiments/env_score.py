@@ -4,7 +4,7 @@ In `cotarget/Follow-v0` the score is the part of an episode's frames with a good
 `cotarget/Schedule-v0` the reward of an episode, and how many of the five targets were served. Chance draws every action
 anew; where it chooses a slot, one that is not empty.
 
-    python -m experiments.env_score [--seeds 10] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.env_score [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import sys
@@ -32,7 +32,7 @@ class ScoreSettings(Settings):
         seconds: of an episode [s].
     """
 
-    seeds: int = 10
+    seeds: int = 5
     seconds: float = SECONDS
 
 

@@ -9,7 +9,7 @@ are those by which the pipeline holds the target, noted beforehand: that the tar
 Steps without pictures need one thread and are timed by its processor time, those with pictures by the clock. What a
 reset takes, which builds a world, is told beside.
 
-    python -m experiments.env_speed [--seeds 2] [--seed-base 0] [--quick] [--out DIR]
+    python -m experiments.env_speed [--seeds 1] [--seed-base 0] [--quick] [--out DIR]
 """
 
 import sys
@@ -44,7 +44,7 @@ class EnvSpeedSettings(Settings):
         seconds_seen: of one with pictures [s].
     """
 
-    seeds: int = 2
+    seeds: int = 1
     targets: tuple[str, ...] = ("book", "person", "bird")
     seconds: float = 20.0
     seconds_seen: float = 6.0

@@ -6,7 +6,7 @@ components with what foliage needs (`motion`; `--set fig6_outdoors.detector=mog2
 stands the paper's own way, the plain mixture and one open-loop command at a time (`experiments.paper_loop`), with the
 same calibration. The policy is the paper's, first-come.
 
-    python -m experiments.fig6_outdoors [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.fig6_outdoors [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
@@ -82,7 +82,7 @@ class OutdoorSettings(OwnRigInField):
         ways: of following them, by name.
     """
 
-    seeds: int = 3
+    seeds: int = 2
     seconds: float = 12.0
     detector: Literal["motion", "mog2"] = "motion"
     ways: tuple[str, ...] = tuple(WAYS)

@@ -8,7 +8,7 @@ and the lens's positions. A shot at something else than the target counts as a m
 passes unused while the target is not seen or cannot be reached: how many did is told beside, and a correction that
 could not be fired counts as one that missed.
 
-    python -m experiments.first_shot [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.first_shot [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
@@ -47,7 +47,7 @@ class FirstShotSettings(FieldSettings):
         targets: book, person, bird.
     """
 
-    seeds: int = 3
+    seeds: int = 2
     targets: tuple[str, ...] = ("book", "person", "bird")
 
 

@@ -5,7 +5,7 @@ each gone after a time. A target counts as served when it was well in the close-
 second in all. What the wide camera sees is rendered and searched once a seed and kind, and followed under each policy;
 by the wide view alone, unless the zoom view's correction is asked for (`--set five_targets.closed_loop=true`).
 
-    python -m experiments.five_targets [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.five_targets [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
@@ -45,7 +45,7 @@ class FiveSettings(FieldSettings):
         closed_loop: whether the zoom view corrects.
     """
 
-    seeds: int = 3
+    seeds: int = 2
     kinds: tuple[str, ...] = ("person", "bird")
     closed_loop: bool = False
 

@@ -171,10 +171,16 @@ class Experiment(Generic[S]):
                 print(f"experiments.{self.name}: seed {number} failed: {why}", file=sys.stderr)
             if failed and not rows:
                 return 1
-            summary = self.summarise(rows)
-            print(self.describe(settings, summary))
+            try:
+                summary = self.summarise(rows)
+                text, picture = self.describe(settings, summary), None if out is None else self.picture(rows)
+            except Exception as error:
+                if not failed:
+                    raise
+                raise CotargetError(f"the rows without those seeds give no figures ({error})") from error
+            print(text)
             if out is not None:
-                self.write(out, settings, rows, summary, self.picture(rows), pictures)
+                self.write(out, settings, rows, summary, picture, pictures)
         except CotargetError as error:
             print(f"experiments.{self.name}: {error}", file=sys.stderr)
             return 1

@@ -6,7 +6,7 @@ seed is another path, another size and other noise. Figures are medians over the
 least and the largest, as `cotarget.metrics` defines them; everything is judged by the simulation's truth, which the
 pipeline cannot see.
 
-    python -m experiments.hold [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.hold [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
@@ -97,7 +97,7 @@ class HoldSettings(FieldSettings):
         targets: book, person, bird.
     """
 
-    seeds: int = 3
+    seeds: int = 2
     targets: tuple[str, ...] = tuple(WANTED)
 
 
@@ -117,8 +117,8 @@ def _calibrated(from_boards: bool, seed: int, rig: OwnRig) -> Calibration:
     if not from_boards:
         return true_calibration(SimWorld(config, rendered=()))
     world = SimWorld(config)
-    with SafeRig(world.rig, config.safety) as rig:
-        return calibrate_rig(rig, config.board, pitch_mm=config.pitch_mm, seed=config.sim.seed)
+    with SafeRig(world.rig, config.safety) as safe:
+        return calibrate_rig(safe, config.board, pitch_mm=config.pitch_mm, seed=config.sim.seed)
 
 
 # A rig's calibration, from rendered boards or exact; the same for all experiments in the field with that rig.

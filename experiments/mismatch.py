@@ -6,7 +6,7 @@ over the wide view at 4 to 30 m one after the other, their pixel and distance gi
 of a lens that follows another model is nobody's to say). Wanted is an error within twice the predicted one, or a
 refusal.
 
-    python -m experiments.mismatch [--seeds 10] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.mismatch [--seeds 4] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import sys
@@ -136,7 +136,7 @@ QUICK_CASES = ("as modelled", "fixed lens thin prism", "backlash 0.1 deg", "angl
 class MismatchSettings(Settings):
     """How many seeds, boards, head poses for each, targets; noise of corners [px]; which cases."""
 
-    seeds: int = 10
+    seeds: int = 4
     boards: int = 20
     looks: int = 4
     noise_px: float = 0.1

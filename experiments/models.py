@@ -10,7 +10,7 @@ image's width at the focal length at which a bird of 0.8 m is 160 px wide, withi
 Twice: `exact`, pixel and depth given as they are, the head without steps: what the models alone lose; and `seen`, the
 pixel with 0.5 px of noise, the depth with 5 %, the head in steps of 0.0514 degrees, the same for all models.
 
-    python -m experiments.models [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.models [--seeds 10] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import math
@@ -60,7 +60,7 @@ class ModelsSettings(Settings):
         zero_depth: of the target on which pan and tilt are set [m].
     """
 
-    seeds: int = 20
+    seeds: int = 10
     baselines: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.5, 3.0)
     depths: tuple[float, ...] = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
     targets: int = 60

@@ -11,7 +11,7 @@ is none, and is drawn again. Targets lie all over the wide view at 4 to 30 m (gr
 reaches. Beside the number of rigs beyond twice their predicted error stands how many chance would put there if every
 covariance were true.
 
-    python -m experiments.random_rigs [--seeds 100] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.random_rigs [--seeds 50] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import sys
@@ -61,7 +61,7 @@ CHANCE_DRAWS, CHANCE_TARGETS = 50, 50
 class RigsSettings(Settings):
     """How many rigs, boards, head poses for each, and targets for each rig."""
 
-    seeds: int = 100
+    seeds: int = 50
     boards: int = 20
     looks: int = 4
     targets: int = 200

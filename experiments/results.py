@@ -41,7 +41,7 @@ REMEDY = "take another folder with --out, or begin anew with --fresh"
 KEEP = ", or keep it all the same with --any-code"
 SHARED = "shared.json"
 # Modules of the experiments on which no row depends: they choose what is done, record it and tell it.
-NO_ROWS = ("__main__", "arguments", "bounds", "cases", "outcome", "report", "runner", "sessions")
+NO_ROWS = ("__main__", "arguments", "bounds", "cases", "gallery", "outcome", "report", "runner", "sessions")
 
 
 @dataclass(frozen=True)
@@ -179,8 +179,13 @@ class Jobs:
             if settings != self._identity:
                 raise ConfigError(f"{path}: {self._differing(settings)}; {REMEDY}")
             names = [part.name for part in dataclasses.fields(Record) if part.name != "number"]
-            told["pictures"] = {name: base64.b64decode(png) for name, png in told["pictures"].items()}
-            yield Record(told["seed"], **{name: told[name] for name in names})
+            try:
+                told["pictures"] = {
+                    name: base64.b64decode(png, validate=True) for name, png in told["pictures"].items()
+                }
+                yield Record(told["seed"], **{name: told[name] for name in names})
+            except (ValueError, KeyError, TypeError, AttributeError) as error:
+                raise ConfigError(f"{path}: lacks something ({type(error).__name__}); delete it, or {REMEDY}") from None
 
     def _differing(self, settings: dict[str, Any]) -> str:
         keys = [key for key in {**self._identity, **settings} if self._identity.get(key) != settings.get(key)]

@@ -11,7 +11,7 @@ over the steps are given.
    rendered, all effects on; and nothing rendered, detections from the truth. Of the latter also what the simulation
    alone takes.
 
-    python -m experiments.sim_speed [--seeds 2] [--seed-base 0] [--quick] [--out DIR]
+    python -m experiments.sim_speed [--seeds 1] [--seed-base 0] [--quick] [--out DIR]
 """
 
 import math
@@ -59,7 +59,7 @@ class SimSpeedSettings(FieldSettings):
         seconds_rendered: with pictures [s].
     """
 
-    seeds: int = 2
+    seeds: int = 1
     steps: int = 60
     seconds_rendered: float = 6.0
 

@@ -13,7 +13,7 @@ then neither looks: the head stands in a direction drawn from all over the wide 
 that the target has to be found. What a lone camera costs besides is the view of all else: `watched` is how much of the
 wide camera's field its own view is as large as, where the pair always sees all of it.
 
-    python -m experiments.single_ptz [--seeds 10] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.single_ptz [--seeds 6] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import math
@@ -50,7 +50,7 @@ class SingleSettings(Settings):
         lasts_s: of the lone camera's manoeuvres [s], see `experiments.lone_course`; each target's own by default.
     """
 
-    seeds: int = 10
+    seeds: int = 6
     seconds: float = SECONDS
     targets: tuple[str, ...] = LONE
     misses: tuple[float, ...] = (0.05, 0.5, 0.9)

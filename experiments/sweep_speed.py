@@ -4,7 +4,7 @@ The same seeds of two experiments, one that fits and one that renders, are done 
 because a machine's pace drifts, each process held to one thread. The time is that of the whole sweep, the start of its
 processes included. Rows must be the same, number by number: how many jobs have others is counted.
 
-    python -m experiments.sweep_speed [--seeds 2: times] [--quick] [--out DIR]
+    python -m experiments.sweep_speed [--seeds 1: times] [--quick] [--out DIR]
 """
 
 import functools
@@ -33,7 +33,7 @@ WANTED = 1.8  # times as fast with two processes
 class SweepSpeedSettings(Settings):
     """Times as seeds; how many jobs each sweep has, and how long one of those that render looks [s]."""
 
-    seeds: int = 2
+    seeds: int = 1
     jobs: int = 12
     seconds: float = 4.0
 

@@ -8,7 +8,7 @@ why they are one experiment.
 The error over the seeds stands beside the standard deviation that each calibration predicts for itself; rotations err
 by the components of the rotation vector from the true orientation to the one found.
 
-    python -m experiments.table2_table3 [--seeds 4] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.table2_table3 [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import dataclasses
@@ -54,7 +54,7 @@ class Settings(OwnRig):
         placements: of the board.
     """
 
-    seeds: int = 4
+    seeds: int = 3
     placements: int = 30
 
 

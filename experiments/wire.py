@@ -48,14 +48,14 @@ class WireSettings(Settings):
 
     only: tuple[str, ...] = ("polls", "age", "command", "faults", "latency", "parity")
     poll_s: float = 10.0
-    age_s: float = 60.0
+    age_s: float = 30.0
     targets: tuple[str, ...] = ("book", "person")
-    command_s: float = 30.0
+    command_s: float = 20.0
     faults: tuple[str, ...] = ()
-    repetitions: int = 3
+    repetitions: int = 1
     wiggle_s: float = 8.0
     swing_s: float = 10.0
-    places: int = 3
+    places: int = 2
     still_s: float = 6.0
 
     def __post_init__(self) -> None:

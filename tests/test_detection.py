@@ -129,6 +129,10 @@ def test_another_colour_is_not_taken_for_the_target():
 def test_a_grey_or_missing_template_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="grey"):
         ColourDetector(np.full((10, 10, 3), 128, np.uint8))
+    badge = np.full((10, 10, 3), 128, np.uint8)
+    badge[3:7, 3:7] = (25, 35, 230)  # 16 % of it strongly red
+    with pytest.raises(ConfigError, match="cut it to the coloured part"):
+        ColourDetector(badge)
     book = dataclasses.replace(DEFAULT_TARGETS["book"], template=None)
     with pytest.raises(ConfigError, match="template"):
         make_detector(book, RATE)

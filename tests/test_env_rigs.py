@@ -177,3 +177,11 @@ def test_a_world_ends_with_its_episode(field, make, action):
             assert [world() is not None for world in worlds] == [False] * seed + [True]
         env.close()
         assert worlds[-1]() is None
+
+
+@pytest.mark.parametrize(
+    "make", [lambda rig: Follow("bird", rig=rig, seconds=1.0), lambda rig: Schedule("bird", rig=rig)]
+)
+def test_a_targets_detector_does_not_count(field, make):
+    told = {**field.targets, "bird": dataclasses.replace(field.target("bird"), detector="speck")}
+    assert make(dataclasses.replace(field, targets=told)).target == make(field).target

@@ -209,6 +209,7 @@ def test_figures_that_cannot_be_made_are_told(run, monkeypatch):
         (["tiny"], "file is no folder; name one that is, or that can be made"),
         (["tiny", "--scheduler", "tcp://127.0.0.1:1"], "goes with --backend dask"),
         (["tiny", "--update-expected"], "goes with --quick alone"),
+        (["tiny", "--report", "--fresh"], "say one of them"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -309,10 +310,18 @@ def test_other_settings_are_refused(run):
 
 def test_a_file_that_cannot_be_read(run, tmp_path):
     assert run("tiny", "--seeds", "1")[0] == 0
-    (tmp_path / "out" / "tiny" / "jobs" / "000000.json").write_text("{")
-    status, _, complaints = run("tiny", "--seeds", "1")
-    assert (status, complaints.count("\n")) == (1, 1)
-    assert "000000.json: cannot be read" in complaints
+    file = tmp_path / "out" / "tiny" / "jobs" / "000000.json"
+    told = json.loads(file.read_text())
+    harms = [("cannot be read", "{")]
+    harms += [
+        ("lacks something", json.dumps({key: told[key] for key in told if key != gone})) for gone in ("rows", "seed")
+    ]
+    harms += [("lacks something", json.dumps(told | {"pictures": {"a": "no base 64"}}))]
+    for complaint, text in harms:
+        file.write_text(text)
+        status, _, complaints = run("tiny", "--seeds", "1")
+        assert (status, complaints.count("\n")) == (1, 1)
+        assert f"000000.json: {complaint}" in complaints
 
 
 # ---------------------------------------------------------------- what is broken off

@@ -126,7 +126,7 @@ def test_whatever_is_sent_is_counted():
     rig = Rig(t=2.0)
     move, goal = rig.head.move, (0.05, 0.1)
     rig.head.move = lambda *command: move(*command) and goal
-    driver = servo(rig, steering=SteeringSettings(zone=0.0))
+    driver = servo(rig, steering=SteeringSettings(spared=False))
     for i in range(20):
         driver.drive(still(0.5 + 1e-4 * (i % 2)), rig.t, FRAME)
         assert driver.commanded[:2] == goal
@@ -139,9 +139,9 @@ def test_whatever_is_sent_is_counted():
 
 def test_the_aim_is_at_where_the_target_will_be_when_the_command_takes_effect():
     rig = Rig(t=2.0)
-    found = servo(rig).drive(moving(1.0), 1.9, FRAME).aim
-    assert found.pan == pytest.approx(math.atan(2.1 / 10))
-    assert found.tilt == pytest.approx(math.atan(1 / math.hypot(2.1, 10)))  # up
+    found = servo(rig).drive(moving(2.0), 1.9, FRAME).aim
+    assert found.pan == pytest.approx(math.atan(4.2 / 10))
+    assert found.tilt == pytest.approx(math.atan(1 / math.hypot(4.2, 10)))  # up
     # The head was at rest in the middle: it is sent farther than there, as the target goes on.
     assert rig.moves[-1][0] > found.pan
 
@@ -286,7 +286,7 @@ def test_what_can_be_reached():
 
 def test_every_frame_has_its_command_without_a_dead_zone():
     rig = Rig()
-    driver = servo(rig, steering=SteeringSettings(zone=0.0))
+    driver = servo(rig, steering=SteeringSettings(spared=False))
     for i in range(10):
         rig.t = i * FRAME
         driver.drive(moving(1.0), rig.t, FRAME)

@@ -1,8 +1,9 @@
 """Finding targets in the wide view: by colour (the book), by motion (a person), as a speck that changes (a bird).
 
-`make_detector` knows four by name: "colour"; "mog2", the paper's adaptive Gaussian mixture and nothing beside it;
-"motion", that mixture with what foliage needs; and "speck", for small targets that may hover, seen by a camera that may
-shake. `ExternalDetector` makes a fifth of any function from a picture to boxes.
+`make_detector` knows four by name: "colour"; "mog2", the paper's adaptive Gaussian mixture, its foreground cleaned and
+joined to pieces of a target's size; "motion", the same with what foliage and light need; and "speck", for small targets
+that may hover, seen by a camera that may shake. `ExternalDetector` makes a fifth of any function from a picture to
+boxes.
 """
 
 import cv2

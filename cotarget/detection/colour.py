@@ -13,6 +13,8 @@ from cotarget.rig import Frame, Image
 
 # A template whose mean colour is closer to grey than this tells nothing by its colour [grey levels].
 LEAST_CHROMA = 20.0
+# The template's strongest colour is that of which this part of it in per cent is weaker.
+STRONG = 75
 # A pixel is taken for the template's colour when it has at least this part of its chroma ...
 LEAST_WEIGHT = 0.35
 # ... and its chroma points at most this far away from the template's (tangent of the angle in the chroma plane).
@@ -48,7 +50,7 @@ class ColourDetector:
             template: (h, w, 3) BGR picture of the target, cut to its outline; its scale does not matter.
 
         Raises:
-            ConfigError: the template is grey.
+            ConfigError: the template is grey, or most of it is.
         """
         pixels = template.reshape(-1, 3).astype(float)
         chroma = (pixels - pixels.mean(axis=1, keepdims=True)).mean(axis=0)
@@ -58,13 +60,16 @@ class ColourDetector:
         self._along = chroma / length
         across = np.cross(np.full(3, 1 / np.sqrt(3)), self._along)
         plane = template.astype(float) @ self._along
-        self._plane = (plane / np.percentile(plane, 75)).astype(np.float32)
+        strong = float(np.percentile(plane, STRONG))
+        if strong < LEAST_CHROMA:
+            raise ConfigError("most of the colour template is grey; cut it to the coloured part of the target")
+        self._plane = (plane / strong).astype(np.float32)
         h, w = plane.shape
         top, left = round(AROUND * h), round(AROUND * w)
         framed = cv2.copyMakeBorder(self._plane, top, top, left, left, cv2.BORDER_CONSTANT, value=0)
         self._look = _normalised(cv2.resize(framed, LOOK, interpolation=cv2.INTER_AREA))
         tests = np.vstack([self._along, HUE_TANGENT * self._along - across, HUE_TANGENT * self._along + across])
-        self._tests = tests * CHROMA_BYTE / np.percentile(plane, 75)
+        self._tests = tests * CHROMA_BYTE / strong
         self._shape: tuple[int, ...] | None = None
         self.mask: Image | None = None
 

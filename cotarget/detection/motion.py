@@ -108,7 +108,10 @@ PERSON = MotionSettings(
 
 
 def plain(settings: MotionSettings) -> MotionSettings:
-    """The paper's detector: the mixture alone, with OpenCV's part of the background; nothing against sway or light."""
+    """The paper's detector: the mixture with OpenCV's part of the background; nothing against sway or light.
+
+    What of the foreground is taken together, and how large a target may be, the paper does not say: that is as here.
+    """
     return replace(
         settings,
         history_s=PLAIN_HISTORY_S,

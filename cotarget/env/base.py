@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig
+from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetConfig
 from cotarget.env.arguments import calibration_of, check_options, name_of, noise_of, rig_of, seconds_of, size_of
 from cotarget.env.units import Units
 from cotarget.geometry import Array
@@ -116,6 +116,10 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
     def times(self) -> tuple[float, float]:
         """When the newest frame of the wide camera was exposed, and of the zoom camera [s]."""
         raise NotImplementedError
+
+    def told_of(self, name: str) -> TargetConfig:
+        """What the pipeline is told of a target, whose detections are the truth with noise whatever its detector is."""
+        return replace(self.config.target(name), detector=DEFAULT_TARGETS[name].detector)
 
     def render(self) -> Picture | None:
         """Both views side by side, RGB, where the render mode is "rgb_array"."""

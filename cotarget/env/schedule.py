@@ -122,7 +122,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
         self.kind = name_of("kind", kind, GROUPED)
         super().__init__(observation, rig, calibration, seconds, image_size, noise, render_mode)
         check_scene(self.config.sim, kind, group_paths)
-        self.target, self._served_reward = self.config.target(kind), reward_of(served_reward)
+        self.target, self._served_reward = self.told_of(kind), reward_of(served_reward)
         self._rig_space, self._track_space = box(RIG_FEATURES.values()), box(CANDIDATE_FEATURES.values(), SLOTS)
         self.action_space = gymnasium.spaces.Discrete(SLOTS)  # type: ignore[assignment]  # its numbers are numpy's
         pictures = self._picture_spaces() if observation == "images" else {}
