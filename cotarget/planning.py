@@ -33,6 +33,7 @@ class Candidate:
         leaves_in: how long until it leaves the wide view [s]; inf for one that does not.
         seen_s: how long it has been well in the close-up so far [s].
         reachable: whether the head can point at it.
+        likely: whether both views together make it what was told; so does whoever was not looked at yet.
     """
 
     track: Track
@@ -40,6 +41,7 @@ class Candidate:
     leaves_in: float = math.inf
     seen_s: float = 0.0
     reachable: bool = True
+    likely: bool = True
 
     @property
     def id(self) -> int:

@@ -43,9 +43,14 @@ class Policy(Protocol):
         """What was asked for and is not there, in words; empty where it is there, or where anybody will do."""
 
 
-def _reachable(candidates: Sequence[Candidate]) -> Sequence[Candidate]:
-    """Those that the head can point at; where it can point at none, all of them, so that it is said why."""
-    return [candidate for candidate in candidates if candidate.reachable] or candidates
+def _eligible(candidates: Sequence[Candidate]) -> Sequence[Candidate]:
+    """Those that the head can point at; where it can point at none, all of them, so that it is said why.
+
+    Of these the likely ones, such as no cloud that was taken for a person; where none is, all, as size or calibration
+    may be wrong.
+    """
+    reachable = [candidate for candidate in candidates if candidate.reachable] or candidates
+    return [candidate for candidate in reachable if candidate.likely] or reachable
 
 
 @dataclass
@@ -60,8 +65,8 @@ class FirstCome:
         return False
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
-        """The one followed before, if it is still there and can be reached, or the eldest."""
-        ids = [candidate.id for candidate in _reachable(candidates)]
+        """The one followed before, if it is still there, can be reached and is likely, or else the eldest that is."""
+        ids = [candidate.id for candidate in _eligible(candidates)]
         if self._id not in ids:
             self._id = min(ids, default=None)
         return self._id
@@ -96,7 +101,7 @@ class Rounds:
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
         """The next one, as long as somebody waits."""
-        candidates = _reachable(candidates)
+        candidates = _eligible(candidates)
         waiting = sorted((c for c in candidates if c.seen_s < self.look_s), key=lambda c: (c.leaves_in, c.id))
         t = max((c.track.t for c in candidates), default=-math.inf)
         if waiting:

@@ -75,6 +75,7 @@ class Pursuit:
         self._assumed = estimation_settings_for(target, calibration)
         self._filters: dict[int, SpatialFilter] = {}
         self._seen_s: dict[int, float] = {}
+        self._unlikely: set[int] = set()
         self._followed: int | None = None
         self._zoom_t = math.inf
         self._unfound_s = 0.0
@@ -109,6 +110,7 @@ class Pursuit:
         self._filters = {number: each for number, each in self._filters.items() if number in numbers}
         numbers = {track.id for track in tracks}
         self._seen_s = {number: seconds for number, seconds in self._seen_s.items() if number in numbers}
+        self._unlikely &= numbers
         for track in known:
             if track.missed:
                 continue
@@ -163,6 +165,7 @@ class Pursuit:
         pose, estimate = self.states.at(frame.t), self.estimate(self._followed, frame.t)
         if pose is None or estimate is None:
             return None
+        (self._unlikely.discard if _agrees(estimate) else self._unlikely.add)(self._followed)
         seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
         if seen is None:
             return None
@@ -265,6 +268,7 @@ class Pursuit:
                 partial(self._direction, self._filters[track.id], t),
                 leaves_in(track, self._size),
                 self._seen_s.get(track.id, 0.0),
+                likely=track.id not in self._unlikely,
             )
             for track in tracks
             if track.confirmed and track.id in self._filters and self._filters[track.id].knows(t)
@@ -276,6 +280,11 @@ class Pursuit:
         assert estimate is not None, "what is known at a time is known later"
         x, y, z = self._to_base.apply(estimate.x_fixed)
         return np.array([math.atan2(x, z), math.atan2(-y, math.hypot(x, z))])
+
+
+def _agrees(estimate: Estimate) -> bool:
+    """Whether both views together make size and head what they were taken for."""
+    return abs(estimate.size_surprise) <= WRONG and estimate.bias_surprise <= WRONG
 
 
 def _doubted(estimate: Estimate) -> Estimate:

@@ -163,7 +163,7 @@ def test_the_whole_loop_does_not_oscillate_however_late_it_is(exact, delay_s):
     walking, after = offsets_of_who_stops(exact, delay_s, closed_loop=True)
     offset, alone = (float(np.median(np.linalg.norm(each, axis=1))) for each in (walking, wide))
     assert offset < NO_WORSE * alone
-    assert np.linalg.norm(after, axis=1).max() < ZONE
+    assert np.linalg.norm(after, axis=1).max() < 1.5 * ZONE  # of which half is the error of where it is taken to be
     assert [swings(axis) for axis in after.T] == [0, 0]
 
 

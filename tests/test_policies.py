@@ -50,6 +50,18 @@ def test_first_come_stays_until_its_target_is_gone():
     assert policy.select([candidate(3), candidate(4)], STILL, LIMITS) == 3
 
 
+@pytest.mark.parametrize("make", POLICIES.values(), ids=POLICIES)
+def test_what_is_unlikely_is_looked_at_only_where_nothing_else_is(make):
+    cloud = replace(candidate(1, leaves=1.0), likely=False)
+    policy = make()
+    assert policy.select([cloud], STILL, LIMITS) == 1
+    assert policy.select([cloud, candidate(2)], STILL, LIMITS) == 2
+    # Where size or calibration are wrong they all turn out to be; then nobody is left for that.
+    unlikely = replace(candidate(2), likely=False)
+    assert policy.select([cloud, unlikely], STILL, LIMITS) is not None
+    assert make().select([unlikely], STILL, LIMITS) == 2
+
+
 def test_the_nearest_deadline_comes_first_and_is_seen_to_its_end():
     policy = nearest_deadline()
     there = [candidate(1, 0.2, leaves=9.0), candidate(2, -0.2, leaves=4.0), candidate(3, 0.1, leaves=6.0)]

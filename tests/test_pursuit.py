@@ -368,6 +368,18 @@ def test_what_is_not_found_where_it_should_be_is_said_and_then_looked_for_farthe
     assert len(pursuit.doubts(1, t)) <= 1
 
 
+def test_who_is_not_what_was_told_is_an_unlikely_candidate():
+    x = (BASELINE + 0.05, 0.0, 10.0)
+    for wrong, likely in ((1.0, True), (1.15, False)):
+        frames = int(UNFOUND_S / FRAME_S) + 32
+        pursuit, _ = followed(x, wrong, frames, Gated(x))
+        (seen_so,) = pursuit.candidates([track(1, box_at(*x, wrong=wrong))], (frames - 1) * FRAME_S)
+        assert seen_so.likely is likely
+        pursuit.follow(2)  # what it was found to be is not forgotten meanwhile
+        (seen_so,) = pursuit.candidates([track(1, box_at(*x, wrong=wrong))], frames * FRAME_S)
+        assert seen_so.likely is likely
+
+
 def test_what_cannot_be_seen_is_not_missed():
     """Out of the zoom view, or hidden in the wide one too."""
     x = (BASELINE + 2.0, 0.0, 10.0)  # 600 px beside the middle

@@ -1,0 +1,109 @@
+"""Takes the README's pictures from the results of a full run, as JPEGs small enough to be kept with the code.
+
+python -m experiments.gallery [--results experiments-out] [--out experiments/pictures]
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from cotarget.errors import ConfigError, CotargetError
+from cotarget.outputs import write_whole
+from experiments.arguments import Parser, check_folder
+from experiments.harness import FIGURE
+from experiments.paper_loop import WAYS, picture_name
+
+PROGRAM = "python -m experiments.gallery"
+RESULTS = Path("experiments-out")
+PICTURES = Path(__file__).parent / "pictures"
+WIDEST_PX = 1280
+QUALITY = 85
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A picture of the README.
+
+    Attributes:
+        experiment: whose results it is of.
+        picture: name of its file there, without ending.
+        name: of its file in the README, without ending.
+    """
+
+    experiment: str
+    picture: str
+    name: str
+
+
+SHOWN = (
+    *(
+        Shown(experiment, picture_name(figure, way), picture_name(figure, way))
+        for experiment, figure in (("fig4_book", "fig4"), ("fig5_person", "fig5"), ("fig6_outdoors", "fig6"))
+        for way in WAYS
+    ),
+    *(Shown(name, FIGURE, name) for name in ("hold", "delay", "shortcut", "models", "single_ptz", "five_targets")),
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; the exit status."""
+    parser = Parser(prog=PROGRAM, description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help=f"of a full run ({RESULTS})")
+    parser.add_argument("--out", type=Path, default=PICTURES, metavar="DIR", help="for the pictures")
+    given = parser.parse_args(arguments)
+    try:
+        for path in gather(given.results, given.out):
+            print(f"{path}  {path.stat().st_size // 1024} kB")
+    except CotargetError as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def gather(results: Path, out: Path) -> list[Path]:
+    """Write every picture that the README shows, or none.
+
+    Args:
+        results: folder of `python -m experiments`.
+        out: folder for the pictures.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ConfigError: a picture is missing or cannot be read, or one cannot be written.
+    """
+    check_folder(out)
+    files = {out / f"{each.name}.jpg": _jpeg(results / each.experiment / f"{each.picture}.png") for each in SHOWN}
+    out.mkdir(parents=True, exist_ok=True)
+    for path, data in files.items():
+        write_whole(path, data)
+    return list(files)
+
+
+def _jpeg(path: Path) -> bytes:
+    """A PNG as a JPEG no wider than what a page shows.
+
+    Raises:
+        ConfigError: there is none, or it cannot be read.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; --results names the folder of a full run") from None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if image is None:
+        raise ConfigError(f"{path} is no picture; run its experiment again, with --fresh")
+    height, width = image.shape[:2]
+    if width > WIDEST_PX:
+        size = (WIDEST_PX, round(height * WIDEST_PX / width))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))[1].tobytes()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
