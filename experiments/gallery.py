@@ -45,7 +45,7 @@ SHOWN = (
         for experiment, figure in (("fig4_book", "fig4"), ("fig5_person", "fig5"), ("fig6_outdoors", "fig6"))
         for way in WAYS
     ),
-    *(Shown(name, FIGURE, name) for name in ("hold", "delay", "shortcut", "models", "single_ptz", "five_targets")),
+    *(Shown(name, FIGURE, name) for name in ("models", "shortcut", "single_ptz")),
 )
 
 

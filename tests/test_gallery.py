@@ -1,10 +1,15 @@
-"""The README's pictures: taken from results, all or none."""
+"""The README's pictures: taken from results, all or none, and all of them shown."""
+
+import re
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from experiments.gallery import SHOWN, WIDEST_PX, main
+from experiments.gallery import PICTURES, SHOWN, WIDEST_PX, main
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture
@@ -35,3 +40,9 @@ def test_without_one_none_is_written(results, tmp_path, capsys, harm):
     assert str(lacking) in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_the_readme_shows_them_all_and_no_other():
+    shown = re.findall(r"\]\((experiments/\S+\.jpg)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert sorted(ROOT / path for path in shown) == sorted(PICTURES / f"{each.name}.jpg" for each in SHOWN)
+    assert all((ROOT / path).is_file() for path in shown)
