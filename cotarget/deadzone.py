@@ -29,6 +29,7 @@ every frame, and a bird's picture smears by a third more.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from cotarget.headmodel import Angles, HeadCommand, HeadModel, Motion
@@ -136,7 +137,8 @@ class Steering:
         """
         zone = max(self._settings.zone * field, self._limits.step)
         way = self._calmed(wanted, rates, zone, lead_s)
-        if self._settings.spared and self._may_rest(effect_t, interval_s, way, zone):
+        rests = self._rests(effect_t, interval_s, way, zone) if self._settings.spared else [False, False]
+        if self._settings.spared and self._may_rest(effect_t, interval_s, way, zone, rests):
             return None
         off = _apart(way.wanted, self._at(effect_t), wanted[1])
         if math.isinf(self._limits.acceleration):  # it jumps: to the middle of the target's way until the next chance
@@ -146,8 +148,8 @@ class Steering:
         else:
             catch_s = self._settings.hurry_s if off > self._settings.far * zone else self._settings.catch_s
             command = self._along(effect_t, interval_s, way, catch_s)
-            if self._settings.spared and not way.still:
-                command = self._spared(command, effect_t, interval_s, way, zone)
+            if not way.still:
+                command = self._spared(command, way, rests)
         command = self._within(command)
         self.head.obeys(effect_t, command)
         return command
@@ -162,8 +164,8 @@ class Steering:
         pan_rate, tilt_rate = (0.0 if at_rest else rate for rate, at_rest in zip(rates, slow, strict=True))
         return _Way((pan, tilt), (pan_rate, tilt_rate), (slow[0], slow[1]), still)
 
-    def _may_rest(self, effect_t: float, interval_s: float, way: _Way, zone: float) -> bool:
-        """Whether the last command will do until the next chance."""
+    def _may_rest(self, effect_t: float, interval_s: float, way: _Way, zone: float, rests: Sequence[bool]) -> bool:
+        """Whether the last command will do until the next chance; `rests` tells of which axis it does."""
         command = self.head.command
         if command is None:
             return False
@@ -173,7 +175,7 @@ class Steering:
         if way.still and off_goal <= zone and (command.speed is None or off_then <= zone):
             fine = max(FINE_STEPS * self._limits.step, FINE * zone)
             return off_then <= fine or effect_t - self.head.commanded_t < self._settings.rest_s
-        return all(self._rests(effect_t, interval_s, way, zone))
+        return all(rests)
 
     def _rests(self, effect_t: float, interval_s: float, way: _Way, zone: float) -> list[bool]:
         """Of each axis, whether its last goal and speed will do until the next chance.
@@ -212,7 +214,7 @@ class Steering:
             speeds.append(max(abs(v), LEAST_SPEED))
         return HeadCommand(goals[0], goals[1], (speeds[0], speeds[1]))
 
-    def _spared(self, command: HeadCommand, effect_t: float, interval_s: float, way: _Way, zone: float) -> HeadCommand:
+    def _spared(self, command: HeadCommand, way: _Way, rests: Sequence[bool]) -> HeadCommand:
         """The same, but an axis that is slow and near enough keeps its goal and its speed.
 
         Whoever walks by stays at one height. Where the tilt is told anew as often as the pan has to be, it goes up and
@@ -221,7 +223,6 @@ class Steering:
         last = self.head.command
         if last is None:
             return command
-        rests = self._rests(effect_t, interval_s, way, zone)
         (pan, pan_speed), (tilt, tilt_speed) = (
             old if slow and rest else new
             for old, new, slow, rest in zip(self._axes(last), self._axes(command), way.slow, rests, strict=True)

@@ -165,7 +165,10 @@ class Pursuit:
         pose, estimate = self.states.at(frame.t), self.estimate(self._followed, frame.t)
         if pose is None or estimate is None:
             return None
-        (self._unlikely.discard if _agrees(estimate) else self._unlikely.add)(self._followed)
+        if _contradicted(estimate):
+            self._unlikely.add(self._followed)
+        else:
+            self._unlikely.discard(self._followed)
         seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
         if seen is None:
             return None
@@ -218,12 +221,8 @@ class Pursuit:
         estimate = self.estimate(number, t)
         if estimate is None:
             return []
-        wrong, found = [], []
-        if abs(estimate.size_surprise) > WRONG:
-            wrong.append(f"both views make it {estimate.size:.2g} m and not {self._target.size:.2g} m")
-        if estimate.bias_surprise > WRONG:
-            wrong.append(f"the head points {math.degrees(math.hypot(*estimate.bias)):.2g} degrees beside")
-        if wrong:
+        found = []
+        if wrong := _contradicted(estimate):
             found.append(f"the told size or the calibration seems wrong: {', '.join(wrong)}")
         if number == self._followed and abs(self._apart_s) > LATEST_S:
             later = "zoom" if self._apart_s < 0 else "wide"
@@ -282,9 +281,14 @@ class Pursuit:
         return np.array([math.atan2(x, z), math.atan2(-y, math.hypot(x, z))])
 
 
-def _agrees(estimate: Estimate) -> bool:
-    """Whether both views together make size and head what they were taken for."""
-    return abs(estimate.size_surprise) <= WRONG and estimate.bias_surprise <= WRONG
+def _contradicted(estimate: Estimate) -> list[str]:
+    """What both views together make other than it was told or calibrated, in words."""
+    wrong = []
+    if abs(estimate.size_surprise) > WRONG:
+        wrong.append(f"both views make it {estimate.size:.2g} m and not {estimate.target.size:.2g} m")
+    if estimate.bias_surprise > WRONG:
+        wrong.append(f"the head points {math.degrees(math.hypot(*estimate.bias)):.2g} degrees beside")
+    return wrong
 
 
 def _doubted(estimate: Estimate) -> Estimate:
