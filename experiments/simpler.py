@@ -112,17 +112,17 @@ def models_of(
         crude: how the offsets are measured.
         centring: how the table is learnt, and the zeros are set.
     """
-    T = calibration.T_base_fixed
+    beside = -calibration.T_base_fixed.inv().translation  # the head's place as the wide camera has it, free of turns
     still = RigidTransform.identity()
     planar = replace(
         calibration,
-        T_zoom0_fixed=RigidTransform.from_translation([*T.translation[:2], 0.0]),
+        T_zoom0_fixed=RigidTransform.from_translation([*beside[:2], 0.0]),
         T_head_zoom=still,
     )
     believed = {
         FULL: calibration,
         IGNORED: without_offsets(calibration),
-        PARALLEL: replace(calibration, T_zoom0_fixed=RigidTransform.from_translation(T.translation), T_head_zoom=still),
+        PARALLEL: replace(calibration, T_zoom0_fixed=RigidTransform.from_translation(beside), T_head_zoom=still),
         PLANAR: planar,
         PLANAR_TURNED: in_plane(calibration),
         CRUDE_OFFSET: replace(
