@@ -18,7 +18,8 @@ from typing import Any
 
 from cotarget.errors import ConfigError
 from cotarget.outputs import write_whole
-from experiments.harness import Experiment, plain
+from experiments.harness import Experiment
+from experiments.texts import plain
 
 EXPECTED = Path(__file__).parent / "expected"
 WORSE = 1.10  # times: other versions of the libraries round and render otherwise by as much

@@ -1,6 +1,6 @@
 """What the dead zone spares the motors: commands and reversals a minute with it and without, and the offset it costs.
 
-A book that is put elsewhere once and a person who walks are held in the field of `experiments.hold_scenes`, by the
+A book that is put elsewhere once and a person who walks are held in the field of `experiments.field_scenes`, by the
 whole pipeline; all that differs is whether the head is ever left alone: how it is driven, when it is told anything, is
 the same.
 
@@ -20,9 +20,9 @@ from cotarget.calibration import Calibration
 from cotarget.deadzone import SteeringSettings
 from cotarget.loop import FollowSettings
 from cotarget.metrics import score
+from experiments.field import FieldSettings, calibrated, held, target_of
+from experiments.field_scenes import hold_config
 from experiments.harness import Experiment, Row, seeds_of, table
-from experiments.hold import FieldSettings, calibrated, held, target_of
-from experiments.hold_scenes import hold_config
 from experiments.spread import in_words, spread_of
 from experiments.wide_view import record
 

@@ -1,6 +1,6 @@
 """What prediction is worth: the offset in the close-up with it and without, over the delay of cameras and head.
 
-A person walks and a bird flies in the field of `experiments.hold_scenes`, and the delay from light to the start of
+A person walks and a bird flies in the field of `experiments.field_scenes`, and the delay from light to the start of
 motion goes from none to 600 ms, of which three fifths are the cameras' and the rest the head's and the lens's, as in
 the field's 120 + 80 ms. Without prediction the head is sent where the target was seen. The curve is of the wide view
 alone, so that nothing is rendered but its frames, once a seed; at one delay, the field's, both are compared once more
@@ -24,9 +24,9 @@ from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
 from cotarget.loop import FollowSettings
 from cotarget.metrics import score
+from experiments.field import FieldSettings, calibrated, held, target_of
+from experiments.field_scenes import COMMAND_DELAY_S, LATENCY_S, hold_config
 from experiments.harness import Experiment, Row, seeds_of, table
-from experiments.hold import FieldSettings, calibrated, held, target_of
-from experiments.hold_scenes import COMMAND_DELAY_S, LATENCY_S, hold_config
 from experiments.spread import in_words, spread_of
 from experiments.wide_view import record
 
@@ -83,9 +83,10 @@ def one(calibration: Calibration, settings: DelaySettings, seed: int) -> list[Ro
 
 def delayed(config: RigConfig, delay: float) -> RigConfig:
     """The same rig with another delay from light to the start of motion [s]."""
-    sim, late = config.sim, {"latency_s": LIGHT_PART * delay}
+    sim, latency_s = config.sim, LIGHT_PART * delay
     head = dataclasses.replace(sim.head, command_delay_s=(1 - LIGHT_PART) * delay)
-    fixed, zoom = dataclasses.replace(sim.fixed, **late), dataclasses.replace(sim.zoom, **late)
+    fixed = dataclasses.replace(sim.fixed, latency_s=latency_s)
+    zoom = dataclasses.replace(sim.zoom, latency_s=latency_s)
     return dataclasses.replace(config, sim=dataclasses.replace(sim, fixed=fixed, zoom=zoom, head=head))
 
 

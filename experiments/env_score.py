@@ -22,6 +22,7 @@ from cotarget.sim.fieldpaths import GROUPED, LONE, SECONDS
 from experiments.harness import Experiment, Row, Settings, seeds_of, table
 
 CHANCE, PIPELINE = "chance", "pipeline"
+Policy = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)
@@ -41,19 +42,20 @@ def one(shared: None, settings: ScoreSettings, seed: int) -> list[Row]:
     rows = []
     for target in LONE:
         env = gymnasium.make(FOLLOW, target=target, seconds=settings.seconds)
-        for name, policy in ((PIPELINE, PipelinePolicy(env)), (CHANCE, chance(env, seed))):
+        alone: dict[str, Policy] = {PIPELINE: PipelinePolicy(env), CHANCE: chance(env, seed)}
+        for name, policy in alone.items():
             rows.append({"env": FOLLOW, "of": target, "policy": name, "seed": seed, **episode(env, policy, seed)})
         env.close()
     for kind in GROUPED:
         env = gymnasium.make(SCHEDULE, kind=kind, seconds=settings.seconds)
-        policies = {name: SchedulingPolicy(env, name) for name in POLICIES}
+        policies: dict[str, Policy] = {name: SchedulingPolicy(env, name) for name in POLICIES}
         for name, policy in {**policies, CHANCE: chance(env, seed)}.items():
             rows.append({"env": SCHEDULE, "of": kind, "policy": name, "seed": seed, **episode(env, policy, seed)})
         env.close()
     return rows
 
 
-def chance(env: gymnasium.Env[Any, Any], seed: int) -> Callable[[Any], Any]:
+def chance(env: gymnasium.Env[Any, Any], seed: int) -> Policy:
     """Actions by chance, the same for the same seed."""
     env.action_space.seed(seed)
 
@@ -66,7 +68,7 @@ def chance(env: gymnasium.Env[Any, Any], seed: int) -> Callable[[Any], Any]:
     return act
 
 
-def episode(env: gymnasium.Env[Any, Any], policy: Callable[[Any], Any], seed: int) -> dict[str, float]:
+def episode(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> dict[str, float]:
     """An episode's reward, its steps, and the targets served where that is told."""
     observation, info = env.reset(seed=seed)
     reward, steps, over = 0.0, 0, False

@@ -30,8 +30,8 @@ from cotarget.metrics import Row as Judged
 from cotarget.safety import SafeRig
 from cotarget.sim.fieldpaths import BOOK_MOVED_AT, BOOK_TAKES, lone_path
 from cotarget.sim.world import SimWorld
+from experiments.field import OwnRigInField, calibrated
 from experiments.harness import Experiment, Row, seeds_of, table
-from experiments.hold import OwnRigInField, calibrated
 from experiments.panels import laid_out
 from experiments.paper_loop import OURS, WAYS, picture_name
 from experiments.pictured import Pictured

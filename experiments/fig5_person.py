@@ -27,8 +27,8 @@ from cotarget.loop import FollowSettings, Step
 from cotarget.metrics import Row as Judged
 from cotarget.metrics import score
 from cotarget.sim.world import SimWorld
+from experiments.field import OwnRigInField, calibrated, watched_in
 from experiments.harness import Experiment, Row, seeds_of
-from experiments.hold import OwnRigInField, calibrated, watched_in
 from experiments.panels import laid_out
 from experiments.paper_loop import OURS, WAYS, picture_name
 from experiments.pictured import Pictured

@@ -30,9 +30,9 @@ from cotarget.sim.targets import PERSON_HEIGHT, draw_size, target_rng
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from cotarget.simconfig import Waypoint
+from experiments.field import OwnRigInField, calibrated, watched_in
 from experiments.handover import Moment, figures
 from experiments.harness import Experiment, Row, seeds_of
-from experiments.hold import OwnRigInField, calibrated, watched_in
 from experiments.panels import laid_out
 from experiments.paper_loop import OURS, WAYS, picture_name
 from experiments.pictured import Pictured

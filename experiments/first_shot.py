@@ -1,12 +1,12 @@
 """How well a single shot from the wide view alone hits, what one correction adds, and what a miss consists of.
 
-A book, a person and a bird in the field of `experiments.hold_scenes` are shot at again and again (`experiments.shots`):
-each time one command from what the wide view has told, judged in the zoom frame that follows at the focal length
-solved for, then one more after a look through the zoom camera. Beside what was measured stands the sum, in quadrature,
-of what each cause leaves alone while all else is as it truly is: detection, size, calibration, delay, the head's steps
-and the lens's positions. A shot at something else than the target counts as a miss, and not in the budget. A chance
-passes unused while the target is not seen or cannot be reached: how many did is told beside, and a correction that
-could not be fired counts as one that missed.
+A book, a person and a bird in the field of `experiments.field_scenes` are shot at again and again
+(`experiments.shots`): each time one command from what the wide view has told, judged in the zoom frame that follows at
+the focal length solved for, then one more after a look through the zoom camera. Beside what was measured stands the
+sum, in quadrature, of what each cause leaves alone while all else is as it truly is: detection, size, calibration,
+delay, the head's steps and the lens's positions. A shot at something else than the target counts as a miss, and not in
+the budget. A chance passes unused while the target is not seen or cannot be reached: how many did is told beside, and a
+correction that could not be fired counts as one that missed.
 
     python -m experiments.first_shot [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -23,9 +23,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
+from experiments.field import FieldSettings, calibrated, target_of
+from experiments.field_scenes import hold_config
 from experiments.harness import Experiment, Row, rms, seeds_of, table
-from experiments.hold import FieldSettings, calibrated, target_of
-from experiments.hold_scenes import hold_config
 from experiments.shots import CAUSES, Fired, fire
 from experiments.spread import BESIDE, in_words, spread_of
 

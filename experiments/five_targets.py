@@ -1,6 +1,6 @@
 """Of five targets at once, how many get a good close-up under each policy.
 
-Five persons, or five birds, cross the wide view in the field of `experiments.hold_scenes`: all at once for a while,
+Five persons, or five birds, cross the wide view in the field of `experiments.field_scenes`: all at once for a while,
 each gone after a time. A target counts as served when it was well in the close-up, by the metrics' definition, for a
 second in all. What the wide camera sees is rendered and searched once a seed and kind, and followed under each policy;
 by the wide view alone, unless the zoom view's correction is asked for (`--set five_targets.closed_loop=true`).
@@ -25,9 +25,9 @@ from cotarget.loop import FollowSettings
 from cotarget.policies import POLICIES
 from cotarget.sim.fieldpaths import GROUP
 from cotarget.sim.truth import Truth
+from experiments.field import FieldSettings, calibrated, target_of, watched
+from experiments.field_scenes import five_targets_config
 from experiments.harness import Experiment, Row, seeds_of, table
-from experiments.hold import FieldSettings, calibrated, target_of, watched
-from experiments.hold_scenes import five_targets_config
 from experiments.spread import BESIDE
 from experiments.wide_view import WideView, record
 

@@ -1,6 +1,6 @@
 """How long and how well a target is held in the close-up: a book, a person and a bird in the field, by the truth.
 
-The rig is the default one, calibrated from rendered boards, under the field's conditions (`experiments.hold_scenes`):
+The rig is the default one, calibrated from rendered boards, under the field's conditions (`experiments.field_scenes`):
 exposure blur, clutter, 120 ms from light to frame, 80 ms from command to motion, true sizes that nobody knows. Each
 seed is another path, another size and other noise. Figures are medians over the seeds of the field's terms, with the
 least and the largest, as `cotarget.metrics` defines them; everything is judged by the simulation's truth, which the
@@ -10,34 +10,20 @@ pipeline cannot see.
 """
 
 import dataclasses
-import functools
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from cotarget.calibration import Calibration, calibrate_rig
-from cotarget.config import RigConfig, TargetConfig
-from cotarget.detection import Detector, make_detector
-from cotarget.judging import add_row
-from cotarget.loop import FollowSettings, Step, follow
-from cotarget.metrics import Row as Judged
+from cotarget.calibration import Calibration
 from cotarget.metrics import score
-from cotarget.oracle import true_calibration
-from cotarget.safety import SafeRig
-from cotarget.sim.fieldpaths import SECONDS
-from cotarget.sim.truth import Truth
-from cotarget.sim.world import SimWorld
-from experiments import harness
+from experiments.field import FieldSettings, calibrated, held
+from experiments.field_scenes import hold_config
 from experiments.harness import Experiment, Row, seeds_of, table
-from experiments.hold_scenes import hold_config
-from experiments.own_rig import OwnRig
-from experiments.paper_loop import Follow
 from experiments.spread import in_words, points, spread_of
-from experiments.wide_view import WideView, open_on
 
 # What is wanted of each figure's median: at least, or at most.
 WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
@@ -77,19 +63,6 @@ ALSO = ("tpe_px_median", "false_tracks_per_min", "commands_per_min", "reversals_
 
 
 @dataclass(frozen=True)
-class FieldSettings(harness.Settings):
-    """How many runs in the field, how long they are, and what is known of the rig.
-
-    Attributes:
-        seconds: of each run [s].
-        calibrated: whether the rig is calibrated from rendered boards; otherwise it is known exactly.
-    """
-
-    seconds: float = SECONDS
-    calibrated: bool = True
-
-
-@dataclass(frozen=True)
 class HoldSettings(FieldSettings):
     """How many seeds, and which targets.
 
@@ -99,30 +72,6 @@ class HoldSettings(FieldSettings):
 
     seeds: int = 2
     targets: tuple[str, ...] = tuple(WANTED)
-
-
-@dataclass(frozen=True)
-class OwnRigInField(OwnRig, FieldSettings):
-    """The same for an experiment that takes a rig of one's own."""
-
-
-def _of_calibration(settings: FieldSettings) -> tuple[bool, int, OwnRig]:
-    rig = OwnRig(rig=settings.rig) if isinstance(settings, OwnRig) else OwnRig()
-    return settings.calibrated, settings.seed_base, rig
-
-
-@functools.cache
-def _calibrated(from_boards: bool, seed: int, rig: OwnRig) -> Calibration:
-    config = rig.config("indoor", (), seed)
-    if not from_boards:
-        return true_calibration(SimWorld(config, rendered=()))
-    world = SimWorld(config)
-    with SafeRig(world.rig, config.safety) as safe:
-        return calibrate_rig(safe, config.board, pitch_mm=config.pitch_mm, seed=config.sim.seed)
-
-
-# A rig's calibration, from rendered boards or exact; the same for all experiments in the field with that rig.
-calibrated = harness.Preparation(_calibrated, _of_calibration)
 
 
 def one(calibration: Calibration, settings: HoldSettings, seed: int) -> list[Row]:
@@ -135,69 +84,6 @@ def one(calibration: Calibration, settings: HoldSettings, seed: int) -> list[Row
         }
         for name in settings.targets
     ]
-
-
-def held(
-    calibration: Calibration,
-    config: RigConfig,
-    name: str,
-    seconds: float,
-    settings: FollowSettings | None = None,
-    view: WideView | None = None,
-) -> list[Judged]:
-    """Hold a target of a simulated rig, and judge every frame.
-
-    Args:
-        calibration: what is known of the rig.
-        config: the rig and its world.
-        name: of the target.
-        seconds: for how long [s].
-        settings: how it is followed; as always, by default.
-        view: what the wide camera sees, where that was recorded.
-    """
-    target, rows = target_of(config, name), list[Judged]()
-    for step, truth in watched(calibration, config, target, seconds, settings, view):
-        add_row(rows, step, truth, name, target)
-    return rows
-
-
-def watched(
-    calibration: Calibration,
-    config: RigConfig,
-    target: TargetConfig,
-    seconds: float,
-    settings: FollowSettings | None = None,
-    view: WideView | None = None,
-) -> Iterator[tuple[Step, Truth]]:
-    """Follow a target of a simulated rig; each Step, and the truth to judge it by. See `held`."""
-    settings = settings or FollowSettings(command_delay_s=config.command_delay_s)
-    if view is None:
-        world, detector = SimWorld(config), make_detector(target, config.rate_hz)
-    else:
-        world, detector = open_on(view, config, closed_loop=settings.closed_loop)
-    yield from watched_in(world, detector, calibration, target, seconds, settings)
-
-
-def watched_in(
-    world: SimWorld,
-    detector: Detector,
-    calibration: Calibration,
-    target: TargetConfig,
-    seconds: float,
-    settings: FollowSettings,
-    how: Follow = follow,
-) -> Iterator[tuple[Step, Truth]]:
-    """The same in a world that is open, with a detector and perhaps a loop of one's own."""
-    truth = world.truth()
-    with SafeRig(world.rig, world.config.safety) as rig:
-        for step in how(rig, calibration, target, detector, seconds=seconds, settings=settings):
-            yield step, truth
-
-
-def target_of(config: RigConfig, name: str) -> TargetConfig:
-    """What is told of a target in the field, where clutter that moves by itself drowns a bird for its own detector."""
-    target = config.target(name)
-    return dataclasses.replace(target, detector="speck") if target.dimension == "wingspan" else target
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:

@@ -16,9 +16,9 @@ from cotarget.report.page import STYLE
 from cotarget.report.tables import Table
 from cotarget.report.wording import count, digits, listed
 from experiments.bounds import WORSE, leaves
-from experiments.harness import plain
 from experiments.outcome import Outcome
 from experiments.sessions import Session
+from experiments.texts import plain
 
 MINUTE_S, HOUR_S = 60.0, 3600.0
 WANTED_MIN, WANTED_RENDERS = 60, 80_000  # of all experiments as they are reported, on two cores

@@ -18,7 +18,7 @@ import fcntl
 import functools
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -111,7 +111,11 @@ def code_version() -> str:
 
 def differing(one: str, other: str) -> str:
     """What two fingerprints differ in: "version" of the package, "code", "libraries"; empty where in nothing."""
-    parts = {"version": lambda v: v.partition("+")[0], "code": lambda v: v.rpartition(".")[0], "libraries": str}
+    parts: Mapping[str, Callable[[str], str]] = {
+        "version": lambda v: v.partition("+")[0],
+        "code": lambda v: v.rpartition(".")[0],
+        "libraries": str,
+    }
     return next((what for what, part in parts.items() if part(one) != part(other)), "")
 
 

@@ -98,7 +98,7 @@ class Sweep:
             for alone, using in ((False, engine), (True, in_turn)):
                 mine = [i for i, case in enumerate(self.cases) if case.experiment.alone == alone]
                 tasks = [task for i in mine for task in self._jobs(i, shared.get(i))]
-                self._do(tasks, using, show, lambda task, done: self._keep(task.case, task.number, done))
+                self._do(tasks, using, show, self._keep_rows)
         finally:
             self._log.write()
 
@@ -152,6 +152,11 @@ class Sweep:
         other = differing(done.version, code_version())
         if other and not (self.any_code and other == "libraries"):
             raise ConfigError(f"a worker has cotarget {done.version}, this is {code_version()}; was the code changed?")
+
+    def _keep_rows(self, task: Task, done: Done) -> None:
+        """Put what came of a task of one seed on disk."""
+        assert task.number is not None, "what jobs share is no seed's"
+        self._keep(task.case, task.number, done)
 
     def _keep(self, i: int, number: int, done: Done) -> None:
         """Put what came of a job on disk."""

@@ -18,10 +18,10 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.errors import UnreachableError
@@ -237,7 +237,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
     """Maps of both readings' errors over the wide image of mounted rigs, medians over the seeds; then all regions."""
     depths, rigs = _depths(rows), list(dict.fromkeys(row["rig"] for row in rows))
     figure.set_size_inches(3.2 * len(depths) + 5, 5)
-    maps, regions = figure.subfigures(1, 2, width_ratios=(3.2 * len(depths) + 1, 4))
+    maps, regions = cast(list[SubFigure], figure.subfigures(1, 2, width_ratios=(3.2 * len(depths) + 1, 4)))
     axes = maps.subplots(len(READINGS), len(depths), squeeze=False, sharex=True, sharey=True)
     levels = np.geomspace(0.01, 10.0, 13)
     for line, method in zip(axes, READINGS, strict=True):
@@ -263,8 +263,16 @@ def _by_region(ax: "Axes", summary: Mapping[str, Any]) -> None:
             figures = [found[method][name]["all"] for name in REGIONS]
             low, mid, high = (np.array([each[key] for each in figures]) for key in ("deg_low", "deg", "deg_high"))
             x = np.arange(len(REGIONS)) + 0.1 * (2 * i + j - 1.5)
-            marker = {"fmt": "os"[i], "mfc": f"C{j}" if i == 0 else "w", "color": f"C{j}"}
-            ax.errorbar(x, mid, [mid - low, high - mid], capsize=2, label=f"{NAMES[method]}; rig: {rig}", **marker)
+            ax.errorbar(
+                x,
+                mid,
+                [mid - low, high - mid],
+                fmt="os"[i],
+                mfc=f"C{j}" if i == 0 else "w",
+                color=f"C{j}",
+                capsize=2,
+                label=f"{NAMES[method]}; rig: {rig}",
+            )
     ax.set_xticks(range(len(REGIONS)), [name.replace(" ", "\n", 1) for name in REGIONS])
     ax.set(yscale="log", ylabel="rms pointing error, all depths [degrees]")
     ax.legend(frameon=False, fontsize="small")

@@ -30,9 +30,9 @@ from cotarget.loop import FollowSettings, Step
 from cotarget.oracle import TruthDetector
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
+from experiments.field import FieldSettings, calibrated, target_of, watched, watched_in
+from experiments.field_scenes import hold_config
 from experiments.harness import Experiment, Row, seeds_of, table
-from experiments.hold import FieldSettings, calibrated, target_of, watched, watched_in
-from experiments.hold_scenes import hold_config
 from experiments.plain_renderer import PlainRenderer
 
 IMAGE_EFFECTS = ("noise", "jpeg", "distortion", "blur", "clutter")

@@ -1,6 +1,6 @@
 """A single pan-tilt-zoom camera that has to find and follow its target by itself, against the pair: time on target.
 
-The field of `experiments.hold_scenes` without its clutter: the same unit, lens, delays, ways and sizes, the rig known
+The field of `experiments.field_scenes` without its clutter: the same unit, lens, delays, ways and sizes, the rig known
 exactly. Nothing is rendered: detections are the truth with a detector's noise (`cotarget.oracle`), for the pair in its
 wide camera, for the lone camera (`experiments.lone_camera`) in its own view; either believes them by the same tracker
 with the same settings, those of a detector that goes by what a target looks like, as a lone camera has no background.

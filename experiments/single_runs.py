@@ -18,7 +18,7 @@ from cotarget.rig import Rig
 from cotarget.safety import SafeRig
 from cotarget.sim.outlines import Outlines
 from cotarget.sim.world import SimWorld
-from experiments.hold_scenes import hold_config
+from experiments.field_scenes import hold_config
 from experiments.lone_camera import LoneCamera, scan_of
 from experiments.shaken import NOISE, Shaken
 

@@ -21,8 +21,8 @@ from matplotlib.figure import Figure
 from cotarget.detection import make_detector
 from cotarget.sim.world import SimWorld
 from experiments import chain
+from experiments.field_scenes import hold_config
 from experiments.harness import Experiment, Row, Settings, table
-from experiments.hold_scenes import hold_config
 from experiments.workers import in_processes
 
 PROCESSES = (1, 2)

@@ -211,8 +211,8 @@ def _lens(summary: Mapping[str, Any], truth: str) -> Iterator[list[str]]:
             sigmas = {name: each["first_sigma"] if key == "first" else None for name, each in parameters.items()}
             cells = {name: value_and_sigma(each[key], sigmas[name]) for name, each in parameters.items()}
             focal_mm = [
-                value_and_sigma(parameters[name][key] * pitch, sigmas[name] and sigmas[name] * pitch)
-                for name in LENS[:2]
+                value_and_sigma(parameters[name][key] * pitch, sigma and sigma * pitch)
+                for name, sigma in zip(LENS[:2], map(sigmas.get, LENS[:2]), strict=True)
             ]
             size = ", ".join(f"{each:.2f}" for each in CCD_MM[camera])
             yield [

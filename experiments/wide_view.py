@@ -4,18 +4,64 @@ Its frames and what is found in them depend neither on where the zoom camera loo
 opened on such a view renders the zoom camera only, and nothing at all where nobody looks through it.
 """
 
+import os
+import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from tempfile import TemporaryFile
 
-import cv2
 import numpy as np
 
 from cotarget.config import RigConfig, TargetConfig
 from cotarget.detection import Detection, make_detector
 from cotarget.rig import Camera, Frame, Image
+from cotarget.sim.appearances import CameraName
 from cotarget.sim.world import SimWorld
 
-QUICKLY = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # without loss, at a third of the size
+WIDE: tuple[CameraName] = ("fixed",)
+CLOSE: tuple[CameraName] = ("zoom",)
+
+
+class Shelf:
+    """Images in a file that no folder lists, and that is gone with the last one who knows it.
+
+    They are kept as they are: 20 s of pictures and masks take 600 MB, and compressing them would take longer than
+    following.
+    """
+
+    def __init__(self) -> None:
+        """Make the file."""
+        self._file = TemporaryFile(prefix="cotarget-")  # noqa: SIM115  closed below
+        weakref.finalize(self, self._file.close)
+
+    def put(self, image: Image | None) -> "Kept | None":
+        """Keep an image; nothing where there is none."""
+        if image is None:
+            return None
+        offset = self._file.tell()
+        self._file.write(np.ascontiguousarray(image).data)
+        self._file.flush()
+        return Kept(self, offset, image.shape)
+
+    def take(self, offset: int, shape: tuple[int, ...]) -> Image:
+        """An image of that shape from there, the caller's own."""
+        image = np.empty(shape, dtype=np.uint8)
+        read = os.preadv(self._file.fileno(), [image.data], offset)
+        assert read == image.nbytes, "it was written whole"
+        return image
+
+
+@dataclass(frozen=True)
+class Kept:
+    """An image on a shelf, and where."""
+
+    shelf: Shelf = field(repr=False)
+    offset: int
+    shape: tuple[int, ...]
+
+    def image(self) -> Image:
+        """The image, the caller's own."""
+        return self.shelf.take(self.offset, self.shape)
 
 
 @dataclass(frozen=True)
@@ -24,13 +70,13 @@ class Seen:
 
     Attributes:
         detections: in it.
-        picture: as a PNG; None where nothing was rendered.
+        picture: of it; None where nothing was rendered.
         mask: the detector's foreground, likewise.
     """
 
     detections: tuple[Detection, ...]
-    picture: bytes | None = None
-    mask: bytes | None = None
+    picture: Kept | None = None
+    mask: Kept | None = None
 
 
 @dataclass(frozen=True)
@@ -59,13 +105,13 @@ def record(config: RigConfig, target: TargetConfig, seconds: float) -> WideView:
         seconds: for how long [s].
     """
     frames: dict[int, Seen] = {}
-    detector = make_detector(target, config.rate_hz)
-    with SimWorld(config, rendered=("fixed",)).rig as rig:
+    detector, shelf = make_detector(target, config.rate_hz), Shelf()
+    with SimWorld(config, rendered=WIDE).rig as rig:
         t: float | None = None
         while t is None or t < seconds:
             frame = rig.fixed.read(newer_than=t)
             t, found = frame.t, tuple(detector.detect(frame))
-            frames[_key(t)] = Seen(found, _png(frame.image), _png(detector.mask))
+            frames[_key(t)] = Seen(found, shelf.put(frame.image), shelf.put(detector.mask))
     return WideView(frames, pictures=True)
 
 
@@ -78,7 +124,7 @@ def open_on(view: WideView, config: RigConfig, *, closed_loop: bool) -> tuple[Si
         closed_loop: whether the zoom camera is rendered.
     """
     assert view.pictures or not closed_loop, "the zoom view is searched for what the wide view shows"
-    world = SimWorld(config, rendered=("zoom",) if closed_loop else ())
+    world = SimWorld(config, rendered=CLOSE if closed_loop else ())
     if view.pictures:  # the middle of a body is told by its outline, whoever looks at the zoom view
         world.rig.fixed = _RecordedCamera(world.rig.fixed, view)
     return world, RecordedDetector(view)
@@ -94,7 +140,7 @@ class RecordedDetector:
     def detect(self, frame: Frame) -> list[Detection]:
         """What was found, best first."""
         seen = self._view.at(frame.t)
-        self.mask = None if seen.mask is None else _picture(seen.mask, cv2.IMREAD_GRAYSCALE)
+        self.mask = None if seen.mask is None else seen.mask.image()
         return list(seen.detections)
 
 
@@ -114,16 +160,8 @@ class _RecordedCamera:
         t = self._camera.read(newer_than, timeout).t
         picture = self._view.at(t).picture
         assert picture is not None, "pictures were kept"
-        return Frame(_picture(picture, cv2.IMREAD_COLOR), t)
+        return Frame(picture.image(), t)
 
 
 def _key(t: float) -> int:
     return round(t * 1e6)
-
-
-def _png(image: Image | None) -> bytes | None:
-    return None if image is None else cv2.imencode(".png", image, QUICKLY)[1].tobytes()
-
-
-def _picture(png: bytes, flags: int) -> Image:
-    return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), flags))

@@ -8,12 +8,13 @@ import bisect
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import TracebackType
 
 from cotarget.config import RigConfig
 from cotarget.detection import Detection, Detector, make_detector
 from cotarget.hardware.clock import MonotonicClock
 from cotarget.loop import FollowSettings, follow
-from cotarget.rig import Camera, Clock, Frame, Image, PanTilt, PanTiltLimits, PanTiltState, Rig, open_rig
+from cotarget.rig import Camera, Clock, Frame, Image, PanTilt, PanTiltLimits, PanTiltState, Rig, Speed, open_rig
 from cotarget.safety import SafeRig
 from experiments.harness import Row
 from experiments.wire_rig import EmulatedRig, Tap, exact_calibration, load, tapped
@@ -75,7 +76,7 @@ class TimedHead:
         """The head's."""
         return self._head.state()
 
-    def move(self, pan: float, tilt: float, speed: float | None = None, wait: bool = False) -> tuple[float, float]:
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         """The head's."""
         self._notes.turns[-1].called = self._notes.clock.now()
         return self._head.move(pan, tilt, speed, wait)
@@ -111,7 +112,21 @@ class TimedRig:
     def __init__(self, rig: Rig, notes: Notes) -> None:
         self.fixed, self.head = TimedCamera(rig.fixed, notes), TimedHead(rig.head, notes)
         self.zoom, self.clock, self.board = rig.zoom, rig.clock, rig.board
-        self.close, self.__enter__, self.__exit__ = rig.close, rig.__enter__, rig.__exit__
+        self._rig = rig
+
+    def close(self) -> None:
+        """The rig's."""
+        self._rig.close()
+
+    def __enter__(self) -> "TimedRig":
+        """Give the rig itself; it is open."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Halt, then close."""
+        self._rig.__exit__(kind, error, trace)
 
 
 def run(folder: Path, targets: tuple[str, ...], seconds: float) -> list[Row]:
@@ -126,7 +141,8 @@ def run(folder: Path, targets: tuple[str, ...], seconds: float) -> list[Row]:
 
 def _follow(emulated: EmulatedRig, name: str, seconds: float) -> list[Row]:
     config = emulated.config()
-    with SafeRig(open_tapped(config, taps := []), config.safety) as rig:
+    taps: list[Tap] = []
+    with SafeRig(open_tapped(config, taps), config.safety) as rig:
         notes = Notes(rig.clock, config.hardware.fixed.latency_s)
         target = config.target(name)
         detector = TimedDetector(make_detector(target, config.rate_hz), notes)

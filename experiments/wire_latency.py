@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from cotarget.latency import measure_fixed, measure_head
-from cotarget.rig import Frame, Rig, ZoomCamera, ZoomState
+from cotarget.rig import Frame, Rig, Speed, ZoomCamera, ZoomState
 from cotarget.safety import SafeRig
 from experiments.harness import Row
 from experiments.wire_command import ORDER, Notes, TimedHead, Turn, open_tapped
@@ -101,7 +101,7 @@ class NotedRig:
 class NotedHead(TimedHead):
     """Notes each move as a turn of its own."""
 
-    def move(self, pan: float, tilt: float, speed: float | None = None, wait: bool = False) -> tuple[float, float]:
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         """The head's."""
         now = self._notes.clock.now()
         self._notes.turns.append(Turn(now, now))
@@ -113,7 +113,8 @@ def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
     with EmulatedRig(folder / "latency", {"sim": {"scene": "outdoor"}}) as emulated, Watcher(emulated) as watcher:
         config = emulated.config()
         hardware = config.hardware
-        with SafeRig(open_tapped(config, taps := []), config.safety) as rig:
+        taps: list[Tap] = []
+        with SafeRig(open_tapped(config, taps), config.safety) as rig:
             notes = Notes(rig.clock, 0.0)
             noted = NotedRig(rig, notes)
             found = measure_head(noted, head_seconds)  # type: ignore[arg-type]

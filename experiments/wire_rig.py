@@ -20,7 +20,7 @@ import tomli_w
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, load_config
 from cotarget.errors import DeviceError
-from cotarget.hardware import line
+from cotarget.hardware import line, serialport
 from cotarget.oracle import true_calibration
 from cotarget.sim.world import SimWorld
 
@@ -172,17 +172,17 @@ class Tap:
 def tapped(clock: Any) -> Iterator[list[Tap]]:
     """While it lasts, each serial port that the driver of the head opens is tapped; the taps so far."""
     taps: list[Tap] = []
-    unchanged = line.open_port
+    unchanged = serialport.open_port
 
     def tap(name: str, baud: int) -> Any:
         taps.append(Tap(unchanged(name, baud), clock))
         return taps[-1]
 
-    line.open_port = tap
+    vars(line)["open_port"] = tap  # by the name that the driver calls
     try:
         yield taps
     finally:
-        line.open_port = unchanged
+        vars(line)["open_port"] = unchanged
 
 
 @contextlib.contextmanager

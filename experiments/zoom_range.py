@@ -10,6 +10,7 @@ stands beside that of a true calibration rounded alike.
 """
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -68,10 +69,10 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
             calibration = calibrate_rig(rig, config.board, seed=seed)
             reach, truth = reach_of(rig), world.truth()
             for i, nominal in enumerate(np.geomspace(*reach.focal_px, FOCAL_LENGTHS)):
-                judged = {"nominal_px": float(nominal), "count": settings.targets}
-                errors = pointing_errors(
-                    calibration, truth, reach, rng=np.random.default_rng((seed, STREAM, i)), **judged
+                judged = functools.partial(
+                    pointing_errors, truth=truth, reach=reach, nominal_px=float(nominal), count=settings.targets
                 )
+                errors = judged(calibration, rng=np.random.default_rng((seed, STREAM, i)))
                 row: Row = {
                     "head": head,
                     "seed": seed,
@@ -88,7 +89,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
                         ("rounding", true_calibration(config, truth, float(nominal))),
                     ):
                         rng = np.random.default_rng((seed, STREAM, i))
-                        rounded = pointing_errors(one_calibration, truth, reach, rng=rng, step=reach.step, **judged)
+                        rounded = judged(one_calibration, rng=rng, step=reach.step)
                         row[f"{name}_rms_deg"] = rms(np.degrees(rounded))
                 rows.append(row)
     return rows

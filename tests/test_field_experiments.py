@@ -16,9 +16,9 @@ from cotarget.oracle import TruthDetector, TruthFinder, TruthNoise, true_calibra
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
-from experiments import dead_zone, delay, env_score, first_shot, five_targets, hold, shots, sim_speed
+from experiments import dead_zone, delay, env_score, field, first_shot, five_targets, hold, shots, sim_speed
 from experiments.bounds import compare
-from experiments.hold_scenes import hold_config
+from experiments.field_scenes import hold_config
 from experiments.shots import CAUSES, Shot, budget
 from experiments.spread import spread_of
 from experiments.wide_view import Seen, WideView, open_on, record
@@ -41,7 +41,7 @@ def seen_well(config, target, seconds, *, pictures=False):
 
 @pytest.fixture(scope="module")
 def exact():
-    return hold.calibrated(hold.HoldSettings(calibrated=False))
+    return field.calibrated(field.FieldSettings(calibrated=False))
 
 
 def test_all_hold_targets_with_the_same_calibration(exact):
@@ -60,7 +60,7 @@ def test_what_was_recorded_is_what_is_seen():
     view = record(config, target, 0.04)
     late = delay.delayed(config, 0.5)
     with (seen := SimWorld(config)).rig, (world := open_on(view, late, closed_loop=True)[0]).rig:
-        detector, again = hold.make_detector(target, 25.0), open_on(view, late, closed_loop=False)[1]
+        detector, again = field.make_detector(target, 25.0), open_on(view, late, closed_loop=False)[1]
         t = None
         for _ in range(2):
             frame, recorded = seen.rig.fixed.read(newer_than=t), world.rig.fixed.read(newer_than=t)
@@ -141,7 +141,7 @@ def offsets_of_who_stops(exact, delay_s, closed_loop):
         finder=lambda calibration, target: TruthFinder(calibration, target, truth, "person", 0),
     )
     target, end = config.target("person"), SETTLED[1]
-    steps = [step for step, _ in hold.watched_in(world, detector, exact, target, end, how)]
+    steps = [step for step, _ in field.watched_in(world, detector, exact, target, end, how)]
     t = np.array([step.zoom.t for step in steps])
     off = np.array([truth.pixel("zoom", truth.center("person", each), each) - (319.5, 239.5) for each in t]) / 640
     walking, after = ((t > begin) & (t < end) for begin, end in (WALKED, SETTLED))
@@ -175,7 +175,7 @@ def test_good_seconds_are_those_that_rows_tell(exact):
     target, how = config.target("person"), FollowSettings(command_delay_s=0.08, closed_loop=False)
     view = seen_well(config, target, 4.0)
     found = five_targets.good_seconds(exact, config, target, 4.0, how, view)
-    rows = hold.held(exact, config, "person", 4.0, how, view)
+    rows = field.held(exact, config, "person", 4.0, how, view)
     assert found.keys() == {"person"}
     assert found["person"] == pytest.approx(FRAME_S * sum(row.good_closeup for row in rows[1:]))
     assert found["person"] > 0
@@ -406,7 +406,7 @@ HELD_S = 6.0  # two seconds to learn the background, four to hold
 def test_a_book_is_held_through_the_cameras(exact):
     """The whole loop, rendered: all that is wanted of a median over many long runs, of one short one."""
     config = hold_config("book", 0)
-    found = dataclasses.asdict(score(hold.held(exact, config, "book", HELD_S)))
+    found = dataclasses.asdict(score(field.held(exact, config, "book", HELD_S)))
     assert found["frames"] > 90
     assert hold.missed(hold.summarise([{"target": "book", **found}])) == []
 

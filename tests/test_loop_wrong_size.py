@@ -9,7 +9,7 @@ import pytest
 from cotarget.loop import FollowSettings, State, follow
 from cotarget.oracle import TruthDetector, TruthFinder, TruthNoise, true_calibration
 from cotarget.sim.world import SimWorld
-from experiments.hold_scenes import hold_config
+from experiments.field_scenes import hold_config
 
 # As well as the real detectors find them.
 NOISE = {"book": TruthNoise(0.2, 0.01, 0.0), "person": TruthNoise(0.5, 0.04, 0.05)}

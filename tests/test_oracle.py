@@ -11,7 +11,7 @@ from cotarget.oracle import TruthDetector, TruthFinder, TruthNoise, counted, see
 from cotarget.rig import Frame
 from cotarget.sim.fieldpaths import SECONDS
 from cotarget.sim.world import SimWorld
-from experiments.hold_scenes import five_targets_config, hold_config
+from experiments.field_scenes import five_targets_config, hold_config
 
 STEP = 0.04
 TIMES = np.arange(0.0, SECONDS + STEP / 2, STEP)

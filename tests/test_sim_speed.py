@@ -7,8 +7,8 @@ import pytest
 
 from cotarget.loop import State
 from cotarget.safety import SafeRig
-from experiments import hold, sim_speed
-from experiments.hold_scenes import hold_config
+from experiments import field, sim_speed
+from experiments.field_scenes import hold_config
 
 # A step against mujoco.Renderer is 1.15 on a quiet machine; a busy one adds what it likes.
 BUSY = 1.5
@@ -59,13 +59,13 @@ def test_the_real_time_factor_is_of_what_came_after_the_target_had_settled(monke
 
 def test_what_is_timed_is_how_a_bird_is_held(monkeypatch):
     """The field's own detector, and the safety layer between the pipeline and the rig."""
-    calibration, asked = hold.calibrated(hold.FieldSettings(calibrated=False)), []
+    calibration, asked = field.calibrated(field.FieldSettings(calibrated=False)), []
     monkeypatch.setattr(sim_speed, "watched", lambda *arguments: asked.append(arguments))
     sim_speed.held(calibration, 2.0, 3)
     config = hold_config("bird", 3)
-    assert asked == [(calibration, config, hold.target_of(config, "bird"), sim_speed.SETTLED_S + 2.0)]
+    assert asked == [(calibration, config, field.target_of(config, "bird"), sim_speed.SETTLED_S + 2.0)]
     guarded = []
-    monkeypatch.setattr(hold, "SafeRig", lambda rig, safety: guarded.append(safety) or SafeRig(rig, safety))
+    monkeypatch.setattr(field, "SafeRig", lambda rig, safety: guarded.append(safety) or SafeRig(rig, safety))
     steps = [step for step, _ in sim_speed.held_unrendered(calibration, 1.0, 3)]
     assert steps[-1].t == pytest.approx(2.0, abs=0.2)
     assert State.FOLLOWING in {step.state for step in steps}

@@ -8,7 +8,7 @@ from typing import NoReturn
 from cotarget.config import SimCamera, SimEffects, SimHead, SimZoomCamera
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
-from cotarget.rig import Clock, Frame, Image, PanTiltLimits, PanTiltState, Speed, ZoomState
+from cotarget.rig import Camera, Clock, Frame, Image, PanTiltLimits, PanTiltState, Speed, ZoomState
 from cotarget.sim.motion import Axis, HeadDrive, LensDrive
 
 # Frame times are multiples of the frame period; this much of a period [1] absorbs their rounding.
@@ -250,7 +250,8 @@ class SimRig:
         board: SimBoard,
         release: Callable[[], None],
     ) -> None:
-        self.fixed, self.zoom, self.head, self.clock, self.board = fixed, zoom, head, clock, board
+        self.fixed: Camera = fixed
+        self.zoom, self.head, self.clock, self.board = zoom, head, clock, board
         self._of_world = (fixed, zoom, board)  # whatever is put in their places
         self._release = release
 

@@ -156,10 +156,11 @@ class Views:
                 cv2.accumulate(self._render(camera, now, aside, moment, plain=self._multisampling), total)
             return self._through(lens, view, cv2.convertScaleAbs(total, alpha=1 / BLUR_RENDERS))
         image = np.ascontiguousarray(self._render(camera, lens, view, t))
-        for window in windows:
-            part = np.zeros((window.height, window.width, 3), dtype=np.float32)
-            for moment in moments:
+        parts = [np.zeros((window.height, window.width, 3), dtype=np.float32) for window in windows]
+        for moment in moments:  # each once: to put everything in its place takes as long as to draw a small window
+            for window, part in zip(windows, parts, strict=True):
                 cv2.accumulate(self._render(camera, lens, view, moment, window), part)
+        for window, part in zip(windows, parts, strict=True):
             rows, columns = window.top + np.arange(2) * window.height, window.left + np.arange(2) * window.width
             image[slice(*rows), slice(*columns)] = cv2.convertScaleAbs(part, alpha=1 / BLUR_RENDERS)
         return self._through(lens, view, image)

@@ -51,15 +51,14 @@ def five_targets_config(seed: int, kind: str = "person", scene: str = SCENE) -> 
 def _config(paths: Mapping[str, tuple[Waypoint, ...]], seed: int, scene: str) -> RigConfig:
     """The default rig under the field's conditions, with targets on these paths."""
     sim = SimConfig()
-    slow = {"latency_s": LATENCY_S, "exposure_s": EXPOSURE_S}
     sim = replace(
         sim,
         scene=scene,
         seed=seed,
         targets=tuple(paths),
         paths=paths,
-        fixed=replace(sim.fixed, **slow),
-        zoom=replace(sim.zoom, **slow),
+        fixed=replace(sim.fixed, latency_s=LATENCY_S, exposure_s=EXPOSURE_S),
+        zoom=replace(sim.zoom, latency_s=LATENCY_S, exposure_s=EXPOSURE_S),
         head=replace(sim.head, command_delay_s=COMMAND_DELAY_S),
         effects=replace(sim.effects, clutter=True),
     )

@@ -12,7 +12,7 @@ from cotarget.oracle import TruthDetector, true_calibration
 from cotarget.sim.fieldpaths import SECONDS
 from cotarget.sim.targets import marker_of
 from cotarget.sim.world import SimWorld
-from experiments.hold_scenes import five_targets_config, hold_config
+from experiments.field_scenes import five_targets_config, hold_config
 
 SEEDS = (0, 1, 2, 100, 101)
 NAMES = ("book", "person", "bird")
