@@ -8,7 +8,7 @@ Beside the joint fit stand its own prediction, the Cramer-Rao bound with the tru
 were known, and the sequential method. The default rig; one with a wide baseline, toed in and rolled, with a long lever;
 and the default rig with the usual board of 9 x 6 corners.
 
-    python -m experiments.chain [--seeds 100] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.chain [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import sys
@@ -51,8 +51,9 @@ FIGURES = ("joint", "predicted", "bound", "bound_intrinsics_known", "sequential"
 
 @dataclass(frozen=True)
 class ChainSettings(Settings):
-    """Noise of corners [px], boards, head poses for each, targets for each seed, and which cases."""
+    """How many seeds; noise of corners [px], boards, head poses for each, targets for each seed, and which cases."""
 
+    seeds: int = 20
     noise_px: float = 0.2
     boards: int = 15
     looks: int = 6
@@ -143,7 +144,7 @@ EXPERIMENT = Experiment(
     summarise,
     describe,
     plot,
-    cost_s=4.0,
+    cost_s=15.0,
 )
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ baseline, toed in and rolled. Each seed draws its own boards, poses and noise. C
 they say could only widen the ellipses. Beside the ellipses stand the measured and the predicted pointing error, on the
 same targets.
 
-    python -m experiments.honesty [--seeds 200] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+    python -m experiments.honesty [--seeds 60] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
 import sys
@@ -40,7 +40,7 @@ GROUPS = {
 class HonestySettings(Settings):
     """How many seeds, boards, head poses for each, targets; noise of corners [px]."""
 
-    seeds: int = 200
+    seeds: int = 60
     boards: int = 12
     looks: int = 4
     noise_px: float = 0.1
@@ -150,7 +150,7 @@ EXPERIMENT = Experiment(
     summarise,
     describe,
     plot,
-    cost_s=1.0,
+    cost_s=5.0,
 )
 
 if __name__ == "__main__":
