@@ -21,11 +21,6 @@ walks of 20 s (median offset in % of the width, commands and reversals a minute)
 With rendered pictures, which leave less noise and more that lasts, four walks of 8 s are 1.03, 1.07, 1.06 and 1.19
 times as far off as without a zone at 0.6, 0.7, 0.8 and 1 %, with 0.45, 0.41, 0.38 and 0.35 of the commands.
 
-When a book is carried elsewhere, most changes of direction are of the axis along which it hardly goes: every error of
-the estimate, times the delays, is more than the zone then. That axis does not turn back for less than the estimate's
-standard deviation, which halves the head's changes of direction (two runs of 20 s; 0.44 of those without a zone, 0.32
-for a person, at 1.00 and 1.08 times the offset).
-
 An axis along which the target moves slowly counts as standing: who walks bobs at each step, by 5 px and up to 60 px/s.
 Where it counts so only up to half that speed, the head nods at every step, 2 cycles a second, and is farther off.
 
@@ -50,9 +45,6 @@ NEARER = 0.2
 # Of what an axis that is slow, while the other turns, is told to lead by, so much is left out: with all of it the head
 # nods with the noise of the speed, without any it lags behind whoever goes slightly aslant.
 DOUBTED_LEAD = 0.5
-# The slower axis turns back for no less than so many standard deviations of where the target will be. Whatever is told
-# to the faster one in every frame would carry it to and fro with the noise of the estimate.
-DOUBTED_TURN = 1.0
 
 
 @dataclass(frozen=True)
@@ -74,7 +66,7 @@ class SteeringSettings:
         rest_s: one that stands in the zone is centred no sooner than so long after the last command [s].
     """
 
-    zone: float = 0.008
+    zone: float = 0.007
     spared: bool = True
     ahead_s: float = 0.2
     catch_s: float = 0.15
@@ -93,11 +85,13 @@ class _Way:
     Attributes:
         wanted: when a command given now takes effect [rad].
         rates: how fast that changes [rad/s]; 0 for an axis that is slow.
+        slow: of each axis, whether it hardly turns.
         still: whether the target stands.
     """
 
     wanted: Angles
     rates: Angles
+    slow: tuple[bool, bool]
     still: bool
 
     def after(self, seconds: float) -> Angles:
@@ -118,7 +112,6 @@ class Steering:
         self._limits = limits
         self._settings = settings
         self.head = HeadModel(limits)
-        self._turning = (0.0, 0.0)  # the sign of each goal's last change
 
     def decide(
         self,
@@ -128,7 +121,6 @@ class Steering:
         rates: Angles,
         field: float,
         lead_s: float = 0.0,
-        doubts: Angles = (0.0, 0.0),
     ) -> HeadCommand | None:
         """Decide on the head.
 
@@ -139,7 +131,6 @@ class Steering:
             rates: how fast that changes [rad/s].
             field: the angle of the image's width [rad].
             lead_s: from when the target was measured last to ``effect_t`` [s]; one that stands is still there.
-            doubts: standard deviations of ``wanted``, as angles on the sphere [rad].
 
         Returns:
             None where it is best left alone.
@@ -157,10 +148,9 @@ class Steering:
         else:
             catch_s = self._settings.hurry_s if off > self._settings.far * zone else self._settings.catch_s
             command = self._along(effect_t, interval_s, way, catch_s)
-            if self._settings.spared and not way.still:
-                command = self._spared(command, way, rests, doubts)
+            if not way.still:
+                command = self._spared(command, way, rests)
         command = self._within(command)
-        self._note_turns(command)
         self.head.obeys(effect_t, command)
         return command
 
@@ -172,7 +162,7 @@ class Steering:
         back_s = lead_s if still else DOUBTED_LEAD * lead_s
         pan, tilt = (q - back_s * rate if at_rest else q for q, rate, at_rest in zip(wanted, rates, slow, strict=True))
         pan_rate, tilt_rate = (0.0 if at_rest else rate for rate, at_rest in zip(rates, slow, strict=True))
-        return _Way((pan, tilt), (pan_rate, tilt_rate), still)
+        return _Way((pan, tilt), (pan_rate, tilt_rate), (slow[0], slow[1]), still)
 
     def _may_rest(self, effect_t: float, interval_s: float, way: _Way, zone: float, rests: Sequence[bool]) -> bool:
         """Whether the last command will do until the next chance; `rests` tells of which axis it does."""
@@ -224,8 +214,8 @@ class Steering:
             speeds.append(max(abs(v), LEAST_SPEED))
         return HeadCommand(goals[0], goals[1], (speeds[0], speeds[1]))
 
-    def _spared(self, command: HeadCommand, way: _Way, rests: Sequence[bool], doubts: Angles) -> HeadCommand:
-        """The same, but an axis that may rest keeps its goal and speed, and the slower one turns back for no noise.
+    def _spared(self, command: HeadCommand, way: _Way, rests: Sequence[bool]) -> HeadCommand:
+        """The same, but an axis that is slow and near enough keeps its goal and its speed.
 
         Whoever walks by stays at one height. Where the tilt is told anew as often as the pan has to be, it goes up and
         down with every error of the estimate.
@@ -233,25 +223,11 @@ class Steering:
         last = self.head.command
         if last is None:
             return command
-        olds, news = self._axes(last), self._axes(command)
-        changes = command.pan - last.pan, command.tilt - last.tilt
-        kept = []
-        for i, scale in enumerate(_scales(way.wanted[1])):
-            slower = abs(way.rates[i]) < abs(way.rates[1 - i])
-            back = changes[i] * self._turning[i] < 0 and abs(changes[i]) * scale <= DOUBTED_TURN * doubts[i]
-            kept.append(olds[i] if rests[i] or (slower and back) else news[i])
-        (pan, pan_speed), (tilt, tilt_speed) = kept
+        (pan, pan_speed), (tilt, tilt_speed) = (
+            old if slow and rest else new
+            for old, new, slow, rest in zip(self._axes(last), self._axes(command), way.slow, rests, strict=True)
+        )
         return HeadCommand(pan, tilt, (pan_speed, tilt_speed))
-
-    def _note_turns(self, command: HeadCommand) -> None:
-        last = self.head.command
-        if last is not None:
-            changes = command.pan - last.pan, command.tilt - last.tilt
-            pan, tilt = (
-                math.copysign(1.0, change) if change else before
-                for change, before in zip(changes, self._turning, strict=True)
-            )
-            self._turning = pan, tilt
 
     def _axes(self, command: HeadCommand) -> Motion:
         """Goal and speed of each axis."""

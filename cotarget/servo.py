@@ -174,7 +174,6 @@ class Servo:
             rates,
             self._rig.zoom.size[0] / self._true(focal),
             effect - course.target.measured_t,
-            _doubts(course.target, first),
         )
         if command is not None:
             pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)
@@ -211,15 +210,6 @@ class Servo:
         pan = min(max(pan, reach.pan[0]), reach.pan[1])
         tilt = min(max(tilt, reach.tilt[0]), reach.tilt[1])
         return dataclasses.replace(found, pan=pan, tilt=tilt)
-
-
-def _doubts(target: Estimate, aimed: Aim) -> tuple[float, float]:
-    """How surely it is known where a target is: standard deviations across and along the zoom image [rad]."""
-    seen = target.appearance(aimed.pan, aimed.tilt, aimed.nominal_px)
-    if seen is None:
-        return 0.0, 0.0
-    across, along = (np.sqrt(np.diag(seen.covariance)) / seen.focal_px).tolist()
-    return across, along
 
 
 def reach_of(rig: Rig, state: PanTiltState | None = None) -> Reach:
