@@ -212,7 +212,8 @@ def _lens(summary: Mapping[str, Any], truth: str) -> Iterator[list[str]]:
             cells = {name: value_and_sigma(each[key], sigmas[name]) for name, each in parameters.items()}
             focal_mm = [
                 value_and_sigma(parameters[name][key] * pitch, sigma and sigma * pitch)
-                for name, sigma in zip(LENS[:2], map(sigmas.get, LENS[:2]), strict=True)
+                for name in LENS[:2]
+                for sigma in [sigmas[name]]
             ]
             size = ", ".join(f"{each:.2f}" for each in CCD_MM[camera])
             yield [

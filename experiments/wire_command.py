@@ -8,7 +8,6 @@ import bisect
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 
 from cotarget.config import RigConfig
 from cotarget.detection import Detection, Detector, make_detector
@@ -112,21 +111,6 @@ class TimedRig:
     def __init__(self, rig: Rig, notes: Notes) -> None:
         self.fixed, self.head = TimedCamera(rig.fixed, notes), TimedHead(rig.head, notes)
         self.zoom, self.clock, self.board = rig.zoom, rig.clock, rig.board
-        self._rig = rig
-
-    def close(self) -> None:
-        """The rig's."""
-        self._rig.close()
-
-    def __enter__(self) -> "TimedRig":
-        """Give the rig itself; it is open."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Halt, then close."""
-        self._rig.__exit__(kind, error, trace)
 
 
 def run(folder: Path, targets: tuple[str, ...], seconds: float) -> list[Row]:
@@ -148,7 +132,8 @@ def _follow(emulated: EmulatedRig, name: str, seconds: float) -> list[Row]:
         detector = TimedDetector(make_detector(target, config.rate_hz), notes)
         settings = FollowSettings(command_delay_s=config.command_delay_s)
         timed, calibration = TimedRig(rig, notes), exact_calibration(emulated.sim)
-        for _ in follow(timed, calibration, target, detector, seconds=seconds, settings=settings):
+        steps = follow(timed, calibration, target, detector, seconds=seconds, settings=settings)  # type: ignore[arg-type]
+        for _ in steps:
             pass
     return [row | {"load": load()} for row in _parts(notes.turns, taps[0])]
 

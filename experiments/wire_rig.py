@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import tomli_w
 
@@ -172,17 +173,13 @@ class Tap:
 def tapped(clock: Any) -> Iterator[list[Tap]]:
     """While it lasts, each serial port that the driver of the head opens is tapped; the taps so far."""
     taps: list[Tap] = []
-    unchanged = serialport.open_port
 
     def tap(name: str, baud: int) -> Any:
-        taps.append(Tap(unchanged(name, baud), clock))
+        taps.append(Tap(serialport.open_port(name, baud), clock))
         return taps[-1]
 
-    vars(line)["open_port"] = tap  # by the name that the driver calls
-    try:
+    with mock.patch.object(line, "open_port", tap):
         yield taps
-    finally:
-        vars(line)["open_port"] = unchanged
 
 
 @contextlib.contextmanager
