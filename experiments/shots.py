@@ -23,6 +23,7 @@ from cotarget.judging import observe
 from cotarget.loop import State, Step
 from cotarget.metrics import Row as Judged
 from cotarget.oracle import true_calibration
+from cotarget.policies import FirstCome
 from cotarget.pursuit import Pursuit
 from cotarget.rig import Frame, Rig
 from cotarget.safety import SafeRig
@@ -147,11 +148,11 @@ def _on_target(truth: Truth, name: str, shot: Shot) -> bool:
 
 
 class _Lookout:
-    """Watches the wide view of a rig, and shoots at the eldest track.
+    """Watches the wide view of a rig, and shoots at whom the pipeline would follow: the first who came.
 
     Attributes:
         frame: the newest of the wide view.
-        track: the eldest confirmed one, if any.
+        track: who that is, if anybody.
     """
 
     frame: Frame
@@ -162,6 +163,7 @@ class _Lookout:
         self._tracker = Tracker(settings_for(target), rig.fixed.size)
         self._wide = Pursuit(calibration, target, rig.fixed.size)  # which never sees the zoom view
         self._both: Pursuit | None = None
+        self._policy = FirstCome()
         self._tracks: list[Track] = []
         self._t: float | None = None
         self.track: Track | None = None
@@ -171,11 +173,15 @@ class _Lookout:
         self.frame = self._rig.fixed.read(newer_than=self._t)
         self._t = self.frame.t
         self._tracks = self._tracker.update(self._detector.detect(self.frame), self.frame.t)
-        self.track = min((track for track in self._tracks if track.confirmed), key=lambda track: track.id, default=None)
+        state = self._rig.head.state()
         for pursuit in self._pursuits():
             pursuit.see_wide(self.frame, self._tracks, self._detector.mask)
-            pursuit.follow(None if self.track is None else self.track.id)
-            pursuit.states.add(self._rig.head.state(), self._rig.zoom.state())
+            pursuit.states.add(state, self._rig.zoom.state())
+        candidates = self._wide.candidates(self._tracks, self._rig.clock.now())
+        number = self._policy.select(candidates, np.array([state.pan, state.tilt]), self._rig.head.limits)
+        self.track = next((track for track in self._tracks if track.id == number), None)
+        for pursuit in self._pursuits():
+            pursuit.follow(number)
 
     def _pursuits(self) -> Iterator[Pursuit]:
         yield self._wide
