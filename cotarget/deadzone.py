@@ -37,14 +37,16 @@ from cotarget.rig import PanTiltLimits
 
 LEAST_SPEED = 1e-3  # a command needs one above zero [rad/s]
 FRAMES_AHEAD = 1.5  # a goal lies no nearer than that, so that a head of slow cameras does not stop between frames
-# A target that stands is not centred better than this part of the zone, however fine the head's steps are, and than
-# this part of a step: rounding leaves up to half of one, and with no more a head would go to and fro between two.
-FINE, FINE_STEPS = 0.1, 0.75
+# A target that stands is not centred better along either axis than this part of the zone, however fine the head's steps
+# are, and than this part of a step: rounding leaves up to half of one, and with no more a head would go to and fro.
+FINE, FINE_STEPS = 0.1, 0.6
 # From afar an axis is on its way there if it will be so many times nearer.
 NEARER = 0.2
 # Of what an axis that is slow, while the other turns, is told to lead by, so much is left out: with all of it the head
 # nods with the noise of the speed, without any it lags behind whoever goes slightly aslant.
 DOUBTED_LEAD = 0.5
+# While a target is carried elsewhere no axis turns back for less than so many standard deviations of where it will be.
+DOUBTED_TURN = 0.5
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,7 @@ class Steering:
         self._limits = limits
         self._settings = settings
         self.head = HeadModel(limits)
+        self._turning = (0.0, 0.0)  # the sign of each goal's last change
 
     def decide(
         self,
@@ -121,6 +124,7 @@ class Steering:
         rates: Angles,
         field: float,
         lead_s: float = 0.0,
+        doubts: Angles = (0.0, 0.0),
     ) -> HeadCommand | None:
         """Decide on the head.
 
@@ -131,6 +135,7 @@ class Steering:
             rates: how fast that changes [rad/s].
             field: the angle of the image's width [rad].
             lead_s: from when the target was measured last to ``effect_t`` [s]; one that stands is still there.
+            doubts: of a target that is carried elsewhere, standard deviations of pan and tilt ``ahead_s`` later [rad].
 
         Returns:
             None where it is best left alone.
@@ -148,9 +153,10 @@ class Steering:
         else:
             catch_s = self._settings.hurry_s if off > self._settings.far * zone else self._settings.catch_s
             command = self._along(effect_t, interval_s, way, catch_s)
-            if not way.still:
-                command = self._spared(command, way, rests)
+            if self._settings.spared and not way.still:
+                command = self._spared(command, way, rests, doubts)
         command = self._within(command)
+        self._note_turns(command)
         self.head.obeys(effect_t, command)
         return command
 
@@ -174,7 +180,9 @@ class Steering:
         # There, or on the way to the right place; a head that ran past it while it followed would come back at a crawl.
         if way.still and off_goal <= zone and (command.speed is None or off_then <= zone):
             fine = max(FINE_STEPS * self._limits.step, FINE * zone)
-            return off_then <= fine or effect_t - self.head.commanded_t < self._settings.rest_s
+            there = zip(way.after(interval_s), self._at(effect_t + interval_s), strict=True)
+            centred = all(abs(q - x) <= fine for q, x in there)
+            return centred or effect_t - self.head.commanded_t < self._settings.rest_s
         return all(rests)
 
     def _rests(self, effect_t: float, interval_s: float, way: _Way, zone: float) -> list[bool]:
@@ -214,20 +222,31 @@ class Steering:
             speeds.append(max(abs(v), LEAST_SPEED))
         return HeadCommand(goals[0], goals[1], (speeds[0], speeds[1]))
 
-    def _spared(self, command: HeadCommand, way: _Way, rests: Sequence[bool]) -> HeadCommand:
+    def _spared(self, command: HeadCommand, way: _Way, rests: Sequence[bool], doubts: Angles) -> HeadCommand:
         """The same, but an axis that is slow and near enough keeps its goal and its speed.
 
         Whoever walks by stays at one height. Where the tilt is told anew as often as the pan has to be, it goes up and
-        down with every error of the estimate.
+        down with every error of the estimate. What is carried elsewhere is as doubtful along both axes.
         """
         last = self.head.command
         if last is None:
             return command
-        (pan, pan_speed), (tilt, tilt_speed) = (
-            old if slow and rest else new
-            for old, new, slow, rest in zip(self._axes(last), self._axes(command), way.slow, rests, strict=True)
-        )
+        olds, news = self._axes(last), self._axes(command)
+        kept = []
+        for i in range(2):
+            turn = news[i][0] - olds[i][0]
+            back = turn * self._turning[i] < 0 and abs(turn) <= DOUBTED_TURN * doubts[i]
+            kept.append(olds[i] if back or (way.slow[i] and rests[i]) else news[i])
+        (pan, pan_speed), (tilt, tilt_speed) = kept
         return HeadCommand(pan, tilt, (pan_speed, tilt_speed))
+
+    def _note_turns(self, command: HeadCommand) -> None:
+        """Note which way each goal has changed last."""
+        last = self.head.command
+        if last is not None:
+            turns = command.pan - last.pan, command.tilt - last.tilt
+            pan, tilt = (math.copysign(1.0, new) if new else old for new, old in zip(turns, self._turning, strict=True))
+            self._turning = pan, tilt
 
     def _axes(self, command: HeadCommand) -> Motion:
         """Goal and speed of each axis."""

@@ -14,6 +14,7 @@ from cotarget.calibration import Calibration
 from cotarget.deadzone import Steering, SteeringSettings
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
+from cotarget.headmodel import Angles
 from cotarget.rig import PanTiltState, Rig
 from cotarget.targeting import Aim, Reach, aim
 from cotarget.zoompolicy import ZoomPolicy, ZoomSettings, expect
@@ -66,12 +67,14 @@ class _Course:
         target: the target then.
         first: the aim at it.
         then: the aim at where it is a frame later, at the same focal length.
+        doubts: of a target that is carried elsewhere, how surely the head's next goal is known [rad].
     """
 
     effect_t: float
     target: Estimate
     first: Aim
     then: Aim
+    doubts: Angles
 
 
 class Servo:
@@ -160,7 +163,9 @@ class Servo:
         self._steering.head.saw(state)  # a head that was halted, or is slow, is not where it was sent
         reach = reach_of(self._rig, state)
         first = self._aim(at_effect, reach)
-        return _Course(effect, at_effect, first, self._aim(then, reach, first))
+        later = predict(effect + self._settings.steering.ahead_s) if at_effect.carried else None
+        doubts = (0.0, 0.0) if later is None else _doubts(later, first)
+        return _Course(effect, at_effect, first, self._aim(then, reach, first), doubts)
 
     def _steer(self, course: _Course, interval: float) -> None:
         """Send the head, if that is worth it."""
@@ -174,6 +179,7 @@ class Servo:
             rates,
             self._rig.zoom.size[0] / self._true(focal),
             effect - course.target.measured_t,
+            course.doubts,
         )
         if command is not None:
             pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)
@@ -210,6 +216,15 @@ class Servo:
         pan = min(max(pan, reach.pan[0]), reach.pan[1])
         tilt = min(max(tilt, reach.tilt[0]), reach.tilt[1])
         return dataclasses.replace(found, pan=pan, tilt=tilt)
+
+
+def _doubts(target: Estimate, aimed: Aim) -> Angles:
+    """How surely the pan and tilt at a target are known: standard deviations [rad]; 0 out of sight."""
+    seen = target.appearance(aimed.pan, aimed.tilt, aimed.nominal_px)
+    if seen is None:
+        return 0.0, 0.0
+    across, along = (np.sqrt(np.diag(seen.covariance)) / seen.focal_px).tolist()
+    return across / math.cos(aimed.tilt), along
 
 
 def reach_of(rig: Rig, state: PanTiltState | None = None) -> Reach:

@@ -35,7 +35,7 @@ class SweepSpeedSettings(Settings):
 
     seeds: int = 1
     jobs: int = 12
-    seconds: float = 4.0
+    seconds: float = 2.0
 
 
 def fitted(settings: SweepSpeedSettings, number: int) -> list[Row]:

@@ -19,6 +19,7 @@ LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians
 LATENCY, DELAY = 0.12, 0.08  # from light to frame, and from command to motion [s]
 SECONDS = 8.0
 EXPOSURE = 0.01  # [s]
+AHEAD = SteeringSettings().ahead_s
 FRAME = 1 / RATE
 NOMINAL = {"book": 160 * 10 / 0.234, "person": 300 * 10 / 1.75}  # for the size wanted at 10 m
 
@@ -89,7 +90,8 @@ def follow(name, seed, settings):
             head.move(t, *goals, None)
         else:
             steering.head.saw(PanTiltState(*head.at(t), True, t))
-            command = steering.decide(effect, 1 / RATE, wanted, rates, field_angle, effect - estimates[0].measured_t)
+            late, doubts = effect - estimates[0].measured_t, doubted(estimator.at(effect + AHEAD), aims[0])
+            command = steering.decide(effect, 1 / RATE, wanted, rates, field_angle, late, doubts)
             if command is not None:
                 head.move(t, command.pan, command.tilt, command.speed)
         if t > 1.5:
@@ -97,6 +99,12 @@ def follow(name, seed, settings):
             misses.append(100 * np.hypot(*seen[1]) / SIZE[0])
             smears.append(np.hypot(*(seen[2] - seen[0])))
     return Result(len(head.goals) * 60 / SECONDS, head.reversals() * 60 / SECONDS, misses, smears)
+
+
+def doubted(estimate, aimed):
+    """Standard deviations of pan and tilt at a target that is carried, as the servo tells them [rad]."""
+    seen = estimate.appearance(aimed.pan, aimed.tilt, aimed.nominal_px) if estimate.carried else None
+    return (0.0, 0.0) if seen is None else tuple(np.sqrt(np.diag(seen.covariance)) / seen.focal_px)
 
 
 def in_closeup(flight, head, t):
@@ -167,10 +175,10 @@ def test_a_target_that_stands_is_centred_once_and_left_alone():
     # On its way, and there: the same place, give or take what is less than the zone, needs no further command ...
     assert all(decide(steering, i * FRAME, 0.05 + 0.9 * ZONE * (-1) ** i) is None for i in range(1, 25))
     # ... until it has rested for a second: then it is centred, slowly, if it is off by more than rounding leaves.
-    assert decide(steering, 1.04, 0.05 + 0.7 * STEP) is None
-    centred = decide(steering, 1.08, 0.05 + 0.8 * STEP)
-    assert centred.pan == 0.05 + 0.8 * STEP
-    assert centred.speed[0] == pytest.approx(0.8 * STEP / SteeringSettings().catch_s)
+    assert decide(steering, 1.04, 0.05 + 0.55 * STEP) is None
+    centred = decide(steering, 1.08, 0.05 + 0.65 * STEP)
+    assert centred.pan == 0.05 + 0.65 * STEP
+    assert centred.speed[0] == pytest.approx(0.65 * STEP / SteeringSettings().catch_s)
     assert decide(steering, 1.12, 0.05) is None
     # Out of the zone it is gone after at once.
     assert decide(steering, 1.2, 0.05 + 2 * ZONE).pan == 0.05 + 2 * ZONE
@@ -222,6 +230,19 @@ def test_an_axis_that_stands_is_left_alone_while_the_other_turns():
     assert len(set(tilts)) == 1
     # It is sent on when it is not near any more.
     assert steering.decide(4.0, FRAME, (0.5 + 0.3 * 4.0, 0.1 + 2 * ZONE), (0.3, 0.0), WIDTH).tilt > tilts[-1]
+
+
+@pytest.mark.parametrize(("doubt", "turns_back"), [(0.0, True), (0.1, False), (0.01, True)])
+def test_what_is_carried_does_not_have_the_head_turn_back_for_less_than_is_doubted(doubt, turns_back):
+    """Half a standard deviation is less than what is doubted: of 0.1 rad it is more than the goal goes back by."""
+    steering = standing()
+    tilts = [
+        steering.decide(i * FRAME, FRAME, (0.5 + 0.3 * i * FRAME, tilt), (0.3, 0.1), WIDTH, 0.0, (doubt, doubt)).tilt
+        for i, tilt in enumerate((0.1, 0.12, 0.09))
+    ]
+    assert tilts[1] > tilts[0]
+    assert (tilts[2] < tilts[1]) == turns_back
+    assert turns_back or tilts[2] == tilts[1]
 
 
 def test_a_goal_is_within_the_limits():

@@ -173,8 +173,8 @@ def _told(node: Node, surprise: float, settings: EstimationSettings) -> Node:
     """Keep count of how surprising measurements are; a target that surprises manoeuvres harder than usual."""
     mean = node.surprise + settings.surprise_gain * (surprise / 2 - node.surprise)
     boost = min(max(mean, 1.0), settings.most_boost)
-    if node.t < node.moved_t + settings.carried_s:
-        boost = max(boost, settings.carried_boost)
+    if node.jumped(settings.motion.jump):
+        boost = max(boost, settings.jump_boost)
     return replace(node, surprise=mean, boost=boost)
 
 
@@ -202,8 +202,8 @@ def _elsewhere(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node
     P[:, moved] = 0.0
     P[:2, :2] = seen.R
     # Along the axis only sizes tell, and badly: there it is taken for no faster than usual.
-    speeds = settings.jump_speed, settings.jump_speed, motion.speed
-    accelerations = settings.jump_acceleration, settings.jump_acceleration, motion.acceleration
+    speeds = motion.jump.speed, motion.jump.speed, motion.speed
+    accelerations = motion.jump.acceleration, motion.jump.acceleration, motion.acceleration
     P[range(3, 9), range(3, 9)] = (np.array([*speeds, *accelerations]) * nearness) ** 2
     P[L, L] += settings.depth_doubt**2
     return replace(
@@ -214,7 +214,7 @@ def _elsewhere(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node
         missed_zoom=0,
         lean=(0.0, 0.0),
         surprise=1.0,
-        boost=settings.carried_boost,
+        boost=settings.jump_boost,
         moved_t=node.t,
     )
 

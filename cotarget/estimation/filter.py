@@ -127,15 +127,17 @@ class SpatialFilter:
         node = self._before(t)
         if node is None:
             return None
-        x, P = propagate(node.x, node.P, t - node.t, self._settings.motion, node.boost)
+        x, P = self._propagate(node, t)
+        motion = self._settings.motion
         return Estimate(
             t=t,
             measured_t=node.t,
             state=x,
             state_covariance=P,
             surprise=node.surprise,
-            size_prior=self._settings.motion.size_sigma,
-            bias_prior=self._settings.motion.bias_sigma,
+            carried=motion.jump.by_hand_s is not None and node.jumped(motion.jump),
+            size_prior=motion.size_sigma,
+            bias_prior=motion.bias_sigma,
             target=self._target,
             calibration=self._calibration,
             sights=self._sights,
@@ -144,6 +146,12 @@ class SpatialFilter:
     def knows(self, t: float) -> bool:
         """Whether there is an estimate for a time [s]."""
         return self._before(t) is not None
+
+    def _propagate(self, node: Node, t: float) -> tuple[Array, Array]:
+        """Predict state and covariance at a time that is no earlier [s]."""
+        settings = self._settings
+        motion = settings.jump_motion if node.jumped(settings.motion.jump) else settings.motion
+        return propagate(node.x, node.P, t - node.t, motion, node.boost)
 
     def _before(self, t: float) -> Node | None:
         """The newest state that is no later than a time [s]."""
@@ -190,7 +198,7 @@ class SpatialFilter:
         nearest = settings.motion.nearest
         if node is None:
             return sound(begin(seen, settings), nearest) if isinstance(seen, WideSeen) else None
-        x, P = propagate(node.x, node.P, seen.t - node.t, settings.motion, node.boost)
+        x, P = self._propagate(node, seen.t)
         node = replace(node, t=seen.t, x=x, P=P)
         if isinstance(seen, WideSeen):
             corrected = correct_wide(node, seen, settings)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cotarget.estimation.motion import L
+from cotarget.estimation.settings import Jump
 from cotarget.geometry import Array
 
 FARTHEST = 1e5  # [m]; nothing is seen from farther away
@@ -42,6 +43,10 @@ class Node:
     wide_t: float = -math.inf
     moved_t: float = -math.inf
     lean: tuple[float, float] = (0.0, 0.0)
+
+    def jumped(self, jump: Jump) -> bool:
+        """Whether it was found elsewhere so lately that it may be on its way still."""
+        return self.t < self.moved_t + jump.seconds
 
 
 def sound(node: Node, nearest: float) -> Node | None:

@@ -4,8 +4,9 @@ Accelerations and time constants were chosen on simulated tracks, by the error o
 long as its covariance stayed honest; `cotarget.estimation` says against what.
 """
 
+import functools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +21,24 @@ USUAL_BIAS = 7e-4
 # fixed camera is likely to have, and no pointing at it helps.
 NEAREST_SIZES = 0.5
 USUAL_DEPTH = 15.0  # [m]; a target whose size is not seen, at first
+
+
+@dataclass(frozen=True)
+class Jump:
+    """How a target moves that was found elsewhere than it could be: a hand carries it, or it was mistaken.
+
+    Attributes:
+        speed: standard deviation, across the line of sight, of its velocity when it is found [m/s]
+        acceleration: ... and of its acceleration [m/s^2], then and ...
+        seconds: ... for so long: whoever carries it speeds up and brakes [s].
+        by_hand_s: how long an acceleration lasts meanwhile of what is carried by hand [s]; None of what goes by itself,
+            of which they last as long as always.
+    """
+
+    speed: float = 3.0
+    acceleration: float = 10.0
+    seconds: float = 1.5
+    by_hand_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -38,6 +57,7 @@ class MotionSettings:
         bias_sigma: of the head's pan and tilt each [rad].
         bias_s: how long such a bias lasts [s].
         nearest: no target is nearer to the fixed camera than this, along its axis [m].
+        jump: how it moves when it was found elsewhere than it could be.
     """
 
     acceleration: float
@@ -50,6 +70,7 @@ class MotionSettings:
     bias_sigma: float = USUAL_BIAS
     bias_s: float = 60.0
     nearest: float = 0.1
+    jump: Jump = field(default_factory=Jump)
 
     @property
     def fading_s(self) -> float:
@@ -76,9 +97,6 @@ class EstimationSettings:
         jump_gate: beyond this it is either wrong or elsewhere: ten standard deviations. Between the two it counts less.
         size_gate: likewise of a size; 99.7 % with one.
         misses: so many measurements beyond jump_gate on end are believed.
-        jump_speed: standard deviation, across the line of sight, of the velocity of a target so found elsewhere [m/s]
-        jump_acceleration: ... and of its acceleration [m/s^2], then and ...
-        carried_s: ... for so long: whoever carries it speeds up and brakes [s].
         zoom_misses: likewise in the zoom view, while the wide view has no surprise: then size or head is doubted.
         calm: a mean surprise below which the wide view counts as having none.
         lean_gain: weight of the newest innovation in the zoom view in their mean, in standard deviations.
@@ -105,9 +123,6 @@ class EstimationSettings:
     jump_gate: float = 100.0
     size_gate: float = 9.0
     misses: int = 3
-    jump_speed: float = 3.0
-    jump_acceleration: float = 10.0
-    carried_s: float = 1.5
     zoom_misses: int = 8
     calm: float = 2.0
     lean_gain: float = 0.1
@@ -121,13 +136,21 @@ class EstimationSettings:
     history_s: float = 1.5
 
     @property
-    def carried_boost(self) -> float:
-        """By what the acceleration's variance is larger than usual while it is carried."""
-        return max(1.0, (self.jump_acceleration / self.motion.acceleration) ** 2)
+    def jump_boost(self) -> float:
+        """By what the acceleration's variance is larger than usual then."""
+        return max(1.0, (self.motion.jump.acceleration / self.motion.acceleration) ** 2)
+
+    @functools.cached_property
+    def jump_motion(self) -> MotionSettings:
+        """How it moves when it was found elsewhere, the larger acceleration aside."""
+        by_hand_s = self.motion.jump.by_hand_s
+        return self.motion if by_hand_s is None else replace(self.motion, manoeuvre_s=by_hand_s)
 
 
+# A hand that reaches somewhere speeds up and brakes within a second or so.
+HAND = Jump(acceleration=5.0, seconds=1.25, by_hand_s=0.15)
 BOOK = EstimationSettings(
-    MotionSettings(0.5, 0.5, 0.7, 0.01, attitude_sigma=0.01, attitude_s=2.0),
+    MotionSettings(0.5, 0.5, 0.7, 0.01, attitude_sigma=0.01, attitude_s=2.0, jump=HAND),
     noise_px=0.2,
     noise_of_size=0.01,
     noise_s=0.0,
@@ -166,8 +189,14 @@ def estimation_settings_for(target: TargetConfig, calibration: Calibration | Non
     elif target.dimension == "wingspan":
         settings = BIRD
     told = settings.motion if target.motion is None else KINDS[target.motion].motion
-    moves = {"acceleration": told.acceleration, "manoeuvre_s": told.manoeuvre_s, "speed": told.speed}
-    motion = replace(settings.motion, **moves, nearest=NEAREST_SIZES * target.size)
+    motion = replace(
+        settings.motion,
+        acceleration=told.acceleration,
+        manoeuvre_s=told.manoeuvre_s,
+        speed=told.speed,
+        jump=told.jump,
+        nearest=NEAREST_SIZES * target.size,
+    )
     settings = replace(settings, motion=motion)
     if calibration is None or calibration.covariance is None:
         return settings
