@@ -146,7 +146,7 @@ class Servo:
         self.zoom_out()
         course = self._course(predict, seen_t, interval)
         seen = course.target.appearance(course.first.pan, course.first.tilt, self._rig.zoom.focal_range[0])
-        if seen is None or (np.sqrt(np.diag(seen.covariance)) > np.array(self._rig.zoom.size) / 2).any():
+        if seen is None or (seen.sigma_px > np.array(self._rig.zoom.size) / 2).any():
             return None
         self._steer(course, interval)
         return course.first
@@ -164,7 +164,7 @@ class Servo:
         reach = reach_of(self._rig, state)
         first = self._aim(at_effect, reach)
         later = predict(effect + self._settings.steering.ahead_s) if at_effect.carried else None
-        doubts = (0.0, 0.0) if later is None else _doubts(later, first)
+        doubts = (0.0, 0.0) if later is None else doubts_of(later, first)
         return _Course(effect, at_effect, first, self._aim(then, reach, first), doubts)
 
     def _steer(self, course: _Course, interval: float) -> None:
@@ -218,12 +218,12 @@ class Servo:
         return dataclasses.replace(found, pan=pan, tilt=tilt)
 
 
-def _doubts(target: Estimate, aimed: Aim) -> Angles:
-    """How surely the pan and tilt at a target are known: standard deviations [rad]; 0 out of sight."""
+def doubts_of(target: Estimate, aimed: Aim) -> Angles:
+    """How surely the pan and tilt at a target are known, near to an aim: standard deviations [rad]; 0 out of sight."""
     seen = target.appearance(aimed.pan, aimed.tilt, aimed.nominal_px)
     if seen is None:
         return 0.0, 0.0
-    across, along = (np.sqrt(np.diag(seen.covariance)) / seen.focal_px).tolist()
+    across, along = (seen.sigma_px / seen.focal_px).tolist()
     return across / math.cos(aimed.tilt), along
 
 

@@ -9,6 +9,7 @@ import pytest
 from cotarget.deadzone import Steering, SteeringSettings
 from cotarget.estimation import SpatialFilter
 from cotarget.rig import PanTiltLimits, PanTiltState
+from cotarget.servo import doubts_of
 from cotarget.sim.motion import Axis
 from cotarget.targeting import Reach, aim
 from experiments.synthetic import SIZE
@@ -90,7 +91,8 @@ def follow(name, seed, settings):
             head.move(t, *goals, None)
         else:
             steering.head.saw(PanTiltState(*head.at(t), True, t))
-            late, doubts = effect - estimates[0].measured_t, doubted(estimator.at(effect + AHEAD), aims[0])
+            late, ahead = effect - estimates[0].measured_t, estimator.at(effect + AHEAD)
+            doubts = doubts_of(ahead, aims[0]) if ahead.carried else (0.0, 0.0)
             command = steering.decide(effect, 1 / RATE, wanted, rates, field_angle, late, doubts)
             if command is not None:
                 head.move(t, command.pan, command.tilt, command.speed)
@@ -99,12 +101,6 @@ def follow(name, seed, settings):
             misses.append(100 * np.hypot(*seen[1]) / SIZE[0])
             smears.append(np.hypot(*(seen[2] - seen[0])))
     return Result(len(head.goals) * 60 / SECONDS, head.reversals() * 60 / SECONDS, misses, smears)
-
-
-def doubted(estimate, aimed):
-    """Standard deviations of pan and tilt at a target that is carried, as the servo tells them [rad]."""
-    seen = estimate.appearance(aimed.pan, aimed.tilt, aimed.nominal_px) if estimate.carried else None
-    return (0.0, 0.0) if seen is None else tuple(np.sqrt(np.diag(seen.covariance)) / seen.focal_px)
 
 
 def in_closeup(flight, head, t):

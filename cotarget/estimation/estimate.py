@@ -36,6 +36,11 @@ class Appearance:
     size_sigma: float
     focal_px: Array
 
+    @property
+    def sigma_px(self) -> Array:
+        """Standard deviations of the offset, (2,) [px]."""
+        return np.sqrt(np.diag(self.covariance))
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:

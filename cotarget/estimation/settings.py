@@ -137,7 +137,7 @@ class EstimationSettings:
 
     @property
     def jump_boost(self) -> float:
-        """By what the acceleration's variance is larger than usual then."""
+        """By what the acceleration's variance is larger than usual where it was found elsewhere."""
         return max(1.0, (self.motion.jump.acceleration / self.motion.acceleration) ** 2)
 
     @functools.cached_property
