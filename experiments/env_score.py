@@ -20,8 +20,10 @@ from cotarget.env import FOLLOW, SCHEDULE, PipelinePolicy, SchedulingPolicy
 from cotarget.policies import POLICIES
 from cotarget.sim.fieldpaths import GROUPED, LONE, SECONDS
 from experiments.harness import Experiment, Row, Settings, seeds_of, table
+from experiments.spread import bars, mean_of
 
 CHANCE, PIPELINE = "chance", "pipeline"
+SERVED = ", served"  # of a figure's name: how many targets, beside the reward
 Policy = Callable[[Any], Any]
 
 
@@ -78,43 +80,65 @@ def episode(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> dict[str
     return {"reward": reward, "steps": steps, "served": info.get("served", np.nan)}
 
 
-def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Means over the seeds: reward a step of following; reward, and targets served, of scheduling."""
-    found: dict[str, dict[str, float]] = {}
-    for env, of, policy in dict.fromkeys((row["env"], row["of"], row["policy"]) for row in rows):
-        own = [row for row in rows if (row["env"], row["of"], row["policy"]) == (env, of, policy)]
-        each = [row["reward"] / (row["steps"] if env == FOLLOW else 1) for row in own]
-        found.setdefault(f"{env} {of}", {})[policy] = float(np.mean(each))
-        if env == SCHEDULE:
-            found.setdefault(f"{env} {of}, served", {})[policy] = float(np.mean([row["served"] for row in own]))
+def figures_of(rows: Sequence[Row]) -> dict[str, dict[str, list[float]]]:
+    """Of each figure and policy a value a seed: reward a step of following; reward and targets served of scheduling."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        name, follows = f"{row['env']} {row['of']}", row["env"] == FOLLOW
+        told = {name: row["reward"] / row["steps"]} if follows else {name: row["reward"], name + SERVED: row["served"]}
+        for figure, value in told.items():
+            found.setdefault(figure, {}).setdefault(row["policy"], []).append(value)
     return found
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
+    """Means of the figures over the seeds, with their standard errors."""
+    return {
+        name: {policy: dict(zip(("mean", "error"), mean_of(values), strict=True)) for policy, values in found.items()}
+        for name, found in figures_of(rows).items()
+    }
+
+
+def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """The means."""
+    return {name: {policy: each["mean"] for policy, each in found.items()} for name, found in summary.items()}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
     """Where chance earns as much as the best of the project's own."""
-    return [name for name, found in summary.items() if found[CHANCE] >= max(v for k, v in found.items() if k != CHANCE)]
+    means = bounded(summary)
+    return [name for name, found in means.items() if found[CHANCE] >= max(v for k, v in found.items() if k != CHANCE)]
 
 
 def describe(settings: ScoreSettings, summary: Mapping[str, Any]) -> str:
     """A table for each environment."""
-    texts = [f"means of {seeds_of(settings)}, {settings.seconds:g} s each"]
+    texts = [f"means with standard errors of {seeds_of(settings)}, {settings.seconds:g} s each"]
     for env in (FOLLOW, SCHEDULE):
         own = {name: found for name, found in summary.items() if name.startswith(env)}
-        head = (env, *next(iter(own.values())))
-        texts.append(table(head, ([name.removeprefix(env).strip(), *found.values()] for name, found in own.items())))
+        lines = (
+            [name.removeprefix(env).strip(), *("{mean:.3g} +- {error:.2g}".format(**each) for each in found.values())]
+            for name, found in own.items()
+        )
+        texts.append(table((env, *next(iter(own.values()))), lines))
     return "\n\n".join(texts)
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Each policy a bar."""
-    found = summarise(rows)
-    for ax, env in zip(figure.subplots(1, 2), (FOLLOW, SCHEDULE), strict=True):
-        own = {name.removeprefix(env).strip(): each for name, each in found.items() if name.startswith(env)}
-        policies = list(next(iter(own.values())))
+    """Each policy a bar: means with standard errors, a point a seed."""
+    found = figures_of(rows)
+    panels = {
+        (FOLLOW, "reward a step"): [name for name in found if name.startswith(FOLLOW)],
+        (SCHEDULE, "reward"): [name for name in found if name.startswith(SCHEDULE) and not name.endswith(SERVED)],
+        (SCHEDULE, "targets served"): [name for name in found if name.endswith(SERVED)],
+    }
+    figure.set_size_inches(12, 4.2)
+    for ax, ((env, label), names) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
+        policies = list(found[names[0]])
         for i, policy in enumerate(policies):
-            ax.bar(np.arange(len(own)) + 0.8 * i / len(policies), [each[policy] for each in own.values()],
-                   0.7 / len(policies), label=policy)  # fmt: skip
-        ax.set(title=env, ylabel="reward", xticks=range(len(own)), xticklabels=list(own))
+            at = [place + 0.8 * (i - (len(policies) - 1) / 2) / len(policies) for place in range(len(names))]
+            bars(ax, at, [found[name][policy] for name in names], 0.7 / len(policies), label=policy)
+        targets = [name.removeprefix(env).removesuffix(SERVED).strip() for name in names]
+        ax.set(title=env, ylabel=label, xticks=range(len(names)), xticklabels=targets)
         ax.legend(frameon=False)
 
 
@@ -130,6 +154,7 @@ EXPERIMENT = Experiment(
     plot,
     missed,
     cost_s=60.0,
+    bounded=bounded,
 )
 
 if __name__ == "__main__":

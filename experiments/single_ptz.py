@@ -32,6 +32,7 @@ from cotarget.simconfig import SimConfig
 from experiments.harness import Experiment, Row, Settings, seeds_of, table
 from experiments.mounted import check_above
 from experiments.single_runs import PAIR, WAYS, held
+from experiments.spread import bars, mean_of
 
 WIDE_PX = SimConfig().fixed.focal_px[0]
 LEAST_MISS = 0.05
@@ -99,7 +100,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
         mine = [row for row in rows if (row["target"], row["way"]) == (name, way)]
         found: dict[str, float] = {}
         for key in FIGURES:
-            found[key], found[f"{key}_error"] = _mean(mine, key)
+            found[key], found[f"{key}_error"] = mean_of(_told(mine, key))
         times = [math.inf if row["time_to_acquire_s"] is None else row["time_to_acquire_s"] for row in mine]
         at = dict(zip(("low", "median", "high"), np.quantile(times, (0.25, 0.5, 0.75), method="nearest"), strict=True))
         found |= {f"time_to_acquire_s_{part}": float(value) for part, value in at.items()}
@@ -107,11 +108,9 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
     return summary
 
 
-def _mean(rows: Sequence[Row], key: str) -> tuple[float, float]:
-    """Mean of a figure over the rows that have it, and its standard error."""
-    values = [float(row[key]) for row in rows if row[key] is not None]
-    error = float(np.std(values, ddof=1) / math.sqrt(len(values))) if len(values) > 1 else math.nan
-    return (float(np.mean(values)) if values else math.nan), error
+def _told(rows: Sequence[Row], key: str) -> list[float]:
+    """A figure's values in the rows that have it."""
+    return [float(row[key]) for row in rows if row[key] is not None]
 
 
 def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -169,11 +168,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
         for i, way in enumerate(ways):
             mine = [[r for r in rows if (r["target"], r["way"]) == (name, way)] for name in targets]
             x = np.arange(len(targets)) + (i - (len(ways) - 1) / 2) * 0.8 / len(ways)
-            means, errors = np.array([_mean(each, key) for each in mine]).T
-            ax.bar(x, means, 0.75 / len(ways), yerr=np.nan_to_num(errors), capsize=3, label=way, **styles[i])
-            for at, each in zip(x, mine, strict=True):
-                values = [row[key] for row in each if row[key] is not None]
-                ax.plot([at] * len(values), values, ".", ms=3, color="k")
+            bars(ax, x.tolist(), [_told(each, key) for each in mine], 0.75 / len(ways), label=way, **styles[i])
         ax.set(ylabel=label, ylim=(0, None if key.endswith("_s") else 1.02))
         ax.set_xticks(range(len(targets)), targets)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)

@@ -1,4 +1,4 @@
-"""A figure over the seeds: its median, the least and the largest, in numbers, in words and drawn."""
+"""A figure over the seeds: its median, the least and the largest, or its mean, in numbers, in words and drawn."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,6 +26,13 @@ def spread_of(values: Iterable[float]) -> dict[str, float]:
     told = list(values)
     three = (np.median(told), min(told), max(told)) if told else (np.nan,) * 3
     return dict(zip(("median", "least", "largest"), map(float, three), strict=True))
+
+
+def mean_of(values: Iterable[float]) -> tuple[float, float]:
+    """Mean of values and its standard error; nan of none, and an error of nan of one."""
+    told = list(values)
+    error = float(np.std(told, ddof=1) / math.sqrt(len(told))) if len(told) > 1 else math.nan
+    return (float(np.mean(told)) if told else math.nan), error
 
 
 def in_words(found: Mapping[str, float], form: str = "") -> str:
@@ -67,6 +74,22 @@ def points(ax: "Axes", at: float, values: Sequence[float], **how: Any) -> None:
         reach = [[found["median"] - found["least"]], [found["largest"] - found["median"]]]
         bar = ax.errorbar([at], [found["median"]], yerr=reach, fmt="_", markersize=12, capsize=3, **how)
         ax.plot([at + BESIDE] * len(values), values, ".", color=bar.lines[0].get_color(), alpha=0.5)
+
+
+def bars(ax: "Axes", at: Sequence[float], values: Sequence[Sequence[float]], width: float, **how: Any) -> None:
+    """Draw the mean of each group of values as a bar with its standard error, and each value as a point on it.
+
+    Args:
+        ax: where.
+        at: each group's place on the x axis.
+        values: of each group.
+        width: of a bar.
+        how: colour and label, as matplotlib has them.
+    """
+    means, errors = np.array([mean_of(each) for each in values]).T
+    ax.bar(at, means, width, yerr=np.nan_to_num(errors), capsize=3, **how)
+    for place, each in zip(at, values, strict=True):
+        ax.plot([place] * len(each), each, ".", ms=3, color="k")
 
 
 def by_way(axes: "Iterable[Axes]", rows: Sequence[Row], titles: Mapping[str, str]) -> None:

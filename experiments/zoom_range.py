@@ -20,11 +20,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration, calibrate_rig, predicted_pointing
-from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import RigConfig, SimConfig, SimEffects
 from cotarget.geometry import RigidTransform, angle_between
 from cotarget.judging import pointing_errors
-from cotarget.pantilt import HeadGeometry
+from cotarget.oracle import true_calibration
 from cotarget.safety import SafeRig
 from cotarget.servo import reach_of
 from cotarget.sim.truth import Truth
@@ -67,7 +66,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
         world = SimWorld(config)
         with SafeRig(world.rig, config.safety) as rig:
             calibration = calibrate_rig(rig, config.board, seed=seed)
-            reach, truth = reach_of(rig), world.truth()
+            reach, truth, exact = reach_of(rig), world.truth(), true_calibration(world, stops=FOCAL_LENGTHS)
             for i, nominal in enumerate(np.geomspace(*reach.focal_px, FOCAL_LENGTHS)):
                 judged = functools.partial(
                     pointing_errors, truth=truth, reach=reach, nominal_px=float(nominal), count=settings.targets
@@ -84,10 +83,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
                     **lens_errors(calibration, truth, float(nominal)),
                 }
                 if HEADS[head]:
-                    for name, one_calibration in (
-                        ("rounded", calibration),
-                        ("rounding", true_calibration(config, truth, float(nominal))),
-                    ):
+                    for name, one_calibration in (("rounded", calibration), ("rounding", exact)):
                         rng = np.random.default_rng((seed, STREAM, i))
                         rounded = judged(one_calibration, rng=rng, step=reach.step)
                         row[f"{name}_rms_deg"] = rms(np.degrees(rounded))
@@ -117,20 +113,6 @@ def lens_errors(calibration: Calibration, truth: Truth, nominal_px: float) -> di
 def truth_hand(truth: Truth) -> RigidTransform:
     """The true T_head_zoom, from the world's own poses at home."""
     return truth.T_world_base.inv() * truth.T_world_camera("zoom", 0.0)
-
-
-def true_calibration(config: RigConfig, truth: Truth, nominal_px: float) -> Calibration:
-    """What a calibration without any error would be at one focal length."""
-    sim, lens = config.sim, truth.zoom_lens_for(nominal_px)
-    to_pupil = RigidTransform.from_translation([0.0, 0.0, lens.pupil])
-    fixed = truth.fixed_lens
-    return Calibration(
-        fixed=Intrinsics(fixed.size, fixed.focal_px, fixed.center_px, fixed.distortion),
-        zoom=ZoomLens((nominal_px,), (Intrinsics(lens.size, lens.focal_px, lens.center_px, lens.distortion),)),
-        T_zoom0_fixed=to_pupil.inv() * sim.T_zoom0_fixed,
-        T_head_zoom=sim.T_head_zoom * to_pupil,
-        head=HeadGeometry(sim.head.axis_offset_mm / 1000, np.radians(sim.head.squareness_deg)),
-    )
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
