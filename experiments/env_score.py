@@ -139,7 +139,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
             bars(ax, at, [found[name][policy] for name in names], 0.7 / len(policies), label=policy)
         targets = [name.removeprefix(env).removesuffix(SERVED).strip() for name in names]
         ax.set(title=env, ylabel=label, xticks=range(len(names)), xticklabels=targets)
-        ax.legend(frameon=False)
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=2, frameon=False)
 
 
 SETTINGS = ScoreSettings()
