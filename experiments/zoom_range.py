@@ -11,6 +11,7 @@ stands beside that of a true calibration rounded alike.
 
 import dataclasses
 import functools
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from cotarget.calibration import Calibration, calibrate_rig, predicted_pointing
 from cotarget.config import RigConfig, SimConfig, SimEffects
@@ -197,6 +199,9 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
             (line,) = ax.loglog(focal, middle, label=words)
             ax.fill_between(focal, low, high, color=line.get_color(), alpha=0.25, lw=0)
         ax.set(title=f"head: {head}", xlabel="nominal focal length [px]", ylabel="rms pointing error [degrees]")
+        octaves = focal[0] * 2.0 ** np.arange(1 + math.floor(math.log2(focal[-1] / focal[0])))
+        ax.set_xticks(octaves, [f"{each:.0f}" for each in octaves])
+        ax.xaxis.set_minor_locator(NullLocator())
         ax.legend(frameon=False)
 
 
