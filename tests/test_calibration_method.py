@@ -152,6 +152,32 @@ def test_an_outlying_view_is_left_out_and_named():
     assert "px off" in residuals.rejected[0].reason
 
 
+def without_a_head(turned):
+    """Pairs of views of ten placements; in the first so many the zoom camera has been turned, and nobody says so."""
+    truth, rng = Truth(), np.random.default_rng(4)
+    views = synthetic_views(truth, POINTS, rng, boards=30, moved=1, pan_range=0.1, tilt_range=0.1)
+    pairs = []
+    for board in dict.fromkeys(view.board for view in views):
+        fixed, *zoomed = (view for view in views if view.board == board)
+        if len(zoomed) == 2 and zoomed[0].pan == 0 and len(pairs) < 20:
+            pairs += [fixed, replace(zoomed[1 if len(pairs) < 2 * turned else 0], pan=0.0, tilt=0.0)]
+    assert len(pairs) == 20
+    return pairs
+
+
+@pytest.mark.parametrize("method", ["joint", "sequential"])
+@pytest.mark.parametrize("turned", [4, 10])
+def test_two_cameras_that_did_not_stand_still_are_refused(turned, method):
+    with pytest.raises(CalibrationError, match=r"contradict each other: .* must stand still"):
+        calibrate_views(without_a_head(turned), BOARD, SIZES, options=Options(method))
+
+
+def test_two_cameras_that_stood_still_are_not():
+    found = calibrate_views(without_a_head(0), BOARD, SIZES)
+    off = found.T_zoom0_fixed.translation - Truth().gamma.translation
+    assert (np.abs(off) < 3 * np.array([found.covariance.sigma(f"T_zoom0_fixed.t{axis}") for axis in "xyz"])).all()
+
+
 def test_what_cannot_be_calibrated_is_refused_in_words():
     views = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=3)
     with pytest.raises(CalibrationError, match=r"fixed camera: 0 usable views.*at least 3"):

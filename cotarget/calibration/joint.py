@@ -25,7 +25,7 @@ from cotarget.calibration.observability import limits_of_use, name_directions, w
 from cotarget.calibration.parameters import ALL_BLOCKS, Block, RigModel, parameter_names, stop_of
 from cotarget.calibration.placing import place_boards
 from cotarget.calibration.robust import MEDIAN_TO_SIGMA, rms, robust_sigma
-from cotarget.calibration.sequential import Solution, Steps, both_cameras, stereo
+from cotarget.calibration.sequential import Solution, Steps, both_cameras, check_pairs, stereo
 from cotarget.calibration.start import at_home, of_both, pairs_at_home, rough_gamma, rough_hand
 from cotarget.calibration.stops import check_stops, fit_stop, lens_prior, with_stop
 from cotarget.calibration.uncertainty import covariance_of
@@ -115,6 +115,7 @@ def joint(
         again = fit(with_k3.model, everything.views, points, with_k3.free, prior=prior)
         result, wrong, left_out = _cleaned(again, points, prior)
     rejected += left_out
+    check_pairs(steps, rms(result.residuals))
     if not options.insist and (text := undetermined(result)):
         raise CalibrationError(text)
     covariance = covariance_of(result)
@@ -281,7 +282,7 @@ def _with_k3_where_needed(found: Fit, points: Array, prior: Prior) -> tuple[Fit,
 
 def _residuals(steps: Steps, result: Fit, points: Array, rejected: Sequence[Rejected], wrong: int) -> Residuals:
     """The figures of each part by itself, as everybody states them, and those of the whole."""
-    pairs = pairs_at_home(steps.views)
+    pairs = pairs_at_home(result.views)
     zoom = np.array([view.camera == "zoom" for view in result.views])
     return Residuals(
         fixed_rms_px=steps.fixed_fit.rms_px,

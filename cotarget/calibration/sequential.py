@@ -21,6 +21,10 @@ from cotarget.camera import ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
 
+# Pictures of two cameras that did not stand still are explained so many times worse together than each camera's alone;
+# lenses and boards that are not as modelled cost less than twice.
+CONTRADICTION, CONTRADICTION_FLOOR_PX = 3.0, 1.0
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -68,6 +72,25 @@ def stereo(model: RigModel, pairs: Sequence[View], points: Array) -> Fit:
     return fit(place_boards(start, pairs, points), pairs, points, {"gamma"})
 
 
+def check_pairs(steps: Steps, together_px: float) -> None:
+    """Refuse pictures of two cameras without a head that contradict each other: alone each explains its own far better.
+
+    Args:
+        steps: each camera by itself.
+        together_px: rms of both with one offset between them [px].
+
+    Raises:
+        CalibrationError: they do.
+    """
+    alone_px = max(steps.fixed_fit.rms_px, steps.zoom_fit.rms_px)
+    if not steps.has_head and together_px > max(CONTRADICTION * alone_px, CONTRADICTION_FLOOR_PX):
+        raise CalibrationError(
+            f"the two cameras contradict each other: no one offset between them explains the corners to better than "
+            f"{together_px:.2g} px, where each camera by itself does to {alone_px:.2g} px; both must stand still from "
+            "the first picture to the last, and the two of a pair must show the board in the same place"
+        )
+
+
 def sequential(
     views: Sequence[View],
     points: Array,
@@ -93,6 +116,7 @@ def sequential(
             "needs; the joint method does not"
         )
     stereo_fit = stereo(steps.model, pairs, points)
+    check_pairs(steps, stereo_fit.rms_px)
     model = replace(steps.model, gamma=stereo_fit.model.gamma)
     used, handeye_rms = of_both(steps.views), None
     if steps.has_head:
