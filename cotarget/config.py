@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal
 
 from cotarget.assets import assets_dir
 from cotarget.errors import ConfigError, choices
-from cotarget.hwconfig import HardwareConfig, check_hardware
-from cotarget.simchecks import check_numbers, check_sim
+from cotarget.hwconfig import HardwareConfig
+from cotarget.rigchecks import check_config
 from cotarget.simconfig import (
     Limits,
     Pair,
@@ -275,39 +275,3 @@ def _overlap(own: Pair, soft: Pair | None, where: str) -> Pair:
     if both[0] >= both[1]:
         raise ConfigError(f"{where}: {list(soft or own)} leaves nothing of the device's own range {list(own)}")
     return both
-
-
-def check_config(config: RigConfig, recorded: bool = False) -> None:
-    """Refuse values of the right type that make no sense.
-
-    Args:
-        config: of a rig.
-        recorded: as in `parse_config`.
-
-    Raises:
-        ConfigError: with the key.
-    """
-    check_numbers(config.sim) if recorded else check_sim(config.sim)
-    check_hardware(config.hardware)
-    positive: dict[str, float] = {
-        "board.square": config.board.square,
-        "safety.max_frame_age_s": config.safety.max_frame_age_s,
-        "safety.watchdog_s": config.safety.watchdog_s,
-    }
-    for name, target in config.targets.items():
-        positive |= {f"targets.{name}.size": target.size, f"targets.{name}.wanted_px": target.wanted_px}
-    for where, value in positive.items():
-        if value <= 0:
-            raise ConfigError(f"{where}: {value:g} is not greater than zero")
-    for where, limits in (("safety.pan_deg", config.safety.pan_deg), ("safety.tilt_deg", config.safety.tilt_deg)):
-        if limits is not None and limits[0] >= limits[1]:
-            raise ConfigError(f"{where}: {list(limits)} is not [lowest, highest]")
-    if config.safety.speed_deg_s is not None and config.safety.speed_deg_s <= 0:
-        raise ConfigError(f"safety.speed_deg_s: {config.safety.speed_deg_s:g} is not greater than zero")
-    if config.safety.watchdog_s * config.rate_hz <= 1:
-        raise ConfigError(
-            f"safety.watchdog_s: {config.safety.watchdog_s:g} s would halt the head between any two frames of the "
-            f"fixed camera, of which {config.rate_hz:g} come a second"
-        )
-    if min(config.board.corners) < 3:
-        raise ConfigError(f"board.corners: {list(config.board.corners)} has fewer than 3 corners a side")

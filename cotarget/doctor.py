@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from cotarget.assets import assets_dir
-from cotarget.errors import ConfigError, CotargetError, EmergencyStopError
+from cotarget.errors import ConfigError, CotargetError, EmergencyStopError, MissingPackageError
 
 if TYPE_CHECKING:
     from cotarget.config import HardwareConfig, RigConfig
@@ -196,6 +196,8 @@ def _fix(error: CotargetError, name: str, there: str) -> str:
     from cotarget.hardware.vapix import LoginError
 
     match error:
+        case MissingPackageError():
+            return "pip install 'cotarget[hardware]'"
         case InUseError():
             return "end the program that has it" + (f", which 'fuser -v {there}' names" if "://" not in there else "")
         case NoPermissionError():

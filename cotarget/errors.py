@@ -11,6 +11,10 @@ class ConfigError(CotargetError):
     """A configuration or a file does not say what it should."""
 
 
+class MissingPackageError(CotargetError):
+    """A package that only some uses need is not installed."""
+
+
 class CalibrationError(CotargetError):
     """The captures or a calibration cannot be used."""
 

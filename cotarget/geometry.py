@@ -17,7 +17,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 Array = npt.NDArray[np.float64]
 
-__all__ = ["Array", "RigidTransform", "Rotation", "angle_between", "pose", "pose_dict", "rot_x", "rot_y"]
+__all__ = ["FARTHEST_M", "Array", "RigidTransform", "Rotation", "angle_between", "pose", "pose_dict", "rot_x", "rot_y"]
+
+FARTHEST_M, WHOLE_TURN_DEG = 1e6, 360.0  # whoever tells of a place that is farther or turned further is mistaken
 
 
 def rot_x(angle: float) -> Rotation:
@@ -31,7 +33,15 @@ def rot_y(angle: float) -> Rotation:
 
 
 def pose(translation: Sequence[float] | Array, rotvec_deg: Sequence[float] | Array) -> RigidTransform:
-    """Make a transform from a translation [m], (3,), and a rotation vector [degrees], (3,)."""
+    """Make a transform from a translation [m], (3,), and a rotation vector [degrees], (3,).
+
+    Raises:
+        ValueError: it is farther than anything between two cameras, or turned by more than a whole turn.
+    """
+    if np.abs(translation).max() > FARTHEST_M:
+        raise ValueError(f"translation: {list(translation)} is farther than {FARTHEST_M:g} m")
+    if np.abs(rotvec_deg).max() > WHOLE_TURN_DEG:
+        raise ValueError(f"rotvec_deg: {list(rotvec_deg)} is more than a whole turn, {WHOLE_TURN_DEG:g} degrees")
     return RigidTransform.from_components(
         np.asarray(translation, dtype=float), Rotation.from_rotvec(rotvec_deg, degrees=True)
     )

@@ -14,6 +14,8 @@ from cotarget.simconfig import TARGETS, SimCamera, SimConfig, SimZoomCamera, spl
 CHECKED_FOCALS = 33
 # Farther than any lens is long: an entrance pupil that moves so far was given in millimetres [m].
 FARTHEST_PUPIL = 1.0
+# Beyond these it is another unit that was meant: of millimetres, degrees, frames a second and grey levels.
+MOST_AXIS_OFFSET_MM, MOST_SQUARENESS_DEG, MOST_RATE_HZ, MOST_NOISE = 1000.0, 45.0, 1000.0, 255.0
 MODEL_SUFFIXES = (".obj", ".stl", ".xml")  # of what a target of one's own is made of
 
 
@@ -75,6 +77,17 @@ def check_numbers(sim: SimConfig) -> None:
     for where, values in not_negative.items():
         if min(values) < 0:
             raise ConfigError(f"{where}: {min(values):g} is negative")
+    at_most: dict[str, tuple[float, float]] = {
+        "sim.head.axis_offset_mm": (abs(sim.head.axis_offset_mm), MOST_AXIS_OFFSET_MM),
+        "sim.head.squareness_deg": (abs(sim.head.squareness_deg), MOST_SQUARENESS_DEG),
+        "sim.fixed.rate_hz": (sim.fixed.rate_hz, MOST_RATE_HZ),
+        "sim.zoom.rate_hz": (sim.zoom.rate_hz, MOST_RATE_HZ),
+        "sim.fixed.noise": (sim.fixed.noise, MOST_NOISE),
+        "sim.zoom.noise": (sim.zoom.noise, MOST_NOISE),
+    }
+    for where, (value, most) in at_most.items():
+        if value > most:
+            raise ConfigError(f"{where}: {value:g} is more than {most:g}")
     ranges = {
         "sim.head.pan_deg": sim.head.pan_deg,
         "sim.head.tilt_deg": sim.head.tilt_deg,

@@ -121,7 +121,9 @@ def _convert_pose(value: Any, where: str) -> RigidTransform:
             f"{where}: {'unknown' if wrong in value else 'missing'} key '{wrong}'; needed: {choices(keys)}"
         )
     triple = (float, float, float)
-    return pose(
-        _convert_tuple(triple, value["translation"], f"{where}.translation", "[x, y, z]"),
-        _convert_tuple(triple, value["rotvec_deg"], f"{where}.rotvec_deg", "[rx, ry, rz]"),
-    )
+    translation = _convert_tuple(triple, value["translation"], f"{where}.translation", "[x, y, z]")
+    rotvec_deg = _convert_tuple(triple, value["rotvec_deg"], f"{where}.rotvec_deg", "[rx, ry, rz]")
+    try:
+        return pose(translation, rotvec_deg)
+    except ValueError as error:
+        raise ConfigError(f"{where}.{error}") from None

@@ -10,7 +10,7 @@ from cotarget.calibration import Calibration, predicted_pointing
 from cotarget.camera import depth_from_size, focal_for_size
 from cotarget.config import TargetConfig
 from cotarget.errors import UnreachableError
-from cotarget.geometry import Array
+from cotarget.geometry import FARTHEST_M, Array
 from cotarget.pantilt import Pointing, nearest, shortcut, solve
 
 Method = Literal["exact", "paper-table", "paper-example"]
@@ -105,6 +105,8 @@ def point_at(calibration: Calibration, pixel: Array, depth: float) -> Array:
     """
     if not (np.isfinite(depth) and depth > 0):
         raise UnreachableError(f"a target at a depth of {depth:g} m is not in front of the fixed camera")
+    if depth > FARTHEST_M:
+        raise UnreachableError(f"a target at a depth of {depth:g} m is farther than anything on earth; give metres")
     ray = calibration.fixed.ray(np.asarray(pixel, dtype=float))
     if not np.isfinite(ray).all():
         u, v = pixel

@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from cotarget.cli.arguments import count, not_negative, progress_bar
+from cotarget.cli.parsers import Parser
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.report.wording import count as number_of
-from experiments.arguments import Parser, check_folder
+from experiments.arguments import check_folder
 from experiments.bounds import EXPECTED, tighten
 from experiments.cases import Case, Known, choose, known_experiments
 from experiments.cluster import check_cluster, on_dask
@@ -132,6 +133,8 @@ def _run(given: argparse.Namespace, typed: Sequence[str], known: Known, expected
     )
     if given.report and given.fresh:
         raise ConfigError("--report reports what is there, which --fresh would forget: say one of them")
+    if given.report and not folder.is_dir():
+        raise ConfigError(f"{folder}: no such folder; --out names one with results")
     if given.update_expected and not all(case.has_bounds for case in chosen):
         raise ConfigError("the bounds are of quick runs as they are: --update-expected goes with --quick alone")
     cases, skipped = _split(chosen, named=bool(given.names))

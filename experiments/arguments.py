@@ -1,21 +1,9 @@
-"""What the experiments' commands share: mistakes end in one line, and before the work."""
+"""What the experiments' commands share: mistakes in their options end before the work."""
 
-import argparse
 import os
 from pathlib import Path
-from typing import NoReturn
 
 from cotarget.errors import ConfigError
-
-USAGE = 2  # exit status of wrong arguments
-
-
-class Parser(argparse.ArgumentParser):
-    """A parser whose mistakes end in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong, without the usage in front of it."""
-        self.exit(USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
 def check_folder(out: Path) -> None:

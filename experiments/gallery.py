@@ -11,9 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from cotarget.cli.parsers import Parser
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.outputs import write_whole
-from experiments.arguments import Parser, check_folder
+from experiments.arguments import check_folder
 from experiments.harness import FIGURE
 from experiments.paper_loop import WAYS, picture_name
 

@@ -24,8 +24,8 @@ from cotarget.calibration.bundle import fit
 from cotarget.calibration.placing import place_boards
 from cotarget.calibration.uncertainty import model_of
 from cotarget.cli.arguments import corners, count, positive
+from cotarget.cli.parsers import Parser
 from cotarget.config import BoardConfig
-from experiments.arguments import Parser
 from experiments.harness import Experiment, Row, Settings, rms, table
 
 NOT_HELD_OUT = Options(folds=0)

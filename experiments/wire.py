@@ -21,9 +21,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from cotarget.cli.arguments import count, not_negative
+from cotarget.cli.parsers import Parser
 from cotarget.errors import ConfigError, choices
 from experiments import wire_age, wire_command, wire_faults, wire_latency, wire_parity, wire_polls
-from experiments.arguments import Parser
 from experiments.harness import TERMINATED, Experiment, Row, Settings, table
 from experiments.wire_figures import FAULT_COLUMNS, PART_COLUMNS, bounded, missed, summarise
 

@@ -20,7 +20,7 @@ import pytest
 
 from cotarget.emulators.axis import AxisServer
 from cotarget.emulators.plant import Feed, Picture
-from cotarget.errors import ConfigError, DeviceError, StaleFrameError
+from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
 from cotarget.hardware import axis, vapix
 from cotarget.hardware.axis import AxisCamera, probe
 from cotarget.hardware.clock import MonotonicClock
@@ -402,7 +402,7 @@ def test_an_address_that_is_none(url, words):
 
 def test_httpx_is_named_where_it_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "httpx", None)
-    with pytest.raises(DeviceError, match=r"need httpx: pip install 'cotarget\[hardware\]'"):
+    with pytest.raises(MissingPackageError, match=r"need httpx: pip install 'cotarget\[hardware\]'"):
         AxisCamera(HardwareFixed(url="http://127.0.0.1"), MonotonicClock())
 
 

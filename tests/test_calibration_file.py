@@ -116,6 +116,10 @@ def edited(tmp_path, edit):
     (lambda t: t["zoom"].update(stops=[]), "zoom.stops: is empty"),
     (lambda t: t["zoom"]["stops"].reverse(), "nominal_px do not increase"),
     (lambda t: t["zoom"]["stops"][1].update(distortion=[0] * 4), r"zoom.stops\[1\].distortion: has 4 values"),
+    (
+        lambda t: t["T_zoom0_fixed"].update(rotvec_deg=[1e308, 1e308, 3]),
+        r"T_zoom0_fixed.rotvec_deg: \[1e\+308, 1e\+308, 3.0\] is more than a whole turn",
+    ),
     (lambda t: t.update(T_zoom0_fixed=None), "T_zoom0_fixed: None is not an object"),
     (lambda t: t["T_head_zoom"].pop("rotvec_deg"), "missing key 'T_head_zoom.rotvec_deg'"),
     (lambda t: t["head"].update(squareness_deg=True), "head.squareness_deg: True is not a finite number"),

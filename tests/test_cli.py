@@ -138,6 +138,10 @@ MISTAKES = {
     "follow without a rig": (changed(FOLLOW, "--rig", "none.toml"), ["none.toml: no such file"]),
     "follow an unknown target": (changed(FOLLOW, "--target", "dog"), ["unknown target 'dog'", "bird, book, person"]),
     "detect an unknown target": ([*changed(DETECT, "--target", "dog"), "text.mp4"], ["unknown target 'dog'"]),
+    "a size that nothing has": ([*AIM, "--size-px", "5000", "--target", "book"],
+                                ["--size-px: 5000 px is no size that a book of 0.234 m has", "640x480"]),
+    "a size that vanishes": ([*AIM, "--size-px", "1e-320", "--target", "book"], ["--size-px: ", "is no size"]),
+    "a depth beyond the sky": ([*AIM, "--depth", "1e300"], ["farther than anything on earth"]),
     "aim with an unknown target": ([*AIM, "--size-px", "9", "--target", "dog"], ["unknown target 'dog'", "book"]),
     # calibration.json
     "no calibration": (changed([*AIM, "--depth", "5"], "--calibration", "none.json"), ["none.json: no such file"]),
@@ -154,6 +158,7 @@ MISTAKES = {
     "no photos": ([*FROM, "nothing", *PHOTOS], ["nothing: no file matches 'left*.png'"]),
     "no folder": ([*FROM, "none", *PHOTOS], ["none: no such folder"]),
     "no captures": ([*FROM, "nothing"], ["holds no index.json of captures"]),
+    "no folder of captures": ([*FROM, "none"], ["none: no such folder; --from takes one of captures or photos"]),
     "a malformed index": ([*FROM, "index"], ["index.json: ", "board"]),
     "captures without the fixed camera": ([*FROM, "no_fixed"], ["no_fixed: has no capture of the fixed camera"]),
     "captures without the zoom camera": ([*FROM, "no_zoom"], ["no_zoom: has no capture of the zoom camera"]),
@@ -316,14 +321,14 @@ def test_aim_tells_json_with_the_documented_keys(folder, capsys):
 @pytest.mark.parametrize(
     ("depth", "more", "doubted"),
     [
-        ("0.01", [], "book fits into the fixed view only from 0.25 m"),  # 0.234 m at 686 px are 640 px at 0.251 m
-        ("0.24", [], "book fits into the fixed view only from 0.25 m"),
+        ("0.01", [], "no target, not even the book, fits into the fixed view nearer than 0.25 m"),  # 640 px at 0.251 m
+        ("0.24", [], "no target, not even the book, fits into the fixed view nearer than 0.25 m"),
         ("0.26", [], None),
         (
             "2",
             ["--target", "person"],
-            "person fits into the fixed view only from 2.5 m",
-        ),  # 1.75 m at 684 px are 480 px at 2.49 m
+            "the person does not fit into the fixed view nearer than 2.5 m",  # 1.75 m at 684 px are 480 px at 2.49 m
+        ),
         ("2.6", ["--target", "person"], None),
     ],
 )
@@ -333,7 +338,7 @@ def test_a_depth_at_which_no_target_fits_into_the_view_is_doubted(folder, capsys
     assert json.loads(out)["depth_plausible"] is (doubted is None)
     assert len(err.splitlines()) == (doubted is not None)
     if doubted is not None:
-        assert err == f"cotarget aim: the {doubted} on: is a depth of {depth} m meant?\n"
+        assert err == f"cotarget aim: {doubted}: is a depth of {depth} m meant?\n"
 
 
 def test_aim_takes_depth_from_a_size_and_focal_length_from_a_close_up(folder, capsys):

@@ -94,7 +94,7 @@ def sessions(monkeypatch):
 
 
 CALIBRATE = ("calibrate", "--rig", "rig.toml", "--captures", "kept")
-HINT = "the captures so far are in kept: cotarget calibrate --from kept goes on with them"
+HINT = "the captures so far are in kept: cotarget calibrate --from kept fits them"
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,21 @@ def test_offsets_and_targets_are_taken(tmp_path):
             "[targets.bird]\ndimension = 'depth'",
             "targets.bird.dimension: 'depth' is not one of: height, width, wingspan",
         ),
-        ("[board]\ncorners = [2, 6]", "board.corners: [2, 6] has fewer than 3 corners a side"),
+        ("[board]\ncorners = [2, 6]", "board.corners: 2x6 has fewer than 3 corners a side"),
+        (
+            "[sim]\nT_zoom0_fixed = { translation = [0, 0, 0], rotvec_deg = [1e308, 1e308, 0] }",
+            "sim.T_zoom0_fixed.rotvec_deg: [1e+308, 1e+308, 0.0] is more than a whole turn, 360 degrees",
+        ),
+        (
+            "[sim]\nT_zoom0_fixed = { translation = [1e300, 0, 0], rotvec_deg = [0, 0, 0] }",
+            "sim.T_zoom0_fixed.translation: [1e+300, 0.0, 0.0] is farther than 1e+06 m",
+        ),
+        ("[sim.fixed]\nrate_hz = 1e9", "sim.fixed.rate_hz: 1e+09 is more than 1000"),
+        ("[sim.head]\nsquareness_deg = -90", "sim.head.squareness_deg: 90 is more than 45"),
+        ("[board]\ncorners = [201, 400]", "board.corners: 201x400 has more than 100 corners a side"),
+        ("[board]\ncorners = [8, 6]", "one count must be odd and the other even, like 8x7"),
+        ("[safety]\nstop_file = '.'", "safety.stop_file: '.' is a folder; name a file in it, as 'stop'"),
+        ("[safety]\nstop_file = 'run/..'", "safety.stop_file: 'run/..' is a folder; name a file in it, as 'stop'"),
         ("[safety]\nwatchdog_s = 0", "safety.watchdog_s: 0 is not greater than zero"),
         ("[safety]\nwatchdog_s = inf", "safety.watchdog_s: inf is not a finite number"),
         (

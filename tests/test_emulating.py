@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from cotarget.calibration import save_calibration
-from cotarget.config import RigConfig
+from cotarget.config import RigConfig, load_config
 from tests.test_cli import call, true_calibration
 
 
@@ -32,6 +32,18 @@ def test_it_tells_who_is_there_to_be_followed(folder, capsys, rig, there):
     status, out, err = call(capsys, "emulate", *rig, "--write", "hw.toml", "--seconds", "0.01")
     assert (status, err) == (0, "")
     assert f"\ntargets  {there}\n" in out
+
+
+@pytest.mark.wire
+@pytest.mark.render
+def test_a_rig_toml_of_the_same_name_is_kept(folder, capsys):
+    (folder / "mine.toml").write_text("[sim]\n")
+    status, _, err = call(capsys, "emulate", "--write", "mine.toml", "--seconds", "0.01")
+    assert status == 0
+    assert err == "mine.toml: the one of before is kept as mine.previous-1.toml\n"
+    assert (folder / "mine.previous-1.toml").read_text() == "[sim]\n"
+    written = load_config(folder / "mine.toml")
+    assert (written.backend, written.board) == ("hardware", RigConfig().board)
 
 
 @pytest.mark.slow

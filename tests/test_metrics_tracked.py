@@ -116,7 +116,8 @@ def test_labels_of_a_spreadsheet_begin_with_a_mark(tmp_path):
     ("rows", "head", "why"),
     [
         (["1,2,3,4"], "frame,x_px,y_px,width_px", "no column 'height_px'"),
-        (["1,2,3,4"], "frame,x_px,y_px,width_px,height_px", "number is missing"),
+        (["1,2,3,4"], "frame,x_px,y_px,width_px,height_px", "line 2 has no number for height_px"),
+        (["1,2,3,4,5", "2,nan,3,4,5"], "frame,x_px,y_px,width_px,height_px", "line 3 has no number for x_px"),
         (["1,2,3,x,5"], "frame,x_px,y_px,width_px,height_px", "could not convert"),
         (["1,2,3,0,5"], "frame,x_px,y_px,width_px,height_px", "above 0"),
         (["1.5,2,3,4,5"], "frame,x_px,y_px,width_px,height_px", "whole frame"),

@@ -6,6 +6,7 @@ import os
 import socket
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ import pytest
 
 from cotarget import cli, doctor
 from cotarget.calibration import save_calibration
-from cotarget.config import RigConfig
+from cotarget.config import BoardConfig, RigConfig, parse_config
 from cotarget.doctor import Finding
 from cotarget.emulators.emulation import copied_tables
 from cotarget.errors import EmergencyStopError
@@ -161,6 +162,7 @@ BROKEN = {
     "an impossible value": "[hardware.head]\nbaud = 9601\n[board]\nsquare = -1\n",
     "an unknown table": "[hardwear]\n",
     "another mistake beside it": "",
+    "no TOML at all": "[sim\nscene = indoor\n",
 }
 
 
@@ -280,6 +282,34 @@ def test_the_doctor_tells_which_devices_do_not_answer(folder, capsys, monkeypatc
     status, out, _ = call(capsys, "doctor", "--rig", "nameless.toml")
     assert status == 1
     assert "MISSING  hardware.head: is not configured\n" in out
+
+
+def test_the_doctor_tells_how_to_get_a_package_that_a_device_needs(folder, capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "_rendering", lambda: Finding("rendering", True, "replaced: it takes a second"))
+    monkeypatch.setitem(sys.modules, "httpx", None)
+    lines = call(capsys, "doctor", "--rig", "hw.toml")[1].splitlines()
+    at = next(i for i, line in enumerate(lines) if "hardware.fixed: devices on HTTP need httpx" in line)
+    assert lines[at + 1].strip() == "fix: pip install 'cotarget[hardware]'"
+
+
+@pytest.mark.parametrize("more", ["", "[board]\ncorners = [9, 6]\n"])
+@pytest.mark.parametrize("command", [("calibrate", "--rig", "hw.toml", "--out", "new.json")])
+def test_real_squares_have_no_size_by_default(folder, capsys, command, more):
+    (folder / "hw.toml").write_text(HARDWARE + more)
+    status, out, err = call(capsys, *command)
+    assert (status, out) == (1, "")
+    assert err.startswith("cotarget calibrate: hw.toml: does not say how large the squares of your board are; ")
+    assert "[board] square = 0.025" in err
+    assert not (folder / "new.json").exists()
+    (folder / "hw.toml").write_text(HARDWARE + "[board]\nsquare = 0.025\n")
+    assert "squares" not in call(capsys, *command)[2]
+
+
+def test_a_printed_board_is_told_as_the_rig_wants_it(folder, capsys):
+    status, out, _ = call(capsys, "board", "--out", "board.svg", "--board", "7x6", "--kind", "charuco")
+    assert status == 0
+    said = tomllib.loads(out[out.index("[board]") :])
+    assert parse_config(said).board == BoardConfig("charuco", (7, 6), 0.025)
 
 
 def test_the_doctor_asks_no_devices_of_a_simulated_rig(folder, capsys, monkeypatch):

@@ -210,6 +210,7 @@ def test_figures_that_cannot_be_made_are_told(run, monkeypatch):
         (["tiny", "--scheduler", "tcp://127.0.0.1:1"], "goes with --backend dask"),
         (["tiny", "--update-expected"], "goes with --quick alone"),
         (["tiny", "--report", "--fresh"], "say one of them"),
+        (["tiny", "--report"], "out: no such folder; --out names one with results"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

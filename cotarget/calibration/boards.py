@@ -26,10 +26,10 @@ from cotarget.calibration.gridsearch import (
     through,
 )
 from cotarget.config import BoardConfig
-from cotarget.errors import ConfigError
 from cotarget.geometry import Array
 from cotarget.pattern import cells, check_markers
 from cotarget.rig import Image
+from cotarget.rigchecks import check_corners
 
 FILLABLE_PX = (-10000.0, 10000.0)  # OpenCV paints no polygons whose corners are much farther out
 LARGEST_BEND = 0.4  # of a square, of the corners from a plane's picture; a lens bends real ones by 0.3
@@ -40,19 +40,11 @@ def check_board(board: BoardConfig) -> None:
     """Refuse a board that looks the same upside down, or has more squares than there are markers.
 
     Raises:
-        ConfigError: the counts of corners are below 3; of a chessboard, both even or both odd; of a ChArUco board, too
-            many.
+        ConfigError: there are too few or too many corners; or, of a chessboard, both counts are even or both odd.
     """
-    columns, rows = board.corners
-    if min(columns, rows) < 3:
-        raise ConfigError(f"board.corners: {columns}x{rows} has fewer than 3 corners a side")
+    check_corners(board)
     if board.kind == "charuco":
         check_markers(board)
-    elif (columns + rows) % 2 == 0:
-        raise ConfigError(
-            f"board.corners: {columns}x{rows} looks the same upside down; "
-            f"one count must be odd and the other even, like {columns}x{rows + 1}"
-        )
 
 
 def board_points(board: BoardConfig) -> Array:

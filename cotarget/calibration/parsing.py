@@ -131,7 +131,11 @@ def as_pose(value: Any, where: str) -> RigidTransform:
     """Expect a translation [m] and a rotation vector [degrees]."""
     table = as_table(value, where)
     translation = as_numbers(get(table, "translation", where), join(where, "translation"), 3)
-    return pose(translation, as_numbers(get(table, "rotvec_deg", where), join(where, "rotvec_deg"), 3))
+    rotvec_deg = as_numbers(get(table, "rotvec_deg", where), join(where, "rotvec_deg"), 3)
+    try:
+        return pose(translation, rotvec_deg)
+    except ValueError as error:
+        raise CalibrationError(join(where, str(error))) from None
 
 
 def short(value: Any) -> str:

@@ -33,11 +33,14 @@ def aim(options: argparse.Namespace) -> None:
         raise ConfigError("--size-px needs --target NAME, whose true size gives the depth")
     if options.wanted_px is not None and target is None:
         raise ConfigError("--wanted-px needs --target NAME, whose true size gives the focal length")
-    depth = (
-        options.depth
-        if target is None or options.size_px is None
-        else depth_of(calibration, target, options.size_px, np.array(options.pixel))
-    )
+    depth = options.depth
+    if target is not None and options.size_px is not None:
+        depth = depth_of(calibration, target, options.size_px, np.array(options.pixel))
+        if not math.isfinite(depth):
+            raise ConfigError(
+                f"--size-px: {options.size_px:g} px is no size that a {options.target} of {target.size:g} m has in the "
+                "fixed camera's {}x{} image".format(*calibration.fixed.size)
+            )
     pitch_mm = calibration.pitch_mm or config.pitch_mm
     shortest, longest = config.focal_range_px
     if options.rig is None:  # the calibration knows its own lens's shortest focal length
@@ -74,9 +77,10 @@ def aim(options: argparse.Namespace) -> None:
     nearest, name = min(_fits_from(calibration, config.targets if target is None else {options.target: target}))
     plausible = found.depth >= nearest
     if not plausible:
+        fits = f"no target, not even the {name}, fits" if target is None else f"the {name} does not fit"
         print(
-            f"cotarget aim: the {name} fits into the fixed view only from {nearest:.2g} m on: is a depth of "
-            f"{found.depth:g} m meant?",
+            f"cotarget aim: {fits} into the fixed view nearer than {nearest:.2g} m: is a depth of {found.depth:g} m "
+            "meant?",
             file=sys.stderr,
         )
     print_json(

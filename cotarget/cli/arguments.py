@@ -8,6 +8,7 @@ import math
 import os
 import sys
 import time
+import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -119,6 +120,22 @@ def rig_files(rig: Path | None, config: "RigConfig") -> list[Path | None]:
     templates = [target.template for target in config.targets.values()]
     own = scene if scene.is_file() else None
     return [rig, config.safety.stop_file, config.recording, own, *config.sim.models.values(), *templates]
+
+
+def check_board_is_told(rig: Path, config: "RigConfig") -> None:
+    """Refuse real cameras before a board of which the file does not say how large its squares are.
+
+    All lengths of a calibration are multiples of that, so that nothing else would ever show that it is wrong.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    told = tomllib.loads(rig.read_text(encoding="utf-8")).get("board", {})
+    if config.backend == "hardware" and "square" not in told:
+        raise ConfigError(
+            f"{rig}: does not say how large the squares of your board are; measure ten of them, and say so in metres: "
+            "[board] square = 0.025"
+        )
 
 
 def _real(path: Path) -> Path:

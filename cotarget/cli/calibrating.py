@@ -9,7 +9,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cotarget.cli.arguments import check_outputs, previous_kept, print_json, progress_bar, rig_files
+from cotarget.cli.arguments import (
+    check_board_is_told,
+    check_outputs,
+    previous_kept,
+    print_json,
+    progress_bar,
+    rig_files,
+)
 from cotarget.errors import ConfigError
 from cotarget.outputs import behind_link, check_writable
 
@@ -46,6 +53,7 @@ def calibrate(options: argparse.Namespace) -> None:
 
         if config is not None:
             refuse_if_stopped(config.safety.stop_file)
+            check_board_is_told(options.rig, config)
             with SafeRig(open_rig(config), config.safety) as rig:
                 session = {name: getattr(options, name) for name in _given(options, SESSION)}
                 if options.stops is not None:
@@ -107,7 +115,7 @@ def _captures_kept(directory: Path | None) -> Iterator[None]:
         if index is not None and index.exists() and not others:
             with contextlib.suppress(OSError):  # a terminal that has gone hides no error
                 print(
-                    f"the captures so far are in {directory}: cotarget calibrate --from {directory} goes on with them",
+                    f"the captures so far are in {directory}: cotarget calibrate --from {directory} fits them",
                     file=sys.stderr,
                 )
         raise
@@ -154,6 +162,8 @@ def _check_together(options: argparse.Namespace) -> None:
             raise ConfigError(f"--square: {options.square:g} m is no board's square; 25 mm are 0.025")
         if options.encoders:
             raise ConfigError("--encoders goes with --rig or saved captures; plain photos know nothing of a head")
+    elif not options.source.is_dir():
+        raise ConfigError(f"{options.source}: no such folder; --from takes one of captures or photos")
     elif not (options.source / "index.json").exists():
         raise ConfigError(
             f"{options.source}: holds no index.json of captures; photos need --fixed, --zoom, --board and --square"
@@ -208,4 +218,5 @@ def board(options: argparse.Namespace) -> None:
     print(
         f"{options.out}: {1000 * width:.1f} x {1000 * height:.1f} mm with its white border; print it at 100 %, stick it"
     )
-    print("on something flat, and measure ten squares before you trust it")
+    print("on something flat, and measure ten squares before you trust it; what rig.toml has to say of it:")
+    print(f'[board]\nkind = "{options.kind}"\ncorners = {list(options.board)}\nsquare = {options.square:g}')

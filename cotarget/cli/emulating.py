@@ -7,7 +7,7 @@ import time
 import tomllib
 from typing import Any
 
-from cotarget.cli.arguments import check_outputs, rig_files
+from cotarget.cli.arguments import check_outputs, previous_kept, rig_files
 from cotarget.errors import ConfigError
 
 # Mesa's software renderer: one thread, which leaves the client a core. Read when OpenGL starts.
@@ -55,7 +55,8 @@ def emulate(options: argparse.Namespace) -> None:
     with Emulation(paced(config), ports, user=options.user, password=password) as emulation:
         for fault in options.fault:
             emulation.switch(fault)
-        write_atomically(options.write, emulation.rig_toml(tcp=options.tcp, beside=beside).encode())
+        with previous_kept(options.write):
+            write_atomically(options.write, emulation.rig_toml(tcp=options.tcp, beside=beside).encode())
         print(
             f"head     {emulation.tty.port} and {emulation.tcp.url}\n"
             f"fixed    {emulation.fixed.url}/mjpg/video.mjpg\n"

@@ -7,18 +7,17 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
 
 import cotarget
 from cotarget.cli import aiming, calibrating, emulating, operating, running, viewing
 from cotarget.cli.arguments import corners, count, not_negative, number, port, positive
 from cotarget.cli.choosing import add_choice
+from cotarget.cli.parsers import CommandParser, Parser
 from cotarget.errors import CotargetError
 
 # Heavy modules (MuJoCo, OpenCV, matplotlib) are imported by the command that needs them, so that --help and
 # mistakes in the arguments answer at once, and `doctor` runs where one of them is broken.
 
-USAGE = 2  # argparse's own exit status
 INTERRUPTED = 130  # a shell's exit status for Ctrl-C
 TERMINATED = 143  # for SIGTERM,
 HUNG_UP = 129  # and for SIGHUP: a terminal that was closed, a connection that broke
@@ -67,32 +66,12 @@ def _notes(end: BaseException) -> list[str]:
     return getattr(end, "__notes__", [])
 
 
-class _Parser(argparse.ArgumentParser):
-    """A parser whose mistakes, too, end in one line.
-
-    Attributes:
-        more: what --help says last, found only then.
-    """
-
-    more: Callable[[], str] | None = None
-
-    def format_help(self) -> str:
-        """Say what there is to say."""
-        if self.more is not None:
-            self.epilog = self.more()
-        return super().format_help()
-
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong, without the usage in front of it."""
-        self.exit(USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="cotarget", description=(cotarget.__doc__ or "").partition("\n")[0])
+    parser = Parser(prog="cotarget", description=(cotarget.__doc__ or "").partition("\n")[0])
     parser.add_argument("--version", action="version", version=f"cotarget {cotarget.__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=CommandParser)
 
-    def command(name: str, run: Callable[[argparse.Namespace], int | None], summary: str) -> _Parser:
+    def command(name: str, run: Callable[[argparse.Namespace], int | None], summary: str) -> Parser:
         made = commands.add_parser(name, help=summary, description=summary)
         made.add_argument("-v", "--verbose", action="store_true", help="say more about what is done")
         made.set_defaults(run=run)

@@ -2,14 +2,24 @@
 
 import argparse
 import math
+import re
 import sys
 import tomllib
 from pathlib import Path
 
-from cotarget.cli.arguments import check_outputs, check_within, previous_kept, print_json, rig_files
+from cotarget.cli.arguments import (
+    check_board_is_told,
+    check_outputs,
+    check_within,
+    previous_kept,
+    print_json,
+    rig_files,
+)
 from cotarget.errors import CalibrationError, ConfigError
 
 CONSENT = "yes"
+# The line of a file that is not TOML any more which still says what file stops the head.
+STOP_FILE_LINE = r"""^[ \t]*stop_file[ \t]*=[ \t]*(["'])([^"'\n]+)\1"""
 ENOUGH_DIGITS = 4  # of a latency in seconds
 # What is found is within so much of the truth; less than zero by more is no latency [s].
 ACCURACY_S = 0.01
@@ -31,6 +41,7 @@ def latency(options: argparse.Namespace) -> None:
     if calibration is not None:  # refused now, and not when the head has been wiggled
         calibration.hand_eye()
         calibration.for_streams(*config.stream_sizes)
+        check_board_is_told(options.rig, config)
     tables = config.sim if config.backend == "sim" else config.hardware
     where = "sim" if config.backend == "sim" else "hardware"
     with SafeRig(open_rig(config), config.safety) as rig:
@@ -172,12 +183,19 @@ def _stop_file(rig: Path) -> Path:
     Raises:
         ConfigError: it names none.
     """
+    by_hand = "the rig's stop file itself can be made and removed by hand"
     try:
-        safety = tomllib.loads(rig.read_text(encoding="utf-8")).get("safety")
-    except (OSError, ValueError) as error:  # no text and no TOML are of the latter kind
-        said = error.strerror if isinstance(error, OSError) else f"is not TOML: {error}"
-        raise ConfigError(f"{rig}: {said}; the rig's stop file itself can be made and removed by hand") from None
-    path = safety.get("stop_file") if isinstance(safety, dict) else None
-    if not isinstance(path, str) or not path:
+        text = rig.read_bytes().decode("utf-8", "replace")
+    except OSError as error:
+        raise ConfigError(f"{rig}: {error.strerror}; {by_hand}") from None
+    try:
+        safety = tomllib.loads(text).get("safety")
+        path = safety.get("stop_file") if isinstance(safety, dict) else None
+    except tomllib.TOMLDecodeError as error:
+        lines = re.findall(STOP_FILE_LINE, text, re.MULTILINE)
+        if len(lines) != 1:
+            raise ConfigError(f"{rig}: is not TOML: {error}; {by_hand}") from None
+        path = lines[0][1]
+    if not isinstance(path, str) or Path(path).name in ("", ".."):
         raise ConfigError(f'{rig}: has no stop file; give one: [safety] stop_file = "stop"')
     return rig.parent / path

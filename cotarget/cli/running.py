@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from cotarget.cli.arguments import check_outputs, nothing, print_json, progress_bar, rig_files
 from cotarget.cli.choosing import Choice, check_shown
 from cotarget.cli.reasons import Reasons
+from cotarget.errors import ConfigError
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
@@ -150,9 +151,12 @@ def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int], c
 
     steps = sum(states.values())
     if steps and states[State.SEARCHING] == steps and not choice.unmet:
+        why = {"replay": "the recording has none, or is too short for one to be believed"}.get(
+            command, "what --target names has to move in the fixed camera's view"
+        )
         print(
-            f"cotarget {command}: no {name} was seen in {steps} frames; what --target names has to move in the fixed "
-            "camera's view, which --video FILE shows (an emulated rig has who is in its [sim] targets)",
+            f"cotarget {command}: no {name} was seen in {steps} frames; {why}; --video FILE shows that view (an "
+            "emulated rig has who is in its [sim] targets)",
             file=sys.stderr,
         )
 
@@ -165,6 +169,8 @@ def detect(options: argparse.Namespace) -> None:
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
     target = config.target(options.target)
+    if options.film.is_dir():
+        raise ConfigError(f"{options.film}: is a directory; give a film")
     inputs = [options.film, options.labels, *rig_files(options.rig, config)]
     check_outputs([options.csv, options.video], inputs)
     labels = None if options.labels is None else read_labels(options.labels)

@@ -153,7 +153,8 @@ class Emulation:
             },
             "board": {"presenter": f"socket://{self._host}:{self.board.port}"},
         }
-        tables = {"backend": "hardware", "hardware": hardware, **(beside or {})}
+        board = dataclasses.asdict(self.config.board)
+        tables = {"backend": "hardware", "hardware": hardware, **(beside or {}), "board": board}
         return tomli_w.dumps({**tables, "targets": self._targets(tables.get("targets", {}))})
 
     def _targets(self, copied: Mapping[str, Any]) -> dict[str, Any]:
@@ -256,4 +257,7 @@ def _parse_pose(wish: Any) -> RigidTransform:
     translation, rotvec = ([float(v) for v in wish[key]] for key in ("translation", "rotvec_deg"))
     if len(translation) != 3 or len(rotvec) != 3 or not all(map(math.isfinite, translation + rotvec)):
         raise ConfigError("a pose is {translation: [x, y, z], rotvec_deg: [rx, ry, rz]} of finite numbers")
-    return pose(translation, rotvec)
+    try:
+        return pose(translation, rotvec)
+    except ValueError as error:
+        raise ConfigError(f"a pose's {error}") from None

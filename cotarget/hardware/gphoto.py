@@ -10,7 +10,7 @@ import importlib
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
-from cotarget.errors import ConfigError, DeviceError
+from cotarget.errors import ConfigError, DeviceError, MissingPackageError
 from cotarget.hardware.gphoto_memory import keep_settings_in_memory, library, standard_input_kept
 from cotarget.hardware.gphoto_port import check_listening, check_permission, full_port, shortened
 
@@ -275,6 +275,6 @@ def _gphoto2() -> Any:
     try:
         gphoto2 = importlib.import_module("gphoto2")
     except ImportError as error:
-        raise ConfigError(MISSING) from error
+        raise MissingPackageError(MISSING) from error
     keep_settings_in_memory()
     return gphoto2

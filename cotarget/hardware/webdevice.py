@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from cotarget.errors import ConfigError, DeviceError
+from cotarget.errors import ConfigError, DeviceError, MissingPackageError
 
 if TYPE_CHECKING:
     import httpx
@@ -181,5 +181,5 @@ def _import_httpx() -> ModuleType:
     try:
         import httpx
     except ImportError:
-        raise DeviceError("devices on HTTP need httpx: pip install 'cotarget[hardware]'") from None
+        raise MissingPackageError("devices on HTTP need httpx: pip install 'cotarget[hardware]'") from None
     return httpx

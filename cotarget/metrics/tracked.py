@@ -193,8 +193,9 @@ def _table(path: Path, names: Sequence[str], what: str) -> list[dict[str, float]
             if missing := [name for name in names if name not in (reader.fieldnames or ())]:
                 raise ValueError(f"it has no column '{missing[0]}'; it wants {', '.join(names)}")
             rows = [{name: float(row[name] or "nan") for name in names} for row in reader]
-        if any(not math.isfinite(value) for row in rows for value in row.values()):
-            raise ValueError("a number is missing")
+        for line, row in enumerate(rows, start=2):
+            if odd := [name for name, value in row.items() if not math.isfinite(value)]:
+                raise ValueError(f"line {line} has no number for {odd[0]}")
         return rows
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give a csv with {','.join(names)}") from None

@@ -66,6 +66,10 @@ def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.R
         return mujoco.Renderer(model, height, width)
     except Exception as error:  # PyOpenGL and the backends raise whatever they meet
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if "ramebuffer" in reason:
+            raise DeviceError(
+                f"OpenGL ({BACKEND}) renders no picture of {width}x{height}: {reason}; give the cameras a smaller size"
+            ) from None
         raise DeviceError(
             f"OpenGL ({BACKEND}) cannot render without a screen: {reason}; {INSTALL.get(BACKEND, OTHERWISE)}"
         ) from None
