@@ -166,7 +166,7 @@ def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, repo
     with SafeRig(world.rig, config.safety) as rig, FilmWriter(work / f"{name}.mp4", rate_hz) as film:
         stages = TargetStages(rig.zoom.focal_range[0])
         detector = make_detector(target, rate_hz)
-        settings = FollowSettings(command_delay_s=config.command_delay_s)
+        settings = FollowSettings.of(config)
         frames = round(RUN_S[name] * rate_hz)
         for step in follow(rig, calibration, target, detector, seconds=RUN_S[name], settings=settings):
             stages.see(step)

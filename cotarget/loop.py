@@ -6,12 +6,13 @@ Everything that records, draws, scores or prints consumes Steps.
 import enum
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.closeup import CloseupFinder, Found
-from cotarget.config import TargetConfig
+from cotarget.config import RigConfig, TargetConfig
 from cotarget.detection import Detection, Detector
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
@@ -53,6 +54,11 @@ class FollowSettings(ServoSettings):
     closed_loop: bool = True
     finder: MakeFinder = CloseupFinder
     policy: Callable[[], Policy] = FirstCome
+
+    @classmethod
+    def of(cls, config: RigConfig, **changes: Any) -> "FollowSettings":
+        """The settings for a rig: how late its head and lens obey, and whatever else is given by name."""
+        return cls(command_delay_s=config.command_delay_s, lens_delay_s=config.lens_delay_s, **changes)
 
 
 @dataclass(frozen=True)

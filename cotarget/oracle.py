@@ -47,7 +47,7 @@ NumbersAt = Callable[[float], np.random.Generator]
 
 def seeded(seed: int) -> NumbersAt:
     """Random numbers of each time, by a generator of its own."""
-    return lambda t: np.random.default_rng((seed, _microseconds(t)))
+    return lambda t: np.random.default_rng((seed, microseconds(t)))
 
 
 def counted(seed: int) -> NumbersAt:
@@ -56,14 +56,15 @@ def counted(seed: int) -> NumbersAt:
     rng, begin = np.random.Generator(bits), bits.state
 
     def at(t: float) -> np.random.Generator:
-        begin["state"]["counter"][1] = _microseconds(t)  # it counts in [0], and never so far
+        begin["state"]["counter"][1] = microseconds(t)  # it counts in [0], and never so far
         bits.state = begin
         return rng
 
     return at
 
 
-def _microseconds(t: float) -> int:
+def microseconds(t: float) -> int:
+    """A time [s] as a whole number, by which what is of that time is found again."""
     return round(t * 1e6)
 
 

@@ -24,6 +24,7 @@ from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
 from cotarget.loop import FollowSettings
 from cotarget.metrics import score
+from cotarget.simconfig import SimZoomCamera
 from experiments.field import FieldSettings, calibrated, held, target_of
 from experiments.field_scenes import COMMAND_DELAY_S, LATENCY_S, hold_config
 from experiments.harness import Experiment, Row, seeds_of, table
@@ -32,7 +33,8 @@ from experiments.wide_view import record
 
 FIELD_S = LATENCY_S + COMMAND_DELAY_S
 LIGHT_PART = LATENCY_S / FIELD_S  # of a delay, that from light to frame
-NEVER = math.hypot(640, 480) / 2 / 640  # offset over the width, of a target that is never acquired
+WIDTH, HEIGHT = SimZoomCamera().size
+NEVER = math.hypot(WIDTH, HEIGHT) / 2 / WIDTH  # offset over the width, of a target that is never acquired
 WANTED = 3.0  # times smaller with prediction than without, at the field's delay
 
 
@@ -63,7 +65,7 @@ def one(calibration: Calibration, settings: DelaySettings, seed: int) -> list[Ro
         view = record(config, target_of(config, name), settings.seconds)
         for delay, predict, closed_loop in cases:
             late = delayed(config, delay)
-            how = FollowSettings(command_delay_s=late.command_delay_s, predict=predict, closed_loop=closed_loop)
+            how = FollowSettings.of(late, predict=predict, closed_loop=closed_loop)
             found = score(held(calibration, late, name, settings.seconds, how, view))
             rows.append(
                 {
@@ -149,16 +151,16 @@ def describe(settings: DelaySettings, summary: Mapping[str, Any]) -> str:
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Offset over the delay: each seed a point, medians joined."""
+    """Offset over the delay: medians joined, bars from the least seed to the largest."""
     names = _targets(rows)
     for ax, name in zip(np.ravel(figure.subplots(1, len(names), sharey=True)), names, strict=True):
         for predict, label in ((True, "with prediction"), (False, "without")):
             mine = [r for r in rows if (r["target"], r["predict"], r["closed_loop"]) == (name, predict, False)]
             delays = sorted({row["delay_s"] for row in mine})
-            medians = [np.median([row["tpo_width"] for row in mine if row["delay_s"] == delay]) for delay in delays]
-            (line,) = ax.semilogy([1e3 * delay for delay in delays], medians, label=label)
-            at, offsets = [1e3 * row["delay_s"] for row in mine], [row["tpo_width"] for row in mine]
-            ax.semilogy(at, offsets, ".", color=line.get_color(), alpha=0.5)
+            found = [spread_of(row["tpo_width"] for row in mine if row["delay_s"] == delay) for delay in delays]
+            low, middle, high = (np.array([each[key] for each in found]) for key in ("least", "median", "largest"))
+            ax.errorbar(1e3 * np.array(delays), middle, yerr=(middle - low, high - middle), capsize=3, label=label)
+        ax.set_yscale("log")
         ax.set(title=name, xlabel="delay from light to motion [ms]", ylabel="median offset / width")
     ax.legend(frameon=False)
 

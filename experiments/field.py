@@ -95,7 +95,7 @@ def watched(
     view: WideView | None = None,
 ) -> Iterator[tuple[Step, Truth]]:
     """Follow a target of a simulated rig; each Step, and the truth to judge it by. See `held`."""
-    settings = settings or FollowSettings(command_delay_s=config.command_delay_s)
+    settings = settings or FollowSettings.of(config)
     if view is None:
         world, detector = SimWorld(config), make_detector(target, config.rate_hz)
     else:

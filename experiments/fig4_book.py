@@ -95,7 +95,7 @@ def _shown(
     """A row a place, and the Steps of the last one by stage."""
     config = settings.config("indoor", (NAME,), seed)
     config = dataclasses.replace(config, sim=dataclasses.replace(config.sim, paths=lone_path(NAME, seed)))
-    target, how = config.target(NAME), FollowSettings(command_delay_s=config.command_delay_s)
+    target, how = config.target(NAME), FollowSettings.of(config)
     speck = dataclasses.replace(target, wanted_px=SPECK_PX)
     world = SimWorld(config)
     truth = world.truth()

@@ -97,7 +97,7 @@ def _followed(calibration: Calibration, settings: PersonSettings, seed: int, way
     config = settings.config("indoor", (NAME,), seed)
     found_by = settings.detector if way == OURS else "mog2"
     target = dataclasses.replace(config.target(NAME), detector=found_by)
-    how = FollowSettings(command_delay_s=config.command_delay_s)
+    how = FollowSettings.of(config)
     judged: list[Judged] = []
     moments: list[Step] = []
     # The last step is done a frame before the end, or later.

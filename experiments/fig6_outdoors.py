@@ -96,7 +96,7 @@ class OutdoorSettings(OwnRigInField):
 def one(calibration: Calibration, settings: OutdoorSettings, seed: int) -> Pictured:
     """Follow those who pass in each way; a row each, and pictures of the first seed."""
     config = outdoors(settings, seed)
-    how = FollowSettings(command_delay_s=config.command_delay_s)  # whose policy is first-come
+    how = FollowSettings.of(config)  # whose policy is first-come
     rows: list[Row] = []
     pictures: dict[str, bytes] = {}
     for way in settings.ways:

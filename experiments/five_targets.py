@@ -22,6 +22,7 @@ from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, TargetConfig
 from cotarget.judging import closeup_of
 from cotarget.loop import FollowSettings
+from cotarget.metrics import SERVED_S
 from cotarget.policies import POLICIES
 from cotarget.sim.fieldpaths import GROUP
 from cotarget.sim.truth import Truth
@@ -32,7 +33,6 @@ from experiments.spread import BESIDE
 from experiments.wide_view import WideView, record
 
 FIRST = "first-come"
-SERVED_S = 1.0  # of good close-up
 WANTED = 1.5  # times as many served by the best policy as by first-come
 
 
@@ -58,7 +58,7 @@ def one(calibration: Calibration, settings: FiveSettings, seed: int) -> list[Row
         target = target_of(config, kind)
         view = record(config, target, settings.seconds)
         for policy, make in POLICIES.items():
-            how = FollowSettings(command_delay_s=config.command_delay_s, policy=make, closed_loop=settings.closed_loop)
+            how = FollowSettings.of(config, policy=make, closed_loop=settings.closed_loop)
             seconds = good_seconds(calibration, config, target, settings.seconds, how, view)
             rows.append(
                 {

@@ -150,7 +150,7 @@ def held_unrendered(calibration: Calibration, seconds: float, seed: int) -> Iter
     """The same with nothing rendered, so that there is nothing to be looked for in the zoom view either."""
     config = hold_config(TARGET, seed)
     world = SimWorld(config, rendered=())
-    settings = FollowSettings(command_delay_s=config.command_delay_s, closed_loop=False)
+    settings = FollowSettings.of(config, closed_loop=False)
     detector = TruthDetector(world.truth(), seed)
     return watched_in(world, detector, calibration, target_of(config, TARGET), SETTLED_S + seconds, settings)
 

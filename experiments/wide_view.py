@@ -14,6 +14,7 @@ import numpy as np
 
 from cotarget.config import RigConfig, TargetConfig
 from cotarget.detection import Detection, make_detector
+from cotarget.oracle import microseconds
 from cotarget.rig import Camera, Frame, Image
 from cotarget.sim.appearances import CameraName
 from cotarget.sim.world import SimWorld
@@ -93,7 +94,7 @@ class WideView:
 
     def at(self, t: float) -> Seen:
         """The frame of a time [s]."""
-        return self.frames[_key(t)]
+        return self.frames[microseconds(t)]
 
 
 def record(config: RigConfig, target: TargetConfig, seconds: float) -> WideView:
@@ -111,7 +112,7 @@ def record(config: RigConfig, target: TargetConfig, seconds: float) -> WideView:
         while t is None or t < seconds:
             frame = rig.fixed.read(newer_than=t)
             t, found = frame.t, tuple(detector.detect(frame))
-            frames[_key(t)] = Seen(found, shelf.put(frame.image), shelf.put(detector.mask))
+            frames[microseconds(t)] = Seen(found, shelf.put(frame.image), shelf.put(detector.mask))
     return WideView(frames, pictures=True)
 
 
@@ -161,7 +162,3 @@ class _RecordedCamera:
         picture = self._view.at(t).picture
         assert picture is not None, "pictures were kept"
         return Frame(picture.image(), t)
-
-
-def _key(t: float) -> int:
-    return round(t * 1e6)

@@ -130,7 +130,7 @@ def _follow(emulated: EmulatedRig, name: str, seconds: float) -> list[Row]:
         notes = Notes(rig.clock, config.hardware.fixed.latency_s)
         target = config.target(name)
         detector = TimedDetector(make_detector(target, config.rate_hz), notes)
-        settings = FollowSettings(command_delay_s=config.command_delay_s)
+        settings = FollowSettings.of(config)
         timed, calibration = TimedRig(rig, notes), exact_calibration(emulated.sim)
         steps = follow(timed, calibration, target, detector, seconds=seconds, settings=settings)  # type: ignore[arg-type]
         for _ in steps:

@@ -63,6 +63,6 @@ def _aims(rig: Rig, config: RigConfig, calibration: Calibration, seconds: float)
     """Pan and tilt of the head at the end of following, (n, 2) [rad]."""
     target = config.target(NAME)
     detector = make_detector(target, config.rate_hz)
-    settings = FollowSettings(command_delay_s=config.command_delay_s)
+    settings = FollowSettings.of(config)
     steps = list(follow(rig, calibration, target, detector, seconds=seconds, settings=settings))
     return np.array([(s.head.pan, s.head.tilt) for s in steps if s.t >= steps[-1].t - SETTLED_S])

@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from cotarget import zoompolicy
 from cotarget.estimation import SpatialFilter
+from cotarget.metrics import closeup
 from cotarget.zoompolicy import Expected, ZoomPolicy, ZoomSettings, chance_inside, expect, longest_focal
 from tests.moving_targets import APART, Flight, show
 
@@ -130,3 +132,8 @@ def test_an_estimate_says_what_to_expect():
     ]
     assert (np.diff(focals) < 0).all()
     assert expect(estimator.at(t), pan + math.pi, tilt, 1700.0) is None
+
+
+def test_what_it_takes_for_seen_well_is_what_the_metrics_call_good():
+    """The pipeline does not know how it is judged; both mean the same size."""
+    assert zoompolicy.GOOD_SIZE == closeup.GOOD_SIZE

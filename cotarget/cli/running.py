@@ -119,9 +119,7 @@ def _follow(
 
     target = config.target(name)
     detector = make_detector(target, config.rate_hz)
-    settings = FollowSettings(
-        command_delay_s=config.command_delay_s, lens_delay_s=config.lens_delay_s, policy=choice.policy
-    )
+    settings = FollowSettings.of(config, policy=choice.policy)
     states: dict[str, int] = dict.fromkeys(State, 0)
     reasons = Reasons()
     expected = math.ceil(seconds * config.rate_hz) if frames is None else frames

@@ -138,7 +138,7 @@ def _followed(
 
     truth = world.truth()
     target = config.target(name)
-    settings = FollowSettings(command_delay_s=config.command_delay_s, lens_delay_s=config.lens_delay_s)
+    settings = FollowSettings.of(config)
     detector = make_detector(target, config.rate_hz)
     for step in follow(rig, calibration, target, detector, seconds=seconds, settings=settings):
         depths = {} if step.aim is None else {"zoom": step.aim.range}

@@ -45,7 +45,7 @@ class PipelinePolicy:
         env = self._env
         if env.episode is not self._episode:
             self._episode, self._desk = env.episode, Desk(env)
-            settings = FollowSettings(command_delay_s=env.config.command_delay_s, closed_loop=False)
+            settings = FollowSettings.of(env.config, closed_loop=False)
             self._steps: Iterator[Step] = follow(
                 self._desk, env.calibration, env.target, self._desk, seconds=math.inf, settings=settings
             )

@@ -17,6 +17,7 @@ from cotarget.errors import ConfigError
 from cotarget.geometry import Array
 from cotarget.judging import closeup_of
 from cotarget.loop import FollowSettings, Step, follow
+from cotarget.metrics import SERVED_S
 from cotarget.motionfilter import Track
 from cotarget.oracle import TruthNoise
 from cotarget.planning import LOOK_S, Candidate
@@ -26,7 +27,6 @@ from cotarget.simconfig import Size
 
 SLOTS = 8  # for tracks: five targets, and those that were lost and found under another number
 ROUNDING_S = 1e-6  # frame times are sums and differences of binary fractions
-SERVED_S = 1.0  # of good close-up, and a target counts as served
 SERVED_REWARD = 5.0  # for each: as much as looking on at one of them is worth in as many seconds
 
 # What a policy knows of a track (`cotarget.policies.Candidate`), and the range of each number; 0 in an empty slot.
@@ -160,8 +160,8 @@ class Schedule(RigEnv[dict[str, Any], int]):
         paths = group_paths(self.kind, seed)
         episode, self._asked = self._open(paths, seed), Asked()
         asked = self._asked
-        settings = FollowSettings(
-            command_delay_s=self.config.command_delay_s,
+        settings = FollowSettings.of(
+            self.config,
             closed_loop=False,
             policy=lambda: asked,
         )

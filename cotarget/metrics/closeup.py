@@ -8,6 +8,7 @@ VISIBLE_IN_FRAME = 0.5
 SIZE_IN_FRAME = 0.5
 # A close-up is good with the whole target visible at 0.8 to 1.25 of the wanted size.
 GOOD_SIZE = (0.8, 1.25)
+SERVED_S = 1.0  # of good close-up in all, and a target counts as served
 WHOLLY_VISIBLE = 0.999  # the silhouette's area is counted on a grid; a rim of less is rounding
 
 
