@@ -19,7 +19,7 @@ from experiments.results import identity
 EXPERIMENTS = (
     *("hand_eye", "chain", "random_rigs", "mismatch", "honesty", "speed", "photos", "pointing", "zoom_range", "wire"),
     *("hold", "first_shot", "delay", "five_targets", "dead_zone", "sim_speed", "pipeline_speed", "sweep_speed"),
-    *("env_score", "env_speed", "shortcut", "models", "depth_error", "calibration_budget", "single_ptz"),
+    *("detectors", "env_score", "env_speed", "shortcut", "models", "depth_error", "calibration_budget", "single_ptz"),
     *("table2_table3", "worked_example", "fig4_book", "fig5_person", "fig6_outdoors"),
 )
 PROCESSES = "processes"

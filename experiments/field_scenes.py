@@ -31,7 +31,7 @@ def hold_config(name: str, seed: int, scene: str = SCENE) -> RigConfig:
     Raises:
         ConfigError: no such target.
     """
-    return _config(lone_path(name, seed), seed, scene)
+    return field_config(lone_path(name, seed), seed, scene)
 
 
 def five_targets_config(seed: int, kind: str = "person", scene: str = SCENE) -> RigConfig:
@@ -45,11 +45,17 @@ def five_targets_config(seed: int, kind: str = "person", scene: str = SCENE) -> 
     Raises:
         ConfigError: another kind.
     """
-    return _config(group_paths(kind, seed), seed, scene)
+    return field_config(group_paths(kind, seed), seed, scene)
 
 
-def _config(paths: Mapping[str, tuple[Waypoint, ...]], seed: int, scene: str) -> RigConfig:
-    """The default rig under the field's conditions, with targets on these paths."""
+def field_config(paths: Mapping[str, tuple[Waypoint, ...]], seed: int, scene: str = SCENE) -> RigConfig:
+    """The default rig under the field's conditions.
+
+    Args:
+        paths: of the targets, by their names; nobody is there without any.
+        seed: of everything random.
+        scene: the scene; outdoors there is clutter.
+    """
     sim = SimConfig()
     sim = replace(
         sim,

@@ -1,7 +1,7 @@
 """The field's figures: of a target that was held, by the truth, and of tracks on a film, by labels."""
 
 from cotarget.metrics.closeup import SERVED_S, WHOLLY_VISIBLE, Closeup
-from cotarget.metrics.held import Score, score
+from cotarget.metrics.held import Score, false_tracks, id_switches, score
 from cotarget.metrics.rows import Row, read_rows, write_rows
 from cotarget.metrics.tracked import Label, Tracked, TrackScore, read_labels, read_tracks, score_tracks
 
@@ -14,6 +14,8 @@ __all__ = [
     "Score",
     "TrackScore",
     "Tracked",
+    "false_tracks",
+    "id_switches",
     "read_labels",
     "read_rows",
     "read_tracks",

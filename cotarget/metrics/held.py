@@ -5,7 +5,7 @@ the simulation's truth; the scores only read rows.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,9 +108,9 @@ def score(rows: Sequence[Row]) -> Score:
         identification_wide=float(np.mean([r.decoded_wide for r in counted])),
         commands_per_min=_per_minute(counted[-1].head_commands - counted[0].head_commands, counted),
         reversals_per_min=_per_minute(_reversals(counted), counted),
-        false_tracks_per_min=_per_minute(_false_tracks(counted), counted),
+        false_tracks_per_min=_per_minute(false_tracks((r.t_s, r.off_target.split()) for r in counted), counted),
         lens_commands_per_min=_per_minute(counted[-1].lens_commands - counted[0].lens_commands, counted),
-        id_switches_per_min=_per_minute(_id_switches(counted), counted),
+        id_switches_per_min=_per_minute(id_switches(map(_on, counted)), counted),
     )
 
 
@@ -150,26 +150,38 @@ def _reversals(rows: Sequence[Row]) -> int:
     return int(sum(np.count_nonzero(np.diff(np.sign(axis[axis != 0]))) for axis in changes.T))
 
 
-def _false_tracks(rows: Sequence[Row]) -> int:
-    """How many tracks were confirmed and off every target for half a second on end."""
-    false: set[str] = set()
-    since: dict[str, float] = {}
-    for row in rows:
-        since = {track: since.get(track, row.t_s) for track in row.off_target.split()}
-        false |= {track for track, begin in since.items() if row.t_s - begin >= FALSE_S - ROUNDING_S}
+def _on(row: Row) -> list[tuple[str, str]]:
+    """Which track is on which target in a row."""
+    return [(track, target) for track, target in (pair.split(":") for pair in row.on_target.split())]
+
+
+def false_tracks(off: Iterable[tuple[float, Collection[Hashable]]]) -> int:
+    """How many tracks were confirmed and off every target for half a second on end.
+
+    Args:
+        off: of each frame its time [s], and which tracks were.
+    """
+    false: set[Hashable] = set()
+    since: dict[Hashable, float] = {}
+    for t, tracks in off:
+        since = {track: since.get(track, t) for track in tracks}
+        false |= {track for track, begin in since.items() if t - begin >= FALSE_S - ROUNDING_S}
     return len(false)
 
 
-def _id_switches(rows: Sequence[Row]) -> int:
-    """How often a track was on another target than before: on that no more, and on one."""
+def id_switches(on: Iterable[Iterable[tuple[Hashable, str]]]) -> int:
+    """How often a track was on another target than before: on that no more, and on one.
+
+    Args:
+        on: of each frame which track was on which target; one on several is told with each, the nearest first.
+    """
     switches = 0
-    was_on: dict[str, str] = {}
-    for row in rows:
-        on: dict[str, list[str]] = {}
-        for pair in row.on_target.split():
-            track, target = pair.split(":")
-            on.setdefault(track, []).append(target)
-        for track, targets in on.items():
+    was_on: dict[Hashable, str] = {}
+    for pairs in on:
+        now: dict[Hashable, list[str]] = {}
+        for track, target in pairs:
+            now.setdefault(track, []).append(target)
+        for track, targets in now.items():
             switches += was_on.get(track, targets[0]) not in targets
             if was_on.get(track) not in targets:
                 was_on[track] = targets[0]
