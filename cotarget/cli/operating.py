@@ -30,6 +30,7 @@ def latency(options: argparse.Namespace) -> None:
     from cotarget.calibration import load_calibration
     from cotarget.config import load_config
     from cotarget.latency import measure_fixed, measure_head
+    from cotarget.lenslatency import measure_lens
     from cotarget.rig import open_rig
     from cotarget.safety import SafeRig, refuse_if_stopped
 
@@ -51,6 +52,8 @@ def latency(options: argparse.Namespace) -> None:
             f"{where}.head.command_delay_s": head.command,
         }
         agreement = {"zoom": head.zoom.agreement}
+        if config.backend == "hardware":  # a simulated lens is as late as its head
+            found["hardware.zoom.command_delay_s"] = measure_lens(rig, head.zoom.seconds).command
         if calibration is not None:
             fixed, _ = measure_fixed(rig, calibration, config.board)
             # Against the zoom camera, whose own frames are dated too late by what was just found.
