@@ -158,8 +158,9 @@ def _run(given: argparse.Namespace, typed: Sequence[str], known: Known, expected
     page, mine = folder / "report.html", {case.folder for case in cases}
     took = [part for each in sessions(folder) if (part := each.of(mine)).cases]
     does = [word for word in typed if not (word.startswith("--r") and "--report".startswith(word))]
-    is_full = not (given.names or given.quick or given.seeds or given.set)
-    run = Run(outcomes, skipped, took, shlex.join([*PROGRAM.split(), *does]), is_full)
+    is_all = not (given.names or given.seeds or given.set)
+    command = shlex.join([*PROGRAM.split(), *does])
+    run = Run(outcomes, skipped, took, command, is_all and not given.quick, is_all and given.quick)
     write_report(page, run)
     print(f"\nin all: {used(run)}\n{page}")
     return 0 if all(outcome.ok for outcome in outcomes) else 1

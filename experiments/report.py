@@ -22,6 +22,7 @@ from experiments.texts import plain
 
 MINUTE_S, HOUR_S = 60.0, 3600.0
 WANTED_MIN, WANTED_RENDERS = 60, 80_000  # of all experiments as they are reported, on two cores
+WANTED_QUICK_MIN = 5  # of a quick run of all
 FEW = 8  # failed jobs that a summary names
 
 
@@ -35,6 +36,7 @@ class Run:
         sessions: when jobs were done, by whom and for how long.
         command: how to get the same again.
         is_full: whether these are all experiments as they are reported.
+        is_quick: whether these are all, each quick.
     """
 
     outcomes: Sequence[Outcome]
@@ -42,6 +44,7 @@ class Run:
     sessions: Sequence[Session]
     command: str
     is_full: bool = False
+    is_quick: bool = False
 
 
 def write_report(path: Path, run: Run) -> None:
@@ -253,10 +256,13 @@ def used(run: Run) -> str:
     """What all took, in words, beside what a full run may take."""
     wall_s, renders = sum(each.wall_s for each in run.sessions), sum(outcome.renders for outcome in run.outcomes)
     took, wanted = f"{duration(wall_s)} and {renders} renders", f"{WANTED_MIN} min and {WANTED_RENDERS} renders"
+    if run.is_quick:
+        over = wall_s > WANTED_QUICK_MIN * MINUTE_S
+        return f"{took}, of {WANTED_QUICK_MIN} min that a quick run may take" + (": too much time" if over else "")
     if not run.is_full:
         return f"{took}; a full run may take {wanted}"
-    over = {"time": wall_s > WANTED_MIN * MINUTE_S, "renders": renders > WANTED_RENDERS}
-    lost = [what for what, is_over in over.items() if is_over]
+    beyond = {"time": wall_s > WANTED_MIN * MINUTE_S, "renders": renders > WANTED_RENDERS}
+    lost = [what for what, is_over in beyond.items() if is_over]
     return f"{took}, of {wanted} that a full run may take" + (f": too much {listed(lost)}" if lost else "")
 
 

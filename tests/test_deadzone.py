@@ -124,7 +124,7 @@ def over_seeds(name, settings):
 # carried for a large part, in which every frame shows it elsewhere.
 SAME_OFFSET = 1.1
 HALF = 0.5
-COMMANDS = {"book": 0.65, "person": HALF}
+COMMANDS = {"book": 0.6, "person": HALF}
 EVERY_FRAME = SteeringSettings(spared=False)
 # At the target's own speed the picture smears by less than this part of what it does at full speed; measured 0.5.
 LESS_SMEAR = 0.7

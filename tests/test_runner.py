@@ -535,22 +535,25 @@ def test_sessions_are_told_without_what_was_forgotten(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("is_full", "wall_s", "said"),
+    ("what", "wall_s", "said"),
     [
-        (True, 3500.0, "58 min 20 s and 70000 renders, of 60 min and 80000 renders that a full run may take"),
+        ("is_quick", 290.0, "4 min 50 s and 70000 renders, of 5 min that a quick run may take"),
+        ("is_quick", 310.0, "5 min 10 s and 70000 renders, of 5 min that a quick run may take: too much time"),
+        ("is_full", 3500.0, "58 min 20 s and 70000 renders, of 60 min and 80000 renders that a full run may take"),
         (
-            True,
+            "is_full",
             3700.0,
             "1 h 2 min and 70000 renders, of 60 min and 80000 renders that a full run may take: too much time",
         ),
-        (False, 3700.0, "1 h 2 min and 70000 renders; a full run may take 60 min and 80000 renders"),
+        ("neither", 3700.0, "1 h 2 min and 70000 renders; a full run may take 60 min and 80000 renders"),
     ],
 )
-def test_what_all_took_is_told_beside_what_it_may(is_full, wall_s, said):
+def test_what_all_took_is_told_beside_what_it_may(what, wall_s, said):
     (case,) = choose(KNOWN, ["sharing"])
     outcome = Outcome(case, {0: Record(0, 9.0, 8.0, "", 20_000, [])}, shared=Spent(2.0, 1.0, 50_000))
     session = Session("", wall_s, "", "", "", {}, {"sharing": Share(1, 9.0, 2.0, 70_000)})
-    assert used(Run([outcome], {}, [session], "", is_full)) == said
+    run = Run([outcome], {}, [session], "", is_full=what == "is_full", is_quick=what == "is_quick")
+    assert used(run) == said
     assert outcome.cpu_s == 9.0
 
 
