@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.errors import ConfigError, DeviceError, StaleFrameError
+from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
 from cotarget.hardware.canon import GphotoCamera
 from cotarget.hardware.clock import MonotonicClock
 from cotarget.hardware.gphoto import GphotoLink, LinkError, Setting, cameras, probe
@@ -936,7 +936,7 @@ def test_ports_that_cannot_be():
 def test_without_gphoto2_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "gphoto2", None)
     for call in (cameras, lambda: probe("usb:", ""), GphotoLink("usb:", "").open):
-        with pytest.raises(ConfigError, match=r"gphoto2 is not installed; pip install 'cotarget\[hardware\]'"):
+        with pytest.raises(MissingPackageError, match=r"gphoto2 is not installed; pip install 'cotarget\[hardware\]'"):
             call()
 
 
