@@ -67,6 +67,10 @@ class HeadLatency:
 def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
     """Wiggle the head and watch it through the zoom camera.
 
+    Args:
+        rig: its lens is sent to the shortest focal length, and its head back to where it was.
+        seconds: for how long [s].
+
     Raises:
         CalibrationError: the picture does not move with the head: it shows nothing, or something that moves by itself.
         StaleFrameError: frames stopped coming.

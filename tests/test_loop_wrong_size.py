@@ -12,9 +12,9 @@ from cotarget.sim.world import SimWorld
 from experiments.field_scenes import hold_config
 
 # As well as the real detectors find them.
-NOISE = {"book": TruthNoise(0.2, 0.01, 0.0), "person": TruthNoise(0.5, 0.04, 0.05)}
+NOISE = {"book": TruthNoise(0.2, 0.01, 0.0), "person": TruthNoise(0.5, 0.04, 0.05), "bird": TruthNoise(0.5, 0.06, 0.05)}
 # A person comes into view after 1.2 to 1.6 s and is believed after half its height.
-SECONDS = {"book": 3.5, "person": 6.0}
+SECONDS = {"book": 3.5, "person": 6.0, "bird": 6.0}
 CENTER = (319.5, 239.5)
 NEAR_PX = 64.0  # a tenth of the close-up's width
 # The head's bias could be to blame as well, and takes its part at first: so much may be left of the size's logarithm.
@@ -62,6 +62,18 @@ def test_a_wrong_size_is_told_and_made_good(name, seed, wrong):
     # What nothing was known of is at an edge of the close-up or beyond; then it comes to the middle.
     middle = np.mean(truth.box(name, "zoom", last.zoom.t), axis=0)
     assert (np.abs(middle - CENTER) < NEAR_PX).all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("wrong", [2.0, 0.5])
+def test_a_wrong_size_of_a_bird_costs_no_aim(seed, wrong):
+    """It is not told: how a bird shows its wings scatters by nearly as much. The zoom view keeps it in the middle."""
+    steps, truth = told("bird", seed, wrong)
+    followed = [step for step in steps if step.state is State.FOLLOWING]
+    assert len(followed) > 0.9 * len(steps)
+    late = followed[len(followed) // 2 :]
+    off = [np.abs(np.mean(truth.box("bird", "zoom", step.zoom.t), axis=0) - CENTER).max() for step in late]
+    assert np.median(off) < NEAR_PX
 
 
 @pytest.mark.parametrize("seed", SEEDS)

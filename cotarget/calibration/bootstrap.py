@@ -50,7 +50,11 @@ CENTRAL = 0.12  # of the image's width: nearer to the middle a board is central
 
 
 def learn_fixed(recorder: Recorder, rng: np.random.Generator) -> RigModel:
-    """Rough intrinsics of the fixed camera, from one board straight ahead and a few tilted ones."""
+    """Rough intrinsics of the fixed camera, from one board straight ahead and a few tilted ones.
+
+    Raises:
+        CalibrationError: it does not see the board.
+    """
     board, points = recorder.board, board_points(recorder.board)
     width, height = size = recorder.rig.fixed.size
     supposed = width / 2 / np.tan(FIRST_FIELD / 2)

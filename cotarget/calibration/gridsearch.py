@@ -124,7 +124,15 @@ def grid_of(board: BoardConfig) -> Array:
 
 
 def homography(grid: Array, pixels: Array) -> Array | None:
-    """From squares to pixels by least squares over what is finite; None where that is too little."""
+    """From squares to pixels by least squares over what is finite.
+
+    Args:
+        grid: where corners are on the board [squares], (n, 2).
+        pixels: where they are in the image, (n, 2) [px]; nan where one is not known.
+
+    Returns:
+        (3, 3); None where too few are known.
+    """
     finite = np.isfinite(pixels).all(axis=1)
     if np.count_nonzero(finite) < FEWEST_CORNERS:
         return None

@@ -43,7 +43,16 @@ class Detector(Protocol):
 
 
 def box_detection(x: int, y: int, w: int, h: int, score: float, shape: tuple[int, ...]) -> Detection:
-    """Make a detection of a box of whole pixels."""
+    """Make a detection of a box of whole pixels.
+
+    Args:
+        x: its first column [px].
+        y: its first row [px].
+        w: how many columns it has [px].
+        h: how many rows [px].
+        score: how sure the detector is, 0 to 1.
+        shape: of the image, (H, W, ...); a box at its border is clipped.
+    """
     clipped = x <= 0 or y <= 0 or x + w >= shape[1] or y + h >= shape[0]
     return Detection(np.array([x + (w - 1) / 2, y + (h - 1) / 2]), np.array([w, h], dtype=float), score, clipped)
 

@@ -174,7 +174,11 @@ class Schedule(RigEnv[dict[str, Any], int]):
         return self._observe(), self._info(self._good())
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Look at whom a slot has, and wait for the next frame of the wide camera."""
+        """Look at whom a slot has, and wait for the next frame of the wide camera.
+
+        Raises:
+            ConfigError: there is no such slot, or no episode.
+        """
         self.episode  # noqa: B018  whether there is one
         if not self.action_space.contains(action):
             raise ConfigError(f"action: {told(action)} is not the number of a slot, 0 to {SLOTS - 1}")

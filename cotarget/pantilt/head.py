@@ -68,7 +68,15 @@ def zoom_fixed(
     T_zoom0_fixed: RigidTransform,
     head: HeadGeometry = IDEAL_HEAD,
 ) -> RigidTransform:
-    """Where the fixed camera is seen from the moved zoom camera: T_zoom_fixed (Eq. 2)."""
+    """Where the fixed camera is seen from the moved zoom camera: T_zoom_fixed (Eq. 2).
+
+    Args:
+        pan: the pan axis's angle [rad].
+        tilt: the tilt axis's [rad].
+        T_head_zoom: the paper's T.
+        T_zoom0_fixed: the paper's Gamma.
+        head: the unit's own geometry.
+    """
     return T_head_zoom.inv() * base_head(pan, tilt, head).inv() * T_head_zoom * T_zoom0_fixed
 
 

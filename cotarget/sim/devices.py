@@ -125,7 +125,11 @@ class SimZoomStream(SimStream):
         return self._drive.shortest_px, self._drive.longest_px
 
     def zoom(self, focal_px: float) -> float:
-        """Start the lens moving; return the focal length [px] of the position that it will stop at."""
+        """Start the lens moving; return the focal length [px] of the position that it will stop at.
+
+        Raises:
+            DeviceError: no lens can go there.
+        """
         if not focal_px > 0 or math.isinf(focal_px):
             raise DeviceError(f"the lens cannot go to a focal length of {focal_px} px")
         position = self._drive.position_for(focal_px)
@@ -185,7 +189,11 @@ class SimPanTilt:
         return PanTiltState(pan, tilt, now < self._rests, now)
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
-        """Command both axes [rad]; return what was commanded after clipping and rounding to steps."""
+        """Command both axes [rad]; return what was commanded after clipping and rounding to steps.
+
+        Raises:
+            DeviceError: no head can go there.
+        """
         if not (math.isfinite(pan) and math.isfinite(tilt)):
             raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
         speeds = self._limits.capped(speed)
