@@ -29,7 +29,7 @@ from cotarget.calibration import Calibration
 from cotarget.camera import depth_from_size
 from cotarget.geometry import Array
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.mounted import TARGET, at, check_above, exact_calibration, mounted, off_px, wanted_focal_px
+from experiments.mounted import TARGET, at, cell_name, check_above, exact_calibration, mounted, off_px, wanted_focal_px
 from experiments.synthetic import SIZE, Truth, aim, looking_off
 
 CAUSES = ("wrong size", "scatter", "pixels", "together")
@@ -156,17 +156,13 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         for depth, baseline in dict.fromkeys((row["depth_m"], row["baseline_m"]) for row in mine):
             found = [row for row in mine if (row["depth_m"], row["baseline_m"]) == (depth, baseline)]
             keys = ("relative", "reached_deg", "first_order_deg", "width")
-            cells[_cell(depth, baseline)] = {key: float(np.median([row[key] for row in found])) for key in keys}
+            cells[cell_name(depth, baseline)] = {key: float(np.median([row[key] for row in found])) for key in keys}
         ratio = [row["reached_deg"] / row["first_order_deg"] for row in mine]
         summary[cause] = {
             "cells": cells,
             "over_first_order": dict(zip(("low", "median", "high"), np.percentile(ratio, [5, 50, 95]), strict=True)),
         }
     return summary
-
-
-def _cell(depth: float, baseline: float) -> str:
-    return f"depth {depth:g} m, baseline {baseline:g} m"
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:

@@ -28,7 +28,7 @@ from cotarget.config import BoardConfig
 from cotarget.geometry import Array
 from cotarget.simconfig import SimHead
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.mounted import MOUNTED_DEG, at, check_above, mounted, off_px, wanted_focal_px
+from experiments.mounted import MOUNTED_DEG, at, cell_name, check_above, mounted, off_px, wanted_focal_px
 from experiments.regimes import FACTOR, ratios, reach, regime
 from experiments.simpler import CENTRING, FULL, IGNORED, MODELS, TABLE, TURNED, ZEROED, models_of
 from experiments.synthetic import SIZE, SIZES, Placing, looking_off, spread_views
@@ -126,7 +126,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         cells: dict[str, dict[str, dict[str, float]]] = {}
         for depth, baseline in dict.fromkeys((row["depth_m"], row["baseline_m"]) for row in rows):
             mine = [row for row in rows if (row["depth_m"], row["baseline_m"]) == (depth, baseline)]
-            cells[_cell(depth, baseline)] = {
+            cells[cell_name(depth, baseline)] = {
                 name: {key: float(np.median(_of(mine, name, f"{condition}_{key}"))) for key in ("deg", "width")}
                 for name in MODELS
             }
@@ -142,10 +142,6 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 def _of(rows: Sequence[Row], model: str, key: str) -> list[float]:
     return [row[key] for row in rows if row["model"] == model]
-
-
-def _cell(depth: float, baseline: float) -> str:
-    return f"depth {depth:g} m, baseline {baseline:g} m"
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
@@ -173,7 +169,7 @@ def describe(settings: ModelsSettings, summary: Mapping[str, Any]) -> str:
     texts = []
     for condition in CONDITIONS:
         errors = summary[condition]["errors"]
-        cells = [cell for pair in SHOWN if (cell := _cell(*pair)) in errors] or list(errors)[:3]
+        cells = [cell for pair in SHOWN if (cell := cell_name(*pair)) in errors] or list(errors)[:3]
         lines = [
             [name, *(value for c in cells for value in (errors[c][name]["deg"], 100 * errors[c][name]["width"]))]
             for name in MODELS

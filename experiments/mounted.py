@@ -24,6 +24,11 @@ LEVER = 0.15  # [m]
 TARGET = DEFAULT_TARGETS["bird"]  # of 0.8 m, wanted 160 px wide: the close-up is 3.2 m wide wherever the lens reaches
 
 
+def cell_name(depth: float, baseline: float) -> str:
+    """What a depth [m] with a baseline [m] is called in summaries, tables and bounds."""
+    return f"depth {depth:g} m, baseline {baseline:g} m"
+
+
 def check_above(low: float, settings: Settings, *names: str) -> None:
     """Refuse settings that cannot be, before any work.
 

@@ -51,8 +51,6 @@ class Estimate:
         measured_t: when the newest measurement before that was made [s].
         state: see `cotarget.estimation.motion`, (13,).
         state_covariance: (13, 13).
-        surprise: squared innovation over its expectation, averaged over the last measurements; 1 is as expected,
-            several says that the target moves harder than it should or that the calibration is wrong.
         carried: whether a hand may be carrying it elsewhere, by where it was found lately.
         size_prior: standard deviation of the true size over the told one, as it was assumed.
         bias_prior: likewise of the head's bias [rad].
@@ -65,7 +63,6 @@ class Estimate:
     measured_t: float
     state: Array
     state_covariance: Array
-    surprise: float
     carried: bool
     size_prior: float
     bias_prior: float

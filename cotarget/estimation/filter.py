@@ -134,7 +134,6 @@ class SpatialFilter:
             measured_t=node.t,
             state=x,
             state_covariance=P,
-            surprise=node.surprise,
             carried=motion.jump.by_hand_s is not None and node.jumped(motion.jump),
             size_prior=motion.size_sigma,
             bias_prior=motion.bias_sigma,
