@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from cotarget.detection.base import Detection, box_detection, check_size
 from cotarget.rig import Frame, Image
@@ -60,7 +59,6 @@ class MotionSettings:
 BACKGROUND_UPDATE_S = 0.25
 # Up to this part of the picture its foreground pixels are quicker looked up one by one than the picture is as a whole.
 FEW = 0.01
-WORD = np.dtype(np.uint64).itemsize  # so many pixels are looked at at once
 # Levels by which a pixel must leave the background's range: five standard deviations of the sensor's noise of 2, and
 # coding.
 MARGIN = 15
@@ -259,20 +257,10 @@ def _outside(mask: Image, image: Image, colours: tuple[Image, Image]) -> Image:
     """The part of a mask, (H, W), 0 or 255, where an image leaves a range of colours."""
     if cv2.countNonZero(mask) > FEW * mask.size:
         return cv2.subtract(mask, cv2.inRange(image, *colours))
-    there = _lit(mask)
+    there = np.flatnonzero(mask.ravel() != 0)  # of truth values: ten times as quick as of bytes
     if len(there):
         pixels, darkest, brightest = (
             each.reshape(-1, 3).take(there, axis=0).reshape(-1, 1, 3) for each in (image, *colours)
         )
         mask.ravel()[there] = cv2.bitwise_not(cv2.inRange(pixels, darkest, brightest)).ravel()
     return mask
-
-
-def _lit(mask: Image) -> npt.NDArray[np.intp]:
-    """Where a mask that is dark nearly everywhere is not 0, in its pixels one after the other."""
-    pixels = mask.ravel()
-    if len(pixels) % WORD:
-        return np.flatnonzero(pixels)
-    words = np.flatnonzero(pixels.view(np.uint64))
-    near = (WORD * words[:, None] + np.arange(WORD)).ravel()
-    return near[pixels[near] != 0]
