@@ -75,7 +75,7 @@ class Wrapped:
 def world():
     from cotarget.sim.world import SimWorld
 
-    config = parse_config({"sim": {"fixed": {"rate_hz": 15.0}, "zoom": {"rate_hz": 10.0}}})
+    config = parse_config({"sim": {"fixed": {"rate_hz": 15.0}, "zoom": {"rate_hz": 10.0, "size": [320, 240]}}})
     world = SimWorld(config)
     yield world
     world.rig.close()

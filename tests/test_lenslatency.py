@@ -10,6 +10,7 @@ from cotarget.lenslatency import began, measure_lens, scales
 from cotarget.sim.world import SimWorld
 from tests.test_latency import LateCamera, Wrapped
 
+SMALL = {"size": [320, 240], "rate_hz": 15.0}  # a quarter of the rendering
 CLOSE = 0.01  # [s], with 15 frames a second
 
 
@@ -41,7 +42,7 @@ def test_a_way_between_two_frames_began_between_them():
 @pytest.mark.render
 @pytest.mark.parametrize("late", [pytest.param(0.0, marks=pytest.mark.slow), 0.045])
 def test_the_simulated_lens(late):
-    config = parse_config({"sim": {"zoom": {"rate_hz": 15.0}, "head": {"command_delay_s": 0.12}}})
+    config = parse_config({"sim": {"zoom": SMALL, "head": {"command_delay_s": 0.12}}})
     with SimWorld(config).rig as rig:
         found = measure_lens(Wrapped(rig, zoom=LateCamera(rig.zoom, late)), late)
         assert found.command == pytest.approx(0.12, abs=CLOSE)
@@ -51,7 +52,7 @@ def test_the_simulated_lens(late):
 
 @pytest.mark.render
 def test_a_picture_that_does_not_grow_is_no_measurement():
-    config = parse_config({"sim": {"zoom": {"rate_hz": 15.0}}})
+    config = parse_config({"sim": {"zoom": SMALL}})
     with SimWorld(config).rig as rig:
         frame = rig.zoom.read()
 
