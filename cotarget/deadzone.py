@@ -181,7 +181,7 @@ class Steering:
         if way.still and off_goal <= zone and (command.speed is None or off_then <= zone):
             fine = max(FINE_STEPS * self._limits.step, FINE * zone)
             there = zip(way.after(interval_s), self._at(effect_t + interval_s), strict=True)
-            centred = all(abs(q - x) <= fine for q, x in there)
+            centred = all(abs(q - self._limits.rounded(x)) <= fine for q, x in there)
             return centred or effect_t - self.head.commanded_t < self._settings.rest_s
         return all(rests)
 

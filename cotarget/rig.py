@@ -66,6 +66,10 @@ class PanTiltLimits:
     acceleration: float
     step: float
 
+    def rounded(self, angle: float) -> float:
+        """The angle at which an axis stands when it is sent to one [rad]: the nearest of its steps."""
+        return round(angle / self.step) * self.step if self.step else angle
+
     def capped(self, speed: Speed | None) -> tuple[float, float]:
         """The speeds of pan and tilt to ask for [rad/s]: never above the highest, which is meant by None.
 

@@ -46,7 +46,7 @@ SHOWN = (
         for experiment, figure in (("fig4_book", "fig4"), ("fig5_person", "fig5"), ("fig6_outdoors", "fig6"))
         for way in WAYS
     ),
-    *(Shown(name, FIGURE, name) for name in ("delay", "five_targets", "models", "shortcut", "single_ptz")),
+    *(Shown(name, FIGURE, name) for name in ("hold", "delay", "five_targets", "models", "shortcut", "single_ptz")),
 )
 
 

@@ -170,11 +170,15 @@ def test_a_target_that_stands_is_centred_once_and_left_alone():
     assert (first.pan, first.tilt, first.speed) == (0.05, 0.0, None)
     # On its way, and there: the same place, give or take what is less than the zone, needs no further command ...
     assert all(decide(steering, i * FRAME, 0.05 + 0.9 * ZONE * (-1) ** i) is None for i in range(1, 25))
-    # ... until it has rested for a second: then it is centred, slowly, if it is off by more than rounding leaves.
-    assert decide(steering, 1.04, 0.05 + 0.55 * STEP) is None
-    centred = decide(steering, 1.08, 0.05 + 0.65 * STEP)
-    assert centred.pan == 0.05 + 0.65 * STEP
-    assert centred.speed[0] == pytest.approx(0.65 * STEP / SteeringSettings().catch_s)
+    # ... until it has rested for a second: then it is centred, slowly, if it is off by more than rounding leaves, seen
+    # from the step at which it really stands, a third of one beside its goal.
+    at = round(0.05 / STEP) * STEP
+    assert 0.05 + 0.25 * STEP < at < 0.05 + 0.35 * STEP
+    assert decide(steering, 1.04, at + 0.55 * STEP) is None
+    assert decide(steering, 1.04, at - 0.55 * STEP) is None
+    centred = decide(steering, 1.08, at - 0.65 * STEP)
+    assert centred.pan == at - 0.65 * STEP
+    assert centred.speed[0] == pytest.approx((0.05 - centred.pan) / SteeringSettings().catch_s)
     assert decide(steering, 1.12, 0.05) is None
     # Out of the zone it is gone after at once.
     assert decide(steering, 1.2, 0.05 + 2 * ZONE).pan == 0.05 + 2 * ZONE
