@@ -139,7 +139,7 @@ def aim(
         CalibrationError: the calibration has no T.
         UnreachableError: no pan and tilt within the limits do it.
     """
-    x_base = calibration.T_base_fixed.apply(x_fixed)  # (6)
+    x_base = calibration.in_base(x_fixed)  # (6)
     wanted = calibration.zoom.stops[0].image_center_px if pixel is None else np.asarray(pixel, dtype=float)
     if closeup:  # begin near: with the range from the base
         nominal_px = calibration.zoom.nominal_for(focal_for_size(closeup.size, closeup.wanted_px, math.hypot(*x_base)))

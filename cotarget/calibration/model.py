@@ -257,6 +257,20 @@ class Calibration:
         """
         return self.hand_eye() * self.T_zoom0_fixed
 
+    @cached_property
+    def _base_fixed(self) -> Array:
+        """Rotation and translation of that side by side, (3, 4)."""
+        return self.T_base_fixed.as_matrix()[:3]
+
+    def in_base(self, x_fixed: Array) -> Array:
+        """Where a point of the fixed camera's frame is in the base's (6), (3,) [m]; in a third of scipy's time.
+
+        Raises:
+            CalibrationError: there was no head to calibrate.
+        """
+        x, y, z = x_fixed
+        return np.asarray(self._base_fixed @ np.array((x, y, z, 1.0)))
+
     def for_streams(self, fixed_size: tuple[int, int], zoom_size: tuple[int, int]) -> "Calibration":
         """The same calibration for streams (width, height) [px] that are scaled.
 

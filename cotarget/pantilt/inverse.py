@@ -79,15 +79,14 @@ def solve(
     R, t = T[:3, :3], T[:3, 3] + T[:3, 2] * pupil
     t[2] -= head.axis_offset
     if x_base.ndim == ray.ndim == 1:
-        d = _floats(R @ ray / math.hypot(*ray))
-        pan, tilt, reach = np.array(_solve_one(_floats(x_base), d, _floats(t), head)).T
-    else:
-        x_base, ray = np.broadcast_arrays(x_base, ray)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            d_many = ray / np.linalg.norm(ray, axis=-1, keepdims=True) @ R.T
-            pan, tilt, reach = _solve_many(x_base, d_many, t, head)
-    wrapped = head.reported_angles(*((angle + np.pi) % TURN - np.pi for angle in (pan, tilt)))
-    return Pointing(*(np.where(reach > 0, value, np.nan) for value in (*wrapped, reach)))
+        x, d = _floats(x_base), _floats(R @ ray / math.hypot(*ray))
+        ways = [_reported(*way, head) if way[2] > 0 else NOWHERE for way in _solve_one(x, d, _floats(t), head)]
+        return Pointing(*np.array(ways).T)
+    x_base, ray = np.broadcast_arrays(x_base, ray)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        d_many = ray / np.linalg.norm(ray, axis=-1, keepdims=True) @ R.T
+        found = _solve_many(x_base, d_many, t, head)
+    return Pointing(*(np.where(found[2] > 0, value, np.nan) for value in _reported(*found, head)))
 
 
 def nearest(
@@ -136,6 +135,12 @@ def nearest(
         f"the point needs {wanted} degrees, beyond the limits "
         f"pan {lo_hi[0]:g} to {lo_hi[1]:g}, tilt {lo_hi[2]:g} to {lo_hi[3]:g} degrees"
     )
+
+
+def _reported(pan: Any, tilt: Any, reach: Any, head: HeadGeometry) -> Triple[Any]:
+    """What the head reports at true angles, which are taken within -pi..pi, and the range, of floats or arrays."""
+    pan, tilt = head.reported_angles((pan + math.pi) % TURN - math.pi, (tilt + math.pi) % TURN - math.pi)
+    return pan, tilt, reach
 
 
 def _floats(v: Array) -> Triple[float]:
