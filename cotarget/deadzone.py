@@ -33,7 +33,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from cotarget.headmodel import Angles, HeadCommand, HeadModel, Motion
-from cotarget.rig import PanTiltLimits
+from cotarget.rig import PanTiltLimits, to_step
 
 LEAST_SPEED = 1e-3  # a command needs one above zero [rad/s]
 FRAMES_AHEAD = 1.5  # a goal lies no nearer than that, so that a head of slow cameras does not stop between frames
@@ -181,7 +181,7 @@ class Steering:
         if way.still and off_goal <= zone and (command.speed is None or off_then <= zone):
             fine = max(FINE_STEPS * self._limits.step, FINE * zone)
             there = zip(way.after(interval_s), self._at(effect_t + interval_s), strict=True)
-            centred = all(abs(q - self._limits.rounded(x)) <= fine for q, x in there)
+            centred = all(abs(q - to_step(x, self._limits.step)) <= fine for q, x in there)
             return centred or effect_t - self.head.commanded_t < self._settings.rest_s
         return all(rests)
 

@@ -13,7 +13,7 @@ from cotarget.errors import UnreachableError
 from cotarget.geometry import Array
 from cotarget.loop import Step
 from cotarget.metrics import WHOLLY_VISIBLE, Closeup, Row
-from cotarget.rig import Frame
+from cotarget.rig import Frame, to_step
 from cotarget.sim.appearances import Appearances, Silhouette
 from cotarget.sim.targets import marker_of
 from cotarget.sim.truth import Truth
@@ -230,6 +230,6 @@ def pointing_errors(
             found = aim(calibration, calibration.fixed.ray(pixel) * depth, reach, nominal_px=nominal_px, method=method)
         except UnreachableError:
             continue
-        pan, tilt = (round(angle / step) * step if step else angle for angle in (found.pan, found.tilt))
+        pan, tilt = (to_step(angle, step) for angle in (found.pan, found.tilt))
         errors.append(truth.line_of_sight_miss(pan, tilt, found.nominal_px, x_world))
     return np.array(errors)

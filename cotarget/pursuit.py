@@ -82,7 +82,7 @@ class Pursuit:
         self._finder = finder(calibration, target)
         self._waiting: deque[Frame] = deque(maxlen=MOST_WAITING)  # zoom frames without a wide view of their time
         self._apart_s = 0.0  # by which the newest zoom frame was newer than the newest wide one
-        self._to_base = calibration.hand_eye() * calibration.T_zoom0_fixed
+        self._to_base = calibration.T_base_fixed
         self.states = StateHistory()
 
     def see_wide(

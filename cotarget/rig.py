@@ -48,6 +48,11 @@ class PanTiltState:
     t: float
 
 
+def to_step(angle: float, step: float) -> float:
+    """Where an axis stands that is sent to an angle [rad]: the nearest of its steps [rad]; 0 for a continuous one."""
+    return round(angle / step) * step if step else angle
+
+
 @dataclass(frozen=True)
 class PanTiltLimits:
     """What a pan-tilt unit can do.
@@ -65,10 +70,6 @@ class PanTiltLimits:
     speed: float
     acceleration: float
     step: float
-
-    def rounded(self, angle: float) -> float:
-        """The angle at which an axis stands when it is sent to one [rad]: the nearest of its steps."""
-        return round(angle / self.step) * self.step if self.step else angle
 
     def capped(self, speed: Speed | None) -> tuple[float, float]:
         """The speeds of pan and tilt to ask for [rad/s]: never above the highest, which is meant by None.

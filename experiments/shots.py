@@ -25,7 +25,7 @@ from cotarget.metrics import Row as Judged
 from cotarget.oracle import true_calibration
 from cotarget.policies import FirstCome
 from cotarget.pursuit import Pursuit
-from cotarget.rig import Frame, Rig
+from cotarget.rig import Frame, Rig, to_step
 from cotarget.safety import SafeRig
 from cotarget.servo import reach_of
 from cotarget.sim.truth import Truth
@@ -276,7 +276,7 @@ def budget(
         model: Calibration, x_fixed: Array, x_world: Array, step: float = 0.0, nominal: float | None = None
     ) -> float:
         found = aim(model, x_fixed, free, nominal_px=shot.wished_px)
-        pan, tilt = (round(angle / step) * step if step else angle for angle in (found.pan, found.tilt))
+        pan, tilt = (to_step(angle, step) for angle in (found.pan, found.tilt))
         return truth.line_of_sight_miss(pan, tilt, found.nominal_px if nominal is None else nominal, x_world)
 
     return {

@@ -103,7 +103,7 @@ class CloseupFinder:
             CalibrationError: the calibration has no T.
         """
         self._calibration = calibration
-        self._T_base_fixed = calibration.hand_eye() * calibration.T_zoom0_fixed  # (6)
+        self._T_base_fixed = calibration.T_base_fixed
         self._T_zoom_head = calibration.hand_eye().inv()
         self._target = target
         self._sights: deque[Sight] = deque()

@@ -189,7 +189,7 @@ class MotionDetector:
         """A mask without the background in a brighter light, where most of what changed is that."""
         if cv2.countNonZero(mask) < FEW * mask.size:
             return mask
-        there = np.flatnonzero(mask)
+        there = np.flatnonzero(mask != 0)
         now, before = (each.reshape(-1, 3)[there].astype(np.float32) for each in (image, self._background()))
         light = np.einsum("ij,ij->i", now, before) / np.maximum(np.einsum("ij,ij->i", before, before), 1.0)
         same = (
@@ -257,7 +257,7 @@ def _outside(mask: Image, image: Image, colours: tuple[Image, Image]) -> Image:
     """The part of a mask, (H, W), 0 or 255, where an image leaves a range of colours."""
     if cv2.countNonZero(mask) > FEW * mask.size:
         return cv2.subtract(mask, cv2.inRange(image, *colours))
-    there = np.flatnonzero(mask.ravel() != 0)  # of truth values: ten times as quick as of bytes
+    there = np.flatnonzero(mask != 0)  # of truth values: ten times as quick as of bytes
     if len(there):
         pixels, darkest, brightest = (
             each.reshape(-1, 3).take(there, axis=0).reshape(-1, 1, 3) for each in (image, *colours)

@@ -57,8 +57,7 @@ class Sights:
         """
         self._calibration = calibration
         self._head: HeadGeometry = calibration.head
-        T_base_fixed = calibration.hand_eye() * calibration.T_zoom0_fixed  # (6)
-        self._fixed = T_base_fixed.as_matrix()[:3]  # rotation and translation side by side, (3, 4)
+        self._fixed = calibration.T_base_fixed.as_matrix()[:3]  # rotation and translation side by side, (3, 4)
         self._hand_t = np.asarray(calibration.hand_eye().translation)
         self._hand_z = calibration.hand_eye().rotation.as_matrix()[:, 2]
         self._unhand = calibration.hand_eye().rotation.as_matrix().T

@@ -8,7 +8,7 @@ from typing import NoReturn
 from cotarget.config import SimCamera, SimEffects, SimHead, SimZoomCamera
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
-from cotarget.rig import Camera, Clock, Frame, Image, PanTiltLimits, PanTiltState, Speed, ZoomState
+from cotarget.rig import Camera, Clock, Frame, Image, PanTiltLimits, PanTiltState, Speed, ZoomState, to_step
 from cotarget.sim.motion import Axis, HeadDrive, LensDrive
 
 # Frame times are multiples of the frame period; this much of a period [1] absorbs their rounding.
@@ -185,7 +185,7 @@ class SimPanTilt:
     def state(self) -> PanTiltState:
         """What the unit's own step counters say now."""
         now = self._clock.now()
-        pan, tilt = (self._to_step(axis.motor(now)[0]) for axis in (self._drive.pan, self._drive.tilt))
+        pan, tilt = (to_step(axis.motor(now)[0], self._limits.step) for axis in (self._drive.pan, self._drive.tilt))
         return PanTiltState(pan, tilt, now < self._rests, now)
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
@@ -208,10 +208,6 @@ class SimPanTilt:
         """Brake both axes."""
         t = self._clock.now() + self._delay
         self._rests = max(self._drive.pan.halt(t), self._drive.tilt.halt(t))
-
-    def _to_step(self, angle: float) -> float:
-        step = self._limits.step
-        return round(angle / step) * step if step else angle
 
     def _clip(self, angle: float, limits: tuple[float, float]) -> float:
         step = self._limits.step
