@@ -10,6 +10,7 @@ import pytest
 from cotarget.config import DEFAULT_TARGETS, TargetConfig
 from cotarget.detection import ColourDetector, MotionDetector, colour, make_detector
 from cotarget.detection.colour import LARGEST_FITTED_PX, MOST_FITTED
+from cotarget.detection.motion import pieces
 from cotarget.detection.templatefit import MARGIN_PX, fit_template
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.rig import Frame
@@ -180,6 +181,19 @@ def test_a_box_at_the_border_is_marked():
     (box,) = watch(motion("bird"), pictures)[-1]
     assert box.clipped
     np.testing.assert_allclose(box.center_px, (3.5, 104.5), atol=0.5)
+
+
+@pytest.mark.parametrize("bridge", [(5, 5), (5, 15)])
+def test_pieces_are_those_of_the_whole_bridged_mask(bridge):
+    """Wherever they lie, in the corners too: another of OpenCV's functions gives the same boxes."""
+    rng = np.random.default_rng(0)
+    for few in (0, 1, 2, 5, 20):
+        mask = np.zeros((48, 64), np.uint8)
+        mask[rng.integers(48, size=few), rng.integers(64, size=few)] = 255
+        mask[0, 0] = 255 * (few == 2)
+        joined = cv2.dilate(mask, np.ones(bridge[::-1], np.uint8))
+        stats = cv2.connectedComponentsWithStats(joined)[2]
+        assert sorted(map(tuple, pieces(mask, bridge))) == sorted(map(tuple, stats[1:, :4].tolist()))
 
 
 def test_swaying_twigs_are_background():

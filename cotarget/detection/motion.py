@@ -1,5 +1,6 @@
 """What moves: an adaptive Gaussian mixture of the background, morphology and connected pieces (person, bird)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -216,14 +217,10 @@ class MotionDetector:
         """Boxes of the connected pieces, largest first."""
         settings = self._settings
         height, width = mask.shape
-        bridge_w, bridge_h = settings.bridge_px
-        closed = cv2.dilate(mask, np.ones((bridge_h, bridge_w), np.uint8))
-        contours = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]
         found = []
         largest_w, largest_h = settings.largest * width, settings.largest * height
-        for contour in contours:
-            x, y, w, h = cv2.boundingRect(contour)
-            # The dilation only joined the pieces: the box is that of the mask's own pixels inside.
+        for x, y, w, h in pieces(mask, settings.bridge_px):
+            # Their gaps were only bridged: the box is that of the mask's own pixels inside.
             for first, last in self._upright(mask[y : y + h, x : x + w]):
                 inside = mask[y : y + h, x + first : x + last]
                 area = cv2.countNonZero(inside)
@@ -251,6 +248,22 @@ class MotionDetector:
         columns = cv2.dilate(stands, np.ones((1, self._settings.bridge_px[0]), np.uint8)).any(axis=0)
         edges = np.flatnonzero(np.diff(columns, prepend=False, append=False)).tolist()
         return list(zip(edges[::2], edges[1::2], strict=True))
+
+
+def pieces(mask: Image, bridge_px: tuple[int, int]) -> list[Sequence[int]]:
+    """Left, top, width and height of the connected pieces of a mask, (H, W) [px], half a gap on each side included.
+
+    Gaps of up to (across, down) count as none.
+    """
+    left, top, width, height = cv2.boundingRect(mask)  # mostly small, and all the rest needs no look
+    if not width:
+        return []
+    across, down = bridge_px
+    x, y = max(left - across // 2, 0), max(top - down // 2, 0)
+    near = mask[y : top + height + down // 2, x : left + width + across // 2]
+    joined = cv2.dilate(near, np.ones((down, across), np.uint8))
+    contours = cv2.findContours(joined, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE, offset=(x, y))[0]
+    return [cv2.boundingRect(contour) for contour in contours]
 
 
 def _outside(mask: Image, image: Image, colours: tuple[Image, Image]) -> Image:
