@@ -32,8 +32,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from cotarget.headmodel import Angles, HeadCommand, HeadModel, Motion
-from cotarget.rig import PanTiltLimits, to_step
+from cotarget.headmodel import HeadCommand, HeadModel, Motion
+from cotarget.rig import Angles, PanTiltLimits, to_step
 
 LEAST_SPEED = 1e-3  # a command needs one above zero [rad/s]
 FRAMES_AHEAD = 1.5  # a goal lies no nearer than that, so that a head of slow cameras does not stop between frames

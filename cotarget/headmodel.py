@@ -8,9 +8,8 @@ it says, a command from somebody else.
 import math
 from dataclasses import dataclass, replace
 
-from cotarget.rig import PanTiltLimits, PanTiltState, Speed
+from cotarget.rig import Angles, PanTiltLimits, PanTiltState, Speed
 
-Angles = tuple[float, float]
 Motion = tuple[tuple[float, float], tuple[float, float]]  # position and speed of pan, and of tilt [rad, rad/s]
 
 # A report agrees that is off by no more than so many steps and by what the axis turns in this time [s].

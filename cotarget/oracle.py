@@ -13,6 +13,7 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.closeup import CloseupFinder, Expected, Found
+from cotarget.closeup.registration import GATE_SIGMAS
 from cotarget.config import TargetConfig
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError
@@ -41,6 +42,8 @@ def true_calibration(world: SimWorld, stops: int = 8) -> Calibration:
     )
 
 
+# Seeds so far apart are another's random numbers: what a detector and what a finder err by is independent.
+FINDER_SEED = 1 << 33
 # Gives the random numbers of a time [s]; they are to be drawn before those of another time are asked for.
 NumbersAt = Callable[[float], np.random.Generator]
 
@@ -160,7 +163,6 @@ class TruthFinder:
     """
 
     SIGMA_PX = 1.0  # of the noise; the real finder assumes that lens, head and the times of frames leave as much
-    GATE_SIGMAS = 3.0  # as that of the real finder
 
     def __init__(
         self,
@@ -182,7 +184,8 @@ class TruthFinder:
             missed: whether it is not found in a frame, by the time when that was exposed [s].
         """
         self._view = CloseupFinder(calibration, target).view
-        self._truth, self._name, self._missed, self._numbers_at = truth, name, missed, counted(seed)
+        self._truth, self._name, self._missed = truth, name, missed
+        self._numbers_at = counted(seed + FINDER_SEED)
 
     def see_wide(self, frame: Frame, detection: Detection, mask: Image | None = None) -> None:
         """Nothing of it is remembered."""
@@ -201,6 +204,6 @@ class TruthFinder:
         )
         off = at - view.center_px
         inside = (at >= 0).all() and (at <= np.array(frame.image.shape[1::-1]) - 1).all()
-        if not inside or off @ np.linalg.solve(view.covariance, off) > self.GATE_SIGMAS**2:
+        if not inside or off @ np.linalg.solve(view.covariance, off) > GATE_SIGMAS**2:
             return None
         return Found(at, self.SIGMA_PX, np.full(2, self.SIGMA_PX), 1.0, 1.0, np.ptp(box, axis=0), frame.t)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from cotarget.geometry import Array
 from cotarget.motionfilter import Track
-from cotarget.rig import PanTiltLimits
+from cotarget.rig import Angles, PanTiltLimits
 
 # A good close-up of a second is what a target should have; some more for what the plan does not know [s].
 LOOK_S = 1.2
@@ -19,8 +19,6 @@ SETTLE_S = 0.6
 MOST_PLANNED = 7
 # How fast a target goes round the head is taken over this time [s].
 RATE_S = 0.1
-
-Angles = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -136,6 +134,8 @@ def _worth(order: Plan) -> tuple[int, float, int]:
 def travel_s(way: Angles, limits: PanTiltLimits) -> float:
     """How long the head takes from rest to rest over a way in pan and tilt [rad], both axes at once [s]."""
     longest = max(abs(way[0]), abs(way[1]))
+    if math.isinf(limits.acceleration):  # at its speed at once, or there at once
+        return longest / limits.speed
     if longest * limits.acceleration <= limits.speed**2:  # it never reaches its speed
         return 2 * math.sqrt(longest / limits.acceleration)
     return longest / limits.speed + limits.speed / limits.acceleration

@@ -20,6 +20,7 @@ from cotarget.estimation import Appearance, Estimate, SpatialFilter, estimation_
 from cotarget.estimation.motion import PAN, TILT, K, L
 from cotarget.geometry import Array
 from cotarget.motionfilter import missing, room_inside
+from cotarget.pantilt import towards
 from cotarget.planning import Candidate
 from cotarget.policies import leaves_in
 from cotarget.rig import Frame, Image
@@ -31,7 +32,6 @@ from cotarget.zoompolicy import is_seen_well, shape_of
 MOST_FILTERS = 12
 # The time of a frame, of the head's state and of the lens's are known to each other this well [s].
 TIME_SIGMA_S = 2e-3
-HEAD_SIGMA = 3e-4  # of the angles of a head that stands: rounding of 0.05 degrees [rad]
 # A size or a head's bias that is this many times what was assumed is no chance; a right one comes to 1 or 2.
 WRONG = 4.0
 # Whoever is in both views and yet not found in the zoom view for so long is not where he is thought to be [s]. A bird
@@ -188,7 +188,7 @@ class Pursuit:
                 pose.tilt,
                 pose.nominal_px,
                 frame.t,
-                head_sigma=math.hypot(HEAD_SIGMA, pose.speed * TIME_SIGMA_S),
+                head_sigma=math.hypot(self._assumed.head_sigma, pose.speed * TIME_SIGMA_S),
             )
         return found
 
@@ -277,8 +277,7 @@ class Pursuit:
         """Pan and tilt of a target as seen from the head, (2,) [rad], the zoom camera's place on it aside."""
         estimate = known.at(t + later)
         assert estimate is not None, "what is known at a time is known later"
-        x, y, z = self._to_base.apply(estimate.x_fixed)
-        return np.array([math.atan2(x, z), math.atan2(-y, math.hypot(x, z))])
+        return np.array(towards(self._to_base.apply(estimate.x_fixed)))
 
 
 def _contradicted(estimate: Estimate) -> list[str]:

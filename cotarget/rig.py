@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from cotarget.config import RigConfig
 
 Image = npt.NDArray[np.uint8]
+Angles = tuple[float, float]  # pan and tilt [rad]
 Speed = float | tuple[float, float]  # of both axes of a head, or of pan and tilt each [rad/s]
 
 

@@ -14,8 +14,7 @@ from cotarget.calibration import Calibration
 from cotarget.deadzone import Steering, SteeringSettings
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
-from cotarget.headmodel import Angles
-from cotarget.rig import PanTiltState, Rig
+from cotarget.rig import Angles, PanTiltState, Rig
 from cotarget.targeting import Aim, Reach, aim
 from cotarget.zoompolicy import ZoomPolicy, ZoomSettings, expect
 

@@ -21,14 +21,16 @@ from cotarget.detection import Detection, Detector
 from cotarget.errors import UnreachableError
 from cotarget.geometry import Array
 from cotarget.pantilt import base_head, nearest, solve
-from cotarget.rig import Frame, Rig
+from cotarget.rig import Angles, Frame, Rig
+from cotarget.servo import NO_CHANGE
 from cotarget.sim.truth import Truth
 from cotarget.tracking import Tracker, settings_for
 from cotarget.zoompolicy import Expected, ZoomPolicy
-from experiments.lone_course import SEARCH_S, Angles, Course, Sighting
+from experiments.lone_course import SEARCH_S, Course, Sighting
 
 COAST_S = 0.6  # so long a target out of sight is expected where it would be [s]
 SIZE_SIGMA = 0.1  # relative standard deviation of a size, for the zoom policy
+FIRST_INTERVAL_S = 0.04  # until a second frame has come [s]
 OVERLAP = 0.1  # of neighbouring views of a scan
 RING = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))  # half views about a place
 
@@ -81,7 +83,7 @@ class LoneCamera:
         end, last = self._rig.clock.now() + seconds, None
         while self._rig.clock.now() < end:
             frame = self._rig.zoom.read(newer_than=last)
-            interval = 0.04 if last is None else frame.t - last
+            interval = FIRST_INTERVAL_S if last is None else frame.t - last
             last = frame.t
             found = [self._sighting(frame.t, each) for each in self._detector.detect(frame)]
             doubted = self._take(frame.t, found)
@@ -167,7 +169,7 @@ class LoneCamera:
         if not course.whole:  # not nearer, before all of it was seen
             wanted_px = min(wanted_px, true_px)
         choice = self._policy.choose(expected, wanted_px, true_px, now, now_px)
-        if abs(choice.focal_px / true_px - 1) > 1e-6:
+        if abs(choice.focal_px / true_px - 1) > NO_CHANGE:
             self._focal = rig.zoom.zoom(self._zoom.nominal_for(choice.focal_px))
 
     def _look_around(self, mode: str, frame_t: float) -> None:
@@ -224,6 +226,7 @@ def scan_of(rig: Rig, calibration: Calibration) -> list[Angles]:
     fx, fy = calibration.zoom.stops[0].focal_px
     views = (1 - OVERLAP) * 2 * math.atan(width / 2 / fx), (1 - OVERLAP) * 2 * math.atan(height / 2 / fy)
     fixed = calibration.fixed
+    width, height = fixed.size
     edges = fixed.ray(
         np.array([[0.0, height / 2], [width - 1.0, height / 2], [width / 2, 0.0], [width / 2, height - 1]])
     )

@@ -27,6 +27,7 @@ from matplotlib.figure import Figure
 
 from cotarget.metrics import Row as Judged
 from cotarget.metrics import score
+from cotarget.metrics.held import BACKGROUND_S
 from cotarget.sim.fieldpaths import LONE, SECONDS
 from cotarget.simconfig import SimConfig
 from experiments.harness import Experiment, Row, Settings, seeds_of, table
@@ -60,7 +61,8 @@ class SingleSettings(Settings):
     def __post_init__(self) -> None:
         """Refuse what cannot be."""
         super().__post_init__()
-        check_above(0, self, "seconds", *(() if self.lasts_s is None else ("lasts_s",)))
+        check_above(BACKGROUND_S, self, "seconds")  # when the clock starts
+        check_above(0, self, *(() if self.lasts_s is None else ("lasts_s",)))
 
 
 def one(_: None, settings: SingleSettings, seed: int) -> list[Row]:
@@ -89,8 +91,15 @@ def figures(judged: Sequence[Judged], way: str) -> Row:
         "in_frame_of_all": float(np.mean([row.in_frame for row in since])) if since else math.nan,
         "time_to_acquire_s": found.time_to_acquire_s,
         "tpo_width_median": found.tpo_width_median,
-        "watched": 1.0 if way == PAIR else float(np.mean([min(1.0, (WIDE_PX / row.focal_px) ** 2) for row in since])),
+        "watched": _watched(since, way),
     }
+
+
+def _watched(since: Sequence[Judged], way: str) -> float:
+    """Which part of the wide camera's field is in view, in the mean; nan of no frame."""
+    if way == PAIR:
+        return 1.0
+    return float(np.mean([min(1.0, (WIDE_PX / row.focal_px) ** 2) for row in since])) if since else math.nan
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:

@@ -14,6 +14,7 @@ from cotarget.metrics import WHOLLY_VISIBLE
 from cotarget.metrics import Row as Judged
 from cotarget.metrics.held import BACKGROUND_S, ROUNDING_S
 from cotarget.oracle import TruthDetector, TruthFinder, counted, true_calibration
+from cotarget.pantilt import towards
 from cotarget.rig import Rig
 from cotarget.safety import SafeRig
 from cotarget.sim.outlines import Outlines
@@ -76,9 +77,8 @@ def any_pose(rig: Rig, calibration: Calibration, seed: int) -> tuple[float, floa
     """Pan and tilt at which the zoom camera looks somewhere into the wide view [rad]."""
     rng = np.random.default_rng((seed, STREAM))
     pixel = rng.uniform(0.0, np.array(rig.fixed.size) - 1.0)
-    x, y, z = calibration.T_base_fixed.apply(FAR * calibration.fixed.ray(pixel))
+    pan, tilt = towards(calibration.T_base_fixed.apply(FAR * calibration.fixed.ray(pixel)))
     limits = rig.head.limits
-    pan, tilt = math.atan2(x, z), math.atan2(-y, math.hypot(x, z))
     return float(np.clip(pan, *limits.pan)), float(np.clip(tilt, *limits.tilt))
 
 

@@ -32,6 +32,9 @@ def test_a_way_takes_as_long_as_the_units_profile_says():
     assert travel_s(np.radians([20.0, 5.0]), LIMITS) == pytest.approx(2 * math.sqrt(20 / 206))
     assert travel_s(np.radians([0.0, -140.0]), LIMITS) == pytest.approx(2 * 149 / 206 + (140 - 149**2 / 206) / 149)
     assert travel_s(STILL, LIMITS) == 0.0
+    at_once = replace(LIMITS, acceleration=math.inf)
+    assert travel_s((0.0, at_once.speed), at_once) == pytest.approx(1.0)
+    assert travel_s(STILL, at_once) == travel_s(STILL, replace(at_once, speed=math.inf)) == 0.0
 
 
 def test_when_a_track_leaves_the_image():

@@ -69,6 +69,18 @@ def test_frames_are_a_function_of_seed_and_time_alone():
         assert (third.expose("fixed", 5, 4.0) != image).mean() > 0.1
 
 
+def test_another_seed_is_another_wind():
+    """Noise is another too, so that pictures would not tell: where the treetops are does."""
+    places = []
+    for seed in (3, 3, 4):
+        with (w := world(seed=seed, effects={"clutter": True})).rig:
+            truth = w.truth()
+            crowns = [g for g in range(truth.model.ngeom) if truth.model.geom(g).name.startswith("clutter/crown_")]
+            places.append(truth.set_state(4.0).geom_xpos[crowns].copy())
+    np.testing.assert_array_equal(places[0], places[1])
+    assert np.abs(places[2] - places[0]).max() > 1e-2  # metres
+
+
 def test_foliage_stands_where_it_is_though_only_the_target_was_asked_for_before():
     config = parse_config({"sim": {"scene": "outdoor", "targets": ["bird"], "effects": {"clutter": True}}})
     asked, plain = (SimWorld(config, rendered=()).truth() for _ in range(2))

@@ -18,6 +18,7 @@ from cotarget.geometry import Array
 from cotarget.judging import closeup_of
 from cotarget.loop import FollowSettings, Step, follow
 from cotarget.metrics import SERVED_S
+from cotarget.metrics.held import ROUNDING_S
 from cotarget.motionfilter import Track
 from cotarget.oracle import TruthNoise
 from cotarget.planning import LOOK_S, Candidate
@@ -26,7 +27,6 @@ from cotarget.sim.fieldpaths import GROUPED, SECONDS, group_paths
 from cotarget.simconfig import Size
 
 SLOTS = 8  # for tracks: five targets, and those that were lost and found under another number
-ROUNDING_S = 1e-6  # frame times are sums and differences of binary fractions
 SERVED_REWARD = 5.0  # for each: as much as looking on at one of them is worth in as many seconds
 
 # What a policy knows of a track (`cotarget.policies.Candidate`), and the range of each number; 0 in an empty slot.

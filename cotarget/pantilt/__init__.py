@@ -6,8 +6,19 @@ ideal head has dz = eps = 0. A target x_base is on the ray d of the zoom camera 
     T_base_head(pan, tilt) T_head_zoom (r d) = x_base                                                  (Eqs. 2, 6)
 """
 
-from cotarget.pantilt.head import IDEAL_HEAD, HeadGeometry, base_head, miss, zoom_fixed
+from cotarget.pantilt.head import IDEAL_HEAD, HeadGeometry, base_head, miss, towards, zoom_fixed
 from cotarget.pantilt.inverse import Pointing, nearest, solve
 from cotarget.pantilt.shortcut import shortcut
 
-__all__ = ["IDEAL_HEAD", "HeadGeometry", "Pointing", "base_head", "miss", "nearest", "shortcut", "solve", "zoom_fixed"]
+__all__ = [
+    "IDEAL_HEAD",
+    "HeadGeometry",
+    "Pointing",
+    "base_head",
+    "miss",
+    "nearest",
+    "shortcut",
+    "solve",
+    "towards",
+    "zoom_fixed",
+]

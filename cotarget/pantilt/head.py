@@ -1,5 +1,6 @@
 """A head's own geometry, and where it brings its camera: forward kinematics."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +60,16 @@ def base_head(pan: float, tilt: float, head: HeadGeometry = IDEAL_HEAD) -> Rigid
     offset = RigidTransform.from_translation([0.0, 0.0, head.axis_offset])
     tilting = RigidTransform.from_rotation(Rotation.from_rotvec(head.tilt_axis * true_tilt))
     return RigidTransform.from_rotation(rot_y(true_pan)) * offset * tilting * offset.inv()
+
+
+def towards(x_base: Array) -> tuple[float, float]:
+    """Pan and tilt of an ideal head whose own z then points at a target; where a camera is on it does not count.
+
+    Args:
+        x_base: the target in the base's frame [m], (3,).
+    """
+    x, y, z = x_base
+    return math.atan2(x, z), math.atan2(-y, math.hypot(x, z))
 
 
 def zoom_fixed(
