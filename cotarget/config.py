@@ -212,13 +212,13 @@ def load_config(path: Path) -> RigConfig:
         ConfigError: the file is missing, malformed, or says something unknown or impossible.
     """
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the path of a rig.toml") from None
     except IsADirectoryError:
         raise ConfigError(f"{path}: is a directory; give the path of a rig.toml") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from None
+        raise ConfigError(f"{path}: cannot be read: {error}; give the path of a rig.toml") from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: is not TOML: {error}") from None
     try:

@@ -38,10 +38,11 @@ LOCK = ".lock"  # held by the run that writes
 ONLY_HOW_MANY = ("seeds", "processes")  # settings that change no job, only how many there are and who does them
 SHORT = 8  # digits of a fingerprint
 REMEDY = "take another folder with --out, or begin anew with --fresh"
+AS_BEFORE = "ask as before (--quick, --seed-base, --set), "
 KEEP = ", or keep it all the same with --any-code"
 SHARED = "shared.json"
 # Modules of the experiments on which no row depends: they choose what is done, record it and tell it.
-NO_ROWS = ("__main__", "arguments", "bounds", "cases", "gallery", "outcome", "report", "runner", "sessions")
+NO_ROWS = ("__main__", "arguments", "bounds", "cases", "command", "gallery", "outcome", "report", "runner", "sessions")
 
 
 @dataclass(frozen=True)
@@ -181,7 +182,7 @@ class Jobs:
                 told = f"is of cotarget {version}, this is {code_version()}, of other {other}"
                 raise ConfigError(f"{path}: {told}; {REMEDY}{keep}")
             if settings != self._identity:
-                raise ConfigError(f"{path}: {self._differing(settings)}; {REMEDY}")
+                raise ConfigError(f"{path}: {self._differing(settings)}; {AS_BEFORE}{REMEDY}")
             names = [part.name for part in dataclasses.fields(Record) if part.name != "number"]
             try:
                 told["pictures"] = {

@@ -97,6 +97,19 @@ def test_what_is_read_is_not_written(folder, capsys, command, name):
     assert "is read or written" in line
 
 
+@pytest.mark.parametrize(("command", "said"), [
+    (("point",), "a recording's head and lens cannot be sent anywhere"),
+    (("calibrate", "--out", "new.json"), "what a session has captured is calibrated by --from DIR"),
+    (("aim", "--calibration", "rig_calibration.json", "--pixel", "9", "9", "--depth", "9"), "of the rig that was rec"),
+])  # fmt: skip
+def test_a_recording_is_no_rig_to_be_driven(folder, capsys, command, said):
+    status, out, err = call(capsys, *command, "--rig", "replay.toml")
+    assert (status, out) == (1, "")
+    [line] = err.splitlines()
+    assert line.startswith(f"cotarget {command[0]}: replay.toml: backend is 'replay'; ")
+    assert said in line
+
+
 @pytest.mark.parametrize("name", ["loop", "pipe", "/dev/null", "run"])
 def test_what_is_no_file_is_not_replaced(folder, capsys, name):
     if name == "pipe":

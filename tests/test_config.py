@@ -189,6 +189,12 @@ def test_safety_is_taken():
     assert (SafetyConfig().watchdog_s, SafetyConfig().stop_file) == (0.35, None)
 
 
+def test_a_mark_of_byte_order_does_no_harm(tmp_path):
+    """As Windows' editors put it before a text in UTF-8."""
+    (tmp_path / "rig.toml").write_text('backend = "sim"\n[sim]\nseed = 7\n', encoding="utf-8-sig")
+    assert load_config(tmp_path / "rig.toml").sim.seed == 7
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"nothing\.toml: no such file"):
         load_config(tmp_path / "nothing.toml")

@@ -16,8 +16,8 @@ from cotarget.errors import ConfigError
 from cotarget.metrics import Closeup
 from cotarget.pantilt import base_head, solve
 from experiments import fig4_book, fig5_person, fig6_outdoors, table2_table3, worked_example
-from experiments.__main__ import main
 from experiments.bounds import compare
+from experiments.command import main
 from experiments.handover import Moment, figures
 from experiments.panels import GAP_PX, WIDTH_PX, laid_out
 from experiments.paper_loop import OURS
@@ -275,7 +275,7 @@ def drawn(_, settings, seed):
 
 def test_pictures_are_kept_shown_and_no_part_of_the_rows(tmp_path, capsys, monkeypatch):
     """Seed 0 has none, so that of seed 1 is shown; a run that was broken off goes on with those that are there."""
-    monkeypatch.setattr("experiments.__main__.in_processes", here)
+    monkeypatch.setattr("experiments.command.in_processes", here)
     experiment = replace(TINY, name="drawn", one=drawn)
     known, out = {"drawn": lambda: experiment}, tmp_path / "out"
     for seeds in ("2", "3"):

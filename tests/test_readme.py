@@ -17,8 +17,8 @@ from cotarget.oracle import true_calibration
 from cotarget.recording import COLUMNS as STEP_COLUMNS
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
-from experiments.__main__ import main
 from experiments.cases import choose, known_experiments
+from experiments.command import main
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 # `cotarget NAME ... --option ...` up to where a line of code or of a shell ends.

@@ -18,10 +18,10 @@ import pytest
 
 from cotarget.errors import ConfigError
 from cotarget.sim.opengl import Canvas
-from experiments.__main__ import main
 from experiments.bounds import Bound, compare, tighten
 from experiments.cases import EXPERIMENTS, choose, known_experiments
 from experiments.cluster import on_dask
+from experiments.command import main
 from experiments.harness import Experiment, Settings
 from experiments.outcome import Outcome
 from experiments.report import Run, duration, used, write_report
@@ -47,7 +47,7 @@ def run(tmp_path, capsys, monkeypatch):
         with monkeypatch.context() as patched:
             patched.setattr("cotarget.cli.arguments.REMARK_S", math.inf)  # a busy machine is no complaint
             if "--processes" not in arguments:
-                patched.setattr("experiments.__main__.in_processes", here)
+                patched.setattr("experiments.command.in_processes", here)
                 patched.setattr("experiments.runner.in_turn", here)
             status = main([*arguments, "--out", str(tmp_path / out)], KNOWN, expected)
         told = capsys.readouterr()
@@ -211,12 +211,15 @@ def test_figures_that_cannot_be_made_are_told(run, monkeypatch):
         (["tiny", "--update-expected"], "goes with --quick alone"),
         (["tiny", "--report", "--fresh"], "say one of them"),
         (["tiny", "--report"], "out: no such folder; --out names one with results"),
+        (["tiny", "--report"], "empty: holds no results of what is asked for; --out names the folder that does"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_mistakes_end_in_one_line(run, tmp_path, arguments, message):
     (tmp_path / "file").touch()
-    status, told, complaints = run(*arguments, out="file" if "file" in message else "out")
+    (tmp_path / "empty").mkdir()
+    out = next((name for name in ("file", "empty") if name in message), "out")
+    status, told, complaints = run(*arguments, out=out)
     assert (status, told) == (1, "")
     assert complaints.count("\n") == 1
     assert message in complaints
@@ -306,7 +309,7 @@ def test_other_settings_are_refused(run):
     assert run("tiny", "--quick", "--seeds", "1")[0] == 0
     status, _, complaints = run("tiny", "--seeds", "1", "--seed-base", "5")
     assert status == 1
-    assert "is of tiny with seed_base = 0, here it is 5" in complaints
+    assert "is of tiny with seed_base = 0, here it is 5; ask as before (--quick, --seed-base, --set), " in complaints
 
 
 def test_a_file_that_cannot_be_read(run, tmp_path):
@@ -665,7 +668,7 @@ def test_a_cluster_that_is_not_fit(run, tmp_path, cluster, monkeypatch):
         patched.setattr("experiments.cluster._check_workers", lambda *_: None)  # as if they had joined later
         assert "start it with OMP_NUM_THREADS=1" in run("tiny", *where)[2]
         assert "has 2 threads; start workers with --nthreads 1" in run("tiny", *two)[2]
-    monkeypatch.setattr("experiments.__main__.code_version", lambda: "0.0.9+12345678")
+    monkeypatch.setattr("experiments.command.code_version", lambda: "0.0.9+12345678")
     assert f"has cotarget {code_version()}, this is 0.0.9+12345678; give both the same" in run("tiny", *where)[2]
     assert not list((tmp_path / "out").glob("*/jobs/*"))
 

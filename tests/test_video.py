@@ -207,6 +207,24 @@ def test_what_follows_a_packet_that_cannot_be_decoded_is_read_under_its_own_numb
         assert 59 in lost or len(lost) == 1 or film.shortfall.startswith(f"{len(lost)} packets")
 
 
+def test_frames_that_an_avi_has_lost_altogether_are_counted(tmp_path):
+    """What FFmpeg passes over for want of a chunk's name becomes no packet, nor leaves a gap in time."""
+    other_film(tmp_path / "whole.avi", "mjpeg")
+    with av.open(str(tmp_path / "whole.avi")) as film:
+        chunks = [packet.pos for packet in film.demux(video=0) if packet.size]
+    data = bytearray((tmp_path / "whole.avi").read_bytes())
+    data[chunks[20] : chunks[23]] = bytes(chunks[23] - chunks[20])
+    (tmp_path / "a.avi").write_bytes(data[: data.rindex(b"idx1")])  # nor does the index tell
+    with Film(tmp_path / "a.avi") as film:
+        found = len(list(film))
+    assert 50 <= found < 60
+    refused = film.shortfall.startswith("1 packet from frame 20 on could not be decoded")  # the first, of zeros alone
+    lost = 60 - found - refused
+    assert film.shortfall.endswith(
+        f"of the 60 frames that it says it has {lost} are lost, and those after them come too early"
+    )
+
+
 def test_a_damaged_film_that_ends_early_too_says_both(tmp_path):
     other_film(tmp_path / "whole.avi", "mjpeg")
     damaged(tmp_path / "whole.avi", tmp_path / "a.avi", [5])

@@ -113,6 +113,6 @@ LACKING = replace(TINY, name="lacking", purpose="Lacks something.", needs=lambda
 KNOWN = {each.name: lambda each=each: each for each in (TINY, SHARING, VAIN, ALONE, LACKING)}
 
 if __name__ == "__main__":
-    from experiments.__main__ import main
+    from experiments.command import main
 
     sys.exit(main(known=KNOWN))

@@ -25,6 +25,8 @@ def aim(options: argparse.Namespace) -> None:
     from cotarget.targeting import aim as aim_at
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
+    if config.backend == "replay":
+        raise ConfigError(f"{options.rig}: backend is 'replay'; give the rig.toml of the rig that was recorded")
     calibration = load_calibration(options.calibration)
     if options.rig is not None:
         calibration = calibration.for_streams(*config.stream_sizes)

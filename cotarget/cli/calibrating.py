@@ -43,6 +43,10 @@ def calibrate(options: argparse.Namespace) -> None:
     inputs = _photos(options) if config is None else rig_files(options.rig, config)
     check_outputs([], inputs, options.captures)
     check_outputs([options.out], [*inputs, *_lists(options.captures)])
+    if config is not None and config.backend == "replay":
+        raise ConfigError(
+            f"{options.rig}: backend is 'replay'; what a session has captured is calibrated by --from DIR"
+        )
     _check_together(options)
     check_writable(options.out)
     how = cal.Options(options.method, encoders=options.encoders, insist=options.insist)

@@ -91,6 +91,8 @@ def point(options: argparse.Namespace) -> None:
     refuse_if_stopped(config.safety.stop_file)
     shots = {} if options.pictures is None else {name: options.pictures / f"{name}.png" for name in ("fixed", "zoom")}
     check_outputs(shots.values(), rig_files(options.rig, config))
+    if config.backend == "replay":
+        raise ConfigError(f"{options.rig}: backend is 'replay'; a recording's head and lens cannot be sent anywhere")
     with SafeRig(open_rig(config), config.safety) as rig:
         limits = rig.head.limits
         for option, angle, bounds in (

@@ -18,7 +18,7 @@ from cotarget.sim.fieldpaths import SECONDS, in_view
 from cotarget.sim.room import part_seen
 from cotarget.simconfig import SimConfig, SimEffects, Size, Waypoint
 
-SMALLEST_PX = 8
+SMALLEST_PX, LARGEST_PX = 8, 4096
 # Of the ways of a few episodes, this part at least is to be seen in another scene than the one that they are made for.
 TRIED_SEEDS, LEAST_SEEN, EVERY_KNOT = range(3), 0.5, 5
 # The rig where none is given: the default one, without what makes pictures costly.
@@ -142,9 +142,11 @@ def size_of(given: object) -> Size:
         ConfigError: it is none.
     """
     size = tuple(given) if isinstance(given, list | tuple) else ()
-    whole = all(isinstance(side, int | np.integer) and side >= SMALLEST_PX for side in size)
+    whole = all(isinstance(side, int | np.integer) and SMALLEST_PX <= side <= LARGEST_PX for side in size)
     if len(size) != 2 or not whole:
-        raise ConfigError(f"image_size: {told(given)} is not (width, height) of at least {SMALLEST_PX} pixels each")
+        raise ConfigError(
+            f"image_size: {told(given)} is not (width, height) of {SMALLEST_PX} to {LARGEST_PX} pixels each"
+        )
     return int(size[0]), int(size[1])
 
 
