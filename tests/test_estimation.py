@@ -20,6 +20,9 @@ from cotarget.targeting import Reach, aim, depth_of, point_at
 from experiments.synthetic import NOMINAL_PX, SIZE, Truth
 from tests.moving_targets import APART, RATE, Flight, calibration_of, magnified, show
 
+SPLIT = 0.15  # by which two predictions may differ from one, in variances: a person over half a second
+TRIANGULATED = 0.15  # of the logarithm of a depth by 0.4 m of baseline, 0.1 foretold, and half as much for three runs
+CLEARLY = 0.6  # of an error that is clearly larger
 DELAYS = (0.0, 0.1, 0.2, 0.4, 0.6)
 SETTLED_S = 2.0  # errors count from then on
 DIFFERENCE = 1e-6
@@ -159,7 +162,8 @@ def test_two_short_predictions_are_one_long_one():
     once = propagate(x, root @ root.T, 0.5, PERSON.motion)
     twice = propagate(*propagate(x, root @ root.T, 0.2, PERSON.motion), 0.3, PERSON.motion)
     np.testing.assert_allclose(twice[0], once[0], atol=2e-3)  # the depth's fading velocity is applied at the end
-    np.testing.assert_allclose(np.diag(twice[1]), np.diag(once[1]), rtol=0.15)
+    # Noise is scaled by the depth, and by how uncertain that is, at the end of each.
+    np.testing.assert_allclose(np.diag(twice[1]), np.diag(once[1]), rtol=SPLIT)
     assert np.linalg.eigvalsh(once[1]).min() > 0
 
 
@@ -227,8 +231,8 @@ def test_the_zoom_view_refines_the_depth():
             if t >= SETTLED_S
         ]
         off[zoom] = float(np.sqrt(np.mean(np.square(found))))
-    assert off[True] < 0.15
-    assert off[True] < 0.6 * off[False]
+    assert off[True] < TRIANGULATED
+    assert off[True] < CLEARLY * off[False]
 
 
 # ---------------------------------------------------------------- order, outliers, wrong beliefs
@@ -469,7 +473,7 @@ def test_a_target_that_flies_is_led_however_it_is_found():
         flight = Flight("book", 1, path=Flight("bird", 1).path)
         flight.target = replace(flight.target, motion=motion)
         misses[motion] = np.median(errors(flight)[0][:, DELAYS.index(0.2)])
-    assert misses["flying"] < 0.6 * misses[None]
+    assert misses["flying"] < CLEARLY * misses[None]
     book = DEFAULT_TARGETS["book"]
     assert estimation_settings_for(replace(book, motion="standing")) == estimation_settings_for(book)
     assert estimation_settings_for(replace(book, motion="walking")).noise_px == estimation_settings_for(book).noise_px
