@@ -349,8 +349,11 @@ def test_aim_takes_depth_from_a_size_and_focal_length_from_a_close_up(folder, ca
     assert told["focal_px"] == pytest.approx(100 * told["range_m"] / 0.234, rel=1e-4)  # the principal point is 7 px off
     assert told["focal_mm"] == pytest.approx(6.0 * told["focal_px"] / 692)
     assert told["predicted_error_deg"]["size"] > 0
-    limited = aim_json(capsys, *AIM, "--depth", "30", "--target", "book", "--wanted-px", "160")
-    assert limited["focal_limited"] is True
+    status, out, err = call(capsys, *AIM, "--depth", "30", "--target", "book", "--wanted-px", "160")
+    limited = json.loads(out)
+    assert (status, limited["focal_limited"]) == (0, True)
+    shown = 72.0 * 692 / 6.0 * 0.234 / limited["range_m"]
+    assert f"cotarget aim: the lens shows the book {shown:.3g} px large there, and not 160\n" in err
     assert limited["focal_mm"] == pytest.approx(72.0)
 
 

@@ -85,6 +85,12 @@ def aim(options: argparse.Namespace) -> None:
             "meant?",
             file=sys.stderr,
         )
+    if closeup is not None and found.limited:
+        print(
+            f"cotarget aim: the lens shows the {options.target} {found.focal_px * closeup.size / found.range:.3g} px "
+            f"large there, and not {closeup.wanted_px:g}",
+            file=sys.stderr,
+        )
     print_json(
         {
             "pan_deg": math.degrees(found.pan),
