@@ -47,7 +47,10 @@ __all__ = [
     "check_config",
     "load_config",
     "parse_config",
+    "read_tables",
 ]
+
+ENCODING = "utf-8-sig"  # with the byte-order mark that some editors write, or without
 
 
 @dataclass(frozen=True)
@@ -211,16 +214,7 @@ def load_config(path: Path) -> RigConfig:
     Raises:
         ConfigError: the file is missing, malformed, or says something unknown or impossible.
     """
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; give the path of a rig.toml") from None
-    except IsADirectoryError:
-        raise ConfigError(f"{path}: is a directory; give the path of a rig.toml") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}; give the path of a rig.toml") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: is not TOML: {error}") from None
+    table = read_tables(path)
     try:
         config = parse_config(table)
     except ConfigError as error:
@@ -237,6 +231,26 @@ def load_config(path: Path) -> RigConfig:
         config.safety, stop_file=config.safety.stop_file and path.parent / config.safety.stop_file
     )
     return dataclasses.replace(config, targets=beside, sim=sim, recording=recording, safety=safety)
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """The tables of a rig.toml as it stands, unchecked.
+
+    Raises:
+        ConfigError: the file is missing or is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding=ENCODING))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; give the path of a rig.toml") from None
+    except IsADirectoryError:
+        raise ConfigError(f"{path}: is a directory; give the path of a rig.toml") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is no text in UTF-8: {error.reason}; give the path of a rig.toml") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: is not TOML: {error}") from None
 
 
 def parse_config(table: Mapping[str, Any], *, recorded: bool = False) -> RigConfig:

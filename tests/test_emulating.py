@@ -16,6 +16,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("LP_NUM_THREADS", "1")  # emulate sets it, and how long threads take turns, for its process
     turns = sys.getswitchinterval()
     (tmp_path / "empty.toml").write_text("[sim]\n")
+    (tmp_path / "marked.toml").write_text('\ufeffsim = { targets = ["bird"] }\n')
     (tmp_path / "person.toml").write_text('[sim]\ntargets = ["person"]\n')
     save_calibration(tmp_path / "true.json", true_calibration(RigConfig()))
     yield tmp_path
@@ -26,6 +27,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.mark.render
 @pytest.mark.parametrize(("rig", "there"), [
     ([], "person"),
+    (["--rig", "marked.toml"], "bird"),
     (["--rig", "empty.toml"], 'none; [sim] targets = ["person"] has one to follow'),
 ])  # fmt: skip
 def test_it_tells_who_is_there_to_be_followed(folder, capsys, rig, there):

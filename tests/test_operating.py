@@ -163,6 +163,7 @@ BROKEN = {
     "an unknown table": "[hardwear]\n",
     "another mistake beside it": "",
     "no TOML at all": "[sim\nscene = indoor\n",
+    "no TOML after a mark of byte order": "\ufeff[sim\n",
 }
 
 
@@ -174,6 +175,17 @@ def test_a_rig_is_stopped_whatever_else_is_wrong_with_its_file(folder, capsys, m
     assert call(capsys, "stop", "--rig", "broken.toml")[0] == 0
     assert (folder / "run" / "stop").exists()
     assert call(capsys, "clear", "--rig", "broken.toml")[0] == 0
+
+
+@pytest.mark.parametrize(
+    "named", ['safety.stop_file = "run/stop"', 'safety = { watchdog_s = 1, stop_file = "run/stop" }']
+)
+def test_a_stop_file_is_found_however_toml_has_it_and_where_it_is_toml_no_more(folder, capsys, named):
+    for mark, rest in (("", ""), ("\ufeff", ""), ("", "[sim\n# stop_file = 'another'\n")):
+        (folder / "broken.toml").write_text(f"{mark}{named}\n{rest}")
+        assert call(capsys, "stop", "--rig", "broken.toml")[0] == 0
+        assert (folder / "run" / "stop").exists()
+        assert call(capsys, "clear", "--rig", "broken.toml")[0] == 0
 
 
 def test_a_file_that_names_no_stop_file_any_more_is_told(folder, capsys):
@@ -292,16 +304,17 @@ def test_the_doctor_tells_how_to_get_a_package_that_a_device_needs(folder, capsy
     assert lines[at + 1].strip() == "fix: pip install 'cotarget[hardware]'"
 
 
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
 @pytest.mark.parametrize("more", ["", "[board]\ncorners = [9, 6]\n"])
 @pytest.mark.parametrize("command", [("calibrate", "--rig", "hw.toml", "--out", "new.json")])
-def test_real_squares_have_no_size_by_default(folder, capsys, command, more):
-    (folder / "hw.toml").write_text(HARDWARE + more)
+def test_real_squares_have_no_size_by_default(folder, capsys, command, more, mark):
+    (folder / "hw.toml").write_text(mark + HARDWARE + more)
     status, out, err = call(capsys, *command)
     assert (status, out) == (1, "")
     assert err.startswith("cotarget calibrate: hw.toml: does not say how large the squares of your board are; ")
     assert "[board] square = 0.025" in err
     assert not (folder / "new.json").exists()
-    (folder / "hw.toml").write_text(HARDWARE + "[board]\nsquare = 0.025\n")
+    (folder / "hw.toml").write_text(mark + HARDWARE + "[board]\nsquare = 0.025\n")
     assert "squares" not in call(capsys, *command)[2]
 
 

@@ -8,7 +8,6 @@ import math
 import os
 import sys
 import time
-import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -130,7 +129,9 @@ def check_board_is_told(rig: Path, config: "RigConfig") -> None:
     Raises:
         ConfigError: it does not.
     """
-    told = tomllib.loads(rig.read_text(encoding="utf-8")).get("board", {})
+    from cotarget.config import read_tables
+
+    told = read_tables(rig).get("board", {})
     if config.backend == "hardware" and "square" not in told:
         raise ConfigError(
             f"{rig}: does not say how large the squares of your board are; measure ten of them, and say so in metres: "

@@ -4,7 +4,6 @@ import argparse
 import os
 import sys
 import time
-import tomllib
 from typing import Any
 
 from cotarget.cli.arguments import check_outputs, previous_kept, rig_files
@@ -33,7 +32,7 @@ def emulate(options: argparse.Namespace) -> None:
     os.environ.setdefault(*RENDER_THREADS)
     sys.setswitchinterval(SWITCH_S)
     from cotarget.calibration.atomic import write_atomically
-    from cotarget.config import RigConfig, load_config
+    from cotarget.config import RigConfig, load_config, read_tables
     from cotarget.emulators.emulation import Emulation, Ports, copied_tables, parse_fault
     from cotarget.emulators.world import paced
     from cotarget.simconfig import SimConfig
@@ -43,7 +42,7 @@ def emulate(options: argparse.Namespace) -> None:
         raise ConfigError(f"{options.rig}: backend is '{config.backend}'; what is emulated is a simulated rig")
     beside: dict[str, Any] = {}
     if options.rig is not None:
-        beside = copied_tables(tomllib.loads(options.rig.read_text(encoding="utf-8")), options.rig.parent)
+        beside = copied_tables(read_tables(options.rig), options.rig.parent)
     beside["safety"] = {"stop_file": STOP_FILE} | beside.get("safety", {})
     check_outputs([options.write], rig_files(options.rig, config))
     for fault in options.fault:

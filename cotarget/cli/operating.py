@@ -19,7 +19,7 @@ from cotarget.errors import CalibrationError, ConfigError
 
 CONSENT = "yes"
 # The line of a file that is not TOML any more which still says what file stops the head.
-STOP_FILE_LINE = r"""^[ \t]*stop_file[ \t]*=[ \t]*(["'])([^"'\n]+)\1"""
+STOP_FILE_LINE = r"""^[^#\n]*\bstop_file[ \t]*=[ \t]*(["'])([^"'\n]+)\1"""
 ENOUGH_DIGITS = 4  # of a latency in seconds
 # What is found is within so much of the truth; less than zero by more is no latency [s].
 ACCURACY_S = 0.01
@@ -190,7 +190,7 @@ def _stop_file(rig: Path) -> Path:
     """
     by_hand = "the rig's stop file itself can be made and removed by hand"
     try:
-        text = rig.read_bytes().decode("utf-8", "replace")
+        text = rig.read_bytes().decode("utf-8-sig", "replace")
     except OSError as error:
         raise ConfigError(f"{rig}: {error.strerror}; {by_hand}") from None
     try:
