@@ -23,6 +23,7 @@ from cotarget.pantilt import solve
 STEP = 1e-5
 # Smallest eigenvalue of the normal matrix, scaled to a unit diagonal, that rounding cannot have made.
 SMALLEST_EIGENVALUE = 1e-13
+LENS_BLOCKS = ("zoom", "pupil")  # the zoom lens's: of the targets they change nothing, only where it looks
 
 
 def covariance_of(result: Fit) -> Covariance | None:
@@ -143,18 +144,28 @@ def miss_derivatives(
         hand = model.hand * model.zoom.to_pupil(nominal_px)
         found = solve(x_base, hand, model.head, lens.ray(lens.image_center_px))
         pan_tilt = found.pan[:, 0], found.tilt[:, 0]
+    pan, tilt = pan_tilt
     across = _across(_line_of_sight(model, nominal_px))
-    known, model = parameter_names(EVERY_BLOCK, model.stops), replace(model, boards={})
+    model = replace(model, boards={})
+    x_zoom = _moved_targets(model, pixels, depths, pan, tilt)
 
-    def miss(step: Array, turn: Array) -> Array:
-        at = stepped(model, step, np.empty((0, POSE_PARAMETERS)), EVERY_BLOCK)
-        pan, tilt = pan_tilt[0] + turn[0], pan_tilt[1] + turn[1]
-        return (_directions(at, pixels, depths, pan, tilt, nominal_px) - _line_of_sight(at, nominal_px)) @ across
+    def miss(at: RigModel, x_zoom: Array) -> Array:
+        return (_directions(at, x_zoom, nominal_px) - _line_of_sight(at, nominal_px)) @ across
 
-    still, unturned = np.zeros(len(known)), np.zeros(2)
-    steps = STEP * np.eye(len(known))[[known.index(name) for name in parameters]]
-    by_parameter = [(miss(step, unturned) - miss(-step, unturned)) / (2 * STEP) for step in steps]
-    by_turn = [(miss(still, turn) - miss(still, -turn)) / (2 * STEP) for turn in STEP * np.eye(2)]
+    names = {block: parameter_names((block,), model.stops) for block in EVERY_BLOCK}
+    block_of = {name: block for block, own in names.items() for name in own}
+
+    def beside(name: str, step: float) -> Array:
+        block = block_of[name]
+        steps = step * np.array([name == other for other in names[block]], dtype=float)
+        at = stepped(model, steps, np.empty((0, POSE_PARAMETERS)), (block,))
+        return miss(at, x_zoom if block in LENS_BLOCKS else _moved_targets(at, pixels, depths, pan, tilt))
+
+    def turned(pan_step: float, tilt_step: float) -> Array:
+        return miss(model, _moved_targets(model, pixels, depths, pan + pan_step, tilt + tilt_step))
+
+    by_parameter = [(beside(name, STEP) - beside(name, -STEP)) / (2 * STEP) for name in parameters]
+    by_turn = [(turned(*step) - turned(*-step)) / (2 * STEP) for step in STEP * np.eye(2)]
     return np.stack(by_parameter, axis=-1), np.stack(by_turn, axis=-1)
 
 
@@ -172,14 +183,18 @@ def model_of(calibration: Calibration) -> RigModel:
     )
 
 
-def _directions(model: RigModel, pixels: Array, depths: Array, pan: Array, tilt: Array, nominal_px: float) -> Array:
-    """Unit vectors from the moved zoom camera to the targets, (n, 3) (Eq. 2)."""
+def _moved_targets(model: RigModel, pixels: Array, depths: Array, pan: Array, tilt: Array) -> Array:
+    """The targets in the moved zoom camera's frame, as it is at the first stop [m], (n, 3) (Eq. 2)."""
     assert model.fixed is not None
-    assert model.zoom is not None
     x_base = (model.hand * model.gamma).apply(model.fixed.ray(pixels) * depths[:, None])
     R, t, _ = base_heads(model.head, pan, tilt)
-    x_head = np.einsum("vji,vj->vi", R, x_base - t)
-    return _unit(model.hand.inv().apply(x_head) - np.array([0.0, 0.0, model.zoom.pupil_at(nominal_px)]))
+    return model.hand.inv().apply(np.einsum("vji,vj->vi", R, x_base - t))
+
+
+def _directions(model: RigModel, x_zoom: Array, nominal_px: float) -> Array:
+    """Unit vectors from the zoom camera's pupil at a nominal focal length to `_moved_targets`, (n, 3)."""
+    assert model.zoom is not None
+    return _unit(x_zoom - np.array([0.0, 0.0, model.zoom.pupil_at(nominal_px)]))
 
 
 def _line_of_sight(model: RigModel, nominal_px: float) -> Array:
