@@ -353,8 +353,30 @@ def test_aim_takes_depth_from_a_size_and_focal_length_from_a_close_up(folder, ca
     limited = json.loads(out)
     assert (status, limited["focal_limited"]) == (0, True)
     shown = 72.0 * 692 / 6.0 * 0.234 / limited["range_m"]
-    assert f"cotarget aim: the lens shows the book {shown:.3g} px large there, and not 160\n" in err
+    assert f"cotarget aim: the lens shows the book {shown:.0f} px large there, and not 160\n" in err
     assert limited["focal_mm"] == pytest.approx(72.0)
+
+
+def test_a_close_up_that_the_lens_cannot_make_is_told_in_the_pixels_along_the_known_dimension(folder, capsys):
+    """Of a person along v, whose focal length is another; thousands without an exponent; and what is as wanted, not."""
+
+    def told(*arguments):
+        status, out, err = call(capsys, *AIM, *arguments)
+        assert status == 0
+        return json.loads(out), [line for line in err.splitlines() if "the lens shows" in line]
+
+    near, lines = told("--depth", "1", "--target", "person", "--wanted-px", "160")
+    shown = 1.75 * near["focal_px"] * 693 / 692 / near["range_m"]
+    assert lines == [f"cotarget aim: the lens shows the person {shown:.0f} px large there, and not 160"]
+    assert shown > 1000
+    far, lines = told("--depth", "3000", "--target", "book", "--wanted-px", "160")
+    shown = 0.234 * far["focal_px"] / far["range_m"]
+    assert lines == [f"cotarget aim: the lens shows the book {shown:.2g} px large there, and not 160"]
+    limit = 72.0 * 692 / 6.0 * 0.234 / 160  # range from which on the lens is too short [m]
+    depth = 2 * limit - told("--depth", f"{limit}", "--target", "book", "--wanted-px", "160")[0]["range_m"]
+    for beyond, limited, told_of in ((0.998, False, False), (1.002, True, False), (1.008, True, True)):
+        book, lines = told("--depth", f"{depth * beyond}", "--target", "book", "--wanted-px", "160")
+        assert (book["focal_limited"], bool(lines)) == (limited, told_of)
 
 
 def test_the_shortcut_is_told_without_a_prediction_that_is_of_the_exact_inverse(folder, capsys):

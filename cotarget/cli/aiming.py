@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import TargetConfig
 
+SMALL_PX = 10.0  # sizes below are told with two digits, others in whole pixels
+
 
 def aim(options: argparse.Namespace) -> None:
     """Cotarget aim."""
@@ -86,11 +88,13 @@ def aim(options: argparse.Namespace) -> None:
             file=sys.stderr,
         )
     if closeup is not None and found.limited:
-        print(
-            f"cotarget aim: the lens shows the {options.target} {found.focal_px * closeup.size / found.range:.3g} px "
-            f"large there, and not {closeup.wanted_px:g}",
-            file=sys.stderr,
-        )
+        focal = calibration.zoom.at(found.nominal_px).focal_px[int(closeup.vertical)]
+        shown, wanted = _pixels(focal * closeup.size / found.range), _pixels(closeup.wanted_px)
+        if shown != wanted:
+            print(
+                f"cotarget aim: the lens shows the {options.target} {shown} px large there, and not {wanted}",
+                file=sys.stderr,
+            )
     print_json(
         {
             "pan_deg": math.degrees(found.pan),
@@ -113,3 +117,8 @@ def _fits_from(calibration: "Calibration", targets: Mapping[str, "TargetConfig"]
     for name, target in targets.items():
         axis = 1 if target.dimension == "height" else 0
         yield calibration.fixed.focal_px[axis] * target.size / calibration.fixed.size[axis], name
+
+
+def _pixels(size: float) -> str:
+    """A size in an image in words: whole pixels, but for the smallest."""
+    return f"{size:.2g}" if size < SMALL_PX else f"{size:.0f}"
