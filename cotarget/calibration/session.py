@@ -48,7 +48,8 @@ def capture_session(
 
     Args:
         recorder: of a rig that stands still.
-        placements: how many placements of the board.
+        placements: how many placements of the board, those included that a first rough model comes from, which no
+            session does without.
         stops: how many stops of the zoom lens.
         far_placements: how many more placements of the board, for the stops beyond the first.
         rng: chooses among possible placements.

@@ -103,7 +103,10 @@ def _parser() -> argparse.ArgumentParser:
     calibrate.add_argument("--square", type=positive, metavar="M", help="side of a square [m]")
     calibrate.add_argument("--kind", choices=KINDS, help=f"of the board on photos ({KINDS[0]})")
     calibrate.add_argument(
-        "--placements", type=count, metavar="N", help="with --rig: how many placements of the board (30)"
+        "--placements",
+        type=count,
+        metavar="N",
+        help="with --rig: how many placements of the board, the first handful in any case (30)",
     )
     calibrate.add_argument(
         "--stops",
