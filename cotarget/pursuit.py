@@ -125,7 +125,8 @@ class Pursuit:
                 continue
             lacks = missing(track.size_px, box.size_px)
             if lacks.any() and isinstance(box, Detection):  # a piece of it, which tells no size and its middle badly
-                found.see_wide(replace(box, clipped=True), frame.t, sigma_px=lacks / 2)
+                sigma_px = np.hypot(lacks, box.size_px) / 2
+                found.see_wide(replace(box, clipped=True), frame.t, sigma_px=sigma_px)
                 continue
             if track.id == self._followed and isinstance(box, Detection):
                 sight = self._finder.see_wide(frame, box, mask)

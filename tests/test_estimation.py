@@ -22,7 +22,12 @@ from tests.moving_targets import APART, RATE, Flight, calibration_of, magnified,
 
 SPLIT = 0.15  # by which two predictions may differ from one, in variances: a person over half a second
 TRIANGULATED = 0.15  # of the logarithm of a depth by 0.4 m of baseline, 0.1 foretold, and half as much for three runs
-CLEARLY = 0.6  # of an error that is clearly larger
+CLEARLY = 0.6  # of an error that is clearly larger; the depth of three flights comes to 0.36 of it
+JUMP_PX = 200.0  # beyond any motion from frame to frame
+SOON = 0.03  # of how long an error lasts
+HARDLY = 0.95  # a further measurement that errs alike takes so little away; an independent one takes a third
+# Of a velocity's sigma by two positions; accelerations leave 1.5, and a second counted by how long errors last, 1.7.
+AS_TWO = 1.6
 DELAYS = (0.0, 0.1, 0.2, 0.4, 0.6)
 SETTLED_S = 2.0  # errors count from then on
 DIFFERENCE = 1e-6
@@ -439,6 +444,41 @@ def test_a_box_that_the_border_cuts_tells_no_size():
     estimator.see_wide(seen, 0.04)
     found = estimator.at(0.04)
     assert abs(math.log(found.depth / flight.path(0.04)[2])) < 4 * depth_sigma(found) < 0.5
+
+
+def middle_variance(estimator, t):
+    return np.diag(estimator.at(t).state_covariance)[:2]
+
+
+def test_a_middle_of_known_error_is_believed_as_told_though_its_box_is_clipped():
+    flight = Flight("person", 0, 1.0)
+    seen, variances = flight.wide(0.0), []
+    for clipped in (False, True):
+        estimator = SpatialFilter(flight.calibration, flight.target)
+        estimator.see_wide(replace(seen, clipped=clipped), 0.0, sigma_px=np.array([2.0, 3.0]))
+        variances.append(middle_variance(estimator, 0.0))
+    np.testing.assert_allclose(variances[1], variances[0], rtol=EXACT)
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_two_sights_tell_a_velocity_and_a_third_that_errs_alike_hardly_more(elsewhere):
+    flight = Flight("bird", 0, 1.0)
+    estimator = SpatialFilter(flight.calibration, flight.target)
+    seen, t, dt = flight.wide(0.0), 0.0, 1.0 / RATE
+    estimator.see_wide(seen, t)
+    if elsewhere:
+        seen = replace(seen, center_px=seen.center_px + JUMP_PX)
+        for _ in range(BIRD.misses):
+            t += dt
+            estimator.see_wide(seen, t)
+    first = np.sqrt(middle_variance(estimator, t))
+    t += dt
+    estimator.see_wide(seen, t)
+    found = estimator.at(t).state_covariance
+    assert (np.sqrt(np.diag(found))[3:5] < AS_TWO * math.sqrt(2.0) * first / dt).all()
+    t += SOON * BIRD.noise_s
+    estimator.see_wide(seen, t)
+    assert (middle_variance(estimator, t) > HARDLY * np.diag(found)[:2]).all()
 
 
 @pytest.mark.parametrize("seed", [1, 4, 6])

@@ -59,7 +59,11 @@ class ZoomSeen:
 
 
 def begin(seen: WideSeen, settings: EstimationSettings) -> Node:
-    """The state after the first measurement."""
+    """The state after the first measurement.
+
+    No time is set in it by which the next would count less: an error that both share leaves the velocity that the two
+    tell as it is.
+    """
     motion = settings.motion
     x = np.zeros(STATES)
     x[:2] = seen.tangent

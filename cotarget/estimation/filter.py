@@ -53,9 +53,10 @@ class SpatialFilter:
         """Take a detection in the wide view into account.
 
         Args:
-            detection: its box; one that is cut tells its middle badly, and of its size only that it is no smaller.
+            detection: its box; one that is clipped tells of its size only that it is no smaller.
             t: when the frame's light fell [s].
-            sigma_px: standard deviation of the middle, (2,) [px]; by default from the settings and the box's size.
+            sigma_px: standard deviation of the middle, (2,) [px]; by default from the settings and the box's size,
+                and half a clipped box more, whose hidden part may be as large again.
             size_px: the known dimension in the image [px], where it is better known than from this box alone, as
                 the largest over a wing beat.
 
@@ -72,10 +73,8 @@ class SpatialFilter:
         if sigma_px is not None:
             sigma_u, sigma_v = (float(sigma) for sigma in sigma_px)
         else:
-            sigma_u = math.hypot(settings.noise_px, settings.noise_of_size * width)
-            sigma_v = math.hypot(settings.noise_px, settings.noise_of_size * height)
-        if detection.clipped:  # the hidden part may be as large again
-            sigma_u, sigma_v = math.hypot(sigma_u, width / 2), math.hypot(sigma_v, height / 2)
+            part = math.hypot(settings.noise_of_size, 0.5 if detection.clipped else 0.0)
+            sigma_u, sigma_v = math.hypot(settings.noise_px, part * width), math.hypot(settings.noise_px, part * height)
         vertical = self._vertical(width, height)
         side = height if vertical else width
         if size_px is not None and not detection.clipped:

@@ -27,7 +27,7 @@ class Node:
         missed_size: likewise of the size.
         size_t: when the size was last measured [s].
         lean: innovation in the zoom view over its standard deviation, averaged over the last second or so, (2,).
-        wide_t: when the middle was last measured in the wide view [s].
+        wide_t: when the wide view last corrected the middle [s]; a start, at first or elsewhere, is no correction.
         moved_t: when it was last found elsewhere than it could be [s].
     """
 
