@@ -18,6 +18,7 @@ from cotarget.sim.fieldpaths import SECONDS, in_view
 from cotarget.sim.room import part_seen
 from cotarget.simconfig import SimConfig, SimEffects, Size, Waypoint
 
+# Sides of pictures: fewer pixels show nothing, and more are hardly meant, as one such picture takes 50 MB.
 SMALLEST_PX, LARGEST_PX = 8, 4096
 # Of the ways of a few episodes, this part at least is to be seen in another scene than the one that they are made for.
 TRIED_SEEDS, LEAST_SEEN, EVERY_KNOT = range(3), 0.5, 5

@@ -82,7 +82,7 @@ class Follow(RigEnv[Any, Vector]):
                 seen is refused.
             calibration: that a policy may use, or its file; the true one by default.
             seconds: of an episode, at most 20 [s].
-            image_size: (width, height) of the pictures [px].
+            image_size: (width, height) of the pictures, 8 to 4096 each [px].
             noise: of the detections.
             render_mode: "rgb_array", or None for no `render`.
 

@@ -111,7 +111,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
             rig: as in `cotarget.env.Follow`.
             calibration: that the pipeline uses, or its file; the true one by default.
             seconds: of an episode, at most 20 [s].
-            image_size: (width, height) of the pictures [px].
+            image_size: (width, height) of the pictures, 8 to 4096 each [px].
             noise: of the detections.
             served_reward: for each target served.
             render_mode: "rgb_array", or None for no `render`.
