@@ -128,9 +128,9 @@ def _check_targets(sim: SimConfig) -> None:
             if split_name(name)[0] not in (*TARGETS, *sim.models):
                 raise ConfigError(f"{where}: unknown target '{name}'; {told_targets(sim.models)}")
             if name in names[:at]:
-                raise ConfigError(
-                    f"{where}: '{name}' is named twice; a further one has a number, as '{split_name(name)[0]}2'"
-                )
+                kind = split_name(name)[0]
+                free = next(f"{kind}{number}" for number in itertools.count(2) if f"{kind}{number}" not in names)
+                raise ConfigError(f"{where}: '{name}' is named twice; a further one has a number, as '{free}'")
 
 
 def _check_frame_time(where: str, camera: SimCamera) -> None:

@@ -92,7 +92,7 @@ def test_offsets_and_targets_are_taken(tmp_path):
         ),
         (
             "[sim]\ntargets = ['bird', 'bird2', 'bird']",
-            "sim.targets: 'bird' is named twice; a further one has a number",
+            "sim.targets: 'bird' is named twice; a further one has a number, as 'bird3'",
         ),
         ("[sim]\ntargets = 'bird'", "sim.targets: 'bird' is not a list of texts"),
         ("[sim.fixed]\nsize = 640", "sim.fixed.size: 640 is not a list of 2 whole numbers, [width, height]"),

@@ -167,12 +167,13 @@ def test_a_scene_that_cannot_serve_is_named(tmp_path, text, said):
     assert "\n" not in str(caught.value)
 
 
-def test_a_scene_of_another_ending_is_refused_before_mujoco_guesses(tmp_path, monkeypatch, capfd):
+@pytest.mark.parametrize("name", ["yard", "yard.XML"])
+def test_a_scene_of_another_ending_is_refused_before_mujoco_guesses(tmp_path, monkeypatch, capfd, name):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "yard").write_text("<mujoco/>")
-    with pytest.raises(ConfigError, match=r"yard: is no \.xml; a scene is an MJCF file with that ending"):
-        world(scene="yard")
-    assert (*capfd.readouterr(), [path.name for path in tmp_path.iterdir()]) == ("", "", ["yard"])
+    (tmp_path / name).write_text("<mujoco/>")
+    with pytest.raises(ConfigError, match=rf"{name}: does not end in \.xml, as a scene does, which is an MJCF file"):
+        world(scene=name)
+    assert (*capfd.readouterr(), [path.name for path in tmp_path.iterdir()]) == ("", "", [name])
 
 
 def test_an_unknown_scene_is_told_the_scenes():

@@ -56,8 +56,8 @@ def scene_spec(scene: str) -> "mujoco.MjSpec":
         ConfigError: it is not MJCF, or has no mount for the rig.
     """
     path = scene_path(scene)
-    if path.suffix.lower() != ".xml":  # MuJoCo decodes by the ending
-        raise ConfigError(f"{path}: is no .xml; a scene is an MJCF file with that ending")
+    if path.suffix != ".xml":  # MuJoCo decodes by the ending, and knows no other, nor .XML
+        raise ConfigError(f"{path}: does not end in .xml, as a scene does, which is an MJCF file")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
