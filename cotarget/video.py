@@ -76,7 +76,7 @@ class Film:
         self.count: int | None = stream.frames or None
         self.number = -1
         self.shortfall = ""
-        self._packets = 0  # of pictures, that were read
+        self._slots = 0  # of the stream's own time, in frames
         self._end = 0.0  # of what was read of pictures and sound, by the film's own time [s]
 
     def __enter__(self) -> "Film":
@@ -97,7 +97,7 @@ class Film:
         Raises:
             CotargetError: nothing can be decoded, or the picture's size changes on the way.
         """
-        places, self._packets = Places(self._container.streams.video[0]), 0
+        places, self._slots = Places(self._container.streams.video[0]), 0
         reason, damaged, size = "", False, self.size
         try:
             for picture in self._pictures(places):
@@ -124,7 +124,8 @@ class Film:
         for packet in self._container.demux():
             if packet.pts is not None and packet.time_base is not None:
                 self._end = max(self._end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
-            self._packets += packet.stream is pictures and packet.dts is not None
+            if packet.stream is pictures and packet.dts is not None:
+                self._slots = max(self._slots, packet.dts + (packet.duration or 1))
             # An empty one stands for the frame before it, but for the last of all, which has no time and ends the work.
             if packet.stream is pictures and (packet.size or packet.dts is None):
                 places.expect(packet)
@@ -147,7 +148,8 @@ class Film:
             begin, told = (container.start_time or 0) / MICROSECONDS, container.duration / MICROSECONDS
         if begin + told - self._end > max(SHORT_S, SHORT_FRAMES / self.rate_hz):
             return f"the film says that it lasts {told:.1f} s, and ends at {max(self._end - begin, 0.0):.1f} s"
-        if container.format.name == "avi" and (lost := stream.frames - self._packets) > 0:
+        # Of an AVI every frame is a slot of its time, an empty one too; those that are lost leave the others earlier.
+        if container.format.name == "avi" and (lost := stream.frames - self._slots) > 0:
             told_count = f"of the {stream.frames} frames that it says it has {lost} are lost"
             return f"{told_count}, and those after them come too early"
         return "its last frame is damaged" if damaged else ""

@@ -216,13 +216,25 @@ def test_frames_that_an_avi_has_lost_altogether_are_counted(tmp_path):
     data[chunks[20] : chunks[23]] = bytes(chunks[23] - chunks[20])
     (tmp_path / "a.avi").write_bytes(data[: data.rindex(b"idx1")])  # nor does the index tell
     with Film(tmp_path / "a.avi") as film:
-        found = len(list(film))
+        times = [frame.t for frame in film]
+    found = len(times)
     assert 50 <= found < 60
     refused = film.shortfall.startswith("1 packet from frame 20 on could not be decoded")  # the first, of zeros alone
     lost = 60 - found - refused
     assert film.shortfall.endswith(
         f"of the 60 frames that it says it has {lost} are lost, and those after them come too early"
     )
+    assert times[-1] == pytest.approx((59 - lost) / RATE, abs=1e-3)
+
+
+@pytest.mark.parametrize("codec", ["mpeg4", "mjpeg"])
+def test_an_avi_whose_frames_come_seldom_is_whole(tmp_path, codec):
+    """Where none comes a chunk is empty, and counts as a frame of those that the file says it has."""
+    other_film(tmp_path / "a.avi", codec, empty_from=20)
+    with Film(tmp_path / "a.avi") as film:
+        times = [frame.t for frame in film]
+    assert film.shortfall == ""
+    assert times == pytest.approx([i / RATE for i in range(60) if i < 20 or i % 10 == 0], abs=1e-3)
 
 
 def test_a_damaged_film_that_ends_early_too_says_both(tmp_path):
