@@ -2,6 +2,8 @@
 
 import sys
 
+INTERRUPTED = 130  # exit status of Ctrl-C; `experiments.harness` has it too, but takes a second to load
+
 
 def main() -> int:
     """The command; Ctrl-C is told in one line while its modules are loaded too, which takes a second or two."""
@@ -9,7 +11,7 @@ def main() -> int:
         from experiments.command import main as run
     except KeyboardInterrupt:
         print("python -m experiments: interrupted", file=sys.stderr)
-        return 130  # a shell's exit status for Ctrl-C
+        return INTERRUPTED
     return run()
 
 

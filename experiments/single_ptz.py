@@ -82,24 +82,24 @@ def case(way: str, miss: float) -> str:
 
 
 def figures(judged: Sequence[Judged], way: str) -> Row:
-    """Of one run of PAIR or LONE_CAMERA; one that never acquired its target has no time for that."""
+    """Of one run of PAIR or LONE_CAMERA; what never came to be, as an acquisition, is None."""
     found = score(judged)
     since = judged[-found.frames :] if found.frames else []
     return {
         "closeup_yield": found.closeup_yield,
         "in_frame_ratio": found.in_frame_ratio if found.in_frame_ratio is not None else 0.0,
-        "in_frame_of_all": float(np.mean([row.in_frame for row in since])) if since else math.nan,
+        "in_frame_of_all": float(np.mean([row.in_frame for row in since])) if since else None,
         "time_to_acquire_s": found.time_to_acquire_s,
         "tpo_width_median": found.tpo_width_median,
         "watched": _watched(since, way),
     }
 
 
-def _watched(since: Sequence[Judged], way: str) -> float:
-    """Which part of the wide camera's field is in view, in the mean; nan of no frame."""
+def _watched(since: Sequence[Judged], way: str) -> float | None:
+    """Which part of the wide camera's field is in view, in the mean; None of no frame."""
     if way == PAIR:
         return 1.0
-    return float(np.mean([min(1.0, (WIDE_PX / row.focal_px) ** 2) for row in since])) if since else math.nan
+    return float(np.mean([min(1.0, (WIDE_PX / row.focal_px) ** 2) for row in since])) if since else None
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:

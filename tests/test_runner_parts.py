@@ -1,5 +1,6 @@
 """What sweeps are made of: who knows which code gave a row, what is counted, what cannot be asked for."""
 
+import builtins
 import functools
 import json
 import multiprocessing
@@ -16,7 +17,9 @@ import pytest
 import experiments
 from cotarget.errors import ConfigError
 from cotarget.sim import opengl
-from experiments import delay, hold, sweep_speed, tasks
+from experiments import delay, harness, hold, sweep_speed, tasks
+from experiments.__main__ import INTERRUPTED
+from experiments.__main__ import main as entry
 from experiments.bounds import compare
 from experiments.cases import choose, known_experiments
 from experiments.results import NO_ROWS, differing, fingerprint
@@ -24,6 +27,19 @@ from experiments.sessions import Log, Share, sessions
 from experiments.tasks import Task, perform
 from experiments.versions import OPENGL, versions
 from experiments.workers import ONE_THREAD, in_turn
+
+
+def test_ctrl_c_is_told_in_one_line_while_the_experiments_load(monkeypatch, capsys):
+    load = builtins.__import__
+
+    def interrupted(name, *more, **options):
+        if name == "experiments.command":
+            raise KeyboardInterrupt
+        return load(name, *more, **options)
+
+    monkeypatch.setattr(builtins, "__import__", interrupted)
+    assert entry() == INTERRUPTED == harness.INTERRUPTED
+    assert capsys.readouterr() == ("", "python -m experiments: interrupted\n")
 
 
 def test_rows_are_of_the_code_that_was_loaded(monkeypatch):

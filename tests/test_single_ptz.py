@@ -1,6 +1,7 @@
 """A lone pan-tilt-zoom camera: where it looks, what it expects, and that it finds what it lost."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from experiments.workers import here
 
 BOOK = DEFAULT_TARGETS["book"]
 STEP = 0.04
+SCAN_POSES = 4  # two rows of two views that are as wide as the wide one, turned and aside
 
 
 def test_a_course_leads_by_its_velocity():
@@ -51,10 +53,16 @@ def world():
         yield w
 
 
-def test_a_scan_sees_all_that_the_wide_camera_does(world):
+@pytest.mark.parametrize("size", [(640, 480), (1280, 960), (320, 240)])
+def test_a_scan_sees_all_that_the_wide_camera_does(size):
+    config = single_runs.config_of("book", 0)
+    scale = size[0] / config.sim.fixed.size[0]
+    focal_px = tuple(scale * focal for focal in config.sim.fixed.focal_px)
+    fixed = replace(config.sim.fixed, size=size, focal_px=focal_px, center_px=tuple((side - 1) / 2 for side in size))
+    world = SimWorld(replace(config, sim=replace(config.sim, fixed=fixed)), rendered=())
     calibration = true_calibration(world)
     poses = np.array(scan_of(world.rig, calibration))
-    rim = np.array([[u, v] for u in (0.0, 319.5, 639.0) for v in (0.0, 239.5, 479.0)])
+    rim = np.array([[u, v] for u in (0.0, 0.5, 1.0) for v in (0.0, 0.5, 1.0)]) * (np.array(size) - 1.0)
     far = calibration.fixed.ray(rim) * 1000.0  # where the cameras' offset does not count
     x = calibration.T_base_fixed.apply(far)
     pans, tilts = np.arctan2(x[:, 0], x[:, 2]), np.arctan2(-x[:, 1], np.hypot(x[:, 0], x[:, 2]))
@@ -63,6 +71,19 @@ def test_a_scan_sees_all_that_the_wide_camera_does(world):
     for pan, tilt in zip(pans, tilts, strict=True):
         near = (np.abs(poses[:, 0] - pan) < across) & (np.abs(poses[:, 1] - tilt) < down)
         assert near.any(), np.degrees([pan, tilt])
+    assert len(poses) == SCAN_POSES  # and no more than that
+
+
+def test_a_run_whose_clock_never_starts_leaves_the_others_their_figures():
+    """A person is not wholly in view yet after the least time that can be asked for."""
+    rows = [
+        {"seed": seed, "target": "person", "way": "pair"} | single_ptz.figures(judged, "pair")
+        for seed, judged in enumerate([single_runs.held("pair", "person", 0, 2.1, 0.05), []])
+    ]
+    assert all(row[key] in (None, 0.0, 1.0) for row in rows for key in single_ptz.FIGURES)
+    well = dict(rows[0], closeup_yield=0.6, in_frame_of_all=0.7, watched=0.1)
+    found = single_ptz.summarise([*rows, well])["person"]["pair"]
+    assert (found["closeup_yield"], found["in_frame_of_all"]) == (0.6, 0.7)
 
 
 class Blind:
