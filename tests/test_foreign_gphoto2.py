@@ -4,7 +4,6 @@ import os
 import re
 import shutil
 import subprocess
-import threading
 import time
 
 import cv2
@@ -18,7 +17,6 @@ from cotarget.emulators.s5is import S5IS_FAULTS, S5isServer
 pytestmark = pytest.mark.foreign
 
 TIMEOUT_S = 60  # gphoto2's own waits add up to a few seconds
-FRAME_S = 0.03  # between pictures of the viewfinder
 # Grey levels by which the decoded JPEG of an even area may differ, colours too.
 GREY = 4.0
 STILL_SIZE = (3264, 2448)
@@ -88,24 +86,26 @@ def assert_shows(path, size, position):
         np.testing.assert_allclose(image[height * v // 4, width * u // 4], colour, atol=GREY)
 
 
+class View(Feed):
+    """What a lens shows when it is asked for, and not some time before: `scene`."""
+
+    def __init__(self, lens):
+        super().__init__()
+        self.lens, self.index = lens, 0
+
+    def newest(self, after=-1, timeout=0.0):
+        self.index = max(self.index, after) + 1
+        self.publish(Picture(scene((640, 480), self.lens.position()), self.index, time.monotonic()))
+        return super().newest(after, timeout)
+
+
 @pytest.fixture
 def camera():
     """An emulated camera that sees `scene`, with its lens and faults as attributes."""
-    lens, faults, feed, stop = Lens(), Faults(S5IS_FAULTS), Feed(), threading.Event()
-
-    def run():
-        index = 0
-        while not stop.wait(FRAME_S):
-            feed.publish(Picture(scene((640, 480), lens.position()), index, time.monotonic()))
-            index += 1
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    with S5isServer(feed, lambda: scene(STILL_SIZE, lens.position()), lens, faults=faults) as server:
+    lens, faults = Lens(), Faults(S5IS_FAULTS)
+    with S5isServer(View(lens), lambda: scene(STILL_SIZE, lens.position()), lens, faults=faults) as server:
         server.lens, server.faults = lens, faults
         yield server
-    stop.set()
-    thread.join(TIMEOUT_S)
 
 
 @pytest.fixture

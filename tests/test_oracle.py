@@ -15,6 +15,7 @@ from experiments.field_scenes import five_targets_config, hold_config
 
 STEP = 0.04
 TIMES = np.arange(0.0, SECONDS + STEP / 2, STEP)
+ALIKE = 0.3  # correlation of 200 pairs: four standard deviations of what chance makes
 
 
 @pytest.mark.parametrize("numbers", [seeded, counted])
@@ -78,6 +79,22 @@ def test_the_truth_finder_finds_where_it_is_told_to_look():
         assert seeds[0].find(frame, expected(x_fixed * [1.0, 1.1, 1.0])) is None
         blind = TruthFinder(calibration, target, truth, "book", 0, missed=lambda t: True)
         assert blind.find(frame, expected(x_fixed)) is None
+
+
+def test_a_finder_errs_independently_of_a_detector_of_its_seed():
+    with (w := SimWorld(hold_config("book", 0), rendered=())).rig:
+        truth, calibration = w.truth(), true_calibration(w)
+        finders = [TruthFinder(calibration, w.config.target("book"), truth, "book", seed) for seed in range(200)]
+        x_fixed = truth.T_world_camera("fixed", 1.0).inv().apply(truth.center("book", 1.0))
+        expected = Expected(x_fixed, 1e4 * np.eye(2), 0.0, 0.0, w.rig.zoom.focal_range[0])
+        frame = Frame(np.zeros((480, 640, 3), np.uint8), 1.0)
+        found = np.array([each.find(frame, expected).center_px for each in finders])
+        noise = TruthNoise(center_px=1.0, size=0.0, miss=0.0)
+        for numbers in (seeded, counted):
+            detectors = [TruthDetector(truth, seed, noise, numbers=numbers) for seed in range(200)]
+            detected = np.array([each.detect(frame)[0].center_px for each in detectors])
+            alike = np.corrcoef(found.T, detected.T)[:2, 2:]
+            assert np.abs(alike).max() < ALIKE
 
 
 def test_seeded_detections_are_those_of_a_generator_of_the_seed_and_the_microsecond():
