@@ -38,7 +38,8 @@ class Eyes:
 
     Attributes:
         interval: from the wide frame before to the newest [s]; inf for the first.
-        close_is_new: whether the newest zoom frame was not seen before.
+        close_is_new: whether the newest zoom frame shows what was not seen before: another time, and another picture,
+            but where the wide view has not changed either since that picture came first.
     """
 
     def __init__(self, fixed: Camera, zoom: Camera, clock: Clock) -> None:
@@ -46,7 +47,7 @@ class Eyes:
         self._wide: Frame | None = None
         self._close: Frame | None = None
         # By the times of wide frames:
-        self._now = self._picture_t = self._close_t = -math.inf
+        self._now = self._picture_t = self._close_t = self._shown_t = -math.inf
         self._why_blind = self._why_late = ""
         self._looked_t = -math.inf  # by the rig's clock
         self.interval, self.close_is_new = math.inf, False
@@ -107,11 +108,14 @@ class Eyes:
             if before is None:
                 raise
             frame, self._why_blind = before, str(error)
-        self.close_is_new = before is None or frame.t > before.t
-        if self.close_is_new:
+        is_later = before is None or frame.t > before.t
+        if is_later:
             _check_size(frame, self._zoom, "zoom")
             self._close, self._close_t = frame, self._now
-        if before is None or self.close_is_new:
+            if before is None or not _same(frame.image, before.image):
+                self._shown_t = self._now
+        self.close_is_new = is_later and not self._picture_t > self._shown_t
+        if before is None or is_later:
             return frame
         if self._now - self._close_t > GONE_S:
             raise StaleFrameError(self._blindness())
@@ -126,6 +130,8 @@ class Eyes:
             found.append(f"the fixed camera has shown the same picture for {same:.1f} s")
         if self._why_blind or self._now - self._close_t > BLIND_S:
             found.append(self._blindness())
+        elif (same := self._picture_t - self._shown_t) > FROZEN_S:
+            found.append(f"the zoom camera has shown the same picture for {same:.1f} s")
         return found
 
     def _blindness(self) -> str:

@@ -238,16 +238,22 @@ def test_frames_that_change_their_size(camera):
     assert_it_comes_to_rest(rig, steps[-1].t)
 
 
-def test_a_picture_that_stays_the_same_is_told():
-    """A server that repeats its last picture with new times: what is seen in it says nothing of what is there."""
-    rig, kept = Rig(), []
+def frozen(rig, camera, since=FAULT):
+    """A rig one of whose cameras gives its first picture again from a fault on, with new times."""
+    kept = []
 
     def change(read, t, newer_than, timeout):
         frame = read(newer_than, timeout)
         kept.append(frame.image)
-        return replace(frame, image=kept[0].copy()) if t > FAULT else frame
+        return replace(frame, image=kept[0].copy()) if t > since else frame
 
-    rig.fixed = Faulty(rig.fixed, change)
+    setattr(rig, camera, Faulty(getattr(rig, camera), change))
+    return rig
+
+
+def test_a_picture_that_stays_the_same_is_told():
+    """A server that repeats its last picture with new times: what is seen in it says nothing of what is there."""
+    rig = frozen(Rig(), "fixed")
     steps = run(rig, Seer(lambda t: crossing(min(t, FAULT))), FAULT + 3.0)
     told = [step for step in steps if "the fixed camera has shown the same picture for" in step.reason]
     assert told[0].t == pytest.approx(FAULT + FROZEN_S + LATENCY, abs=2 * FRAME_S)
@@ -309,6 +315,43 @@ def test_a_zoom_camera_that_repeats_its_frame_is_told():
     assert told[0].t == pytest.approx(FAULT + BLIND_S, abs=2 * FRAME_S)
     assert told == steps[-len(told) :]
     assert {step.state for step in told} == {State.FOLLOWING}
+
+
+class Asked:
+    """A finder that notes the times of the zoom frames that it is asked to look at, and finds nothing."""
+
+    def __init__(self):
+        self.times = []
+
+    def see_wide(self, frame, detection, mask=None):
+        del frame, detection, mask
+
+    def sight_at(self, t):
+        return t
+
+    def find(self, frame, expected):
+        del expected
+        self.times.append(frame.t)
+
+
+def test_a_zoom_picture_that_stays_the_same_is_told_and_not_looked_at_again():
+    """What an old picture shows beside the middle would lead the head off a target that the wide view still sees."""
+    rig, asked = frozen(Rig(), "zoom"), Asked()
+    steps = run(rig, Seer(crossing), FAULT + 2.0, finder=lambda *_: asked)
+    told = [step for step in steps if "the zoom camera has shown the same picture for" in step.reason]
+    assert told[0].t == pytest.approx(FAULT + FROZEN_S + LATENCY, abs=2 * FRAME_S)
+    assert told == steps[-len(told) :]
+    assert {step.state for step in told} == {State.FOLLOWING}
+    assert len(asked.times) > 1.0 * RATE_HZ  # until then at every frame
+    assert asked.times[-1] == pytest.approx(FAULT, abs=2 * FRAME_S + LATENCY)
+
+
+def test_pictures_that_stay_the_same_in_both_views_are_looked_at():
+    """As of a scene without noise in which nothing moves."""
+    rig, asked = frozen(frozen(Rig(), "zoom", since=0.0), "fixed", since=0.0), Asked()
+    steps = run(rig, Seer(still), FAULT + 2.0, finder=lambda *_: asked)
+    assert asked.times[-1] == steps[-1].zoom.t
+    assert "the zoom camera has shown the same picture" not in steps[-1].reason
 
 
 def test_a_zoom_camera_that_is_dead_for_good_is_an_error():
