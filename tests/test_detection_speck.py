@@ -19,6 +19,8 @@ from cotarget.tracking import Tracker, settings_for
 RATE = 25.0
 NOISE = 2.0  # grey levels, as the simulated sensor's
 HEIGHT, WIDTH = 240, 320
+PLACE_PX, OUTLINE_PX = 1.5, 3.0  # soft edges and noise move an outline, on each side, by a pixel
+SIGN_PX = 7.0  # half of a bird's length: of one that flies before a sign the front is boxed alone
 SPECK = dataclasses.replace(DEFAULT_TARGETS["bird"], detector="speck")
 
 
@@ -98,6 +100,32 @@ def test_small_targets_of_all_sizes_are_found_where_they_are(size):
         # The outline at a third of the contrast lies half a pixel outside the true one on each side, at most one.
         np.testing.assert_allclose(box.center_px, (40.3 + speed * i, 80.6), atol=1.0)
         assert -0.1 * size - 1 <= box.size_px[0] - size <= 2.5
+
+
+@pytest.mark.parametrize(("length", "step"), [(12, 1), (12, 2), (24, 2), (24, 4), (40, 3)])
+def test_all_of_a_plain_bird_is_boxed_though_only_its_front_is_new(length, step):
+    """It moves by less than its own length in the shortest time over which pictures are compared."""
+
+    def paint(picture, i):
+        draw(picture, 60 + step * i, 60, length, length / 2)
+
+    for i, found in enumerate(watch(film(60, paint))):
+        if i >= 30:  # a second after the first
+            assert found[0].center_px == pytest.approx([60 + step * i, 60], abs=PLACE_PX)
+            assert found[0].size_px == pytest.approx([length, length / 2], abs=OUTLINE_PX)
+
+
+def test_a_bird_that_passes_a_sign_is_not_as_large_as_the_sign():
+    """The sign changes too, by what the bird hides of it, but has come from nowhere."""
+
+    def paint(picture, i):
+        picture[50:90, 140:180] = 60.0
+        draw(picture, 60 + 3 * i, 70, 14, 7, grey=230.0)
+
+    for i, found in enumerate(watch(film(60, paint))):
+        if i >= 30 and 145 <= 60 + 3 * i <= 175:
+            assert found[0].center_px == pytest.approx([60 + 3 * i, 70], abs=SIGN_PX)
+            assert (found[0].size_px <= [14 + OUTLINE_PX, 7 + OUTLINE_PX]).all()
 
 
 def test_faint_targets_in_much_noise_are_found():

@@ -6,10 +6,12 @@ was not there before, in units of what the air, the codec and the camera's shake
 
 In front of foliage, or beside the edge of a roof, a bird does not stand out; but what it does to the picture stands
 out from what the wind does there. So where the camera stands, the difference from all earlier pictures is searched for
-specks as well: in the simulated field that finds the bird in 99 % of the frames in which its contrast finds half.
+specks as well: in the simulated field that finds the bird in 99 % of the frames in which its contrast finds half. Of a
+plain bird that flies slowly it finds the front alone; where contrast finds the whole of it, that is the box.
 """
 
 import functools
+import math
 from dataclasses import replace
 
 import cv2
@@ -38,6 +40,11 @@ SLOPE, EVEN = 3.4, 18.0
 CLEAR_SIGNAL = 20.0
 # Specks below this score are not worth telling; a target that stays quiet for a moment is above it.
 LEAST_SCORE = 0.02
+# From this score on a speck is more likely a target than not.
+BELIEVED_SCORE = 0.5
+# A speck of which so much was not there at one of AGES_S has come from elsewhere as a whole; of a sign in front of which
+# a bird flies it is a tenth.
+ARRIVED = 0.5
 # A change since long ago counts at most e to this times as much as the one since a moment ago: what has appeared and
 # stands (a cloud uncovers the sun, a door opens) has changed once; a target goes on changing.
 MOST_RISE = 1.5
@@ -89,6 +96,7 @@ class SpeckDetector:
         if not fresh or self._history.span < WARM_UP_S:
             return []
         found: list[tuple[Speck, Detection]] = []
+        arrived: list[tuple[Speck, Detection]] = []
         for speck in find_specks(grey, LEAST_SIGNAL, MOST_SPECKS):
             changes = [
                 change(grey, speck.low, speck.size, speck.around, shift, self._history.noise, before)
@@ -101,7 +109,10 @@ class SpeckDetector:
                 detection = replace(detection, score=min(detection.score, MOST_CLIPPED_SCORE))
             if detection.score >= LEAST_SCORE:
                 found.append((speck, detection))
-        found = _best_of(found + self._differing(grey, shift, references))
+            if detection.score >= BELIEVED_SCORE and np.nanmax(changes) >= ARRIVED:
+                arrived.append((speck, detection))
+        differing = self._differing(grey, shift, references)
+        found = _best_of(found + [_as_a_whole(pair, arrived) for pair in differing])
         for speck, detection in reversed(found):
             (x, y), (w, h) = speck.low, speck.size
             self.mask[y : y + h, x : x + w] = round(255 * detection.score)
@@ -130,6 +141,20 @@ class SpeckDetector:
             if detection.score >= LEAST_SCORE:
                 found.append((speck, detection))
         return found
+
+
+def _as_a_whole(differing: tuple[Speck, Detection], arrived: list[tuple[Speck, Detection]]) -> tuple[Speck, Detection]:
+    """What differs from earlier pictures, with the box of the speck that has arrived there and that it is a part of.
+
+    Of a plain target that moves by less than its own length within AGES_S[0] only the front differs. Its contrast shows
+    all of it. A thing that stands behind a target differs, but has not arrived.
+    """
+    speck, detection = differing
+    around = [pair for pair in arrived if share(pair[0], speck)]
+    if len(around) != 1 or math.prod(around[0][0].size) <= math.prod(speck.size):
+        return differing
+    whole, box = around[0]
+    return whole, replace(box, score=max(box.score, detection.score))
 
 
 def _best_of(found: list[tuple[Speck, Detection]]) -> list[tuple[Speck, Detection]]:
