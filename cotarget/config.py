@@ -89,7 +89,7 @@ DEFAULT_TARGETS: Mapping[str, TargetConfig] = types.MappingProxyType(
     {
         "book": TargetConfig(0.234, "width", 160.0, "colour", assets_dir() / "textures" / "book_front.png"),
         "person": TargetConfig(1.75, "height", 300.0, "motion"),
-        "bird": TargetConfig(0.8, "wingspan", 160.0, "motion"),
+        "bird": TargetConfig(0.8, "wingspan", 160.0, "speck"),
     }
 )
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS, TargetConfig
-from cotarget.detection import ColourDetector, MotionDetector, colour, make_detector
+from cotarget.detection import ColourDetector, MotionDetector, SpeckDetector, colour, make_detector
 from cotarget.detection.colour import LARGEST_FITTED_PX, MOST_FITTED
 from cotarget.detection.motion import pieces
 from cotarget.detection.templatefit import MARGIN_PX, fit_template
@@ -154,7 +154,7 @@ def watch(detector, pictures, rate=RATE):
 
 
 def motion(name):
-    return make_detector(DEFAULT_TARGETS[name], RATE)
+    return make_detector(dataclasses.replace(DEFAULT_TARGETS[name], detector="motion"), RATE)
 
 
 def test_a_small_dark_bird_is_boxed():
@@ -311,5 +311,6 @@ def test_another_image_size_is_an_error(name):
 
 def test_the_kind_of_detector_follows_the_target():
     assert isinstance(motion("bird"), MotionDetector)
+    assert isinstance(make_detector(DEFAULT_TARGETS["bird"], RATE), SpeckDetector)
     red = TargetConfig(0.2, "width", 160.0, "colour")
     assert isinstance(make_detector(red, RATE, cover()), ColourDetector)

@@ -13,6 +13,7 @@ from cotarget.tracking import MOST_DETECTIONS, Tracker, TrackerSettings, setting
 
 RATE = 25.0
 SIZE = (640, 480)
+MOVING_BIRD = replace(DEFAULT_TARGETS["bird"], detector="motion")
 NOISE_PX = 0.4  # what TrackerSettings tells the filter, with boxes whose own part is switched off below
 PLAIN = TrackerSettings(noise_px=NOISE_PX, noise_of_size=0.0)
 # The filter's own steady state for white acceleration q and noise R every dt: the variance of the velocity is
@@ -224,7 +225,7 @@ def test_a_flash_is_never_confirmed():
 
 def test_what_trembles_on_the_spot_is_no_bird():
     rng = np.random.default_rng(2)
-    tracker = Tracker(settings_for(DEFAULT_TARGETS["bird"]))
+    tracker = Tracker(settings_for(MOVING_BIRD))
     for i in range(100):
         tracks = tracker.update([seen(*(np.array([200, 200]) + rng.uniform(-2, 2, 2)), 12, 12)], i / RATE)
     assert not any(t.confirmed for t in tracks)
@@ -343,7 +344,7 @@ def test_of_two_who_pass_one_vanishes_and_his_track_does_not_jump_on(off_px, num
 @pytest.mark.parametrize(("size", "taken"), [((50, 70), False), ((8, 6), True)])
 def test_what_the_border_cuts_is_at_least_as_large_as_it_looks(size, taken):
     """A post that rises from the lower border is no bird; a part of a bird may be one."""
-    tracker = Tracker(settings_for(DEFAULT_TARGETS["bird"]))
+    tracker = Tracker(settings_for(MOVING_BIRD))
     for i in range(40):
         tracker.update([seen(300 + i, 450, 9, 7)], i / RATE)
     for i in range(40, 50):
@@ -364,7 +365,7 @@ def test_who_enters_at_a_corner_is_one_although_the_next_box_is_far_larger():
 @pytest.mark.parametrize("turn", [-0.9, 0.9])
 def test_a_bird_that_turns_behind_foliage_is_found_again(gap_s, turn):
     """At 25 m it flies at 10 m/s, 280 px/s, and turns by 0.9 rad/s, with 9 m/s^2: newcomers are not that near."""
-    tracker = Tracker(settings_for(DEFAULT_TARGETS["bird"]), SIZE)
+    tracker = Tracker(settings_for(MOVING_BIRD), SIZE)
     rng = np.random.default_rng(5)
     place, heading = np.array([120.0, 240.0]), 0.0
     for i in range(int((1.2 + gap_s) * RATE)):
