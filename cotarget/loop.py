@@ -14,6 +14,7 @@ from cotarget.calibration import Calibration
 from cotarget.closeup import CloseupFinder, Found
 from cotarget.config import RigConfig, TargetConfig
 from cotarget.detection import Detection, Detector
+from cotarget.detection.base import flood
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
 from cotarget.eyes import Eyes
@@ -213,7 +214,9 @@ class _Loop:
         if unmet := self._policy.unmet:
             return unmet
         if not tracks:
-            return "nothing is detected"
+            part = flood(self._detector.mask)
+            why = part and f": {part:.0%} of the wide view changed at once, as when the light does or the camera moves"
+            return f"nothing is detected{why or ''}"
         return "what is detected is not believed yet"
 
     def _choose(self, tracks: list[Track]) -> Track | None:

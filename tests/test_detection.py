@@ -9,8 +9,9 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS, TargetConfig
 from cotarget.detection import ColourDetector, MotionDetector, SpeckDetector, colour, make_detector
+from cotarget.detection.base import MOST_FOREGROUND, flood
 from cotarget.detection.colour import LARGEST_FITTED_PX, MOST_FITTED
-from cotarget.detection.motion import pieces
+from cotarget.detection.motion import FLOODED_S, pieces
 from cotarget.detection.templatefit import MARGIN_PX, fit_template
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.rig import Frame
@@ -307,6 +308,31 @@ def test_another_image_size_is_an_error(name):
     detector.detect(Frame(sky(rng), 0.0))
     with pytest.raises(CotargetError, match="320x240 to 200x100"):
         detector.detect(Frame(sky(rng, (100, 200)), 0.1))
+
+
+@pytest.mark.parametrize("what", ["the camera is nudged", "a light goes on"])
+def test_who_walks_is_seen_again_soon_after_the_whole_picture_has_changed(what):
+    """By itself the mixture would take as long as a colour takes to become background: six of its twenty seconds."""
+    rng, at_s, seen, flooded = np.random.default_rng(4), 3.0, [], []
+    ground = np.clip(cv2.GaussianBlur(rng.normal(0, 1, (260, 340, 3)), (0, 0), 2) * 180 + 72, 0, 153)
+    detector = motion("person")
+    for i in range(round(5 * RATE)):
+        t, nudge, light = i / RATE, 0, 1.0
+        if t >= at_s:
+            nudge, light = (6, 1.0) if "nudged" in what else (0, 1.6)
+        picture = ground[nudge : nudge + 240, nudge : nudge + 320] * light
+        u = 20 + 2 * i
+        picture[100:180, u : u + 26] = 20.0
+        found = detector.detect(Frame(photograph(picture, rng), t))
+        there = [each for each in found if abs(each.center_px[0] - u - 12.5) < 6 and abs(each.center_px[1] - 139.5) < 6]
+        seen.append(bool(there))
+        flooded.append(flood(detector.mask) > MOST_FOREGROUND)
+    changed = round(at_s * RATE)
+    assert all(seen[changed - 20 : changed])
+    assert flooded == [changed <= i <= changed + FLOODED_S * RATE for i in range(len(flooded))]
+    assert all(
+        seen[changed + round(1.0 * RATE) :]
+    )  # after half a second to learn, and to be clear of where he was then
 
 
 def test_the_kind_of_detector_follows_the_target():

@@ -446,3 +446,13 @@ def test_a_calibration_of_another_aspect_ratio_is_refused_before_anything_moves(
         run(rig, Seer(still), 1.0)
     assert not rig.moves
     assert not rig.zooms
+
+
+def test_a_picture_that_changes_as_a_whole_is_told():
+    """Else who walks in plain view and is not seen, because a light was switched, would be told to be nobody."""
+    seer = Seer(still, lambda t: False)
+    seer.mask = np.zeros((480, 640), np.uint8)
+    seer.mask[:240] = 255
+    assert {step.reason for step in run(Rig(), seer, 0.5)} == {
+        "nothing is detected: 50% of the wide view changed at once, as when the light does or the camera moves"
+    }

@@ -7,11 +7,15 @@ box of a single lit pixel at column 3 is centred on u = 3 and 1 wide.
 from dataclasses import dataclass
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from cotarget.errors import CotargetError
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
+
+# A target is small: when more of the picture than this changed at once, the light or the camera did.
+MOST_FOREGROUND = 0.3
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,12 @@ class Detector(Protocol):
 
     def detect(self, frame: Frame) -> list[Detection]:
         """Find the targets, best first; [] where there is none."""
+
+
+def flood(mask: Image | None) -> float:
+    """The part of a picture that is foreground, 0 to 1, where that is too much to be targets; else 0."""
+    part = 0.0 if mask is None else cv2.countNonZero(mask) / mask.size
+    return part if part > MOST_FOREGROUND else 0.0
 
 
 def box_detection(x: int, y: int, w: int, h: int, score: float, shape: tuple[int, ...]) -> Detection:

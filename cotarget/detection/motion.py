@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from cotarget.detection.base import Detection, box_detection, check_size
+from cotarget.detection.base import Detection, box_detection, check_size, flood
 from cotarget.rig import Frame, Image
 
 # What MOG2 writes into its mask: 255 is foreground, 127 a shadow.
 FOREGROUND = 255
-# A target is small: when more of the picture than this changed at once, the light or the camera did.
-MOST_FOREGROUND = 0.3
+# A light that was switched on or a camera that was nudged stays so: after so long [s] the background is learnt anew.
+# Left to itself the mixture would take as long as it remembers, and what moves meanwhile would not be seen.
+FLOODED_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,7 @@ class MotionDetector:
         self._model.setBackgroundRatio(settings.background_part)
         self._t: float | None = None
         self._learnt = 0.0
+        self._since: float | None = None  # when so much changed that it is no target
         self._known: tuple[Image, float] | None = None  # background, and when it was taken out of the mixture
         self._range: tuple[Image, Image] | None = None
         self._range_of: Image | None = None
@@ -166,9 +168,19 @@ class MotionDetector:
         if self._settings.opening_px:
             mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((self._settings.opening_px,) * 2, np.uint8))
         self.mask = mask
-        if self._learnt < self._settings.warm_up_s or cv2.countNonZero(mask) > MOST_FOREGROUND * mask.size:
+        if self._learnt < self._settings.warm_up_s:
             return []
+        if flood(mask):
+            self._since = frame.t if self._since is None else self._since
+            if frame.t - self._since >= FLOODED_S:
+                self._forget()
+            return []
+        self._since = None
         return self._boxes(mask)
+
+    def _forget(self) -> None:
+        """Learn the background anew from the next picture on."""
+        self._learnt, self._t, self._since, self._known = 0.0, None, None, None
 
     def _rate(self, t: float) -> float:
         """Learning rate for a frame at ``t`` [s]: fast while there is little to remember."""
@@ -176,7 +188,9 @@ class MotionDetector:
         self._t = t
         if dt <= 0:
             dt = self._interval
-        self._learnt += dt
+        anew, self._learnt = not self._learnt, self._learnt + dt
+        if anew:  # nothing of what the mixture may have learnt before
+            return 1.0
         return min(1.0, dt / min(self._settings.history_s, 2 * self._learnt))
 
     def _background(self) -> Image:

@@ -42,8 +42,8 @@ CLEAR_SIGNAL = 20.0
 LEAST_SCORE = 0.02
 # From this score on a speck is more likely a target than not.
 BELIEVED_SCORE = 0.5
-# A speck of which so much was not there at one of AGES_S has come from elsewhere as a whole; of a sign in front of which
-# a bird flies it is a tenth.
+# A speck of which so much was not there at one of AGES_S has come from elsewhere as a whole; of a sign before which a
+# bird flies it is a tenth.
 ARRIVED = 0.5
 # A change since long ago counts at most e to this times as much as the one since a moment ago: what has appeared and
 # stands (a cloud uncovers the sun, a door opens) has changed once; a target goes on changing.
