@@ -88,7 +88,7 @@ def test_figures_from_rows():
 
 def test_each_figure_is_a_job(monkeypatch):
     monkeypatch.setitem(wire.RUNS, "age", lambda settings, folder: [{"figure": "age", "in": folder.is_dir()}])
-    settings = replace(SHORT, only=("polls", "age"))
+    settings = replace(SHORT, tries=1, only=("polls", "age"))
     assert list(wire.jobs(settings)) == [0, 1]
     assert wire.one(None, settings, 1) == [{"figure": "age", "in": True}]
 
@@ -111,6 +111,28 @@ def test_a_head_that_strays():
 
 
 @pytest.mark.slow
+def stalled(settled_s, hang=0):
+    return [{"figure": "faults", "fault": "fixed.stall", "way": "held", "outcome": "ended", "settled_s": settled_s,
+             "beyond_deg": 0.0, "hang": hang, "traceback": 0, "load": 1.0}]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("runs", "measured"),
+    [
+        ([stalled(0.3)], 0.3),
+        ([stalled(4.6), stalled(0.4), stalled(0.3)], 0.4),  # the machine was busy once
+        ([stalled(math.inf), stalled(0.4)], 0.4),
+        ([stalled(4.6), stalled(4.5), stalled(4.4), stalled(0.3)], 4.4),  # it is slow
+        ([stalled(4.6, hang=1), stalled(0.3)], 4.6),  # no machine explains that
+    ],
+)
+def test_what_a_busy_machine_has_spoilt_is_measured_again(monkeypatch, runs, measured):
+    runs = iter(runs)
+    monkeypatch.setitem(wire.RUNS, "faults", lambda *_: next(runs))
+    settings = replace(SHORT, only=("faults",))
+    assert [row["settled_s"] for row in wire.one(None, settings, 0)] == [measured]
+
+
 @pytest.mark.wire
 @pytest.mark.render
 def test_a_short_run(tmp_path, capsys):
