@@ -21,6 +21,10 @@ from cotarget.rig import PanTiltLimits
 
 # A click means the target in whose box it is, or one whose middle is within this part of the image's width.
 CLICK_PART = 0.08
+# Whoever was chosen and lost is looked for so long [s]: a person behind a tree or a car, a bird behind a roof. A track
+# that begins meanwhile is taken for the same target if it is no more than so many times as large or as small and no
+# farther than so many of its sizes, and this part of the way gone meanwhile, from where the old one would be.
+RETURNS_S, RETURN_SIZES, RETURN_TIMES, RETURN_PART = 3.0, 2.0, 2.0, 0.5
 
 
 class Policy(Protocol):
@@ -153,6 +157,9 @@ def most_served(outlook: Outlook) -> int:
 class Chosen:
     """Follow what the user chose, by its number or by a click into the wide view, and nothing else.
 
+    A target that was out of sight for longer than its track lives comes back under another number. Whoever turns up
+    soon after where it would have gone is taken for it.
+
     Attributes:
         number: of the track.
         pixel: of the click (u, v).
@@ -164,17 +171,28 @@ class Chosen:
     width_px: float = math.inf
     _found: int | None = field(default=None, init=False)
     _there: bool = field(default=False, init=False)
+    _last: Candidate | None = field(default=None, init=False)  # as it was seen last
+    _newest: int = field(default=0, init=False)  # of the tracks that were there beside it then
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
         """The chosen one while it is there."""
         if self._found is None:
             self._found = self.number if self.pixel is None else self._clicked(candidates)
-        self._there = self._found in {candidate.id for candidate in candidates}
-        return self._found if self._there else None
+        there = {candidate.id: candidate for candidate in candidates}
+        if self._found not in there and (back := [c.track for c in candidates if self._is_back(c.track)]):
+            self._found = min(back, key=lambda track: (self._off_course(track), track.id)).id
+        self._there = self._found in there
+        if self._found is None or not self._there:
+            return None
+        if not there[self._found].track.missed:
+            self._last, self._newest = there[self._found], max(there)
+        return self._found
 
     def favours(self, track: Track) -> bool:
         """Whether it is the chosen one, or may be."""
-        return track.id == self._found if self._found is not None else self._means(track)
+        if self._found is None:
+            return self._means(track)
+        return track.id == self._found or (not self._there and self._is_back(track))
 
     @property
     def unmet(self) -> str:
@@ -187,6 +205,23 @@ class Chosen:
         return (
             f"no track {at}" if self._found is None else f"track {self._found}, which was {at}, is not there any more"
         )
+
+    def _is_back(self, track: Track) -> bool:
+        """Whether a track may be of the chosen one, which was lost and has not left the wide view."""
+        if self._last is None or track.id <= self._newest:
+            return False
+        last, gone_s = self._last.track, track.t - self._last.track.t
+        if not 0.0 < gone_s <= min(RETURNS_S, self._last.leaves_in):
+            return False
+        room = RETURN_SIZES * last.larger_side_px + RETURN_PART * gone_s * float(np.linalg.norm(last.velocity_px))
+        resized = track.larger_side_px / last.larger_side_px
+        return 1 / RETURN_TIMES <= resized <= RETURN_TIMES and self._off_course(track) <= room
+
+    def _off_course(self, track: Track) -> float:
+        """How far a track is from where the chosen one would be by now [px]."""
+        assert self._last is not None, "who asks has looked"
+        last = self._last.track
+        return float(np.linalg.norm(track.center_px - last.center_px - last.velocity_px * (track.t - last.t)))
 
     def _clicked(self, candidates: Sequence[Candidate]) -> int | None:
         """The track under a click, or the nearest that is near."""

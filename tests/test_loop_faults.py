@@ -3,6 +3,7 @@
 Nothing ends in a crash, a head that runs away, or a Step that does not say what is wrong.
 """
 
+import itertools
 import math
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -473,6 +474,21 @@ def test_a_chosen_target_that_has_gone_is_told():
     u, v = pixel
     assert steps[-1].reason == f"track 1, which was at the click ({u:g}, {v:g}), is not there any more"
     assert_it_comes_to_rest(rig, 1.0)
+
+
+def test_a_chosen_target_that_was_hidden_for_long_is_followed_on():
+    """Its track lives for 0.8 s; then it has another number, and is the same target."""
+    rig = Rig()
+    hidden = run(rig, Seer(still, lambda t: not 1.0 <= t < 2.5), 5.0, policy=partial(Chosen, number=1))
+    assert [(state, number) for (state, number), _ in itertools.groupby(hidden, key=whom)][-2:] == [
+        (State.SEARCHING, None),
+        (State.FOLLOWING, 2),
+    ]
+    assert off(rig, still, rig.t) < STEP
+
+
+def whom(step):
+    return step.state, None if step.target is None else step.target.id
 
 
 class Two:

@@ -274,6 +274,47 @@ def test_a_click_means_the_box_it_is_in_or_the_nearest_one_near():
     assert far.select([candidate(7, center=(20, 20)), small], STILL, LIMITS) == 7  # it is known by its number now
 
 
+def lost_at_zero(**last):
+    """A policy whose chosen target, number 2, was seen last at the time 0; number 5 was there too."""
+    policy = Chosen(number=2)
+    assert policy.select([candidate(2, **last), candidate(5, center=(20, 20))], STILL, LIMITS) == 2
+    return policy
+
+
+def test_whoever_was_chosen_and_hidden_is_followed_on_under_another_number():
+    policy = lost_at_zero(center=(300, 200), velocity=(50, 0))
+    assert policy.select([candidate(5, center=(20, 20), t=1.0)], STILL, LIMITS) is None
+    assert policy.favours(track(6, center=(370, 200), t=1.5))  # 75 px on, where it would be
+    there = [candidate(6, center=(370, 200), t=1.5), candidate(7, center=(400, 200), t=1.5)]
+    assert policy.select(there, STILL, LIMITS) == 6
+    assert policy.unmet == ""
+    assert policy.select(there[1:], STILL, LIMITS) is None  # that one was there beside it
+    assert policy.select([candidate(8, center=(370, 200), t=4.0)], STILL, LIMITS) == 8
+
+
+@pytest.mark.parametrize(
+    ("number", "where"),
+    [
+        (5, {"center": (350, 200), "t": 1.0}),  # was there beside it
+        (6, {"center": (450, 200), "t": 1.0}),  # 100 px from where it would be: two sizes are 40, half the way is 25
+        (6, {"center": (350, 200), "t": 1.0, "size": (41, 20)}),
+        (6, {"center": (350, 200), "t": 1.0, "size": (9, 9)}),
+        (6, {"center": (455, 200), "t": 3.1}),
+        (6, {"center": (300, 200), "t": 0.0}),
+    ],
+)
+def test_nobody_else_is_taken_for_whoever_was_chosen(number, where):
+    policy = lost_at_zero(center=(300, 200), velocity=(50, 0))
+    assert not policy.favours(track(number, **where))
+    assert policy.select([candidate(number, **where)], STILL, LIMITS) is None
+    assert policy.unmet == "track 2 is not there"
+
+
+def test_whoever_was_chosen_and_has_left_the_view_is_not_back():
+    policy = lost_at_zero(center=(600, 200), velocity=(80, 0), leaves=0.5)
+    assert policy.select([candidate(6, center=(639, 200), velocity=(-80, 0), t=0.6)], STILL, LIMITS) is None
+
+
 @pytest.mark.parametrize("name", sorted(POLICIES))
 def test_who_is_out_of_reach_keeps_nobody_waiting(name):
     policy = POLICIES[name]()
