@@ -12,6 +12,7 @@ from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.closeup import CloseupFinder, Expected
 from cotarget.closeup.matching import correlate, resample, summit
+from cotarget.closeup.template import look
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.demo import SCENES, sim_config
 from cotarget.detection import Detection
@@ -410,3 +411,10 @@ def test_samples_lie_where_they_should(pitch):
     _, inside = resample(u, np.array([[pitch, 0.0, -left], [0.0, pitch, 100.0]]), (20, 17))
     there = pitch * np.arange(20) - left >= -0.5  # a pixel reaches half a one to each side
     assert (inside == there).all()
+
+
+def test_a_box_beyond_the_frame_shows_nothing_though_its_surroundings_do():
+    """As a detector of one's own may give; what it holds would be no pixel, and its likeness to anything no number."""
+    frame = Frame(np.full((480, 640, 3), 128, np.uint8), 0.0)
+    assert look(frame, Detection(np.array([90.8, 485.4]), np.array([0.9, 8.3]), 1.0), None, BIRD) is None
+    assert look(frame, Detection(np.array([90.8, 483.0]), np.array([0.9, 8.3]), 1.0), None, BIRD) is not None

@@ -122,7 +122,7 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetC
     limit = np.array(frame.image.shape[1::-1])
     low = np.maximum(np.floor(center - size / 2 - margin).astype(int), 0)
     high = np.minimum(np.ceil(center + size / 2 + margin).astype(int) + 1, limit)
-    if (high - low < 1).any():
+    if (high - low < 1).any():  # nor does its surroundings
         return None
     here = slice(low[1], high[1]), slice(low[0], high[0])
     patch = frame.image[here].copy()
@@ -130,6 +130,8 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetC
     beyond = np.abs(u - center[0]) - size[0] / 2, np.abs(v - center[1])[:, None] - size[1] / 2
     outside = np.maximum(np.maximum(*beyond), 0)
     in_box = outside == 0
+    if not in_box.any():
+        return None
     foreground = np.zeros_like(in_box) if mask is None else (mask[here] > 0) & in_box
     if not _is_outline(foreground, in_box):
         foreground = _stands_out(patch, in_box)

@@ -93,8 +93,8 @@ class ColourDetector:
             dx, dy, w, h = cv2.boundingRect(inside)
             if max(w / self.mask.shape[1], h / self.mask.shape[0]) <= LARGEST_COLOURED:
                 boxes.append(box_detection(x + dx, y + dy, w, h, 0.0, self.mask.shape))
-        found = [self._refine(frame.image, box) for box in self._likeliest(tests[..., 0], boxes)]
-        return sorted((d for d in found if d.score >= LEAST_FIT), key=lambda d: -d.score)
+        fitted = [self._refine(frame.image, box) for box in self._likeliest(tests[..., 0], boxes)]
+        return sorted((d for d in fitted if d is not None and d.score >= LEAST_FIT), key=lambda d: -d.score)
 
     def _likeliest(self, plane: Image, boxes: list[Detection]) -> list[Detection]:
         """Those that look most like the template in the plane of its colour (H, W): MOST_FITTED at most."""
@@ -109,8 +109,8 @@ class ColourDetector:
         largest = sorted(boxes, key=lambda box: -float(box.size_px.prod()))[:MOST_LOOKED_AT]
         return sorted(largest, key=likeness, reverse=True)[:MOST_FITTED]
 
-    def _refine(self, image: Image, coarse: Detection) -> Detection:
-        """Locate the target in its coarse box to a fraction of a pixel."""
+    def _refine(self, image: Image, coarse: Detection) -> Detection | None:
+        """Locate the target in its coarse box to a fraction of a pixel; None where the template does not fit."""
         scale = math.ceil(float(coarse.size_px.max()) / LARGEST_FITTED_PX)
         low = np.maximum(0, np.rint(coarse.center_px - coarse.size_px / 2 - scale * MARGIN_PX)).astype(int)
         high = np.rint(coarse.center_px + coarse.size_px / 2 + scale * MARGIN_PX).astype(int) + 1
@@ -125,7 +125,7 @@ class ColourDetector:
         corner = low + (scale - 1) / 2  # where the first of its pixels has its middle
         fit = fit_template(self._plane, part, (coarse.center_px - corner) / scale, coarse.size_px / scale)
         if fit is None:
-            return coarse
+            return None
         center, size, likeness = fit
         return Detection(scale * center + corner, scale * size, likeness, coarse.clipped)
 
