@@ -1,10 +1,12 @@
-"""Takes the README's pictures from the results of a full run, as JPEGs small enough to be kept with the code.
+"""Takes the README's pictures from results, as JPEGs small enough to be kept with the code.
 
-python -m experiments.gallery [--results experiments-out] [--out experiments/pictures]
+Each is of as many seeds as the README says beside its table, which of hold and single_ptz are more than in a full run.
+
+python -m experiments.gallery [NAME ...] [--results experiments-out] [--out experiments/pictures]
 """
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import cv2
 import numpy as np
 
 from cotarget.cli.parsers import Parser
-from cotarget.errors import ConfigError, CotargetError
+from cotarget.errors import ConfigError, CotargetError, choices
 from cotarget.outputs import write_whole
 from experiments.arguments import check_folder
 from experiments.harness import FIGURE
@@ -53,11 +55,15 @@ SHOWN = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; the exit status."""
     parser = Parser(prog=PROGRAM, description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help=f"of a full run ({RESULTS})")
+    names = tuple(dict.fromkeys(each.experiment for each in SHOWN))
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"experiments whose pictures; all of {choices(names)}")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="DIR", help=f"their folder ({RESULTS})")
     parser.add_argument("--out", type=Path, default=PICTURES, metavar="DIR", help="for the pictures")
     given = parser.parse_args(arguments)
     try:
-        for path in gather(given.results, given.out):
+        if unknown := sorted(set(given.names) - set(names)):
+            raise ConfigError(f"'{unknown[0]}' is not one of: {choices(names)}")
+        for path in gather(given.results, given.out, given.names or names):
             print(f"{path}  {path.stat().st_size // 1024} kB")
     except CotargetError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
@@ -65,12 +71,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def gather(results: Path, out: Path) -> list[Path]:
-    """Write every picture that the README shows, or none.
+def gather(results: Path, out: Path, names: Collection[str]) -> list[Path]:
+    """Write every picture of some experiments that the README shows, or none.
 
     Args:
         results: folder of `python -m experiments`.
         out: folder for the pictures.
+        names: of the experiments.
 
     Returns:
         What was written.
@@ -79,7 +86,8 @@ def gather(results: Path, out: Path) -> list[Path]:
         ConfigError: a picture is missing or cannot be read, or one cannot be written.
     """
     check_folder(out)
-    files = {out / f"{each.name}.jpg": _jpeg(results / each.experiment / f"{each.picture}.png") for each in SHOWN}
+    shown = [each for each in SHOWN if each.experiment in names]
+    files = {out / f"{each.name}.jpg": _jpeg(results / each.experiment / f"{each.picture}.png") for each in shown}
     out.mkdir(parents=True, exist_ok=True)
     for path, data in files.items():
         write_whole(path, data)
@@ -95,7 +103,7 @@ def _jpeg(path: Path) -> bytes:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; --results names the folder of a full run") from None
+        raise ConfigError(f"{path}: {error.strerror}; --results names the folder of their results") from None
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if image is None:
         raise ConfigError(f"{path} is no picture; run its experiment again, with --fresh")

@@ -1,7 +1,8 @@
 """The project's own pipeline as policies of the environments, to compare others with.
 
 Policies are called with an observation and give an action. These do not read the observation: they look at what it is
-made from, and of the truth they know no more than that.
+made from. Of the truth they know no more than that, and the environment's calibration of its rig, which is exact by
+default.
 """
 
 import math
