@@ -134,6 +134,10 @@ def test_settings_can_be_swept(run, tmp_path):
         (1.0, (1,)), (1.0, ()), (2.0, (1,)), (2.0, ())
     ]  # fmt: skip
     assert len({case.folder for case in cases}) == 4
+    again = ("factor=0.1", "wrong=[1, 2]", "factor=1e-1", "wrong=[1,2]", "factor=0.10", "factor=0.2")
+    assert [case.changes for case in choose(KNOWN, ["tiny"], changes=[f"tiny.{each}" for each in again])] == [
+        ("factor=0.1", "wrong=[1, 2]"), ("factor=0.2", "wrong=[1, 2]")
+    ]  # fmt: skip
 
 
 # ---------------------------------------------------------------- what goes wrong
