@@ -20,7 +20,7 @@ from cotarget.sim.fieldpaths import SECONDS
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments import harness
-from experiments.own_rig import OwnRig
+from experiments.own_rig import OwnRig, RigText
 from experiments.paper_loop import Follow
 from experiments.wide_view import WideView, open_on
 
@@ -43,13 +43,13 @@ class OwnRigInField(OwnRig, FieldSettings):
     """The same for an experiment that takes a rig of one's own."""
 
 
-def _of_calibration(settings: FieldSettings) -> tuple[bool, int, OwnRig]:
-    rig = OwnRig(rig=settings.rig) if isinstance(settings, OwnRig) else OwnRig()
+def _of_calibration(settings: FieldSettings) -> tuple[bool, int, RigText]:
+    rig = settings.text if isinstance(settings, OwnRig) else RigText()
     return settings.calibrated, settings.seed_base, rig
 
 
 @functools.cache
-def _calibrated(from_boards: bool, seed: int, rig: OwnRig) -> Calibration:
+def _calibrated(from_boards: bool, seed: int, rig: RigText) -> Calibration:
     config = rig.config("indoor", (), seed)
     if not from_boards:
         return true_calibration(SimWorld(config, rendered=()))
