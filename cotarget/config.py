@@ -45,9 +45,11 @@ __all__ = [
     "SimZoomCamera",
     "TargetConfig",
     "check_config",
+    "config_of",
     "load_config",
     "parse_config",
     "read_tables",
+    "read_text",
 ]
 
 ENCODING = "utf-8-sig"  # with the byte-order mark that some editors write, or without
@@ -214,7 +216,20 @@ def load_config(path: Path) -> RigConfig:
     Raises:
         ConfigError: the file is missing, malformed, or says something unknown or impossible.
     """
-    table = read_tables(path)
+    return config_of(read_text(path), path)
+
+
+def config_of(text: str, path: Path) -> RigConfig:
+    """What a rig.toml says, from its text alone.
+
+    Args:
+        text: of the file, as `read_text` gives it.
+        path: where it is: relative paths in it are relative to its folder, and messages name it. It is not read.
+
+    Raises:
+        ConfigError: the text is malformed, or says something unknown or impossible.
+    """
+    table = _tables(text, path)
     try:
         config = parse_config(table)
     except ConfigError as error:
@@ -239,8 +254,17 @@ def read_tables(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: the file is missing or is not TOML.
     """
+    return _tables(read_text(path), path)
+
+
+def read_text(path: Path) -> str:
+    """What stands in a rig.toml.
+
+    Raises:
+        ConfigError: the file is missing or is no text.
+    """
     try:
-        return tomllib.loads(path.read_text(encoding=ENCODING))
+        return path.read_text(encoding=ENCODING)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; give the path of a rig.toml") from None
     except IsADirectoryError:
@@ -249,6 +273,11 @@ def read_tables(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: is no text in UTF-8: {error.reason}; give the path of a rig.toml") from None
+
+
+def _tables(text: str, path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: is not TOML: {error}") from None
 

@@ -21,8 +21,8 @@ from matplotlib.figure import Figure
 from cotarget.calibration import Options, calibrate_views, predicted_pointing
 from cotarget.calibration.boards import board_points
 from cotarget.config import BoardConfig
+from experiments.checks import check_above
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.mounted import check_above
 from experiments.synthetic import LONGEST_PX, SIZES, Placing, Truth, draw_targets, misses, spread_views
 
 BOARD = BoardConfig()

@@ -98,7 +98,8 @@ def choose(
         seeds: how many; each experiment's own number by default.
         seed_base: the first; each experiment's own by default.
         changes: settings as NAME.KEY=VALUE, the value as TOML has it; where a key comes more than once, there is a case
-            for each of its values, and for each combination with those of other keys.
+            for each of its values, however often and in whatever way each is written, and for each combination with
+            those of other keys.
 
     Raises:
         ConfigError: an unknown experiment or setting, or a value that it cannot have.
@@ -111,12 +112,15 @@ def choose(
         base = experiment.quick if quick else experiment.settings
         told = {"seeds": seeds, "seed_base": seed_base}
         base = dataclasses.replace(base, **{key: value for key, value in told.items() if value is not None})
-        mine = values.get(name, {})
+        mine, already = values.get(name, {}), list[Settings]()
         for picked in itertools.product(*([(key, text) for text in texts] for key, texts in mine.items())):
             tables = {key: _value(text) for key, text in picked}
             settings = build(type(base), tables, name, base=base)
             for key in tables:
                 _check(settings, key, f"{name}.{key}")
+            if settings in already:  # the same values, written in another way
+                continue
+            already.append(settings)
             cases.append(Case(experiment, settings, tuple(f"{key}={text}" for key, text in picked), quick))
     return cases
 

@@ -6,7 +6,8 @@ import importlib
 import importlib.util
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -18,12 +19,13 @@ from experiments.workers import LINEAR_ALGEBRA, ONE_THREAD, Died, Job, Results, 
 
 EXTRA = "cotarget[sweeps]"
 ANSWER_S = 10.0  # for a scheduler to answer [s]
-HEEDED = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")  # by the linear algebra of numpy and scipy as they are published
+# By OpenBLAS, the linear algebra of numpy and scipy as they are published: the first of these that is above zero.
+HEEDED = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")
 START_SO = "start workers with --nthreads 1 (and --nworkers N)"
 WITHOUT_PACKAGES = (
     "does not find the packages cotarget and experiments; start it with PYTHONPATH set to a clone of this repository"
 )
-SEVERAL_THREADS = "has linear algebra on several threads; start it with OMP_NUM_THREADS=1"
+SEVERAL_THREADS = "has linear algebra on several threads"
 QUIET = logging.CRITICAL + 10  # what is wrong is told in one line
 
 
@@ -135,13 +137,13 @@ def _check_workers(client: Any, scheduler: str, version: str, any_libraries: boo
         if count > 1:  # an OpenGL context belongs to one thread
             raise ConfigError(f"the Dask worker at {worker} has {count} threads; {START_SO}")
 
-    def about() -> tuple[str, bool]:  # sent as it stands: there may be nothing there to find it in
-        held = any(os.environ.get(name) == "1" for name in HEEDED)
+    def about() -> tuple[str, dict[str, str]]:  # sent as it stands: there may be nothing there to find it in
+        told = {name: os.environ.get(name, "") for name in HEEDED}
         if not (importlib.util.find_spec("experiments") and importlib.util.find_spec("cotarget")):
-            return "", held
-        return str(importlib.import_module("experiments.results").code_version()), held
+            return "", told
+        return str(importlib.import_module("experiments.results").code_version()), told
 
-    for worker, (code, held) in client.run(about).items():
+    for worker, (code, told) in client.run(about).items():
         if not code:
             raise ConfigError(f"the Dask worker at {worker} {WITHOUT_PACKAGES}")
         other = differing(code, version) if version else ""
@@ -150,8 +152,31 @@ def _check_workers(client: Any, scheduler: str, version: str, any_libraries: boo
             raise ConfigError(
                 f"the Dask worker at {worker} has cotarget {code}, this is {version}; give both the same {other}{keep}"
             )
-        if not held:
-            raise ConfigError(f"the Dask worker at {worker} {SEVERAL_THREADS}")
+        _check_linear_algebra(worker, told)
+
+
+def _check_linear_algebra(worker: str, environment: Mapping[str, str]) -> None:
+    """Refuse a worker whose linear algebra takes several threads.
+
+    Args:
+        worker: its address.
+        environment: its variables.
+
+    Raises:
+        ConfigError: what OpenBLAS heeds of them is not 1, or is none: then it takes all cores.
+    """
+    heeded = next((name for name in HEEDED if _number(environment.get(name, "")) > 0), None)
+    if heeded is None:
+        raise ConfigError(f"the Dask worker at {worker} {SEVERAL_THREADS}; start it with OMP_NUM_THREADS=1")
+    if _number(environment[heeded]) != 1:
+        told = f"{heeded}={environment[heeded]}"
+        raise ConfigError(f"the Dask worker at {worker} {SEVERAL_THREADS}, by {told}; start it with {heeded}=1")
+
+
+def _number(text: str) -> int:
+    """What OpenBLAS reads in a variable, which is what C's atoi does: the number that it begins with, or else 0."""
+    found = re.match(r"\s*[+-]?\d+", text, re.ASCII)
+    return int(found[0]) if found else 0
 
 
 def _held_to_one_thread(work: Callable[[Job], Any], job: Job) -> Any:
@@ -163,8 +188,7 @@ def _held_to_one_thread(work: Callable[[Job], Any], job: Job) -> Any:
     worker: Any = importlib.import_module("distributed").get_worker()
     if worker.state.nthreads > 1:
         raise ConfigError(f"the Dask worker at {worker.address} has {worker.state.nthreads} threads; {START_SO}")
-    if not any(os.environ.get(name) == "1" for name in HEEDED):
-        raise ConfigError(f"the Dask worker at {worker.address} {SEVERAL_THREADS}")
+    _check_linear_algebra(worker.address, os.environ)
     for name in ONE_THREAD.keys() - set(LINEAR_ALGEBRA):  # heeded by rendering; linear algebra is loaded already
         os.environ.setdefault(name, ONE_THREAD[name])
     cv2.setNumThreads(1)

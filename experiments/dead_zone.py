@@ -103,13 +103,16 @@ def describe(settings: DeadZoneSettings, summary: Mapping[str, Any]) -> str:
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """With against without: each seed a point, its median a cross with arms from the least to the largest."""
+    """With against without: each seed that has both a point, its median a cross with arms from least to largest."""
     for ax, key in zip(figure.subplots(1, len(FIGURES)), FIGURES, strict=True):
         highest = 0.0
         for name in dict.fromkeys(row["target"] for row in rows):
-            of_way = [[r[key] or 0.0 for r in rows if (r["target"], r["way"]) == (name, way)] for way in WAYS]
-            (dots,) = ax.plot(of_way[1], of_way[0], ".", alpha=0.6)
-            told = [spread_of(each) for each in (of_way[1], of_way[0])]
+            with_it, without = ([r[key] for r in rows if (r["target"], r["way"]) == (name, way)] for way in WAYS)
+            # A run that never acquired its target has no figure, and none is no zero, which would be the best place.
+            both = [pair for pair in zip(without, with_it, strict=True) if None not in pair]
+            of_way = [[pair[i] for pair in both] for i in range(len(WAYS))]
+            (dots,) = ax.plot(*of_way, ".", alpha=0.6)
+            told = [spread_of(each) for each in of_way]
             x, y = (each["median"] for each in told)
             arms = [[[each["median"] - each["least"]], [each["largest"] - each["median"]]] for each in told]
             ax.errorbar([x], [y], xerr=arms[0], yerr=arms[1], fmt="o", color=dots.get_color(), label=name)

@@ -28,8 +28,9 @@ from matplotlib.figure import Figure
 from cotarget.calibration import Calibration
 from cotarget.camera import depth_from_size
 from cotarget.geometry import Array
+from experiments.checks import check_above
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.mounted import TARGET, at, cell_name, check_above, exact_calibration, mounted, off_px, wanted_focal_px
+from experiments.mounted import TARGET, at, cell_name, exact_calibration, mounted, off_px, wanted_focal_px
 from experiments.synthetic import SIZE, Truth, aim, looking_off
 
 CAUSES = ("wrong size", "scatter", "pixels", "together")

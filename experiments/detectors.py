@@ -31,6 +31,7 @@ from cotarget.sim.appearances import Silhouette
 from cotarget.sim.fieldpaths import GROUPED, SECONDS
 from cotarget.sim.world import SimWorld
 from cotarget.tracking import Tracker, settings_for
+from experiments.checks import check_above, check_ways
 from experiments.field_scenes import field_config, five_targets_config
 from experiments.harness import Experiment, Row, Settings, seeds_of, table
 from experiments.spread import in_words, points, spread
@@ -40,6 +41,7 @@ DetectorName = Literal["mog2", "motion", "speck"]
 DETECTORS: tuple[DetectorName, ...] = ("mog2", "motion", "speck")
 STANDS, SHAKES = "stands", "shakes"
 MEMORY_S = 0.1  # of the shake
+COME_S = 3.0  # by then the first of five is in view, whatever the seed, and the background was learnt [s]
 STREAM = 11  # of random numbers, apart from the world's own
 FIGURES = {
     "found": "targets in view with a track on them",
@@ -64,6 +66,12 @@ class DetectorsSettings(Settings):
     kinds: tuple[str, ...] = GROUPED
     detectors: tuple[DetectorName, ...] = DETECTORS
     shake_px: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_above(COME_S, self, "seconds")
+        check_ways(self, "seconds")
 
 
 @dataclass

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from cotarget.env import FOLLOW, SCHEDULE, PipelinePolicy, SchedulingPolicy
 from cotarget.policies import POLICIES
 from cotarget.sim.fieldpaths import GROUPED, LONE, SECONDS
+from experiments.checks import check_above, check_ways
 from experiments.harness import Experiment, Row, Settings, seeds_of, table
 from experiments.spread import bars, mean_of
 
@@ -37,6 +38,12 @@ class ScoreSettings(Settings):
 
     seeds: int = 5
     seconds: float = SECONDS
+
+    def __post_init__(self) -> None:
+        """Refuse what the environments do."""
+        super().__post_init__()
+        check_above(0, self, "seconds")
+        check_ways(self, "seconds")
 
 
 def one(shared: None, settings: ScoreSettings, seed: int) -> list[Row]:

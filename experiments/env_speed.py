@@ -21,10 +21,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from cotarget.config import RigConfig
 from cotarget.env import Follow, PipelinePolicy
 from cotarget.env.units import Vector
 from cotarget.sim.opengl import mujoco
 from cotarget.sim.world import SimWorld
+from experiments.checks import check_above, check_least, check_ways
 from experiments.harness import Experiment, Row, Settings, seeds_of, table
 from experiments.plain_renderer import PlainRenderer
 
@@ -48,6 +50,13 @@ class EnvSpeedSettings(Settings):
     targets: tuple[str, ...] = ("book", "person", "bird")
     seconds: float = 20.0
     seconds_seen: float = 6.0
+
+    def __post_init__(self) -> None:
+        """Refuse what the environments do, and what is too short to be timed."""
+        super().__post_init__()
+        check_least(BLOCK / RigConfig().rate_hz, self, "seconds")
+        check_above(0, self, "seconds_seen")
+        check_ways(self, "seconds", "seconds_seen")
 
 
 class Alone:

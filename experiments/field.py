@@ -14,13 +14,15 @@ from cotarget.detection import Detector, make_detector
 from cotarget.judging import add_row
 from cotarget.loop import FollowSettings, Step, follow
 from cotarget.metrics import Row as Judged
+from cotarget.metrics.held import BACKGROUND_S
 from cotarget.oracle import true_calibration
 from cotarget.safety import SafeRig
 from cotarget.sim.fieldpaths import SECONDS
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments import harness
-from experiments.own_rig import OwnRig
+from experiments.checks import check_above, check_ways
+from experiments.own_rig import OwnRig, RigText
 from experiments.paper_loop import Follow
 from experiments.wide_view import WideView, open_on
 
@@ -32,10 +34,24 @@ class FieldSettings(harness.Settings):
     Attributes:
         seconds: of each run [s].
         calibrated: whether the rig is calibrated from rendered boards; otherwise it is known exactly.
+
+    Raises:
+        ConfigError: the clock does not start in a run, or targets' ways end before it.
     """
 
     seconds: float = SECONDS
     calibrated: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        starts_s, ends_s = self.lasting_s
+        check_above(starts_s, self, "seconds")
+        check_ways(self, "seconds", end_s=ends_s)
+
+    @property
+    def lasting_s(self) -> tuple[float, float]:
+        """When there begins to be something to be told of a run, and how long its targets have ways to go [s]."""
+        return BACKGROUND_S, SECONDS
 
 
 @dataclass(frozen=True)
@@ -43,13 +59,13 @@ class OwnRigInField(OwnRig, FieldSettings):
     """The same for an experiment that takes a rig of one's own."""
 
 
-def _of_calibration(settings: FieldSettings) -> tuple[bool, int, OwnRig]:
-    rig = OwnRig(rig=settings.rig) if isinstance(settings, OwnRig) else OwnRig()
+def _of_calibration(settings: FieldSettings) -> tuple[bool, int, RigText]:
+    rig = settings.text if isinstance(settings, OwnRig) else RigText()
     return settings.calibrated, settings.seed_base, rig
 
 
 @functools.cache
-def _calibrated(from_boards: bool, seed: int, rig: OwnRig) -> Calibration:
+def _calibrated(from_boards: bool, seed: int, rig: RigText) -> Calibration:
     config = rig.config("indoor", (), seed)
     if not from_boards:
         return true_calibration(SimWorld(config, rendered=()))

@@ -60,7 +60,7 @@ class BookSettings(OwnRigInField):
         places: one or two of the book.
 
     Raises:
-        ConfigError: more places, or no time to see anything.
+        ConfigError: more places, no time to see anything, or so much that the book is taken elsewhere meanwhile.
     """
 
     seeds: int = 2
@@ -68,13 +68,18 @@ class BookSettings(OwnRigInField):
     places: int = 2
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if not 1 <= self.places <= len(ARRIVES_S):
             raise ConfigError(f"places = {self.places}: the book is at 1 or {len(ARRIVES_S)}")
         if self.seconds < LEAST_S:
             raise ConfigError(
                 f"seconds = {self.seconds:g}: at least {LEAST_S:g} are needed for a frame of both cameras"
             )
+        super().__post_init__()
+
+    @property
+    def lasting_s(self) -> tuple[float, float]:
+        """At its first place the book stays until it is taken elsewhere, at its second one for good."""
+        return 0.0, BOOK_MOVED_AT[0] - TURN_S
 
 
 def one(calibration: Calibration, settings: BookSettings, seed: int) -> Pictured:

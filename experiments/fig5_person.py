@@ -10,6 +10,7 @@ simulation's truth.
 """
 
 import dataclasses
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -73,11 +74,16 @@ class PersonSettings(OwnRigInField):
     detector: Literal["mog2", "motion"] = "mog2"
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if self.seconds <= FIRST_S:
             raise ConfigError(
                 f"seconds = {self.seconds:g}: more than {FIRST_S:g} are needed, when the person has come in"
             )
+        super().__post_init__()
+
+    @property
+    def lasting_s(self) -> tuple[float, float]:
+        """The person goes to and fro for good (`cotarget.sim.paths`)."""
+        return FIRST_S, math.inf
 
 
 def one(calibration: Calibration, settings: PersonSettings, seed: int) -> Pictured:

@@ -92,6 +92,11 @@ class OutdoorSettings(OwnRigInField):
         if unknown := [way for way in self.ways if way not in WAYS]:
             raise ConfigError(f"ways: '{unknown[0]}' is not one of: {choices(WAYS)}")
 
+    @property
+    def lasting_s(self) -> tuple[float, float]:
+        """Before the first comes in nothing is to be seen; the ways end outside the view, where nobody is held."""
+        return ENTERS_S, math.inf
+
 
 def one(calibration: Calibration, settings: OutdoorSettings, seed: int) -> Pictured:
     """Follow those who pass in each way; a row each, and pictures of the first seed."""

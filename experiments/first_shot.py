@@ -24,9 +24,9 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
 from experiments.field import FieldSettings, calibrated, target_of
-from experiments.field_scenes import hold_config
+from experiments.field_scenes import LATENCY_S, hold_config
 from experiments.harness import Experiment, Row, rms, seeds_of, table
-from experiments.shots import CAUSES, Fired, fire
+from experiments.shots import BEGIN_S, CAUSES, Fired, fire
 from experiments.spread import BESIDE, in_words, spread_of
 
 # What is wanted of each target, at least and at most.
@@ -49,6 +49,11 @@ class FirstShotSettings(FieldSettings):
 
     seeds: int = 2
     targets: tuple[str, ...] = ("book", "person", "bird")
+
+    @property
+    def lasting_s(self) -> tuple[float, float]:
+        """The first shot is fired in the first wide frame of its time, which comes as late as frames do."""
+        return BEGIN_S + LATENCY_S, super().lasting_s[1]
 
 
 def one(calibration: Calibration, settings: FirstShotSettings, seed: int) -> list[Row]:

@@ -27,8 +27,9 @@ from cotarget.calibration.boards import board_points
 from cotarget.config import BoardConfig
 from cotarget.geometry import Array
 from cotarget.simconfig import SimHead
+from experiments.checks import check_above
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.mounted import MOUNTED_DEG, at, cell_name, check_above, mounted, off_px, wanted_focal_px
+from experiments.mounted import MOUNTED_DEG, at, cell_name, mounted, off_px, wanted_focal_px
 from experiments.regimes import FACTOR, ratios, reach, regime
 from experiments.simpler import CENTRING, FULL, IGNORED, MODELS, TABLE, TURNED, ZEROED, models_of
 from experiments.synthetic import SIZE, SIZES, Placing, looking_off, spread_views

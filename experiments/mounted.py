@@ -12,10 +12,8 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.errors import ConfigError
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import HeadGeometry
-from experiments.harness import Settings
 from experiments.random_rigs import OUT_OF_PLANE, any_direction, any_lens
 from experiments.synthetic import LONGEST_PX, NOMINAL_PX, SIZE, Lens, Truth, undistorted
 
@@ -27,27 +25,6 @@ TARGET = DEFAULT_TARGETS["bird"]  # of 0.8 m, wanted 160 px wide: the close-up i
 def cell_name(depth: float, baseline: float) -> str:
     """What a depth [m] with a baseline [m] is called in summaries, tables and bounds."""
     return f"depth {depth:g} m, baseline {baseline:g} m"
-
-
-def check_above(low: float, settings: Settings, *names: str) -> None:
-    """Refuse settings that cannot be, before any work.
-
-    Args:
-        low: what every number is to be above of.
-        settings: of an experiment.
-        names: of those that are numbers, or several.
-
-    Raises:
-        ConfigError: a number is not above that, or there is none.
-    """
-    for name in names:
-        value = getattr(settings, name)
-        values = value if isinstance(value, tuple) else (value,)
-        if not values:
-            raise ConfigError(f"{name}: at least one number is needed")
-        for each in values:
-            if not each > low:
-                raise ConfigError(f"{name}: {each:g} is not above {low:g}")
 
 
 def mounted(rng: np.random.Generator, baseline: float, mounted_deg: float = MOUNTED_DEG) -> Truth:

@@ -5,12 +5,32 @@ their models and paths.
 """
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 
-from cotarget.config import RigConfig, load_config
+from cotarget.config import RigConfig, config_of, read_text
 from cotarget.errors import ConfigError
 from experiments import harness
+
+
+@dataclass(frozen=True)
+class RigText:
+    """What a rig.toml said when it was read, and where it was; it is not read again.
+
+    Attributes:
+        text: of the file; empty for the default rig.
+        path: of it, absolute, for relative paths in it; empty for the default rig.
+    """
+
+    text: str = ""
+    path: str = ""
+
+    def config(self, scene: str, targets: tuple[str, ...], seed: int) -> RigConfig:
+        """The rig in a scene with targets."""
+        config = config_of(self.text, Path(self.path)) if self.path else RigConfig()
+        sim = dataclasses.replace(config.sim, scene=scene, targets=targets, seed=seed, models={}, paths={})
+        return dataclasses.replace(config, sim=sim)
 
 
 @dataclass(frozen=True)
@@ -32,23 +52,27 @@ class OwnRig(harness.Settings):
         super().__post_init__()
         said = ""
         if self.rig:
-            _own(self.rig)
-            said = Path(self.rig).read_text(encoding="utf-8")
+            said = read_text(Path(self.rig))
+            _check(said, Path(self.rig))
         if self.rig_toml not in ("", said):
             raise ConfigError(
                 f"rig_toml: is not what rig = '{self.rig}' says; give the path of a rig.toml as rig alone"
             )
         object.__setattr__(self, "rig_toml", said)
+        _ = self.text  # worked out now: it goes along to processes in other folders and on other machines
+
+    @functools.cached_property
+    def text(self) -> RigText:
+        """What the file says, and where it is."""
+        return RigText(self.rig_toml, str(Path(self.rig).absolute())) if self.rig else RigText()
 
     def config(self, scene: str, targets: tuple[str, ...], seed: int) -> RigConfig:
-        """The rig in a scene with targets."""
-        config = _own(self.rig) if self.rig else RigConfig()
-        sim = dataclasses.replace(config.sim, scene=scene, targets=targets, seed=seed, models={}, paths={})
-        return dataclasses.replace(config, sim=sim)
+        """The rig in a scene with targets, as its file was when these settings were made."""
+        return self.text.config(scene, targets, seed)
 
 
-def _own(rig: str) -> RigConfig:
-    config = load_config(Path(rig))
+def _check(text: str, path: Path) -> None:
+    """Refuse what is no simulated rig's rig.toml."""
+    config = config_of(text, path)
     if config.backend != "sim":
-        raise ConfigError(f"{rig}: backend = '{config.backend}' cannot be tried here; give a rig.toml with 'sim'")
-    return config
+        raise ConfigError(f"{path}: backend = '{config.backend}' cannot be tried here; give a rig.toml with 'sim'")

@@ -30,6 +30,7 @@ from cotarget.loop import FollowSettings, Step
 from cotarget.oracle import TruthDetector
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
+from experiments.checks import check_above, check_ways
 from experiments.field import FieldSettings, calibrated, target_of, watched, watched_in
 from experiments.field_scenes import hold_config
 from experiments.harness import Experiment, Row, seeds_of, table
@@ -62,6 +63,16 @@ class SimSpeedSettings(FieldSettings):
     seeds: int = 1
     steps: int = 60
     seconds_rendered: float = 6.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_above(self.lasting_s[0], self, "seconds_rendered")
+        check_ways(self, "seconds_rendered")
+
+    @property
+    def lasting_s(self) -> tuple[float, float]:
+        """What is timed is counted from when the target has settled; ways last that much longer than a run."""
+        return 0.0, super().lasting_s[1]
 
 
 def one(calibration: Calibration, settings: SimSpeedSettings, seed: int) -> list[Row]:

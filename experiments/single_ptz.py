@@ -30,8 +30,8 @@ from cotarget.metrics import score
 from cotarget.metrics.held import BACKGROUND_S
 from cotarget.sim.fieldpaths import LONE, SECONDS
 from cotarget.simconfig import SimConfig
+from experiments.checks import check_above, check_ways
 from experiments.harness import Experiment, Row, Settings, seeds_of, table
-from experiments.mounted import check_above
 from experiments.single_runs import PAIR, WAYS, held
 from experiments.spread import bars, mean_of
 
@@ -62,6 +62,7 @@ class SingleSettings(Settings):
         """Refuse what cannot be."""
         super().__post_init__()
         check_above(BACKGROUND_S, self, "seconds")  # when the clock starts
+        check_ways(self, "seconds")
         check_above(0, self, *(() if self.lasts_s is None else ("lasts_s",)))
 
 

@@ -43,6 +43,7 @@ HONEST = (0.7, 1.3)
 # ... and a parameter's mean error over the seeds, over what it should scatter by, sigma / sqrt(seeds). Of twenty right
 # ones one is beyond 3 in one run of twenty.
 BIASED = 3.0
+NOT_KNOWN = "-"  # in a table
 CAMERA_WORDS = {"zoom": "zoom camera", "fixed": "fixed camera"}
 
 
@@ -172,10 +173,7 @@ def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
     return "\n\n".join(
         [
             f"Table 2: as the run of seed {settings.seed_base} has it, ± the standard deviation that it predicts\n"
-            + table(
-                ("rows are [v, u]", "focal length, px", "mm", "centre, px", "CCD, mm", "pitch, mm"),
-                _lens(summary, "  true" if settings.rig else "  true, as printed"),
-            ),
+            + _table_2(settings, summary),
             *(_matrices(words, summary[name], settings) for name, words in TRANSFORMS.items()),
             f"error of one run (rms over {seeds_of(settings)}) beside the standard deviation that it predicts\n"
             + table(
@@ -203,26 +201,51 @@ def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
     )
 
 
-def _lens(summary: Mapping[str, Any], truth: str) -> Iterator[list[str]]:
-    """The rows of Table 2, each camera's truth, which is what the paper printed, under what was found."""
-    for camera, words in CAMERAS.items():
-        parameters, pitch = summary[camera], PITCH_MM[camera]
-        for title, key in ((words, "first"), (truth, "true")):
+def _table_2(settings: Settings, summary: Mapping[str, Any]) -> str:
+    """Table 2 of the paper's cameras, or of one's own, of which no maker is known, nor how large their CCDs are."""
+    head = ("rows are [v, u]", "focal length, px", "mm", "centre, px", "CCD, mm", "pitch, mm")
+    if not settings.rig:
+        return table(head, _lens(summary, CAMERAS, "  true, as printed", PITCH_MM, CCD_MM))
+    pitch_mm = {"zoom": settings.config("indoor", (), settings.seed_base).pitch_mm}
+    return table([words for words in head if words != "CCD, mm"], _lens(summary, CAMERA_WORDS, "  true", pitch_mm))
+
+
+def _lens(
+    summary: Mapping[str, Any],
+    names: Mapping[str, str],
+    truth: str,
+    pitch_mm: Mapping[str, float],
+    ccd_mm: Mapping[str, tuple[float, float]] | None = None,
+) -> Iterator[list[str]]:
+    """The rows of Table 2, each camera's truth under what was found.
+
+    Args:
+        summary: the figures.
+        names: of the cameras, in words.
+        truth: what it is called; of the paper's cameras it is what the paper printed.
+        pitch_mm: size of a pixel [mm] of the cameras of which it is known.
+        ccd_mm: the CCDs' sizes [mm], where there is to be a column of them.
+    """
+    for camera in CAMERAS:
+        parameters, pitch = summary[camera], pitch_mm.get(camera)
+        for title, key in ((names[camera], "first"), (truth, "true")):
             sigmas = {name: each["first_sigma"] if key == "first" else None for name, each in parameters.items()}
             cells = {name: value_and_sigma(each[key], sigmas[name]) for name, each in parameters.items()}
-            focal_mm = [
-                value_and_sigma(parameters[name][key] * pitch, sigma and sigma * pitch)
-                for name in LENS[:2]
-                for sigma in [sigmas[name]]
-            ]
-            size = ", ".join(f"{each:.2f}" for each in CCD_MM[camera])
+            focal_mm = NOT_KNOWN
+            if pitch is not None:
+                told = [
+                    value_and_sigma(parameters[name][key] * pitch, sigma and sigma * pitch)
+                    for name in LENS[:2]
+                    for sigma in [sigmas[name]]
+                ]
+                focal_mm = f"[{', '.join(told)}]"
             yield [
                 title,
                 f"[{cells['fy']}, {cells['fx']}]",
-                f"[{', '.join(focal_mm)}]",
+                focal_mm,
                 f"[{cells['cy']}, {cells['cx']}]",
-                f"[{size}]",
-                f"{pitch:g}",
+                *([] if ccd_mm is None else ["[{:.2f}, {:.2f}]".format(*ccd_mm[camera])]),
+                NOT_KNOWN if pitch is None else f"{pitch:g}",
             ]
 
 
@@ -236,7 +259,8 @@ def _matrices(words: str, parameters: Mapping[str, Any], settings: Settings) -> 
     spread = {axis: parameters[axis]["first_sigma"] for axis in (*PLACES, *TURNS)}
     told = [f"±{', '.join(f'{spread[axis]:.2g}' for axis in axes)}" for axes in (PLACES, TURNS)]
     title = f"Table 3, {words} of seed {settings.seed_base} [mm], {told[0]} mm and {told[1]} degrees"
-    return f"{title}\n{'found':43}   true (stands in for the lost one)\n" + "\n".join(lines)
+    truth = "true" if settings.rig else "true (stands in for the lost one)"
+    return f"{title}\n{'found':43}   {truth}\n" + "\n".join(lines)
 
 
 def _matrix(parameters: Mapping[str, Any], key: str) -> Array:

@@ -6,11 +6,13 @@ import pytest
 from cotarget.detection import Detection
 from cotarget.rig import Frame
 from cotarget.sim.appearances import Silhouette
+from cotarget.sim.fieldpaths import GROUPED, group_paths, in_view
 from experiments import detectors
 from experiments.detectors import MEMORY_S, SHAKES, STANDS, Watch
 from experiments.field_scenes import five_targets_config
 
 FRAMES, RATE = 100, 25.0
+HALF_SIZE = 0.5  # of a bird or, across, a person, and more [m]
 SIDE = np.array([20.0, 20.0])
 
 
@@ -27,6 +29,13 @@ def test_a_shaken_picture_is_where_the_shake_is():
     picture[20:30, 30:45] = 255
     v, u = np.nonzero(detectors._shifted(picture, np.array([3.0, -2.0]))[..., 0] > 127)
     assert (u.min(), u.max(), v.min(), v.max()) == (33, 47, 18, 27)
+
+
+@pytest.mark.parametrize("kind", GROUPED)
+def test_the_first_of_five_is_in_view_before_the_shortest_run_ends(kind):
+    for seed in range(50):
+        ways = [np.array(way) for way in group_paths(kind, seed).values()]
+        assert any(in_view(way[way[:, 0] <= detectors.COME_S, 1:], HALF_SIZE).any() for way in ways), seed
 
 
 class Seer:

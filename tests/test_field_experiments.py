@@ -246,8 +246,12 @@ def test_with_a_dead_zone_over_without():
         {"commands_per_min": 0.25, "reversals_per_min": 1.0, "tpo_width_median": 1.05}
     )
     assert dead_zone.missed(summary) == ["book: reversals_per_min"]  # nothing cannot be halved, and is told
-    lost = dead_zone.summarise([row("with", 10.0, 1.0, None), row("without", 40.0, 4.0, 0.02)])
-    assert dead_zone.missed(lost) == ["book: tpo_width_median"]
+    lost = [row("with", 10.0, 1.0, None), row("without", 40.0, 4.0, 0.02)]
+    assert dead_zone.missed(dead_zone.summarise(lost)) == ["book: tpo_width_median"]
+    dead_zone.plot([*rows, *lost], figure := Figure())
+    of_seeds = [[xy.tolist() for xy in ax.lines[0].get_xydata()] for ax in figure.axes]
+    assert of_seeds == [[[40.0, 10.0]] * 2, [[0.0, 0.0], [4.0, 1.0]], [[0.02, 0.021]]]  # none is not drawn as zero
+    dead_zone.plot(lost, Figure())
 
 
 # ---------------------------------------------------------------- first shot

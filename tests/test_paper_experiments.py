@@ -136,6 +136,22 @@ def test_the_tables_have_the_papers_layout():
     np.testing.assert_allclose(found, [[0, 0, 1, -400], [0, 1, 0, 30], [-1, 0, 0, 60], [0, 0, 0, 1]], atol=1e-4)
 
 
+def test_the_tables_of_a_rig_of_ones_own_tell_nothing_of_the_papers_cameras(tmp_path):
+    """Its zoom camera's pitch is what its rig.toml says: 693 px of 0.02 mm are 13.86 mm. Of the fixed one none is."""
+    path = tmp_path / "rig.toml"
+    path.write_text("[sim.zoom]\npitch_mm = 0.02\n")
+    settings = replace(table2_table3.SETTINGS, seeds=2, rig=str(path))
+    text = table2_table3.describe(settings, table2_table3.summarise(rows_of((1.0, -1.0))))
+    head, zoom, zoom_true, fixed, fixed_true = text.splitlines()[1:6]
+    assert "CCD" not in head
+    assert re.search(r"^zoom camera +\[693.10 ± 0.10, 692.10 ± 0.10\] +\[13.8620 ± 0.0020, ", zoom)
+    assert re.search(r"^ +true +\[693.000, 692.000\] +\[13.8600, 13.8400\] +\[235.000, 326.000\] +0.02$", zoom_true)
+    assert re.search(r"^fixed camera +\[684.10 ± 0.10, 686.10 ± 0.10\] +- +\[239.10 ± 0.10, [^]]+\] +-$", fixed)
+    assert re.search(r"^ +true +\[684.000, 686.000\] +- +\[239.000, 325.000\] +-$", fixed_true)
+    for of_the_paper in ("Canon", "Philips", "as printed", "5.74", "0.009", "stands in"):
+        assert of_the_paper not in text
+
+
 def test_errors_are_rms_over_the_seeds_and_beside_sigma():
     """3 and 4 times sigma are 3.54 rms."""
     summary = table2_table3.summarise(rows_of((3.0, -4.0)))

@@ -1,5 +1,8 @@
 """The paper's own way to follow, and experiments on a rig of one's own."""
 
+import pickle
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -85,6 +88,29 @@ def test_results_of_another_rig_in_the_same_file_are_told_apart(own):
     settings = pointing.Settings(rig=str(own))
     own.write_text("[sim.fixed]\nfocal_px = [500, 500]\n")
     assert identity(pointing.Settings(rig=str(own))) != identity(settings)
+
+
+def test_a_worker_has_the_rig_as_it_was_read_wherever_it_is(tmp_path, own, monkeypatch):
+    """Also while the file is changed meanwhile, or where it is not to be found."""
+    own.write_text(own.read_text() + "[targets.book]\ntemplate = 'book.png'\n", encoding="utf-8-sig")
+    monkeypatch.chdir(tmp_path)
+    settings = replace(fig4_book.SETTINGS, rig="rig.toml", calibrated=False)
+    before = identity(settings)
+    assert before.keys() == identity(fig4_book.SETTINGS).keys()  # no folder among them
+    make, given = fig4_book.EXPERIMENT.shares(settings)
+    sent = pickle.dumps((settings, make, given))
+    own.write_text("[sim.fixed]\nfocal_px = [500, 500]\n")
+    (elsewhere := tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(elsewhere)
+    settings, make, given = pickle.loads(sent)
+    for config in (settings.config("indoor", ("book",), 7), given[-1].config("indoor", ("book",), 7)):
+        assert config.sim.fixed.focal_px == (600, 601)
+        assert config.target("book").template == tmp_path / "book.png"
+    assert make(*given).fixed.focal_px == (600, 601)
+    assert fig4_book.EXPERIMENT.prepare(settings).fixed.focal_px == (600, 601)
+    assert identity(settings) == before
+    own.unlink()
+    assert settings.config("indoor", (), 7).sim.fixed.focal_px == (600, 601)
 
 
 def test_wrong_rigs_are_refused_in_one_line(tmp_path, own):

@@ -1,6 +1,7 @@
 """Sweeps: every job once, whatever happens to the others or to the program; the same rows whoever does them."""
 
 import base64
+import contextlib
 import json
 import math
 import os
@@ -20,7 +21,7 @@ from cotarget.errors import ConfigError
 from cotarget.sim.opengl import Canvas
 from experiments.bounds import Bound, compare, tighten
 from experiments.cases import EXPERIMENTS, choose, known_experiments
-from experiments.cluster import on_dask
+from experiments.cluster import _check_linear_algebra, on_dask
 from experiments.command import main
 from experiments.harness import Experiment, Settings
 from experiments.outcome import Outcome
@@ -134,6 +135,10 @@ def test_settings_can_be_swept(run, tmp_path):
         (1.0, (1,)), (1.0, ()), (2.0, (1,)), (2.0, ())
     ]  # fmt: skip
     assert len({case.folder for case in cases}) == 4
+    again = ("factor=0.1", "wrong=[1, 2]", "factor=1e-1", "wrong=[1,2]", "factor=0.10", "factor=0.2")
+    assert [case.changes for case in choose(KNOWN, ["tiny"], changes=[f"tiny.{each}" for each in again])] == [
+        ("factor=0.1", "wrong=[1, 2]"), ("factor=0.2", "wrong=[1, 2]")
+    ]  # fmt: skip
 
 
 # ---------------------------------------------------------------- what goes wrong
@@ -668,9 +673,41 @@ def test_a_cluster_that_is_not_fit(run, tmp_path, cluster, monkeypatch):
         patched.setattr("experiments.cluster._check_workers", lambda *_: None)  # as if they had joined later
         assert "start it with OMP_NUM_THREADS=1" in run("tiny", *where)[2]
         assert "has 2 threads; start workers with --nthreads 1" in run("tiny", *two)[2]
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")  # which OpenBLAS heeds first
+    several = "has linear algebra on several threads, by OPENBLAS_NUM_THREADS=2; start it with OPENBLAS_NUM_THREADS=1"
+    assert several in run("tiny", *where)[2]
+    with monkeypatch.context() as patched:
+        patched.setattr("experiments.cluster._check_workers", lambda *_: None)
+        assert several in run("tiny", *where)[2]
     monkeypatch.setattr("experiments.command.code_version", lambda: "0.0.9+12345678")
     assert f"has cotarget {code_version()}, this is 0.0.9+12345678; give both the same" in run("tiny", *where)[2]
     assert not list((tmp_path / "out").glob("*/jobs/*"))
+
+
+@pytest.mark.parametrize(
+    ("environment", "held"),
+    [
+        ({}, False),
+        ({"OMP_NUM_THREADS": "1"}, True),
+        ({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "4"}, True),
+        ({"OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "1"}, False),
+        ({"OPENBLAS_NUM_THREADS": "0", "GOTO_NUM_THREADS": "2", "OMP_NUM_THREADS": "1"}, False),
+        ({"OPENBLAS_NUM_THREADS": "many", "OMP_NUM_THREADS": "1,2"}, True),
+    ],
+    ids=str,
+)
+def test_one_thread_is_what_openblas_makes_of_the_variables(environment, held):
+    """OpenBLAS itself starts its threads when numpy is loaded."""
+    with contextlib.nullcontext() if held else pytest.raises(ConfigError, match="several threads"):
+        _check_linear_algebra("tcp://10.0.0.1:9", environment)
+    tasks = Path("/proc/self/task")
+    if not tasks.is_dir() or len(os.sched_getaffinity(0)) < 2:
+        pytest.skip("a process's threads cannot be counted here, or have but one core")
+    clean = {name: value for name, value in os.environ.items() if name not in LINEAR_ALGEBRA}
+    count = f"import os, numpy; print(len(os.listdir('{tasks}')))"
+    made = subprocess.run([sys.executable, "-c", count], env=clean | environment, capture_output=True, check=True)
+    assert (int(made.stdout) == 1) == held
 
 
 def test_nobody_answers(run):

@@ -128,6 +128,12 @@ def test_timings_may_start_processes_and_take_all_cores(monkeypatch):
     assert dict(in_turn(as_it_is, [0])) == {0: (False, [None] * len(ONE_THREAD))}
 
 
+IN_THE_FIELD = (
+    *("hold", "first_shot", "delay", "five_targets", "dead_zone", "sim_speed"),
+    *("detectors", "single_ptz", "env_score", "env_speed"),
+)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -136,7 +142,24 @@ def test_timings_may_start_processes_and_take_all_cores(monkeypatch):
         ("chain.cases=[]", "chain.cases: is empty; at least one is needed"),
         ("hold.targets=['cat']", "hold.targets: 'cat' is not one of: bird, book, person"),
         ("env_speed.targets=['cat']", "env_speed.targets: 'cat' is not one of: bird, book, person"),
-        ("hold.seconds=0", "hold.seconds: lasts no time"),
+        ("wire.poll_s=0", "wire.poll_s: lasts no time"),
+        *(
+            (f"{name}.{key}=20.1", f"{key}: 20.1 is above 20, up to which there are ways to go")
+            for name, key in (
+                *((name, "seconds") for name in IN_THE_FIELD),
+                ("sim_speed", "seconds_rendered"),
+                ("env_speed", "seconds_seen"),
+            )
+        ),
+        ("fig4_book.seconds=7", "seconds: 7 is above 6.8, up to which there are ways to go"),
+        ("hold.seconds=2", "seconds: 2 is not above 2"),
+        ("first_shot.seconds=3.1", "seconds: 3.1 is not above 3.12"),
+        ("sim_speed.seconds_rendered=0", "seconds_rendered: 0 is not above 0"),
+        ("fig6_outdoors.seconds=2", "seconds: 2 is not above 2"),
+        ("detectors.seconds=2.5", "seconds: 2.5 is not above 3"),
+        ("env_speed.seconds=0.99", "seconds: 0.99 is below 1"),
+        ("env_speed.seconds_seen=0", "seconds_seen: 0 is not above 0"),
+        ("env_score.seconds=0", "seconds: 0 is not above 0"),
         ("wire.faults=['head.fire']", "faults: 'head.fire' is not one of: "),
         ("random_rigs.boards=0", "random_rigs.boards: 0 is below 1"),
         ("hold.processes=2", "say --processes"),
@@ -152,6 +175,12 @@ def test_what_can_be_is_taken():
     changes = ["depth_error.wrong=-0.05", "delay.delays=[0.0, 0.2]", "fig5_person.detector=motion"]
     cases = choose(known_experiments(), ["depth_error", "delay", "fig5_person"], seed_base=0, changes=changes)
     assert [case.changes[0].partition("=")[0] for case in cases] == ["wrong", "delays", "detector"]
+    as_long_as_there_are_ways = [
+        *(f"{name}.seconds=20" for name in IN_THE_FIELD),
+        *("fig4_book.seconds=6.8", "fig5_person.seconds=60", "fig6_outdoors.seconds=60"),
+    ]
+    names = [change.partition(".")[0] for change in as_long_as_there_are_ways]
+    assert len(choose(known_experiments(), names, changes=as_long_as_there_are_ways)) == len(names)
 
 
 def test_experiments_in_the_field_share_one_calibration():
