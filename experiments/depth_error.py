@@ -27,6 +27,7 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
 from cotarget.camera import depth_from_size
+from cotarget.errors import ConfigError
 from cotarget.geometry import Array
 from experiments.checks import check_above
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
@@ -65,6 +66,8 @@ class DepthSettings(Settings):
         super().__post_init__()
         check_above(0, self, "baselines", "depths", "targets", "scatter", "noise_px")
         check_above(-1, self, "wrong")
+        if self.wrong == 0:
+            raise ConfigError("wrong: 0 is no error; give one above -1 that is not 0, such as 0.1")
 
 
 def one(_: None, settings: DepthSettings, seed: int) -> list[Row]:
