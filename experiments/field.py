@@ -136,6 +136,6 @@ def watched_in(
 
 
 def target_of(config: RigConfig, name: str) -> TargetConfig:
-    """What is told of a target in the field, where clutter that moves by itself drowns a bird for its own detector."""
+    """What is told of a target in the field, where clutter that moves by itself drowns a bird for all but `speck`."""
     target = config.target(name)
     return dataclasses.replace(target, detector="speck") if target.dimension == "wingspan" else target
