@@ -10,6 +10,7 @@ where few of them leave parts of the view unseen; what it does are the exponents
     python -m experiments.calibration_budget [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
 
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +22,7 @@ from matplotlib.figure import Figure
 from cotarget.calibration import Options, calibrate_views, predicted_pointing
 from cotarget.calibration.boards import board_points
 from cotarget.config import BoardConfig
-from experiments.checks import check_above
+from experiments.checks import check_above, check_session
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.synthetic import LONGEST_PX, SIZES, Placing, Truth, draw_targets, misses, spread_views
 
@@ -53,6 +54,7 @@ class BudgetSettings(Settings):
         """Refuse what cannot be."""
         super().__post_init__()
         check_above(0, self, "noises_px", "placements", "looks", "targets")
+        check_session(self, "placements", "looks")
 
 
 def one(_: None, settings: BudgetSettings, seed: int) -> list[Row]:
@@ -100,10 +102,16 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def exponents(rows: Sequence[Row], key: str = "reached_px") -> tuple[float, float]:
-    """How an error grows with the noise and with the number of placements: 1 and -0.5 in theory."""
+    """How an error grows with the noise and with the number of placements: 1 and -0.5 in theory.
+
+    Returns:
+        The exponents; nan of what was the same in all rows.
+    """
     terms = [[np.log(row["noise_px"]), np.log(row["placements"]), 1.0] for row in rows]
     slopes, *_ = np.linalg.lstsq(np.array(terms), np.log([row[key] for row in rows]), rcond=None)
-    return float(slopes[0]), float(slopes[1])
+    varied = [len({row[of] for row in rows}) > 1 for of in ("noise_px", "placements")]
+    with_noise, with_placements = (float(s) if so else math.nan for s, so in zip(slopes[:2], varied, strict=True))
+    return with_noise, with_placements
 
 
 def _cell(noise_px: float, boards: int) -> str:
@@ -111,11 +119,11 @@ def _cell(noise_px: float, boards: int) -> str:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """What is not as theory has it, or as the calibrations predict for themselves."""
+    """What is not as theory has it, or as the calibrations predict for themselves; of what was measured."""
     return [
         f"{name} is {summary[name]:.2f}, not {low:g} to {high:g}"
         for name, (low, high) in WANTED.items()
-        if not low <= summary[name] <= high
+        if not (math.isnan(summary[name]) or low <= summary[name] <= high)
     ]
 
 

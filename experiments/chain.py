@@ -27,6 +27,7 @@ from cotarget.calibration.placing import place_boards
 from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from cotarget.geometry import Array
+from experiments.checks import check_session
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.synthetic import (
     LONGEST_PX,
@@ -59,6 +60,11 @@ class ChainSettings(Settings):
     looks: int = 6
     targets: int = 100
     cases: tuple[str, ...] = tuple(CASES)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_session(self, "boards", "looks")
 
 
 def one(_: None, settings: ChainSettings, seed: int) -> list[Row]:

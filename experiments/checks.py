@@ -2,9 +2,12 @@
 
 from collections.abc import Iterator, Sequence
 
+from cotarget.calibration.intrinsics import FEWEST_VIEWS
 from cotarget.errors import ConfigError
 from cotarget.sim.fieldpaths import SECONDS
 from experiments.harness import Settings
+
+FEWEST_LOOKS = 2  # at a board that stays where it is, that tell how the zoom camera sits on the head
 
 
 def check_above(low: float, settings: Settings, *names: str) -> None:
@@ -28,6 +31,21 @@ def check_least(least: float, settings: Settings, *names: str) -> None:
     for name, each in _numbers(settings, names):
         if not each >= least:
             raise ConfigError(f"{name}: {each:g} is below {least:g}")
+
+
+def check_session(settings: Settings, boards: str, looks: str) -> None:
+    """Refuse calibrations that cannot come to anything.
+
+    Args:
+        settings: of an experiment.
+        boards: name of the one that says how many placements of the board there are.
+        looks: of the one that says from how many head poses each is looked at.
+
+    Raises:
+        ConfigError: there are too few for a camera's intrinsics, or for T.
+    """
+    check_least(FEWEST_VIEWS, settings, boards)
+    check_least(FEWEST_LOOKS, settings, looks)
 
 
 def _numbers(settings: Settings, names: Sequence[str]) -> Iterator[tuple[str, float]]:

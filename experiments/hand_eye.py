@@ -25,6 +25,7 @@ from cotarget.calibration.parameters import RigModel
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import base_head
+from experiments.checks import check_above, check_least
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.synthetic import NOMINAL_PX, SIZE, Lens, Truth, noisy, seen_from
 
@@ -35,7 +36,8 @@ BOARD_TURNED = (20.0, -15.0, 5.0)  # [degrees]
 REACH = (np.radians(40.0), np.radians(30.0))  # more than the image lets see
 LEVEL = 0.9
 METHODS = ("Park and Martin", "poses, weighted", "joint fit")
-DRAWN = 400  # head poses, of which the first are taken that see the board
+DRAWN = 400  # head poses at a time, of which the first are taken that see the board
+FEWEST_POSES = 3  # that tell T: from two of them the head turns about one axis only
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,12 @@ class HandEyeSettings(Settings):
 
     poses: int = 20
     noise_px: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_least(FEWEST_POSES, self, "poses")
+        check_above(0, self, "noise_px")  # or there would be no bound to come near to
 
 
 def one(_: None, settings: HandEyeSettings, seed: int) -> list[Row]:
@@ -56,8 +64,11 @@ def one(_: None, settings: HandEyeSettings, seed: int) -> list[Row]:
     turned = Rotation.from_rotvec(BOARD_TURNED, degrees=True)
     x_zoom0 = RigidTransform.from_components([0.0, 0.0, DISTANCE], turned).apply(points - middle)
     x_fixed = truth.gamma.inv().apply(x_zoom0)
-    drawn = rng.uniform(np.negative(REACH), REACH, (DRAWN, 2))
-    poses = drawn[seen_from(truth, x_fixed, drawn)][: settings.poses]
+    poses = np.empty((0, 2))
+    while len(poses) < settings.poses:
+        drawn = rng.uniform(np.negative(REACH), REACH, (DRAWN, 2))
+        poses = np.r_[poses, drawn[seen_from(truth, x_fixed, drawn)]]
+    poses = poses[: settings.poses]
     views = [
         View("zoom", noisy(LENS.project(truth.in_zoom(x_fixed, *q)), settings.noise_px, rng), 0, q[0], q[1], NOMINAL_PX)
         for q in poses

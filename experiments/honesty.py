@@ -21,6 +21,7 @@ from cotarget.calibration import Calibration, Options, calibrate_views, predicte
 from cotarget.calibration.boards import board_points
 from cotarget.calibration.parameters import ALL_BLOCKS, parameter_names
 from cotarget.config import BoardConfig
+from experiments.checks import check_session
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.synthetic import LONGEST_PX, SIZES, Placing, Truth, draw_targets, misses, other_rig, spread_views
 
@@ -45,6 +46,11 @@ class HonestySettings(Settings):
     looks: int = 4
     noise_px: float = 0.1
     targets: int = 20
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_session(self, "boards", "looks")
 
 
 def one(_: None, settings: HonestySettings, seed: int) -> list[Row]:

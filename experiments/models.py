@@ -27,7 +27,7 @@ from cotarget.calibration.boards import board_points
 from cotarget.config import BoardConfig
 from cotarget.geometry import Array
 from cotarget.simconfig import SimHead
-from experiments.checks import check_above
+from experiments.checks import check_above, check_session
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.mounted import MOUNTED_DEG, at, cell_name, mounted, off_px, wanted_focal_px
 from experiments.regimes import FACTOR, ratios, reach, regime
@@ -78,6 +78,7 @@ class ModelsSettings(Settings):
         super().__post_init__()
         check_above(0, self, "baselines", "depths", "targets", "boards", "looks")
         check_above(0, self, "mounted_deg", "corner_px", "pixel_px", "depth_error", "zero_depth")
+        check_session(self, "boards", "looks")
 
 
 def one(_: None, settings: ModelsSettings, seed: int) -> list[Row]:
@@ -237,6 +238,8 @@ def _regimes(ax: "Axes", rows: Sequence[Row], model: str) -> None:
     """By how much a model's error is larger than the full one's, quartiles over the seeds, and where it is FACTOR."""
     for condition, colour in zip(CONDITIONS, ("C0", "C1"), strict=True):
         by_reach = {far: values for far, values in ratios(rows, condition, model).items() if math.isfinite(far)}
+        if not by_reach:  # all targets are as far away as the one on which the zeros were set
+            continue
         low, mid, high = np.array([np.percentile(values, [25, 50, 75]) for values in by_reach.values()]).T
         error = [mid - low, high - mid]
         ax.errorbar(list(by_reach), mid, error, fmt="o", ms=4, capsize=2, color=colour, label=condition)
@@ -246,7 +249,8 @@ def _regimes(ax: "Axes", rows: Sequence[Row], model: str) -> None:
             ax.axvspan(begin, min(end, max(by_reach)), color=colour, alpha=0.12, label=label)
     ax.axhline(FACTOR, color="k", lw=0.8)
     ax.set(xscale="log", yscale="log", ylabel="times the error of the full model", title=model)
-    ax.legend(frameon=False, fontsize="small")
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(frameon=False, fontsize="small")
 
 
 SETTINGS = ModelsSettings()

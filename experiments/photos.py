@@ -26,6 +26,8 @@ from cotarget.calibration.uncertainty import model_of
 from cotarget.cli.arguments import corners, count, positive
 from cotarget.cli.parsers import Parser
 from cotarget.config import BoardConfig
+from cotarget.rigchecks import FEWEST_CORNERS
+from experiments.checks import check_above, check_least
 from experiments.harness import Experiment, Row, Settings, rms, table
 
 NOT_HELD_OUT = Options(folds=0)
@@ -42,6 +44,12 @@ class PhotosSettings(Settings):
     columns: int = 9
     rows: int = 6
     square: float = 0.025
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_least(FEWEST_CORNERS, self, "columns", "rows")
+        check_above(0, self, "square")
 
 
 def needs(settings: PhotosSettings) -> str:

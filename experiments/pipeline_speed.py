@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 from cotarget.calibration import Calibration
 from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetConfig
 from cotarget.detection import Detector, make_detector
+from cotarget.errors import ConfigError
 from cotarget.oracle import true_calibration
 from cotarget.policies import FirstCome
 from cotarget.pursuit import Pursuit
@@ -49,6 +50,12 @@ class PipelineSpeedSettings(Settings):
     seeds: int = 1
     frames: int = 300
     untimed: int = 60
+
+    def __post_init__(self) -> None:
+        """Refuse to time nothing."""
+        super().__post_init__()
+        if self.untimed >= self.frames:
+            raise ConfigError(f"untimed: {self.untimed} is not below frames = {self.frames}, so that none is timed")
 
 
 class Pipeline:
@@ -97,9 +104,14 @@ def calibration_of(size: tuple[int, int]) -> Calibration:
     return replace(calibration, fixed=replace(calibration.fixed, size=size, center_px=middle))
 
 
-def needs(_: PipelineSpeedSettings) -> str:
+def needs(settings: PipelineSpeedSettings) -> str:
     """Say what is missing."""
-    return "" if FILM.is_file() else f"needs {FILM}, which is not part of the project"
+    if not FILM.is_file():
+        return f"needs {FILM}, which is not part of the project"
+    with Film(FILM) as film:
+        there = film.count
+    few = there is not None and there < settings.frames
+    return f"needs {settings.frames} frames, and {FILM} has {there}" if few else ""
 
 
 def one(_: None, settings: PipelineSpeedSettings, seed: int) -> list[Row]:

@@ -168,6 +168,9 @@ def _depths(rows: Sequence[Row]) -> list[float]:
 
 
 def _figures(rows: Sequence[Row], method: Method) -> dict[str, float]:
+    """Of a region in which there are targets; a coarse grid may have none at 20 degrees."""
+    if not rows:
+        return dict.fromkeys(("deg", "deg_low", "deg_high", "worst_deg", "px"), math.nan)
     seeds: dict[int, list[Row]] = {}
     for row in rows:
         seeds.setdefault(row["seed"], []).append(row)
@@ -197,7 +200,8 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _worst(summary: Mapping[str, Any]) -> float:
-    return float(max(found[EXACT][name]["all"]["worst_deg"] for found in summary.values() for name in REGIONS))
+    """The exact range's worst error [degrees]; on the grid and near the axis there are always targets."""
+    return float(np.nanmax([found[EXACT][name]["all"]["worst_deg"] for found in summary.values() for name in REGIONS]))
 
 
 def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -231,6 +235,8 @@ def describe(settings: ShortcutSettings, summary: Mapping[str, Any]) -> str:
 
 
 def _texts(found: Mapping[str, float]) -> tuple[str, float]:
+    if math.isnan(found["deg"]):
+        return "-", math.nan
     return f"{found['deg']:.2g} ({found['deg_low']:.2g} to {found['deg_high']:.2g})", found["px"]
 
 

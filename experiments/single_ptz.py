@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from cotarget.errors import ConfigError
 from cotarget.metrics import Row as Judged
 from cotarget.metrics import score
 from cotarget.metrics.held import BACKGROUND_S
@@ -63,6 +64,8 @@ class SingleSettings(Settings):
         super().__post_init__()
         check_above(BACKGROUND_S, self, "seconds")  # when the clock starts
         check_ways(self, "seconds")
+        if parts := [miss for miss in self.misses if not 0 <= miss <= 1]:
+            raise ConfigError(f"misses: {parts[0]:g} is no part of the frames, which is 0 to 1")
         check_above(0, self, *(() if self.lasts_s is None else ("lasts_s",)))
 
 

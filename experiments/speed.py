@@ -20,7 +20,9 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Options, View, calibrate_views
 from cotarget.calibration.boards import board_points
+from cotarget.calibration.intrinsics import FEWEST_VIEWS
 from cotarget.config import BoardConfig
+from experiments.checks import check_least
 from experiments.harness import Experiment, Row, Settings, seeds_of, table
 from experiments.synthetic import SIZE, SIZES, Truth, synthetic_views
 
@@ -37,6 +39,11 @@ class SpeedSettings(Settings):
     seeds: int = 5
     pairs: int = 20
     noise_px: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_least(FEWEST_VIEWS, self, "pairs")
 
 
 def one(_: None, settings: SpeedSettings, seed: int) -> list[Row]:

@@ -115,6 +115,9 @@ def test_how_many_times_is_of_medians_at_one_delay():
     assert delay.missed(summary) == []  # the closed loop was not measured
     rows += [row("bird", 0.2, True, True, 0.05), row("bird", 0.2, False, True, 0.1)]
     assert delay.missed(delay.summarise(rows)) == ["bird"]
+    other = [row | {"delay_s": 0.4} for row in rows if not row["closed_loop"]]
+    assert delay.missed(delay.summarise(other)) == []  # nothing is wanted at other delays than the field's
+    assert "bird, 400 ms" in delay.describe(delay.SETTINGS, delay.summarise(other))
 
 
 WALKED = 3.0, 5.0  # of a person who walks from 1 s on; nothing is left of how it was acquired [s]

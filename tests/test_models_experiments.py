@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, pose
@@ -148,6 +149,15 @@ def test_the_regime_reaches_as_far_as_the_full_model_is_five_times_better():
     assert none == [f"{c}: full model 5 times better than {o}" for c in models.CONDITIONS for o in models.OPPONENTS]
 
 
+def test_targets_at_the_depth_of_the_zeros_alone_leave_a_picture():
+    """Zeroed, no offset is seen there: their reach is infinite, and not to be drawn."""
+    far = [row | {"reach": math.inf} if row["model"] in ZEROED.values() else row for row in error_rows({50.0: 9.0})]
+    models.plot(far, figure := Figure())
+    ignored, zeroed = figure.axes[2], figure.axes[5]
+    assert [bars.get_label() for bars in ignored.containers] == list(models.CONDITIONS)
+    assert zeroed.containers == []
+
+
 @pytest.mark.parametrize("first", [True, False])
 def test_of_depths_and_baselines_with_the_same_reach_the_worst_counts(first):
     good, bad = error_rows({5.0: 40.0, 10.0: 20.0, 20.0: 9.0}), error_rows({20.0: 4.0}, baseline=2.0)
@@ -185,6 +195,12 @@ def test_depths_are_measured_by_the_size():
     assert noisy == pytest.approx([10.0 * 40 / 41] * 2)
 
 
+def test_the_nearest_targets_all_have_a_depth():
+    settings = replace(depth_error.SETTINGS, depths=(depth_error.NEAREST_M,), baselines=(0.4,))
+    rows = [row for seed in range(10) for row in depth_error.one(None, settings, seed)]
+    assert all(math.isfinite(row["width"]) for row in rows)
+
+
 def test_first_order_agrees_with_monte_carlo():
     settings = replace(depth_error.SETTINGS, baselines=(0.4,), depths=(10.0,), targets=100, scatter=0.02, wrong=0.01)
     rows = {row["cause"]: row for row in depth_error.one(None, settings, 0)}
@@ -217,6 +233,20 @@ def test_the_exact_range_is_exact_and_the_shortcut_worse_the_farther_off_the_axi
     assert len(wrong) == 2
 
 
+def test_a_grid_that_has_no_target_at_20_degrees_tells_nothing_of_them():
+    """Its corners are 25 degrees and more off the axis."""
+    settings = replace(shortcut.SETTINGS, depths=(10.0,), grid=(2, 2), near=8, rigs=("mounted",))
+    rows = shortcut.one(None, settings, 0)
+    summary = shortcut.summarise(rows)
+    found = summary["mounted"]["paper-table"]
+    assert math.isnan(found["at 20 degrees"]["all"]["deg"])
+    assert found["whole view"]["10 m"]["deg"] > 1.0
+    assert shortcut.missed(summary) == []
+    line = next(line for line in shortcut.describe(settings, summary).splitlines() if "at 20 degrees, 10 m" in line)
+    assert line.split()[-6:] == ["-"] * 6
+    shortcut.plot(rows, Figure())
+
+
 def test_targets_near_the_axis_are_all_over_its_disc():
     truth = mounted(np.random.default_rng(0), 1.5)
     x = shortcut.near_axis(truth, 7.0, 400, np.random.default_rng(1))
@@ -245,6 +275,10 @@ def test_how_the_error_grows_is_read_from_the_rows():
         for n in (6, 12, 48)
     ]
     assert calibration_budget.exponents(rows) == pytest.approx((1.0, -0.5))
+    of_one_noise = [row for row in rows if row["noise_px"] == 0.1]
+    assert calibration_budget.exponents(of_one_noise) == pytest.approx((math.nan, -0.5), nan_ok=True)
+    of_one_number = [row for row in rows if row["placements"] == 6]
+    assert calibration_budget.exponents(of_one_number) == pytest.approx((1.0, math.nan), nan_ok=True)
 
 
 def test_a_calibration_is_to_err_as_theory_and_it_itself_have_it():
@@ -252,6 +286,7 @@ def test_a_calibration_is_to_err_as_theory_and_it_itself_have_it():
     assert calibration_budget.missed(right) == []
     said = calibration_budget.missed(right | {"exponent_noise": 0.5})
     assert said == ["exponent_noise is 0.50, not 0.75 to 1.25"]
+    assert calibration_budget.missed(right | {"exponent_noise": math.nan}) == []  # one noise tells of none
 
 
 @pytest.mark.slow
@@ -272,6 +307,8 @@ def test_a_calibration_of_less_noise_points_better():
     (depth_error, {"depths": [5.0, -1.0]}, "depths: -1 is not above 0"),
     (shortcut, {"grid": [1, 5]}, "grid: 1 is not above 1"),
     (calibration_budget, {"placements": [0]}, "placements: 0 is not above 0"),
+    (depth_error, {"depths": [1.9]}, "depths: 1.9 is below 2"),
+    (depth_error, {"wrong": 0.0}, "wrong: 0 is no error"),
 ])  # fmt: skip
 def test_settings_that_cannot_be_are_refused(module, given, said):
     settings = module.EXPERIMENT.settings
