@@ -29,7 +29,7 @@ from cotarget.calibration import Calibration
 from cotarget.camera import depth_from_size
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array
-from experiments.checks import check_above
+from experiments.checks import check_above, check_least
 from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
 from experiments.mounted import TARGET, at, cell_name, exact_calibration, mounted, off_px, wanted_focal_px
 from experiments.synthetic import SIZE, Truth, aim, looking_off
@@ -37,6 +37,8 @@ from experiments.synthetic import SIZE, Truth, aim, looking_off
 CAUSES = ("wrong size", "scatter", "pixels", "together")
 # Monte Carlo over first order, the median over all: a size 10 % too large turns by 1 / 1.1 of what first order says.
 AGREES = (0.88, 1.12)
+# Nearer than this some bird at the image's edge, half of it outside, reaches where the lens's model tells no depth.
+NEAREST_M = 2.0
 SHOWN_BASELINE, SHOWN_DEPTH = 0.4, 10.0  # [m]
 
 
@@ -65,6 +67,7 @@ class DepthSettings(Settings):
         """Refuse what cannot be."""
         super().__post_init__()
         check_above(0, self, "baselines", "depths", "targets", "scatter", "noise_px")
+        check_least(NEAREST_M, self, "depths")
         check_above(-1, self, "wrong")
         if self.wrong == 0:
             raise ConfigError("wrong: 0 is no error; give one above -1 that is not 0, such as 0.1")

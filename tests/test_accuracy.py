@@ -4,6 +4,8 @@ The bounds in experiments/expected are what the quick runs gave when they were c
 corners are fixed, so that nothing but the calibration can change a figure.
 """
 
+from dataclasses import replace
+
 import pytest
 
 from experiments import chain, hand_eye, honesty, mismatch, random_rigs, speed
@@ -25,6 +27,16 @@ def test_no_figure_gets_worse(name):
     for bound in bounds:
         assert bound.kept, f"{name}: {bound.name} is {bound.reached}, not {bound.text}"
     assert experiment.describe(experiment.quick, summary)
+
+
+def test_a_board_is_looked_at_from_as_many_poses_as_are_asked_for(monkeypatch):
+    """Of the poses that are drawn at a time, some 60 to 80 see it."""
+    seen = []
+    monkeypatch.setattr(hand_eye, "fit", lambda start, views, *_: seen.append(len(views)) or 1 / 0)
+    for poses in (20, 200):
+        with pytest.raises(ZeroDivisionError):  # the solving is not what this is about
+            hand_eye.one(None, replace(hand_eye.SETTINGS, poses=poses), 0)
+    assert seen == [20, 200]
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ import pytest
 
 from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, pose
+from cotarget.video import FilmWriter
 from experiments import photos, pipeline_speed, random_rigs
 from experiments.harness import Experiment, Settings, rms, table
 from experiments.synthetic import (
@@ -233,6 +234,17 @@ def test_a_pipeline_that_is_too_slow_is_missed():
     assert pipeline_speed.missed(summary) == ["motion", "speck"]
     assert pipeline_speed.EXPERIMENT.missed is pipeline_speed.missed
     assert "<= 2.5" in pipeline_speed.describe(pipeline_speed.SETTINGS, summary)
+
+
+def test_a_film_that_is_too_short_is_told_before_any_work(tmp_path, monkeypatch):
+    path = tmp_path / "film.mp4"
+    with FilmWriter(path, 25.0) as film:
+        for _ in range(10):
+            film.write(np.zeros((48, 64, 3), np.uint8))
+    monkeypatch.setattr(pipeline_speed, "FILM", path)
+    settings = replace(pipeline_speed.SETTINGS, frames=10, untimed=2)
+    assert pipeline_speed.needs(settings) == ""
+    assert pipeline_speed.needs(replace(settings, frames=11)) == f"needs 11 frames, and {path} has 10"
 
 
 def test_processes_change_nothing():

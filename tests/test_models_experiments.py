@@ -195,6 +195,12 @@ def test_depths_are_measured_by_the_size():
     assert noisy == pytest.approx([10.0 * 40 / 41] * 2)
 
 
+def test_the_nearest_targets_all_have_a_depth():
+    settings = replace(depth_error.SETTINGS, depths=(depth_error.NEAREST_M,), baselines=(0.4,))
+    rows = [row for seed in range(10) for row in depth_error.one(None, settings, seed)]
+    assert all(math.isfinite(row["width"]) for row in rows)
+
+
 def test_first_order_agrees_with_monte_carlo():
     settings = replace(depth_error.SETTINGS, baselines=(0.4,), depths=(10.0,), targets=100, scatter=0.02, wrong=0.01)
     rows = {row["cause"]: row for row in depth_error.one(None, settings, 0)}
@@ -301,6 +307,7 @@ def test_a_calibration_of_less_noise_points_better():
     (depth_error, {"depths": [5.0, -1.0]}, "depths: -1 is not above 0"),
     (shortcut, {"grid": [1, 5]}, "grid: 1 is not above 1"),
     (calibration_budget, {"placements": [0]}, "placements: 0 is not above 0"),
+    (depth_error, {"depths": [1.9]}, "depths: 1.9 is below 2"),
     (depth_error, {"wrong": 0.0}, "wrong: 0 is no error"),
 ])  # fmt: skip
 def test_settings_that_cannot_be_are_refused(module, given, said):
