@@ -10,6 +10,7 @@ pipeline cannot see.
 """
 
 import dataclasses
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -59,6 +60,8 @@ WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
     },
 }
 # Told beside them.
+# Parts of the frames of which more is better: a target that was never acquired had none.
+SHARES = ("closeup_yield", "in_frame_ratio", "identification")
 ALSO = ("tpe_px_median", "false_tracks_per_min", "commands_per_min", "reversals_per_min", "lens_commands_per_min")
 
 
@@ -89,16 +92,17 @@ def one(calibration: Calibration, settings: HoldSettings, seed: int) -> list[Row
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
     """Of each target's figures the median over the seeds, the least and the largest."""
     return {
-        name: {key: _spread([row[key] for row in rows if row["target"] == name]) for key in (*wanted, *ALSO)}
+        name: {key: _spread(key, [row[key] for row in rows if row["target"] == name]) for key in (*wanted, *ALSO)}
         for name, wanted in WANTED.items()
         if any(row["target"] == name for row in rows)
     }
 
 
-def _spread(values: Sequence[float | None]) -> dict[str, float]:
-    """In the median a run without the figure counts as the worst there is, as infinite; the others are nan then."""
-    found = spread_of(np.inf if value is None else float(value) for value in values)
-    return found if None not in values else {**dict.fromkeys(found, np.nan), "median": found["median"]}
+def _spread(key: str, values: Sequence[float | None]) -> dict[str, float]:
+    """In the median a run without the figure counts as the worst there is; the others are nan then."""
+    worst = 0.0 if key in SHARES else math.inf
+    found = spread_of(worst if value is None else float(value) for value in values)
+    return found if None not in values else {**dict.fromkeys(found, math.nan), "median": found["median"]}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:

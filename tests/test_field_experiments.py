@@ -398,6 +398,11 @@ def test_a_target_that_is_never_acquired_is_missed():
         "book: time_to_acquire_s",
     ]
     assert math.isnan(hold.summarise([*rows, lost])["book"]["time_to_acquire_s"]["largest"])
+    never = {"target": "book", **dict.fromkeys(good), "closeup_yield": 0.0}
+    for key in ("in_frame_ratio", "identification"):  # who was never there has the least share, not the most
+        found = hold.summarise([{**row, key: 0.5} for row in rows] + [never, never])["book"]
+        assert found[key]["median"] == 0.5
+        assert hold.summarise([{**row, key: 0.5} for row in rows] + [never] * 4)["book"][key]["median"] == 0.0
     assert "closeup_yield" in hold.describe(hold.SETTINGS, summary)
     hold.plot(rows, Figure())
 
