@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline
 from cotarget.calibration.boards import board_points, find_corners
 from cotarget.config import BoardConfig, SimZoomCamera, parse_config
 from cotarget.geometry import pose
+from cotarget.sim.lens import TrueLens
 from cotarget.sim.world import SimWorld
 
 BOARD = BoardConfig(square=0.04)
@@ -19,6 +20,7 @@ STOPS = 8  # calibrated focal lengths, evenly spaced in the logarithm
 FOCAL_FOUND, CENTER_FOUND_PX, IMAGE_FOUND_PX = 1e-3, 0.3, 0.3  # what a spline through the stops has to reach
 NOT_A_CUBIC = 3.0  # a cubic misses by at least so many times of these
 EXACT = 1e-12
+ROUNDING_PX = 1e-9
 LONGEST = 12.0  # 72 / 6 mm
 SHORTEST_PX = 6 / 0.009
 SPINE = 2e-3  # the book's cover and back stand 0.03 m apart and it swings: the nearer one decides
@@ -219,3 +221,15 @@ def test_switched_off_the_lens_only_magnifies_whatever_the_curves():
             assert (lens.center_px, lens.distortion, lens.pupil) == ((326, 235), (-0.1, 0, 0, 0, 0), 0)
             assert lens.focal_px == pytest.approx((692 * factor, 693 * factor))
     np.testing.assert_array_equal(*images)
+
+
+@pytest.mark.parametrize("k1", [-0.2, 2.0, 5.0, 100.0])
+def test_a_lens_is_undone_however_much_it_stretches(k1):
+    """By OpenCV's projection; where a lens stretches by two and more, plain steps go farther off each time."""
+    distortion = (k1, 0.0, 1e-3, -2e-3, 0.0)
+    lens = TrueLens((640, 480), (686.0, 684.0), (325.0, 239.0), distortion)
+    pixels = np.stack(np.meshgrid(np.linspace(0, 639, 9), np.linspace(0, 479, 7)), axis=-1).reshape(-1, 2)
+    rays = np.column_stack([lens.directions(pixels), np.ones(len(pixels))])
+    K = np.array([[686.0, 0.0, 325.0], [0.0, 684.0, 239.0], [0.0, 0.0, 1.0]])
+    back = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(distortion))[0][:, 0]
+    np.testing.assert_allclose(back, pixels, atol=ROUNDING_PX)

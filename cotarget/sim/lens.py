@@ -26,8 +26,9 @@ REAL_ROOT = 1e-9  # imaginary over absolute value of a root that is real but for
 # Fields and maps are kept for the lens positions in use: the fixed camera's one and the zoom camera's latest.
 KEPT_MAPS = 8
 KEPT_FIELDS = 128  # a few numbers each; a rig that is built again and again asks for all its focal lengths
-# A fixed point: every round shrinks the error by about 3 |k1| r^2, less than 0.3.
+# A fixed point: every round shrinks the error by about 3 |k1| r^2, less than 0.3 for the usual lenses.
 UNDISTORT_ROUNDS = 60
+DIVERGED = 10.0  # times its smallest step: a lens that stretches by two and more makes plain steps grow
 UNDISTORTED = 1e-14  # step of the normalised coordinates at which it has converged
 
 
@@ -62,9 +63,34 @@ class TrueLens:
     def directions(self, pixels: Array) -> Array:
         """Undistorted image-plane coordinates (x / z, y / z) of pixels, (..., 2)."""
         bent = (pixels - self.center_px) / self.focal_px
-        xy = bent
+        xy, most = bent, math.inf
         for _ in range(UNDISTORT_ROUNDS):
             step = bent - self.bend(xy)
+            size = np.abs(step).max()
+            if size > most:
+                break
+            most = min(most, DIVERGED * size)
+            xy = xy + step
+            if size < UNDISTORTED:
+                return xy
+        return self._by_newton(bent)
+
+    def _by_newton(self, bent: Array) -> Array:
+        """The same of distorted coordinates, (..., 2), where the lens stretches so much that plain steps go too far."""
+        k1, k2, p1, p2, k3 = self.distortion
+        xy = bent
+        for _ in range(UNDISTORT_ROUNDS):
+            x, y = xy[..., 0], xy[..., 1]
+            r2 = x**2 + y**2
+            gain, rise = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3, k1 + 2 * k2 * r2 + 3 * k3 * r2**2
+            across = gain + 2 * x**2 * rise + 2 * p1 * y + 6 * p2 * x
+            down = gain + 2 * y**2 * rise + 6 * p1 * y + 2 * p2 * x
+            mixed = 2 * x * y * rise + 2 * p1 * x + 2 * p2 * y
+            off = bent - self.bend(xy)
+            step = np.stack(
+                [down * off[..., 0] - mixed * off[..., 1], across * off[..., 1] - mixed * off[..., 0]], axis=-1
+            )
+            step /= (across * down - mixed**2)[..., None]
             xy = xy + step
             if np.abs(step).max() < UNDISTORTED:
                 break
