@@ -18,6 +18,9 @@ from cotarget.pantilt import HeadGeometry
 # Rounding leaves a covariance, scaled to a unit diagonal, no less symmetric and its smallest eigenvalue no further
 # below zero than this, for every parameter.
 ROUNDING = 1e-9
+# Beyond these a number was mistyped: an encoder's scale is within percents of 1, and no lens is longer than a
+# telescope's 1e7 px, has its axis more than ten images off the middle, or needs coefficients that large.
+SCALES, FOCALS_PX, IMAGES_OFF, LARGEST_COEFFICIENT = (0.5, 2.0), (1.0, 1e7), 10.0, 1e6
 RESIDUAL_KEYS = (
     "fixed_rms_px",
     "zoom_rms_px",
@@ -58,8 +61,8 @@ def parse_calibration(table: Table) -> Calibration:
         head=HeadGeometry(
             axis_offset=parsing.as_number(get(head, "axis_offset", "head"), "head.axis_offset"),
             squareness=angle("squareness"),
-            pan_scale=parsing.as_number(get(head, "pan_scale", "head"), "head.pan_scale", positive=True),
-            tilt_scale=parsing.as_number(get(head, "tilt_scale", "head"), "head.tilt_scale", positive=True),
+            pan_scale=_within(SCALES, get(head, "pan_scale", "head"), "head.pan_scale"),
+            tilt_scale=_within(SCALES, get(head, "tilt_scale", "head"), "head.tilt_scale"),
             pan_zero=angle("pan_zero"),
             tilt_zero=angle("tilt_zero"),
         ),
@@ -120,9 +123,12 @@ def parse_board(value: Any, where: str) -> BoardConfig:
 
 
 def _parse_intrinsics(table: Table, size: tuple[int, int], where: str) -> Intrinsics:
-    fx, fy = (parsing.as_number(get(table, k, where), join(where, k), positive=True) for k in ("fx", "fy"))
-    cx, cy = (parsing.as_number(get(table, k, where), join(where, k)) for k in ("cx", "cy"))
-    k1, k2, p1, p2, k3 = parsing.as_numbers(get(table, "distortion", where), join(where, "distortion"), 5)
+    fx, fy = (_within(FOCALS_PX, get(table, k, where), join(where, k)) for k in ("fx", "fy"))
+    far = IMAGES_OFF * max(size)
+    cx, cy = (_within((-far, far), get(table, k, where), join(where, k)) for k in ("cx", "cy"))
+    told = parsing.as_list(get(table, "distortion", where), join(where, "distortion"), 5)
+    bounds = (-LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
+    k1, k2, p1, p2, k3 = (_within(bounds, k, f"{join(where, 'distortion')}[{i}]") for i, k in enumerate(told))
     return Intrinsics(size=size, focal_px=(fx, fy), center_px=(cx, cy), distortion=(k1, k2, p1, p2, k3))
 
 
@@ -135,7 +141,7 @@ def _parse_lens(table: Table) -> ZoomLens:
     for i, value in enumerate(stops):
         where = f"zoom.stops[{i}]"
         stop = parsing.as_table(value, where)
-        nominal.append(parsing.as_number(get(stop, "nominal_px", where), join(where, "nominal_px"), positive=True))
+        nominal.append(_within(FOCALS_PX, get(stop, "nominal_px", where), join(where, "nominal_px")))
         intrinsics.append(_parse_intrinsics(stop, size, where))
         pupil.append(parsing.as_number(get(stop, "pupil", where), join(where, "pupil")))
     if any(b <= a for a, b in itertools.pairwise(nominal)):
@@ -178,6 +184,15 @@ def _parse_held_out(value: Any) -> HeldOut | None:
         name: _at_least(least, get(table, name, "held_out"), f"held_out.{name}") for name, least in lowest.items()
     }
     return HeldOut(views=parsing.as_whole(get(table, "views", "held_out"), "held_out.views"), **numbers)
+
+
+def _within(bounds: tuple[float, float], value: Any, where: str) -> float:
+    """Expect a number that can be; one that is to be above zero is told that first."""
+    low, high = bounds
+    number = parsing.as_number(value, where, positive=low > 0)
+    if not low <= number <= high:
+        raise CalibrationError(f"{where}: {number:g} is not between {low:g} and {high:g}")
+    return number
 
 
 def _at_least(lowest: int, value: Any, where: str) -> float:
