@@ -5,7 +5,6 @@ import dataclasses
 import json
 import math
 import platform
-import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -173,9 +172,10 @@ class Recorder:
         chosen = config.target(target)
         if chosen.template is not None:
             copy = TEMPLATE + chosen.template.suffix
-            shutil.copyfile(chosen.template, self._directory / copy)
+            (self._directory / copy).write_bytes(chosen.template.read_bytes())
             chosen = dataclasses.replace(chosen, template=Path(copy))
-        shutil.copyfile(calibration, self._directory / CALIBRATION)
+        # By hand: where the disk is full shutil's copy blames the file that it reads.
+        (self._directory / CALIBRATION).write_bytes(calibration.read_bytes())
         table = {
             "schema": SCHEMA,
             "cotarget": __version__,

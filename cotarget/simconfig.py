@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from cotarget.errors import ConfigError
+from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform, pose
 
 # What the numbers of a list are, for who gives something else.
@@ -258,16 +258,20 @@ class SimConfig:
 
 # No effect of a real rig but the quality of the rendering, which `all` leaves alone.
 QUALITY = ("multisampling", "shadows")
+ALL = "all"
 
 
 def expand_all(effects: Mapping[str, Any]) -> dict[str, Any]:
     """Let ``all`` set every switch of [sim.effects] that is not named.
 
     Raises:
-        ConfigError: it is neither true nor false.
+        ConfigError: it is neither true nor false, or a key is neither a switch nor ``all``.
     """
+    switches = {f.name for f in fields(SimEffects)}
+    if unknown := sorted(set(effects) - switches - {ALL}):
+        raise ConfigError(f"unknown key 'sim.effects.{unknown[0]}'; valid here: {choices({*switches, ALL})}")
     named = dict(effects)
-    every = named.pop("all", None)
+    every = named.pop(ALL, None)
     if every is None:
         return named
     if not isinstance(every, bool):

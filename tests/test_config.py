@@ -84,6 +84,7 @@ def test_offsets_and_targets_are_taken(tmp_path):
         ("[sim.fixed]\njpeg_quality = 0", "sim.fixed.jpeg_quality: 0 is not within 1 to 100"),
         ("[sim.head]\npan_deg = [10, -10]", "sim.head.pan_deg: [10.0, -10.0] is not [lowest, highest]"),
         ("[sim.effects]\nall = 0", "sim.effects.all: 0 is not true or false"),
+        ("[sim.effects]\nfoo = true", "unknown key 'sim.effects.foo'; valid here: all, axes, backlash"),
         ("sim = 3", "sim: 3 is not a table"),
         ("[sim]\ntargets = ['cow']", "sim.targets: unknown target 'cow'; the simulation has: bird, book, person, and"),
         (

@@ -267,6 +267,15 @@ def test_a_recording_that_cannot_begin_is_refused_in_one_line_and_leaves_nothing
     assert "recording" not in {thread.name for thread in threading.enumerate()}
 
 
+@pytest.mark.parametrize("room", [0, 1000])
+def test_a_full_disk_is_named_by_the_folder_that_is_on_it(tmp_path, calibration_path, room):
+    """And not by the file that is copied there."""
+    folder = tmp_path / "run"
+    with full_disk(room), pytest.raises(ConfigError, match=rf"run: cannot be recorded: {SAID}"):
+        Recorder(folder, CONFIG, calibration_path, "bird")
+    assert not folder.exists()
+
+
 @pytest.mark.parametrize("exists", [False, True])
 def test_a_rig_that_cannot_be_opened_leaves_room_for_the_next_try(tmp_path, calibration_path, exists):
     folder = tmp_path / "run"
