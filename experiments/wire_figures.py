@@ -23,6 +23,8 @@ FAULT_COLUMNS = (
     "tracebacks", "runs",
 )  # fmt: skip
 
+AGAIN = "measured"  # how often, in the rows of what was measured more than once
+
 Figure = dict[str, Any]
 
 
@@ -56,6 +58,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "figures": figures,
         "parts": _parts(of),
         "faults": faults,
+        "again": {name: mine[0][AGAIN] for name, mine in of.items() if AGAIN in mine[0]},
         "load": [min(loads, default=math.nan), max(loads, default=math.nan)],
     }
 

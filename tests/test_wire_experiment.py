@@ -130,7 +130,11 @@ def test_what_a_busy_machine_has_spoilt_is_measured_again(monkeypatch, runs, mea
     runs = iter(runs)
     monkeypatch.setitem(wire.RUNS, "faults", lambda *_: next(runs))
     settings = replace(SHORT, only=("faults",))
-    assert [row["settled_s"] for row in wire.one(None, settings, 0)] == [measured]
+    rows = wire.one(None, settings, 0)
+    assert [row["settled_s"] for row in rows] == [measured]
+    told = wire.describe(settings, summarise(rows))
+    assert ("faults 2 times" in told, "faults 3 times" in told) == (measured == 0.4, measured == 4.4)
+    assert ("measured more than once" in told) == (measured in (0.4, 4.4))
 
 
 @pytest.mark.wire
