@@ -59,9 +59,9 @@ WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
         "identification_wide": (0.0, 0.01),
     },
 }
-# Told beside them.
 # Parts of the frames of which more is better: a target that was never acquired had none.
 SHARES = ("closeup_yield", "in_frame_ratio", "identification")
+# Told beside them.
 ALSO = ("tpe_px_median", "false_tracks_per_min", "commands_per_min", "reversals_per_min", "lens_commands_per_min")
 
 
