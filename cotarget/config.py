@@ -2,55 +2,889 @@
 
 Values keep the units of the file, because people edit it: metres and degrees, millimetres where a name says so.
 Defaults are the rig that the project's figures are stated for.
+
+The [hardware] tables of rig.toml as frozen dataclasses: where the devices are and what is expected of them.
+
+Values keep the units of the file: metres and degrees, millimetres where a name says so. Defaults are a PTU-D46-17.5 as
+it leaves the factory, an Axis 241Q, and a Canon PowerShot S5 IS.
+
+What rig.toml must not say beyond its [sim] and [hardware] tables: values of the right type that make no sense.
+
+What the [sim] tables of rig.toml must not say: values of the right type that make no sense.
+
+The [sim] tables of rig.toml as frozen dataclasses: the simulated world, its cameras, head and effects.
+
+Values keep the units of the file: metres and degrees, millimetres where a name says so. Defaults are the rig that the
+project's figures are stated for.
+
+Turns tables, as TOML gives them, into frozen dataclasses by the types of their fields.
 """
 
 import dataclasses
+import itertools
 import math
+import re
 import tomllib
 import types
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
-from cotarget.assets import assets_dir
+import numpy as np
+
+from cotarget.camera import Intrinsics
 from cotarget.errors import ConfigError, choices
-from cotarget.hwconfig import HardwareConfig
-from cotarget.rigchecks import check_config
-from cotarget.simconfig import (
-    Limits,
-    Pair,
-    SimCamera,
-    SimConfig,
-    SimEffects,
-    SimHead,
-    SimZoomCamera,
-    Size,
-    expand_all,
-    fit_sizes,
-    split_name,
-)
-from cotarget.tables import build, expect_table
+from cotarget.files import assets_dir
+from cotarget.geometry import RigidTransform, pose, pose_dict
 
-__all__ = [
-    "DEFAULT_TARGETS",
-    "BoardConfig",
-    "HardwareConfig",
-    "RigConfig",
-    "SafetyConfig",
-    "SimCamera",
-    "SimConfig",
-    "SimEffects",
-    "SimHead",
-    "SimZoomCamera",
-    "TargetConfig",
-    "check_config",
-    "config_of",
-    "load_config",
-    "parse_config",
-    "read_tables",
-    "read_text",
-]
+FEWEST_CORNERS, MOST_CORNERS = 3, 100  # of a board, a side
+
+
+def check_config(config: "RigConfig", recorded: bool = False) -> None:
+    """Refuse values of the right type that make no sense.
+
+    Args:
+        config: of a rig.
+        recorded: as `cotarget.config.parse_config` has it.
+
+    Raises:
+        ConfigError: with the key.
+    """
+    check_numbers(config.sim) if recorded else check_sim(config.sim)
+    check_hardware(config.hardware)
+    positive: dict[str, float] = {
+        "board.square": config.board.square,
+        "safety.max_frame_age_s": config.safety.max_frame_age_s,
+        "safety.watchdog_s": config.safety.watchdog_s,
+    }
+    for name, target in config.targets.items():
+        positive |= {f"targets.{name}.size": target.size, f"targets.{name}.wanted_px": target.wanted_px}
+    for where, value in positive.items():
+        if value <= 0:
+            raise ConfigError(f"{where}: {value:g} is not greater than zero")
+    _check_safety(config.safety, config.rate_hz)
+    check_corners(config.board)
+
+
+def check_corners(board: "BoardConfig") -> None:
+    """Refuse a board whose corners are too few or too many, and a chessboard that looks the same upside down.
+
+    Raises:
+        ConfigError: with the key.
+    """
+    columns, rows = board.corners
+    if min(columns, rows) < FEWEST_CORNERS:
+        raise ConfigError(f"board.corners: {columns}x{rows} has fewer than {FEWEST_CORNERS} corners a side")
+    if max(columns, rows) > MOST_CORNERS:
+        raise ConfigError(f"board.corners: {columns}x{rows} has more than {MOST_CORNERS} corners a side")
+    if board.kind == "chessboard" and (columns + rows) % 2 == 0:
+        raise ConfigError(
+            f"board.corners: {columns}x{rows} looks the same upside down; "
+            f"one count must be odd and the other even, like {columns}x{rows + 1}"
+        )
+
+
+def _check_safety(safety: "SafetyConfig", rate_hz: float) -> None:
+    """Refuse limits that are none, a watchdog that halts between two frames, and a stop file without a name."""
+    for where, limits in (("safety.pan_deg", safety.pan_deg), ("safety.tilt_deg", safety.tilt_deg)):
+        if limits is not None and limits[0] >= limits[1]:
+            raise ConfigError(f"{where}: {list(limits)} is not [lowest, highest]")
+    if safety.speed_deg_s is not None and safety.speed_deg_s <= 0:
+        raise ConfigError(f"safety.speed_deg_s: {safety.speed_deg_s:g} is not greater than zero")
+    if safety.watchdog_s * rate_hz <= 1:
+        raise ConfigError(
+            f"safety.watchdog_s: {safety.watchdog_s:g} s would halt the head between any two frames of the "
+            f"fixed camera, of which {rate_hz:g} come a second"
+        )
+    if safety.stop_file is not None and safety.stop_file.name in ("", ".."):
+        raise ConfigError(f"safety.stop_file: '{safety.stop_file}' is a folder; name a file in it, as 'stop'")
+
+
+# --- simconfig ---
+
+# What the numbers of a list are, for who gives something else.
+Pair = tuple[float, float]
+Limits = Annotated[Pair, "[lowest, highest]"]
+Size = Annotated[tuple[int, int], "[width, height]"]
+Focal = Annotated[Pair, "[fx, fy]"]
+Center = Annotated[Pair, "[u, v]"]
+Distortion = Annotated[tuple[float, float, float, float, float], "[k1, k2, p1, p2, k3]"]
+Waypoint = Annotated[tuple[float, float, float, float], "[t, x, y, z]"]
+# Coefficients of s, s^2, s^3 ...: a curve that is 0 at the shortest focal length.
+Curve = Annotated[tuple[float, ...], "[of s, of s^2, ...]"]
+TARGETS = ("book", "person", "bird")  # that the simulation has models of
+
+
+@dataclass(frozen=True)
+class SimCamera:
+    """The simulated fixed camera: true intrinsics, sensor and link.
+
+    Attributes:
+        size: (width, height) [px].
+        focal_px: true (fx, fy) [px]; where a file gives another size and not this, the field of view stays as wide.
+        center_px: true principal point [px]; likewise it stays where it is beside the image's middle.
+        distortion: true (k1, k2, p1, p2, k3).
+        noise: standard deviation of the sensor's noise [grey levels].
+        rate_hz: frames a second.
+        latency_s: from light to frame [s].
+        exposure_s: how long light is gathered [s]; what moves meanwhile is blurred, and rendering takes twice as
+            long while the camera turns. 0 for an instant.
+        jpeg_quality: 1 to 100.
+    """
+
+    size: Size = (640, 480)
+    focal_px: Focal = (686.0, 684.0)
+    center_px: Center = (325.0, 239.0)
+    distortion: Distortion = (-0.2, 0.0, 0.0, 0.0, 0.0)
+    noise: float = 2.0
+    rate_hz: float = 25.0
+    latency_s: float = 0.06
+    exposure_s: float = 0.0
+    jpeg_quality: int = 90
+
+    def fitted(self, size: Size, focal_px: Focal | None) -> dict[str, Any]:
+        """What else is other in pixels in an image of another size [px], with a focal length, or of the same view."""
+        by = self._gain(size, focal_px)
+        return {
+            "focal_px": tuple(by * focal for focal in self.focal_px),
+            "center_px": tuple(
+                (new - 1) / 2 + by * (at - (old - 1) / 2)
+                for at, old, new in zip(self.center_px, self.size, size, strict=True)
+            ),
+        }
+
+    def _gain(self, size: Size, focal_px: Focal | None) -> float:
+        """How many times as many pixels there are to an angle; more or fewer at its sides change nothing of that."""
+        return size[0] / self.size[0] if focal_px is None else focal_px[0] / self.focal_px[0]
+
+
+@dataclass(frozen=True)
+class ZoomOptics:
+    """What a zoom lens does at one focal length; ``pupil`` is how far forward its entrance pupil has moved [m]."""
+
+    focal_px: Focal
+    center_px: Center
+    distortion: Distortion
+    pupil: float
+
+
+@dataclass(frozen=True)
+class SimZoomCamera(SimCamera):
+    """The simulated zoom camera; ``focal_px``, ``center_px`` and ``distortion`` hold at the shortest focal length.
+
+    The curves are what the effect "optics" adds, over s = ln(nominal / shortest) / ln(longest / shortest) in 0..1.
+    Their defaults are of the size of a 12x consumer zoom's, and bent as no cubic is.
+
+    Attributes:
+        focal_mm: shortest and longest focal length as the maker states them [mm].
+        pitch_mm: size of a pixel as the maker states it [mm]; focal_mm / pitch_mm is what the device tells.
+        lens_steps: number of positions from shortest to longest, evenly spaced in the logarithm.
+        lens_speed: positions a second.
+        focal_curve: true over nominal focal length is 1 + this times what it is at the shortest.
+        center_drift_px: what the principal point's u and v have moved by [px].
+        distortion_drift: what is added to k1 as it is measured in the image, in tangents at the shortest focal length.
+        pupil: how far the entrance pupil has moved along the axis [m]; forward is positive.
+    """
+
+    focal_px: Focal = (692.0, 693.0)
+    center_px: Center = (326.0, 235.0)
+    distortion: Distortion = (-0.1, 0.0, 0.0, 0.0, 0.0)
+    focal_mm: Limits = (6.0, 72.0)
+    pitch_mm: float = 0.009
+    lens_steps: int = 129
+    lens_speed: float = 129.0
+    focal_curve: Curve = (0.13, 0.14, -1.76, 2.39, -0.91)
+    center_drift_px: tuple[Curve, Curve] = ((27.0, 85.0, -322.0, 268.0, -62.0), (-7.0, -4.0, -92.0, 195.0, -102.0))
+    distortion_drift: Curve = (0.4, 0.04, -0.88, 0.62, -0.05)
+    pupil: Curve = (0.03, 0.06, -0.9, 1.17, -0.44)
+
+    def fitted(self, size: Size, focal_px: Focal | None) -> dict[str, Any]:
+        """The same of a zoom camera: more pixels to an angle are smaller ones, as what it tells and does agree."""
+        by = self._gain(size, focal_px)
+        return {
+            **super().fitted(size, focal_px),
+            "pitch_mm": self.pitch_mm / by,
+            "center_drift_px": tuple(tuple(by * c for c in curve) for curve in self.center_drift_px),
+        }
+
+    def optics_at(self, magnification: float) -> ZoomOptics:
+        """What the lens does at a nominal focal length, given as a multiple of the shortest."""
+        s = math.log(magnification) / math.log(self.focal_mm[1] / self.focal_mm[0])
+        gain = magnification * (1 + _along(self.focal_curve, s))
+        (fx, fy), (cx, cy), (k1, k2, p1, p2, k3) = self.focal_px, self.center_px, self.distortion
+        du, dv = (_along(curve, s) for curve in self.center_drift_px)
+        # A pixel's tangent shrinks as the focal length grows; coefficients that grow with its powers keep the image's
+        # distortion.
+        squared = gain * gain
+        k1 = (k1 + _along(self.distortion_drift, s)) * squared
+        return ZoomOptics(
+            focal_px=(fx * gain, fy * gain),
+            center_px=(cx + du, cy + dv),
+            distortion=(k1, k2 * squared * squared, p1 * gain, p2 * gain, k3 * squared * squared * squared),
+            pupil=_along(self.pupil, s),
+        )
+
+
+def _along(curve: Curve, s: float) -> float:
+    """A curve's value, by Horner's rule."""
+    value = 0.0
+    for coefficient in reversed(curve):
+        value = (value + coefficient) * s
+    return value
+
+
+@dataclass(frozen=True)
+class SimHead:
+    """The simulated pan-tilt unit; defaults are a stock PTU-D46-17.5 with the geometry of a real, imperfect one.
+
+    Attributes:
+        step_deg: resolution [degrees].
+        pan_deg: lowest and highest pan [degrees].
+        tilt_deg: lowest and highest tilt [degrees].
+        speed_deg_s: highest speed [degrees/s].
+        accel_deg_s2: acceleration [degrees/s^2].
+        command_delay_s: from command to motion [s].
+        axis_offset_mm: distance between the axes along the pan frame's z, dz [mm].
+        squareness_deg: departure of the axes from a right angle, eps [degrees].
+        backlash_deg: play of each axis [degrees].
+    """
+
+    step_deg: float = 0.0514286
+    pan_deg: Limits = (-158.9, 158.9)
+    tilt_deg: Limits = (-46.6, 31.1)
+    speed_deg_s: float = 149.0
+    accel_deg_s2: float = 206.0
+    command_delay_s: float = 0.04
+    axis_offset_mm: float = 5.0
+    squareness_deg: float = 0.1
+    backlash_deg: float = 0.0
+
+
+@dataclass(frozen=True)
+class SimEffects:
+    """One switch for each way in which the simulation departs from the textbook; ``all = false`` clears them.
+
+    Attributes:
+        noise: sensor noise.
+        jpeg: compression.
+        distortion: lens distortion of both cameras.
+        latency: light to frame.
+        blur: motion during the exposure.
+        command_delay: command to motion.
+        profile: finite speed and acceleration of the head.
+        steps: the head's resolution.
+        axes: axis offset and non-squareness.
+        backlash: play.
+        lens: positions and travel time of the zoom lens.
+        optics: what the zoom lens's optics do besides magnifying: focal curve, centre, distortion and pupil that move
+            with focal length. Without it the coefficients of the distortion stay what they are, so that the image's
+            distortion vanishes as the field narrows.
+        scatter: true sizes differ from what the pipeline is told.
+        shadows: cast shadows (costs two to four times the rendering).
+        multisampling: antialiasing with 4 samples.
+        clutter: outdoors foliage sways, clouds drift, shadows cross the ground and the light changes. Off by default:
+            the figures of calibration and of the demo are for a world at rest.
+    """
+
+    noise: bool = True
+    jpeg: bool = True
+    distortion: bool = True
+    latency: bool = True
+    blur: bool = True
+    command_delay: bool = True
+    profile: bool = True
+    steps: bool = True
+    axes: bool = True
+    backlash: bool = True
+    lens: bool = True
+    optics: bool = True
+    scatter: bool = True
+    shadows: bool = False
+    multisampling: bool = True
+    clutter: bool = False
+
+
+# Offsets of the kind the paper's rig had: 0.4 m beside each other, a few degrees apart, the camera bolted to the
+# unit with a lever of some ten centimetres.
+DEFAULT_GAMMA = pose([-0.40, 0.03, 0.06], [0.8, -1.9, 0.6])
+DEFAULT_T = pose([0.02, -0.08, 0.05], [0.7, -1.4, 0.5])
+
+
+@dataclass(frozen=True)
+class SimConfig:
+    """The simulated world.
+
+    Attributes:
+        scene: a scene of sim_assets, or a path to an MJCF file.
+        seed: of everything random.
+        targets: which targets are in the scene.
+        T_zoom0_fixed: the true Gamma.
+        T_head_zoom: the true T, at the zoom lens's shortest focal length like Gamma.
+        fixed: the wide camera.
+        zoom: the zoom camera.
+        head: the pan-tilt unit.
+        effects: switches.
+        models: for targets of one's own, by name: a mesh in metres (.obj, .stl), x forward and z up, or an MJCF file
+            with one body; a relative path is relative to rig.toml.
+        paths: for a target of that name, waypoints [t, x, y, z] (seconds, metres in the world) of a smooth path
+            that replaces the built-in one.
+    """
+
+    scene: str = "outdoor"
+    seed: int = 0
+    targets: tuple[str, ...] = ()
+    T_zoom0_fixed: RigidTransform = DEFAULT_GAMMA
+    T_head_zoom: RigidTransform = DEFAULT_T
+    fixed: SimCamera = SimCamera()
+    zoom: SimZoomCamera = SimZoomCamera()
+    head: SimHead = SimHead()
+    effects: SimEffects = SimEffects()
+    models: Mapping[str, Path] = field(default_factory=dict)
+    paths: Mapping[str, tuple[Waypoint, ...]] = field(default_factory=dict)
+
+
+# No effect of a real rig but the quality of the rendering, which `all` leaves alone.
+QUALITY = ("multisampling", "shadows")
+ALL = "all"
+
+
+def expand_all(effects: Mapping[str, Any]) -> dict[str, Any]:
+    """Let ``all`` set every switch of [sim.effects] that is not named.
+
+    Raises:
+        ConfigError: it is neither true nor false, or a key is neither a switch nor ``all``.
+    """
+    switches = {f.name for f in fields(SimEffects)}
+    if unknown := sorted(set(effects) - switches - {ALL}):
+        raise ConfigError(f"unknown key 'sim.effects.{unknown[0]}'; valid here: {choices({*switches, ALL})}")
+    named = dict(effects)
+    every = named.pop(ALL, None)
+    if every is None:
+        return named
+    if not isinstance(every, bool):
+        raise ConfigError(f"sim.effects.all: {every!r} is not true or false")
+    return {f.name: every for f in fields(SimEffects) if f.name not in QUALITY} | named
+
+
+def fit_sizes(sim: SimConfig, given: Mapping[str, Any]) -> SimConfig:
+    """Let a view stay what it is where another image size was given, and go with the focal length where that was.
+
+    Args:
+        sim: as it was read.
+        given: the [sim] table that it was read from; what a camera's table says stays as it is said.
+    """
+    cameras: dict[str, SimCamera] = {}
+    for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
+        if min(*camera.size, *camera.focal_px) <= 0:
+            continue  # refused elsewhere
+        said = given.get(name, {})
+        # Nothing changes where size and focal length are the default's.
+        follows = type(camera)().fitted(camera.size, camera.focal_px if "focal_px" in said else None)
+        cameras[name] = replace(camera, **{key: value for key, value in follows.items() if key not in said})
+    return replace(sim, **cameras)  # type: ignore[arg-type]
+
+
+def split_name(name: str) -> tuple[str, int]:
+    """A target's kind and its number among its kind: ("bird", 1) of ``bird``, ("bird", 2) of ``bird2``."""
+    number = re.search(r"(?<=\D)([2-9]|[1-9]\d+)\Z", name)
+    return (name, 1) if number is None else (name[: number.start()], int(number[0]))
+
+
+# --- hwconfig ---
+
+BAUDS = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
+SOCKET = re.compile(r"socket://(\[[0-9A-Fa-f:.]+\]|[^:/\s]+):(\d+)/?")
+# Positions of the S5 IS's lens and their focal lengths [mm], as measured by the CHDK project.
+S5_IS_LENS = ((0, 6.0), (11, 6.4), (41, 12.1), (64, 21.3), (86, 41.6), (105, 61.4), (128, 72.0))
+
+
+@dataclass(frozen=True)
+class HardwareHead:
+    """A Directed Perception PTU-D46.
+
+    Attributes:
+        port: serial port such as "/dev/ttyUSB0", or "socket://host:port".
+        baud: of the serial line.
+        step_deg: resolution that the unit is expected to report [degrees].
+        pan_deg: lowest and highest pan that it is expected to report, in this file's sense of pan [degrees].
+        tilt_deg: the same of tilt [degrees].
+        pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left, as the D46's manual has it.
+        tilt_sign: 1 where the unit's positive tilt goes up, -1 where it goes down.
+        speed_deg_s: speed of moves, as far as the unit allows [degrees/s].
+        command_delay_s: from a command to the start of motion, as measured [s].
+    """
+
+    port: str = ""
+    baud: int = 9600
+    step_deg: float = 0.0514286
+    pan_deg: Limits = (-158.9, 158.9)
+    tilt_deg: Limits = (-46.6, 31.1)
+    pan_sign: Literal[1, -1] = -1
+    tilt_sign: Literal[1, -1] = 1
+    speed_deg_s: float = 149.0
+    command_delay_s: float = 0.04
+
+
+@dataclass(frozen=True)
+class HardwareFixed:
+    """The wide camera, on an Axis video server or network camera.
+
+    Attributes:
+        url: of the server, such as "http://192.168.0.90".
+        camera: its number on the server, from 1.
+        user: empty where none is asked for.
+        password: empty where the environment variable COTARGET_PASSWORD holds it.
+        size: (width, height) that is expected [px].
+        resolution: as the server calls it, such as "4CIF"; empty for its default.
+        rate_hz: frames a second asked for.
+        compression: 0 to 100; less is finer.
+        latency_s: from light to a frame's first byte, as measured [s].
+    """
+
+    url: str = ""
+    camera: int = 1
+    user: str = ""
+    password: str = ""
+    size: Size = (704, 576)
+    resolution: str = "4CIF"
+    rate_hz: float = 25.0
+    compression: int = 30
+    latency_s: float = 0.1
+
+
+@dataclass(frozen=True)
+class HardwareZoom:
+    """The zoom camera, by gphoto2.
+
+    Attributes:
+        port: "usb:", "usb:BUS,DEVICE" or "ptpip:host:port:port", as gphoto2 writes them.
+        model: as gphoto2 calls it; empty for the one that it finds there.
+        settings: what else to set when it is opened, by gphoto2's names.
+        zoom_key: gphoto2's name of the setting that moves the lens.
+        lens: (position, focal length [mm]) of some positions, from the shortest to the longest; between them the
+            logarithm of the focal length is interpolated.
+        lens_speed: positions a second, to tell when the lens stands; the camera does not.
+        size: (width, height) of the frames of the viewfinder [px].
+        still_size: the same of full stills [px].
+        pitch_mm: size of a pixel of the viewfinder's frames [mm].
+        rate_hz: frames of the viewfinder a second, at most.
+        latency_s: from light to a frame, as measured [s].
+        command_delay_s: from a command to the start of the lens's motion [s].
+    """
+
+    port: str = ""
+    model: str = ""
+    settings: Mapping[str, str] = field(default_factory=dict)
+    zoom_key: str = "zoom"
+    lens: tuple[Annotated[tuple[int, float], "[position, mm]"], ...] = S5_IS_LENS
+    lens_speed: float = 60.0
+    size: Size = (320, 240)
+    still_size: Size = (3264, 2448)
+    pitch_mm: float = 0.01794
+    rate_hz: float = 15.0
+    latency_s: float = 0.1
+    command_delay_s: float = 0.05
+
+
+@dataclass(frozen=True)
+class HardwareBoard:
+    """Who holds the calibration board: "person", or a program at "socket://host:port"."""
+
+    presenter: str = "person"
+
+
+@dataclass(frozen=True)
+class HardwareConfig:
+    """The real devices."""
+
+    head: HardwareHead = HardwareHead()
+    fixed: HardwareFixed = HardwareFixed()
+    zoom: HardwareZoom = field(default_factory=HardwareZoom)
+    board: HardwareBoard = HardwareBoard()
+
+
+def socket_address(url: str) -> tuple[str, int] | None:
+    """Host and port of "socket://host:port"; None for anything else."""
+    match = SOCKET.fullmatch(url)
+    return None if match is None else (match[1].strip("[]"), int(match[2]))
+
+
+def check_hardware(hardware: HardwareConfig) -> None:
+    """Refuse values of the right type that make no sense; devices that are not named are no mistake yet.
+
+    Raises:
+        ConfigError: with the key.
+    """
+    head, fixed, zoom = hardware.head, hardware.fixed, hardware.zoom
+    if head.baud not in BAUDS:
+        raise ConfigError(f"hardware.head.baud: {head.baud} is not one of: {', '.join(map(str, BAUDS))}")
+    for name, limits in (("pan_deg", head.pan_deg), ("tilt_deg", head.tilt_deg)):
+        if limits[0] >= limits[1]:
+            raise ConfigError(f"hardware.head.{name}: {list(limits)} is not [lowest, highest]")
+    if fixed.url and not _is_web_address(fixed.url):
+        raise ConfigError(f"hardware.fixed.url: '{fixed.url}' is not like http://192.168.0.90")
+    if not 0 <= fixed.compression <= 100:
+        raise ConfigError(f"hardware.fixed.compression: {fixed.compression} is not within 0 to 100")
+    if len(zoom.lens) < 2 or any(b[0] <= a[0] or b[1] <= a[1] for a, b in itertools.pairwise(zoom.lens)):
+        raise ConfigError("hardware.zoom.lens: needs two or more [position, mm], both of them increasing")
+    presenter = hardware.board.presenter
+    if presenter != "person" and socket_address(presenter) is None:
+        raise ConfigError(f"hardware.board.presenter: '{presenter}' is neither person nor like socket://host:port")
+    positive: dict[str, tuple[float, ...]] = {
+        "head.step_deg": (head.step_deg,),
+        "head.speed_deg_s": (head.speed_deg_s,),
+        "fixed.camera": (fixed.camera,),
+        "fixed.size": fixed.size,
+        "fixed.rate_hz": (fixed.rate_hz,),
+        "zoom.size": zoom.size,
+        "zoom.still_size": zoom.still_size,
+        "zoom.lens": (zoom.lens[0][1],),
+        "zoom.lens_speed": (zoom.lens_speed,),
+        "zoom.pitch_mm": (zoom.pitch_mm,),
+        "zoom.rate_hz": (zoom.rate_hz,),
+    }
+    not_negative = {
+        "head.command_delay_s": head.command_delay_s,
+        "fixed.latency_s": fixed.latency_s,
+        "zoom.latency_s": zoom.latency_s,
+        "zoom.command_delay_s": zoom.command_delay_s,
+    }
+    for where, values in positive.items():
+        if min(values) <= 0:
+            raise ConfigError(f"hardware.{where}: {min(values):g} is not greater than zero")
+    for where, value in not_negative.items():
+        if value < 0:
+            raise ConfigError(f"hardware.{where}: {value:g} is negative")
+
+
+def _is_web_address(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # an address in brackets that is none, a port that is no number
+        return False
+
+
+# --- simchecks ---
+
+# The curves of the zoom lens are checked at this many focal lengths.
+CHECKED_FOCALS = 33
+# Farther than any lens is long: an entrance pupil that moves so far was given in millimetres [m].
+FARTHEST_PUPIL = 1.0
+# Beyond these it is another unit that was meant: of millimetres, degrees, frames a second and grey levels.
+MOST_AXIS_OFFSET_MM, MOST_SQUARENESS_DEG, MOST_RATE_HZ, MOST_NOISE = 1000.0, 45.0, 1000.0, 255.0
+MODEL_SUFFIXES = (".obj", ".stl", ".xml")  # of what a target of one's own is made of
+
+
+def check_sim(sim: SimConfig) -> None:
+    """Refuse a simulated world that cannot be.
+
+    Raises:
+        ConfigError: with the key.
+    """
+    check_numbers(sim)
+    for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
+        _check_center(f"sim.{name}", camera)
+        _check_frame_time(f"sim.{name}", camera)
+        _check_lens(f"sim.{name}", camera)
+    if sim.effects.optics:
+        _check_optics(sim.zoom)
+    for name, waypoints in sim.paths.items():
+        if len(waypoints) < 2 or any(b[0] <= a[0] for a, b in itertools.pairwise(waypoints)):
+            raise ConfigError(f"sim.paths.{name}: needs two or more waypoints [t, x, y, z] with increasing t")
+    _check_models(sim)
+    _check_targets(sim)
+    for name in sim.targets:
+        if split_name(name)[0] in sim.models and name not in sim.paths:
+            raise ConfigError(
+                f"sim.targets: a {name} of your own needs a way: [sim.paths] {name} = [[t, x, y, z], ...]"
+            )
+
+
+def check_numbers(sim: SimConfig) -> None:
+    """Refuse what no rig can be, simulated or of a recording: sizes, rates and limits.
+
+    Raises:
+        ConfigError: with the key.
+    """
+    positive: dict[str, tuple[float, ...]] = {
+        "sim.zoom.pitch_mm": (sim.zoom.pitch_mm,),
+        "sim.zoom.lens_speed": (sim.zoom.lens_speed,),
+        "sim.head.speed_deg_s": (sim.head.speed_deg_s,),
+        "sim.head.accel_deg_s2": (sim.head.accel_deg_s2,),
+    }
+    not_negative: dict[str, tuple[float, ...]] = {
+        "sim.seed": (sim.seed,),
+        "sim.head.step_deg": (sim.head.step_deg,),
+        "sim.head.command_delay_s": (sim.head.command_delay_s,),
+        "sim.head.backlash_deg": (sim.head.backlash_deg,),
+    }
+    for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
+        positive[f"sim.{name}.size"] = camera.size
+        positive[f"sim.{name}.focal_px"] = camera.focal_px
+        positive[f"sim.{name}.rate_hz"] = (camera.rate_hz,)
+        not_negative[f"sim.{name}.noise"] = (camera.noise,)
+        not_negative[f"sim.{name}.latency_s"] = (camera.latency_s,)
+        not_negative[f"sim.{name}.exposure_s"] = (camera.exposure_s,)
+        if not 1 <= camera.jpeg_quality <= 100:
+            raise ConfigError(f"sim.{name}.jpeg_quality: {camera.jpeg_quality} is not within 1 to 100")
+    for where, values in positive.items():
+        if min(values) <= 0:
+            raise ConfigError(f"{where}: {min(values):g} is not greater than zero")
+    for where, values in not_negative.items():
+        if min(values) < 0:
+            raise ConfigError(f"{where}: {min(values):g} is negative")
+    at_most: dict[str, tuple[float, float]] = {
+        "sim.head.axis_offset_mm": (abs(sim.head.axis_offset_mm), MOST_AXIS_OFFSET_MM),
+        "sim.head.squareness_deg": (abs(sim.head.squareness_deg), MOST_SQUARENESS_DEG),
+        "sim.fixed.rate_hz": (sim.fixed.rate_hz, MOST_RATE_HZ),
+        "sim.zoom.rate_hz": (sim.zoom.rate_hz, MOST_RATE_HZ),
+        "sim.fixed.noise": (sim.fixed.noise, MOST_NOISE),
+        "sim.zoom.noise": (sim.zoom.noise, MOST_NOISE),
+    }
+    for where, (value, most) in at_most.items():
+        if value > most:
+            raise ConfigError(f"{where}: {value:g} is more than {most:g}")
+    ranges = {
+        "sim.head.pan_deg": sim.head.pan_deg,
+        "sim.head.tilt_deg": sim.head.tilt_deg,
+        "sim.zoom.focal_mm": sim.zoom.focal_mm,
+    }
+    for where, limits in ranges.items():
+        if limits[0] >= limits[1]:
+            raise ConfigError(f"{where}: {list(limits)} is not [lowest, highest]")
+    if sim.zoom.focal_mm[0] <= 0:
+        raise ConfigError(f"sim.zoom.focal_mm: {sim.zoom.focal_mm[0]:g} is not greater than zero")
+    if sim.zoom.lens_steps < 2:
+        raise ConfigError(f"sim.zoom.lens_steps: {sim.zoom.lens_steps} is fewer than 2")
+
+
+def told_targets(own: Iterable[str] = ()) -> str:
+    """Which targets the simulation has, with those of [sim.models], for messages."""
+    return (
+        f"the simulation has: {choices([*TARGETS, *own])}, and further ones with a number, as 'bird2'; others need a "
+        "model: [sim.models]"
+    )
+
+
+def _check_models(sim: SimConfig) -> None:
+    """Refuse models of targets that the simulation has, and files that can be none."""
+    for name, path in sim.models.items():
+        if name in TARGETS:
+            raise ConfigError(f"sim.models.{name}: the simulation has a {name} of its own; give yours another name")
+        if split_name(name)[1] > 1:
+            raise ConfigError(f"sim.models.{name}: a model is of a kind; give its name without the number")
+        if path.suffix not in MODEL_SUFFIXES:
+            raise ConfigError(f"sim.models.{name}: {path} is not one of: {choices(MODEL_SUFFIXES)}")
+
+
+def _check_targets(sim: SimConfig) -> None:
+    """Refuse targets of which there is no model, and two of a name."""
+    for where, names in (("sim.targets", sim.targets), ("sim.paths", tuple(sim.paths))):
+        for at, name in enumerate(names):
+            if split_name(name)[0] not in (*TARGETS, *sim.models):
+                raise ConfigError(f"{where}: unknown target '{name}'; {told_targets(sim.models)}")
+            if name in names[:at]:
+                kind = split_name(name)[0]
+                free = next(f"{kind}{number}" for number in itertools.count(2) if f"{kind}{number}" not in names)
+                raise ConfigError(f"{where}: '{name}' is named twice; a further one has a number, as '{free}'")
+
+
+def _check_frame_time(where: str, camera: SimCamera) -> None:
+    """Refuse an exposure that does not end before the next begins."""
+    if camera.rate_hz > 0 and camera.exposure_s * camera.rate_hz > 1:
+        raise ConfigError(
+            f"{where}.exposure_s: {camera.exposure_s:g} s is longer than the {1 / camera.rate_hz:g} s from one frame "
+            f"to the next, of which {camera.rate_hz:g} come a second"
+        )
+
+
+def _check_center(where: str, camera: SimCamera) -> None:
+    """Refuse a principal point outside of the picture, as one that was meant for a larger picture."""
+    (u, v), (width, height) = camera.center_px, camera.size
+    if min(camera.size) > 0 and not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+        raise ConfigError(
+            f"{where}.center_px: ({u:g}, {v:g}) is not in the {width}x{height} image; give one near its middle, or none"
+        )
+
+
+def _sees_nothing(lens: Intrinsics) -> bool:
+    """Whether part of the image has no ray."""
+    w, h = lens.size
+    rim = np.array([(u, v) for u in np.linspace(-1, w, 9) for v in np.linspace(-1, h, 9)])
+    return not np.isfinite(lens.ray(rim)).all()
+
+
+def _check_lens(where: str, camera: SimCamera) -> None:
+    """Refuse a lens through which part of the image sees nothing."""
+    if min(*camera.size, *camera.focal_px) <= 0:
+        return  # said elsewhere
+    if _sees_nothing(Intrinsics(camera.size, camera.focal_px, camera.center_px, camera.distortion)):
+        raise ConfigError(
+            f"{where}.distortion: {list(camera.distortion)} folds back inside the image, so that parts of it see "
+            "nothing; give a weaker distortion, a longer focal_px or a smaller size"
+        )
+
+
+def _check_optics(zoom: SimZoomCamera) -> None:
+    """Refuse a zoom lens whose curves no real lens follows."""
+    shortest_mm, longest_mm = zoom.focal_mm
+    before = 0.0
+    for magnification in np.geomspace(1.0, longest_mm / shortest_mm, CHECKED_FOCALS).tolist():
+        optics, at = zoom.optics_at(magnification), f"at {magnification:.3g} times the shortest focal length"
+        focal = optics.focal_px[0]
+        if not before < focal < math.inf:
+            raise ConfigError(f"sim.zoom.focal_curve: the true focal length does not grow with the nominal one {at}")
+        before = focal
+        drift = np.abs(np.subtract(optics.center_px, zoom.center_px))
+        if not (drift < zoom.size).all():
+            raise ConfigError(f"sim.zoom.center_drift_px: moves the centre by the whole image or more {at}")
+        if not abs(optics.pupil) < FARTHEST_PUPIL:
+            raise ConfigError(f"sim.zoom.pupil: {optics.pupil:g} m {at} is {FARTHEST_PUPIL:g} m or more; give metres")
+        lens = Intrinsics(zoom.size, optics.focal_px, optics.center_px, optics.distortion)
+        if not np.isfinite(optics.distortion).all() or _sees_nothing(lens):
+            raise ConfigError(
+                f"sim.zoom.distortion_drift: the distortion folds back inside the image {at}, so that parts of it see "
+                "nothing; give smaller coefficients"
+            )
+
+
+# --- tables ---
+
+KINDS = {int: "whole numbers", float: "numbers", str: "texts"}  # what lists are of, beside lists
+
+
+def expect_table(value: Any, where: str) -> None:
+    """Refuse what is not a table."""
+    if not isinstance(value, Mapping):
+        raise ConfigError(f"{where}: {value!r} is not a table")
+
+
+def build(cls: type[Any], table: Any, where: str, base: Any = None) -> Any:
+    """Make a dataclass from a table.
+
+    Args:
+        cls: the dataclass; its fields' types say what each value must be.
+        table: of values; what is not said keeps its default.
+        where: dotted name of the table, for messages.
+        base: an instance whose values are the defaults instead.
+
+    Raises:
+        ConfigError: an unknown key with the valid ones, a missing key, or a value of the wrong kind.
+    """
+    expect_table(table, where or "the file")
+    hints = typing.get_type_hints(cls, include_extras=True)
+    unknown = sorted(set(table) - set(hints))
+    if unknown:
+        raise ConfigError(f"unknown key '{_join(where, unknown[0])}'; valid here: {choices(hints)}")
+    values = {name: _convert(hints[name], value, _join(where, name)) for name, value in table.items()}
+    if base is not None:
+        return dataclasses.replace(base, **values)
+    required = {
+        f.name
+        for f in dataclasses.fields(cls)
+        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+    }
+    missing = sorted(required - set(values))
+    if missing:
+        raise ConfigError(f"{where}: missing key '{missing[0]}'; needed here: {choices(required)}")
+    return cls(**values)
+
+
+def _join(where: str, name: str) -> str:
+    return f"{where}.{name}" if where else name
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    """Check one value against its field's type and convert it."""
+    hint, form = _parts(hint)
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):  # the only unions are "or None", which TOML cannot say
+        return _convert(args[0], value, where)
+    if origin is Literal:
+        if value not in args or isinstance(value, bool):
+            raise ConfigError(f"{where}: {value!r} is not one of: {choices(map(str, args))}")
+        return value
+    if hint is Path:
+        if not _convert(str, value, where):
+            raise ConfigError(f"{where}: is empty; give a path, or leave it out")
+        return Path(value)
+    if hint is RigidTransform:
+        return _convert_pose(value, where)
+    if dataclasses.is_dataclass(hint):
+        return build(typing.cast(type[Any], hint), value, where)
+    if origin is tuple:
+        return _convert_tuple(args, value, where, form)
+    if origin is Mapping or (isinstance(origin, type) and issubclass(origin, Mapping)):
+        expect_table(value, where)
+        return {key: _convert(args[1], item, _join(where, key)) for key, item in value.items()}
+    if hint is float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise ConfigError(f"{where}: {value!r} is not a finite number")
+        return float(value)
+    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
+        kinds = {int: "a whole number", str: "a text", bool: "true or false"}
+        raise ConfigError(f"{where}: {value!r} is not {kinds[hint]}")
+    return value
+
+
+def _parts(hint: Any) -> tuple[Any, str]:
+    """A type, and the words beside it for what its values are: `Annotated[type, words]`; empty where there are none."""
+    if typing.get_origin(hint) is Annotated:
+        hint, form = typing.get_args(hint)
+        return hint, form
+    return hint, ""
+
+
+def _convert_tuple(args: tuple[Any, ...], value: Any, where: str, form: str = "") -> tuple[Any, ...]:
+    several = args[-1] is Ellipsis
+    if several and not form and (one := _parts(args[0])[1]):
+        form = f"[{one}, ...]"
+    form = form and f", {form}"
+    if not isinstance(value, list):
+        kinds = [kind for kind in args if kind is not Ellipsis]
+        kind = KINDS.get(kinds[0] if len(set(kinds)) == 1 else float, "lists")
+        raise ConfigError(f"{where}: {value!r} is not a list of {'' if several else f'{len(args)} '}{kind}{form}")
+    if several:
+        return tuple(_convert(args[0], item, f"{where}[{i}]") for i, item in enumerate(value))
+    if len(value) != len(args):
+        raise ConfigError(f"{where}: has {len(value)} values where {len(args)} are wanted{form}")
+    return tuple(_convert(a, item, f"{where}[{i}]") for i, (a, item) in enumerate(zip(args, value, strict=True)))
+
+
+def _convert_pose(value: Any, where: str) -> RigidTransform:
+    expect_table(value, where)
+    keys = {"translation", "rotvec_deg"}
+    if set(value) != keys:
+        wrong = sorted(set(value) ^ keys)[0]
+        raise ConfigError(
+            f"{where}: {'unknown' if wrong in value else 'missing'} key '{wrong}'; needed: {choices(keys)}"
+        )
+    triple = (float, float, float)
+    translation = _convert_tuple(triple, value["translation"], f"{where}.translation", "[x, y, z]")
+    rotvec_deg = _convert_tuple(triple, value["rotvec_deg"], f"{where}.rotvec_deg", "[rx, ry, rz]")
+    try:
+        return pose(translation, rotvec_deg)
+    except ValueError as error:
+        raise ConfigError(f"{where}.{error}") from None
+
+
+def _as_tables(value: Any) -> Any:
+    """Dataclasses as tables, without what is None, for TOML cannot say that."""
+    if isinstance(value, RigidTransform):
+        return pose_dict(value)
+    if dataclasses.is_dataclass(value):
+        parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return {name: _as_tables(part) for name, part in parts.items() if part is not None}
+    if isinstance(value, Mapping):
+        return {key: _as_tables(part) for key, part in value.items()}
+    if isinstance(value, tuple):
+        return [_as_tables(part) for part in value]
+    return str(value) if isinstance(value, Path) else value
+
 
 ENCODING = "utf-8-sig"  # with the byte-order mark that some editors write, or without
 
@@ -318,3 +1152,17 @@ def _overlap(own: Pair, soft: Pair | None, where: str) -> Pair:
     if both[0] >= both[1]:
         raise ConfigError(f"{where}: {list(soft or own)} leaves nothing of the device's own range {list(own)}")
     return both
+
+
+def config_table(config: RigConfig) -> dict[str, Any]:
+    """Write a configuration as `parse_config` reads it.
+
+    Passwords stay behind; and so does what would keep a replay, which moves nothing, from running.
+    """
+    table: dict[str, Any] = _as_tables(dataclasses.replace(config, recording=None))
+    table["safety"].pop("stop_file", None)
+    fixed = table["hardware"]["fixed"]
+    fixed["password"] = ""
+    url = urlsplit(fixed["url"])
+    fixed["url"] = url._replace(netloc=url.netloc.rpartition("@")[2]).geturl()
+    return table

@@ -18,22 +18,15 @@ import numpy as np
 
 from cotarget.calibration import Calibration, calibrate_rig, save_calibration
 from cotarget.config import RigConfig
+from cotarget.control.controller import reach_of
 from cotarget.detection import make_detector
-from cotarget.drawing import (
-    TargetStages,
-    captioned,
-    draw_frames,
-    side_by_side,
-    write_picture,
-)
+from cotarget.drawing import TargetStages, captioned, draw_frames, plot_aim_error, side_by_side, write_picture
 from cotarget.errors import ConfigError
-from cotarget.judging import add_row, pointing_errors
-from cotarget.loop import FollowSettings, follow
+from cotarget.evaluation import add_row, pointing_errors
 from cotarget.metrics import Row, Score, score, write_rows
 from cotarget.parallel import Report, run_side_by_side
-from cotarget.plots import plot_aim_error
+from cotarget.pipeline import FollowSettings, follow
 from cotarget.safety import SafeRig
-from cotarget.servo import reach_of
 from cotarget.sim.world import SimWorld
 from cotarget.video import FilmWriter, join_films
 

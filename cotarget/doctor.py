@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from cotarget.assets import assets_dir
 from cotarget.errors import ConfigError, CotargetError, EmergencyStopError, MissingPackageError
+from cotarget.files import assets_dir
 
 if TYPE_CHECKING:
     from cotarget.config import HardwareConfig, RigConfig
@@ -30,7 +30,7 @@ PACKAGES = (
 OLDEST_PYTHON = (3, 11)
 # Rendering is tried in a process of its own, because a broken OpenGL may take its process with it.
 RENDER = (
-    "from cotarget.sim.opengl import BACKEND, make_renderer, mujoco;"
+    "from cotarget.sim.render.opengl import BACKEND, make_renderer, mujoco;"
     "m = mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size=\"1\"/></worldbody></mujoco>');"
     "r = make_renderer(m, 64, 48); r.update_scene(mujoco.MjData(m)); r.render(); r.close(); print(BACKEND)"
 )
@@ -121,7 +121,7 @@ def _codec() -> Finding:
 
 
 def _serial_ports() -> Finding:
-    from cotarget.hardware.serialport import ports
+    from cotarget.drivers.serial_line import ports
 
     try:
         found = [f"{device} ({description})" for device, description in ports()]
@@ -131,7 +131,7 @@ def _serial_ports() -> Finding:
 
 
 def _gphoto_cameras(needed: bool) -> Finding:
-    from cotarget.hardware.gphoto import cameras
+    from cotarget.drivers.gphoto import cameras
 
     note = "" if needed else " (none is needed for the simulation)"
     try:
@@ -158,7 +158,7 @@ def _emergency_stop(config: "RigConfig") -> Finding:
 
 def _position(config: "RigConfig") -> Finding:
     """Whether anybody has noted that the head is not where it says."""
-    from cotarget.hardware.d46lost import LostPosition
+    from cotarget.drivers.interlock import LostPosition
 
     try:
         LostPosition(config.hardware.head.port, config.safety.stop_file).refuse()
@@ -169,11 +169,11 @@ def _position(config: "RigConfig") -> Finding:
 
 def _devices(hardware: "HardwareConfig") -> list[Finding]:
     """Ask the devices who they are."""
-    from cotarget.hardware import axis, board, d46unit, gphoto
+    from cotarget.drivers import axis, board, gphoto, ptu_d46
 
     head, zoom = hardware.head, hardware.zoom
     questions: tuple[tuple[str, str, Callable[[], str]], ...] = (
-        ("head", head.port, lambda: d46unit.probe(head.port, head.baud)),
+        ("head", head.port, lambda: ptu_d46.probe(head.port, head.baud)),
         ("fixed", hardware.fixed.url, lambda: axis.probe(hardware.fixed)),
         ("zoom", zoom.port, lambda: gphoto.probe(zoom.port, zoom.model)),
         ("board", hardware.board.presenter, lambda: board.probe(hardware.board)),
@@ -192,8 +192,8 @@ def _devices(hardware: "HardwareConfig") -> list[Finding]:
 
 def _fix(error: CotargetError, name: str, there: str) -> str:
     """What helps with a device that does not answer as it should."""
-    from cotarget.hardware.serialport import InUseError, NoPermissionError
-    from cotarget.hardware.vapix import LoginError
+    from cotarget.drivers.axis import LoginError
+    from cotarget.drivers.serial_line import InUseError, NoPermissionError
 
     match error:
         case MissingPackageError():

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.errors import ConfigError, DeviceError
+from cotarget.errors import DeviceError
 from cotarget.geometry import RigidTransform
 
 if TYPE_CHECKING:
-    from cotarget.config import RigConfig
+    pass
+
 
 Image = npt.NDArray[np.uint8]
 Angles = tuple[float, float]  # pan and tilt [rad]
@@ -204,28 +205,3 @@ class Rig(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Halt, then close."""
-
-
-def open_rig(config: "RigConfig") -> Rig:
-    """Open the rig that a configuration describes; the only place that imports a backend.
-
-    Raises:
-        ConfigError: the configuration does not say enough of that rig.
-        DeviceError: a device could not be opened.
-    """
-    match config.backend:
-        case "sim":
-            from cotarget.sim.world import SimWorld
-
-            return SimWorld(config).rig
-        case "hardware":
-            from cotarget.hardware.rig import open_hardware
-
-            return open_hardware(config)
-        case "replay":
-            from cotarget.recordreader import open_recording
-            from cotarget.replay import ReplayRig
-
-            if config.recording is None:
-                raise ConfigError("recording: is missing; backend 'replay' needs the folder of a recording")
-            return ReplayRig(open_recording(config.recording))

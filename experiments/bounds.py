@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from cotarget.errors import ConfigError
-from cotarget.outputs import write_whole
+from cotarget.files import write_whole
 from experiments.harness import Experiment
 from experiments.texts import plain
 

@@ -19,12 +19,15 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from cotarget.board import board_points
 from cotarget.calibration import Options, calibrate_views, predicted_pointing
-from cotarget.calibration.boards import board_points
 from cotarget.config import BoardConfig
 from experiments.checks import check_above, check_session
-from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.synthetic import LONGEST_PX, SIZES, Placing, Truth, draw_targets, misses, spread_views
+from experiments.harness import Experiment, Row, Settings, seeds_of
+from experiments.synthetic.aims import draw_targets, misses
+from experiments.synthetic.rig import LONGEST_PX, SIZES, Truth
+from experiments.synthetic.views import Placing, spread_views
+from experiments.texts import rms, table
 
 BOARD = BoardConfig()
 RIG = Truth()

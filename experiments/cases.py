@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from cotarget.config import build
 from cotarget.errors import ConfigError, choices
-from cotarget.tables import build
 from experiments.harness import Experiment, Settings
 from experiments.results import identity
 

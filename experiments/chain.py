@@ -19,26 +19,19 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from cotarget.board import board_points
 from cotarget.calibration import Calibration, Covariance, Options, calibrate_views, predicted_pointing
-from cotarget.calibration.boards import board_points
-from cotarget.calibration.bundle import fit
-from cotarget.calibration.parameters import ALL_BLOCKS, Block, parameter_names
-from cotarget.calibration.placing import place_boards
+from cotarget.calibration.bundle import ALL_BLOCKS, Block, fit, parameter_names
+from cotarget.calibration.initialization import place_boards
 from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from cotarget.geometry import Array
 from experiments.checks import check_session
-from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.synthetic import (
-    LONGEST_PX,
-    SIZES,
-    Placing,
-    Truth,
-    draw_targets,
-    misses,
-    other_rig,
-    spread_views,
-)
+from experiments.harness import Experiment, Row, Settings, seeds_of
+from experiments.synthetic.aims import draw_targets, misses
+from experiments.synthetic.rig import LONGEST_PX, SIZES, Truth, other_rig
+from experiments.synthetic.views import Placing, spread_views
+from experiments.texts import rms, table
 
 FINE_BOARD = BoardConfig(corners=(14, 11), square=0.068)
 CASES = {

@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator, Sequence
 
-from cotarget.calibration.intrinsics import FEWEST_VIEWS
+from cotarget.calibration.initialization import FEWEST_VIEWS
 from cotarget.errors import ConfigError
-from cotarget.sim.fieldpaths import SECONDS
+from cotarget.sim.targets.random_paths import SECONDS
 from experiments.harness import Settings
 
 FEWEST_LOOKS = 2  # at a board that stays where it is, that tell how the zoom camera sits on the head

@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from cotarget.cli.arguments import count, not_negative, progress_bar
-from cotarget.cli.parsers import Parser
+from cotarget.cli.common import count, not_negative, progress_bar
+from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, CotargetError
-from cotarget.report.wording import count as number_of
+from cotarget.report.text import count as number_of
 from experiments.arguments import check_folder
 from experiments.bounds import EXPECTED, tighten
 from experiments.cases import Case, Known, choose, known_experiments

@@ -17,13 +17,14 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
-from cotarget.deadzone import SteeringSettings
-from cotarget.loop import FollowSettings
+from cotarget.control.head import SteeringSettings
 from cotarget.metrics import score
+from cotarget.pipeline import FollowSettings
 from experiments.field import FieldSettings, calibrated, held, target_of
 from experiments.field_scenes import hold_config
-from experiments.harness import Experiment, Row, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of
 from experiments.spread import in_words, spread_of
+from experiments.texts import table
 from experiments.wide_view import record
 
 WAYS = {"with": SteeringSettings(), "without": SteeringSettings(spared=False)}

@@ -21,14 +21,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig
-from cotarget.loop import FollowSettings
+from cotarget.config import RigConfig, SimZoomCamera
 from cotarget.metrics import score
-from cotarget.simconfig import SimZoomCamera
+from cotarget.pipeline import FollowSettings
 from experiments.field import FieldSettings, calibrated, held, target_of
 from experiments.field_scenes import COMMAND_DELAY_S, LATENCY_S, hold_config
-from experiments.harness import Experiment, Row, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of
 from experiments.spread import in_words, spread_of
+from experiments.texts import table
 from experiments.wide_view import record
 
 FIELD_S = LATENCY_S + COMMAND_DELAY_S

@@ -30,9 +30,11 @@ from cotarget.camera import depth_from_size
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array
 from experiments.checks import check_above, check_least
-from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, seeds_of
 from experiments.mounted import TARGET, at, cell_name, exact_calibration, mounted, off_px, wanted_focal_px
-from experiments.synthetic import SIZE, Truth, aim, looking_off
+from experiments.synthetic.aims import aim, looking_off
+from experiments.synthetic.rig import SIZE, Truth
+from experiments.texts import rms, table
 
 CAUSES = ("wrong size", "scatter", "pixels", "together")
 # Monte Carlo over first order, the median over all: a size 10 % too large turns by 1 / 1.1 of what first order says.

@@ -22,19 +22,20 @@ from matplotlib.figure import Figure
 
 from cotarget.config import RigConfig, TargetConfig
 from cotarget.detection import make_detector
+from cotarget.evaluation import off_target, on_target
 from cotarget.geometry import Array
-from cotarget.judging import off_target, on_target
-from cotarget.metrics import WHOLLY_VISIBLE, false_tracks, id_switches
-from cotarget.metrics.held import BACKGROUND_S
+from cotarget.metrics import BACKGROUND_S, WHOLLY_VISIBLE, false_tracks, id_switches
 from cotarget.rig import Frame
-from cotarget.sim.appearances import Silhouette
-from cotarget.sim.fieldpaths import GROUPED, SECONDS
+from cotarget.sim.targets.random_paths import GROUPED, SECONDS
+from cotarget.sim.truth import Silhouette
 from cotarget.sim.world import SimWorld
-from cotarget.tracking import Tracker, settings_for
+from cotarget.tracking.track import settings_for
+from cotarget.tracking.tracker import Tracker
 from experiments.checks import check_above, check_ways
 from experiments.field_scenes import field_config, five_targets_config
-from experiments.harness import Experiment, Row, Settings, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, seeds_of
 from experiments.spread import in_words, points, spread
+from experiments.texts import table
 from experiments.wide_view import WIDE
 
 DetectorName = Literal["mog2", "motion", "speck"]

@@ -16,12 +16,13 @@ import gymnasium
 import numpy as np
 from matplotlib.figure import Figure
 
+from cotarget.control.selection import POLICIES
 from cotarget.env import FOLLOW, SCHEDULE, PipelinePolicy, SchedulingPolicy
-from cotarget.policies import POLICIES
-from cotarget.sim.fieldpaths import GROUPED, LONE, SECONDS
+from cotarget.sim.targets.random_paths import GROUPED, LONE, SECONDS
 from experiments.checks import check_above, check_ways
-from experiments.harness import Experiment, Row, Settings, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, seeds_of
 from experiments.spread import bars, mean_of
+from experiments.texts import table
 
 CHANCE, PIPELINE = "chance", "pipeline"
 SERVED = ", served"  # of a figure's name: how many targets, beside the reward

@@ -23,12 +23,13 @@ from matplotlib.figure import Figure
 
 from cotarget.config import RigConfig
 from cotarget.env import Follow, PipelinePolicy
-from cotarget.env.units import Vector
-from cotarget.sim.opengl import mujoco
+from cotarget.env.common import Vector
+from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.world import SimWorld
 from experiments.checks import check_above, check_least, check_ways
-from experiments.harness import Experiment, Row, Settings, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, seeds_of
 from experiments.plain_renderer import PlainRenderer
+from experiments.texts import table
 
 SIZE = (64, 64)
 BLOCK = 25  # steps of each, by turns: alone each finds the caches as the other left them

@@ -11,13 +11,12 @@ from dataclasses import dataclass
 from cotarget.calibration import Calibration, calibrate_rig
 from cotarget.config import RigConfig, TargetConfig
 from cotarget.detection import Detector, make_detector
-from cotarget.judging import add_row
-from cotarget.loop import FollowSettings, Step, follow
+from cotarget.evaluation import add_row, true_calibration
+from cotarget.metrics import BACKGROUND_S
 from cotarget.metrics import Row as Judged
-from cotarget.metrics.held import BACKGROUND_S
-from cotarget.oracle import true_calibration
+from cotarget.pipeline import FollowSettings, Step, follow
 from cotarget.safety import SafeRig
-from cotarget.sim.fieldpaths import SECONDS
+from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments import harness

@@ -1,18 +1,17 @@
 """The field in which targets are held: a book put elsewhere, a person walking, a bird flying, five of a kind at once.
 
 The rig is the default one under harder conditions: 1/100 s of exposure, 120 ms from light to frame, 80 ms from command
-to motion, and outdoors, with the clutter on. Paths are random by seed (`cotarget.sim.fieldpaths`).
+to motion, and outdoors, with the clutter on. Paths are random by seed (`cotarget.sim.targets.random_paths`).
 
 Accuracy runs that need no pictures open `SimWorld(config, rendered=())` and detect with
-`cotarget.oracle.TruthDetector`.
+`cotarget.evaluation.TruthDetector`.
 """
 
 from collections.abc import Mapping
 from dataclasses import replace
 
-from cotarget.config import RigConfig, SimConfig
-from cotarget.sim.fieldpaths import group_paths, lone_path
-from cotarget.simconfig import Waypoint
+from cotarget.config import RigConfig, SimConfig, Waypoint
+from cotarget.sim.targets.random_paths import group_paths, lone_path
 
 EXPOSURE_S = 0.01
 LATENCY_S = 0.12  # from light to frame, both cameras
@@ -35,7 +34,7 @@ def hold_config(name: str, seed: int, scene: str = SCENE) -> RigConfig:
 
 
 def five_targets_config(seed: int, kind: str = "person", scene: str = SCENE) -> RigConfig:
-    """Five persons or birds that cross the wide view, as `cotarget.sim.fieldpaths.group_paths` has them.
+    """Five persons or birds that cross the wide view, as `cotarget.sim.targets.random_paths.group_paths` has them.
 
     Args:
         seed: of everything random.

@@ -1,6 +1,7 @@
 """Fig. 4 of the paper: indoors, a book about 10 m away, found by its colours: before, centred, and close up.
 
-Each seed puts the book somewhere, and after a while elsewhere (`cotarget.sim.fieldpaths.lone_path`). At either place
+Each seed puts the book somewhere, and after a while elsewhere (`cotarget.sim.targets.random_paths.lone_path`). At
+either place
 the zoom camera begins where pan = tilt = 0; it is turned to the book with the lens kept at its shortest, as in the
 paper's Fig. 4(c), and then goes on to the close-up: once by this project's pipeline, and once as the paper does it
 (`experiments.paper_loop`), with the same calibration. What each zoom view shows is judged by the simulation's truth:
@@ -24,18 +25,19 @@ from cotarget.calibration import Calibration
 from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
 from cotarget.errors import ConfigError
-from cotarget.judging import observe
-from cotarget.loop import FollowSettings, Step
+from cotarget.evaluation import observe
 from cotarget.metrics import Row as Judged
+from cotarget.pipeline import FollowSettings, Step
 from cotarget.safety import SafeRig
-from cotarget.sim.fieldpaths import BOOK_MOVED_AT, BOOK_TAKES, lone_path
+from cotarget.sim.targets.random_paths import BOOK_MOVED_AT, BOOK_TAKES, lone_path
 from cotarget.sim.world import SimWorld
 from experiments.field import OwnRigInField, calibrated
-from experiments.harness import Experiment, Row, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of
 from experiments.panels import laid_out
 from experiments.paper_loop import OURS, WAYS, picture_name
 from experiments.pictured import Pictured
 from experiments.spread import in_words, points, spread, ways_of
+from experiments.texts import table
 
 NAME = "book"
 TURN_S = 1.2  # that the head is given to turn to the book, all latencies included [s]

@@ -23,10 +23,10 @@ from cotarget.calibration import Calibration
 from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
 from cotarget.errors import ConfigError
-from cotarget.judging import add_row
-from cotarget.loop import FollowSettings, Step
+from cotarget.evaluation import add_row
 from cotarget.metrics import Row as Judged
 from cotarget.metrics import score
+from cotarget.pipeline import FollowSettings, Step
 from cotarget.sim.world import SimWorld
 from experiments.field import OwnRigInField, calibrated, watched_in
 from experiments.harness import Experiment, Row, seeds_of
@@ -82,7 +82,7 @@ class PersonSettings(OwnRigInField):
 
     @property
     def lasting_s(self) -> tuple[float, float]:
-        """The person goes to and fro for good (`cotarget.sim.paths`)."""
+        """The person goes to and fro for good (`cotarget.sim.targets.paths`)."""
         return FIRST_S, math.inf
 
 

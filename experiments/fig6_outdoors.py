@@ -20,16 +20,15 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig, TargetConfig
+from cotarget.config import RigConfig, TargetConfig, Waypoint
 from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
 from cotarget.errors import ConfigError, choices
-from cotarget.judging import closeup_of, on_target
-from cotarget.loop import FollowSettings, Step
-from cotarget.sim.targets import PERSON_HEIGHT, draw_size, target_rng
+from cotarget.evaluation import closeup_of, on_target
+from cotarget.pipeline import FollowSettings, Step
+from cotarget.sim.targets.target import PERSON_HEIGHT, draw_size, target_rng
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
-from cotarget.simconfig import Waypoint
 from experiments.field import OwnRigInField, calibrated, watched_in
 from experiments.handover import Moment, figures
 from experiments.harness import Experiment, Row, seeds_of

@@ -25,9 +25,10 @@ from matplotlib.figure import Figure
 from cotarget.calibration import Calibration
 from experiments.field import FieldSettings, calibrated, target_of
 from experiments.field_scenes import LATENCY_S, hold_config
-from experiments.harness import Experiment, Row, rms, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of
 from experiments.shots import BEGIN_S, CAUSES, Fired, fire
 from experiments.spread import BESIDE, in_words, spread_of
+from experiments.texts import rms, table
 
 # What is wanted of each target, at least and at most.
 WANTED: Mapping[str, tuple[float, float]] = {

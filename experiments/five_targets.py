@@ -20,16 +20,17 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, TargetConfig
-from cotarget.judging import closeup_of
-from cotarget.loop import FollowSettings
+from cotarget.control.selection import POLICIES
+from cotarget.evaluation import closeup_of
 from cotarget.metrics import SERVED_S
-from cotarget.policies import POLICIES
-from cotarget.sim.fieldpaths import GROUP
+from cotarget.pipeline import FollowSettings
+from cotarget.sim.targets.random_paths import GROUP
 from cotarget.sim.truth import Truth
 from experiments.field import FieldSettings, calibrated, target_of, watched
 from experiments.field_scenes import five_targets_config
-from experiments.harness import Experiment, Row, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of
 from experiments.spread import BESIDE
+from experiments.texts import table
 from experiments.wide_view import WideView, record
 
 FIRST = "first-come"

@@ -13,9 +13,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cotarget.cli.parsers import Parser
+from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, CotargetError, choices
-from cotarget.outputs import write_whole
+from cotarget.files import write_whole
 from experiments.arguments import check_folder
 from experiments.harness import FIGURE
 from experiments.paper_loop import WAYS, picture_name

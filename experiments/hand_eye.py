@@ -19,15 +19,16 @@ from scipy.stats import chi2
 
 from cotarget.calibration.bundle import fit
 from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye_from_poses
-from cotarget.calibration.intrinsics import board_pose
-from cotarget.calibration.model import View
-from cotarget.calibration.parameters import RigModel
+from cotarget.calibration.initialization import board_pose
+from cotarget.calibration.model import RigModel, View
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import base_head
 from experiments.checks import check_above, check_least
-from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.synthetic import NOMINAL_PX, SIZE, Lens, Truth, noisy, seen_from
+from experiments.harness import Experiment, Row, Settings, seeds_of
+from experiments.synthetic.rig import NOMINAL_PX, SIZE, Lens, Truth
+from experiments.synthetic.views import noisy, seen_from
+from experiments.texts import rms, table
 
 LENS = Lens(693.0, 693.0, 319.5, 239.5)
 COLUMNS, ROWS, WIDTH, HEIGHT = 14, 11, 0.89, 0.67  # corners, and between the outer ones [m]

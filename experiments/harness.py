@@ -26,15 +26,13 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from tqdm import tqdm
 
-from cotarget.cli.arguments import count, not_negative
-from cotarget.cli.parsers import Parser
+from cotarget.cli.common import count, not_negative
+from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, CotargetError, DeviceError
-from cotarget.outputs import write_whole
+from cotarget.files import write_whole
 from experiments.arguments import check_folder
 from experiments.pictured import Pictured, parted, shown
 from experiments.texts import in_one_line, plain
-from experiments.texts import rms as rms
-from experiments.texts import table as table
 from experiments.versions import versions
 from experiments.workers import Died, Engine, here, in_processes
 

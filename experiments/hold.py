@@ -23,8 +23,9 @@ from cotarget.calibration import Calibration
 from cotarget.metrics import score
 from experiments.field import FieldSettings, calibrated, held
 from experiments.field_scenes import hold_config
-from experiments.harness import Experiment, Row, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of
 from experiments.spread import in_words, points, spread_of
+from experiments.texts import table
 
 # What is wanted of each figure's median: at least, or at most.
 WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {

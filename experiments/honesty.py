@@ -17,13 +17,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
+from cotarget.board import board_points
 from cotarget.calibration import Calibration, Options, calibrate_views, predicted_pointing
-from cotarget.calibration.boards import board_points
-from cotarget.calibration.parameters import ALL_BLOCKS, parameter_names
+from cotarget.calibration.bundle import ALL_BLOCKS, parameter_names
 from cotarget.config import BoardConfig
 from experiments.checks import check_session
-from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.synthetic import LONGEST_PX, SIZES, Placing, Truth, draw_targets, misses, other_rig, spread_views
+from experiments.harness import Experiment, Row, Settings, seeds_of
+from experiments.synthetic.aims import draw_targets, misses
+from experiments.synthetic.rig import LONGEST_PX, SIZES, Truth, other_rig
+from experiments.synthetic.views import Placing, spread_views
+from experiments.texts import rms, table
 
 BOARD = BoardConfig()
 RIGS = {"default rig": Truth(), "toed-in rig": other_rig()}

@@ -16,16 +16,17 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import TargetConfig
-from cotarget.deadzone import Steering
+from cotarget.control.controller import NO_CHANGE
+from cotarget.control.head import Steering
+from cotarget.control.zoom import Expected, ZoomPolicy
 from cotarget.detection import Detection, Detector
 from cotarget.errors import UnreachableError
 from cotarget.geometry import Array
 from cotarget.pantilt import base_head, nearest, solve
 from cotarget.rig import Angles, Frame, Rig
-from cotarget.servo import NO_CHANGE
 from cotarget.sim.truth import Truth
-from cotarget.tracking import Tracker, settings_for
-from cotarget.zoompolicy import Expected, ZoomPolicy
+from cotarget.tracking.track import settings_for
+from cotarget.tracking.tracker import Tracker
 from experiments.lone_course import SEARCH_S, Course, Sighting
 
 COAST_S = 0.6  # so long a target out of sight is expected where it would be [s]

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cotarget.axisfilter import AxisFilter
 from cotarget.config import TargetConfig
-from cotarget.estimation.settings import estimation_settings_for
+from cotarget.estimation.motion_model import estimation_settings_for
 from cotarget.rig import Angles
+from cotarget.tracking.track import AxisFilter
 
 SEARCH_S = 3.0  # so long a target out of sight is sought about where it should be [s]
 SIZES_S = 0.5  # so far back its size is looked at: a wing's beat or a step [s]

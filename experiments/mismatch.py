@@ -17,23 +17,16 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from cotarget.board import board_points
 from cotarget.calibration import View, calibrate_views, predicted_pointing
-from cotarget.calibration.boards import board_points
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
-from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.synthetic import (
-    LONGEST_PX,
-    SIZES,
-    Lens,
-    Placing,
-    Truth,
-    draw_targets,
-    misses,
-    spread_views,
-    with_lever_shifted,
-)
+from experiments.harness import Experiment, Row, Settings, seeds_of
+from experiments.synthetic.aims import draw_targets, misses
+from experiments.synthetic.rig import LONGEST_PX, SIZES, Lens, Truth, with_lever_shifted
+from experiments.synthetic.views import Placing, spread_views
+from experiments.texts import rms, table
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)

@@ -22,17 +22,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from cotarget.board import board_points
 from cotarget.calibration import Options, calibrate_views
-from cotarget.calibration.boards import board_points
-from cotarget.config import BoardConfig
+from cotarget.config import BoardConfig, SimHead
 from cotarget.geometry import Array
-from cotarget.simconfig import SimHead
 from experiments.checks import check_above, check_session
-from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, seeds_of
 from experiments.mounted import MOUNTED_DEG, at, cell_name, mounted, off_px, wanted_focal_px
 from experiments.regimes import FACTOR, ratios, reach, regime
 from experiments.simpler import CENTRING, FULL, IGNORED, MODELS, TABLE, TURNED, ZEROED, models_of
-from experiments.synthetic import SIZE, SIZES, Placing, looking_off, spread_views
+from experiments.synthetic.aims import looking_off
+from experiments.synthetic.rig import SIZE, SIZES
+from experiments.synthetic.views import Placing, spread_views
+from experiments.texts import rms, table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

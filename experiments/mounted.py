@@ -15,7 +15,7 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import HeadGeometry
 from experiments.random_rigs import OUT_OF_PLANE, any_direction, any_lens
-from experiments.synthetic import LONGEST_PX, NOMINAL_PX, SIZE, Lens, Truth, undistorted
+from experiments.synthetic.rig import LONGEST_PX, NOMINAL_PX, SIZE, Lens, Truth, undistorted
 
 MOUNTED_DEG = 1.5  # standard deviation of each of the three angles of a mounting by eye, as the default rig's
 LEVER = 0.15  # [m]

@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterator, Mapping
 
 from cotarget.calibration import Calibration
 from cotarget.config import TargetConfig
+from cotarget.control.controller import reach_of
 from cotarget.detection import Detector
 from cotarget.errors import UnreachableError
-from cotarget.eyes import Eyes
-from cotarget.loop import FollowSettings, State, Step, follow
+from cotarget.pipeline import Eyes, FollowSettings, State, Step, follow
 from cotarget.rig import Rig
-from cotarget.servo import reach_of
 from cotarget.targeting import Aim, Closeup, Method, aim, depth_of, point_at
-from cotarget.tracking import Track, Tracker, settings_for
+from cotarget.tracking.track import Track, settings_for
+from cotarget.tracking.tracker import Tracker
 
 METHOD: Method = "paper-table"  # the depth as Table 1 has it
 Follow = Callable[..., Iterator[Step]]  # with the arguments of `follow`

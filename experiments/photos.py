@@ -18,17 +18,17 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from cotarget.board import board_points
 from cotarget.calibration import Calibration, Options, calibrate_photos, calibrate_views
-from cotarget.calibration.boards import board_points
 from cotarget.calibration.bundle import fit
-from cotarget.calibration.placing import place_boards
+from cotarget.calibration.initialization import place_boards
 from cotarget.calibration.uncertainty import model_of
-from cotarget.cli.arguments import corners, count, positive
-from cotarget.cli.parsers import Parser
-from cotarget.config import BoardConfig
-from cotarget.rigchecks import FEWEST_CORNERS
+from cotarget.cli.common import corners, count, positive
+from cotarget.cli.main import Parser
+from cotarget.config import FEWEST_CORNERS, BoardConfig
 from experiments.checks import check_above, check_least
-from experiments.harness import Experiment, Row, Settings, rms, table
+from experiments.harness import Experiment, Row, Settings
+from experiments.texts import rms, table
 
 NOT_HELD_OUT = Options(folds=0)
 PHOTOS = Path(__file__).resolve().parents[2] / "shared" / "data" / "opencv_stereo"

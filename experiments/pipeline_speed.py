@@ -23,17 +23,19 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
 from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetConfig
+from cotarget.control.selection import FirstCome
 from cotarget.detection import Detector, make_detector
 from cotarget.errors import ConfigError
-from cotarget.oracle import true_calibration
-from cotarget.policies import FirstCome
-from cotarget.pursuit import Pursuit
+from cotarget.evaluation import true_calibration
+from cotarget.fusion import Pursuit
 from cotarget.rig import Frame, PanTiltLimits
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim
-from cotarget.tracking import Tracker, settings_for
+from cotarget.tracking.track import settings_for
+from cotarget.tracking.tracker import Tracker
 from cotarget.video import Film
-from experiments.harness import Experiment, Row, Settings, table
+from experiments.harness import Experiment, Row, Settings
+from experiments.texts import table
 
 FILM = Path(__file__).resolve().parents[2] / "shared" / "data" / "birds" / "V_BIRD_036.mp4"
 ALONE = "MOG2 alone"

@@ -4,11 +4,11 @@ import time
 
 import numpy as np
 
+from cotarget.config import Size
 from cotarget.sim.model import RENDER_PITCH, RIG, build_model
-from cotarget.sim.opengl import make_renderer, mujoco
+from cotarget.sim.render.opengl import make_renderer, mujoco
 from cotarget.sim.state import WorldState
 from cotarget.sim.world import CAMERAS, SimWorld
-from cotarget.simconfig import Size
 
 
 class PlainRenderer:

@@ -21,15 +21,16 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration, calibrate_rig
 from cotarget.config import RigConfig, SimConfig
+from cotarget.control.controller import reach_of
+from cotarget.evaluation import pointing_errors
 from cotarget.geometry import RigidTransform, pose
-from cotarget.judging import pointing_errors
 from cotarget.safety import SafeRig
-from cotarget.servo import reach_of
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Method
-from experiments.harness import Experiment, Row, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of
 from experiments.own_rig import OwnRig
 from experiments.spread import in_words, points, spread
+from experiments.texts import table
 
 RIGS = {
     "default": SimConfig(scene="indoor"),

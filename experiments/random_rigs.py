@@ -22,30 +22,18 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from cotarget.board import board_points
 from cotarget.calibration import Calibration, calibrate_views, predicted_pointing
-from cotarget.calibration.boards import board_points
-from cotarget.calibration.parameters import EVERY_BLOCK, POSE_PARAMETERS, parameter_names, stepped
+from cotarget.calibration.bundle import EVERY_BLOCK, POSE_PARAMETERS, parameter_names, stepped
 from cotarget.calibration.uncertainty import model_of
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
-from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
-from experiments.synthetic import (
-    BOARD_DEPTHS,
-    HEAD_LIMITS,
-    LONGEST_PX,
-    SIZES,
-    TARGET_DEPTHS,
-    Lens,
-    Placing,
-    Truth,
-    aimed,
-    draw_targets,
-    misses,
-    spread_views,
-    truth_of,
-    undistorted,
-)
+from experiments.harness import Experiment, Row, Settings, seeds_of
+from experiments.synthetic.aims import TARGET_DEPTHS, aimed, draw_targets, misses
+from experiments.synthetic.rig import LONGEST_PX, SIZES, Lens, Truth, truth_of, undistorted
+from experiments.synthetic.views import BOARD_DEPTHS, HEAD_LIMITS, Placing, spread_views
+from experiments.texts import rms, table
 
 BASELINES = (0.1, 10.0)  # [m]
 OUT_OF_PLANE = np.sin(np.radians(30.0))

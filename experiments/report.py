@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from cotarget.outputs import write_whole
-from cotarget.report import markup
-from cotarget.report.markup import Picture
+from cotarget.files import write_whole
+from cotarget.report import page as page_module
+from cotarget.report.figures import Picture
 from cotarget.report.page import STYLE
-from cotarget.report.tables import Table
-from cotarget.report.wording import count, digits, listed
+from cotarget.report.text import Table, count, digits, listed
 from experiments.bounds import WORSE, leaves
 from experiments.outcome import Outcome
 from experiments.sessions import Session
@@ -57,17 +56,17 @@ def write_report(path: Path, run: Run) -> None:
     links = [(anchor, outcome.case.title) for anchor, outcome in anchored]
     compared = list(_comparisons(run.outcomes))
     sections = [
-        markup.section("summary", "All at a glance", _summary(run)),
-        *(markup.section(anchor, outcome.case.title, _case(outcome)) for anchor, outcome in anchored),
-        *([markup.section("compared", "Settings compared", compared)] if compared else []),
-        markup.section("times", "Times", _times(run)),
-        markup.section("made", "How this was made", _made(run)),
+        page_module.section("summary", "All at a glance", _summary(run)),
+        *(page_module.section(anchor, outcome.case.title, _case(outcome)) for anchor, outcome in anchored),
+        *([page_module.section("compared", "Settings compared", compared)] if compared else []),
+        page_module.section("times", "Times", _times(run)),
+        page_module.section("made", "How this was made", _made(run)),
     ]
     more = [("compared", "settings compared")] if compared else []
     links += [*more, ("times", "times"), ("made", "how this was made")]
-    head = markup.header("The experiments of cotarget", [run.command]) + "\n" + _verdict(run)
-    body = "\n".join([head, markup.contents(links), *sections])
-    page = markup.document("The experiments of cotarget", STYLE.read_text(encoding="utf-8"), body)
+    head = page_module.header("The experiments of cotarget", [run.command]) + "\n" + _verdict(run)
+    body = "\n".join([head, page_module.contents(links), *sections])
+    page = page_module.document("The experiments of cotarget", STYLE.read_text(encoding="utf-8"), body)
     write_whole(path, page.encode())
 
 
@@ -90,12 +89,12 @@ def _verdict(run: Run) -> str:
     others = [outcome.case.title for outcome in run.outcomes if outcome.other_code]
     ran += f"; done by other code than this: {listed(others)}" if others else ""
     if wrong:
-        return markup.verdict("bad", "Something is wrong", f"{ran}: {'; '.join(wrong)}.")
+        return page_module.verdict("bad", "Something is wrong", f"{ran}: {'; '.join(wrong)}.")
     if short:
-        return markup.verdict("care", "Some figures are not what is wanted", f"{ran}: {listed(short)}.")
+        return page_module.verdict("care", "Some figures are not what is wanted", f"{ran}: {listed(short)}.")
     if not run.outcomes:
-        return markup.verdict("unknown", "Nothing was run", "There is nothing to tell.")
-    return markup.verdict("good", "All as it should be", f"{ran}; none failed, no bound is broken.")
+        return page_module.verdict("unknown", "Nothing was run", "There is nothing to tell.")
+    return page_module.verdict("good", "All as it should be", f"{ran}; none failed, no bound is broken.")
 
 
 def _summary(run: Run) -> Iterator[str]:
@@ -111,11 +110,11 @@ def _summary(run: Run) -> Iterator[str]:
         )
         for outcome in run.outcomes
     )
-    yield markup.table(Table("", header, rows))
+    yield page_module.table(Table("", header, rows))
     if any(outcome.case.quick and outcome.missed for outcome in run.outcomes):
-        yield markup.paragraph("A quick run is too short for what is wanted; it is held to its bounds.", "note")
+        yield page_module.paragraph("A quick run is too short for what is wanted; it is held to its bounds.", "note")
     if run.skipped:
-        yield markup.table(Table("Not run", ("experiment", "why"), tuple(run.skipped.items())))
+        yield page_module.table(Table("Not run", ("experiment", "why"), tuple(run.skipped.items())))
 
 
 def _wanted(outcome: Outcome) -> str:
@@ -139,44 +138,44 @@ def _named(numbers: Mapping[int, Any]) -> str:
 
 def _case(outcome: Outcome) -> Iterator[str]:
     case = outcome.case
-    yield markup.paragraph(case.experiment.purpose)
+    yield page_module.paragraph(case.experiment.purpose)
     if outcome.broken:
-        yield markup.paragraph(outcome.broken[:1].upper() + outcome.broken[1:] + ".")
+        yield page_module.paragraph(outcome.broken[:1].upper() + outcome.broken[1:] + ".")
     if outcome.text:
-        yield markup.preformatted(outcome.text)
+        yield page_module.preformatted(outcome.text)
     for name, png in outcome.pictures.items():
         caption = f"{name}.png, of seed {outcome.pictured}"
-        yield markup.figure(Picture(name, png, None, f"{case.experiment.name}: {caption}", caption))
+        yield page_module.figure(Picture(name, png, None, f"{case.experiment.name}: {caption}", caption))
     if outcome.picture is not None:
         name = case.experiment.name
-        yield markup.figure(Picture(name, outcome.picture, None, f"{name}: {outcome.caption}", outcome.caption))
+        yield page_module.figure(Picture(name, outcome.picture, None, f"{name}: {outcome.caption}", outcome.caption))
     if outcome.missed is not None:
         lost = outcome.missed
-        yield markup.subheading("Wanted figures")
-        yield markup.bullets(lost) if lost else markup.paragraph("All are met.")
+        yield page_module.subheading("Wanted figures")
+        yield page_module.bullets(lost) if lost else page_module.paragraph("All are met.")
     if outcome.bounds:
-        yield markup.subheading("Bounds")
+        yield page_module.subheading("Bounds")
         rows = tuple(
             (bound.name, bound.text, _figure(bound.reached), "yes" if bound.kept else "NO") for bound in outcome.bounds
         )
         note = f"The best that was reached before; what is up to {WORSE:g} times as bad is kept."
-        yield markup.table(Table("", ("figure", "bound", "reached", "kept"), rows, note))
+        yield page_module.table(Table("", ("figure", "bound", "reached", "kept"), rows, note))
     if outcome.failed:
-        yield markup.subheading("Failed jobs")
+        yield page_module.subheading("Failed jobs")
         why = tuple((str(number), record.failed) for number, record in outcome.failed.items())
-        yield markup.table(Table("", ("seed", "why"), why, "The next run tries them again."))
+        yield page_module.table(Table("", ("seed", "why"), why, "The next run tries them again."))
         tracebacks = {record.traceback: number for number, record in reversed(outcome.failed.items())}
         for text, number in reversed(tracebacks.items()):
             if text:
-                yield markup.folded(f"Traceback of seed {number}", markup.preformatted(text))
+                yield page_module.folded(f"Traceback of seed {number}", page_module.preformatted(text))
     told = {key: value for key, value in dataclasses.asdict(case.settings).items() if key != "processes"}
     settings = tuple((key, json.dumps(plain(value))) for key, value in told.items())
     done_by = sorted({record.version for record in outcome.records.values()})
     facts = (*settings, ("done by cotarget", listed(done_by)))
-    yield markup.folded("Settings and versions", markup.table(Table("", ("setting", "value"), facts)))
+    yield page_module.folded("Settings and versions", page_module.table(Table("", ("setting", "value"), facts)))
     if outcome.summary is not None:
         figures = tuple((" / ".join(trail), json.dumps(value)) for trail, value in leaves(plain(outcome.summary)))
-        yield markup.folded("Every figure", markup.table(Table("", ("figure", "value"), figures)))
+        yield page_module.folded("Every figure", page_module.table(Table("", ("figure", "value"), figures)))
 
 
 def _figure(value: float | None) -> str:
@@ -196,7 +195,7 @@ def _comparisons(outcomes: Sequence[Outcome]) -> Iterator[str]:
             for trail in trails
         )
         header = ("figure", *(", ".join(outcome.case.changes) for outcome in mine))
-        yield markup.table(Table(name, header, rows))
+        yield page_module.table(Table(name, header, rows))
 
 
 def _is_number(value: Any) -> bool:
@@ -204,7 +203,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _times(run: Run) -> Iterator[str]:
-    yield markup.paragraph(f"In all: {used(run)}.")
+    yield page_module.paragraph(f"In all: {used(run)}.")
     header = ("experiment", "jobs", "all together", "median", "longest", "shared", "processor", "renders", "alone")
     rows = [
         (
@@ -230,7 +229,7 @@ def _times(run: Run) -> Iterator[str]:
         "Processor time and renders, pictures that MuJoCo drew (a part of one counts as that part), are those of jobs "
         "and of what they share, processes that these start included. Jobs done alone measure times themselves."
     )
-    yield markup.table(Table("", header, tuple(rows), note))
+    yield page_module.table(Table("", header, tuple(rows), note))
     sessions = tuple(
         (
             each.began,
@@ -249,7 +248,7 @@ def _times(run: Run) -> Iterator[str]:
         "Without what was forgotten or belongs to experiments that are not reported here. Of a session that was killed "
         "the last seconds are missing."
     )
-    yield markup.table(Table("Sessions", heads, sessions, note))
+    yield page_module.table(Table("Sessions", heads, sessions, note))
 
 
 def used(run: Run) -> str:
@@ -267,13 +266,13 @@ def used(run: Run) -> str:
 
 
 def _made(run: Run) -> Iterator[str]:
-    yield markup.preformatted(run.command)
+    yield page_module.preformatted(run.command)
     made: dict[tuple[tuple[str, str], ...], list[str]] = {}
     for each in run.sessions:
         facts = {**each.versions, "cotarget": each.cotarget, "machine": each.machine}
         made.setdefault(tuple(facts.items()), []).append(each.began)
     for rows, began in made.items():
-        yield markup.table(
+        yield page_module.table(
             Table(f"Of the {count(len(began), 'session')} begun {listed(began)}", ("what", "value"), rows)
         )
 

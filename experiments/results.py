@@ -25,9 +25,8 @@ from typing import Any
 
 import cotarget
 import experiments
-from cotarget.assets import assets_dir
 from cotarget.errors import ConfigError
-from cotarget.outputs import write_whole
+from cotarget.files import assets_dir, write_whole
 from experiments.harness import Row, Settings
 from experiments.versions import versions
 

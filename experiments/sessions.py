@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from cotarget.config import build
 from cotarget.errors import ConfigError
-from cotarget.outputs import write_whole
-from cotarget.tables import build
+from cotarget.files import write_whole
 from experiments.results import code_version
 from experiments.versions import versions
 

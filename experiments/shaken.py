@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from cotarget.detection import Detection
-from cotarget.oracle import TruthDetector, TruthNoise, counted
+from cotarget.evaluation import TruthDetector, TruthNoise, counted
 from cotarget.rig import Frame, Image
-from cotarget.sim.outlines import Outlines
-from cotarget.sim.truth import Truth
+from cotarget.sim.truth import Outlines, Truth
 
 NOISE = TruthNoise()
 APART = 1 << 32  # of seeds: other numbers than the detectors'

@@ -28,9 +28,11 @@ from cotarget.errors import UnreachableError
 from cotarget.geometry import Array, RigidTransform
 from cotarget.targeting import METHODS, Method, Reach, aim
 from experiments.checks import check_above
-from experiments.harness import Experiment, Row, Settings, rms, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, seeds_of
 from experiments.mounted import at, exact_calibration, idealised, mounted, off_px, wanted_focal_px
-from experiments.synthetic import LONGEST_PX, NOMINAL_PX, SIZE, Truth, looking_off
+from experiments.synthetic.aims import looking_off
+from experiments.synthetic.rig import LONGEST_PX, NOMINAL_PX, SIZE, Truth
+from experiments.texts import rms, table
 from experiments.worked_example import X_FIXED_MM, X_ZOOM0_MM, stand_in
 
 if TYPE_CHECKING:

@@ -15,23 +15,23 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, TargetConfig
+from cotarget.control.controller import reach_of
+from cotarget.control.selection import FirstCome
 from cotarget.detection import make_detector
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
+from cotarget.evaluation import observe, true_calibration
+from cotarget.fusion import Pursuit
 from cotarget.geometry import Array
-from cotarget.judging import observe
-from cotarget.loop import State, Step
 from cotarget.metrics import Row as Judged
-from cotarget.oracle import true_calibration
-from cotarget.policies import FirstCome
-from cotarget.pursuit import Pursuit
+from cotarget.pipeline import State, Step
 from cotarget.rig import Frame, Rig, to_step
 from cotarget.safety import SafeRig
-from cotarget.servo import reach_of
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Aim, Reach, aim
-from cotarget.tracking import Track, Tracker, settings_for
+from cotarget.tracking.track import Track, settings_for
+from cotarget.tracking.tracker import Tracker
 
 # A head and a lens that are wherever they are sent within a millisecond.
 QUICK_DEG_S, QUICK_DEG_S2, QUICK_STEPS_S = 1e6, 1e9, 1e6

@@ -26,15 +26,16 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
-from cotarget.loop import FollowSettings, Step
-from cotarget.oracle import TruthDetector
+from cotarget.evaluation import TruthDetector
+from cotarget.pipeline import FollowSettings, Step
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments.checks import check_above, check_ways
 from experiments.field import FieldSettings, calibrated, target_of, watched, watched_in
 from experiments.field_scenes import hold_config
-from experiments.harness import Experiment, Row, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of
 from experiments.plain_renderer import PlainRenderer
+from experiments.texts import table
 
 IMAGE_EFFECTS = ("noise", "jpeg", "distortion", "blur", "clutter")
 TARGET = "bird"

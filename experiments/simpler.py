@@ -30,7 +30,8 @@ from cotarget.calibration import Calibration
 from cotarget.geometry import Array, RigidTransform, Rotation
 from experiments.mounted import at
 from experiments.pointing import without_offsets
-from experiments.synthetic import SIZE, Truth, aim, aimed, middle_of
+from experiments.synthetic.aims import aim, aimed
+from experiments.synthetic.rig import SIZE, Truth, middle_of
 
 Model = Callable[[Array, Array], Array]  # pixels (n, 2) and depths (n,) [m] -> pan and tilt (n, 2) [rad]
 

@@ -1,7 +1,8 @@
 """A single pan-tilt-zoom camera that has to find and follow its target by itself, against the pair: time on target.
 
 The field of `experiments.field_scenes` without its clutter: the same unit, lens, delays, ways and sizes, the rig known
-exactly. Nothing is rendered: detections are the truth with a detector's noise (`cotarget.oracle`), for the pair in its
+exactly. Nothing is rendered: detections are the truth with a detector's noise (`cotarget.evaluation`), for the pair in
+its
 wide camera, for the lone camera (`experiments.lone_camera`) in its own view; either believes them by the same tracker
 with the same settings, those of a detector that goes by what a target looks like, as a lone camera has no background.
 The pair finds the target in its zoom view besides. What is missed there while the picture moves, because head or lens
@@ -25,16 +26,16 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from cotarget.config import SimConfig
 from cotarget.errors import ConfigError
+from cotarget.metrics import BACKGROUND_S, score
 from cotarget.metrics import Row as Judged
-from cotarget.metrics import score
-from cotarget.metrics.held import BACKGROUND_S
-from cotarget.sim.fieldpaths import LONE, SECONDS
-from cotarget.simconfig import SimConfig
+from cotarget.sim.targets.random_paths import LONE, SECONDS
 from experiments.checks import check_above, check_ways
-from experiments.harness import Experiment, Row, Settings, seeds_of, table
+from experiments.harness import Experiment, Row, Settings, seeds_of
 from experiments.single_runs import PAIR, WAYS, held
 from experiments.spread import bars, mean_of
+from experiments.texts import table
 
 WIDE_PX = SimConfig().fixed.focal_px[0]
 LEAST_MISS = 0.05

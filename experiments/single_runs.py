@@ -8,16 +8,14 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, TargetConfig
-from cotarget.judging import closeup_of
-from cotarget.loop import FollowSettings, follow
-from cotarget.metrics import WHOLLY_VISIBLE
+from cotarget.evaluation import TruthDetector, TruthFinder, closeup_of, counted, true_calibration
+from cotarget.metrics import BACKGROUND_S, ROUNDING_S, WHOLLY_VISIBLE
 from cotarget.metrics import Row as Judged
-from cotarget.metrics.held import BACKGROUND_S, ROUNDING_S
-from cotarget.oracle import TruthDetector, TruthFinder, counted, true_calibration
 from cotarget.pantilt import towards
+from cotarget.pipeline import FollowSettings, follow
 from cotarget.rig import Rig
 from cotarget.safety import SafeRig
-from cotarget.sim.outlines import Outlines
+from cotarget.sim.truth import Outlines
 from cotarget.sim.world import SimWorld
 from experiments.field_scenes import hold_config
 from experiments.lone_camera import LoneCamera, scan_of

@@ -18,13 +18,15 @@ import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
+from cotarget.board import board_points
 from cotarget.calibration import Options, View, calibrate_views
-from cotarget.calibration.boards import board_points
-from cotarget.calibration.intrinsics import FEWEST_VIEWS
+from cotarget.calibration.initialization import FEWEST_VIEWS
 from cotarget.config import BoardConfig
 from experiments.checks import check_least
-from experiments.harness import Experiment, Row, Settings, seeds_of, table
-from experiments.synthetic import SIZE, SIZES, Truth, synthetic_views
+from experiments.harness import Experiment, Row, Settings, seeds_of
+from experiments.synthetic.rig import SIZE, SIZES, Truth
+from experiments.synthetic.views import synthetic_views
+from experiments.texts import table
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.harness import Row, table
+from experiments.harness import Row
+from experiments.texts import table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -22,7 +22,8 @@ from cotarget.detection import make_detector
 from cotarget.sim.world import SimWorld
 from experiments import chain
 from experiments.field_scenes import hold_config
-from experiments.harness import Experiment, Row, Settings, table
+from experiments.harness import Experiment, Row, Settings
+from experiments.texts import table
 from experiments.workers import in_processes
 
 PROCESSES = (1, 2)

@@ -23,11 +23,12 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration, calibrate_rig
 from cotarget.geometry import Array, RigidTransform, pose
-from cotarget.report.wording import value_and_sigma
+from cotarget.report.text import value_and_sigma
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
-from experiments.harness import Experiment, Row, rms, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of
 from experiments.own_rig import OwnRig
+from experiments.texts import rms, table
 
 # Table 2: rows of the paper's list [v, u]; the CCD's size and the pitch are the makers'.
 CAMERAS = {"zoom": "Canon PowerShot S5 IS (zoom camera)", "fixed": "Philips LTC 0600 (stationary camera)"}

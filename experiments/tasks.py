@@ -20,7 +20,7 @@ from experiments.pictured import parted
 from experiments.results import code_version, fingerprint
 from experiments.texts import in_one_line
 
-TALLY = "COTARGET_TALLY"  # of `cotarget.sim.opengl`, which many tasks have no need of
+TALLY = "COTARGET_TALLY"  # of `cotarget.sim.render.opengl`, which many tasks have no need of
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def _tallied() -> Iterator[Callable[[], int]]:
 
 def _drawn() -> float:
     """How many pictures MuJoCo has drawn in this process, which may have no need of it."""
-    opengl = sys.modules.get("cotarget.sim.opengl")
+    opengl = sys.modules.get("cotarget.sim.render.opengl")
     return 0 if opengl is None else opengl.Canvas.drawn
 
 

@@ -18,7 +18,7 @@ def versions() -> dict[str, str]:
     """Of what the figures depend on; of OpenGL who draws too, nothing where nobody does."""
     if OPENGL not in os.environ:
         try:
-            from cotarget.sim.opengl import renderer_version
+            from cotarget.sim.render.opengl import renderer_version
 
             os.environ[OPENGL] = renderer_version()
         except CotargetError:  # what needs no pictures is done all the same

@@ -14,9 +14,9 @@ import numpy as np
 
 from cotarget.config import RigConfig, TargetConfig
 from cotarget.detection import Detection, make_detector
-from cotarget.oracle import microseconds
+from cotarget.evaluation import microseconds
 from cotarget.rig import Camera, Frame, Image
-from cotarget.sim.appearances import CameraName
+from cotarget.sim.truth import CameraName
 from cotarget.sim.world import SimWorld
 
 WIDE: tuple[CameraName] = ("fixed",)

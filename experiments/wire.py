@@ -20,12 +20,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cotarget.cli.arguments import count, not_negative
-from cotarget.cli.parsers import Parser
+from cotarget.cli.common import count, not_negative
+from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, choices
 from experiments import wire_age, wire_command, wire_faults, wire_latency, wire_parity, wire_polls
 from experiments.bounds import compare
-from experiments.harness import TERMINATED, Experiment, Row, Settings, table
+from experiments.harness import TERMINATED, Experiment, Row, Settings
+from experiments.texts import table
 from experiments.wire_figures import AGAIN, FAULT_COLUMNS, PART_COLUMNS, bounded, missed, summarise
 
 NEVER = (0.0, 0.0)  # the bound of what no machine may do, however busy: hang, move beyond the limits

@@ -10,11 +10,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cotarget.emulators.axis import AxisServer
+from cotarget.config import HardwareFixed
+from cotarget.drivers.axis import AxisCamera
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.emulators.axis_241q import AxisServer
 from cotarget.emulators.plant import Feed, Picture
-from cotarget.hardware.axis import AxisCamera
-from cotarget.hardware.clock import MonotonicClock
-from cotarget.hwconfig import HardwareFixed
 from cotarget.rig import Image
 from experiments.harness import Row
 from experiments.wire_rig import beside, load

@@ -9,11 +9,12 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from cotarget.backends import open_rig
 from cotarget.config import RigConfig
 from cotarget.detection import Detection, Detector, make_detector
-from cotarget.hardware.clock import MonotonicClock
-from cotarget.loop import FollowSettings, follow
-from cotarget.rig import Camera, Clock, Frame, Image, PanTilt, PanTiltLimits, PanTiltState, Rig, Speed, open_rig
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.pipeline import FollowSettings, follow
+from cotarget.rig import Camera, Clock, Frame, Image, PanTilt, PanTiltLimits, PanTiltState, Rig, Speed
 from cotarget.safety import SafeRig
 from experiments.harness import Row
 from experiments.wire_rig import EmulatedRig, Tap, exact_calibration, load, tapped

@@ -25,7 +25,7 @@ from cotarget.calibration import save_calibration
 from cotarget.config import parse_config
 from cotarget.emulators.emulation import FAULTS
 from cotarget.geometry import Array
-from cotarget.sim.targets import waypoint_path
+from cotarget.sim.targets.paths import waypoint_path
 from cotarget.targeting import Reach, aim
 from experiments.harness import Row
 from experiments.wire_rig import MOUNT, EmulatedRig, end, exact_calibration, load

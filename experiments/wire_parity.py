@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from cotarget.backends import open_rig
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
 from cotarget.detection import make_detector
 from cotarget.emulators.world import paced
-from cotarget.loop import FollowSettings, follow
-from cotarget.rig import Rig, open_rig
+from cotarget.pipeline import FollowSettings, follow
+from cotarget.rig import Rig
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
 from experiments.harness import Row

@@ -5,12 +5,13 @@ from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from cotarget.emulators.d46 import D46, D46_FAULTS, D46_PAPER
+from cotarget.config import HardwareHead
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.polled_head import D46Head
 from cotarget.emulators.faults import Faults
-from cotarget.emulators.lines import SerialLine
-from cotarget.hardware.clock import MonotonicClock
-from cotarget.hardware.head import D46Head
-from cotarget.hwconfig import HardwareHead
+from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
+from cotarget.emulators.ptu_d46.unit import D46_PAPER
+from cotarget.emulators.serve import SerialLine
 from experiments.harness import Row
 from experiments.wire_rig import EmulatedRig, Tap, beside, load, tapped
 

@@ -20,9 +20,9 @@ import tomli_w
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, load_config
+from cotarget.drivers import ptu_protocol, serial_line
 from cotarget.errors import DeviceError
-from cotarget.hardware import line, serialport
-from cotarget.oracle import true_calibration
+from cotarget.evaluation import true_calibration
 from cotarget.sim.world import SimWorld
 
 READY, CONTROL = "connects to them", "control "  # what the command says when it is up, and where its faults are
@@ -175,10 +175,10 @@ def tapped(clock: Any) -> Iterator[list[Tap]]:
     taps: list[Tap] = []
 
     def tap(name: str, baud: int) -> Any:
-        taps.append(Tap(serialport.open_port(name, baud), clock))
+        taps.append(Tap(serial_line.open_port(name, baud), clock))
         return taps[-1]
 
-    with mock.patch.object(line, "open_port", tap):
+    with mock.patch.object(ptu_protocol, "open_port", tap):
         yield taps
 
 

@@ -25,7 +25,8 @@ from cotarget.camera import Intrinsics, focal_for_size
 from cotarget.geometry import Array, RigidTransform, Rotation, angle_between
 from cotarget.pantilt import base_head, shortcut, solve
 from experiments import harness
-from experiments.harness import Experiment, Row, table
+from experiments.harness import Experiment, Row
+from experiments.texts import table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -23,16 +23,16 @@ from matplotlib.ticker import NullLocator
 
 from cotarget.calibration import Calibration, calibrate_rig, predicted_pointing
 from cotarget.config import RigConfig, SimConfig, SimEffects
+from cotarget.control.controller import reach_of
+from cotarget.evaluation import pointing_errors, true_calibration
 from cotarget.geometry import RigidTransform, angle_between
-from cotarget.judging import pointing_errors
-from cotarget.oracle import true_calibration
 from cotarget.safety import SafeRig
-from cotarget.servo import reach_of
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments import harness
-from experiments.harness import Experiment, Row, rms, seeds_of, table
+from experiments.harness import Experiment, Row, seeds_of
 from experiments.spread import spread_of
+from experiments.texts import rms, table
 
 # What is wanted of each head's figures, at least and at most; of an ideal head nothing is rounded.
 WANTED: Mapping[str, tuple[float, float]] = {

@@ -1,10 +1,9 @@
 """The driver of the PTU-D46 and the tests' own unit on a line in simulated time."""
 
-from cotarget.hardware.d46loop import Loop
-from cotarget.hardware.d46unit import connect
-from cotarget.hardware.d46wishes import Halt, Move
-from cotarget.hardware.line import Line
-from cotarget.hwconfig import HardwareHead
+from cotarget.config import HardwareHead
+from cotarget.drivers.polled_head import Halt, Loop, Move
+from cotarget.drivers.ptu_d46 import connect
+from cotarget.drivers.ptu_protocol import Line
 from tests.d46_peer import SimPort, Unit
 from tests.simulated_clock import SimClock
 

@@ -6,7 +6,7 @@ import gc
 import math
 from pathlib import Path
 
-from cotarget.env.arguments import DEFAULT_RIG
+from cotarget.env.common import DEFAULT_RIG
 
 FRAME_S = 0.04
 # As outdoors, the wide camera looks 9 degrees up, over a field where nothing stands.

@@ -14,7 +14,8 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.pantilt import HeadGeometry
-from experiments.synthetic import LONGEST_PX, NOMINAL_PX, SIZE, Truth, aimed
+from experiments.synthetic.aims import aimed
+from experiments.synthetic.rig import LONGEST_PX, NOMINAL_PX, SIZE, Truth
 
 RATE = 25.0
 APART = 0.013  # the zoom camera's frames come that much after the wide one's [s]

@@ -19,8 +19,8 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS, RigConfig
 from cotarget.detection import Detection
 from cotarget.geometry import pose
-from cotarget.loop import FollowSettings, follow
-from cotarget.recording import Recorder
+from cotarget.pipeline import FollowSettings, follow
+from cotarget.recording.recorder import Recorder
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
 from cotarget.safety import SafeRig
 

@@ -24,6 +24,6 @@ def test_it_is_built_without_a_warning(tmp_path):
     built = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=False)
     assert (built.returncode, built.stdout, built.stderr) == (0, "", "")
     front = (tmp_path / "cotarget.html").read_text(encoding="utf-8")
-    assert "cotarget/loop.html#follow" in front  # names in docstrings are links
+    assert "cotarget/pipeline.html#follow" in front  # names in docstrings are links
     loop = (tmp_path / "cotarget" / "loop.html").read_text(encoding="utf-8")
     assert re.search(r"<h6[^>]*>Arguments:</h6>", loop)  # Google's sections are sections

@@ -18,13 +18,14 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.emulators.axis import AxisServer
+from cotarget.config import HardwareFixed
+from cotarget.drivers import axis
+from cotarget.drivers import axis as axis_module
+from cotarget.drivers.axis import AxisCamera, probe
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.emulators.axis_241q import AxisServer
 from cotarget.emulators.plant import Feed, Picture
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
-from cotarget.hardware import axis, vapix
-from cotarget.hardware.axis import AxisCamera, probe
-from cotarget.hardware.clock import MonotonicClock
-from cotarget.hwconfig import HardwareFixed
 
 pytestmark = pytest.mark.wire
 
@@ -424,7 +425,7 @@ def test_a_busy_server_is_asked_again(server, monkeypatch):
 @pytest.mark.parametrize("sent", [b"", STREAM, STREAM + b"--myboundary\r\nContent-Type: text/plain\r\n\r\nno"])
 def test_a_server_that_sends_no_picture(server, sent, monkeypatch):
     monkeypatch.setattr(axis, "OPEN_S", 0.3)
-    monkeypatch.setattr(vapix, "SILENCE_S", SHORT_SILENCE_S)
+    monkeypatch.setattr(axis_module, "SILENCE_S", SHORT_SILENCE_S)
     server.pages[VIDEO] = sent or None
     assert refused(server).startswith(server.url)
 
@@ -462,7 +463,7 @@ def test_a_password_that_changed_is_told_and_not_tried_in_haste(server, monkeypa
 
 
 def test_a_stalled_stream_is_opened_again(server, monkeypatch):
-    monkeypatch.setattr(vapix, "SILENCE_S", SHORT_SILENCE_S)
+    monkeypatch.setattr(axis_module, "SILENCE_S", SHORT_SILENCE_S)
     monkeypatch.setattr(axis, "FROZEN_S", SHORT_SILENCE_S / 2)
     with opened(server) as camera:
         viewer = server.viewer()
@@ -495,7 +496,7 @@ def test_silence_is_told_before_the_stream_is_given_up(server):
 
 
 def test_bytes_without_pictures_do_not_go_on_for_ever(server, monkeypatch):
-    monkeypatch.setattr(vapix, "SILENCE_S", SHORT_SILENCE_S)
+    monkeypatch.setattr(axis_module, "SILENCE_S", SHORT_SILENCE_S)
     with opened(server) as camera:
         t, viewer, end = camera.read().t, server.viewer(), threading.Event()
 
@@ -613,7 +614,7 @@ def test_closing_frees_a_reader_at_once_and_ends_the_thread(server):
     begun = time.monotonic()
     camera.close()
     assert said.get(timeout=PATIENCE_S) == "the fixed camera is closed"
-    assert time.monotonic() - begun < vapix.SILENCE_S  # it did not wait for the socket
+    assert time.monotonic() - begun < axis_module.SILENCE_S  # it did not wait for the socket
     ended(reader)
     camera.close()
     assert server.viewer().gone()
@@ -640,7 +641,7 @@ def test_a_driver_that_fails_says_so_to_whoever_reads(server, monkeypatch, capfd
 
 
 def test_closing_while_the_server_hangs(server, monkeypatch):
-    monkeypatch.setattr(vapix, "SILENCE_S", SHORT_SILENCE_S)
+    monkeypatch.setattr(axis_module, "SILENCE_S", SHORT_SILENCE_S)
     with opened(server) as camera:
         server.pages[VIDEO] = None
         server.viewer().cut()

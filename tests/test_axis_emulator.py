@@ -16,12 +16,24 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.emulators import axis_auth, axis_stream
-from cotarget.emulators.axis import AXIS_FAULTS, AxisServer, AxisUnit
-from cotarget.emulators.axis_answers import fixed_ptz, list_parameters, video_status
-from cotarget.emulators.axis_auth import Guard
-from cotarget.emulators.axis_http import HttpError, Request, read_request, text_reply
-from cotarget.emulators.axis_pictures import Pace, damaged, named_sizes, parse_order
+from cotarget.emulators import axis_241q
+from cotarget.emulators.axis_241q import (
+    AXIS_FAULTS,
+    AxisServer,
+    AxisUnit,
+    Guard,
+    HttpError,
+    Pace,
+    Request,
+    damaged,
+    fixed_ptz,
+    list_parameters,
+    named_sizes,
+    parse_order,
+    read_request,
+    text_reply,
+    video_status,
+)
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed, Picture
 from cotarget.errors import ConfigError, DeviceError
@@ -220,7 +232,7 @@ def authorized(authorization, target="/dir/index.html", method="GET"):
 @pytest.fixture
 def rfc_guard(monkeypatch):
     nonces = itertools.chain([RFC_NONCE], (f"{i:032x}" for i in itertools.count()))
-    monkeypatch.setattr(axis_auth.secrets, "token_hex", lambda _: next(nonces))
+    monkeypatch.setattr(axis_241q.secrets, "token_hex", lambda _: next(nonces))
     guard = Guard("Mufasa", "Circle Of Life", "digest", "testrealm@host.com", now=lambda: guard.time)
     guard.time = 0.0
     assert guard.refuse(authorized("")) == (
@@ -280,9 +292,9 @@ def test_a_nonce_that_nobody_issued_is_stale():
 
 def test_nonces_do_not_pile_up():
     guard = Guard("u", "p", "digest", "R")
-    for _ in range(3 * axis_auth.MAX_NONCES):
+    for _ in range(3 * axis_241q.MAX_NONCES):
         guard.challenge()
-    assert len(guard._issued) == len(guard._used) == axis_auth.MAX_NONCES
+    assert len(guard._issued) == len(guard._used) == axis_241q.MAX_NONCES
 
 
 def test_basic_is_the_rfc_s():
@@ -525,7 +537,7 @@ def test_refusals(server):
 
 @pytest.mark.wire
 def test_a_camera_without_any_picture_is_not_ready(monkeypatch):
-    monkeypatch.setattr(axis_stream, "FIRST_PICTURE_S", 0.1)
+    monkeypatch.setattr(axis_241q, "FIRST_PICTURE_S", 0.1)
     with AxisServer({1: Feed()}) as server:
         assert exchange(server, SNAPSHOT).startswith(b"HTTP/1.0 503 Service Unavailable\r\n")
 

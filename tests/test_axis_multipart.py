@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.hardware.multipart import LONGEST_PICTURE, LONGEST_SKIP, MultipartReader, boundary_of
+from cotarget.drivers.mjpeg import LONGEST_PICTURE, LONGEST_SKIP, MultipartReader, boundary_of
 
 FUZZ_SEED = 20240
 FUZZ_COUNT = 50_000

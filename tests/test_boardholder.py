@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cotarget.calibration.recorder import Recorder
-from cotarget.emulators.jsonlines import JsonLines
+from cotarget.calibration.session import Recorder
+from cotarget.config import HardwareBoard
+from cotarget.drivers.board import PersonBoard, SocketBoard, in_words, make_board
+from cotarget.emulators.serve import JsonLines
 from cotarget.errors import DeviceError
 from cotarget.geometry import pose
-from cotarget.hardware.board import PersonBoard, SocketBoard, in_words, make_board
-from cotarget.hwconfig import HardwareBoard
 from tests.synthetic_rig import SyntheticRig, _Board
 
 DEADLINE_S = 30.0  # for what should come at once

@@ -6,19 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.calibration.boards import (
-    another_board,
-    board_points,
-    check_board,
-    draw_board,
-    find_corners,
-    guess_corners,
-    smallest_spacing,
-)
+from cotarget.board import board_points, check_board, draw_board
+from cotarget.calibration.corners import another_board, find_corners, guess_corners, smallest_spacing
 from cotarget.config import BoardConfig
 from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, Rotation
-from experiments.synthetic import Truth
+from experiments.synthetic.rig import Truth
 from tests.synthetic_rig import draw, pixel_rays
 
 BOARD = BoardConfig()

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from cotarget.boxhistory import SizeHistory, Trail
 from cotarget.detection import Detection
-from cotarget.motionfilter import TargetFilter, TrackerSettings
+from cotarget.tracking.track import SizeHistory, TargetFilter, TrackerSettings, Trail
 
 DT = 0.04
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cotarget.calibration import (
+from cotarget.calibration import (  # fmt: skip
     Calibration,
     Covariance,
     HeldOut,
@@ -16,12 +16,11 @@ from cotarget.calibration import (
     View,
     load_calibration,
     save_calibration,
-)  # fmt: skip
+)
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.config import BoardConfig
+from cotarget.config import DEFAULT_GAMMA, DEFAULT_T, BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.pantilt import HeadGeometry
-from cotarget.simconfig import DEFAULT_GAMMA, DEFAULT_T
 
 ROUNDING = 1e-15  # between radians and degrees, matrix and rotation vector
 

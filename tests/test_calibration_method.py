@@ -6,19 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cotarget.board import board_points
 from cotarget.calibration import Options, calibrate_photos, calibrate_views
-from cotarget.calibration.boards import board_points
-from cotarget.calibration.bundle import fit
-from cotarget.calibration.model import View
-from cotarget.calibration.parameters import EVERY_BLOCK, RigModel, difference, parameter_names, stepped
-from cotarget.calibration.reprojection import batches_of, predict
+from cotarget.calibration.bundle import EVERY_BLOCK, batches_of, difference, fit, parameter_names, predict, stepped
+from cotarget.calibration.model import RigModel, View
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.config import BoardConfig
+from cotarget.config import DEFAULT_GAMMA, DEFAULT_T, BoardConfig
 from cotarget.errors import CalibrationError, ConfigError
 from cotarget.geometry import pose
 from cotarget.pantilt import HeadGeometry
-from cotarget.simconfig import DEFAULT_GAMMA, DEFAULT_T
-from experiments.synthetic import SIZE, Truth, other_rig, pointing_errors, synthetic_views
+from experiments.synthetic.aims import pointing_errors
+from experiments.synthetic.rig import SIZE, Truth, other_rig
+from experiments.synthetic.views import synthetic_views
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)

@@ -10,13 +10,14 @@ import pytest
 from cotarget import __version__
 from cotarget.calibration import calibrate_captures, calibrate_photos, calibrate_rig
 from cotarget.calibration.captures import INDEX, read_index
-from cotarget.calibration.plan import GRID, Coverage
-from cotarget.calibration.recorder import Recorder
+from cotarget.calibration.planning import GRID, Coverage
+from cotarget.calibration.session import Recorder
 from cotarget.config import BoardConfig, parse_config
 from cotarget.errors import CalibrationError, DeviceError, EmergencyStopError, HaltedError, StaleFrameError
 from cotarget.geometry import pose
 from cotarget.rig import PanTiltLimits
-from experiments.synthetic import SIZE, Truth, pointing_errors
+from experiments.synthetic.aims import pointing_errors
+from experiments.synthetic.rig import SIZE, Truth
 from tests.synthetic_rig import SyntheticRig
 
 BOARD = BoardConfig()

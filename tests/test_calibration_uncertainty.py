@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from cotarget.calibration import (
+from cotarget.board import board_points
+from cotarget.calibration import (  # fmt: skip
     Calibration,
     Covariance,
     Options,
@@ -15,13 +16,11 @@ from cotarget.calibration import (
     load_calibration,
     predicted_pointing,
     save_calibration,
-)  # fmt: skip
-from cotarget.calibration.boards import board_points
-from cotarget.calibration.bundle import Fit, fit
+)
+from cotarget.calibration.bundle import ALL_BLOCKS, Fit, coordinate_variance, fit, parameter_names
+from cotarget.calibration.initialization import at_home
 from cotarget.calibration.joint import joint
-from cotarget.calibration.parameters import ALL_BLOCKS, RigModel, parameter_names
-from cotarget.calibration.robust import coordinate_variance
-from cotarget.calibration.start import at_home
+from cotarget.calibration.model import RigModel
 from cotarget.calibration.uncertainty import covariance_of
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
@@ -29,7 +28,9 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform
 from cotarget.targeting import Reach, aim, error_budget, point_at
 from experiments.honesty import GROUPS, error_of, inside
-from experiments.synthetic import SIZE, Truth, draw_targets, other_rig, pointing_errors, synthetic_views
+from experiments.synthetic.aims import draw_targets, pointing_errors
+from experiments.synthetic.rig import SIZE, Truth, other_rig
+from experiments.synthetic.views import synthetic_views
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)

@@ -21,14 +21,11 @@ import cv2
 import numpy as np
 import pytest
 
+from cotarget.config import HardwareZoom
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.gphoto import GphotoLink, LinkError, Setting, cameras, full_port, probe
+from cotarget.drivers.gphoto_camera import Desk, GphotoCamera, Shooting
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
-from cotarget.hardware.canon import GphotoCamera
-from cotarget.hardware.clock import MonotonicClock
-from cotarget.hardware.gphoto import GphotoLink, LinkError, Setting, cameras, probe
-from cotarget.hardware.gphoto_desk import Desk
-from cotarget.hardware.gphoto_port import full_port
-from cotarget.hardware.gphoto_work import Shooting
-from cotarget.hwconfig import HardwareZoom
 from tests.simulated_clock import SimClock
 
 SIZE, STILL_SIZE = (32, 24), (64, 48)
@@ -753,7 +750,7 @@ def test_what_is_no_focal_length(focal_px):
 
 
 def test_a_lens_in_trouble_is_told_until_it_is_sent_again(monkeypatch):
-    monkeypatch.setattr("cotarget.hardware.gphoto_duties.VERIFY_S", 0.0)
+    monkeypatch.setattr("cotarget.drivers.gphoto_camera.VERIFY_S", 0.0)
     with opened(replace(CONFIG, lens_speed=1e4)) as rig:
         rig.link.ignore = 2
         rig.camera.zoom(1000.0)
@@ -797,18 +794,18 @@ def test_stills_that_cannot_be_read_or_taken():
 
 
 def test_a_still_waits_its_turn_and_its_limit(monkeypatch):
-    monkeypatch.setattr("cotarget.hardware.canon.STILL_LIMIT_S", 0.01)
+    monkeypatch.setattr("cotarget.drivers.gphoto_camera.STILL_LIMIT_S", 0.01)
     with opened() as rig:
         rig.link.fail["shoot"] = [BUSY, ...]
         with pytest.raises(DeviceError, match=r"the zoom camera took no still within 0\.01 s"):
             rig.camera.capture()
         rig.link.fail.clear()
-        monkeypatch.setattr("cotarget.hardware.canon.STILL_LIMIT_S", DEADLINE_S)
+        monkeypatch.setattr("cotarget.drivers.gphoto_camera.STILL_LIMIT_S", DEADLINE_S)
         assert rig.camera.capture().image.shape == (48, 64, 3)
 
 
 def test_a_still_that_is_always_refused(monkeypatch):
-    monkeypatch.setattr("cotarget.hardware.gphoto_duties.BUSY_PATIENCE_S", 0.0)
+    monkeypatch.setattr("cotarget.drivers.gphoto_camera.BUSY_PATIENCE_S", 0.0)
     with opened() as rig:
         rig.link.fail["shoot"] = [-1, ...]
         with pytest.raises(DeviceError, match=r"the zoom camera takes no still: gphoto2 says \[-1\]"):
@@ -845,7 +842,7 @@ def test_reading_waits_while_a_still_is_taken():
 
 
 def test_a_gone_camera_says_so_at_every_call(monkeypatch):
-    monkeypatch.setattr("cotarget.hardware.gphoto_work.RECONNECT_S", 0.0)
+    monkeypatch.setattr("cotarget.drivers.gphoto_camera.RECONNECT_S", 0.0)
     with opened() as rig:
         rig.link.fail = {"open": [IO, ...], "preview": [IO, ...]}
         wait_for(lambda: rig.camera._desk.gone)
@@ -856,7 +853,7 @@ def test_a_gone_camera_says_so_at_every_call(monkeypatch):
 
 
 def test_waiting_ends_when_the_camera_is_gone_or_closed(monkeypatch):
-    monkeypatch.setattr("cotarget.hardware.gphoto_work.RECONNECT_S", 0.0)
+    monkeypatch.setattr("cotarget.drivers.gphoto_camera.RECONNECT_S", 0.0)
     with opened() as rig:
         rig.link.fail = {"open": [IO, ...], "shoot": [BUSY, ...], "preview": [BUSY, BUSY, IO]}
         with pytest.raises(DeviceError, match="is gone"):
@@ -975,7 +972,7 @@ class FakeGphoto(types.ModuleType):
 @pytest.fixture
 def gphoto2(monkeypatch):
     """Puts a module in the place of gphoto2."""
-    monkeypatch.setattr("cotarget.hardware.gphoto.keep_settings_in_memory", lambda: None)
+    monkeypatch.setattr("cotarget.drivers.gphoto.keep_settings_in_memory", lambda: None)
 
     def put(*found):
         module = FakeGphoto(found)
@@ -1048,10 +1045,10 @@ def test_a_camera_of_another_user_and_one_of_another_program(gphoto2, monkeypatc
 # libgphoto2 has a camera of its own on a USB port of its own, if that is asked for before it is loaded.
 VIRTUAL = """
 from cotarget.errors import ConfigError
-from cotarget.hardware.canon import GphotoCamera
-from cotarget.hardware.clock import MonotonicClock
-from cotarget.hardware.gphoto import cameras, probe
-from cotarget.hwconfig import HardwareZoom
+from cotarget.drivers.gphoto_camera import GphotoCamera
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.gphoto import cameras, probe
+from cotarget.config import HardwareZoom
 
 print(cameras())
 print(probe("usb:", ""))
@@ -1099,7 +1096,7 @@ import json, sys, threading, time
 import numpy as np
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed, Picture
-from cotarget.emulators.s5is import S5IS_FAULTS, S5isServer
+from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
 
 class Lens:
     last, at = 128, 0

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from cotarget.hardware.lens import LensMotion, LensTable
-from cotarget.hwconfig import S5_IS_LENS
+from cotarget.config import S5_IS_LENS
+from cotarget.drivers.lens import LensMotion, LensTable
 
 PITCH_MM = 0.01794  # 5.74 mm of sensor on 320 px
 S5_IS = LensTable(S5_IS_LENS, tuple(range(129)), PITCH_MM)

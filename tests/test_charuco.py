@@ -4,13 +4,21 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.calibration.boards import board_points, check_board, draw_board, find_corners
-from cotarget.calibration.partial import find_near
-from cotarget.calibration.printing import print_board
+from cotarget.board import (
+    CELLS_PER_SQUARE,
+    MARKER_SHARE,
+    board_points,
+    cells,
+    check_board,
+    draw_board,
+    marker_dictionary,
+    print_board,
+    tiles,
+)
+from cotarget.calibration.corners import find_corners, find_near
 from cotarget.config import BoardConfig, parse_config
 from cotarget.errors import ConfigError
 from cotarget.geometry import pose
-from cotarget.pattern import CELLS_PER_SQUARE, MARKER_SHARE, cells, marker_dictionary, tiles
 from cotarget.sim.world import SimWorld
 
 BOARD = BoardConfig("charuco", (8, 6), 0.1)  # both counts even, as no chessboard may have

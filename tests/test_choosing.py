@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 
 import cotarget.cli as cli
-from cotarget import policies
 from cotarget.calibration import save_calibration
-from cotarget.cli.choosing import POLICIES, Choice, add_choice
+from cotarget.cli.common import POLICIES, Choice, add_choice
 from cotarget.config import RigConfig
+from cotarget.control import selection
+from cotarget.control.selection import Candidate, Whom
 from cotarget.errors import ConfigError
-from cotarget.motionfilter import Track
-from cotarget.oracle import true_calibration
-from cotarget.planning import Candidate
+from cotarget.evaluation import true_calibration
 from cotarget.rig import PanTiltLimits
 from cotarget.sim.world import SimWorld
-from cotarget.whom import Whom
+from cotarget.tracking.track import Track
 
 SIZE = (640, 480)
 LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), 2.6, 3.6, 0.0)
@@ -47,7 +46,7 @@ def pick(choice, seen=(0.0, 0.0, 0.0)):
 
 
 def test_the_names_are_those_of_the_policies():
-    assert set(POLICIES) == set(policies.POLICIES)
+    assert set(POLICIES) == set(selection.POLICIES)
     assert POLICIES[0] == "first-come"
 
 

@@ -18,7 +18,7 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig, RigConfig
 from cotarget.geometry import pose
 from cotarget.pantilt import HeadGeometry
-from experiments.synthetic import NOMINAL_PX, Truth, undistorted
+from experiments.synthetic.rig import NOMINAL_PX, Truth, undistorted
 from tests.synthetic_rig import draw, fourfold, pixel_rays, zoomed
 
 OLD = "what was there before\n"
@@ -496,7 +496,7 @@ def test_the_sequential_method_leaves_other_focal_lengths_alone(folder, capsys, 
     def never(*_):
         raise AssertionError("the joint method was asked")
 
-    monkeypatch.setattr("cotarget.calibration.finding.joint", never)
+    monkeypatch.setattr("cotarget.calibration.calibrate.joint", never)
     directory, rows = zooming
     (folder / "out.json").unlink()
     write_index(directory, rows)

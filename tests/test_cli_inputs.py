@@ -7,7 +7,7 @@ import pytest
 
 from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
-from cotarget.outputs import PartFile
+from cotarget.files import PartFile
 from tests.recorded_run import ToyRig, calibration_file, record
 from tests.test_cli import OLD, call, draw_photo, true_calibration, write_index
 from tests.test_video import bird_film
@@ -53,7 +53,7 @@ def made(tmp_path_factory):
 def folder(made, monkeypatch):
     """It is the working folder, and nothing in it has changed afterwards."""
     monkeypatch.chdir(made)
-    monkeypatch.setattr("cotarget.rig.open_rig", lambda config: ToyRig())
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: ToyRig())
     before = contents(made)
     yield made
     assert contents(made) == before
@@ -150,7 +150,7 @@ def test_a_link_to_a_result_is_written_through(folder, capsys, tmp_path):
 
 
 def test_a_calibration_through_a_link_keeps_the_one_of_before(tmp_path):
-    from cotarget.cli.arguments import previous_kept
+    from cotarget.cli.common import previous_kept
 
     goal, link = tmp_path / "goal.json", tmp_path / "link.json"
     goal.write_text(OLD)
@@ -192,7 +192,7 @@ def test_a_calibration_takes_the_place_of_no_photo_and_of_nothing_in_an_index(fo
 
 
 def test_a_calibration_that_could_not_be_written_is_told_before_the_session(folder, capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr("cotarget.rig.open_rig", lambda config: pytest.fail("opened"))
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: pytest.fail("opened"))
     out = tmp_path / "c.json"
     writing = PartFile(out)
     try:

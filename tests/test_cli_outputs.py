@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.cli.arguments import previous_kept, print_json, progress_bar
+from cotarget.cli.common import previous_kept, print_json, progress_bar
 from cotarget.config import RigConfig
 from cotarget.errors import CalibrationError, DeviceError
 from cotarget.rig import Frame, ZoomState
@@ -89,7 +89,7 @@ def sessions(monkeypatch):
     """Lets `calibrate --rig` open a rig without a world; its session is what a test says."""
     rig = SimulatedRig()
     rig.zoom.still_size, rig.zoom.focal_range = rig.zoom.size, RigConfig().focal_range_px  # 12 x zoom
-    monkeypatch.setattr("cotarget.rig.open_rig", lambda config: rig)
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: rig)
     return lambda error=None: monkeypatch.setattr("cotarget.calibration.calibrate_rig", Session(error))
 
 
@@ -198,7 +198,7 @@ def pointed(folder, monkeypatch):
         capture=lambda: Frame(image, rig.clock.now()),
         zoom=lambda focal: rig.head.log.append(("zoom", focal)),
     )
-    monkeypatch.setattr("cotarget.rig.open_rig", lambda config: rig)
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: rig)
     return rig
 
 

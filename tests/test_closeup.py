@@ -10,14 +10,13 @@ import pytest
 
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.closeup import CloseupFinder, Expected
-from cotarget.closeup.matching import correlate, resample, summit
-from cotarget.closeup.template import look
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.demo import SCENES, sim_config
 from cotarget.detection import Detection
+from cotarget.estimation.correlation import correlate, resample, summit
+from cotarget.estimation.zoom_matching import CloseupFinder, Expected, look
+from cotarget.evaluation import true_calibration
 from cotarget.geometry import pose
-from cotarget.oracle import true_calibration
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim

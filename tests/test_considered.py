@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cotarget.board import board_points
 from cotarget.calibration import Options, calibrate_views, predicted_pointing
-from cotarget.calibration.boards import board_points
-from cotarget.calibration.bundle import fit
-from cotarget.calibration.considered import with_considered
-from cotarget.calibration.parameters import ALL_BLOCKS, difference, parameter_names
-from cotarget.calibration.placing import place_boards
-from cotarget.calibration.uncertainty import covariance_of, model_of
+from cotarget.calibration.bundle import ALL_BLOCKS, difference, fit, parameter_names
+from cotarget.calibration.initialization import place_boards
+from cotarget.calibration.uncertainty import covariance_of, model_of, with_considered
 from cotarget.config import BoardConfig
-from experiments.synthetic import SIZES, Placing, Truth, draw_targets, misses, spread_views
+from experiments.synthetic.aims import draw_targets, misses
+from experiments.synthetic.rig import SIZES, Truth
+from experiments.synthetic.views import Placing, spread_views
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)

@@ -5,8 +5,8 @@ import random
 
 import pytest
 
+from cotarget.drivers import ptu_protocol
 from cotarget.errors import DeviceError
-from cotarget.hardware import d46
 
 # A default run; the figure that is promised is a million.
 FUZZED = int(os.environ.get("COTARGET_FUZZ", "50000"))
@@ -64,13 +64,13 @@ EVENTS = [
     (b"!P\r\n", b"\r\n", ("P",)),
 ]
 MODES = [
-    (d46.echoing, b"E * Echoing ON\r\n", True),
-    (d46.echoing, b"* Echoing OFF\r\n", False),
-    (d46.terse, b"* ASCII verbose mode\r\n", False),
-    (d46.terse, b"* ASCII terse mode\r\n", True),
-    (d46.independent, b"* PTU is in Independent Mode\r\n", True),
-    (d46.independent, b"* Independent speed control mode\r\n", True),
-    (d46.independent, b"* Pure Velocity speed control mode\r\n", False),
+    (ptu_protocol.echoing, b"E * Echoing ON\r\n", True),
+    (ptu_protocol.echoing, b"* Echoing OFF\r\n", False),
+    (ptu_protocol.terse, b"* ASCII verbose mode\r\n", False),
+    (ptu_protocol.terse, b"* ASCII terse mode\r\n", True),
+    (ptu_protocol.independent, b"* PTU is in Independent Mode\r\n", True),
+    (ptu_protocol.independent, b"* Independent speed control mode\r\n", True),
+    (ptu_protocol.independent, b"* Pure Velocity speed control mode\r\n", False),
 ]
 # Answers that lost or gained a byte must not become another number.
 GARBLED = [b"* 12\xff4", b"* 12.5", b"* x3", b"* --3", b"* 3-4", b"*", b"* is -", b"* 12345678901234567890"]
@@ -81,23 +81,23 @@ WORDY = [b"* 1 2x", b"* 1 2", b"* Current Pan position is 0", b"*"]
 
 
 def text_of(line):
-    return d46.parse(d46.split_events(line)[0]).text
+    return ptu_protocol.parse(ptu_protocol.split_events(line)[0]).text
 
 
 @pytest.mark.parametrize(("line", "number"), NUMBERS)
 def test_the_first_integer_after_is(line, number):
-    assert d46.integer(text_of(line)) == number
+    assert ptu_protocol.integer(text_of(line)) == number
 
 
 @pytest.mark.parametrize(("line", "arcseconds"), RESOLUTIONS)
 def test_resolution_in_seconds_of_arc(line, arcseconds):
-    assert d46.arcseconds(text_of(line)) == arcseconds
+    assert ptu_protocol.arcseconds(text_of(line)) == arcseconds
 
 
 @pytest.mark.parametrize(("line", "said"), ERRORS)
 def test_errors_are_told_in_the_units_words(line, said):
-    rest, events = d46.split_events(line)
-    reply = d46.parse(rest)
+    rest, events = ptu_protocol.split_events(line)
+    reply = ptu_protocol.parse(rest)
     assert reply.refused
     assert reply.text == said
     assert events == ()
@@ -105,7 +105,7 @@ def test_errors_are_told_in_the_units_words(line, said):
 
 @pytest.mark.parametrize(("received", "rest", "events"), EVENTS)
 def test_events_come_anywhere(received, rest, events):
-    assert d46.split_events(received) == (rest, events)
+    assert ptu_protocol.split_events(received) == (rest, events)
 
 
 @pytest.mark.parametrize(("meaning", "line", "value"), MODES)
@@ -115,54 +115,62 @@ def test_words_tell_modes(meaning, line, value):
 
 @pytest.mark.parametrize("line", GARBLED)
 def test_a_garbled_number_is_refused(line):
-    with pytest.raises(d46.ReplyError):
-        d46.integer(text_of(line))
+    with pytest.raises(ptu_protocol.ReplyError):
+        ptu_protocol.integer(text_of(line))
 
 
 @pytest.mark.parametrize("line", WORDY)
 def test_a_terse_number_stands_alone(line):
-    assert d46.bare_integer(text_of(b"* -17\r\n")) == -17
-    with pytest.raises(d46.ReplyError):
-        d46.bare_integer(text_of(line))
+    assert ptu_protocol.bare_integer(text_of(b"* -17\r\n")) == -17
+    with pytest.raises(ptu_protocol.ReplyError):
+        ptu_protocol.bare_integer(text_of(line))
 
 
 @pytest.mark.parametrize("line", [b"$GPGGA,1,2\r\n", b"ED FT\r\n", b"OK\r\n", b"\xfe* 3\r\n"])
 def test_lines_of_other_devices_are_refused(line):
-    with pytest.raises(d46.ReplyError, match="is no answer of a PTU-D46"):
-        d46.parse(line)
+    with pytest.raises(ptu_protocol.ReplyError, match="is no answer of a PTU-D46"):
+        ptu_protocol.parse(line)
 
 
 def test_the_echo_stands_before_the_answer():
-    assert d46.parse(b"ED *\r\n") == d46.Reply("", False, "ED")
-    assert d46.parse(b"\r\n") is None
+    assert ptu_protocol.parse(b"ED *\r\n") == ptu_protocol.Reply("", False, "ED")
+    assert ptu_protocol.parse(b"\r\n") is None
 
 
 def test_an_order_is_answered_by_a_star_alone():
-    d46.done(text_of(b"*\r\n"))
-    with pytest.raises(d46.ReplyError, match="'123' answers something else"):
-        d46.done(text_of(b"* 123\r\n"))
+    ptu_protocol.done(text_of(b"*\r\n"))
+    with pytest.raises(ptu_protocol.ReplyError, match="'123' answers something else"):
+        ptu_protocol.done(text_of(b"* 123\r\n"))
 
 
 def test_commands_end_in_a_space():
-    assert d46.command("PP", -120) == b"PP-120 "
-    assert d46.command("TS", 1000) == b"TS1000 "
-    assert d46.command("ED") == b"ED "
+    assert ptu_protocol.command("PP", -120) == b"PP-120 "
+    assert ptu_protocol.command("TS", 1000) == b"TS1000 "
+    assert ptu_protocol.command("ED") == b"ED "
 
 
 def test_the_banner_is_not_the_answer_to_the_version():
     assert text_of(VERSION).startswith("Pan-Tilt Controller v2.12.1d1(C14/E)")
-    assert not d46.BANNER.search(VERSION)
-    assert d46.BANNER.search(b"\r\n### PAN-TILT CONTROLLER v2.12 ###\r\n!T!T!P!P*\r\n")
+    assert not ptu_protocol.BANNER.search(VERSION)
+    assert ptu_protocol.BANNER.search(b"\r\n### PAN-TILT CONTROLLER v2.12 ###\r\n!T!T!P!P*\r\n")
 
 
 def test_strange_bytes_are_quoted_in_one_short_line():
-    assert d46.shown(b"\x00\xffa\tb\r\n") == r"'\x00\xffa\tb'"
-    assert len(d46.shown(bytes(1000))) < 50
+    assert ptu_protocol.shown(b"\x00\xffa\tb\r\n") == r"'\x00\xffa\tb'"
+    assert len(ptu_protocol.shown(bytes(1000))) < 50
 
 
 SEEDS = [line for line, *_ in [*NUMBERS, *RESOLUTIONS, *ERRORS, *EVENTS]] + [line for _, line, _ in MODES] + [VERSION]
 TOKENS = (b"!P", b"!T", b"!", b"*", b" is ", b"-", b"9" * 400, b"\r\n", b"\0")
-READERS = (d46.integer, d46.bare_integer, d46.arcseconds, d46.echoing, d46.terse, d46.independent, d46.done)
+READERS = (
+    ptu_protocol.integer,
+    ptu_protocol.bare_integer,
+    ptu_protocol.arcseconds,
+    ptu_protocol.echoing,
+    ptu_protocol.terse,
+    ptu_protocol.independent,
+    ptu_protocol.done,
+)
 
 
 def mutated(rng):
@@ -190,8 +198,8 @@ def fuzz(count, seed):
     understood, complaints = 0, set()
     for _ in range(count):
         try:
-            rest, events = d46.split_events(mutated(rng))
-            reply = d46.parse(rest)
+            rest, events = ptu_protocol.split_events(mutated(rng))
+            reply = ptu_protocol.parse(rest)
         except DeviceError as error:
             complaints.add(str(error))
             continue

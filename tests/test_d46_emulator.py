@@ -13,11 +13,10 @@ from dataclasses import replace
 import pytest
 import serial
 
-from cotarget.emulators.d46 import D46, D46_FAULTS, D46_PAPER, D46_STOCK, E_SERIES, UnitProfile
-from cotarget.emulators.d46_axis import plain_acceleration
-from cotarget.emulators.d46_wire import Wire
 from cotarget.emulators.faults import Faults
-from cotarget.emulators.lines import SerialLine, TcpLine
+from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
+from cotarget.emulators.ptu_d46.unit import D46_PAPER, D46_STOCK, E_SERIES, UnitProfile, plain_acceleration
+from cotarget.emulators.serve import SerialLine, TcpLine, Wire
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.sim.motion import Axis
 

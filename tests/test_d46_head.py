@@ -8,12 +8,10 @@ import time
 import pytest
 import serial
 
-from cotarget.config import SafetyConfig
+from cotarget.config import HardwareHead, SafetyConfig
+from cotarget.drivers.interlock import LostPosition
+from cotarget.drivers.polled_head import D46Head, Move
 from cotarget.errors import ConfigError, DeviceError, HaltedError
-from cotarget.hardware.d46lost import LostPosition
-from cotarget.hardware.d46wishes import Move
-from cotarget.hardware.head import D46Head
-from cotarget.hwconfig import HardwareHead
 from tests.d46_bench import CONFIG, Bench
 
 STEP = math.radians(185.1428 / 3600)

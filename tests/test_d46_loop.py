@@ -5,8 +5,8 @@ import random
 import pytest
 import serial
 
+from cotarget.drivers.interlock import PositionLostError
 from cotarget.errors import DeviceError
-from cotarget.hardware.d46lost import PositionLostError
 from tests.d46_bench import Bench
 from tests.d46_peer import BANNER
 

@@ -2,8 +2,8 @@
 
 import pytest
 
+from cotarget.drivers.interlock import LostPosition, PositionLostError
 from cotarget.errors import DeviceError
-from cotarget.hardware.d46lost import LostPosition, PositionLostError
 
 USB = "/dev/serial/by-id/usb-FTDI_FT232R-if00"
 

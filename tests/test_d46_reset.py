@@ -3,9 +3,9 @@
 import pytest
 import serial
 
+from cotarget.drivers.interlock import LostPosition
+from cotarget.drivers.ptu_d46 import reset
 from cotarget.errors import DeviceError, EmergencyStopError
-from cotarget.hardware.d46lost import LostPosition
-from cotarget.hardware.d46reset import reset
 from tests.d46_bench import CONFIG, Bench
 
 SOON_S = 0.2  # from a stop to the halt on the wire; a hundredth of what the reset takes

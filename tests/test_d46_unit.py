@@ -3,10 +3,10 @@
 import pytest
 import serial
 
+from cotarget.config import HardwareHead
+from cotarget.drivers.ptu_d46 import probe
+from cotarget.drivers.ptu_protocol import open_line
 from cotarget.errors import ConfigError, DeviceError
-from cotarget.hardware.d46unit import probe
-from cotarget.hardware.line import open_line
-from cotarget.hwconfig import HardwareHead
 from tests.d46_bench import CONFIG, Bench
 from tests.d46_peer import BANNER, VERSION
 from tests.simulated_clock import SimClock
@@ -134,7 +134,7 @@ def test_a_unit_that_starts_up_is_told(bench):
 
 
 def test_a_look_at_a_unit_changes_nothing(opened, monkeypatch):
-    monkeypatch.setattr("cotarget.hardware.d46unit.MonotonicClock", lambda: opened.clock)
+    monkeypatch.setattr("cotarget.drivers.ptu_d46.MonotonicClock", lambda: opened.clock)
     assert probe("PORT", 9600) == f"{VERSION}, unit 0"
     assert opened.unit.heard == ["V", "U"]
     assert opened.unit.echo

@@ -12,16 +12,16 @@ from pathlib import Path
 
 import pytest
 
-from cotarget.emulators.d46 import D46, D46_FAULTS, D46_STOCK, E_SERIES
+from cotarget.config import HardwareHead
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.interlock import LostPosition
+from cotarget.drivers.polled_head import D46Head
+from cotarget.drivers.ptu_d46 import probe, reset
 from cotarget.emulators.faults import Faults
-from cotarget.emulators.lines import SerialLine, TcpLine
+from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
+from cotarget.emulators.ptu_d46.unit import D46_STOCK, E_SERIES
+from cotarget.emulators.serve import SerialLine, TcpLine
 from cotarget.errors import ConfigError, DeviceError
-from cotarget.hardware.clock import MonotonicClock
-from cotarget.hardware.d46lost import LostPosition
-from cotarget.hardware.d46reset import reset
-from cotarget.hardware.d46unit import probe
-from cotarget.hardware.head import D46Head
-from cotarget.hwconfig import HardwareHead
 from cotarget.sim.motion import Axis
 
 pytestmark = pytest.mark.wire
@@ -174,8 +174,8 @@ def test_it_goes_where_it_is_sent_and_halts(bench):
 
 def test_the_end_of_the_program_stops_it(stock):
     program = (
-        "from cotarget.hardware.clock import MonotonicClock; from cotarget.hardware.head import D46Head\n"
-        "from cotarget.hwconfig import HardwareHead\n"
+        "from cotarget.drivers.clock import MonotonicClock; from cotarget.drivers.polled_head import D46Head\n"
+        "from cotarget.config import HardwareHead\n"
         f"D46Head(HardwareHead(port='{stock.config.port}'), MonotonicClock()).move(2.5, 0.0, speed=0.5)"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=DEADLINE_S)

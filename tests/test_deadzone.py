@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from cotarget.deadzone import Steering, SteeringSettings
+from cotarget.control.controller import doubts_of
+from cotarget.control.head import Steering, SteeringSettings
 from cotarget.estimation import SpatialFilter
 from cotarget.rig import PanTiltLimits, PanTiltState
-from cotarget.servo import doubts_of
 from cotarget.sim.motion import Axis
 from cotarget.targeting import Reach, aim
-from experiments.synthetic import SIZE
+from experiments.synthetic.rig import SIZE
 from tests.moving_targets import RATE, Flight, show
 
 STEP = math.radians(0.0514286)

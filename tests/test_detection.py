@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS, TargetConfig
-from cotarget.detection import ColourDetector, MotionDetector, SpeckDetector, colour, make_detector
+from cotarget.detection import ColourDetector, MotionDetector, SpeckDetector, color_template, make_detector
+from cotarget.detection.background import FLOODED_S, pieces
 from cotarget.detection.base import MOST_FOREGROUND, flood
-from cotarget.detection.colour import LARGEST_FITTED_PX, MOST_FITTED
-from cotarget.detection.motion import FLOODED_S, pieces
-from cotarget.detection.templatefit import MARGIN_PX, fit_template
+from cotarget.detection.color_template import LARGEST_FITTED_PX, MARGIN_PX, MOST_FITTED, fit_template
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.rig import Frame
 
@@ -92,7 +91,7 @@ def test_a_large_book_is_located_as_well_and_by_no_more_pixels(width, monkeypatc
         fitted.append(patch.shape)
         return fit_template(template, patch, center, size)
 
-    monkeypatch.setattr(colour, "fit_template", fit)
+    monkeypatch.setattr(color_template, "fit_template", fit)
     (found,) = ColourDetector(cover()).detect(Frame(on_a_wall((book_of(width), 107, 63)), 0.0))
     height = width * 3 // 4
     np.testing.assert_allclose(found.center_px, (107 + (width - 1) / 2, 63 + (height - 1) / 2), atol=ACCURACY_PX)
@@ -110,7 +109,7 @@ def test_a_large_book_at_the_border_is_located():
 @pytest.mark.parametrize("size", [10, 24, 40])
 def test_among_a_hundred_red_things_the_book_is_found_by_a_few_fits(size, monkeypatch):
     fits = []
-    monkeypatch.setattr(colour, "fit_template", lambda *args: fits.append(1) or fit_template(*args))
+    monkeypatch.setattr(color_template, "fit_template", lambda *args: fits.append(1) or fit_template(*args))
     red = np.full((size * 3 // 4, size, 3), (35, 25, 190), np.uint8)
     red[:, : size // 4] = (60, 40, 150)
     things = [(red, 20 + 60 * (k % 10), 10 + 47 * (k // 10)) for k in range(100)]

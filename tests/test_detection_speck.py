@@ -8,13 +8,11 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import MotionDetector, SpeckDetector, make_detector
-from cotarget.detection.cameramotion import CameraMotion
-from cotarget.detection.change import History, change
-from cotarget.detection.contrast import find_specks
-from cotarget.detection.speck import CLEAR_SIGNAL, EVEN, speck_score
+from cotarget.detection.small_target import CLEAR_SIGNAL, EVEN, CameraMotion, History, change, find_specks, speck_score
 from cotarget.errors import CotargetError
 from cotarget.rig import Frame
-from cotarget.tracking import Tracker, settings_for
+from cotarget.tracking.track import settings_for
+from cotarget.tracking.tracker import Tracker
 
 RATE = 25.0
 NOISE = 2.0  # grey levels, as the simulated sensor's

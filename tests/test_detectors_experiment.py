@@ -5,8 +5,8 @@ import pytest
 
 from cotarget.detection import Detection
 from cotarget.rig import Frame
-from cotarget.sim.appearances import Silhouette
-from cotarget.sim.fieldpaths import GROUPED, group_paths, in_view
+from cotarget.sim.targets.random_paths import GROUPED, group_paths, in_view
+from cotarget.sim.truth import Silhouette
 from experiments import detectors
 from experiments.detectors import MEMORY_S, SHAKES, STANDS, Watch
 from experiments.field_scenes import five_targets_config

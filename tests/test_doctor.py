@@ -12,7 +12,7 @@ import serial
 from cotarget import cli, doctor
 from cotarget.config import parse_config
 from cotarget.doctor import PACKAGES, Finding
-from cotarget.emulators.axis import AxisServer
+from cotarget.emulators.axis_241q import AxisServer
 from cotarget.emulators.plant import Feed
 
 

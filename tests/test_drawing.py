@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from cotarget import drawing
-from cotarget.closeup import Found
 from cotarget.detection import Detection
-from cotarget.drawing import SIZE_KNOWN_S, TargetStages, draw_frames
-from cotarget.loop import State, Step
+from cotarget.drawing import SIZE_KNOWN_S, TargetStages, aim_error_figure, draw_frames
+from cotarget.estimation.zoom_matching import Found
 from cotarget.metrics import Row
-from cotarget.motionfilter import Track
-from cotarget.plots import aim_error_figure
+from cotarget.pipeline import State, Step
 from cotarget.rig import Frame, PanTiltState, ZoomState
 from cotarget.targeting import Aim
+from cotarget.tracking.track import Track
 
 PICTURE = np.zeros((48, 64, 3), np.uint8)
 MIDDLE = np.array([31.5, 23.5])

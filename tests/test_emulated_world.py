@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from cotarget.config import RigConfig, SimConfig, parse_config
-from cotarget.emulators.d46 import D46_FAULTS, D46_STOCK
-from cotarget.emulators.d46_twins import make_twins
 from cotarget.emulators.faults import Faults
-from cotarget.emulators.jsonlines import JsonLines
-from cotarget.emulators.mechanics import REMEMBERED, EmulatedAxis, EmulatedLens
-from cotarget.emulators.world import FIXED_HZ, ZOOM_HZ, LiveWorld, paced
+from cotarget.emulators.ptu_d46.firmware import D46_FAULTS, make_twins
+from cotarget.emulators.ptu_d46.unit import D46_STOCK
+from cotarget.emulators.serve import JsonLines
+from cotarget.emulators.world import FIXED_HZ, REMEMBERED, ZOOM_HZ, EmulatedAxis, EmulatedLens, LiveWorld, paced
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.geometry import pose
 from cotarget.sim.motion import Axis, HeadDrive, LensDrive

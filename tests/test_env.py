@@ -12,11 +12,11 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 from cotarget.config import RigConfig
 from cotarget.env import FOLLOW, SCHEDULE, Follow, PipelinePolicy, Schedule, SchedulingPolicy
+from cotarget.env.common import RIG_FEATURES, Units
 from cotarget.env.follow import TRACK_FEATURES
 from cotarget.env.schedule import SLOTS
-from cotarget.env.units import RIG_FEATURES, Units
 from cotarget.errors import ConfigError, CotargetError
-from cotarget.oracle import TruthNoise
+from cotarget.evaluation import TruthNoise
 from tests.env_episodes import FRAME_S, field_rig, run
 
 NO_NOISE = TruthNoise(center_px=0.0, size=0.0, miss=0.0)
@@ -265,7 +265,7 @@ def test_the_truth_is_in_info_alone(field, make, name, action, steps):
     (lambda: Follow(rig=3), "rig: 3 is neither a cotarget.config.RigConfig nor the path"),
     (lambda: Follow(calibration=3), "calibration: 3 is neither a cotarget.calibration.Calibration nor the path"),
     (lambda: Follow(calibration="nothing.json"), "nothing.json: "),
-    (lambda: Follow(noise=0.5), "noise: 0.5 is no cotarget.oracle.TruthNoise"),
+    (lambda: Follow(noise=0.5), "noise: 0.5 is no cotarget.evaluation.TruthNoise"),
     (lambda: Schedule(served_reward=math.inf), "served_reward: inf is not a finite number"),
     (lambda: Schedule(served_reward="much"), "served_reward: 'much' is not a finite number"),
     (lambda: PipelinePolicy(Schedule()), "the pipeline is a policy of cotarget/Follow-v0"),

@@ -11,9 +11,9 @@ from gymnasium.utils.env_checker import check_env
 
 from cotarget.config import SimCamera
 from cotarget.env import FOLLOW, Follow, Schedule
-from cotarget.env.arguments import DEFAULT_RIG
+from cotarget.env.common import DEFAULT_RIG
 from cotarget.errors import DeviceError
-from cotarget.sim import opengl
+from cotarget.sim.render import opengl
 from tests.env_episodes import field_rig, run, uncollected
 
 pytestmark = pytest.mark.render

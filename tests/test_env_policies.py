@@ -10,10 +10,9 @@ import pytest
 from cotarget.config import RigConfig, SimConfig, SimEffects
 from cotarget.env import FOLLOW, SCHEDULE, Follow, PipelinePolicy, Schedule, SchedulingPolicy
 from cotarget.env.schedule import CANDIDATE_FEATURES, SLOTS
+from cotarget.evaluation import closeup_of, true_calibration
 from cotarget.geometry import pose
-from cotarget.judging import closeup_of
 from cotarget.metrics import SERVED_S
-from cotarget.oracle import true_calibration
 from tests.env_episodes import FRAME_S, field_rig, run
 
 

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 from cotarget.config import RigConfig, SafetyConfig
 from cotarget.env import FOLLOW, Follow, PipelinePolicy, Schedule
-from cotarget.env.arguments import DEFAULT_RIG
+from cotarget.env.common import DEFAULT_RIG
 from cotarget.errors import ConfigError
 from tests.env_episodes import FIELD, field_rig, run, uncollected
 

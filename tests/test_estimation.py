@@ -12,12 +12,11 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.errors import CalibrationError
 from cotarget.estimation import SpatialFilter, estimation_settings_for
-from cotarget.estimation.motion import STATES, propagate
-from cotarget.estimation.settings import BIRD, PERSON, USUAL_BIAS, MotionSettings
-from cotarget.estimation.sight import Sights
-from cotarget.motionfilter import TargetFilter, settings_for
+from cotarget.estimation.measurement_model import Sights
+from cotarget.estimation.motion_model import BIRD, PERSON, STATES, USUAL_BIAS, MotionSettings, propagate
 from cotarget.targeting import Reach, aim, depth_of, point_at
-from experiments.synthetic import NOMINAL_PX, SIZE, Truth
+from cotarget.tracking.track import TargetFilter, settings_for
+from experiments.synthetic.rig import NOMINAL_PX, SIZE, Truth
 from tests.moving_targets import APART, RATE, Flight, calibration_of, magnified, show
 
 SPLIT = 0.15  # by which two predictions may differ from one, in variances: a person over half a second

@@ -9,8 +9,8 @@ import pytest
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.estimation import SpatialFilter
-from cotarget.loop import FollowSettings, State, follow
-from experiments.synthetic import SIZE, Truth
+from cotarget.pipeline import FollowSettings, State, follow
+from experiments.synthetic.rig import SIZE, Truth
 from tests.moving_targets import calibration_of
 from tests.test_loop import CALIBRATION, DELAY, PLAIN, Rig
 

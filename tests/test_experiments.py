@@ -19,19 +19,11 @@ from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, pose
 from cotarget.video import FilmWriter
 from experiments import photos, pipeline_speed, random_rigs
-from experiments.harness import Experiment, Settings, rms, table
-from experiments.synthetic import (
-    SIZE,
-    Lens,
-    Placing,
-    Stop,
-    Truth,
-    aimed,
-    spread_views,
-    undistorted,
-    views_at_stops,
-    with_lever_shifted,
-)
+from experiments.harness import Experiment, Settings
+from experiments.synthetic.aims import aimed
+from experiments.synthetic.rig import SIZE, Lens, Stop, Truth, undistorted, with_lever_shifted
+from experiments.synthetic.views import Placing, spread_views, views_at_stops
+from experiments.texts import rms, table
 from tests.tiny_experiments import TINY
 
 PHOTOS = Path(__file__).parents[2] / "shared" / "data" / "opencv_stereo"

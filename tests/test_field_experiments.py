@@ -8,11 +8,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from cotarget.config import parse_config
-from cotarget.deadzone import SteeringSettings
+from cotarget.control.head import SteeringSettings
+from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, true_calibration
 from cotarget.geometry import pose
-from cotarget.loop import FollowSettings
 from cotarget.metrics import score
-from cotarget.oracle import TruthDetector, TruthFinder, TruthNoise, true_calibration
+from cotarget.pipeline import FollowSettings
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach

@@ -7,10 +7,10 @@ import pytest
 
 from cotarget.config import SimHead
 from cotarget.errors import ConfigError
-from cotarget.loop import follow
-from cotarget.oracle import TruthDetector, true_calibration
-from cotarget.sim.fieldpaths import SECONDS
-from cotarget.sim.targets import marker_of
+from cotarget.evaluation import TruthDetector, true_calibration
+from cotarget.pipeline import follow
+from cotarget.sim.targets.random_paths import SECONDS
+from cotarget.sim.targets.target import marker_of
 from cotarget.sim.world import SimWorld
 from experiments.field_scenes import five_targets_config, hold_config
 

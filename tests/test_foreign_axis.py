@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.emulators.axis import AxisServer, AxisUnit
+from cotarget.emulators.axis_241q import AxisServer, AxisUnit
 from cotarget.emulators.plant import Feed, Picture
 
 pytestmark = pytest.mark.foreign

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed, Picture
-from cotarget.emulators.s5is import S5IS_FAULTS, S5isServer
 
 pytestmark = pytest.mark.foreign
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from cotarget.emulators.d46 import E_SERIES, UnitProfile
-from cotarget.emulators.lines import SerialLine, TcpLine
+from cotarget.emulators.ptu_d46.unit import E_SERIES, UnitProfile
+from cotarget.emulators.serve import SerialLine, TcpLine
 from tests.test_d46_emulator import live
 
 pytestmark = [pytest.mark.foreign, pytest.mark.wire]

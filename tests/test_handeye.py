@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye, solve_hand_eye_from_poses
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform, Rotation, pose
-from experiments.synthetic import Truth
+from experiments.synthetic.rig import Truth
 
 EXACT = 1e-10  # m and rad: noise-free motions leave only rounding
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from cotarget.headmodel import HeadCommand, HeadModel, axis_at
+from cotarget.control.head import HeadCommand, HeadModel, axis_at
 from cotarget.rig import PanTiltLimits, PanTiltState
 from cotarget.sim.motion import Axis
 

@@ -6,16 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.calibration import Calibration, Options, calibrate_views, heldout
-from cotarget.calibration.boards import board_points
-from cotarget.calibration.bundle import fit
-from cotarget.calibration.heldout import cross_validate
-from cotarget.calibration.normal import Prior
-from cotarget.calibration.parameters import ALL_BLOCKS, parameter_names
-from cotarget.calibration.placing import place_boards
-from cotarget.calibration.uncertainty import model_of
+from cotarget.board import board_points
+from cotarget.calibration import Calibration, Options, calibrate_views, uncertainty
+from cotarget.calibration.bundle import ALL_BLOCKS, Prior, fit, parameter_names
+from cotarget.calibration.initialization import place_boards
+from cotarget.calibration.uncertainty import cross_validate, model_of
 from cotarget.config import BoardConfig
-from experiments.synthetic import SIZES, Lens, Placing, Truth, other_rig, spread_views, truth_of
+from experiments.synthetic.rig import SIZES, Lens, Truth, other_rig, truth_of
+from experiments.synthetic.views import Placing, spread_views
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)
@@ -43,7 +41,7 @@ MOST_WIDENED = 1  # of six, where the threshold of three standard deviations is 
 @pytest.mark.slow
 def test_an_exact_model_predicts_what_it_has_not_seen(monkeypatch):
     # Then what is told is the ratio itself, below 1 too.
-    monkeypatch.setattr(heldout, "CHANCE_SIGMAS", -np.inf)
+    monkeypatch.setattr(uncertainty, "CHANCE_SIGMAS", -np.inf)
     ratios = []
     for truth in RIGS:
         start = model_of(calibrate_views(drawn(truth, 99), BOARD, SIZES, options=QUICK))
@@ -56,7 +54,7 @@ def test_an_exact_model_predicts_what_it_has_not_seen(monkeypatch):
             ratios.append(found.widened**2)
     assert np.mean(ratios) == pytest.approx(1.0, abs=RATIO_TOLERANCE)
     monkeypatch.undo()
-    limit = 1 + heldout.CHANCE_SIGMAS / np.sqrt(8)
+    limit = 1 + uncertainty.CHANCE_SIGMAS / np.sqrt(8)
     assert np.count_nonzero(np.array(ratios) > limit) <= MOST_WIDENED
 
 
@@ -68,7 +66,7 @@ NOISE_TOLERANCE = 0.6
 @pytest.mark.slow
 def test_of_a_rig_that_is_known_only_the_boards_noise_is_left(monkeypatch):
     """Then every miss comes from the board's pose, as one view of the fixed camera tells it."""
-    monkeypatch.setattr(heldout, "CHANCE_SIGMAS", -np.inf)
+    monkeypatch.setattr(uncertainty, "CHANCE_SIGMAS", -np.inf)
     exact = model_of(calibrate_views(drawn(Truth(), 0, noise_px=0.0), BOARD, SIZES, options=QUICK))
     known = Prior(exact, dict.fromkeys(parameter_names(ALL_BLOCKS), 1e-8))
     found = cross_validate(fitted(exact, drawn(Truth(), 1, PLACEMENTS, looks=2), known), POINTS, known, folds=2)

@@ -4,9 +4,8 @@ import tomllib
 
 import pytest
 
-from cotarget.config import parse_config
+from cotarget.config import parse_config, socket_address
 from cotarget.errors import ConfigError
-from cotarget.hwconfig import socket_address
 
 MISTAKES = [
     ("hardware.head.port = 3", "hardware.head.port: 3 is not a text"),

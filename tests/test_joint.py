@@ -5,23 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cotarget.board import board_points
 from cotarget.calibration import Options, calibrate_views, predicted_pointing
-from cotarget.calibration.boards import board_points
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform, Rotation
 from experiments.honesty import error_of
-from experiments.synthetic import (
-    SIZES,
-    Placing,
-    Truth,
-    aim,
-    draw_targets,
-    misses,
-    other_rig,
-    spread_views,
-    synthetic_views,
-)
+from experiments.synthetic.aims import aim, draw_targets, misses
+from experiments.synthetic.rig import SIZES, Truth, other_rig
+from experiments.synthetic.views import Placing, spread_views, synthetic_views
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.hardware.jpeg import USUAL, JpegDecoder
+from cotarget.drivers.mjpeg import USUAL, JpegDecoder
 
 GRAY, FULL, HALF, QUARTER = 0, 0x111111, 0x211111, 0x221111  # how finely a picture's colour is sampled
 KINDS = [

@@ -9,14 +9,13 @@ import pytest
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import parse_config
 from cotarget.detection import Detection
+from cotarget.evaluation import add_row, decodes, observe, pointing_errors, true_calibration
 from cotarget.geometry import pose
-from cotarget.judging import add_row, decodes, observe, pointing_errors
-from cotarget.loop import State, Step
-from cotarget.oracle import true_calibration
+from cotarget.pipeline import State, Step
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
-from cotarget.tracking import Track
+from cotarget.tracking.track import Track
 
 pytestmark = pytest.mark.render
 

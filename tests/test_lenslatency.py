@@ -6,7 +6,7 @@ import pytest
 
 from cotarget.config import parse_config
 from cotarget.errors import CalibrationError
-from cotarget.lenslatency import began, measure_lens, scales
+from cotarget.latency import began, measure_lens, scales
 from cotarget.sim.world import SimWorld
 from tests.test_latency import LateCamera, Wrapped
 

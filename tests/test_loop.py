@@ -10,14 +10,14 @@ import pytest
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
+from cotarget.control.selection import FirstCome
+from cotarget.control.zoom import ZoomSettings
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError, StaleFrameError
-from cotarget.loop import FollowSettings, State, follow
-from cotarget.policies import FirstCome
+from cotarget.pipeline import FollowSettings, State, follow
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
 from cotarget.sim.motion import Axis
-from cotarget.zoompolicy import ZoomSettings
-from experiments.synthetic import SIZE, Lens, Truth
+from experiments.synthetic.rig import SIZE, Lens, Truth
 
 RATE_HZ = 24.0  # neither 0.4 s nor 0.8 s is a whole number of frames
 LATENCY = 0.06

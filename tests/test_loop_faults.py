@@ -14,14 +14,14 @@ import pytest
 from cotarget.calibration import load_calibration
 from cotarget.config import RigConfig as Config
 from cotarget.config import SafetyConfig, SimConfig
+from cotarget.control.selection import POLICIES, Chosen
 from cotarget.detection import Detection
 from cotarget.errors import CotargetError, DeviceError, StaleFrameError
-from cotarget.eyes import BLIND_S, FROZEN_S, GONE_S, ZOOM_WAIT_S
-from cotarget.loop import FollowSettings, State, follow
-from cotarget.oracle import TruthDetector, true_calibration
-from cotarget.policies import POLICIES, Chosen
-from cotarget.pursuit import MOST_FILTERS
-from cotarget.replay import ReplayRig, open_recording, until_end
+from cotarget.evaluation import TruthDetector, true_calibration
+from cotarget.fusion import MOST_FILTERS
+from cotarget.pipeline import BLIND_S, FROZEN_S, GONE_S, ZOOM_WAIT_S, FollowSettings, State, follow
+from cotarget.recording.format import open_recording
+from cotarget.recording.replay import ReplayRig, until_end
 from cotarget.rig import Frame
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld

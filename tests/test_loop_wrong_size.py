@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cotarget.loop import FollowSettings, State, follow
-from cotarget.oracle import TruthDetector, TruthFinder, TruthNoise, true_calibration
+from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, true_calibration
+from cotarget.pipeline import FollowSettings, State, follow
 from cotarget.sim.world import SimWorld
 from experiments.field_scenes import hold_config
 

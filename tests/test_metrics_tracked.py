@@ -8,8 +8,7 @@ import pytest
 
 from cotarget.cli.main import main
 from cotarget.errors import ConfigError
-from cotarget.metrics import Label, read_labels, read_tracks, score_tracks
-from cotarget.metrics.tracked import Tracked
+from cotarget.metrics import Label, Tracked, read_labels, read_tracks, score_tracks
 from cotarget.video import FilmWriter
 from tests.recorded_run import RATE_HZ, Bright, calibration_file, record
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from cotarget.config import build
 from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, pose
-from cotarget.tables import build
 from experiments import calibration_budget, depth_error, models, regimes, shortcut
 from experiments.bounds import compare
 from experiments.mounted import MOUNTED_DEG, at, exact_calibration, idealised, mounted, off_px, wanted_focal_px
@@ -29,7 +29,8 @@ from experiments.simpler import (
     models_of,
     scattered,
 )
-from experiments.synthetic import Lens, Truth, looking_off
+from experiments.synthetic.aims import looking_off
+from experiments.synthetic.rig import Lens, Truth
 from experiments.workers import here
 
 STILL = RigidTransform.identity()

@@ -9,7 +9,7 @@ import pytest
 from cotarget.calibration.observability import name_directions, weak_directions
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform, Rotation, pose
-from experiments.synthetic import Truth
+from experiments.synthetic.rig import Truth
 
 POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")

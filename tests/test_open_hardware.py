@@ -6,13 +6,12 @@ import sys
 
 import pytest
 
-from cotarget.config import HardwareConfig, RigConfig, parse_config
+from cotarget.backends import open_rig
+from cotarget.config import HardwareConfig, HardwareHead, RigConfig, parse_config
+from cotarget.drivers import rig as rig_module
+from cotarget.drivers.ptu_d46 import probe
+from cotarget.drivers.rig import open_hardware
 from cotarget.errors import ConfigError, DeviceError
-from cotarget.hardware import rig as hardware_rig
-from cotarget.hardware.d46unit import probe
-from cotarget.hardware.rig import open_hardware
-from cotarget.hwconfig import HardwareHead
-from cotarget.rig import open_rig
 
 ORDER = ("board", "fixed", "zoom", "head")
 CONFIG = parse_config(
@@ -49,7 +48,7 @@ def devices(monkeypatch):
         return Device
 
     for name, attribute in zip(ORDER, ("make_board", "AxisCamera", "GphotoCamera", "D46Head"), strict=True):
-        monkeypatch.setattr(hardware_rig, attribute, maker(name))
+        monkeypatch.setattr(rig_module, attribute, maker(name))
     return log, missing, stuck
 
 
@@ -155,7 +154,7 @@ def test_ctrl_c_while_it_opens_lets_go_too(devices, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(hardware_rig, "D46Head", interrupted)
+    monkeypatch.setattr(rig_module, "D46Head", interrupted)
     with pytest.raises(KeyboardInterrupt):
         open_hardware(CONFIG)
     assert log[-3:] == ["close zoom", "close fixed", "close board"]

@@ -16,9 +16,9 @@ from cotarget import cli, doctor
 from cotarget.calibration import save_calibration
 from cotarget.config import BoardConfig, RigConfig, parse_config
 from cotarget.doctor import Finding
+from cotarget.drivers import ptu_d46
 from cotarget.emulators.emulation import copied_tables
 from cotarget.errors import EmergencyStopError
-from cotarget.hardware import d46reset
 from cotarget.latency import Delay, HeadLatency
 from cotarget.safety import refuse_if_stopped
 from tests.safety_rigs import SimulatedRig
@@ -202,7 +202,7 @@ def test_a_latency_that_cannot_be_is_refused(folder, capsys, monkeypatch, delay,
     """Frames of the default simulation are dated by 60 ms; less than zero by what is measured inaccurately is zero."""
     found = HeadLatency(Delay(delay, 0.99), command=0.04, frames=100)
     monkeypatch.setattr("cotarget.latency.measure_head", lambda rig: found)
-    monkeypatch.setattr("cotarget.rig.open_rig", lambda config: SimulatedRig())
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: SimulatedRig())
     status, out, err = call(capsys, "latency", "--rig", "sim.toml")
     if configured is None:
         assert (status, out) == (1, "")
@@ -246,7 +246,7 @@ def resets(monkeypatch):
         asked.append(config.port)
         return SimpleNamespace(version="v2.12.1d1", pan=axis, tilt=axis)
 
-    monkeypatch.setattr(d46reset, "reset", reset)
+    monkeypatch.setattr(ptu_d46, "reset", reset)
     return asked
 
 

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from cotarget.closeup import Expected
 from cotarget.errors import ConfigError
-from cotarget.oracle import TruthDetector, TruthFinder, TruthNoise, counted, seeded, true_calibration
+from cotarget.estimation.zoom_matching import Expected
+from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, counted, seeded, true_calibration
 from cotarget.rig import Frame
-from cotarget.sim.fieldpaths import SECONDS
+from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.world import SimWorld
 from experiments.field_scenes import five_targets_config, hold_config
 

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cotarget.board import board_points
 from cotarget.calibration import Calibration, Options, calibrate_views, predicted_pointing
-from cotarget.calibration.boards import board_points
-from cotarget.calibration.bundle import fit
-from cotarget.calibration.outlook import BORDER, DEPTHS_SQUARES, GRID, outlook_of, planned_views
-from cotarget.calibration.parameters import ALL_BLOCKS
-from cotarget.calibration.placing import place_boards
+from cotarget.calibration.bundle import ALL_BLOCKS, fit
+from cotarget.calibration.initialization import place_boards
+from cotarget.calibration.planning import BORDER, DEPTHS_SQUARES, OUTLOOK_GRID, outlook_of, planned_views
 from cotarget.calibration.uncertainty import covariance_of, model_of
 from cotarget.config import BoardConfig
-from experiments.synthetic import SIZE, SIZES, Placing, Truth, spread_views, synthetic_views
+from experiments.synthetic.rig import SIZE, SIZES, Truth
+from experiments.synthetic.views import Placing, spread_views, synthetic_views
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)
@@ -55,7 +55,7 @@ def test_its_error_is_that_of_the_calibration(found, outlook):
     calibration = Calibration(
         model.fixed, model.zoom, model.gamma, model.hand, model.head, covariance=covariance_of(found)
     )
-    across, down = (np.linspace(BORDER, 1 - BORDER, count) for count in GRID)
+    across, down = (np.linspace(BORDER, 1 - BORDER, count) for count in OUTLOOK_GRID)
     pixels = np.array([(u, v) for u in across for v in down]) * (np.array(SIZE) - 1)
     errors = [predicted_pointing(calibration, pixels, depth * BOARD.square) for depth in DEPTHS_SQUARES]
     assert outlook.error() == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=ROUNDING)

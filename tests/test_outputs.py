@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cotarget import outputs
+from cotarget import files
 from cotarget.drawing import write_picture
 from cotarget.errors import ConfigError
-from cotarget.outputs import CsvFile, PartFile, write_whole
+from cotarget.files import CsvFile, PartFile, write_whole
 from cotarget.video import Film, FilmWriter
 from tests.full_disk import SAID, full_disk
 
@@ -120,7 +120,7 @@ def test_small_files_wait_for_each_other(tmp_path):
 
 
 def test_who_waits_for_a_run_that_goes_on_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("cotarget.outputs.PATIENCE_S", 0.05)
+    monkeypatch.setattr("cotarget.files.PATIENCE_S", 0.05)
     with CsvFile(tmp_path / "a.csv", ("n",)), pytest.raises(ConfigError, match="is being written by another run"):
         write_whole(tmp_path / "a.csv", b"whole")
     assert (tmp_path / "a.csv").read_text().split() == ["n"]
@@ -206,7 +206,7 @@ class _Signalled(FilmWriter):
 def test_what_a_killed_run_has_left_is_taken_over(tmp_path):
     path = tmp_path / "a.csv"
     killed = (
-        "import os, pathlib\nfrom cotarget.outputs import CsvFile\n"
+        "import os, pathlib\nfrom cotarget.files import CsvFile\n"
         "table = CsvFile(pathlib.Path('a.csv'), ('much',) * 1000)\n"
         "table._file.flush()\nos.kill(os.getpid(), 9)\n"
     )
@@ -223,14 +223,14 @@ def test_a_result_that_has_just_got_its_name_is_not_taken_for_a_part(tmp_path, m
     first, opened = PartFile(path), []
     first.path.write_text("first")
 
-    def lock(descriptor, plain=outputs._lock):
+    def lock(descriptor, plain=files._lock):
         if not opened:
             opened.append(descriptor)
             with first.ending(keep=True):
                 pass
         plain(descriptor)
 
-    monkeypatch.setattr("cotarget.outputs._lock", lock)
+    monkeypatch.setattr("cotarget.files._lock", lock)
     second = PartFile(path)
     with pytest.raises(ConfigError, match="another run"):
         PartFile(path)

@@ -8,9 +8,9 @@ import pytest
 
 from cotarget.config import parse_config
 from cotarget.errors import ConfigError
-from cotarget.loop import FollowSettings
-from cotarget.oracle import TruthDetector, TruthNoise, true_calibration
+from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
 from cotarget.pantilt import shortcut
+from cotarget.pipeline import FollowSettings
 from cotarget.sim.world import SimWorld
 from experiments import fig4_book, pointing, table2_table3
 from experiments.cases import choose

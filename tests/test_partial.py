@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.calibration.boards import board_points
-from cotarget.calibration.partial import find_near
+from cotarget.board import board_points
+from cotarget.calibration.corners import find_near
 from cotarget.config import BoardConfig, parse_config
 from cotarget.geometry import pose
 from cotarget.pantilt import IDEAL_HEAD, nearest, solve

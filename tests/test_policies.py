@@ -7,11 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cotarget import planning
-from cotarget.motionfilter import Track
-from cotarget.planning import LOOK_S, MOST_PLANNED, SETTLE_S, Candidate, Outlook, plan, travel_s
-from cotarget.policies import POLICIES, Chosen, FirstCome, leaves_in
+from cotarget.control import selection
+from cotarget.control.selection import (
+    LOOK_S,
+    MOST_PLANNED,
+    POLICIES,
+    SETTLE_S,
+    Candidate,
+    Chosen,
+    FirstCome,
+    Outlook,
+    leaves_in,
+    plan,
+    travel_s,
+)
 from cotarget.rig import PanTiltLimits
+from cotarget.tracking.track import Track
 
 LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians(206), math.radians(0.0514286))
 STILL = np.zeros(2)
@@ -199,7 +210,7 @@ def test_the_plan_is_the_best_of_all_orders():
 def test_a_plan_of_many_takes_a_part_of_a_frame(monkeypatch):
     """All can be had in any order, so that nothing is left out: ways are counted, as time depends on the machine."""
     ways = []
-    monkeypatch.setattr(planning, "travel_s", lambda way, limits: ways.append(way) or travel_s(way, limits))
+    monkeypatch.setattr(selection, "travel_s", lambda way, limits: ways.append(way) or travel_s(way, limits))
     many = [candidate(i, 0.1 * i, leaves=1000.0) for i in range(MOST_PLANNED + 3)]
     assert most_served().select(many, STILL, LIMITS) is not None
     n = MOST_PLANNED

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.calibration.boards import find_corners
-from cotarget.calibration.printing import print_board
+from cotarget.board import print_board
+from cotarget.calibration.corners import find_corners
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError, ConfigError
 from tests.full_disk import SAID, full_disk

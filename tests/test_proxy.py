@@ -12,7 +12,7 @@ from cotarget.config import parse_config
 from cotarget.detection import make_detector
 from cotarget.errors import CotargetError
 from cotarget.geometry import pose
-from cotarget.loop import FollowSettings, State, follow
+from cotarget.pipeline import FollowSettings, State, follow
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, Rig, ZoomState
 from cotarget.safety import SafeRig
 from tests.test_cli import true_calibration

@@ -7,15 +7,28 @@ import time
 
 import pytest
 
-from cotarget.emulators import ptp, ptpip
+from cotarget.emulators import ptpip
+from cotarget.emulators import ptpip as ptpip_module
+from cotarget.emulators.canon_s5is import OPERATIONS, S5IS_FAULTS, Exposure, S5isCamera
 from cotarget.emulators.faults import Faults
-from cotarget.emulators.ptp import Answer, Code, DeviceInfo, ObjectInfo, Property, PtpError, Range
-from cotarget.emulators.ptpip import Cancel, Data, InitCommand, InitEvent, PacketReader, Probe, Request, StartData
-from cotarget.emulators.ptpserver import CommandSession
-from cotarget.emulators.s5is import S5IS_FAULTS
-from cotarget.emulators.s5is_camera import S5isCamera
-from cotarget.emulators.s5is_pictures import Exposure
-from cotarget.emulators.s5is_tables import OPERATIONS
+from cotarget.emulators.ptpip import (
+    Answer,
+    Cancel,
+    Code,
+    CommandSession,
+    Data,
+    DeviceInfo,
+    InitCommand,
+    InitEvent,
+    ObjectInfo,
+    PacketReader,
+    Probe,
+    Property,
+    PtpError,
+    Range,
+    Request,
+    StartData,
+)
 
 GUID = bytes(range(16))
 # What libgphoto2 sends when it connects from a machine named "ab", asks for its info and sets the zoom to 105.
@@ -106,44 +119,44 @@ def test_a_long_data_phase(length):
 @pytest.mark.parametrize(
     ("kind", "value", "coded"),
     [
-        (ptp.UINT8, 200, "c8"),
-        (ptp.INT8, -2, "fe"),
-        (ptp.UINT16, 0xD02A, "2ad0"),
-        (ptp.INT16, -2, "feff"),
-        (ptp.UINT32, 524288, "00000800"),
-        (ptp.UINT64, 1, "0100000000000000"),
-        (ptp.STRING, "S5", "03 5300 3500 0000"),
-        (ptp.STRING, "", "00"),
-        (ptp.ARRAY | ptp.UINT32, (119, 0), "02000000 77000000 00000000"),
-        (ptp.ARRAY | ptp.UINT8, (), "00000000"),
-        (ptp.ARRAY | ptp.INT16, (-2, 3), "02000000 feff 0300"),
+        (ptpip_module.UINT8, 200, "c8"),
+        (ptpip_module.INT8, -2, "fe"),
+        (ptpip_module.UINT16, 0xD02A, "2ad0"),
+        (ptpip_module.INT16, -2, "feff"),
+        (ptpip_module.UINT32, 524288, "00000800"),
+        (ptpip_module.UINT64, 1, "0100000000000000"),
+        (ptpip_module.STRING, "S5", "03 5300 3500 0000"),
+        (ptpip_module.STRING, "", "00"),
+        (ptpip_module.ARRAY | ptpip_module.UINT32, (119, 0), "02000000 77000000 00000000"),
+        (ptpip_module.ARRAY | ptpip_module.UINT8, (), "00000000"),
+        (ptpip_module.ARRAY | ptpip_module.INT16, (-2, 3), "02000000 feff 0300"),
     ],
 )
 def test_values(kind, value, coded):
     coded = bytes.fromhex(coded)
-    assert ptp.encode(kind, value) == coded
-    assert ptp.decode(kind, coded) == value
+    assert ptpip_module.encode(kind, value) == coded
+    assert ptpip_module.decode(kind, coded) == value
     for wrong in (coded[:-1], coded + b"\0"):
         with pytest.raises(PtpError):
-            ptp.decode(kind, wrong)
+            ptpip_module.decode(kind, wrong)
 
 
 def test_a_type_that_there_is_not():
     with pytest.raises(PtpError, match="0x000b"):
-        ptp.decode(11, b"\0")
+        ptpip_module.decode(11, b"\0")
 
 
 def test_descriptions_of_properties():
     # code, type UINT16, writable, default 0, now 64, range, 0 to 134 by 1
-    zoom = Property(0xD02A, ptp.UINT16, 0, True, Range(0, 134))
+    zoom = Property(0xD02A, ptpip_module.UINT16, 0, True, Range(0, 134))
     assert zoom.describe(64) == bytes.fromhex("2ad0 0400 01 0000 4000 01 0000 8600 0100")
-    aperture = Property(0xD01D, ptp.UINT16, 40, False, ())  # a list of nothing
+    aperture = Property(0xD01D, ptpip_module.UINT16, 40, False, ())  # a list of nothing
     assert aperture.describe(40) == bytes.fromhex("1dd0 0400 00 2800 2800 02 0000")
-    metering = Property(0xD010, ptp.UINT8, 3, True, (3, 0, 1))
+    metering = Property(0xD010, ptpip_module.UINT8, 3, True, (3, 0, 1))
     assert metering.describe(0) == bytes.fromhex("10d0 0200 01 03 00 02 0300 03 00 01")
-    assert Property(0xD038, ptp.UINT16, 27).describe(27) == bytes.fromhex("38d0 0400 00 1b00 1b00 00")
+    assert Property(0xD038, ptpip_module.UINT16, 27).describe(27) == bytes.fromhex("38d0 0400 00 1b00 1b00 00")
     assert [zoom.allows(value) for value in (-1, 0, 134, 135)] == [False, True, True, False]
-    assert [Property(1, ptp.UINT8, 1, True, Range(1, 9, 4)).allows(value) for value in (5, 6)] == [True, False]
+    assert [Property(1, ptpip_module.UINT8, 1, True, Range(1, 9, 4)).allows(value) for value in (5, 6)] == [True, False]
     assert [metering.allows(value) for value in (1, 2)] == [True, False]
 
 
@@ -330,7 +343,7 @@ def fuzz(count):
                 refused += 1
             kind = rng.choice((*range(12), *(0x4000 | kind for kind in range(12)), 0xFFFF, rng.getrandbits(16)))
             with contextlib.suppress(PtpError):
-                ptp.encode(kind, ptp.decode(kind, sent[: rng.randrange(20)]))
+                ptpip_module.encode(kind, ptpip_module.decode(kind, sent[: rng.randrange(20)]))
         assert time.monotonic() - began < BATCH_S
     assert refused > 0.2 * count  # both happen often, or the noise was of the wrong sort
     assert answered > 0.3 * count

@@ -11,16 +11,15 @@ import pytest
 
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.closeup import CloseupFinder, Found
-from cotarget.closeup.finder import LONGEST_APART_S
 from cotarget.config import DEFAULT_TARGETS
+from cotarget.control.selection import RATE_S
 from cotarget.detection import Detection
+from cotarget.estimation.zoom_matching import LONGEST_APART_S, CloseupFinder, Found
+from cotarget.fusion import MOST_FILTERS, MOST_WAITING, UNFOUND_S, Pursuit
 from cotarget.geometry import pose
-from cotarget.motionfilter import Track
-from cotarget.planning import RATE_S
-from cotarget.pursuit import MOST_FILTERS, MOST_WAITING, UNFOUND_S, Pursuit
 from cotarget.rig import Frame, PanTiltState, ZoomState
-from cotarget.tracking import Tracker, settings_for
+from cotarget.tracking.track import Track, settings_for
+from cotarget.tracking.tracker import Tracker
 
 SIZE, CENTER, FOCAL, ZOOMED = (640, 480), (319.5, 239.5), 700.0, 3000.0
 BASELINE = 0.4

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.film import run_on_film
+from cotarget.detect_video import run_on_film
 from cotarget.metrics import Label, read_labels, read_tracks, score_tracks
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -12,18 +12,18 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget import recordwriter
 from cotarget.calibration import load_calibration
-from cotarget.config import DEFAULT_TARGETS, RigConfig, parse_config
+from cotarget.config import DEFAULT_TARGETS, RigConfig, config_table, parse_config
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError, CotargetError, DeviceError
-from cotarget.loop import State, Step
-from cotarget.recordformat import CALLS, Event, config_table, event_line, parse_event
-from cotarget.recording import COLUMNS, Recorder, StepTable
-from cotarget.replay import ReplayRig, open_recording
+from cotarget.pipeline import State, Step
+from cotarget.recording import recorder as recorder_module
+from cotarget.recording.format import CALLS, Event, event_line, open_recording, parse_event
+from cotarget.recording.recorder import COLUMNS, Recorder, StepTable
+from cotarget.recording.replay import ReplayRig
 from cotarget.rig import Frame, PanTiltState, ZoomState
 from cotarget.targeting import Aim
-from cotarget.tracking import Track
+from cotarget.tracking.track import Track
 from tests.full_disk import SAID, full_disk
 from tests.recorded_run import CONFIG, SIZE, ToyRig, calibration_file, record, run
 
@@ -303,20 +303,20 @@ class Jammed:
 
     def __init__(self, monkeypatch):
         self.free, self.begun = threading.Event(), threading.Event()
-        write = recordwriter.RecordWriter._write_image
+        write = recorder_module.RecordWriter._write_image
 
         def wait_and_write(writer, name, image):
             self.begun.set()
             assert self.free.wait(60)
             return write(writer, name, image)
 
-        monkeypatch.setattr(recordwriter.RecordWriter, "_write_image", wait_and_write)
+        monkeypatch.setattr(recorder_module.RecordWriter, "_write_image", wait_and_write)
 
 
 def test_a_slow_disk_costs_closeups_and_says_how_many(tmp_path, calibration_path, monkeypatch, caplog):
     """The zoom camera's images stay out, and the fixed camera's are all there; the run is the same to the last bit."""
     disk = Jammed(monkeypatch)
-    monkeypatch.setattr(recordwriter, "ZOOM_ROOM", 4 * IMAGE_BYTES)
+    monkeypatch.setattr(recorder_module, "ZOOM_ROOM", 4 * IMAGE_BYTES)
     steps = []
     with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
         for step in run(recorder.wrap(ToyRig()), load_calibration(calibration_path), seconds=2.0):
@@ -339,8 +339,8 @@ def test_a_slow_disk_costs_closeups_and_says_how_many(tmp_path, calibration_path
 
 def test_a_run_waits_for_a_disk_that_has_no_room_for_the_fixed_cameras_images(tmp_path, calibration_path, monkeypatch):
     disk = Jammed(monkeypatch)
-    monkeypatch.setattr(recordwriter, "ROOM", 3 * IMAGE_BYTES)
-    monkeypatch.setattr(recordwriter, "ZOOM_ROOM", 0)
+    monkeypatch.setattr(recorder_module, "ROOM", 3 * IMAGE_BYTES)
+    monkeypatch.setattr(recorder_module, "ZOOM_ROOM", 0)
     steps = []
 
     def work():
@@ -361,14 +361,14 @@ def test_a_run_waits_for_a_disk_that_has_no_room_for_the_fixed_cameras_images(tm
 
 
 def test_a_full_disk_does_not_stop_the_run_but_is_told(tmp_path, calibration_path, monkeypatch, caplog):
-    write = recordwriter.RecordWriter._write_image
+    write = recorder_module.RecordWriter._write_image
 
     def fill_up(writer, name, image):
         if name == "fixed/000010.png":
             raise OSError(errno.ENOSPC, "No space left on device")
         return write(writer, name, image)
 
-    monkeypatch.setattr(recordwriter.RecordWriter, "_write_image", fill_up)
+    monkeypatch.setattr(recorder_module.RecordWriter, "_write_image", fill_up)
     steps = []
 
     def work():

@@ -21,19 +21,17 @@ from cotarget.calibration import load_calibration
 from cotarget.calibration.file import save_calibration
 from cotarget.cli.main import main
 from cotarget.config import parse_config
+from cotarget.control.selection import Chosen, Whom, parse_whom, whom_table
 from cotarget.detection import make_detector
 from cotarget.errors import ConfigError, CotargetError, DeviceError, StaleFrameError
 from cotarget.estimation import Estimate
-from cotarget.loop import FollowSettings, State, follow
-from cotarget.policies import Chosen
-from cotarget.recordformat import COMPLETE, Event
-from cotarget.recording import Recorder
-from cotarget.replay import Differences, RecordingEndedError, ReplayRig, open_recording, until_end
-from cotarget.replaytape import Tape
+from cotarget.pipeline import FollowSettings, State, follow
+from cotarget.recording.format import COMPLETE, Event, open_recording
+from cotarget.recording.recorder import Recorder
+from cotarget.recording.replay import Differences, RecordingEndedError, ReplayRig, Tape, until_end
 from cotarget.rig import PanTiltState
 from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
-from cotarget.whom import Whom, parse_whom, whom_table
 from tests.recorded_run import (
     CONFIG,
     RATE_HZ,

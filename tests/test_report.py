@@ -12,43 +12,31 @@ import numpy as np
 import pytest
 
 from cotarget import cli
+from cotarget.board import board_points
 from cotarget.calibration import Covariance, HeldOut, Options, Rejected, View, calibrate_views, save_calibration
-from cotarget.calibration.boards import board_points
 from cotarget.cli.calibrating import summary
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.report import verdict
-from cotarget.report.advice import advice
-from cotarget.report.evidence import Corners, averaged, empty_places, gather
-from cotarget.report.lenscurves import lens_curves
-from cotarget.report.page import write_report
-from cotarget.report.pointing import (
+from cotarget.report.analysis import (
     JITTER_GROUP,
     Contribution,
+    Corners,
+    averaged,
     contributions,
+    empty_places,
+    gather,
     given,
+    lens_curves,
     pointing,
     what_stays,
     with_more_placements,
 )
-from cotarget.report.tables import correlations
-from cotarget.report.verdict import judge
-from cotarget.report.wording import digits, percent, value_and_sigma
-from experiments.synthetic import (
-    NOMINAL_PX,
-    SIZE,
-    SIZES,
-    Lens,
-    Placing,
-    Stop,
-    Truth,
-    noisy,
-    placed,
-    pointing_errors,
-    synthetic_views,
-    views_at_stops,
-    zoom_view,
-)
+from cotarget.report.page import write_report
+from cotarget.report.text import advice, correlations, digits, judge, percent, value_and_sigma
+from experiments.synthetic.aims import pointing_errors
+from experiments.synthetic.rig import NOMINAL_PX, SIZE, SIZES, Lens, Stop, Truth
+from experiments.synthetic.views import Placing, noisy, placed, synthetic_views, views_at_stops, zoom_view
 from tests.full_disk import SAID, full_disk
 
 BOARD = BoardConfig()

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from cotarget.errors import ConfigError
-from cotarget.sim.opengl import Canvas
+from cotarget.sim.render.opengl import Canvas
 from experiments.bounds import Bound, compare, tighten
 from experiments.cases import EXPERIMENTS, choose, known_experiments
 from experiments.cluster import _check_linear_algebra, on_dask
@@ -46,7 +46,7 @@ def run(tmp_path, capsys, monkeypatch):
 
     def typed(*arguments, out="out", expected=tmp_path):
         with monkeypatch.context() as patched:
-            patched.setattr("cotarget.cli.arguments.REMARK_S", math.inf)  # a busy machine is no complaint
+            patched.setattr("cotarget.cli.common.REMARK_S", math.inf)  # a busy machine is no complaint
             if "--processes" not in arguments:
                 patched.setattr("experiments.command.in_processes", here)
                 patched.setattr("experiments.runner.in_turn", here)

@@ -16,7 +16,7 @@ import pytest
 
 import experiments
 from cotarget.errors import ConfigError
-from cotarget.sim import opengl
+from cotarget.sim.render import opengl
 from experiments import delay, harness, hold, sweep_speed, tasks
 from experiments.__main__ import INTERRUPTED
 from experiments.__main__ import main as entry

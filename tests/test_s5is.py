@@ -13,12 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.emulators import ptpserver, s5is_pictures
+from cotarget.emulators import canon_s5is, ptpip
+from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isCamera, S5isServer, Shutter, Viewfinder
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import Feed, Picture
-from cotarget.emulators.s5is import S5IS_FAULTS, S5isServer
-from cotarget.emulators.s5is_camera import S5isCamera
-from cotarget.emulators.s5is_pictures import Shutter, Viewfinder
 from cotarget.errors import ConfigError, DeviceError
 
 OK, BUSY = 0x2001, 0x2019
@@ -260,7 +258,7 @@ def test_the_viewfinder_averages_areas():
 
 
 def test_the_viewfinder_gives_each_picture_once(monkeypatch):
-    monkeypatch.setattr(s5is_pictures, "PICTURE_WAIT_S", 0.05)
+    monkeypatch.setattr(canon_s5is, "PICTURE_WAIT_S", 0.05)
     with Bench() as bench:
         assert bench.code(0x901D) == BUSY  # it is off
         bench.preview.publish(Picture(plain((64, 48), 10), 0, time.monotonic()))
@@ -423,7 +421,7 @@ def test_the_shutter_goes_after_its_delay():
 
 
 def test_whoever_comes_next_starts_anew(monkeypatch):
-    monkeypatch.setattr(s5is_pictures, "PICTURE_WAIT_S", 0.05)
+    monkeypatch.setattr(canon_s5is, "PICTURE_WAIT_S", 0.05)
     stills = Stills(1)
     with Bench(still=stills) as bench:
         bench.ask(0x900B)
@@ -627,7 +625,7 @@ def test_a_still_on_the_wire_interrupts(server):
 @pytest.mark.wire
 def test_one_initiator_at_a_time(server, monkeypatch):
     with Initiator(server.port):
-        monkeypatch.setattr(ptpserver, "SUCCESSION_S", 0.05)
+        monkeypatch.setattr(ptpip, "SUCCESSION_S", 0.05)
         with Line(server.port, INIT_COMMAND) as second:
             assert second.packet() == (5, struct.pack("<I", 2))
             assert second.ends()
@@ -684,8 +682,8 @@ def test_a_slow_camera_answers_before_libgphoto2_gives_up(server):
         server.faults.set("slow")
         began = time.monotonic()
         assert camera.ask(0x1003)[0] == OK
-        assert time.monotonic() - began >= ptpserver.SLOW_S
-        assert ptpserver.SLOW_S < REPLY_S / 2
+        assert time.monotonic() - began >= ptpip.SLOW_S
+        assert ptpip.SLOW_S < REPLY_S / 2
 
 
 @pytest.mark.wire

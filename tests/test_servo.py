@@ -10,15 +10,15 @@ import pytest
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.deadzone import SteeringSettings
+from cotarget.control.controller import Servo, ServoSettings, reach_of
+from cotarget.control.head import SteeringSettings
+from cotarget.control.zoom import ZoomSettings
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Appearance
 from cotarget.geometry import pose
 from cotarget.rig import PanTiltLimits, PanTiltState, ZoomState
-from cotarget.servo import Servo, ServoSettings, reach_of
 from cotarget.sim.motion import Axis
 from cotarget.targeting import Closeup
-from cotarget.zoompolicy import ZoomSettings
 
 SIZE, CENTER = (640, 480), (319.5, 239.5)
 SHORTEST, LONGEST = 700.0, 7000.0

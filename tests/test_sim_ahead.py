@@ -10,8 +10,8 @@ import pytest
 
 from cotarget.config import parse_config
 from cotarget.errors import DeviceError
-from cotarget.sim.ahead import READ_IN_TURN, Ahead, is_allowed
-from cotarget.sim.opengl import Canvas
+from cotarget.sim.render.opengl import Canvas
+from cotarget.sim.render.views import READ_IN_TURN, Ahead, is_allowed
 from cotarget.sim.world import SimWorld
 
 FRAMES = READ_IN_TURN + 8

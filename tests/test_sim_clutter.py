@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.config import parse_config
+from cotarget.config import SimEffects, parse_config
 from cotarget.sim.world import SimWorld
-from cotarget.simconfig import SimEffects
 
 pytestmark = pytest.mark.render
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cotarget.config import parse_config
-from cotarget.sim.opengl import Canvas
+from cotarget.sim.render.opengl import Canvas
 from cotarget.sim.world import SimWorld
 
 pytestmark = pytest.mark.render

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.config import DEFAULT_TARGETS, RigConfig, SimConfig
+from cotarget.config import DEFAULT_TARGETS, TARGETS, RigConfig, SimConfig
 from cotarget.errors import ConfigError
-from cotarget.sim.targets import TARGETS, kind_of, marker_of
+from cotarget.sim.targets.target import kind_of, marker_of
 from cotarget.sim.world import SimWorld
 
 NEAR = 2.4  # where a marker decodes in the wide view [m]

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from cotarget.calibration.boards import board_points, find_corners
+from cotarget.board import board_points
+from cotarget.calibration.corners import find_corners
 from cotarget.config import BoardConfig, SimZoomCamera, parse_config
 from cotarget.geometry import pose
-from cotarget.sim.lens import TrueLens
+from cotarget.sim.render.optics import TrueLens
 from cotarget.sim.world import SimWorld
 
 BOARD = BoardConfig(square=0.04)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from cotarget.config import parse_config
-from cotarget.sim.fieldpaths import lone_path
-from cotarget.sim.outlines import PHASES, Outlines, outermost
+from cotarget.sim.targets.random_paths import lone_path
+from cotarget.sim.truth import PHASES, Outlines, outermost
 from cotarget.sim.world import SimWorld
 
 # Parts of a target's larger side: a wing between two phases, and what lies between the directions looked in.

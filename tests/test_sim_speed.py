@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from cotarget.loop import State
+from cotarget.pipeline import State
 from cotarget.safety import SafeRig
 from experiments import field, sim_speed
 from experiments.field_scenes import hold_config

@@ -52,7 +52,7 @@ def test_no_opengl_is_opened_for_no_picture(monkeypatch):
     def refuse(*_):
         raise AssertionError("nothing is to be rendered")
 
-    monkeypatch.setattr("cotarget.sim.opengl.make_renderer", refuse)
+    monkeypatch.setattr("cotarget.sim.render.opengl.make_renderer", refuse)
     drive(SimWorld(config(), rendered=()))
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.oracle import TruthDetector, TruthNoise, true_calibration
+from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
 from cotarget.rig import Frame
-from cotarget.sim.outlines import Outlines
+from cotarget.sim.truth import Outlines
 from cotarget.sim.world import SimWorld
 from experiments import single_ptz, single_runs
 from experiments.bounds import compare

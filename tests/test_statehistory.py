@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from cotarget.fusion import REMEMBERED_S, StateHistory
 from cotarget.rig import PanTiltState, ZoomState
 from cotarget.sim.motion import trapezoid
-from cotarget.statehistory import REMEMBERED_S, StateHistory
 
 RATE_S = 0.04
 OFF_DEG = 0.024  # where the acceleration changes between two states

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cotarget.calibration.session import with_stills
 from cotarget.errors import StaleFrameError
 from cotarget.rig import Frame, ZoomState
-from cotarget.stills import with_stills
 
 FACTOR = 10.2  # 3264 over 320: the PowerShot S5 IS
 EXPOSED_AFTER = 0.3  # from asking for a still to its exposure [s]

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cotarget.config import TARGETS
 from cotarget.errors import ConfigError
-from cotarget.sim.opengl import mujoco  # which chooses the OpenGL, whichever test comes first
-from cotarget.sim.targets import MOUNT, TARGETS, make_target, scale_spec, waypoint_path
+from cotarget.sim.render.opengl import mujoco  # which chooses the OpenGL, whichever test comes first
+from cotarget.sim.targets.paths import MOUNT, waypoint_path
+from cotarget.sim.targets.target import make_target, scale_spec
 
 ASSETS = Path(__file__).parent.parent / "sim_assets"
 SEEDS = range(3)

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from cotarget import tracking
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.motionfilter import CUT, TargetFilter, center_variance, missing
-from cotarget.tracking import MOST_DETECTIONS, Tracker, TrackerSettings, settings_for
+from cotarget.tracking import tracker as tracker_module
+from cotarget.tracking.track import CUT, TargetFilter, TrackerSettings, center_variance, missing, settings_for
+from cotarget.tracking.tracker import MOST_DETECTIONS, Tracker
 
 RATE = 25.0
 SIZE = (640, 480)
@@ -197,12 +197,12 @@ def test_comparing_everything_with_everything_is_done_once_a_frame(monkeypatch):
     """However many tracks are born."""
     asked = []
 
-    class Counted(tracking._Pairs):
+    class Counted(tracker_module._Pairs):
         def __init__(self, states, detections, image_size):
             asked.append((len(states), len(detections)))
             super().__init__(states, detections, image_size)
 
-    monkeypatch.setattr(tracking, "_Pairs", Counted)
+    monkeypatch.setattr(tracker_module, "_Pairs", Counted)
     tracker = Tracker(PLAIN, SIZE)
     for i in range(3):
         tracker.update([seen(30 * k + 15, 100 * i + 50) for k in range(20)], i / RATE)
@@ -379,18 +379,18 @@ def test_a_bird_that_turns_behind_foliage_is_found_again(gap_s, turn):
 @pytest.mark.parametrize("name", [None, "book", "person", "bird"])
 def test_a_lone_pair_is_matched_as_any_other(monkeypatch, name):
     """Whatever overlaps or does not, in all ways in which a lone detection is of a lone track, or of nothing known."""
-    shortcut, ways = tracking._belongs, Counter()
+    shortcut, ways = tracker_module._belongs, Counter()
 
     def both(state, detection, image_size):
-        pairs = tracking._Pairs([state], [detection], image_size)
-        matches = tracking._assign(pairs)
+        pairs = tracker_module._Pairs([state], [detection], image_size)
+        matches = tracker_module._assign(pairs)
         found = shortcut(state, detection, image_size)
-        assert tracking._overlap(state, detection) == pairs.overlap[0, 0]
-        assert (matches, tracking._crowds(pairs, matches)) == ({0: 0} if found else {}, {})
-        ways[found, bool(pairs.overlap[0, 0] > tracking.OVERLAP_ENOUGH), state.missed > 0] += 1
+        assert tracker_module._overlap(state, detection) == pairs.overlap[0, 0]
+        assert (matches, tracker_module._crowds(pairs, matches)) == ({0: 0} if found else {}, {})
+        ways[found, bool(pairs.overlap[0, 0] > tracker_module.OVERLAP_ENOUGH), state.missed > 0] += 1
         return found
 
-    monkeypatch.setattr(tracking, "_belongs", both)
+    monkeypatch.setattr(tracker_module, "_belongs", both)
     rng = np.random.default_rng(5)
     for _ in range(30):
         tracker = Tracker(PLAIN if name is None else settings_for(DEFAULT_TARGETS[name]), SIZE)

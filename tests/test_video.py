@@ -12,8 +12,8 @@ import pytest
 
 from cotarget.cli.main import main
 from cotarget.config import DEFAULT_TARGETS
+from cotarget.detect_video import COLUMNS, run_on_film
 from cotarget.errors import CotargetError
-from cotarget.film import COLUMNS, run_on_film
 from cotarget.video import Film, FilmWriter
 
 RATE = 25.0

@@ -12,13 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.cli import viewing
+from cotarget.cli import running
 from cotarget.config import RigConfig, SimConfig
 from cotarget.errors import DeviceError
-from cotarget.sim import browser, desktop
-from cotarget.sim.frusta import FAR, SIDE_POINTS, Sight, frusta_of, frustum_rim
-from cotarget.sim.onlooker import Onlooker, line_geoms
-from cotarget.sim.opengl import mujoco
+from cotarget.sim.render.opengl import mujoco
+from cotarget.sim.viewer import browser, desktop
+from cotarget.sim.viewer.scene import FAR, SIDE_POINTS, Onlooker, Sight, frusta_of, frustum_rim, line_geoms
 from cotarget.sim.world import SimWorld
 from tests.test_cli import call
 
@@ -127,7 +126,7 @@ def moments(clock, took):
 def test_nothing_happens_quicker_than_it_does_and_a_slow_moment_is_not_made_up_for():
     clock = People()
     window = Window(clock)
-    viewing.watch(moments(clock, [0.0, 0.02, 0.02, 0.5, 0.02]), window, clock.now, clock.sleep)
+    running.watch(moments(clock, [0.0, 0.02, 0.02, 0.5, 0.02]), window, clock.now, clock.sleep)
     np.testing.assert_allclose([at for _, at in window.shown], [0.0, 0.02, 0.12, 0.7, 0.72])
     np.testing.assert_allclose(clock.now(), 0.8)
 
@@ -135,7 +134,7 @@ def test_nothing_happens_quicker_than_it_does_and_a_slow_moment_is_not_made_up_f
 def test_it_ends_when_the_window_is_closed():
     clock = People()
     window = Window(clock, closed_after=2)
-    viewing.watch(moments(clock, [0.0] * 9), window, clock.now, clock.sleep)
+    running.watch(moments(clock, [0.0] * 9), window, clock.now, clock.sleep)
     assert len(window.shown) == 2
 
 
@@ -188,8 +187,8 @@ def test_the_command_shows_the_rig_at_rest_or_the_pipeline_at_work(folder, capsy
 
     black = SimWorld(RigConfig(sim=SimConfig(scene="indoor", targets=("book",))), rendered=())
     monkeypatch.setattr("cotarget.sim.world.SimWorld", lambda config: black)
-    monkeypatch.setattr(viewing, "_opener", lambda options: lambda truth: Shown(clock))
-    monkeypatch.setattr(viewing, "time", SimpleNamespace(monotonic=clock.now, sleep=clock.sleep))
+    monkeypatch.setattr(running, "_opener", lambda options: lambda truth: Shown(clock))
+    monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=clock.now, sleep=clock.sleep))
     assert call(capsys, "view", "--rig", "rig.toml", "--seconds", "0.3", *target) == (
         0, "", "the test shows the scene; Ctrl-C ends it\n"
     )  # fmt: skip

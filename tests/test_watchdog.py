@@ -12,7 +12,7 @@ import pytest
 from cotarget.config import SafetyConfig, SimHead
 from cotarget.errors import DeviceError, EmergencyStopError, StaleFrameError
 from cotarget.rig import Frame
-from cotarget.safety import SafeRig, guard, stopfile, stoplook
+from cotarget.safety import SafeRig, stop_file, watchdog
 from tests.safety_rigs import DEADLINE_S, IMAGE, RealRig, SimulatedRig
 
 WATCHDOG_S = 0.35  # the default
@@ -303,13 +303,13 @@ class Hung:
     def __init__(self, monkeypatch):
         self._answers = threading.Event()
         self._answers.set()
-        look = stopfile.stop_reason
+        look = stop_file.stop_reason
 
         def stop_reason(path):
             assert self._answers.wait(DEADLINE_S)
             return look(path)
 
-        for module in (guard, stoplook, stopfile):
+        for module in (watchdog, watchdog, stop_file):
             monkeypatch.setattr(module, "stop_reason", stop_reason)
 
     def hang(self):
@@ -341,15 +341,15 @@ def test_a_stop_file_that_cannot_be_looked_at_does_not_keep_the_watchdog_from_ha
 def test_a_command_waits_for_no_look_where_a_recent_one_found_no_stop(hung, tmp_path, monkeypatch):
     """Nobody but the test watches here, and the clock by which a look is recent goes on when the test says."""
     now = 5.0
-    monkeypatch.setattr(stoplook, "monotonic", lambda: now)
+    monkeypatch.setattr(watchdog, "monotonic", lambda: now)
     head = RealRig().head
-    watched = guard.Guard(head, RealRig().clock, SafetyConfig(stop_file=tmp_path / "stop"), threaded=True)
+    watched = watchdog.Guard(head, RealRig().clock, SafetyConfig(stop_file=tmp_path / "stop"), threaded=True)
     watched.watch()
     hung.hang()
-    now += stoplook.RECENT_S / 2
+    now += watchdog.RECENT_S / 2
     watched.begin((1.0, 0.0))
     assert head.log == []
-    now += stoplook.RECENT_S
+    now += watchdog.RECENT_S
     with pytest.raises(EmergencyStopError, match="cannot be looked at"):
         watched.begin((1.0, 0.0))
     assert head.log == ["halt"]
@@ -360,7 +360,7 @@ def test_a_command_waits_for_no_look_where_a_recent_one_found_no_stop(hung, tmp_
 @pytest.mark.wire
 def test_a_stop_that_was_seen_is_looked_at_again_before_the_next_command(tmp_path):
     """What the operator has cleared keeps nobody waiting for the next look of the thread."""
-    watched = guard.Guard(RealRig().head, RealRig().clock, SafetyConfig(stop_file=tmp_path / "stop"), threaded=True)
+    watched = watchdog.Guard(RealRig().head, RealRig().clock, SafetyConfig(stop_file=tmp_path / "stop"), threaded=True)
     watched.watch()
     (tmp_path / "stop").touch()
     watched.watch()

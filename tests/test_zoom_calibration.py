@@ -11,7 +11,8 @@ from cotarget.calibration.captures import INDEX
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
 from cotarget.geometry import RigidTransform
-from experiments.synthetic import NOMINAL_PX, SIZE, Truth, draw_targets, misses, undistorted
+from experiments.synthetic.aims import draw_targets, misses
+from experiments.synthetic.rig import NOMINAL_PX, SIZE, Truth, undistorted
 from tests.synthetic_rig import FOURFOLD, SyntheticRig, fourfold, zoomed
 
 BOARD = BoardConfig()

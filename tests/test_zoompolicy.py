@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from cotarget import zoompolicy
+from cotarget import metrics
+from cotarget.control import zoom
+from cotarget.control.zoom import Expected, ZoomPolicy, ZoomSettings, chance_inside, expect, longest_focal
 from cotarget.estimation import SpatialFilter
-from cotarget.metrics import closeup
-from cotarget.zoompolicy import Expected, ZoomPolicy, ZoomSettings, chance_inside, expect, longest_focal
 from tests.moving_targets import APART, Flight, show
 
 SIZE = (640, 480)
@@ -136,4 +136,4 @@ def test_an_estimate_says_what_to_expect():
 
 def test_what_it_takes_for_seen_well_is_what_the_metrics_call_good():
     """The pipeline does not know how it is judged; both mean the same size."""
-    assert zoompolicy.GOOD_SIZE == closeup.GOOD_SIZE
+    assert zoom.GOOD_SIZE == metrics.GOOD_SIZE

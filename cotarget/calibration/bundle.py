@@ -1,21 +1,698 @@
 """The parameters that explain the corners best: one least-squares problem that serves every step.
 
 The steps of a calibration differ in which blocks are free. The solver is Levenberg and Marquardt's and not scipy's
-least_squares, because of the structure that `cotarget.calibration.normal` makes use of.
+least_squares, because of the structure that `cotarget.calibration.bundle` makes use of.
+
+The normal equations of all corners: views added up block by block, boards and head turns eliminated.
+
+A view depends on its own board's pose and on no other: eliminating the poses first (Schur's complement) makes a step of
+150 views take a twentieth of a second, where a dense factorisation takes one or two, and leaves the shared parameters'
+normal matrix. Where a head does not stand quite where it says, all corners of a view are off together. Such a jitter is
+two more unknowns a view, its true pan and tilt, which are eliminated likewise, held near the reported ones by their own
+standard deviation.
+
+A rig's model and its parameters: their names and order, and how a step changes them.
+
+Poses are stepped as R <- exp(w) R, t <- t + d.
+
+Where a rig's model puts the corners of every view, and how that changes with its parameters.
+
+Boards are placed in the fixed camera's frame, so that a corner X of placement b is seen
+
+    by the fixed camera at      x_fixed = T_fixed_board X
+    by the zoom camera at       x_zoom = T_head_zoom^-1 T_base_head^-1 T_head_zoom T_zoom0_fixed x_fixed       (Eq. 2)
+
+less the way that its entrance pupil has moved forward at the focal length in use. A board that is not flat bulges
+towards its z by a parabola along each side. Poses are stepped as R <- exp(w) R, t <- t + d. The derivatives are
+analytic; OpenCV's cv2.projectPoints gives those of the lens.
+
+Robust statistics of corners: some are found wrongly, and must neither draw a fit nor swell its uncertainty.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
-from cotarget.calibration.model import View
-from cotarget.calibration.normal import Prior, Problem, reduced, robust_scale, solved_step
-from cotarget.calibration.parameters import Block, RigModel, stepped
-from cotarget.calibration.reprojection import batches_of
-from cotarget.calibration.robust import rms
+from cotarget.calibration.model import RigModel, View, stop_of
+from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
-from cotarget.geometry import Array
+from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.pantilt import HeadGeometry
+
+Block = Literal["fixed", "zoom", "pupil", "gamma", "hand", "head", "warp", "k3", "scale", "zero"]
+# What a calibration finds by default, in the order of the parameters; "k3" is the fixed camera's, "scale" and "zero"
+# are the encoders'.
+ALL_BLOCKS: tuple[Block, ...] = ("fixed", "zoom", "pupil", "gamma", "hand", "head", "warp")
+EVERY_BLOCK: tuple[Block, ...] = (*ALL_BLOCKS, "k3", "scale", "zero")
+# fx fy cx cy k1 k2 p1 p2, the order of OpenCV's Jacobian after the pose; k3, the next, is a block by itself, for lenses
+# that ask for it: elsewhere it hardly changes the residuals (0.0002 px on real photos) but bends the image where no
+# board was seen.
+LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+LENS_PARAMETERS = len(LENS_NAMES)
+POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
+POSE_PARAMETERS = len(POSE_NAMES)
+HEAD_NAMES = {
+    "head": ("axis_offset", "squareness"),
+    "scale": ("pan_scale", "tilt_scale"),
+    "zero": ("pan_zero", "tilt_zero"),
+}
+WARP_NAMES = ("warp_x", "warp_y")
+
+
+def columns_of(free: Collection[Block], stops: int) -> dict[str, slice]:
+    """Where each free block stands among the shared parameters, for a zoom lens of so many stops."""
+    columns: dict[str, slice] = {}
+    width = 0
+    for name in EVERY_BLOCK:
+        if name in free:
+            size = len(_names(name, stops))
+            columns[name] = slice(width, width + size)
+            width += size
+    return columns
+
+
+def parameter_names(free: Collection[Block], stops: int = 1) -> tuple[str, ...]:
+    """Name the free blocks' parameters, in their order among the shared ones; see `Covariance` for their units."""
+    return tuple(name for block in columns_of(free, stops) for name in _names(block, stops))
+
+
+def _names(block: str, stops: int) -> list[str]:
+    match block:
+        case "fixed":
+            return [f"fixed.{name}" for name in LENS_NAMES]
+        case "zoom":
+            return [f"zoom[{i}].{name}" for i in range(stops) for name in LENS_NAMES]
+        case "pupil":
+            return [f"zoom[{i}].pupil" for i in range(1, stops)]
+        case "gamma":
+            return [f"T_zoom0_fixed.{name}" for name in POSE_NAMES]
+        case "hand":
+            return [f"T_head_zoom.{name}" for name in POSE_NAMES]
+        case "k3":
+            return ["fixed.k3"]
+        case "warp":
+            return [f"board.{name}" for name in WARP_NAMES]
+        case _:
+            return [f"head.{name}" for name in HEAD_NAMES[block]]
+
+
+def stepped(model: RigModel, shared: Array, boards: Array, free: Collection[Block]) -> RigModel:
+    """Add a step to the shared parameters (n,) and to the boards' poses (B, 6)."""
+    steps = {name: shared[columns] for name, columns in columns_of(free, model.stops).items()}
+    head = model.head
+    for block, names in HEAD_NAMES.items():
+        if block in steps:
+            changed = {name: getattr(head, name) + float(d) for name, d in zip(names, steps[block], strict=True)}
+            head = replace(head, **changed)
+    zoom = model.zoom
+    if zoom is not None and ("zoom" in steps or "pupil" in steps):
+        lenses = steps.get("zoom", np.zeros(LENS_PARAMETERS * model.stops)).reshape(model.stops, LENS_PARAMETERS)
+        pupils = np.append(0.0, steps.get("pupil", np.zeros(model.stops - 1)))
+        zoom = ZoomLens(
+            zoom.nominal_px,
+            tuple(_bent(stop, step) for stop, step in zip(zoom.stops, lenses, strict=True)),
+            tuple(float(old + step) for old, step in zip(zoom.pupil, pupils, strict=True)),
+        )
+    fixed = model.fixed
+    if fixed is not None and "fixed" in steps:
+        fixed = _bent(fixed, steps["fixed"])
+    if fixed is not None and "k3" in steps:
+        fixed = replace(fixed, distortion=(*fixed.distortion[:4], fixed.distortion[4] + float(steps["k3"][0])))
+    return RigModel(
+        boards=_all_moved(model.boards, boards),
+        fixed=fixed,
+        zoom=zoom,
+        gamma=_moved(model.gamma, steps.get("gamma")),
+        hand=_moved(model.hand, steps.get("hand")),
+        head=head,
+        warp=model.warp if "warp" not in steps else _pair(np.add(model.warp, steps["warp"])),
+    )
+
+
+def difference(model: RigModel, reference: RigModel, free: Collection[Block]) -> Array:
+    """The step of the shared parameters that leads from the reference to the model, (n,): the inverse of `stepped`."""
+    parts: list[Array] = []
+    for block in columns_of(free, model.stops):
+        match block:
+            case "fixed":
+                assert model.fixed is not None
+                assert reference.fixed is not None
+                parts.append(_numbers(model.fixed) - _numbers(reference.fixed))
+            case "zoom" | "pupil":
+                assert model.zoom is not None
+                assert reference.zoom is not None
+                if block == "pupil":
+                    parts.append(np.subtract(model.zoom.pupil, reference.zoom.pupil)[1:])
+                else:
+                    pairs = zip(model.zoom.stops, reference.zoom.stops, strict=True)
+                    parts.extend(_numbers(a) - _numbers(b) for a, b in pairs)
+            case "gamma" | "hand":
+                T, T_ref = getattr(model, block), getattr(reference, block)
+                parts.append((T.rotation * T_ref.rotation.inv()).as_rotvec())
+                parts.append(T.translation - T_ref.translation)
+            case "k3":
+                assert model.fixed is not None
+                assert reference.fixed is not None
+                parts.append(np.array([model.fixed.distortion[4] - reference.fixed.distortion[4]]))
+            case "warp":
+                parts.append(np.subtract(model.warp, reference.warp))
+            case _:
+                parts.append(np.array([getattr(model.head, k) - getattr(reference.head, k) for k in HEAD_NAMES[block]]))
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def _all_moved(boards: Mapping[int, RigidTransform], steps: Array) -> dict[int, RigidTransform]:
+    """`_moved` for many at once: scipy takes as long for one transform as for a hundred."""
+    if not boards:
+        return {}
+    M = np.stack([T.as_matrix() for T in boards.values()])
+    M[:, :3, :3] = Rotation.from_rotvec(steps[:, :3]).as_matrix() @ M[:, :3, :3]
+    M[:, :3, 3] += steps[:, 3:]
+    moved = RigidTransform.from_matrix(M)
+    return {number: moved[i] for i, number in enumerate(boards)}
+
+
+def _moved(T: RigidTransform, step: Array | None) -> RigidTransform:
+    if step is None:
+        return T
+    return RigidTransform.from_components(T.translation + step[3:], Rotation.from_rotvec(step[:3]) * T.rotation)
+
+
+def _numbers(lens: Intrinsics) -> Array:
+    return np.array([*lens.focal_px, *lens.center_px, *lens.distortion])[:LENS_PARAMETERS]
+
+
+def _bent(lens: Intrinsics, step: Array) -> Intrinsics:
+    fx, fy, cx, cy, k1, k2, p1, p2 = (float(value) for value in _numbers(lens) + step)
+    return Intrinsics(lens.size, (fx, fy), (cx, cy), (k1, k2, p1, p2, lens.distortion[4]))
+
+
+def _pair(values: Array) -> tuple[float, float]:
+    first, second = values
+    return float(first), float(second)
+
+
+# --- reprojection ---
+
+E3 = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Views through one lens, as arrays.
+
+    Attributes:
+        rows: which of all views these v are, (v,).
+        stop: of the zoom lens; None for the fixed camera.
+        pan: as the head reported it [rad], (v,).
+        tilt: likewise.
+        owners: index of each view's board among the model's, (v,).
+        observed: corners [px], (v, N, 2); 0 where they are not seen.
+        seen: which are, (v, N).
+    """
+
+    rows: npt.NDArray[np.intp]
+    stop: int | None
+    pan: Array
+    tilt: Array
+    owners: npt.NDArray[np.intp]
+    observed: Array
+    seen: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a model says of a batch.
+
+    Attributes:
+        pixels: of all corners, (v, N, 2) [px].
+        by_shared: derivatives by the free parameters that matter to it, (v, N, 2, k).
+        columns: where these stand among all free parameters, (k,).
+        by_board: derivatives by the pose of each view's own board, (v, N, 2, 6).
+        by_turn: derivatives by the true pan and tilt of each view, (v, N, 2, 2); None for the fixed camera.
+    """
+
+    pixels: Array
+    by_shared: Array
+    columns: npt.NDArray[np.intp]
+    by_board: Array
+    by_turn: Array | None
+
+
+def batches_of(model: RigModel, views: Sequence[View]) -> list[Batch]:
+    """Sort views by lens; their placements must be among the model's boards.
+
+    Raises:
+        CalibrationError: there are views of a camera without a model.
+    """
+    order = {number: i for i, number in enumerate(model.boards)}
+    lenses: dict[int | None, list[int]] = {}
+    for row, view in enumerate(views):
+        model.lens_of(view)
+        stop = None if view.camera == "fixed" or model.zoom is None else stop_of(model.zoom.nominal_px, view)
+        lenses.setdefault(stop, []).append(row)
+    found = []
+    for stop, rows in lenses.items():
+        same = [views[row] for row in rows]
+        corners = np.stack([view.corners_px for view in same])
+        seen = np.isfinite(corners[..., 0])
+        found.append(
+            Batch(
+                rows=np.array(rows, dtype=np.intp),
+                stop=stop,
+                pan=np.array([view.pan for view in same], dtype=float),
+                tilt=np.array([view.tilt for view in same], dtype=float),
+                owners=np.array([order[view.board] for view in same], dtype=np.intp),
+                observed=np.where(seen[..., None], corners, 0.0),
+                seen=seen,
+            )
+        )
+    return found
+
+
+def predict(model: RigModel, batch: Batch, points: Array, free: Collection[Block]) -> Prediction:
+    """Predict every corner of a batch, and its derivatives; nan behind a camera."""
+    if batch.stop is None:
+        assert model.fixed is not None
+        lens, own = model.fixed, "fixed"
+    else:
+        assert model.zoom is not None
+        lens, own = model.zoom.stops[batch.stop], "zoom"
+    x, moved = _points_in_camera(model, batch, points)
+    pixels, by_x, by_lens, by_k3 = _project(lens, x)
+    columns = columns_of(free, model.stops)
+    parts, where = [], []
+    if own in columns:
+        first = columns[own].start + LENS_PARAMETERS * (batch.stop or 0)
+        parts.append(by_lens)
+        where.append(np.arange(first, first + LENS_PARAMETERS))
+    if batch.stop is None and "k3" in columns:
+        parts.append(by_k3)
+        where.append(np.array([columns["k3"].start]))
+    if batch.stop and "pupil" in columns:
+        parts.append(-by_x[..., 2:])  # the camera moves forward along its own z
+        where.append(np.array([columns["pupil"].start + batch.stop - 1]))
+    for name, dx in moved.items():  # (v, N, 3, parameters)
+        if name in columns:
+            parts.append(by_x @ dx)
+            where.append(np.arange(columns[name].start, columns[name].stop))
+    return Prediction(
+        pixels=pixels,
+        by_shared=np.concatenate(parts, axis=-1) if parts else np.zeros((*pixels.shape, 0)),
+        columns=np.concatenate(where) if where else np.zeros(0, dtype=np.intp),
+        by_board=by_x @ moved["board"],
+        by_turn=by_x @ moved["turn"] if "turn" in moved else None,
+    )
+
+
+def predict_pixels(model: RigModel, views: Sequence[View], points: Array) -> Array:
+    """Predict every corner of all views, (V, N, 2) [px]; nan behind a camera."""
+    pixels = np.empty((len(views), len(points), 2))
+    for batch in batches_of(model, views):
+        pixels[batch.rows] = predict(model, batch, points, ()).pixels
+    return pixels
+
+
+def _points_in_camera(model: RigModel, batch: Batch, points: Array) -> tuple[Array, dict[str, Array]]:
+    """Map the board's points into the camera of each view, (v, N, 3), with derivatives (v, N, 3, parameters)."""
+    M = np.stack([T.as_matrix() for T in model.boards.values()])[batch.owners]
+    bulge = _bulge(points)
+    turned = (points + np.outer(bulge @ model.warp, E3)) @ M[:, :3, :3].swapaxes(1, 2)
+    y = turned + M[:, None, :3, 3]  # x_fixed
+    d_board = _pose_derivative(turned)
+    d_warp = M[:, None, :3, 2:3] * bulge[:, None]  # dy/dwarp, (v, N, 3, 2)
+    if batch.stop is None:
+        return y, {"board": d_board, "warp": d_warp}
+    assert model.zoom is not None
+    R_g, R_h = model.gamma.rotation.as_matrix(), model.hand.rotation.as_matrix()
+    t_h = model.hand.translation
+    R_p, t_p, A = base_heads(model.head, batch.pan, batch.tilt)
+    turned_g = y @ R_g.T
+    w = turned_g + model.gamma.translation  # x_zoom0
+    turned_h = w @ R_h.T
+    v = turned_h + t_h  # x_base
+    p = (v - t_p[:, None]) @ R_p  # x_head = R_p^T (x_base - t_p)
+    x = (p - t_h) @ R_h - model.zoom.pupil[batch.stop] * E3  # x_zoom, from the pupil
+    R_xp = R_h.T  # dx/dp
+    R_xv = R_xp @ R_p.swapaxes(1, 2)  # dx/dv
+    R_xw = R_xv @ R_h  # dx/dw
+    d_hand = R_xv[:, None] @ _pose_derivative(turned_h) - R_xp @ _pose_derivative(p - t_h)
+    d_turn = R_xp @ _by_turn(model.head, A, p)
+    return x, {
+        "board": (R_xw @ R_g)[:, None] @ d_board,
+        "warp": (R_xw @ R_g)[:, None] @ d_warp,
+        "gamma": R_xw[:, None] @ _pose_derivative(turned_g),
+        "hand": d_hand,
+        "head": R_xp @ _by_head(model.head, A, p),
+        "scale": d_turn * np.stack([batch.pan, batch.tilt], axis=-1)[:, None, None],
+        "zero": d_turn,
+        "turn": d_turn,
+    }
+
+
+def _bulge(points: Array) -> Array:
+    """How far each corner of a board stands out for a unit of warp along x and along y, (N, 2): 1 in the middle."""
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    half = np.maximum((high - low) / 2, np.finfo(float).tiny)
+    return np.asarray(1 - ((points[:, :2] - (low + high) / 2) / half) ** 2)
+
+
+def base_heads(head: HeadGeometry, pan: Array, tilt: Array) -> tuple[Array, Array, Array]:
+    """T_base_head of many poses at once (Eq. 8 with dz and eps).
+
+    Args:
+        head: the unit's geometry.
+        pan: as the head reports it [rad], (v,).
+        tilt: likewise.
+
+    Returns:
+        Rotations (v, 3, 3), translations (v, 3), and the tilts' own rotations (v, 3, 3).
+    """
+    pan, tilt = head.true_angles(pan, tilt)
+    turns = Rotation.from_rotvec(pan[:, None] * np.array([0.0, 1.0, 0.0])).as_matrix()
+    A = Rotation.from_rotvec(tilt[:, None] * head.tilt_axis).as_matrix()
+    offset = head.axis_offset * (E3 - A @ E3)  # Trans(dz) A Trans(-dz) is A with this translation
+    return turns @ A, np.einsum("vij,vj->vi", turns, offset), A
+
+
+def _by_head(head: HeadGeometry, A: Array, x_head: Array) -> Array:
+    """How x_head changes with dz and with eps, (v, N, 3, 2).
+
+    With A the tilt's rotation, x_head = A^T (q - dz e3) + dz e3 where q = Rot(Y, -pan) x_base.
+    """
+    by_dz = np.broadcast_to((E3 - A[:, 2])[:, None], x_head.shape)  # A^T e3 is A's third row
+    # A = Rot(Z, eps) Rot(X, tilt) Rot(Z, -eps), so dA^T/deps = [e3]x A^T - A^T [e3]x
+    a = x_head - head.axis_offset * E3
+    u = a @ A.swapaxes(1, 2)
+    by_eps = np.cross(E3, a) - np.cross(E3, u) @ A
+    return np.stack([by_dz, by_eps], axis=-1)
+
+
+def _by_turn(head: HeadGeometry, A: Array, x_head: Array) -> Array:
+    """How x_head changes with true pan and tilt, (v, N, 3, 2), in the terms of `_by_head`."""
+    a = x_head - head.axis_offset * E3
+    q = a @ A.swapaxes(1, 2) + head.axis_offset * E3
+    by_pan = -np.cross(np.array([0.0, 1.0, 0.0]), q) @ A  # dq/dpan = -e2 x q, then A^T
+    by_tilt = -np.cross(head.tilt_axis, a)
+    return np.stack([by_pan, by_tilt], axis=-1)
+
+
+def _pose_derivative(turned: Array) -> Array:
+    """Derivative of R x + t by a step (w, d), given R x: [-[R x]x, I], (..., 3, 6)."""
+    x, y, z = np.moveaxis(turned, -1, 0)
+    o, i = np.zeros_like(x), np.ones_like(x)
+    rows = [[o, z, -y, i, o, o], [-z, o, x, o, i, o], [y, -x, o, o, o, i]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _project(lens: Intrinsics, x_camera: Array) -> tuple[Array, Array, Array, Array]:
+    """Project points (v, N, 3): pixels, derivatives by the point (v, N, 2, 3), the lens (..., 8) and k3 (..., 1)."""
+    v, n = x_camera.shape[:2]
+    x = np.ascontiguousarray(x_camera.reshape(-1, 1, 3))
+    x = np.where(x[..., 2:] > 0, x, np.nan)
+    px, J = cv2.projectPoints(x, np.zeros(3), np.zeros(3), lens.matrix, np.array(lens.distortion))
+    J = np.asarray(J).reshape(v, n, 2, -1)
+    last = POSE_PARAMETERS + LENS_PARAMETERS
+    by_point = J[..., 3:POSE_PARAMETERS]  # by t, which is the same
+    return np.asarray(px).reshape(v, n, 2), by_point, J[..., POSE_PARAMETERS:last], J[..., last : last + 1]
+
+
+# --- normal ---
+
+SMALLEST_DAMPING = 1e-12
+TURNS = 2  # pan and tilt
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known before the corners speak: parameters near a reference's, with standard deviations by name."""
+
+    reference: RigModel
+    sigmas: Mapping[str, float]
+
+
+# Which parameters a batch speaks of (k,), and J^T W J for each of its views (v, m, m).
+Gram = tuple[npt.NDArray[np.intp], Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Normal equations in blocks: shared (n, n), shared by board (B, n, 6), board (B, 6, 6), gradients, squares."""
+
+    shared: Array
+    mixed: Array
+    boards: Array
+    shared_gradient: Array
+    board_gradient: Array
+    squares: float
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A model's residuals, batch by batch, and those left when every view's pan and tilt gave way (v, N, 2)."""
+
+    model: RigModel
+    predictions: list[Prediction]
+    residuals: list[Array]
+    after: list[Array]
+    given: float  # sum of the squares of how far pan and tilt gave way [rad^2]
+    finite: bool
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What does not change during a fit: the views, sorted by lens, what is free, what is known, and the jitter."""
+
+    batches: list[Batch]
+    points: Array
+    free: tuple[Block, ...]
+    prior: Prior | None
+    jitter: float
+
+    def at(self, model: RigModel) -> Evaluation:
+        """Predict every view."""
+        predictions = [predict(model, batch, self.points, self.free) for batch in self.batches]
+        residuals = [
+            np.where(batch.seen[..., None], p.pixels - batch.observed, 0.0)
+            for batch, p in zip(self.batches, predictions, strict=True)
+        ]
+        finite = all(np.isfinite(r).all() for r in residuals)
+        sigma = robust_sigma(self._seen(residuals)) if finite else np.nan
+        after, given = residuals, 0.0
+        if self.jitter and finite:
+            penalty = (sigma / self.jitter) ** 2
+            after = []
+            for batch, p, r in zip(self.batches, predictions, residuals, strict=True):
+                if p.by_turn is None:
+                    after.append(r)
+                    continue
+                Q = masked(p.by_turn, batch).reshape(len(r), -1, TURNS)
+                QT = Q.swapaxes(1, 2)
+                turned = -np.linalg.solve(QT @ Q + penalty * np.eye(TURNS), QT @ r.reshape(len(r), -1, 1))
+                after.append(r + (Q @ turned).reshape(r.shape))
+                given += float(np.sum(turned**2))
+            sigma = robust_sigma(self._seen(after))
+        return Evaluation(model, predictions, residuals, after, given, finite, sigma)
+
+    def cost(self, here: Evaluation, scale: float) -> float:
+        """Huber's cost, of the residuals and of what is known before."""
+        if not here.finite:
+            return np.inf
+        cost = sum(huber_cost(r, scale) for r in here.after)
+        variance = (scale / HUBER_SIGMAS) ** 2
+        if self.jitter:
+            cost += variance / self.jitter**2 * here.given
+        if self.prior is not None:
+            off, information = self._known(here.model, variance)
+            cost += float(off @ (information * off))
+        return cost
+
+    def variance(self, here: Evaluation) -> float | None:
+        """See `Fit.variance`."""
+        n = len(parameter_names(self.free, here.model.stops))
+        parameters = float(n + POSE_PARAMETERS * len(here.model.boards))
+        if self.jitter:
+            penalty = (here.sigma / self.jitter) ** 2
+            for batch, p in zip(self.batches, here.predictions, strict=True):
+                if p.by_turn is not None:
+                    Q = masked(p.by_turn, batch).reshape(len(batch.rows), -1, TURNS)
+                    QTQ = Q.swapaxes(1, 2) @ Q
+                    parameters += float(
+                        np.trace(np.linalg.solve(QTQ + penalty * np.eye(TURNS), QTQ), axis1=1, axis2=2).sum()
+                    )
+        return coordinate_variance(self._seen(here.after), parameters)
+
+    def equations(self, here: Evaluation, scale: float | None) -> Equations:
+        """Normal equations with Huber's weights; without a scale, of plain squares."""
+        sigma = here.sigma
+        return self.assembled(
+            here, self.grams(here, scale), (sigma / self.jitter) ** 2 if self.jitter else np.inf, sigma**2
+        )
+
+    def grams(self, here: Evaluation, scale: float | None) -> list[Gram]:
+        """Every batch's columns, and J^T W J of J = (shared, board, turn, residual) for each of its views."""
+        found = []
+        for batch, p, r, after in zip(self.batches, here.predictions, here.residuals, here.after, strict=True):
+            turn = [p.by_turn] if p.by_turn is not None else []
+            J = np.concatenate([p.by_shared, p.by_board, *turn, r[..., None]], axis=-1)
+            J = masked(J, batch)
+            if scale is not None:
+                J = J * np.sqrt(huber_weights(after, scale))[..., None, None]
+            J = J.reshape(len(J), -1, J.shape[-1])
+            found.append((p.columns, J.swapaxes(1, 2) @ J))
+        return found
+
+    def assembled(
+        self, here: Evaluation, grams: list[Gram], penalty: float, variance: float | None = None
+    ) -> Equations:
+        """Add up all views, their turns eliminated, and what is known before.
+
+        Args:
+            here: where the views were predicted.
+            grams: of every batch.
+            penalty: variance of a coordinate over that of a turn; infinite where the head is exact.
+            variance: of a coordinate, to weigh the prior [px^2]; the evaluation's own where it is not given.
+        """
+        boards = len(here.model.boards)
+        n = len(parameter_names(self.free, here.model.stops))
+        shared, shared_gradient, squares = np.zeros((n, n)), np.zeros(n), 0.0
+        mixed = np.zeros((boards, n, POSE_PARAMETERS))
+        board = np.zeros((boards, POSE_PARAMETERS, POSE_PARAMETERS))
+        board_gradient = np.zeros((boards, POSE_PARAMETERS))
+        for batch, (columns, full) in zip(self.batches, grams, strict=True):
+            gram = full if batch.stop is None else without_turns(full, penalty)
+            k = len(columns)
+            b = slice(k, k + POSE_PARAMETERS)
+            shared[np.ix_(columns, columns)] += gram[:, :k, :k].sum(0)
+            shared_gradient[columns] += gram[:, :k, -1].sum(0)
+            mine = np.zeros((boards, k, POSE_PARAMETERS))
+            np.add.at(mine, batch.owners, gram[:, :k, b])
+            mixed[:, columns] += mine
+            np.add.at(board, batch.owners, gram[:, b, b])
+            np.add.at(board_gradient, batch.owners, gram[:, b, -1])
+            squares += float(gram[:, -1, -1].sum())
+        if self.prior is not None:
+            off, information = self._known(here.model, here.sigma**2 if variance is None else variance)
+            shared += np.diag(information)
+            shared_gradient += information * off
+            squares += float(off @ (information * off))
+        return Equations(shared, mixed, board, shared_gradient, board_gradient, squares)
+
+    def _known(self, model: RigModel, variance: float) -> tuple[Array, Array]:
+        """How far the free parameters are from the prior's, and its weight in px^2 against a coordinate's, (n,)."""
+        assert self.prior is not None
+        names = parameter_names(self.free, model.stops)
+        sigmas = np.array([self.prior.sigmas.get(name, np.inf) for name in names])
+        return difference(model, self.prior.reference, self.free), variance / sigmas**2
+
+    def _seen(self, residuals: list[Array]) -> Array:
+        """The residuals of the corners that are seen, (n, 2)."""
+        return np.concatenate([r[batch.seen] for batch, r in zip(self.batches, residuals, strict=True)])
+
+
+def masked(J: Array, batch: Batch) -> Array:
+    """Derivatives (v, N, 2, k) with those of unseen corners cleared."""
+    return np.where(batch.seen[..., None, None], J, 0.0)
+
+
+def without_turns(gram: Array, penalty: float) -> Array:
+    """Eliminate each view's own pan and tilt, the two columns before the last."""
+    k = gram.shape[-1] - 1 - TURNS
+    kept = [*range(k), gram.shape[-1] - 1]
+    rest = gram[:, kept][:, :, kept]
+    if np.isinf(penalty):
+        return rest
+    through = gram[:, kept][:, :, k : k + TURNS]
+    own = gram[:, k : k + TURNS, k : k + TURNS] + penalty * np.eye(TURNS)
+    return rest - through @ np.linalg.solve(own, through.swapaxes(1, 2))
+
+
+def reduced(equations: Equations, damping: float) -> tuple[Array, Array, Array]:
+    """Eliminate the boards: reduced matrix (n, n) and gradient (n,), and the boards' inverses (B, 6, 6)."""
+    e = equations
+    inverse = np.asarray(np.linalg.inv(e.boards + damped(e.boards, damping)), dtype=float)
+    through = e.mixed @ inverse
+    matrix = e.shared + damped(e.shared, damping) - (through @ e.mixed.swapaxes(1, 2)).sum(0)
+    return matrix, e.shared_gradient - np.einsum("bij,bj->i", through, e.board_gradient), inverse
+
+
+def solved_step(equations: Equations, damping: float) -> tuple[Array, Array]:
+    """A damped step of the shared parameters (n,) and of the boards (B, 6)."""
+    matrix, gradient, inverse = reduced(equations, damping)
+    shared = np.asarray(np.linalg.solve(matrix, -gradient), dtype=float)
+    right = equations.board_gradient + np.einsum("bij,i->bj", equations.mixed, shared)
+    return shared, -np.einsum("bij,bj->bi", inverse, right)
+
+
+def damped(blocks: Array, damping: float) -> Array:
+    """The diagonal to add to one or many square blocks; never quite zero, so that a free direction stands still."""
+    diagonal = np.diagonal(blocks, axis1=-2, axis2=-1)
+    return np.eye(blocks.shape[-1]) * (diagonal * damping + SMALLEST_DAMPING)[..., None]
+
+
+def robust_scale(here: Evaluation) -> float:
+    """Beyond which a corner's residual counts linearly [px]."""
+    return HUBER_SIGMAS * here.sigma
+
+
+# --- robust ---
+
+# A point further off than this many standard deviations (from the median) counts linearly, not squared (Huber).
+HUBER_SIGMAS = 3.0
+MEDIAN_TO_SIGMA = 1 / 1.1774  # of the length of a 2D Gaussian vector: its median is sigma sqrt(2 ln 2)
+SMALLEST_SIGMA_PX = 1e-4  # corners are rounded to this, so that exact data have no smaller scale
+
+
+def rms(residuals: Array) -> float:
+    """OpenCV's rms: root of the mean squared distance per point of residuals (..., 2) [px]; nan points do not count."""
+    squared = np.sum(residuals**2, axis=-1)
+    seen = np.isfinite(squared)
+    return float(np.sqrt(squared[seen].mean())) if seen.any() else 0.0
+
+
+def robust_sigma(residuals: Array) -> float:
+    """Standard deviation of a coordinate of residuals (n, 2), told by the median length [px]."""
+    return max(float(np.median(np.linalg.norm(residuals, axis=-1))) * MEDIAN_TO_SIGMA, SMALLEST_SIGMA_PX)
+
+
+def coordinate_variance(residuals: Array, parameters: float) -> float | None:
+    """Estimate what variance of one coordinate, times the inverse normal matrix, gives the parameters' covariance.
+
+    It is that of Huber's estimate (Huber 1981, Eq. 7.6.10): mean |psi|^2 / 2 over the squared mean slope of psi, where
+    psi is a residual cut to the robust scale; for Gaussian noise 1 % more than the noise's own variance.
+
+    Args:
+        residuals: of the optimum, (n, 2) [px].
+        parameters: how many were fitted, the boards' poses included; they take up as many coordinates.
+
+    Returns:
+        [px^2]; None where there are not more coordinates than parameters.
+    """
+    freedom = residuals.size - parameters
+    if freedom <= 0:
+        return None
+    scale = HUBER_SIGMAS * robust_sigma(residuals)
+    weights = huber_weights(residuals, scale)
+    psi2 = np.sum((weights[..., None] * residuals) ** 2, axis=-1)
+    slope = np.where(weights < 1, weights / 2, 1.0)  # beyond the scale psi only turns: one direction of the two
+    return float(np.mean(psi2) / 2 / np.mean(slope) ** 2 * residuals.size / freedom)
+
+
+def huber_weights(residuals: Array, scale: float) -> Array:
+    """Huber's weight of every point."""
+    return scale / np.maximum(np.linalg.norm(residuals, axis=-1), scale)
+
+
+def huber_cost(residuals: Array, scale: float) -> float:
+    """Huber's cost."""
+    lengths = np.linalg.norm(residuals, axis=-1)
+    return float(np.sum(np.where(lengths <= scale, lengths**2, scale * (2 * lengths - scale))))
+
 
 STEPS = 60
 CONVERGED = 1e-10  # relative fall of the cost at which the solver stops

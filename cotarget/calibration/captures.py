@@ -3,29 +3,79 @@
 index.json: schema; board; pitch_mm (or null); captures, one object an image with file, camera, board (the number of
 the placement), pan and tilt [rad], focal_px (null for the fixed camera), t [s]. The index is replaced in one step
 after every image, so that a session that is cut short, however, can still be used up to there.
+
+What a capture session leaves beside its images: what rig it was, by which versions, and what it was told to do.
+
+session.json: schema; versions; config, the rig's whole configuration without passwords (null where none was given).
+commands.jsonl: an object a line and a command, written before the next is given: t [s], when it was given; do; asked;
+got. "turn" asks for pan and tilt [rad] and gets those that the head goes to; "zoom" asks for a focal length [px] and
+gets the one that the lens goes to; "present" asks for the board at a pose, T_fixed_board, and gets null.
 """
 
+import importlib.metadata
 import json
 import math
+import platform
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
-from cotarget.calibration import parsing
-from cotarget.calibration.atomic import write_atomically
-from cotarget.calibration.file import write_board
+from cotarget.calibration import file
+from cotarget.calibration.file import Table, get, parse_board, write_board
 from cotarget.calibration.model import CameraName, Capture
-from cotarget.calibration.parsing import Table, get
-from cotarget.calibration.reading import parse_board
-from cotarget.config import BoardConfig
+from cotarget.config import BoardConfig, RigConfig, config_table
 from cotarget.errors import CalibrationError
+from cotarget.files import write_atomically
 from cotarget.rig import Image
 
 SCHEMA = 1
+SESSION, COMMANDS = "session.json", "commands.jsonl"
+VERSIONS = ("numpy", "scipy", "opencv-python-headless")  # of what found the corners and fits
+
+
+def write_session(directory: Path, config: RigConfig | None) -> None:
+    """Write session.json, and begin commands.jsonl.
+
+    Raises:
+        CalibrationError: a file cannot be written.
+    """
+    table = {
+        "schema": SCHEMA,
+        "versions": {"cotarget": version("cotarget"), "python": platform.python_version()}
+        | {name: _version(name) for name in VERSIONS},
+        "config": None if config is None else config_table(config),
+    }
+    write_atomically(directory / SESSION, json.dumps(table, indent=2).encode() + b"\n")
+    write_atomically(directory / COMMANDS, b"")
+
+
+def write_command(directory: Path, t: float, do: str, asked: Any, got: Any = None) -> None:
+    """Append a command to commands.jsonl.
+
+    Raises:
+        CalibrationError: the file cannot be written.
+    """
+    path = directory / COMMANDS
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"t": t, "do": do, "asked": asked, "got": got}) + "\n")
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:  # another build of it
+        return None
+
+
 INDEX = "index.json"
 # zlib's fastest level: noise hardly compresses, and the session's time is better spent on looking for corners.
 PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)
@@ -99,11 +149,11 @@ def read_index(directory: Path) -> CaptureIndex:
     path = directory / INDEX
     if not directory.is_dir():
         raise CalibrationError(f"{directory}: no such folder; give a folder of captures")
-    table = parsing.read_json(path, "give a folder of captures, as cotarget calibrate --captures DIR makes one")
-    parsing.check_schema(path, table, SCHEMA)
+    table = file.read_json(path, "give a folder of captures, as cotarget calibrate --captures DIR makes one")
+    file.check_schema(path, table, SCHEMA)
     try:
         pitch = get(table, "pitch_mm")
-        rows = parsing.as_list(get(table, "captures"), "captures")
+        rows = file.as_list(get(table, "captures"), "captures")
         if not rows:
             raise CalibrationError("captures: is empty")
         board = parse_board(get(table, "board"), "board")
@@ -111,7 +161,7 @@ def read_index(directory: Path) -> CaptureIndex:
         _check_files(directory, captures)
         return CaptureIndex(
             board=board,
-            pitch_mm=None if pitch is None else parsing.as_number(pitch, "pitch_mm", positive=True),
+            pitch_mm=None if pitch is None else file.as_number(pitch, "pitch_mm", positive=True),
             captures=captures,
         )
     except CalibrationError as error:
@@ -218,15 +268,15 @@ def _numbered(directory: Path, pattern: str) -> dict[int, str]:
 
 
 def _parse_capture(value: object, where: str) -> Capture:
-    row: Table = parsing.as_table(value, where)
+    row: Table = file.as_table(value, where)
     camera = get(row, "camera", where)
     if camera not in ("fixed", "zoom"):
-        raise CalibrationError(f"{where}.camera: {parsing.short(camera)} is not one of: fixed, zoom")
-    source = parsing.as_text(get(row, "file", where), f"{where}.file")
+        raise CalibrationError(f"{where}.camera: {file.short(camera)} is not one of: fixed, zoom")
+    source = file.as_text(get(row, "file", where), f"{where}.file")
     if Path(source).is_absolute() or ".." in Path(source).parts:
-        raise CalibrationError(f"{where}.file: {parsing.short(source)} is not inside the folder of the index")
+        raise CalibrationError(f"{where}.file: {file.short(source)} is not inside the folder of the index")
     focal = get(row, "focal_px", where)
-    board = parsing.as_whole(get(row, "board", where), f"{where}.board")
+    board = file.as_whole(get(row, "board", where), f"{where}.board")
     if board < 0:
         raise CalibrationError(f"{where}.board: {board} is negative; placements are numbered from 0")
     pan, tilt = (_parse_angle(row, key, where, camera) for key in ("pan", "tilt"))
@@ -236,8 +286,8 @@ def _parse_capture(value: object, where: str) -> Capture:
         board=board,
         pan=pan,
         tilt=tilt,
-        focal_px=None if focal is None else parsing.as_number(focal, f"{where}.focal_px", positive=True),
-        t=parsing.as_number(get(row, "t", where), f"{where}.t"),
+        focal_px=None if focal is None else file.as_number(focal, f"{where}.focal_px", positive=True),
+        t=file.as_number(get(row, "t", where), f"{where}.t"),
         source=source,
     )
 
@@ -249,7 +299,7 @@ def _parse_angle(row: Table, key: str, where: str, camera: CameraName) -> float:
         if camera == "fixed":
             return 0.0
         raise CalibrationError(f"{where}.{key}: is missing; an image of the zoom camera needs the head's pan and tilt")
-    angle = parsing.as_number(value, f"{where}.{key}")
+    angle = file.as_number(value, f"{where}.{key}")
     if abs(angle) > LARGEST_ANGLE:
         raise CalibrationError(f"{where}.{key}: {angle:g} is more than a whole turn in radians; it looks like degrees")
     return angle

@@ -8,29 +8,303 @@
    jitter is estimated; and the fixed camera's k3, where the corners ask for it.
 5. The uncertainty counts what is held and may be wrong all the same, k3 and the encoders' scales; what captures kept
    out of the fit say widens it where they disagree with it.
+
+How far the head stands from where it says: every view by itself, and the scatter of all.
+
+The zoom lens's stops: from the shortest focal length on, each is looked for where the one before lets expect it.
+
+At long focal lengths the zoom camera sees a part of a board that stands far enough for the fixed camera to see it
+whole. Where its corners should be follows from the fixed camera's view, the head and a guess of the lens, so that they
+can be told apart; and each stop, once seen, makes a good guess of the next.
 """
 
+import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
-from cotarget.calibration.bundle import Fit, fit
-from cotarget.calibration.considered import with_considered
-from cotarget.calibration.heldout import cross_validate
-from cotarget.calibration.jitter import estimate_jitter, head_turns
-from cotarget.calibration.model import DEFAULT_OPTIONS, CameraName, Options, Rejected, Residuals, View
-from cotarget.calibration.normal import Prior
+from cotarget.calibration.bundle import (
+    ALL_BLOCKS,
+    MEDIAN_TO_SIGMA,
+    POSE_PARAMETERS,
+    SMALLEST_SIGMA_PX,
+    TURNS,
+    Block,
+    Fit,
+    Prior,
+    Problem,
+    batches_of,
+    damped,
+    fit,
+    huber_weights,
+    masked,
+    parameter_names,
+    predict_pixels,
+    reduced,
+    rms,
+    robust_scale,
+    robust_sigma,
+)
+from cotarget.calibration.corners import find_corners, find_near
+from cotarget.calibration.initialization import (
+    Steps,
+    at_home,
+    both_cameras,
+    check_pairs,
+    of_both,
+    pairs_at_home,
+    place_boards,
+    rough_gamma,
+    rough_hand,
+    stereo,
+)
+from cotarget.calibration.model import (
+    DEFAULT_OPTIONS,
+    CameraName,
+    Options,
+    Rejected,
+    Residuals,
+    RigModel,
+    Solution,
+    View,
+    stop_of,
+)
 from cotarget.calibration.observability import limits_of_use, name_directions, weak_directions
-from cotarget.calibration.parameters import ALL_BLOCKS, Block, RigModel, parameter_names, stop_of
-from cotarget.calibration.placing import place_boards
-from cotarget.calibration.robust import MEDIAN_TO_SIGMA, rms, robust_sigma
-from cotarget.calibration.sequential import Solution, Steps, both_cameras, check_pairs, stereo
-from cotarget.calibration.start import at_home, of_both, pairs_at_home, rough_gamma, rough_hand
-from cotarget.calibration.stops import check_stops, fit_stop, lens_prior, with_stop
-from cotarget.calibration.uncertainty import covariance_of
+from cotarget.calibration.uncertainty import covariance_of, cross_validate, with_considered
+from cotarget.camera import ZoomLens, distortion_growth
+from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
+from cotarget.rig import Image
+
+# Jitter is looked for between these [rad], and believed when its likelihood is this many times that of none:
+# exp(2.71 / 2), which chance exceeds once in twenty times (a half chi-square at its border).
+JITTER_RANGE = (1e-7, 0.1)
+JITTER_EVIDENCE = 2.71
+TURN_ROUNDS = 6
+RELATIVE_ROUNDING = 1e-10  # of a normal matrix whose boards were eliminated by subtraction
+
+
+def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> float:
+    """Estimate how far the head's angles scatter about the reported ones, by restricted maximum likelihood.
+
+    With the corners' own variance profiled out, the likelihood of a jitter needs only the normal equations of the fit
+    without one (Patterson and Thompson 1971; Harville 1977).
+
+    Args:
+        found: a fit, without jitter or with one found before, by which its corners are then judged.
+        points: the board's corners in its frame [m], (N, 3).
+        prior: that of the fit.
+
+    Returns:
+        Standard deviation of each axis [rad]; 0 where the corners do not speak for any.
+    """
+    problem = Problem(batches_of(found.model, found.views), points, found.free, prior, found.jitter)
+    if found.variance is None or not any(batch.stop is not None for batch in problem.batches):
+        return 0.0
+    here = problem.at(found.model)
+    grams = problem.grams(here, robust_scale(here))
+    coordinates = 2 * sum(int(batch.seen.sum()) for batch in problem.batches)
+    freedom = coordinates - len(found.normal) - POSE_PARAMETERS * len(found.model.boards)
+
+    def profiled(ratio: float) -> tuple[float, Array, Array]:
+        """Squares left, and the reduced matrix and the boards' inverses, at jitter^2 = ratio * variance."""
+        equations = problem.assembled(here, grams, 1 / ratio if ratio else np.inf)
+        matrix, gradient, inverse = reduced(equations, 0.0)
+        matrix = matrix + damped(matrix, RELATIVE_ROUNDING)  # where a direction is open, it stands still
+        left = equations.squares - gradient @ np.linalg.solve(matrix, gradient)
+        left -= np.einsum("bi,bij,bj->", equations.board_gradient, inverse, equations.board_gradient)
+        return max(float(left), SMALLEST_SIGMA_PX**2), matrix, inverse
+
+    def minus_twice_log_likelihood(ratio: float) -> float:
+        left, matrix, inverse = profiled(ratio)
+        spread = float(np.linalg.slogdet(matrix)[1] - np.linalg.slogdet(inverse)[1].sum())
+        turns = slice(-1 - TURNS, -1)
+        for batch, (_, gram) in zip(problem.batches, grams, strict=True):
+            if batch.stop is not None:
+                spread += float(np.linalg.slogdet(np.eye(TURNS) + ratio * gram[:, turns, turns])[1].sum())
+        return float(freedom * np.log(left) + spread)
+
+    lowest, highest = (float(2 * np.log(sigma) - np.log(found.variance)) for sigma in JITTER_RANGE)
+    best = minimize_scalar(lambda x: minus_twice_log_likelihood(np.exp(x)), bounds=(lowest, highest), method="bounded")
+    if minus_twice_log_likelihood(0.0) - best.fun < JITTER_EVIDENCE:
+        return 0.0
+    return float(np.sqrt(np.exp(best.x) * profiled(np.exp(best.x))[0] / freedom))
+
+
+def head_turns(found: Fit, points: Array) -> Array:
+    """By how much every zoom view's own pan and tilt would have to differ for its corners to fit best, (V, 2) [rad].
+
+    nan for the fixed camera's views; the boards and everything else stay where the fit has put them.
+    """
+    problem = Problem(batches_of(found.model, found.views), points, (), None, 0.0)
+    here = problem.at(found.model)
+    turns = np.full((len(found.views), TURNS), np.nan)
+    for batch, p, r in zip(problem.batches, here.predictions, here.residuals, strict=True):
+        if p.by_turn is None:
+            continue
+        Q, after = masked(p.by_turn, batch), r
+        for _ in range(TURN_ROUNDS):  # wrong corners are not to turn a view
+            weighted = Q * huber_weights(after, robust_scale(here))[..., None, None]
+            own = np.einsum("vnik,vnil->vkl", weighted, Q)
+            turn = -np.linalg.solve(
+                own + damped(own, RELATIVE_ROUNDING), np.einsum("vnik,vni->vk", weighted, r)[..., None]
+            )[..., 0]
+            after = r + np.einsum("vnik,vk->vni", Q, turn)
+        turns[batch.rows] = turn
+    return turns
+
+
+# --- stops ---
+
+FINE = 1e-9  # rounding of a logarithm
+SAME_FOCAL = 0.008  # relative; a step of a usual lens changes the focal length by 0.02
+# What is known of a lens before it is seen: its pupil moves by some decimetres over the range; and distortion, measured
+# in the image, stays within several times of what lenses have. Boards all over the image know either far better.
+PUPIL_SIGMA = 0.2  # [m]
+BENT_SIGMAS = {"k1": (0.5, 2), "k2": (1.0, 4), "p1": (0.05, 1), "p2": (0.05, 1)}  # and the power of the focal length
+INSIDE_PX = 2.0  # a corner predicted this far inside the image is expected to be seen
+# A stop is found by where the one before lets expect the board's corners. What that one leaves open, a principal point
+# that is taken for a turn of the camera, grows with the focal length: in three sessions of eight placements, rendered
+# without multisampling, a stop 12 times as far was lost in two, 3.5 times as far in one, 2.3 times in none.
+LARGEST_LEAP = 2.5
+FEWEST_CORNERS = 6  # of a board seen in part, that tell how a lens magnifies and where its axis is
+
+
+def spread_stops(shortest_px: float, longest_px: float, count: int) -> list[float]:
+    """Nominal focal lengths evenly spread in their logarithm [px]; the shortest alone for a lens that does not zoom."""
+    if longest_px <= shortest_px * (1 + SAME_FOCAL) or count < 2:
+        return [shortest_px]
+    return [float(f) for f in np.geomspace(shortest_px, longest_px, count)]
+
+
+def fewest_stops(shortest_px: float, longest_px: float) -> int:
+    """How many stops it takes, evenly spread in their logarithm, to get surely from one to the next."""
+    return 1 + math.ceil(math.log(longest_px / shortest_px) / math.log(LARGEST_LEAP) - FINE)
+
+
+def stops_of(views: Sequence[View]) -> list[float]:
+    """The nominal focal lengths at which the zoom camera was, increasing [px]; empty where no device told one."""
+    stops: list[float] = []
+    for focal in sorted({view.focal_px for view in views if view.camera == "zoom" and view.focal_px is not None}):
+        if not stops or focal > stops[-1] * (1 + SAME_FOCAL):
+            stops.append(focal)
+    return stops
+
+
+def same_focal(view: View, nominal_px: float) -> bool:
+    """Whether a view was taken at a nominal focal length [px]."""
+    return view.focal_px is not None and abs(view.focal_px / nominal_px - 1) <= SAME_FOCAL
+
+
+def with_stop(lens: ZoomLens, nominal_px: float) -> ZoomLens:
+    """A lens with one more stop beyond its last, guessed: ratio and centre go on as they went, the rest stays."""
+    last = lens.stops[-1]
+    magnified = nominal_px / lens.nominal_px[-1]
+    k1, k2, p1, p2, k3 = (float(k) for k in np.array(last.distortion) * distortion_growth(magnified))
+    distortion = (k1, k2, p1, p2, k3)
+    focal, center = np.array(last.focal_px) * magnified, np.array(last.center_px)
+    if len(lens.stops) > 1:
+        before = lens.stops[-2]
+        onward = np.log(magnified) / np.log(lens.nominal_px[-1] / lens.nominal_px[-2])
+        ratio, earlier = (
+            np.array(stop.focal_px) / nominal
+            for stop, nominal in zip((last, before), lens.nominal_px[:-3:-1], strict=True)
+        )
+        focal = focal * (ratio / earlier) ** onward
+        center = center + onward * (center - np.array(before.center_px))
+    else:
+        distortion = (0.0,) * 5  # one stop does not tell how the image's distortion goes on
+    guess = replace(
+        last,
+        focal_px=(float(focal[0]), float(focal[1])),
+        center_px=(float(center[0]), float(center[1])),
+        distortion=distortion,
+    )
+    return ZoomLens((*lens.nominal_px, nominal_px), (*lens.stops, guess), (*lens.pupil, lens.pupil[-1]))
+
+
+def lens_prior(model: RigModel) -> Prior:
+    """What is known of a zoom lens beyond its first stop before it is seen; see `PUPIL_SIGMA` and `BENT_SIGMAS`."""
+    assert model.zoom is not None
+    sigmas: dict[str, float] = {}
+    stops = []
+    for i, (stop, nominal) in enumerate(zip(model.zoom.stops, model.zoom.nominal_px, strict=True)):
+        m = nominal / model.zoom.nominal_px[0]
+        stops.append(replace(stop, distortion=(0.0,) * 5) if i else stop)
+        if i:
+            sigmas[f"zoom[{i}].pupil"] = PUPIL_SIGMA
+            sigmas |= {f"zoom[{i}].{name}": sigma * m**power for name, (sigma, power) in BENT_SIGMAS.items()}
+    still = ZoomLens(model.zoom.nominal_px, tuple(stops))
+    return Prior(replace(model, zoom=still), sigmas)
+
+
+def fit_stop(model: RigModel, number: int, views: Sequence[View], points: Array) -> RigModel:
+    """Fit one stop alone to views at it, the boards where they are, everything else as it is.
+
+    Args:
+        model: with the boards of the views' placements.
+        number: of the stop.
+        views: of the zoom camera at that stop, and of the fixed camera of the same placements.
+        points: the board's corners in its frame [m], (N, 3).
+    """
+    known = lens_prior(model)
+    own = f"zoom[{number}]."  # nothing is to draw the other stops, which have no views here
+    prior = Prior(known.reference, {name: sigma for name, sigma in known.sigmas.items() if name.startswith(own)})
+    found = fit(model, views, points, ("zoom", "pupil"), prior=prior)
+    return replace(found.model, boards=model.boards)
+
+
+def expected_corners(model: RigModel, view: View, points: Array) -> Array:
+    """Where the corners of a view's board should be, (N, 2) [px]; nan behind the camera.
+
+    Args:
+        model: with the board's place, and a stop at the view's focal length.
+        view: its corners do not matter.
+        points: the board's corners in its frame [m], (N, 3).
+    """
+    return predict_pixels(model, [view], points)[0]
+
+
+def expected_inside(expected_px: Array, size: tuple[int, int]) -> Array:
+    """Which corners are expected in the image, (N,)."""
+    with np.errstate(invalid="ignore"):
+        low = (expected_px >= INSIDE_PX).all(axis=-1)
+        return np.asarray(low & (expected_px <= np.array(size) - 1 - INSIDE_PX).all(axis=-1))
+
+
+def find_expected(image: Image, board: BoardConfig, expected_px: Array) -> Array | None:
+    """Find a board, whole or in part, that is expected at (N, 2) [px]; None where it is not surely there."""
+    inside = expected_inside(expected_px, (image.shape[1], image.shape[0]))
+    found = None
+    if inside.all():
+        found = find_corners(image, board, thorough=False)
+    if found is None and np.count_nonzero(inside) >= FEWEST_CORNERS:
+        found = find_near(image, board, expected_px)
+    if found is not None and np.count_nonzero(np.isfinite(found[:, 0])) < FEWEST_CORNERS:
+        return None
+    return found
+
+
+def check_stops(model: RigModel) -> None:
+    """Refuse a lens whose true focal length does not grow with the nominal one.
+
+    Raises:
+        CalibrationError: two stops contradict each other.
+    """
+    assert model.zoom is not None
+    focal = [stop.focal_px[0] for stop in model.zoom.stops]
+    for i, (a, b) in enumerate(itertools.pairwise(focal)):
+        if b <= a:
+            n = model.zoom.nominal_px
+            raise CalibrationError(
+                f"zoom lens: the true focal length comes out as {a:.0f} px at {n[i]:.0f} px and {b:.0f} px at "
+                f"{n[i + 1]:.0f} px by the device's account; check that the lens stood still and was where it said"
+            )
+
 
 # A corner further off than this many standard deviations, and than the floor, is wrong: of Gaussian ones, one in
 # 65 million is.

@@ -1,6 +1,6 @@
 """What a calibration takes and gives: captures, views (the corners of one image), and the calibration itself."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -14,6 +14,9 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
 from cotarget.pantilt import IDEAL_HEAD, HeadGeometry
 from cotarget.rig import Image
+
+STILL = RigidTransform.identity()
+
 
 CameraName = Literal["fixed", "zoom"]
 Progress = Callable[[int, int, str], None]  # done, total, text
@@ -293,3 +296,70 @@ class Calibration:
             covariance=covariance,
             pitch_mm=pitch_mm,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class RigModel:
+    """Everything that determines where corners appear.
+
+    Attributes:
+        fixed: the fixed camera, None while only the zoom camera is looked at.
+        zoom: the zoom camera, None while only the fixed camera is looked at.
+        gamma: T_zoom0_fixed, at the first stop.
+        hand: T_head_zoom, at the first stop.
+        head: the pan-tilt unit's geometry.
+        boards: T_fixed_board by the number of the placement.
+        warp: by how much the board's middle stands out towards its z from its edges along x, and along y [m].
+    """
+
+    boards: Mapping[int, RigidTransform]
+    fixed: Intrinsics | None = None
+    zoom: ZoomLens | None = None
+    gamma: RigidTransform = STILL
+    hand: RigidTransform = STILL
+    head: HeadGeometry = IDEAL_HEAD
+    warp: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def stops(self) -> int:
+        """How many stops the zoom lens has here."""
+        return 0 if self.zoom is None else len(self.zoom.stops)
+
+    @property
+    def focal_px(self) -> dict[str, float]:
+        """Focal length of every lens [px], by how the names of its parameters begin."""
+        found = {} if self.fixed is None else {"fixed": self.fixed.focal_px[0]}
+        stops = () if self.zoom is None else self.zoom.stops
+        return found | {f"zoom[{i}]": stop.focal_px[0] for i, stop in enumerate(stops)}
+
+    def lens_of(self, view: View) -> Intrinsics:
+        """The intrinsics with which a view was taken.
+
+        Raises:
+            CalibrationError: there is no model of its camera.
+        """
+        if view.camera == "fixed" and self.fixed is not None:
+            return self.fixed
+        if view.camera == "zoom" and self.zoom is not None:
+            return self.zoom.stops[stop_of(self.zoom.nominal_px, view)]
+        raise CalibrationError(f"there are views of the {view.camera} camera, but no model of it")
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What a method found: the model (every placement's board in it), residuals, and the views it used."""
+
+    model: RigModel
+    residuals: Residuals
+    views: tuple[View, ...]
+    has_head: bool
+    covariance: Covariance | None = None
+    jitter: float = 0.0
+    held_out: HeldOut | None = None
+
+
+def stop_of(nominal_px: Sequence[float], view: View) -> int:
+    """The stop that is nearest to a view's nominal focal length; the first where none was told."""
+    if view.focal_px is None or not nominal_px:
+        return 0
+    return int(np.argmin(np.abs(np.log(np.array(nominal_px) / view.focal_px))))

@@ -10,85 +10,21 @@ most of what is uncertain: the method gives no covariance.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from cotarget.calibration.bundle import Fit, fit
-from cotarget.calibration.model import CameraName, Covariance, HeldOut, Rejected, Residuals, View
-from cotarget.calibration.parameters import RigModel
-from cotarget.calibration.placing import place_boards
-from cotarget.calibration.start import at_home, of_both, one_camera, pairs_at_home, rough_gamma, rough_hand
-from cotarget.camera import ZoomLens
+from cotarget.calibration.bundle import fit
+from cotarget.calibration.initialization import (
+    both_cameras,
+    check_pairs,
+    of_both,
+    pairs_at_home,
+    place_boards,
+    rough_hand,
+    stereo,
+)
+from cotarget.calibration.model import CameraName, Residuals, Solution, View
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
-
-# Pictures of two cameras that did not stand still are explained so many times worse together than each camera's alone;
-# lenses and boards that are not as modelled cost less than twice.
-CONTRADICTION, CONTRADICTION_FLOOR_PX = 3.0, 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """What a method found: the model (every placement's board in it), residuals, and the views it used."""
-
-    model: RigModel
-    residuals: Residuals
-    views: tuple[View, ...]
-    has_head: bool
-    covariance: Covariance | None = None
-    jitter: float = 0.0
-    held_out: HeldOut | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """What the steps before a joint fit found, and their residuals."""
-
-    model: RigModel
-    fixed_fit: Fit
-    zoom_fit: Fit
-    views: tuple[View, ...]
-    rejected: tuple[Rejected, ...]
-
-    @property
-    def has_head(self) -> bool:
-        """Whether the head ever left home."""
-        return any(view.camera == "zoom" and not at_home(view) for view in self.views)
-
-
-def both_cameras(
-    views: Sequence[View], points: Array, sizes: Mapping[CameraName, tuple[int, int]], nominal_px: float | None
-) -> Steps:
-    """Step 1: each camera by itself, from views of one focal length."""
-    fixed, fixed_fit, fixed_views, fixed_rejected = one_camera("fixed", views, points, sizes["fixed"])
-    zoom, zoom_fit, zoom_views, zoom_rejected = one_camera("zoom", views, points, sizes["zoom"])
-    model = RigModel({}, fixed, ZoomLens((nominal_px or zoom.focal_px[0],), (zoom,)))
-    rejected = (*fixed_rejected, *zoom_rejected)
-    return Steps(model, fixed_fit, zoom_fit, (*fixed_views, *zoom_views), rejected)
-
-
-def stereo(model: RigModel, pairs: Sequence[View], points: Array) -> Fit:
-    """Step 2: Gamma with the intrinsics as they are, from pairs at home."""
-    start = replace(model, gamma=rough_gamma(model, pairs, points))
-    return fit(place_boards(start, pairs, points), pairs, points, {"gamma"})
-
-
-def check_pairs(steps: Steps, together_px: float) -> None:
-    """Refuse pictures of two cameras without a head that contradict each other: alone each explains its own far better.
-
-    Args:
-        steps: each camera by itself.
-        together_px: rms of both with one offset between them [px].
-
-    Raises:
-        CalibrationError: they do.
-    """
-    alone_px = max(steps.fixed_fit.rms_px, steps.zoom_fit.rms_px)
-    if not steps.has_head and together_px > max(CONTRADICTION * alone_px, CONTRADICTION_FLOOR_PX):
-        raise CalibrationError(
-            f"the two cameras contradict each other: no one offset between them explains the corners to better than "
-            f"{together_px:.2g} px, where each camera by itself does to {alone_px:.2g} px; both must stand still from "
-            "the first picture to the last, and the two of a pair must show the board in the same place"
-        )
 
 
 def sequential(

@@ -2,6 +2,6 @@
 
 import sys
 
-from cotarget.cli import main
+from cotarget.cli.main import main
 
 sys.exit(main())

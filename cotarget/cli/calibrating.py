@@ -9,16 +9,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cotarget.cli.arguments import (
-    check_board_is_told,
-    check_outputs,
-    previous_kept,
-    print_json,
-    progress_bar,
-    rig_files,
-)
+from cotarget.cli.common import check_board_is_told, check_outputs, previous_kept, print_json, progress_bar, rig_files
 from cotarget.errors import ConfigError
-from cotarget.outputs import behind_link, check_writable
+from cotarget.files import behind_link, check_writable
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
@@ -33,11 +26,10 @@ SESSION = ("placements", "stops")  # and those of a capture session
 def calibrate(options: argparse.Namespace) -> None:
     """Cotarget calibrate."""
     from cotarget import calibration as cal
-    from cotarget.calibration.recorder import SETTLE, SETTLE_LONG
+    from cotarget.backends import open_rig
+    from cotarget.calibration.session import SETTLE, SETTLE_LONG, with_stills
     from cotarget.config import BoardConfig, load_config
-    from cotarget.rig import open_rig
     from cotarget.safety import SafeRig, refuse_if_stopped
-    from cotarget.stills import with_stills
 
     config = None if options.rig is None else load_config(options.rig)
     inputs = _photos(options) if config is None else rig_files(options.rig, config)
@@ -127,7 +119,7 @@ def _captures_kept(directory: Path | None) -> Iterator[None]:
 
 def _enough_stops(wanted: int, focal_range_px: tuple[float, float]) -> int:
     """As many stops as are wanted, or as it takes to get from one to the next; 1 is the shortest focal length alone."""
-    from cotarget.calibration.stops import fewest_stops
+    from cotarget.calibration.joint import fewest_stops
 
     needed = fewest_stops(*focal_range_px)
     if not 1 < wanted < needed:
@@ -178,8 +170,8 @@ def summary(found: "Calibration", path: Path) -> dict[str, Any]:
     """What calibrate prints: the residuals, how well it points, and the verdict."""
     import numpy as np
 
-    from cotarget.report.pointing import MORE_PLACEMENTS, can_point, pointing, with_more_placements
-    from cotarget.report.verdict import judge
+    from cotarget.report.analysis import MORE_PLACEMENTS, can_point, pointing, with_more_placements
+    from cotarget.report.text import judge
 
     assert found.residuals is not None
     residuals = {k: v for k, v in dataclasses.asdict(found.residuals).items() if k != "rejected"}
@@ -214,7 +206,7 @@ def report(options: argparse.Namespace) -> None:
 
 def board(options: argparse.Namespace) -> None:
     """Cotarget board."""
-    from cotarget.calibration.printing import print_board
+    from cotarget.board import print_board
     from cotarget.config import BoardConfig
 
     check_outputs([options.out], [])

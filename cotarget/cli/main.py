@@ -1,4 +1,7 @@
-"""The commands. Machine-readable output goes to stdout or the named file; a mistake ends in one line on stderr."""
+"""The commands. Machine-readable output goes to stdout or the named file; a mistake ends in one line on stderr.
+
+Parsers of the command line whose mistakes end in one line.
+"""
 
 import argparse
 import contextlib
@@ -6,18 +9,52 @@ import logging
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any, NoReturn
 
-import cotarget
-from cotarget.cli import aiming, calibrating, emulating, operating, running, viewing
-from cotarget.cli.arguments import corners, count, not_negative, number, port, positive
-from cotarget.cli.choosing import add_choice
-from cotarget.cli.parsers import CommandParser, Parser
+from cotarget.cli import calibrating, operating, running
+from cotarget.cli import operating as operating_module
+from cotarget.cli import running as running_module
+from cotarget.cli.common import add_choice, corners, count, not_negative, number, port, positive
 from cotarget.errors import CotargetError
+
+USAGE = 2  # argparse's own exit status
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose mistakes, too, end in one line.
+
+    Attributes:
+        more: what --help says last, found only then.
+    """
+
+    more: Callable[[], str] | None = None
+
+    def format_help(self) -> str:
+        """Say what there is to say."""
+        if self.more is not None:
+            self.epilog = self.more()
+        return super().format_help()
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, without the usage in front of it."""
+        self.exit(USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+class CommandParser(Parser):
+    """A command's own, which complains itself of what it does not know, where its --help tells what it does."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse has it; but all must be known."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return found, unknown
+
 
 # Heavy modules (MuJoCo, OpenCV, matplotlib) are imported by the command that needs them, so that --help and
 # mistakes in the arguments answer at once, and `doctor` runs where one of them is broken.
-
 INTERRUPTED = 130  # a shell's exit status for Ctrl-C
 TERMINATED = 143  # for SIGTERM,
 HUNG_UP = 129  # and for SIGHUP: a terminal that was closed, a connection that broke
@@ -66,9 +103,14 @@ def _notes(end: BaseException) -> list[str]:
     return getattr(end, "__notes__", [])
 
 
+DESCRIPTION = (
+    "Two cameras that cooperate: a wide one finds a small target, a zoom camera on a pan-tilt unit shows it large."
+)
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = Parser(prog="cotarget", description=(cotarget.__doc__ or "").partition("\n")[0])
-    parser.add_argument("--version", action="version", version=f"cotarget {cotarget.__version__}")
+    parser = Parser(prog="cotarget", description=DESCRIPTION)
+    parser.add_argument("--version", action="version", version=f"cotarget {version('cotarget')}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=CommandParser)
 
     def command(name: str, run: Callable[[argparse.Namespace], int | None], summary: str) -> Parser:
@@ -134,7 +176,9 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     aim = command(
-        "aim", aiming.aim, "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout"
+        "aim",
+        operating_module.aim,
+        "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout",
     )
     aim.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
     aim.add_argument("--pixel", type=float, nargs=2, required=True, metavar=("U", "V"), help="in the fixed view [px]")
@@ -204,7 +248,7 @@ def _parser() -> argparse.ArgumentParser:
     reset_head.add_argument("--yes", action="store_true", help="camera and cables are clear of it")
 
     emulate = command(
-        "emulate", emulating.emulate, "put a simulated rig behind the real devices' protocols, in real time"
+        "emulate", operating_module.emulate, "put a simulated rig behind the real devices' protocols, in real time"
     )
     emulate.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml of the simulated rig (the default rig)")
     emulate.add_argument(
@@ -224,15 +268,17 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DEVICE.FAULT",
         help="to be on from the start, of those below; while it runs, the control socket switches them",
     )
-    emulate.more = emulating.fault_names
+    emulate.more = operating_module.fault_names
     emulate.add_argument("--seconds", type=positive, metavar="S", help="for how long (until Ctrl-C)")
 
-    view = command("view", viewing.view, "show the simulated scene, both cameras' frusta and what they see")
+    view = command("view", running_module.view, "show the simulated scene, both cameras' frusta and what they see")
     view.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml of the simulated rig (the default rig)")
     view.add_argument("--target", metavar="NAME", help="follow this target of rig.toml meanwhile")
     view.add_argument("--calibration", type=Path, metavar="FILE", help="to follow by (the simulation's true one)")
     view.add_argument("--browser", action="store_true", help="in a web browser, on this machine alone")
-    view.add_argument("--port", type=port, metavar="P", help=f"of the page; 0: any that is free ({viewing.PORT})")
+    view.add_argument(
+        "--port", type=port, metavar="P", help=f"of the page; 0: any that is free ({running_module.PORT})"
+    )
     view.add_argument("--seconds", type=positive, metavar="S", help="for how long (until it is closed, or Ctrl-C)")
 
     detect = command("detect", running.detect, "run the fixed camera's detector and tracker on any film")

@@ -1,21 +1,206 @@
-"""What an operator does with a rig: point it, measure its latencies, stop it and clear the stop, reset the head."""
+"""What an operator does with a rig: point it, measure its latencies, stop it and clear the stop, reset the head.
+
+The command that tells where to point for one pixel of the fixed camera: aim.
+
+The command that puts a simulated rig behind the devices' protocols.
+"""
 
 import argparse
 import math
+import os
 import re
 import sys
+import time
 import tomllib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from cotarget.cli.arguments import (
-    check_board_is_told,
-    check_outputs,
-    check_within,
-    previous_kept,
-    print_json,
-    rig_files,
-)
+from cotarget.cli.common import check_board_is_told, check_outputs, check_within, previous_kept, print_json, rig_files
 from cotarget.errors import CalibrationError, ConfigError
+
+if TYPE_CHECKING:
+    from cotarget.calibration import Calibration
+    from cotarget.config import TargetConfig
+
+
+SMALL_PX = 10.0  # sizes below are told with two digits, others in whole pixels
+
+
+def aim(options: argparse.Namespace) -> None:
+    """Cotarget aim."""
+    import numpy as np
+
+    from cotarget.calibration import load_calibration
+    from cotarget.calibration.joint import SAME_FOCAL
+    from cotarget.config import RigConfig, load_config
+    from cotarget.targeting import Closeup, Reach, depth_of, error_budget, point_at
+    from cotarget.targeting import aim as aim_at
+
+    config = RigConfig() if options.rig is None else load_config(options.rig)
+    if config.backend == "replay":
+        raise ConfigError(f"{options.rig}: backend is 'replay'; give the rig.toml of the rig that was recorded")
+    calibration = load_calibration(options.calibration)
+    if options.rig is not None:
+        calibration = calibration.for_streams(*config.stream_sizes)
+    target = None if options.target is None else config.target(options.target)
+    if options.size_px is not None and target is None:
+        raise ConfigError("--size-px needs --target NAME, whose true size gives the depth")
+    if options.wanted_px is not None and target is None:
+        raise ConfigError("--wanted-px needs --target NAME, whose true size gives the focal length")
+    depth = options.depth
+    if target is not None and options.size_px is not None:
+        depth = depth_of(calibration, target, options.size_px, np.array(options.pixel))
+        if not math.isfinite(depth):
+            raise ConfigError(
+                f"--size-px: {options.size_px:g} px is no size that a {options.target} of {target.size:g} m has in the "
+                "fixed camera's {}x{} image".format(*calibration.fixed.size)
+            )
+    pitch_mm = calibration.pitch_mm or config.pitch_mm
+    shortest, longest = config.focal_range_px
+    if options.rig is None:  # the calibration knows its own lens's shortest focal length
+        shortest = calibration.zoom.nominal_px[0]
+    reach = Reach(*config.head_limits, (shortest, max(shortest, longest)), step=config.head_step)
+    closeup = (
+        Closeup(target.size, options.wanted_px, target.dimension == "height")
+        if target and options.wanted_px is not None
+        else None
+    )
+    nominal = None if options.focal_mm is None else options.focal_mm / pitch_mm
+    if nominal is not None:
+        shortest, longest = (f * pitch_mm for f in reach.focal_px)
+        check_within("--focal-mm", options.focal_mm, (shortest, longest), "the lens's {} mm")
+    pixel = np.array(options.pixel)
+    size = calibration.fixed.size
+    if not (np.all(pixel >= -0.5) and np.all(pixel <= np.array(size) - 0.5)):
+        raise ConfigError(
+            f"--pixel: ({pixel[0]:g}, {pixel[1]:g}) is not in the fixed camera's {size[0]}x{size[1]} image"
+        )
+    found = aim_at(
+        calibration, point_at(calibration, pixel, depth), reach, closeup=closeup, nominal_px=nominal, method=options.ik
+    )
+    # The budget speaks of the exact inverse; what the paper's shortcut loses beside it, nothing here knows.
+    budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px) if options.ik == "exact" else None
+    calibrated = calibration.zoom.nominal_px
+    within = calibrated[0] * (1 - SAME_FOCAL) <= found.nominal_px <= calibrated[-1] * (1 + SAME_FOCAL)
+    if not within:
+        print(
+            f"cotarget aim: {found.nominal_px * pitch_mm:.1f} mm is beyond the focal lengths calibrated, "
+            f"{calibrated[0] * pitch_mm:.1f} to {calibrated[-1] * pitch_mm:.1f} mm: the prediction only guesses there",
+            file=sys.stderr,
+        )
+    nearest, name = min(_fits_from(calibration, config.targets if target is None else {options.target: target}))
+    plausible = found.depth >= nearest
+    if not plausible:
+        fits = f"no target, not even the {name}, fits" if target is None else f"the {name} does not fit"
+        print(
+            f"cotarget aim: {fits} into the fixed view nearer than {nearest:.2g} m: is a depth of {found.depth:g} m "
+            "meant?",
+            file=sys.stderr,
+        )
+    if closeup is not None and found.limited:
+        focal = calibration.zoom.at(found.nominal_px).focal_px[int(closeup.vertical)]
+        shown, wanted = _pixels(focal * closeup.size / found.range), _pixels(closeup.wanted_px)
+        if shown != wanted:
+            print(
+                f"cotarget aim: the lens shows the {options.target} {shown} px large there, and not {wanted}",
+                file=sys.stderr,
+            )
+    print_json(
+        {
+            "pan_deg": math.degrees(found.pan),
+            "tilt_deg": math.degrees(found.tilt),
+            "focal_px": found.focal_px,
+            "focal_mm": found.nominal_px * pitch_mm,
+            "focal_limited": found.limited,
+            "focal_calibrated": within,
+            "depth_m": found.depth,
+            "depth_plausible": plausible,
+            "range_m": found.range,
+            "predicted_error_deg": budget and {name: math.degrees(part) for name, part in budget.items()},
+            "predicted_error_px": budget and math.tan(budget["total"]) * found.focal_px,
+        }
+    )
+
+
+def _fits_from(calibration: "Calibration", targets: Mapping[str, "TargetConfig"]) -> Iterator[tuple[float, str]]:
+    """From which depth on each target fits into the fixed view [m], and its name; a nearer one is hardly meant."""
+    for name, target in targets.items():
+        axis = 1 if target.dimension == "height" else 0
+        yield calibration.fixed.focal_px[axis] * target.size / calibration.fixed.size[axis], name
+
+
+def _pixels(size: float) -> str:
+    """A size in an image in words: whole pixels, but for the smallest."""
+    return f"{size:.2g}" if size < SMALL_PX else f"{size:.0f}"
+
+
+# --- emulating ---
+
+# Mesa's software renderer: one thread, which leaves the client a core. Read when OpenGL starts.
+RENDER_THREADS = ("LP_NUM_THREADS", "1")
+LOOK = 0.2  # between looks at the time [s]
+# How long a thread that works in Python keeps others waiting [s]; with Python's own 5 ms, a line that is paced by a
+# thread of its own loses half of its rate beside the world's rendering.
+SWITCH_S = 5e-4
+WHO_IS_THERE = ("person",)  # to be followed, where no rig.toml says who
+NOBODY = 'none; [sim] targets = ["person"] has one to follow'
+STOP_FILE = "stop"  # beside the rig.toml that is written, where the simulated rig's names none
+
+
+def fault_names() -> str:
+    """The faults that can be switched on, as --help tells them."""
+    from cotarget.emulators.emulation import FAULTS
+
+    return "faults: " + ", ".join(f"{device}.{name}" for device, names in FAULTS.items() for name in names)
+
+
+def emulate(options: argparse.Namespace) -> None:
+    """Cotarget emulate."""
+    os.environ.setdefault(*RENDER_THREADS)
+    sys.setswitchinterval(SWITCH_S)
+    from cotarget.config import RigConfig, SimConfig, load_config, read_tables
+    from cotarget.emulators.emulation import Emulation, Ports, copied_tables, parse_fault
+    from cotarget.emulators.world import paced
+    from cotarget.files import write_atomically
+
+    config = RigConfig(sim=SimConfig(targets=WHO_IS_THERE)) if options.rig is None else load_config(options.rig)
+    if config.backend != "sim":
+        raise ConfigError(f"{options.rig}: backend is '{config.backend}'; what is emulated is a simulated rig")
+    beside: dict[str, Any] = {}
+    if options.rig is not None:
+        beside = copied_tables(read_tables(options.rig), options.rig.parent)
+    beside["safety"] = {"stop_file": STOP_FILE} | beside.get("safety", {})
+    check_outputs([options.write], rig_files(options.rig, config))
+    for fault in options.fault:
+        parse_fault(fault)
+    ports = Ports(options.host, options.head, options.fixed, options.zoom, options.board, options.control)
+    password = os.environ.get("COTARGET_PASSWORD", "") if options.user else ""
+    if options.user and not password:
+        raise ConfigError("--user needs a password: put it into the environment variable COTARGET_PASSWORD")
+    with Emulation(paced(config), ports, user=options.user, password=password) as emulation:
+        for fault in options.fault:
+            emulation.switch(fault)
+        with previous_kept(options.write):
+            write_atomically(options.write, emulation.rig_toml(tcp=options.tcp, beside=beside).encode())
+        print(
+            f"head     {emulation.tty.port} and {emulation.tcp.url}\n"
+            f"fixed    {emulation.fixed.url}/mjpg/video.mjpg\n"
+            f"zoom     ptpip:{options.host}:{emulation.zoom.port}:{emulation.zoom.port}\n"
+            f"board    socket://{options.host}:{emulation.board.port}\n"
+            f"control  socket://{options.host}:{emulation.control.port}\n"
+            f"targets  {', '.join(config.sim.targets) or NOBODY}\n"
+            f"{options.write} connects to them; Ctrl-C ends them",
+            flush=True,
+        )
+        end = None if options.seconds is None else time.monotonic() + options.seconds
+        try:
+            while end is None or time.monotonic() < end:
+                time.sleep(LOOK)
+                emulation.world.check()
+        except KeyboardInterrupt:
+            print("", file=sys.stderr)
+
 
 CONSENT = "yes"
 # The line of a file that is not TOML any more which still says what file stops the head.
@@ -27,11 +212,10 @@ ACCURACY_S = 0.01
 
 def latency(options: argparse.Namespace) -> None:
     """Cotarget latency."""
+    from cotarget.backends import open_rig
     from cotarget.calibration import load_calibration
     from cotarget.config import load_config
-    from cotarget.latency import measure_fixed, measure_head
-    from cotarget.lenslatency import measure_lens
-    from cotarget.rig import open_rig
+    from cotarget.latency import measure_fixed, measure_head, measure_lens
     from cotarget.safety import SafeRig, refuse_if_stopped
 
     config = load_config(options.rig)
@@ -81,10 +265,10 @@ def _plausible(name: str, seconds: float) -> float:
 
 def point(options: argparse.Namespace) -> None:
     """Cotarget point."""
+    from cotarget.backends import open_rig
     from cotarget.calibration.captures import write_image
-    from cotarget.calibration.standing import wait_for_lens
+    from cotarget.calibration.session import wait_for_lens
     from cotarget.config import load_config
-    from cotarget.rig import open_rig
     from cotarget.safety import SafeRig, refuse_if_stopped
 
     config = load_config(options.rig)
@@ -149,9 +333,9 @@ def clear(options: argparse.Namespace) -> None:
 def reset_head(options: argparse.Namespace) -> None:
     """Cotarget reset-head."""
     from cotarget.config import load_config
-    from cotarget.hardware.clock import MonotonicClock
-    from cotarget.hardware.d46lost import LostPosition
-    from cotarget.hardware.d46reset import reset
+    from cotarget.drivers.clock import MonotonicClock
+    from cotarget.drivers.interlock import LostPosition
+    from cotarget.drivers.ptu_d46 import reset
     from cotarget.safety import StopLook, end_politely, refuse_if_stopped
 
     config = load_config(options.rig)

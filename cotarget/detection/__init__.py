@@ -10,11 +10,10 @@ import cv2
 import numpy as np
 
 from cotarget.config import TargetConfig
-from cotarget.detection.base import Detection, Detector
-from cotarget.detection.colour import ColourDetector
-from cotarget.detection.external import ExternalDetector
-from cotarget.detection.motion import BIRD, PERSON, MotionDetector, MotionSettings, plain
-from cotarget.detection.speck import SpeckDetector
+from cotarget.detection.background import BIRD, PERSON, MotionDetector, MotionSettings, plain
+from cotarget.detection.base import Detection, Detector, ExternalDetector
+from cotarget.detection.color_template import ColourDetector
+from cotarget.detection.small_target import SpeckDetector
 from cotarget.errors import ConfigError
 from cotarget.rig import Image
 

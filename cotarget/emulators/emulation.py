@@ -10,13 +10,12 @@ from typing import Any
 import tomli_w
 
 from cotarget.config import DEFAULT_TARGETS, RigConfig
-from cotarget.emulators.axis import AXIS_FAULTS, AxisServer
-from cotarget.emulators.d46 import D46_FAULTS, UnitProfile
-from cotarget.emulators.d46_twins import make_twins
+from cotarget.emulators.axis_241q import AXIS_FAULTS, AxisServer
+from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isServer
 from cotarget.emulators.faults import Faults
-from cotarget.emulators.jsonlines import JsonLines
-from cotarget.emulators.lines import SerialLine, TcpLine
-from cotarget.emulators.s5is import S5IS_FAULTS, S5isServer
+from cotarget.emulators.ptu_d46.firmware import D46_FAULTS, make_twins
+from cotarget.emulators.ptu_d46.unit import UnitProfile
+from cotarget.emulators.serve import JsonLines, SerialLine, TcpLine
 from cotarget.emulators.world import LiveWorld
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform, pose

@@ -8,8 +8,8 @@ classes; what is really so they tell in `info` alone.
 
 import gymnasium
 
-from cotarget.env.baseline import PipelinePolicy, SchedulingPolicy
 from cotarget.env.follow import Follow
+from cotarget.env.policies import PipelinePolicy, SchedulingPolicy
 from cotarget.env.schedule import Schedule
 
 __all__ = ["FOLLOW", "SCHEDULE", "Follow", "PipelinePolicy", "Schedule", "SchedulingPolicy"]

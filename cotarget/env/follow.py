@@ -8,17 +8,28 @@ import gymnasium
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig
+from cotarget.config import RigConfig, Size
 from cotarget.detection import Detection
-from cotarget.env.arguments import check_scene, name_of
-from cotarget.env.base import DETECTOR_NOISE, IMAGE_SIZE, Kind, RigEnv, corners
-from cotarget.env.units import LONGEST_AGE_S, RIG_FEATURES, Vector, box, rig_numbers, within
-from cotarget.judging import closeup_of
+from cotarget.env.common import (
+    DETECTOR_NOISE,
+    IMAGE_SIZE,
+    LONGEST_AGE_S,
+    RIG_FEATURES,
+    Kind,
+    RigEnv,
+    Vector,
+    box,
+    check_scene,
+    corners,
+    name_of,
+    rig_numbers,
+    within,
+)
+from cotarget.evaluation import TruthNoise, closeup_of
 from cotarget.metrics import Closeup
-from cotarget.oracle import TruthNoise
-from cotarget.sim.fieldpaths import LONE, SECONDS, lone_path
-from cotarget.simconfig import Size
-from cotarget.tracking import Tracker, settings_for
+from cotarget.sim.targets.random_paths import LONE, SECONDS, lone_path
+from cotarget.tracking.track import settings_for
+from cotarget.tracking.tracker import Tracker
 
 # What the tracker knows of the target, and the range of each number; 0 where it knows of none.
 TRACK_FEATURES = {

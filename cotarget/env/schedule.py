@@ -9,27 +9,37 @@ import gymnasium
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig
-from cotarget.env.arguments import check_scene, name_of, reward_of, told
-from cotarget.env.base import DETECTOR_NOISE, IMAGE_SIZE, Kind, RigEnv, corners
-from cotarget.env.units import RIG_FEATURES, box, rig_numbers, within
+from cotarget.config import RigConfig, Size
+from cotarget.control.selection import LOOK_S, Candidate
+from cotarget.env.common import (
+    DETECTOR_NOISE,
+    IMAGE_SIZE,
+    RIG_FEATURES,
+    Kind,
+    RigEnv,
+    box,
+    check_scene,
+    corners,
+    name_of,
+    reward_of,
+    rig_numbers,
+    told,
+    within,
+)
 from cotarget.errors import ConfigError
+from cotarget.evaluation import TruthNoise, closeup_of
 from cotarget.geometry import Array
-from cotarget.judging import closeup_of
-from cotarget.loop import FollowSettings, Step, follow
-from cotarget.metrics import SERVED_S
-from cotarget.metrics.held import ROUNDING_S
-from cotarget.motionfilter import Track
-from cotarget.oracle import TruthNoise
-from cotarget.planning import LOOK_S, Candidate
+from cotarget.metrics import ROUNDING_S, SERVED_S
+from cotarget.pipeline import FollowSettings, Step, follow
 from cotarget.rig import PanTiltLimits
-from cotarget.sim.fieldpaths import GROUPED, SECONDS, group_paths
-from cotarget.simconfig import Size
+from cotarget.sim.targets.random_paths import GROUPED, SECONDS, group_paths
+from cotarget.tracking.track import Track
 
 SLOTS = 8  # for tracks: five targets, and those that were lost and found under another number
 SERVED_REWARD = 5.0  # for each: as much as looking on at one of them is worth in as many seconds
 
-# What a policy knows of a track (`cotarget.policies.Candidate`), and the range of each number; 0 in an empty slot.
+# What a policy knows of a track (`cotarget.control.selection.Candidate`), and the range of each number; 0 in an empty
+# slot.
 CANDIDATE_FEATURES = {
     "there": (0.0, 1.0),  # whether the slot has a track
     "followed": (0.0, 1.0),  # whether it is the one looked at

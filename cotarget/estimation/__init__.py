@@ -19,9 +19,9 @@ A pan that points wrongly and a depth that is wrong look alike along the baselin
 has it; the depth by itself is as good as the calibration.
 """
 
-from cotarget.estimation.estimate import Appearance, Estimate
-from cotarget.estimation.filter import SpatialFilter
-from cotarget.estimation.settings import EstimationSettings, MotionSettings, estimation_settings_for
+from cotarget.estimation.measurement_model import Appearance, Estimate
+from cotarget.estimation.motion_model import EstimationSettings, MotionSettings, estimation_settings_for
+from cotarget.estimation.target_filter import SpatialFilter
 
 __all__ = [
     "Appearance",

@@ -1,24 +1,162 @@
-"""How the report's pictures look, and the pictures of what the corners say."""
+"""How the report's pictures look, and the pictures of what the corners say.
+
+All pictures of a report, with what they show in words.
+
+Pictures of the predicted pointing error: over the wide view, over depth and over focal length.
+"""
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from cotarget.report.evidence import CAMERAS, Corners, Evidence, averaged, counts, head_poses
-from cotarget.report.lenscurves import LensCurves
-from cotarget.report.wording import digits
+from cotarget.calibration.model import Calibration
+from cotarget.calibration.uncertainty import predicted_pointing
+from cotarget.geometry import Array
+from cotarget.report.analysis import (
+    CAMERAS,
+    DEPTHS,
+    TITLES,
+    AtFocal,
+    Corners,
+    Evidence,
+    LensCurves,
+    averaged,
+    counts,
+    head_poses,
+    lens_curves,
+    sample_depths,
+)
+from cotarget.report.text import count, digits
+
+MAP_DEPTHS = 3
+GRID = (29, 22)  # samples across and down the map
+CONTOUR_SHARES = (0.15, 0.4, 0.65, 0.9)  # of the view, over all depths, inside each contour
+TICKS = 5
+LOG_RATIO = 8.0  # from where on colours go by the logarithm
+CURVE_REACH = 3.0  # the curve goes so many times nearer and farther than targets are
+CURVE_POINTS = 60
+
+
+def map_figure(calibration: Calibration, at: AtFocal) -> Figure:
+    """Draw the predicted error over the wide view at three depths, in degrees and in px at the longest focal length."""
+    width, height = calibration.fixed.size
+    u, v = np.linspace(0, width - 1, GRID[0]), np.linspace(0, height - 1, GRID[1])
+    pixels = np.stack(np.meshgrid(u, v), axis=-1)
+    depths = sample_depths(MAP_DEPTHS)
+    errors = np.degrees(predicted_pointing(calibration, pixels[None], depths[:, None, None], nominal_px=at.nominal_px))
+    limits = float(np.nanmin(errors)) * 0.99, float(np.nanmax(errors)) * 1.01
+    norm = (LogNorm if limits[1] > LOG_RATIO * limits[0] else Normalize)(*limits)
+    levels = np.unique([float(digits(level)) for level in np.nanquantile(errors, CONTOUR_SHARES)])
+    with styled(3.3) as figure:
+        axes = figure.subplots(1, MAP_DEPTHS, sharey=True)
+        for ax, depth, error in zip(axes, depths, errors, strict=True):
+            as_image(ax, (width, height))
+            drawn = ax.imshow(
+                error,
+                norm=norm,
+                cmap=HEAT,
+                interpolation="bilinear",
+                extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+            )
+            inside = levels[(levels > np.nanmin(error)) & (levels < np.nanmax(error))]
+            if len(inside):
+                lines = ax.contour(u, v, error, inside, colors="white", linewidths=0.8)
+                ax.clabel(lines, fontsize=7.5, fmt=digits)
+            ax.set_title(f"{depth:.0f} m")
+        bar = figure.colorbar(drawn, ax=axes, orientation="horizontal", shrink=0.75, aspect=45, pad=0.06)
+        ticks = _steps(*limits, TICKS)
+        two_lines = [f"{digits(t)}°\n{digits(np.radians(t) * at.focal_px)} px" for t in ticks]
+        bar.set_ticks(ticks.tolist(), labels=two_lines)
+        bar.ax.minorticks_off()
+        bar.set_label(f"predicted error, one standard deviation; px at a focal length of {at.focal_px:.0f} px")
+        return figure
+
+
+def _steps(low: float, high: float, number: int) -> Array:
+    """Values between two others, evenly, or over their logarithm where they are far apart."""
+    return (np.geomspace if high > LOG_RATIO * low else np.linspace)(low, high, number)
+
+
+def _pixels(focal_px: float) -> tuple[Any, Any]:
+    """Between degrees and px."""
+    return (lambda d: np.radians(d) * focal_px, lambda p: np.degrees(p / focal_px))
+
+
+def depth_figure(calibration: Calibration, at: AtFocal, boards: Array | None) -> Figure:
+    """Draw the predicted error over depth at the wide view's middle and corners; boards are their distances [m]."""
+    depths = np.geomspace(DEPTHS[0] / CURVE_REACH, DEPTHS[1] * CURVE_REACH, CURVE_POINTS)
+    width, height = calibration.fixed.size
+    corners = np.array([(0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)], dtype=float)
+    with styled(3.0) as figure:
+        ax = figure.subplots()
+        middle = calibration.fixed.image_center_px
+        for pixels, label, colour in (
+            (middle[None], "middle of the wide view", BLUE),
+            (corners, "its worst corner", ORANGE),
+        ):
+            error = predicted_pointing(calibration, pixels[None], depths[:, None], nominal_px=at.nominal_px)
+            worst = np.fmax.reduce(error, axis=1)  # nan only where no corner is reached
+            ax.plot(depths, np.degrees(worst), color=colour, lw=1.6, label=label)
+        ax.set_ylim(bottom=0)
+        ax.axvspan(*DEPTHS, color=BLUE, alpha=0.06, lw=0, label="range of the verdict")
+        boards = np.empty(0) if boards is None else boards[(boards > depths[0]) & (boards < depths[-1])]
+        if len(boards):
+            ax.plot(boards, np.zeros(len(boards)), "|", color=INK, ms=12, clip_on=False, label="boards")
+        ax.set(xscale="log", xlabel="depth [m]", ylabel="predicted error [degrees]", xlim=(depths[0], depths[-1]))
+        ticks = [t for t in (1, 2, 5, 10, 20, 50, 100) if depths[0] <= t <= depths[-1]]
+        ax.set_xticks(ticks, [str(t) for t in ticks])
+        ax.minorticks_off()
+        px = ax.secondary_yaxis("right", functions=_pixels(at.focal_px))
+        px.set_ylabel(f"[px] at {at.focal_px:.0f} px")
+        ax.legend(ncols=2, fontsize=8)
+        return figure
+
+
+def focal_figure(stops: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Figure:
+    """Draw the predicted error over focal length, rms over the wide view and the depths, in degrees and in px."""
+    curve = sorted((*stops, *between), key=lambda at: at.nominal_px)
+    with styled(2.7) as figure:
+        for ax, unit in zip(figure.subplots(1, 2), ("degrees", "px in the zoom image"), strict=True):
+            for those, look in ((curve, "-"), (stops, "o")):
+                y = [np.degrees(at.rms) if unit == "degrees" else at.rms_px for at in those]
+                ax.plot([at.nominal_px for at in those], y, look, color=BLUE, lw=1.6, ms=4)
+            ax.set(xscale="log", xlabel="nominal focal length [px]", ylabel=f"[{unit}]", title="predicted error")
+            ax.set_ylim(bottom=0)
+            focal_ticks(ax, [stop.nominal_px for stop in stops])
+        return figure
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture for the page and for the folder beside it.
+
+    Attributes:
+        name: of its file, without ending.
+        png: the picture.
+        svg: the same, where that is what the page shows.
+        alt: what it shows, for those who do not see it.
+        caption: how to read it.
+    """
+
+    name: str
+    png: bytes
+    svg: bytes | None
+    alt: str
+    caption: str
+
 
 INK, BLUE, ORANGE, RED, GREY, PALE = "#22303c", "#1f6f8b", "#c8702a", "#b5403a", "#8a97a3", "#e3e8ec"
 WIDTH = 8.6  # inches: the page's column
 PNG_DPI = 170
 HEAT = "viridis"
-NAMES = {"fixed": "fixed camera", "zoom": "zoom camera"}
 STYLE = {
     "font.size": 9,
     "axes.titlesize": 9.5,
@@ -93,7 +231,7 @@ def residual_figure(evidence: Evidence) -> Figure:
             factor = magnification(corners)
             as_image(row[0], corners.size)
             _arrows(row[0], corners.seen_px, corners.residuals, factor, np.linalg.norm(corners.residuals, axis=-1))
-            row[0].set_title(f"{NAMES[name]}: every corner, ×{factor:g}")
+            row[0].set_title(f"{TITLES[name]}: every corner, ×{factor:g}")
             cells = averaged(corners)
             factor = magnification(corners) * 4
             as_image(row[1], corners.size)
@@ -110,7 +248,7 @@ def residual_figure(evidence: Evidence) -> Figure:
                     width=0.004,
                     in_layout=False,  # an arrow out of the image shall not push it aside
                 )
-            row[1].set_title(f"{NAMES[name]}: averages, ×{factor:g}")
+            row[1].set_title(f"{TITLES[name]}: averages, ×{factor:g}")
         return figure
 
 
@@ -154,7 +292,7 @@ def histogram_figure(evidence: Evidence) -> Figure:
                     label=label,
                 )
             ax.plot(x, gauss * number * width, color=INK, lw=1.2, label=f"Gaussian, {digits(corners.sigma)} px")
-            ax.set(title=NAMES[name], xlabel="residual [px]", ylabel="corners", xlim=(-reach, reach))
+            ax.set(title=TITLES[name], xlabel="residual [px]", ylabel="corners", xlim=(-reach, reach))
             ax.legend(fontsize=8, loc="upper right", handlelength=1.2)
         return figure
 
@@ -176,7 +314,7 @@ def coverage_figure(evidence: Evidence) -> Figure:
             )
             ax.set_facecolor("#f6d9d5")
             ax.scatter(*corners.seen_px.T, s=0.8, color=INK, lw=0, alpha=0.5)
-            ax.set_title(NAMES[name])
+            ax.set_title(TITLES[name])
             figure.colorbar(drawn, ax=ax, orientation="horizontal", label="corners in a cell", shrink=0.8, pad=0.03)
         return figure
 
@@ -243,3 +381,110 @@ def focal_ticks(ax: Any, stops_px: Sequence[float]) -> None:
     shown = stops_px if len(stops_px) <= 7 else stops_px[:: -(-len(stops_px) // 6)]
     ax.set_xticks(shown, [f"{n:.0f}" for n in shown])
     ax.minorticks_off()
+
+
+# --- pictures ---
+
+FIGURE_NAMES = (
+    "pointing_map",
+    "pointing_depth",
+    "pointing_focal",
+    "residuals",
+    "histogram",
+    "coverage",
+    "situation",
+    "lens",
+)
+Add = Callable[[str, Figure, str, str], None]  # name, figure, alt, caption
+# Those with many marks are embedded as PNG; thousands of arrows at a lower resolution, so that the page stays small.
+DENSE = {"pointing_map": PNG_DPI, "residuals": 140, "coverage": PNG_DPI}
+
+
+def draw(
+    calibration: Calibration, at: tuple[AtFocal, ...], between: tuple[AtFocal, ...], evidence: Evidence | None
+) -> dict[str, Picture]:
+    """Draw what the calibration has the data for, by the names of `NAMES`."""
+    made: dict[str, Picture] = {}
+
+    def add(name: str, figure: Figure, alt: str, caption: str) -> None:
+        dense = name in DENSE
+        png = as_bytes(figure, "png", DENSE.get(name, PNG_DPI))
+        made[name] = Picture(name, png, None if dense else as_bytes(figure, "svg"), alt, caption)
+
+    if at and np.isfinite(at[-1].rms):
+        _pointing(calibration, at, between, evidence, add)
+    if evidence is not None:
+        _corners(calibration, evidence, add)
+    if len(calibration.zoom.stops) > 1:
+        bands = "" if calibration.covariance is None else " The bands are one standard deviation."
+        add(
+            "lens",
+            lens_figure(lens_curves(calibration)),
+            "Curves of focal length ratio, principal point, distortion and entrance pupil over focal length",
+            f"What the zoom lens does over its range; the dots are the stops, and splines lead from one to the next."
+            f"{bands} κ₁ = k1 (n₀/n)² is the distortion as it appears in the image. The entrance pupil moves forward.",
+        )
+    return made
+
+
+def _pointing(
+    calibration: Calibration,
+    at: tuple[AtFocal, ...],
+    between: tuple[AtFocal, ...],
+    evidence: Evidence | None,
+    add: Add,
+) -> None:
+    last = at[-1]
+    add(
+        "pointing_map",
+        map_figure(calibration, last),
+        f"Heat maps of the predicted pointing error over the wide view at three depths; {digits(np.degrees(last.rms))} "
+        f"degrees on average",
+        "The wide view with targets at three depths; lines join places of equal error, written in degrees. The error "
+        "grows where no board reached, and with distance where boards were near only.",
+    )
+    add(
+        "pointing_depth",
+        depth_figure(calibration, last, None if evidence is None else evidence.distances),
+        "Curves of the predicted pointing error over depth, for the middle and the worst corner of the wide view",
+        "Over depth, for a target in the middle of the wide view and in the worst of its four corners. The marks on "
+        "the axis are the boards of the calibration.",
+    )
+    if len(at) > 1:
+        add(
+            "pointing_focal",
+            focal_figure(at, between),
+            "Curves of the predicted pointing error over the focal length, in degrees and in pixels of the zoom image",
+            "Over focal length, rms over the wide view and the depths; the dots are the calibrated stops. Between "
+            "them the lens is interpolated, and what that leaves in doubt is counted.",
+        )
+
+
+def _corners(calibration: Calibration, evidence: Evidence, add: Add) -> None:
+    add(
+        "residuals",
+        residual_figure(evidence),
+        "Images of both cameras with the residual of every corner as an arrow, and the averages over small cells",
+        "Left: every corner, the arrow leading from where it was seen to where it is predicted, magnified as stated. "
+        "Noise points everywhere. Right: averages over cells, magnified more; red ones are larger than chance makes "
+        "them, and many of these in a row are what the model of the lens leaves out.",
+    )
+    add(
+        "histogram",
+        histogram_figure(evidence),
+        "Histograms of the residuals of both cameras against Gaussians",
+        "Residuals against the Gaussian of their own standard deviation. Long tails are corners found wrongly.",
+    )
+    add(
+        "coverage",
+        coverage_figure(evidence),
+        "Where corners were seen in the images of both cameras",
+        "Every corner that was used, over the number in each cell; no corner was seen in the pink cells.",
+    )
+    add(
+        "situation",
+        situation_figure(evidence, calibration.zoom.nominal_px, calibration.T_head_zoom is not None),
+        f"Histograms of the distances and the slants of {count(len(evidence.distances), 'board')}, head poses",
+        "How far the boards were from the fixed camera, how they were turned from facing it, and where the head was. "
+        "Near and far, turned to all sides, and both axes moved is what determines a rig.",
+    )

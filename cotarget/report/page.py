@@ -1,31 +1,154 @@
-"""The report on a calibration: one HTML page that needs nothing beside it, and its pictures in a folder."""
+"""The report on a calibration: one HTML page that needs nothing beside it, and its pictures in a folder.
 
+Pieces of HTML; every text is escaped here and nowhere else.
+"""
+
+import base64
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from html import escape
 from pathlib import Path
 
 import numpy as np
 
+from cotarget.calibration.file import check_covariance
 from cotarget.calibration.model import Calibration
-from cotarget.calibration.reading import check_covariance
 from cotarget.errors import CalibrationError
-from cotarget.report import markup, pictures
-from cotarget.report.advice import advice, board_in_words
-from cotarget.report.evidence import CAMERAS, Evidence, averaged, gather, share_beyond
-from cotarget.report.figures import NAMES
-from cotarget.report.markup import Picture
-from cotarget.report.pointing import (
+from cotarget.report import figures
+from cotarget.report.analysis import (
+    CAMERAS,
     DEPTHS,
+    TITLES,
     AtFocal,
     Contribution,
+    Evidence,
+    averaged,
     between_stops,
     contributions,
     corner_errors,
+    gather,
     pointing,
+    share_beyond,
 )
-from cotarget.report.tables import STRONG, Table, correlations, key_figures, parameter_tables, provenance
-from cotarget.report.verdict import LABELS, TOO_CAREFUL, Verdict, judge
-from cotarget.report.wording import count, digits, percent
+from cotarget.report.figures import Picture
+from cotarget.report.text import (
+    LABELS,
+    STRONG,
+    TOO_CAREFUL,
+    Table,
+    Verdict,
+    advice,
+    board_in_words,
+    correlations,
+    count,
+    digits,
+    judge,
+    key_figures,
+    parameter_tables,
+    percent,
+    provenance,
+)
+
+
+def paragraph(text: str, kind: str = "") -> str:
+    """Write a paragraph."""
+    return f"<p{_class(kind)}>{escape(text)}</p>"
+
+
+def section(anchor: str, title: str, parts: Iterable[str]) -> str:
+    """Write a section with a heading."""
+    body = "\n".join(parts)
+    return f'<section id="{escape(anchor)}">\n<h2>{escape(title)}</h2>\n{body}\n</section>'
+
+
+def header(title: str, about: Sequence[str]) -> str:
+    """Write the page's title, and what it is about."""
+    return f"<header><h1>{escape(title)}</h1>{paragraph(' · '.join(about))}</header>"
+
+
+def verdict(level: str, label: str, text: str) -> str:
+    """Write what it all comes to; the level is good, care, bad or unknown."""
+    return f'<div class="verdict {escape(level)}" id="verdict">{paragraph(label, "label")}{paragraph(text)}</div>'
+
+
+def contents(entries: Sequence[tuple[str, str]]) -> str:
+    """Write links to sections: anchor and title."""
+    links = "".join(f'<li><a href="#{escape(anchor)}">{escape(title)}</a></li>' for anchor, title in entries)
+    return f"<nav><ul>{links}</ul></nav>"
+
+
+def subheading(text: str) -> str:
+    """Write a heading within a section."""
+    return f"<h3>{escape(text)}</h3>"
+
+
+def preformatted(text: str) -> str:
+    """Write text as a terminal shows it."""
+    return f"<pre>{escape(text)}</pre>"
+
+
+def bullets(items: Sequence[str], ordered: bool = False) -> str:
+    """Write a list."""
+    tag = "ol" if ordered else "ul"
+    return f"<{tag}>" + "".join(f"<li>{escape(item)}</li>" for item in items) + f"</{tag}>"
+
+
+def definitions(pairs: Sequence[tuple[str, str]]) -> str:
+    """Write names and values side by side."""
+    return '<dl class="figures">' + "".join(
+        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs
+    ) + "</dl>"  # fmt: skip
+
+
+def table(content: Table) -> str:
+    """Write a table; its first column names the rows."""
+    head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in content.header)
+    body = "".join(
+        f'<tr><th scope="row">{escape(first)}</th>' + "".join(f"<td>{escape(cell)}</td>" for cell in rest) + "</tr>"
+        for first, *rest in content.rows
+    )
+    caption = f"<caption>{escape(content.title)}</caption>" if content.title else ""
+    written = f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    note = paragraph(content.note, "note") if content.note else ""
+    return f'<div class="table">{written}{note}</div>'
+
+
+def bars(rows: Sequence[tuple[str, float, str]], unit: str) -> str:
+    """Write horizontal bars: name, share of the width in 0..1, and what is written beside."""
+    body = "".join(
+        f'<tr><th scope="row">{escape(name)}</th><td class="bar"><span style="width:{100 * share:.1f}%"></span></td>'
+        f"<td>{escape(text)}</td></tr>"
+        for name, share, text in rows
+    )
+    return f'<table class="bars"><tbody>{body}</tbody></table>{paragraph(unit, "note")}'
+
+
+def folded(summary: str, body: str) -> str:
+    """Write something long that is opened by a click."""
+    return f"<details><summary>{escape(summary)}</summary>{body}</details>"
+
+
+def figure(picture: Picture) -> str:
+    """Write a picture, embedded."""
+    kind, data = ("svg+xml", picture.svg) if picture.svg is not None else ("png", picture.png)
+    text = base64.b64encode(data).decode("ascii")
+    image = f'<img alt="{escape(picture.alt)}" src="data:image/{kind};base64,{text}">'
+    return f"<figure>{image}<figcaption>{escape(picture.caption)}</figcaption></figure>"
+
+
+def document(title: str, style: str, body: str) -> str:
+    """Write the whole page; it loads nothing."""
+    return (
+        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n<main>\n{body}\n</main>\n</body>\n"
+        "</html>\n"
+    )
+
+
+def _class(kind: str) -> str:
+    return f' class="{escape(kind)}"' if kind else ""
+
 
 FOLDED_FROM = 8  # a longer list of rejected images is folded
 TWO_COLUMNS = 3  # tables with more columns take the whole width
@@ -53,10 +176,10 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
     evidence = gather(calibration)
     found = judge(calibration, at, between, evidence)
     parts = contributions(calibration)
-    made = pictures.draw(calibration, at, between, evidence)
+    made = figures.draw(calibration, at, between, evidence)
     items = advice(calibration, at, between, parts, evidence)
     body = _body(calibration, source, found, at, parts, evidence, made, items)
-    page = markup.document(f"Calibration report: {source}", STYLE.read_text(encoding="utf-8"), body)
+    page = document(f"Calibration report: {source}", STYLE.read_text(encoding="utf-8"), body)
     _write(path, page, made)
     return found
 
@@ -72,7 +195,7 @@ def _write(path: Path, page: str, made: dict[str, Picture]) -> None:
             folder.mkdir(exist_ok=True)
             for file in files:
                 (Path(parts) / file.name).replace(file)
-        for name in pictures.NAMES:
+        for name in figures.FIGURE_NAMES:
             if name not in made:
                 (folder / f"{name}.png").unlink(missing_ok=True)
     except OSError as error:
@@ -97,37 +220,37 @@ def _body(
         ("parameters", "Parameters", _parameters(calibration)),
         ("residuals", "Residuals of the corners", _residuals(calibration, evidence, made)),
         ("coverage", "Where boards were seen", _coverage(evidence, made)),
-        *([("lens", "The zoom lens over its focal lengths", [markup.figure(made["lens"])])] if several else []),
+        *([("lens", "The zoom lens over its focal lengths", [figure(made["lens"])])] if several else []),
         ("heldout", "Captures kept out of the fit", _held_out(calibration)),
         ("rejected", "Images not used", _rejected(calibration)),
         ("advice", "What would make it better", _advice(items)),
     ]
-    return "\n".join([_header(calibration, source, found), *(markup.section(*each) for each in sections)])
+    return "\n".join([_header(calibration, source, found), *(section(*each) for each in sections)])
 
 
 def _key_figures(calibration: Calibration) -> Iterator[str]:
-    yield markup.definitions(key_figures(calibration))
+    yield definitions(key_figures(calibration))
     if calibration.provenance:
-        yield markup.folded("Versions, options and origin", markup.table(provenance(calibration)))
+        yield folded("Versions, options and origin", table(provenance(calibration)))
 
 
 def _header(calibration: Calibration, source: str, found: Verdict) -> str:
     when, method = (calibration.provenance.get(key) for key in ("when", "method"))
     about = [source, *([f"{method} method"] if method else []), *([str(when)] if when else [])]
-    header = markup.header("Calibration report", about)
-    return f"{header}\n{markup.verdict(found.level, LABELS[found.level], found.text)}"
+    top = header("Calibration report", about)
+    return f"{top}\n{verdict(found.level, LABELS[found.level], found.text)}"
 
 
 def _pointing(
     calibration: Calibration, at: tuple[AtFocal, ...], parts: tuple[Contribution, ...], made: dict[str, Picture]
 ) -> Iterator[str]:
     if not at or not np.isfinite(at[-1].rms):
-        yield markup.paragraph("Nothing can be predicted: that takes a head, and a fit that tells its uncertainty.")
+        yield paragraph("Nothing can be predicted: that takes a head, and a fit that tells its uncertainty.")
         return
     near, far = DEPTHS
     middle, corners = corner_errors(calibration, at[-1].nominal_px)
     worst = max(corners.values(), default=np.nan)
-    yield markup.paragraph(
+    yield paragraph(
         "The angle by which the zoom camera's line of sight misses a target whose pixel and depth are known exactly: "
         f"what the calibration itself leaves, one standard deviation. From {near:g} to {far:g} m and all over the wide "
         f"view it is {digits(np.degrees(at[-1].rms))} degrees (rms) at the longest focal length: "
@@ -135,13 +258,13 @@ def _pointing(
     )
     for name in ("pointing_map", "pointing_depth", "pointing_focal"):
         if name in made:
-            yield markup.figure(made[name])
+            yield figure(made[name])
     total = at[-1].rms
     rows = [
         (part.group, 1 - part.left / total, f"{percent(1 - part.left / total)} less") for part in parts if total > 0
     ]
-    yield markup.subheading("Where it comes from")
-    yield markup.bars(
+    yield subheading("Where it comes from")
+    yield bars(
         [(name, max(share, 0.0), text) for name, share, text in rows],
         "By how much the error would fall if these were known exactly, each by itself. They need not add up, because "
         "parameters that were found together share their errors.",
@@ -150,29 +273,28 @@ def _pointing(
 
 def _parameters(calibration: Calibration) -> Iterator[str]:
     if calibration.covariance is None:
-        yield markup.paragraph("No uncertainty is known.")
+        yield paragraph("No uncertainty is known.")
     else:
-        yield markup.paragraph("Every value with one standard deviation, σ.")
+        yield paragraph("Every value with one standard deviation, σ.")
     tables = parameter_tables(calibration)
-    narrow = "\n".join(markup.table(t) for t in tables if len(t.header) <= TWO_COLUMNS)
-    yield from (markup.table(t) for t in tables if len(t.header) > TWO_COLUMNS)
+    narrow = "\n".join(table(t) for t in tables if len(t.header) <= TWO_COLUMNS)
+    yield from (table(t) for t in tables if len(t.header) > TWO_COLUMNS)
     yield f'<div class="tables">{narrow}</div>'
     if strong := correlations(calibration):
-        yield markup.folded(
+        yield folded(
             f"Strongest correlations, beyond {STRONG}",
-            markup.paragraph("What such a pair does together is known much better than each by itself.")
-            + markup.bullets(strong),
+            paragraph("What such a pair does together is known much better than each by itself.") + bullets(strong),
         )
 
 
 def _residuals(calibration: Calibration, evidence: Evidence | None, made: dict[str, Picture]) -> Iterator[str]:
     if evidence is None:
-        yield markup.paragraph("The calibration stores no corners, so that nothing can be checked again.")
+        yield paragraph("The calibration stores no corners, so that nothing can be checked again.")
         return
     text = "Predicted minus seen, with every board's pose fitted again to the stored corners"
     if calibration.jitter:
         text += "; what the head's jitter explains is taken out"
-    yield markup.paragraph(text + ".")
+    yield paragraph(text + ".")
     lines = []
     for name in CAMERAS:
         corners = evidence.corners[name]
@@ -181,40 +303,40 @@ def _residuals(calibration: Calibration, evidence: Evidence | None, made: dict[s
         cells = averaged(corners)
         known, beyond = int(np.isfinite(cells.means[:, 0]).sum()), int(cells.beyond_chance.sum())
         lines.append(
-            f"{NAMES[name].capitalize()}: {len(corners.residuals)} corners, standard deviation "
+            f"{TITLES[name].capitalize()}: {len(corners.residuals)} corners, standard deviation "
             f"{digits(corners.sigma)} px a coordinate; {percent(share_beyond(corners.residuals, corners.sigma))} "
             f"beyond three of them (0.3 % of Gaussian ones); {beyond} of {count(known, 'average')} larger than chance "
             "makes it (one in 90 of noise alone)."
         )
     lines.append(board_in_words(evidence.shape))
-    yield markup.bullets(lines)
-    yield markup.figure(made["residuals"])
-    yield markup.figure(made["histogram"])
+    yield bullets(lines)
+    yield figure(made["residuals"])
+    yield figure(made["histogram"])
 
 
 def _coverage(evidence: Evidence | None, made: dict[str, Picture]) -> Iterator[str]:
     if evidence is None:
-        yield markup.paragraph("The calibration stores no corners.")
+        yield paragraph("The calibration stores no corners.")
         return
-    yield markup.figure(made["coverage"])
-    yield markup.figure(made["situation"])
+    yield figure(made["coverage"])
+    yield figure(made["situation"])
 
 
 def _held_out(calibration: Calibration) -> Iterator[str]:
     held_out = calibration.held_out
     if held_out is None:
-        yield markup.paragraph(
+        yield paragraph(
             "None were kept out: this method does not, or there were too few placements that both cameras saw. What "
             "the fit says of itself is all there is."
         )
         return
     folds = calibration.provenance.get("folds")
     rounds = f"in each of {folds} rounds" if isinstance(folds, int) else "in rounds"
-    yield markup.paragraph(
+    yield paragraph(
         f"Some placements were left out {rounds}, everything else was fitted again, and the board's place, told by the "
         "fixed camera alone, was used to predict where the zoom camera sees it. That is what pointing does."
     )
-    yield markup.table(
+    yield table(
         Table(
             "",
             ("", "rms"),
@@ -228,17 +350,17 @@ def _held_out(calibration: Calibration) -> Iterator[str]:
         )
     )
     if held_out.widened > 1:
-        yield markup.paragraph(
+        yield paragraph(
             f"They disagree: the miss is {digits(held_out.widened)} times what it should be, beyond chance. Something "
             "is not as the model has it. Every uncertainty on this page is widened by that factor already."
         )
     elif held_out.ratio < TOO_CAREFUL:
-        yield markup.paragraph(
+        yield paragraph(
             "They are predicted better than the calibration says: its uncertainty is larger than it need be, as where "
             "the errors of a few views are taken for those of all."
         )
     else:
-        yield markup.paragraph(
+        yield paragraph(
             "They agree within chance: the calibration is as good as it says, as far as these placements can tell."
         )
 
@@ -246,14 +368,14 @@ def _held_out(calibration: Calibration) -> Iterator[str]:
 def _rejected(calibration: Calibration) -> Iterator[str]:
     rejected = calibration.residuals.rejected if calibration.residuals is not None else ()
     if not rejected:
-        yield markup.paragraph("All were used." if calibration.residuals is not None else "Not recorded.")
+        yield paragraph("All were used." if calibration.residuals is not None else "Not recorded.")
         return
-    rows = markup.table(Table("", ("image", "reason"), tuple((each.name, each.reason) for each in rejected)))
-    yield markup.folded(count(len(rejected), "image"), rows) if len(rejected) >= FOLDED_FROM else rows
+    rows = table(Table("", ("image", "reason"), tuple((each.name, each.reason) for each in rejected)))
+    yield folded(count(len(rejected), "image"), rows) if len(rejected) >= FOLDED_FROM else rows
 
 
 def _advice(items: list[str]) -> Iterator[str]:
     if items:
-        yield markup.bullets(items, ordered=True)
+        yield bullets(items, ordered=True)
     else:
-        yield markup.paragraph("Nothing stands out.")
+        yield paragraph("Nothing stands out.")

@@ -9,11 +9,11 @@ limits.
 from typing import TYPE_CHECKING, Any
 
 from cotarget.safety.signals import end_politely
-from cotarget.safety.stopfile import clear_stop_file, refuse_if_stopped, stop_reason, write_stop_file
-from cotarget.safety.stoplook import StopLook
+from cotarget.safety.stop_file import clear_stop_file, refuse_if_stopped, stop_reason, write_stop_file
 
 if TYPE_CHECKING:
-    from cotarget.safety.saferig import SafeRig
+    from cotarget.safety.safe_rig import SafeRig
+    from cotarget.safety.watchdog import StopLook
 
 __all__ = [
     "SafeRig",
@@ -27,10 +27,13 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # What SafeRig needs takes a second to import, by which `cotarget stop` would come later.
+    # These import numpy and SciPy, for which `cotarget stop` must not wait.
     if name == "SafeRig":
-        from cotarget.safety.saferig import SafeRig
+        from cotarget.safety.safe_rig import SafeRig
 
-        globals()[name] = SafeRig  # found without asking from now on, by documentation tools too
         return SafeRig
+    if name == "StopLook":
+        from cotarget.safety.watchdog import StopLook
+
+        return StopLook
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

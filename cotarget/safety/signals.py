@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from types import FrameType
 
-from cotarget.heldsignals import ENDING
+from cotarget.files import ENDING
 
 log = logging.getLogger(__name__)
 

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from cotarget.assets import assets_dir
+from cotarget.board import tiles
 from cotarget.config import BoardConfig, RigConfig, SimConfig
 from cotarget.errors import ConfigError, choices
+from cotarget.files import assets_dir
 from cotarget.geometry import Array, RigidTransform, Rotation
-from cotarget.pattern import tiles
-from cotarget.sim.clutter import INDOORS, add_clutter
-from cotarget.sim.opengl import mujoco
-from cotarget.sim.ownmodels import own_model
-from cotarget.sim.targets import Target, change_marker, scale_spec
+from cotarget.sim.render.opengl import mujoco
+from cotarget.sim.targets.own_models import own_model
+from cotarget.sim.targets.target import Target, change_marker, scale_spec
+from cotarget.sim.weather import INDOORS, add_clutter
 
 # The only place where MuJoCo's camera axes (x right, y up, z back) become OpenCV's (x right, y down, z forward).
 T_OPENCV_MUJOCO = RigidTransform.from_rotation(Rotation.from_rotvec([np.pi, 0.0, 0.0]))

@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.geometry import RigidTransform
-from cotarget.sim.clutter import Clutter
 from cotarget.sim.model import BOARD, RIG, quaternion
 from cotarget.sim.motion import HeadDrive
-from cotarget.sim.opengl import mujoco
-from cotarget.sim.targets import Target
+from cotarget.sim.render.opengl import mujoco
+from cotarget.sim.targets.target import Target
+from cotarget.sim.weather import Clutter
 
 SWING, SWING_PERIOD = 0.15, 1.7  # of a board that swings, to each side [m], and there and back [s]
 

@@ -6,12 +6,9 @@ from functools import partial
 
 import numpy as np
 
-from cotarget.config import RigConfig, SimCamera
+from cotarget.config import RigConfig, SimCamera, split_name
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Clock, Image
-from cotarget.sim.ahead import Ahead, is_allowed
-from cotarget.sim.appearances import CameraName
-from cotarget.sim.clutter import Clutter
 from cotarget.sim.devices import (
     SimBoard,
     SimClock,
@@ -22,16 +19,16 @@ from cotarget.sim.devices import (
     head_drive,
     lens_drive,
 )
-from cotarget.sim.lens import TrueLens, covering_size
 from cotarget.sim.model import base_pose, build_model, has_clutter, mount_pose
-from cotarget.sim.pictures import Pictures
-from cotarget.sim.portrait import Portrait, portrait
-from cotarget.sim.sensor import Sensor
+from cotarget.sim.render.optics import TrueLens, covering_size
+from cotarget.sim.render.pictures import Pictures
+from cotarget.sim.render.portrait import Portrait, portrait
+from cotarget.sim.render.sensor import Sensor
+from cotarget.sim.render.views import Ahead, Views, is_allowed
 from cotarget.sim.state import WorldState
-from cotarget.sim.targets import Target, make_target, target_rng
-from cotarget.sim.truth import Truth
-from cotarget.sim.views import Views
-from cotarget.simconfig import split_name
+from cotarget.sim.targets.target import Target, make_target, target_rng
+from cotarget.sim.truth import CameraName, Truth
+from cotarget.sim.weather import Clutter
 
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)

@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from cotarget.calibration import Calibration
 from cotarget.calibration.model import CameraName
+from cotarget.config import DEFAULT_GAMMA, DEFAULT_T
 from cotarget.geometry import Array, RigidTransform, pose
-from cotarget.simconfig import DEFAULT_GAMMA, DEFAULT_T
 
 SIZE = (640, 480)
 SIZES: Mapping[CameraName, tuple[int, int]] = {"fixed": SIZE, "zoom": SIZE}

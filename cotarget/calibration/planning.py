@@ -1,0 +1,343 @@
+"""Where to hold the board next and where to turn the head, so that the corners cover both images, near and far.
+
+Plans need only a rough model of the rig. Whatever is planned is a wish: what counts is what is then seen.
+
+What a capture session knows so far, in the terms that count: the predicted pointing error; and what more buys.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from cotarget.board import board_outline, board_points
+from cotarget.calibration.bundle import Block, Fit, base_heads, information, parameter_names
+from cotarget.calibration.model import RigModel, View, unseen
+from cotarget.calibration.uncertainty import miss_derivatives
+from cotarget.camera import Intrinsics
+from cotarget.config import BoardConfig
+from cotarget.errors import UnreachableError
+from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.pantilt import nearest, solve
+from cotarget.rig import PanTiltLimits
+
+# Pointing is judged for targets on a grid over the wide view at these depths [m], in squares of the board: a board of
+# 0.1 m is for scenes of 4 to 30 m.
+DEPTHS_SQUARES = (40.0, 110.0, 300.0)
+OUTLOOK_GRID = (5, 4)
+BORDER = 0.02  # of the image, that the grid keeps clear
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """What is known of the parameters, and how pointing depends on them.
+
+    Attributes:
+        model: fitted so far.
+        free: its blocks.
+        normal: what is known, (n, n) [1/px^2].
+        variance: of a coordinate [px^2].
+        pointing: mean over targets of J^T J, with J how the miss changes with the parameters, (n, n).
+    """
+
+    model: RigModel
+    free: tuple[Block, ...]
+    normal: Array
+    variance: float
+    pointing: Array
+
+    def error(self, more: Array | float = 0.0) -> float:
+        """Predicted rms pointing error when so much more is known (n, n) [rad]; infinite where something is open."""
+        total = self.normal + more
+        scale = np.sqrt(np.diagonal(total))
+        if not (scale > 0).all():
+            return np.inf
+        try:
+            spread = np.linalg.solve(total / np.outer(scale, scale), self.pointing / np.outer(scale, scale))
+        except np.linalg.LinAlgError:
+            return np.inf
+        squared = float(np.trace(spread)) * self.variance
+        return float(np.sqrt(squared)) if squared > 0 else np.inf
+
+    def with_views(self, views: Sequence[View], boards: dict[int, RigidTransform], points: Array) -> "Outlook":
+        """The outlook after views of more placements."""
+        return replace(self, normal=self.normal + self.worth(views, boards, points))
+
+    def worth(self, views: Sequence[View], boards: dict[int, RigidTransform], points: Array) -> Array:
+        """What views of placements would add to what is known, (n, n)."""
+        return information(replace(self.model, boards=boards), views, points, self.free)
+
+
+def outlook_of(found: Fit, square: float) -> Outlook | None:
+    """The outlook after a fit of everything at the shortest focal length.
+
+    Args:
+        found: with Gamma, T and both cameras free.
+        square: of the board [m], which tells how far targets are.
+
+    Returns:
+        None where there are too few corners for it, or targets cannot be reached.
+    """
+    model = found.model
+    if found.variance is None or model.fixed is None or model.zoom is None:
+        return None
+    size = np.array(model.fixed.size, dtype=float) - 1
+    u, v, z = np.meshgrid(*(np.linspace(BORDER, 1 - BORDER, n) for n in OUTLOOK_GRID), DEPTHS_SQUARES)
+    pixels = np.stack([u.ravel(), v.ravel()], axis=-1) * size
+    names = parameter_names(found.free, model.stops)
+    J, _ = miss_derivatives(model, names, pixels, z.ravel() * square, model.zoom.nominal_px[0])
+    reached = np.isfinite(J).all(axis=(1, 2))
+    if not reached.any():
+        return None
+    J = J[reached].reshape(-1, len(names))
+    pointing = J.T @ J / np.count_nonzero(reached)
+    return Outlook(model, found.free, found.normal, found.variance, pointing)
+
+
+def planned_views(board: int, turns: Sequence[tuple[float, float]], corners: int) -> list[View]:
+    """The views that a placement seen by the fixed camera and from head poses will be, all corners seen."""
+    seen = np.zeros_like(unseen(corners))
+    return [View("fixed", seen, board), *(View("zoom", seen, board, pan, tilt) for pan, tilt in turns)]
+
+
+# Distances for squares of 0.1 m and a focal length of 1.07 image widths: nearer, the board fills the image and moves
+# out of it at every turn; farther, squares of 8 px and less are no longer found.
+# Markers are read to half that distance, and a board that is seen in part counts.
+NEAR_FAR = {"chessboard": (2.5, 8.0), "charuco": (1.7, 4.0)}
+REFERENCE_SQUARE = 0.1  # [m]
+REFERENCE_FOCAL = 1.07  # in image widths
+MOST_TILTED, LEAST_TILTED = np.radians(40.0), np.radians(8.0)  # from facing the camera; beyond, squares get too thin
+MOST_ROLLED = np.radians(25.0)
+GOLDEN = 0.6180339887  # its multiples spread evenly over 0..1 however many there are
+GRID = (10, 8)  # cells across and down an image in which corners are counted
+HIDDEN_REACH = 0.12  # of the image's width: so near to a board that was not seen, others are not expected either
+SAME_DEPTH = 0.9  # boards this much nearer are
+CANDIDATES = 150  # placements tried before one is chosen; the choice hardly improves with more
+POSES = 120  # head poses tried for a placement
+SMALLEST_SPACING_PX = {"chessboard": 7.0, "charuco": 14.0}  # on average over the board, of the thinner direction
+
+
+@dataclass(eq=False)
+class Coverage:
+    """How many corners each cell of one camera's image has seen, and where boards were held that it did not see.
+
+    Attributes:
+        size: of the image [px].
+        counts: of every cell.
+        misses: middle in the image [px], (2,), and depth [m] of boards that were not seen: behind a wall or below a
+            floor, where others at that depth or farther will not be seen either.
+    """
+
+    size: tuple[int, int]
+    counts: Array = field(default_factory=lambda: np.zeros(GRID))
+    misses: list[tuple[Array, float]] = field(default_factory=list)
+
+    def add(self, corners_px: Array) -> None:
+        """Count corners (N, 2) [px]."""
+        np.add.at(self.counts, self._cells(corners_px), 1)
+
+    def gain(self, corners_px: Array) -> float:
+        """How much corners (N, 2) [px] would add: a corner in a cell with n others is worth 1 / (1 + n)."""
+        new = np.zeros(GRID)
+        np.add.at(new, self._cells(corners_px), 1)
+        return float(np.sum(np.log1p(self.counts + new) - np.log1p(self.counts)))
+
+    def hidden(self, middles_px: Array, depth: float) -> npt.NDArray[np.bool_]:
+        """Which boards with their middles there (K, 2) [px], at a depth [m], are likely not to be seen, (K,)."""
+        near = np.zeros(len(middles_px), dtype=bool)
+        for middle, missed in self.misses:
+            if depth >= SAME_DEPTH * missed:
+                near |= np.linalg.norm(middles_px - middle, axis=-1) < HIDDEN_REACH * self.size[0]
+        return near
+
+    def _cells(self, corners_px: Array) -> tuple[npt.NDArray[np.intp], ...]:
+        cells = (corners_px / np.array(self.size) * np.array(GRID)).astype(np.intp)
+        return tuple(np.clip(cells, 0, np.array(GRID) - 1).T)
+
+
+def board_body(board: BoardConfig) -> Array:
+    """The board's outer corners, then its inner ones [m], (4 + N, 3)."""
+    return np.concatenate([board_outline(board), board_points(board)])
+
+
+def visible(
+    lens: Intrinsics, x_camera: Array, board: BoardConfig, margin_px: float
+) -> tuple[npt.NDArray[np.bool_], Array]:
+    """Which of many boards are well visible, with all their outer squares.
+
+    Args:
+        lens: the camera.
+        x_camera: `board_body` in the camera's frame [m], (K, 4 + N, 3).
+        board: the board.
+        margin_px: how far inside the image it must be.
+
+    Returns:
+        Whether each is visible, (K,), and its inner corners (K, N, 2) [px].
+    """
+    columns, rows = board.corners
+    px = lens.project(x_camera)
+    with np.errstate(invalid="ignore"):
+        inside = (px >= margin_px) & (px <= np.array(lens.size) - 1 - margin_px)  # false where a pixel is nan
+        grid = px[:, 4:].reshape(-1, rows, columns, 2)
+        across = np.linalg.norm(grid[:, :, -1] - grid[:, :, 0], axis=-1).min(axis=1) / (columns - 1)
+        down = np.linalg.norm(grid[:, -1] - grid[:, 0], axis=-1).min(axis=1) / (rows - 1)
+        large = np.minimum(across, down) >= SMALLEST_SPACING_PX[board.kind]
+    right, below = x_camera[:, 1] - x_camera[:, 0], x_camera[:, 3] - x_camera[:, 0]
+    facing = np.sum(np.cross(right, below) * x_camera[:, 0], axis=-1) > 0
+    return inside.all(axis=(1, 2)) & large & facing, px[:, 4:]
+
+
+def facing_board(board: BoardConfig, x_fixed: Array, turn: Rotation) -> RigidTransform:
+    """T_fixed_board with the board's middle at ``x_fixed`` [m], (3,), turned from facing the camera's axis."""
+    middle = board_points(board).mean(axis=0)
+    return RigidTransform.from_components(x_fixed - turn.apply(middle), turn)
+
+
+def distance(board: BoardConfig, lens: Intrinsics, share: float) -> float:
+    """A distance [m] from the nearest (share 0) to the farthest (share 1) for this board and camera."""
+    scale = board.square / REFERENCE_SQUARE * (lens.focal_px[0] / lens.size[0]) / REFERENCE_FOCAL
+    near, far = NEAR_FAR[board.kind]
+    return float(scale * near * (far / near) ** share)
+
+
+def plan_placements(
+    model: RigModel,
+    board: BoardConfig,
+    coverage: dict[str, Coverage],
+    shares: Sequence[float],
+    rng: np.random.Generator,
+    *,
+    shared: bool,
+    margin_px: float,
+    accept: Callable[[RigidTransform], bool] | None = None,
+) -> list[RigidTransform]:
+    """Choose where the board may be held: for each distance, the place that covers most of what was not yet covered.
+
+    Args:
+        model: rough model of the rig; while its ``zoom`` is None, only the fixed camera is looked at.
+        board: the board.
+        coverage: of "fixed" and "zoom".
+        shares: distances, as shares of the way from near to far.
+        rng: random numbers.
+        shared: whether the zoom camera must see it too, at pan = tilt = 0.
+        margin_px: how far inside the images the board must stay.
+        accept: whether a place will do in other respects.
+
+    Returns:
+        T_fixed_board, one for each distance at which a candidate is visible.
+    """
+    assert model.fixed is not None
+    chosen = []
+    for share in shares:
+        pixels = rng.uniform(size=(CANDIDATES, 2)) * (np.array(model.fixed.size) - 1)
+        turns = random_turns(CANDIDATES, rng)
+        middle = board_points(board).mean(axis=0)
+        x = model.fixed.ray(pixels) * distance(board, model.fixed, share)
+        if model.zoom is not None:
+            turns = _between(x, model.gamma.inv().translation) * turns
+        R = turns.as_matrix()
+        t = x - R @ middle
+        x_fixed = board_body(board) @ R.swapaxes(1, 2) + t[:, None]
+        good, seen = visible(model.fixed, x_fixed, board, margin_px)
+        good &= ~coverage["fixed"].hidden(pixels, distance(board, model.fixed, share))
+        if model.zoom is not None:
+            x_zoom0 = model.gamma.apply(x_fixed.reshape(-1, 3)).reshape(x_fixed.shape)
+            in_zoom, seen_zoom = visible(model.zoom.stops[0], x_zoom0, board, margin_px)
+            good = np.logical_and(good, in_zoom) if shared else good
+        gains: list[tuple[float, int]] = []
+        for k in np.flatnonzero(good):
+            gain = coverage["fixed"].gain(seen[k])
+            if model.zoom is not None and in_zoom[k]:
+                gain += coverage["zoom"].gain(seen_zoom[k])
+            gains.append((gain, int(k)))
+        for _, candidate in sorted(gains, reverse=True):
+            place = RigidTransform.from_components(t[candidate], turns[candidate])
+            if accept is None or accept(place):
+                chosen.append(place)
+                break
+    return chosen
+
+
+def where_in(lens: Intrinsics, board: BoardConfig, T_fixed_board: RigidTransform) -> tuple[Array, float]:
+    """Where a board's middle is in the fixed camera's image, (2,) [px], and its depth [m]."""
+    x = T_fixed_board.apply(board_points(board).mean(axis=0))
+    return lens.project(x), float(x[2])
+
+
+def preferred_share(number: int) -> float:
+    """Of the way from near to far: successive placements are spread evenly."""
+    return (number * GOLDEN) % 1.0
+
+
+def _between(x_fixed: Array, center_fixed: Array) -> Rotation:
+    """Half the turn from the fixed camera's line of sight to the other camera's, for points (n, 3): both see alike."""
+    here = x_fixed / np.linalg.norm(x_fixed, axis=-1, keepdims=True)
+    there = x_fixed - center_fixed
+    there = there / np.linalg.norm(there, axis=-1, keepdims=True)
+    axis = np.cross(here, there)
+    sine = np.linalg.norm(axis, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, np.sum(here * there, axis=-1, keepdims=True))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return Rotation.from_rotvec(np.where(sine > 0, axis / sine * angle / 2, 0.0))
+
+
+def plan_poses(
+    model: RigModel,
+    T_fixed_board: RigidTransform,
+    board: BoardConfig,
+    coverage: Coverage,
+    limits: PanTiltLimits,
+    count: int,
+    rng: np.random.Generator,
+    margin_px: float,
+) -> list[tuple[float, float]]:
+    """Choose head poses that move a board over the zoom image, to where few corners were yet.
+
+    Returns:
+        Up to ``count`` pairs (pan, tilt) [rad], within the limits.
+    """
+    assert model.zoom is not None
+    lens = model.zoom.stops[0]
+    middle = (model.hand * model.gamma * T_fixed_board).apply(board_points(board).mean(axis=0))
+    ray = lens.ray(lens.image_center_px)
+    try:
+        centred = nearest(solve(middle, model.hand, model.head, ray), limits.pan, limits.tilt)
+    except UnreachableError:
+        return []
+    reach = np.arctan(np.hypot(*lens.size) / 2 / lens.focal_px[0])
+    pan = float(centred.pan) + rng.uniform(-reach, reach, POSES)
+    tilt = float(centred.tilt) + rng.uniform(-reach, reach, POSES)
+    allowed = limits.allow(pan, tilt)
+    pan, tilt = pan[allowed], tilt[allowed]
+    x_base = (model.hand * model.gamma * T_fixed_board).apply(board_body(board))
+    R, t, _ = base_heads(model.head, pan, tilt)
+    x_head = (x_base - t[:, None]) @ R
+    x_zoom = model.hand.inv().apply(x_head.reshape(-1, 3)).reshape(x_head.shape)
+    good, seen = visible(lens, x_zoom, board, margin_px)
+    candidates = [int(k) for k in np.flatnonzero(good)]
+    chosen: list[tuple[float, float]] = []
+    planned = Coverage(coverage.size, coverage.counts.copy())
+    while candidates and len(chosen) < count:
+        k = max(candidates, key=lambda k: planned.gain(seen[k]))
+        candidates.remove(k)
+        planned.add(seen[k])
+        chosen.append((float(pan[k]), float(tilt[k])))
+    return chosen
+
+
+def seen_at_home(model: RigModel, T_fixed_board: RigidTransform, board: BoardConfig) -> bool:
+    """Whether the zoom camera should see a board at pan = tilt = 0."""
+    assert model.zoom is not None
+    x_zoom = (model.gamma * T_fixed_board).apply(board_body(board))
+    return bool(visible(model.zoom.stops[0], x_zoom[None], board, 0.0)[0][0])
+
+
+def random_turns(count: int, rng: np.random.Generator) -> Rotation:
+    """Turn boards from facing the camera: tilted in any direction, and a little rolled."""
+    direction = rng.uniform(-np.pi, np.pi, count)
+    tilted = rng.uniform(LEAST_TILTED, MOST_TILTED, count)
+    rolled = rng.uniform(-MOST_ROLLED, MOST_ROLLED, count)
+    still = np.zeros(count)
+    tilt = Rotation.from_rotvec(np.stack([tilted * np.cos(direction), tilted * np.sin(direction), still], axis=-1))
+    return tilt * Rotation.from_rotvec(np.stack([still, still, rolled], axis=-1))

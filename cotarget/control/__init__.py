@@ -1,0 +1,1 @@
+"""Command the head and the zoom lens."""

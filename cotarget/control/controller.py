@@ -1,0 +1,231 @@
+"""From an estimate to commands: where the head is sent so that it keeps up, and how far the lens zooms in.
+
+The head is spared by a dead zone; how far the lens may zoom in follows from how surely the target will be in the image.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cotarget.calibration import Calibration
+from cotarget.control.head import Steering, SteeringSettings
+from cotarget.control.zoom import ZoomPolicy, ZoomSettings, expect
+from cotarget.errors import UnreachableError
+from cotarget.estimation import Estimate
+from cotarget.rig import Angles, PanTiltState, Rig
+from cotarget.targeting import Aim, Reach, aim
+
+NO_CHANGE = 1e-6  # of the logarithm of the focal length
+Predict = Callable[[float], Estimate | None]
+
+
+@dataclass(frozen=True)
+class ServoSettings:
+    """How head and lens are driven.
+
+    Attributes:
+        command_delay_s: from a command to the start of the head's motion [s].
+        lens_delay_s: likewise of the lens's [s]; as the head's by default.
+        predict: whether the target's motion is allowed for; without it the head is sent where the target was seen.
+        steering: how the head keeps up, and when it is left alone.
+        zoom: when the lens zooms in and out.
+    """
+
+    command_delay_s: float = 0.0
+    lens_delay_s: float | None = None
+    predict: bool = True
+    steering: SteeringSettings = field(default_factory=SteeringSettings)
+    zoom: ZoomSettings = field(default_factory=ZoomSettings)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What a frame led to.
+
+    Attributes:
+        aim: at where the target will be when a command given now takes effect.
+        chance: that the whole target will be in the next zoom frame.
+        zoom_reason: why the lens is where it is, as `cotarget.control.zoom` says it.
+    """
+
+    aim: Aim
+    chance: float
+    zoom_reason: str
+
+
+@dataclass(frozen=True)
+class _Course:
+    """Where the head shall be.
+
+    Attributes:
+        effect_t: when a command given now takes effect [s].
+        target: the target then.
+        first: the aim at it.
+        then: the aim at where it is a frame later, at the same focal length.
+        doubts: of a target that is carried elsewhere, how surely the head's next goal is known [rad].
+    """
+
+    effect_t: float
+    target: Estimate
+    first: Aim
+    then: Aim
+    doubts: Angles
+
+
+class Servo:
+    """Drives head and lens after one target at a time; remembers what was commanded, and how often.
+
+    Args:
+        rig: its head, lens and clock.
+        calibration: of that rig, for its streams.
+        settings: how.
+    """
+
+    def __init__(self, rig: Rig, calibration: Calibration, settings: ServoSettings = ServoSettings()) -> None:
+        self._rig, self._calibration, self._settings = rig, calibration, settings
+        shortest, longest = (self._true(nominal) for nominal in rig.zoom.focal_range)
+        self._zoom = ZoomPolicy((shortest, longest), rig.zoom.size, settings.zoom)
+        self._steering = Steering(rig.head.limits, settings.steering)
+        state = rig.head.state()
+        self.commanded = (state.pan, state.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
+        self.head_commands, self.lens_commands = 0, 1  # sent so far
+
+    def drive(self, predict: Predict, seen_t: float, interval: float, *, shape: float = 1.0) -> Drive:
+        """Send head and lens after a target.
+
+        Args:
+            predict: the target at any time [s].
+            seen_t: when it was seen last [s].
+            interval: from one command to the next [s].
+            shape: width over height of its box.
+
+        Raises:
+            UnreachableError: no pan and tilt within the limits do it, or nothing is known of it.
+        """
+        course = self._course(predict, seen_t, interval)
+        self._steer(course, interval)
+        pan, tilt, focal = self.commanded
+        now, lens_delay_s = self._rig.clock.now(), self._settings.lens_delay_s
+        exposed = interval + (course.effect_t if lens_delay_s is None else now + lens_delay_s)
+        (pan_then, _), (tilt_then, _) = self._steering.head.at(exposed)
+        then = predict(exposed if self._settings.predict else seen_t)
+        choice = self._zoom.choose(
+            None if then is None else expect(then, pan_then, tilt_then, focal, shape=shape),
+            course.first.focal_px * course.then.range / course.first.range,
+            self._true(focal),
+            now,
+            self._true(self._rig.zoom.state().focal_px),
+        )
+        nominal = self._calibration.zoom.nominal_for(choice.focal_px)
+        if abs(math.log(nominal / focal)) > NO_CHANGE:
+            focal = self._rig.zoom.zoom(nominal)
+            self.lens_commands += 1
+        self.commanded = (pan, tilt, focal)
+        return Drive(course.first, choice.chance, choice.reason)
+
+    def search(self, predict: Predict, seen_t: float, interval: float) -> Aim | None:
+        """Zoom out, and send the head to where a target should be that is out of sight.
+
+        Args:
+            predict: the target at any time [s].
+            seen_t: when it was seen last [s].
+            interval: from one command to the next [s].
+
+        Returns:
+            The aim at it; None where it may as well be outside of all that the zoom camera sees, and the head waits:
+            one standard deviation of where it is reaches beyond the border of the widest close-up.
+
+        Raises:
+            UnreachableError: no pan and tilt within the limits do it, or nothing is known of it.
+        """
+        self.zoom_out()
+        course = self._course(predict, seen_t, interval)
+        seen = course.target.appearance(course.first.pan, course.first.tilt, self._rig.zoom.focal_range[0])
+        if seen is None or (seen.sigma_px > np.array(self._rig.zoom.size) / 2).any():
+            return None
+        self._steer(course, interval)
+        return course.first
+
+    def _course(self, predict: Predict, seen_t: float, interval: float) -> _Course:
+        """Where the head shall be. Raises as `drive` does."""
+        now = self._rig.clock.now()
+        effect = now + self._settings.command_delay_s
+        times = (effect, effect + interval) if self._settings.predict else (seen_t, seen_t)
+        at_effect, then = (predict(t) for t in times)
+        if at_effect is None or then is None:
+            raise UnreachableError("where the target is was not seen yet")
+        state = self._rig.head.state()
+        self._steering.head.saw(state)  # a head that was halted, or is slow, is not where it was sent
+        reach = reach_of(self._rig, state)
+        first = self._aim(at_effect, reach)
+        later = predict(effect + self._settings.steering.ahead_s) if at_effect.carried else None
+        doubts = (0.0, 0.0) if later is None else doubts_of(later, first)
+        return _Course(effect, at_effect, first, self._aim(then, reach, first), doubts)
+
+    def _steer(self, course: _Course, interval: float) -> None:
+        """Send the head, if that is worth it."""
+        effect, first, then = course.effect_t, course.first, course.then
+        rates = (then.pan - first.pan) / interval, (then.tilt - first.tilt) / interval
+        pan, tilt, focal = self.commanded
+        command = self._steering.decide(
+            effect,
+            interval,
+            (first.pan, first.tilt),
+            rates,
+            self._rig.zoom.size[0] / self._true(focal),
+            effect - course.target.measured_t,
+            course.doubts,
+        )
+        if command is not None:
+            pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)
+            self.head_commands += 1
+            self.commanded = (pan, tilt, focal)
+
+    def zoom_out(self) -> None:
+        """Send the lens to its shortest focal length; the head waits."""
+        pan, tilt, focal = self.commanded
+        shortest = self._rig.zoom.focal_range[0]
+        if focal > shortest:
+            self.commanded = (pan, tilt, self._rig.zoom.zoom(shortest))
+            self.lens_commands += 1
+
+    def can_reach(self, estimate: Estimate) -> bool:
+        """Whether the head can point at where a target is estimated to be."""
+        try:
+            self._aim(estimate, reach_of(self._rig))
+        except UnreachableError:
+            return False
+        return True
+
+    def _true(self, nominal_px: float) -> float:
+        """The true focal length at a nominal one [px]."""
+        return self._calibration.zoom.at(nominal_px).focal_px[0]
+
+    def _aim(self, estimate: Estimate, reach: Reach, zoomed: Aim | None = None) -> Aim:
+        """Solve for an estimate, the head's bias allowed for; at the focal length of another aim, if there is one."""
+        if zoomed is None:
+            found = aim(self._calibration, estimate.x_fixed, reach, closeup=estimate.closeup)
+        else:
+            found = aim(self._calibration, estimate.x_fixed, reach, nominal_px=zoomed.nominal_px)
+        pan, tilt = found.pan - estimate.bias[0], found.tilt - estimate.bias[1]
+        pan = min(max(pan, reach.pan[0]), reach.pan[1])
+        tilt = min(max(tilt, reach.tilt[0]), reach.tilt[1])
+        return dataclasses.replace(found, pan=pan, tilt=tilt)
+
+
+def doubts_of(target: Estimate, aimed: Aim) -> Angles:
+    """How surely the pan and tilt at a target are known, near to an aim: standard deviations [rad]; 0 out of sight."""
+    seen = target.appearance(aimed.pan, aimed.tilt, aimed.nominal_px)
+    if seen is None:
+        return 0.0, 0.0
+    across, along = (seen.sigma_px / seen.focal_px).tolist()
+    return across / math.cos(aimed.tilt), along
+
+
+def reach_of(rig: Rig, state: PanTiltState | None = None) -> Reach:
+    """What a rig's head and lens can do, and where the head is; asked by default."""
+    limits, head = rig.head.limits, rig.head.state() if state is None else state
+    return Reach(limits.pan, limits.tilt, rig.zoom.focal_range, (head.pan, head.tilt), limits.step)

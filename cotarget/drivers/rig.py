@@ -1,0 +1,78 @@
+"""Opens the real devices as one Rig; whatever happens, the head is halted and every device released."""
+
+import contextlib
+import sys
+from types import TracebackType
+
+from cotarget.config import RigConfig
+from cotarget.drivers.axis import AxisCamera
+from cotarget.drivers.board import make_board
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.gphoto_camera import GphotoCamera
+from cotarget.drivers.interlock import claimed
+from cotarget.drivers.polled_head import D46Head
+from cotarget.errors import ConfigError
+from cotarget.rig import Board
+
+# How long one of Python's threads may keep the others waiting [s], where Python's own is 5 ms: a driver's thread that
+# waits for its turn makes every command late.
+SWITCH_INTERVAL = 5e-4
+NEEDED = (("head", "port", "/dev/ttyUSB0"), ("fixed", "url", "http://192.168.0.90"), ("zoom", "port", "usb:"))
+
+
+class HardwareRig:
+    """The real rig: devices that are open, and what closes them."""
+
+    real_time = True  # its time passes by itself: the safety layer watches it from a thread
+
+    def __init__(
+        self,
+        fixed: AxisCamera,
+        zoom: GphotoCamera,
+        head: D46Head,
+        clock: MonotonicClock,
+        board: Board,
+        opened: contextlib.ExitStack,
+    ) -> None:
+        self.fixed, self.zoom, self.head, self.clock, self.board = fixed, zoom, head, clock, board
+        self._opened = opened
+
+    def close(self) -> None:
+        """Halt the head and release the devices; more than once does no harm."""
+        self._opened.close()
+
+    def __enter__(self) -> "HardwareRig":
+        """Give the rig itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Halt, then close."""
+        self.close()
+
+
+def open_hardware(config: RigConfig) -> HardwareRig:
+    """Open the devices that a configuration names, the head last, so that it does not move where another is missing.
+
+    From then on this process's threads take turns more often (`SWITCH_INTERVAL`).
+
+    Raises:
+        ConfigError: a device is not named, or is not as configured.
+        DeviceError: a device could not be opened, or another program has them.
+    """
+    hardware = config.hardware
+    for table, key, example in NEEDED:
+        if not getattr(getattr(hardware, table), key):
+            raise ConfigError(
+                f'hardware.{table}.{key}: is missing; the hardware backend needs it, for example {key} = "{example}"'
+            )
+    sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL))
+    clock = MonotonicClock()
+    with contextlib.ExitStack() as opened:
+        opened.enter_context(claimed(hardware.head.port))
+        board = opened.enter_context(contextlib.closing(make_board(hardware.board)))
+        fixed = opened.enter_context(contextlib.closing(AxisCamera(hardware.fixed, clock)))
+        zoom = opened.enter_context(contextlib.closing(GphotoCamera(hardware.zoom, clock)))
+        head = opened.enter_context(contextlib.closing(D46Head(hardware.head, clock, config.safety)))
+        return HardwareRig(fixed, zoom, head, clock, board, opened.pop_all())

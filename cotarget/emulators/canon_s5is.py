@@ -1,0 +1,567 @@
+"""A Canon PowerShot S5 IS behind PTP/IP, with ready pictures and a lens behind it.
+
+It announces all that a real one announces, and does what remote shooting needs; the rest is answered with "operation
+not supported". There is no card in it: a still lies in its memory until the next one, or until it is switched off.
+Stills have their full size whatever the image size is set to; settings of exposure are kept and have no effect.
+
+Positions of the zoom beyond the lens's last are digital: they are accepted, the lens stays at its last, and nothing is
+cropped. The zoom reads back as it was set, whether the lens is there yet or not, and may be set while it moves. The
+viewfinder gives each of its pictures once and waits for the next one; it answers "busy" during a still and where no
+picture comes for a second. Nobody measured any of this on a real camera, nor whether leaving the shooting mode draws
+the lens in (here it does not). Faults of USB are not covered: PTP/IP is another transport.
+
+What a Canon PowerShot S5 IS answers to each operation of PTP, whatever brings the operations to it.
+
+What is not known of the real camera is chosen so that a driver that works with this one expects little; `s5is` tells.
+
+The S5 IS's eyes: a viewfinder that gives each picture once, and a shutter that goes some time after its request.
+
+What a Canon PowerShot S5 IS announces: operations, events, properties.
+
+As one of them told gphoto2 in July 2008 (libgphoto2, camlibs/ptp2/cameras/canon-s5.txt), but for image size and
+quality, which stand at their best here, and the serial number. The properties of `shooting` exist only while it shoots.
+"""
+
+import logging
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from types import TracebackType
+
+import cv2
+
+from cotarget.emulators.faults import Faults
+from cotarget.emulators.plant import Feed, LensPlant
+from cotarget.emulators.ptpip import (
+    ARRAY,
+    LINE_FAULTS,
+    STRING,
+    UINT8,
+    UINT16,
+    UINT32,
+    Answer,
+    Code,
+    DeviceInfo,
+    ObjectInfo,
+    Property,
+    PtpError,
+    PtpIpServer,
+    Range,
+    Value,
+    array,
+    decode,
+    encode,
+    storage_info,
+)
+from cotarget.errors import CotargetError
+from cotarget.rig import Image
+
+THUMB_SIZE = (160, 120)  # px
+PICTURE_WAIT_S = 1.0  # at most, for the viewfinder's next picture
+SLICE_S = 0.1  # between looks at whether waiting is still wanted
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """A still as JPEG, its size [px], and a small one."""
+
+    jpeg: bytes
+    size: tuple[int, int]
+    thumb: bytes
+
+
+class Viewfinder:
+    """Scaled pictures of a feed, as JPEG, each once.
+
+    Args:
+        feed: the pictures.
+        size: to scale them to [px].
+        quality: of JPEG, 1 to 100.
+        closing: set where nobody needs to wait any more.
+    """
+
+    def __init__(self, feed: Feed, size: tuple[int, int], quality: int, closing: threading.Event) -> None:
+        self._feed, self._size, self._quality, self._closing = feed, size, quality, closing
+        self._seen = -1  # index of the last picture given
+        self._since: float | None = None
+
+    @property
+    def on(self) -> bool:
+        """Whether it is on."""
+        return self._since is not None
+
+    def switch(self, on: bool) -> None:
+        """Turn it on, if it is not, or off."""
+        self._since = (time.monotonic() if self._since is None else self._since) if on else None
+
+    def image(self) -> bytes | None:
+        """Wait for a picture that was exposed since it is on and was not given yet; None if there is none."""
+        deadline = time.monotonic() + PICTURE_WAIT_S
+        while (since := self._since) is not None and time.monotonic() < deadline and not self._closing.is_set():
+            picture = self._feed.newest(self._seen, SLICE_S)
+            if picture is not None:
+                self._seen = picture.index
+                if picture.t >= since:
+                    scaled = cv2.resize(picture.image, self._size, interpolation=cv2.INTER_AREA)
+                    return jpeg(scaled, self._quality)
+        return None
+
+
+class Shutter:
+    """Takes stills, each on a thread of its own.
+
+    Args:
+        source: takes a picture at full size now, or a feed of such pictures.
+        quality: of JPEG, 1 to 100.
+        delay_s: from the request to the exposure [s].
+        closing: set where nobody needs the stills any more.
+    """
+
+    def __init__(
+        self, source: Callable[[], Image] | Feed, quality: int, delay_s: float, closing: threading.Event
+    ) -> None:
+        self._source, self._quality, self._delay_s, self._closing = source, quality, delay_s, closing
+        self._threads: list[threading.Thread] = []
+
+    def release(self, done: Callable[[Exposure | None], None]) -> None:
+        """Take a still, and hand it over when it is there; None where none could be taken."""
+        self._threads = [thread for thread in self._threads if thread.is_alive()]
+        self._threads.append(threading.Thread(target=self._run, args=(done,), daemon=True))
+        self._threads[-1].start()
+
+    def join(self) -> None:
+        """Wait for the threads, after ``closing`` was set."""
+        for thread in self._threads:
+            thread.join()
+
+    def _run(self, done: Callable[[Exposure | None], None]) -> None:
+        if self._closing.wait(self._delay_s):
+            return
+        try:
+            image = self._wait(self._source) if isinstance(self._source, Feed) else self._source()
+        except CotargetError as error:
+            log.warning("no still: %s", error)
+            image = None
+        if image is None:
+            done(None)
+            return
+        thumb = cv2.resize(image, THUMB_SIZE, interpolation=cv2.INTER_AREA)
+        size = (image.shape[1], image.shape[0])
+        done(Exposure(jpeg(image, self._quality), size, jpeg(thumb, self._quality)))
+
+    def _wait(self, feed: Feed) -> Image | None:
+        opened, seen = time.monotonic(), -1
+        while not self._closing.is_set():
+            picture = feed.newest(seen, SLICE_S)
+            if picture is not None:
+                if picture.t >= opened:
+                    return picture.image
+                seen = picture.index
+        return None
+
+
+def jpeg(image: Image, quality: int) -> bytes:
+    """An image as JPEG."""
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+# --- s5is_camera ---
+
+MEMORY = 0x80000001  # the storage that is no card
+FIRST_HANDLE = 0x81000000
+ALREADY_SO, REFUSED = 0xA009, 0xA005  # Canon's response codes: in that mode already; operation refused
+OBJECT_TRANSFER, MODE_CHANGED, CAPTURE_COMPLETE = 0xC009, 0xC00C, 0x400D  # events
+INTERRUPTING, CHECKED = (1, 2, 3, 4, 5), (3, 4, 5, 7)  # modes of event emulation, by how the events come
+EVENT_CONTAINER = 4  # its type in PTP over USB, whose layout CheckEvent uses
+INFO, OPEN, CLOSE, SET_VALUE, RESET_VALUE = 0x1001, 0x1002, 0x1003, 0x1016, 0x1017
+START_SHOOTING, END_SHOOTING, VIEWFINDER_ON, VIEWFINDER_OFF = 0x9008, 0x9009, 0x900B, 0x900C
+CAPTURE, VIEWFINDER_IMAGE, FOCUS_LOCK, FOCUS_UNLOCK = 0x901A, 0x901D, 0x9014, 0x9015
+SHOOTING_ONLY = frozenset((VIEWFINDER_ON, VIEWFINDER_OFF, CAPTURE, VIEWFINDER_IMAGE, FOCUS_LOCK, FOCUS_UNLOCK))
+# What a busy camera refuses; it still tells what it is and what happened.
+NOT_WHEN_BUSY = SHOOTING_ONLY | {SET_VALUE, RESET_VALUE, START_SHOOTING, END_SHOOTING}
+OK = Answer()
+
+
+class S5isCamera:
+    """The camera; safe from any thread.
+
+    Args:
+        viewfinder: its live pictures.
+        shutter: its stills.
+        lens: its zoom.
+        faults: which are on; of them "busy" is its own affair.
+    """
+
+    def __init__(self, viewfinder: Viewfinder, shutter: Shutter, lens: LensPlant, faults: Faults) -> None:
+        self._viewfinder, self._shutter, self._lens, self._faults = viewfinder, shutter, lens, faults
+        self._interrupt: Callable[[int, Iterable[int]], None] = lambda code, parameters: None
+        self._lock = threading.RLock()
+        self._playing = {prop.code: prop for prop in ALWAYS}
+        self._all = self._playing | {prop.code: prop for prop in shooting(lens.last)}
+        self._handle = FIRST_HANDLE
+        self._reset()
+        self._values[ZOOM] = lens.position()
+        self._operations: dict[int, Callable[[tuple[int, ...], bytes], Answer]] = {
+            0x1004: lambda words, data: Answer(data=array([MEMORY], UINT32)),  # storages
+            0x1005: self._storage,
+            0x1006: lambda words, data: Answer(parameters=(0,)),  # objects; what lies in memory is not listed
+            0x1007: lambda words, data: Answer(data=array([], UINT32)),
+            0x1008: lambda words, data: self._of_still(words[0], self._still_info),
+            0x1009: lambda words, data: self._of_still(words[0], lambda still: still.jpeg),
+            0x100A: lambda words, data: self._of_still(words[0], lambda still: still.thumb),
+            0x100B: self._delete,
+            0x1014: self._describe,
+            0x1015: self._value,
+            SET_VALUE: self._set,
+            RESET_VALUE: self._set_default,
+            0x101B: self._part,
+            START_SHOOTING: lambda words, data: self._shoot(True),
+            END_SHOOTING: lambda words, data: self._shoot(False),
+            VIEWFINDER_ON: lambda words, data: self._look(True),
+            VIEWFINDER_OFF: lambda words, data: self._look(False),
+            0x9013: lambda words, data: Answer(data=self._events.popleft() if self._events else b""),
+            FOCUS_LOCK: lambda words, data: OK,
+            FOCUS_UNLOCK: lambda words, data: OK,
+            CAPTURE: self._capture,
+        }
+
+    def interrupt_by(self, send_event: Callable[[int, Iterable[int]], None]) -> None:
+        """Have events brought to the initiator at once, as code and parameters, where its mode is such."""
+        self._interrupt = send_event
+
+    def operate(self, code: int, parameters: tuple[int, ...], data: bytes) -> Answer:
+        """Do an operation."""
+        with self._lock:
+            if code == INFO:
+                return Answer(data=self._info())
+            if code == OPEN:
+                return self._open(parameters[0])
+            if not self._session:
+                return Answer(Code.SESSION_NOT_OPEN)
+            if code == CLOSE:
+                self.disconnected()
+                return OK
+            if code in NOT_WHEN_BUSY and (self._exposure is not None or "busy" in self._faults):
+                return Answer(Code.DEVICE_BUSY)
+            if code in SHOOTING_ONLY and not self._shooting:
+                return Answer(REFUSED)
+            if code in self._operations:
+                return self._operations[code](parameters, data)
+        if code == VIEWFINDER_IMAGE:  # waits, and must not hold up a power-off meanwhile
+            image = self._viewfinder.image()
+            return Answer(Code.DEVICE_BUSY) if image is None else Answer(parameters=(len(image),), data=image)
+        return Answer(Code.OPERATION_NOT_SUPPORTED)
+
+    def disconnected(self) -> None:
+        """Close the session; the camera goes on shooting, with its viewfinder off."""
+        with self._lock:
+            self._session = 0
+            self._look(False)
+
+    def unplugged(self) -> None:
+        """Go back to play mode, as it does without a computer."""
+        with self._lock:
+            self.disconnected()
+            self._shooting = False
+
+    def switch_off(self) -> None:
+        """Forget settings and stills, and draw the lens in."""
+        with self._lock:
+            self._reset()
+        self._lens.command(0)
+
+    def _reset(self) -> None:
+        self._session = 0
+        self._shooting = False
+        self._look(False)
+        self._exposure: object | None = None  # the still under way
+        self._taken: tuple[int, Exposure, str] | None = None  # handle, still, date
+        self._events: deque[bytes] = deque()
+        self._clock_offset = 0  # seconds by which its clock was set
+        self._values: dict[int, Value] = {code: prop.default for code, prop in self._all.items()}
+
+    def _properties(self) -> dict[int, Property]:
+        return self._all if self._shooting else self._playing
+
+    def _info(self) -> bytes:
+        codes = tuple(self._properties())
+        return DeviceInfo(EXTENSION, OPERATIONS, EVENTS, codes, FORMATS, MAKER, MODEL, VERSION, SERIAL).pack()
+
+    def _open(self, session: int) -> Answer:
+        if self._session:
+            return Answer(Code.SESSION_ALREADY_OPEN, (self._session,))
+        if session == 0:
+            return Answer(Code.INVALID_PARAMETER)
+        self._session = session
+        self._events.clear()
+        return OK
+
+    def _storage(self, words: tuple[int, ...], _: bytes) -> Answer:
+        return Answer(data=storage_info("V")) if words[0] == MEMORY else Answer(Code.INVALID_STORAGE)
+
+    def _describe(self, words: tuple[int, ...], _: bytes) -> Answer:
+        prop = self._properties().get(words[0])
+        return Answer(Code.PROPERTY_NOT_SUPPORTED) if prop is None else Answer(data=prop.describe(self._now(prop)))
+
+    def _value(self, words: tuple[int, ...], _: bytes) -> Answer:
+        prop = self._properties().get(words[0])
+        return Answer(Code.PROPERTY_NOT_SUPPORTED) if prop is None else Answer(data=encode(prop.kind, self._now(prop)))
+
+    def _now(self, prop: Property) -> Value:
+        return int(time.time()) + self._clock_offset if prop.code == UNIX_TIME else self._values[prop.code]
+
+    def _set(self, words: tuple[int, ...], data: bytes) -> Answer:
+        prop = self._properties().get(words[0])
+        if prop is None:
+            return Answer(Code.PROPERTY_NOT_SUPPORTED)
+        if not prop.writable:
+            return Answer(Code.ACCESS_DENIED)
+        try:
+            value = decode(prop.kind, data)
+        except PtpError:
+            return Answer(Code.INVALID_PROPERTY_FORMAT)
+        return self._assign(prop, value) if prop.allows(value) else Answer(Code.INVALID_PROPERTY_VALUE)
+
+    def _set_default(self, words: tuple[int, ...], _: bytes) -> Answer:
+        prop = self._properties().get(words[0])
+        if prop is None:
+            return Answer(Code.PROPERTY_NOT_SUPPORTED)
+        return self._assign(prop, prop.default) if prop.writable else Answer(Code.ACCESS_DENIED)
+
+    def _assign(self, prop: Property, value: Value) -> Answer:
+        self._values[prop.code] = value
+        if prop.code == UNIX_TIME and isinstance(value, int):
+            self._clock_offset = value - int(time.time())
+        if prop.code == ZOOM and isinstance(value, int):
+            self._lens.command(min(value, self._lens.last))
+        return OK
+
+    def _shoot(self, on: bool) -> Answer:
+        if on == self._shooting:
+            return Answer(ALREADY_SO)
+        self._shooting = on
+        self._look(False)
+        self._happen(MODE_CHANGED)
+        return OK
+
+    def _look(self, on: bool) -> Answer:
+        self._viewfinder.switch(on)
+        return OK
+
+    def _capture(self, _: tuple[int, ...], __: bytes) -> Answer:
+        # The viewfinder is blind until the still is taken: whatever it shows next was exposed after it.
+        live = self._viewfinder.on
+        self._look(False)
+        exposure = self._exposure = object()
+        self._shutter.release(lambda taken: self._keep(exposure, taken, live))
+        return OK
+
+    def _keep(self, exposure: object, taken: Exposure | None, live: bool) -> None:
+        with self._lock:
+            if exposure is not self._exposure:  # it was switched off meanwhile
+                return
+            self._exposure = None
+            self._look(live and bool(self._session))
+            if taken is not None:
+                self._handle += 1
+                self._taken = self._handle, taken, time.strftime("%Y%m%dT%H%M%S")
+                self._happen(OBJECT_TRANSFER, self._handle)
+            self._happen(CAPTURE_COMPLETE)
+
+    def _happen(self, code: int, *parameters: int) -> None:
+        mode = self._values[EVENT_EMULATE_MODE]
+        if mode in CHECKED:
+            length = 12 + 4 * len(parameters)
+            head = struct.pack("<IHHI", length, EVENT_CONTAINER, code, 0)
+            self._events.append(head + struct.pack(f"<{len(parameters)}I", *parameters))
+        if mode in INTERRUPTING:
+            self._interrupt(code, parameters)
+
+    def _of_still(self, handle: int, part: Callable[[Exposure], bytes]) -> Answer:
+        if self._taken is None or self._taken[0] != handle:
+            return Answer(Code.INVALID_HANDLE)
+        return Answer(data=part(self._taken[1]))
+
+    def _still_info(self, still: Exposure) -> bytes:
+        assert self._taken is not None
+        name = f"IMG_{self._handle - FIRST_HANDLE:04d}.JPG"
+        date = self._taken[2]
+        return ObjectInfo(MEMORY, len(still.jpeg), still.size, len(still.thumb), THUMB_SIZE, name, date).pack()
+
+    def _part(self, words: tuple[int, ...], _: bytes) -> Answer:
+        answer = self._of_still(words[0], lambda still: still.jpeg[words[1] :][: words[2]])
+        return answer if answer.data is None else Answer(parameters=(len(answer.data),), data=answer.data)
+
+    def _delete(self, words: tuple[int, ...], _: bytes) -> Answer:
+        answer = self._of_still(words[0], lambda still: b"")
+        self._taken = None if answer.data is not None else self._taken
+        return Answer(answer.code)
+
+
+# --- s5is_tables ---
+
+MAKER, MODEL, VERSION, SERIAL = "Canon Inc.", "Canon PowerShot S5 IS", "1-3.2.1.0", "0" * 32
+EXTENSION = 0xB  # Canon's
+FORMATS = (0x3001, 0x3002, 0x3006, 0x300A, 0x3008, 0x3801, 0x3800, 0xB101, 0xBF01)
+DIGITAL = 6  # positions of the zoom beyond the last of the lens, which is 128
+EVENT_EMULATE_MODE, TRANSFER_MODE, ZOOM, UNIX_TIME = 0xD045, 0xD029, 0xD02A, 0xD034
+# fmt: off
+OPERATIONS = (
+    0x1014, 0x1015, 0x1016, 0x1017, 0x1001, 0x1002, 0x1003, 0x9013, 0x901F, 0x1004, 0x1005, 0x1006, 0x1007, 0x1008,
+    0x1009, 0x100A, 0x101B, 0x100C, 0x100D, 0x100B, 0x100F, 0x1012, 0x9001, 0x9021, 0x901B, 0x901E, 0x9019, 0x9006,
+    0x901C, 0x9002, 0x904C, 0x902C, 0x902D, 0x902E, 0x9024, 0x9025, 0x900E, 0x900F, 0x9010, 0x9011, 0x9028, 0x9023,
+    0x9029, 0x902A, 0x902B, 0x9034, 0x100E, 0x9008, 0x901A, 0x9009, 0x900B, 0x901D, 0x900C, 0x9014, 0x9015, 0x9018,
+    0x9012, 0x9801, 0x9802, 0x9803, 0x9804, 0x9805, 0x9020,
+)
+EVENTS = (
+    0x4001, 0x4002, 0x4003, 0x4004, 0x4005, 0x4006, 0x4007, 0x4008, 0x4009, 0x400A, 0x400B, 0x400C, 0x400D, 0x400E,
+    0xC001, 0xC005, 0xC008, 0xC009, 0xC00A, 0xC00B, 0xC00C, 0xC00D, 0xC00E, 0xC00F, 0xC011, 0xC013,
+)
+# fmt: on
+def size_qualities() -> Iterator[tuple[int, ...]]:
+    """Height, width and number of each size in each of three qualities, as the camera lists them."""
+    sizes = ((2448, 3264, 1, 5), (1944, 2592, 2, 5), (1536, 2048, 3, 5), (1200, 1600, 17, 1), (480, 640, 5, 5))
+    for height, width, number, step in sizes:
+        for quality in range(3):
+            yield height, width, number + step * quality, 0, 0, 0
+
+
+COMPENSATIONS = (8, 11, 13, 16, 19, 21, 24, 27, 29, 32, 35, 37, 40)  # +2 EV to -2 EV
+BYTES_OF_SIZES = (
+    *(3518464, 2563072, 1640448, 0, 254976, 2109440, 1428480, 914432, 0, 153600),
+    *(1003520, 711680, 455680, 0, 86016, 0, 1026048, 571392, 284672),
+)
+ALWAYS = (
+    Property(EVENT_EMULATE_MODE, UINT16, 4, True, (1, 2, 3, 4, 5, 6, 7)),
+    Property(0xD04A, UINT8, 0, True, (0, 1, 2, 3)),
+    Property(0xD02E, UINT32, 524288),  # size of output data from the camera
+    Property(0xD02F, UINT32, 262144),  # size of input data to the camera
+    Property(0xD002, UINT16, 1, False, (0, 1, 2, 3, 4, 5)),  # battery type
+    Property(0xD003, UINT32, 1, False, (0, 1, 2, 3)),  # battery mode
+    Property(UNIX_TIME, UINT32, 0, True),
+    Property(0xD047, UINT16, 2),  # type of slideshow
+    Property(0xD046, UINT16, 257),  # DPOF version
+    Property(0xD02D, ARRAY | UINT32, (119, 0, 159, 0)),  # supported thumb size
+    Property(0xD048, ARRAY | UINT32, BYTES_OF_SIZES),  # average file sizes
+    Property(0xD02C, ARRAY | UINT32, (0, 0, 0, 0, 0, 0), False, tuple(size_qualities())),
+    Property(0xD030, UINT32, 256),  # remote API version
+    Property(0xD049, UINT32, 34144256),  # model id
+    Property(0xD032, STRING, MODEL),
+    Property(0xD033, ARRAY | UINT8, (), True),  # owner
+    Property(0xD031, UINT32, 16777472),  # firmware version
+    Property(0xD402, STRING, MODEL),  # friendly name
+    Property(0xD406, STRING, "Windows", True),  # session initiator
+    Property(0xD407, UINT32, 1),  # perceived device type
+)
+
+
+def shooting(last: int) -> tuple[Property, ...]:
+    """The properties of a shooting camera whose lens has optical positions from 0 to ``last``."""
+    return (
+        Property(TRANSFER_MODE, UINT16, 15, True, (1, 2, 3)),
+        Property(0xD006, UINT8, 5, True, (5, 3, 2)),  # image quality: superfine, fine, economy
+        Property(0xD007, UINT8, 1, False, ()),  # full view file format
+        Property(0xD008, UINT8, 0, True, (0, 1, 3, 7, 2)),  # image size: large, medium 1, 2, 3, small
+        Property(0xD00E, UINT8, 0, False, ()),  # drive mode
+        Property(0xD010, UINT8, 3, True, (3, 0, 1)),  # metering mode
+        Property(0xD011, UINT8, 1, True, (1, 3)),  # AF distance
+        Property(0xD012, UINT16, 12291, False, ()),  # focusing point
+        Property(0xD013, UINT8, 0, True, (0, 1, 2, 3, 4, 7, 5, 6)),  # white balance
+        Property(0xD01C, UINT16, 0, True, (0, 69, 72, 80, 88, 96, 104)),  # ISO speed
+        Property(0xD01F, UINT8, 24, True, COMPENSATIONS),  # of exposure
+        Property(0xD020, UINT8, 24, True, COMPENSATIONS),  # of the flash
+        Property(0xD041, UINT16, 1, True, (1, 0)),  # assist light
+        Property(0xD042, UINT16, 2, False, ()),  # flash quantity count
+        Property(0xD044, UINT16, 0, True, (0, 1)),  # rotation scene
+        Property(0xD00A, UINT8, 0, False, ()),  # flash mode
+        Property(0xD00C, UINT8, 1, True, (1, 2, 3, 4)),  # shooting mode
+        Property(0xD01D, UINT16, 40, False, ()),  # aperture
+        Property(0xD01E, UINT16, 112, False, ()),  # shutter speed
+        Property(ZOOM, UINT16, 0, True, Range(0, last + DIGITAL)),
+        Property(0xD036, UINT8, 3, True, (1, 2, 3)),  # camera output
+        Property(0xD037, UINT16, 1),  # Disp Av
+        Property(0xD038, UINT16, 27),  # Av open apex
+        Property(0xD039, UINT16, 3264),  # digital zoom magnification
+        Property(0xD03B, UINT16, 0),  # Disp Av max
+        Property(0xD03C, UINT16, 56),  # Av max apex
+        Property(0xD03D, UINT16, last + 1),  # EZoom start position
+        Property(0xD043, UINT16, 0),  # rotation angle
+    )
+
+
+# "busy" refuses what shoots or sets; "gone" is unplugged, "power-off" what the camera's timer does: both for as long as
+# they are on. The others are the line's.
+S5IS_FAULTS = (*LINE_FAULTS, "busy", "gone", "power-off")
+GUID = bytes.fromhex("00000000000010008000000085c50148")
+
+
+class S5isServer:
+    """The camera on a TCP port that serves command and event connections of one initiator at a time.
+
+    Args:
+        preview: pictures of the viewfinder.
+        still: takes a picture at full size now, or a feed of such pictures.
+        lens: the zoom.
+        host: where to listen.
+        port: where to listen; 0 for any.
+        preview_size: of the viewfinder's pictures [px]; they are scaled by averaging areas.
+        quality: of JPEG, 1 to 100.
+        faults: knows those of `S5IS_FAULTS`; None for a camera that has none.
+        shutter_s: from the request of a still to its exposure, mostly focusing [s].
+
+    Raises:
+        DeviceError: nobody can listen there.
+    """
+
+    def __init__(
+        self,
+        preview: Feed,
+        still: Callable[[], Image] | Feed,
+        lens: LensPlant,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        preview_size: tuple[int, int] = (320, 240),
+        quality: int = 90,
+        faults: Faults | None = None,
+        shutter_s: float = 0.4,
+    ) -> None:
+        self._faults = Faults(S5IS_FAULTS) if faults is None else faults
+        self._closing = threading.Event()
+        self._shutter = Shutter(still, quality, shutter_s, self._closing)
+        viewfinder = Viewfinder(preview, preview_size, quality, self._closing)
+        self._camera = S5isCamera(viewfinder, self._shutter, lens, self._faults)
+        self._server = PtpIpServer(self._camera, GUID, MODEL, self._faults, self._absent, host, port)
+        self._camera.interrupt_by(self._server.send_event)
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return self._server.port
+
+    def close(self) -> None:
+        """Break the connections and end every thread."""
+        self._closing.set()
+        self._server.close()
+        self._shutter.join()
+
+    def _absent(self) -> bool:
+        if "power-off" in self._faults:
+            self._camera.switch_off()
+            return True
+        if "gone" in self._faults:
+            self._camera.unplugged()
+            return True
+        return False
+
+    def __enter__(self) -> "S5isServer":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

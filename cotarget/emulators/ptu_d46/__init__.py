@@ -1,0 +1,1 @@
+"""Emulator of the Directed Perception PTU-D46."""

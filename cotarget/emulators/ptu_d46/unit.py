@@ -1,0 +1,650 @@
+"""The unit behind the D46's commands: both axes, what is set and what is saved, limits, modes, the reset.
+
+One axis as the unit's firmware sees it: what it believes of its position, its limits, speeds and ramps.
+
+The units that the D46 emulator can be: limits, resolution, speeds, and how each firmware words its replies.
+
+Sources: S1 = PTU-D46 manual v2.14.0 (2006), S2 = Command Reference Manual v3.00D (2008), S3 = PTU-E46 manual; and what
+published drivers read from real units. Where these disagree, the profiles do.
+"""
+
+import copy
+import math
+from collections.abc import Callable, Generator, Iterable
+from dataclasses import dataclass
+
+from cotarget.emulators.plant import AxisPlant
+from cotarget.errors import ConfigError
+
+# Arc seconds a degree.
+ARCSEC = 3600.0
+# Share of a step within which limits given in degrees count as reached [steps]: a rig's step is given to some digits.
+STEP_SLACK = 0.02
+# Position counts beyond this are no pan-tilt unit's: the finest E-series step over a whole turn is a tenth of it.
+MOST_COUNTS = 1_000_000
+Range = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Wording:
+    """What the sources word differently; ``{axis}`` becomes Pan or Tilt, ``{n}`` a number.
+
+    Attributes:
+        offset: reply to the query of an axis' desired position.
+        speed: of its desired speed.
+        acceleration: of its acceleration.
+        resolution: of its resolution.
+        too_fast: refusal of a speed above the upper bound.
+        illegal: refusal of what is not understood.
+        out_of_range: refusal of any other number.
+        uncalibrated: refusal of a move before the reset; None if the limits of 0 refuse it.
+        independent: reply to the query of the control mode, verbose and terse.
+        velocity: the same in pure velocity mode.
+        regular: terse word for regular power.
+    """
+
+    offset: str = "Current {axis} position is {n}"
+    speed: str = "Target {axis} speed is {n} positions/sec"
+    acceleration: str = "{axis} acceleration is {n} positions/sec^2"
+    resolution: str = "{n} seconds arc per position"
+    too_fast: str = "{axis} speed cannot exceed {n} positions/sec"
+    illegal: str = "Illegal argument"
+    out_of_range: str = "Illegal argument"
+    uncalibrated: str | None = None
+    independent: tuple[str, str] = ("independent control mode", "independent control mode")
+    velocity: tuple[str, str] = ("pure velocity control mode", "pure velocity control mode")
+    regular: str = "REGULAR"
+
+
+@dataclass(frozen=True)
+class UnitProfile:
+    """One model of pan-tilt unit, as its firmware announces itself.
+
+    Attributes:
+        name: of the profile.
+        version: of the firmware; commands that came later are unknown to it.
+        title: reply to the query of the version.
+        step: resolution of both axes [arc seconds].
+        resolution_digits: decimals of it in replies.
+        pan: lowest and highest position that the reset finds [steps].
+        tilt: the same of tilt.
+        stop_margin: from those to the mechanical stops [steps].
+        slip: steps lost when an axis runs into something.
+        speed: desired speed at power-up [steps/s].
+        base_speed: up to it a speed is there at once [steps/s].
+        lowest_speed: lower bound at power-up [steps/s].
+        highest_speed: upper bound at power-up [steps/s].
+        ceiling: highest upper bound that can be set [steps/s].
+        acceleration: at power-up [steps/s^2].
+        reset_speed: at which the stops are sought [steps/s].
+        tables_s: time to compute the tables after a change of acceleration or a bound [s].
+        boot_s: from power to being ready, without a reset [s].
+        leading_lf: whether a command ended by CR is answered after a line feed.
+        reset_at_once: whether RE, RP and RT reset now, rather than say what R and power-up do.
+        halt_waits: whether H answers once the axes stand, rather than at once; the sources do not say.
+        expansion: whether the unit has the ports A and B.
+        slip_ring: whether it can turn without end.
+        greeting: what a TCP client is told when it connects; empty for a plain serial line.
+        wording: of the replies.
+    """
+
+    name: str
+    version: tuple[int, int, int]
+    title: str
+    step: float
+    pan: Range
+    tilt: Range
+    resolution_digits: int = 4
+    stop_margin: int = 30
+    slip: int = 8
+    speed: int = 1000
+    base_speed: int = 1000
+    lowest_speed: int = 31
+    highest_speed: int = 2902
+    ceiling: int = 6000
+    acceleration: int = 2000
+    reset_speed: int = 1000
+    tables_s: float = 3.0
+    boot_s: float = 1.0
+    leading_lf: bool = False
+    reset_at_once: bool = False
+    halt_waits: bool = False
+    expansion: bool = False
+    slip_ring: bool = False
+    greeting: str = ""
+    wording: Wording = Wording()
+
+    @property
+    def banner(self) -> str:
+        """What it prints when it gets power, but for the star of readiness."""
+        return f"\r\n{self.title}\r\n"
+
+    @classmethod
+    def from_degrees(
+        cls,
+        pan: tuple[float, float],
+        tilt: tuple[float, float],
+        step: float,
+        speed: float,
+        acceleration: float,
+        name: str = "d46_sim",
+    ) -> "UnitProfile":
+        """Announce a head that is known in degrees, such as a simulated rig's.
+
+        Its ramps start from rest (base speed 0), as the simulated head's do, and its stops are its limits, so that not
+        even a reset leaves them.
+
+        Args:
+            pan: lowest and highest [degrees].
+            tilt: lowest and highest [degrees].
+            step: resolution of both axes [degrees].
+            speed: highest, and that of moves at power-up [degrees/s].
+            acceleration: of both axes [degrees/s^2].
+            name: of the profile.
+
+        Raises:
+            ConfigError: the head does not move in steps, or its range in steps is no such unit's.
+        """
+        if not step > 0 or max(abs(angle) for angle in (*pan, *tilt)) / step > MOST_COUNTS:
+            raise ConfigError(f"head.step: {step:g} degrees is no step of a PTU-D46; 0.0514286 is its usual one")
+
+        def counts(limits: tuple[float, float]) -> Range:
+            return math.ceil(limits[0] / step - STEP_SLACK), math.floor(limits[1] / step + STEP_SLACK)
+
+        fastest = max(round(speed / step), 1)
+        return cls(
+            name=name,
+            version=(2, 14, 0),
+            title="Pan-Tilt Controller v2.14.0(C14/E), (C)2006 Directed Perception, Inc., All Rights Reserved",
+            step=step * ARCSEC,
+            resolution_digits=6,
+            pan=counts(pan),
+            tilt=counts(tilt),
+            stop_margin=0,
+            speed=fastest,
+            base_speed=0,
+            lowest_speed=min(31, fastest),
+            highest_speed=fastest,
+            ceiling=fastest,
+            acceleration=max(round(acceleration / step), 1),
+            reset_speed=fastest,
+        )
+
+
+# A PTU-D46-17.5 as it leaves the factory: half steps, limits of the examples in S1 and S2.
+D46_STOCK = UnitProfile(
+    name="d46_stock",
+    version=(2, 14, 0),
+    title="Pan-Tilt Controller v2.14.0(C14/E), (C)2006 Directed Perception, Inc., All Rights Reserved",
+    step=185.1428,
+    pan=(-3090, 3090),
+    tilt=(-907, 604),
+)
+# The paper's range, +-180 and -80..+30 degrees, which needs the extended-range option; an older firmware, with the
+# wordings of S2 where S1 has others, of units that CARMEN and ASR met, and MRPT's prefix of numbers out of range.
+D46_PAPER = UnitProfile(
+    name="d46_paper",
+    version=(2, 12, 1),
+    title="Pan-Tilt Controller v2.12.1d1(C14/E), (C)2003 Directed Perception, Inc., All Rights Reserved",
+    step=185.1428,
+    pan=(-3500, 3500),
+    tilt=(-1555, 583),
+    base_speed=57,
+    highest_speed=1985,
+    wording=Wording(
+        offset="Target {axis} position is {n}",
+        acceleration="{axis} acceleration is {n} positions/sec/sec",  # ASR's parser allows no digit after the number
+        resolution="{n} seconds arc per {axis} position",
+        too_fast="{axis} speed cannot exceed {n} pos/sec",
+        out_of_range="Value out of range",
+        independent=("PTU is in independent control mode", "independent"),
+        velocity=("PTU is in pure velocity control mode", "pure velocity"),
+    ),
+)
+# An E-series unit: eight steps where a D46 has one.
+E_SERIES = UnitProfile(
+    name="e_series",
+    version=(3, 2, 1),
+    title="Pan-Tilt Controller v3.2.1(E46), (C)2011 FLIR Commercial Systems, Inc., All Rights Reserved",
+    step=23.142857,
+    resolution_digits=6,
+    pan=(-24720, 24720),
+    tilt=(-7256, 4832),
+    stop_margin=240,
+    slip=64,
+    speed=8000,
+    base_speed=456,
+    lowest_speed=0,
+    highest_speed=23216,
+    ceiling=48000,
+    acceleration=16000,
+    reset_speed=8000,
+    tables_s=0.5,
+    leading_lf=True,
+    reset_at_once=True,
+    halt_waits=True,
+    greeting="\r\n### PAN-TILT CONTROLLER v3.2.1 ###\r\n*\r\n",
+    wording=Wording(
+        offset="Target {axis} position is {n}",
+        speed="Desired {axis} speed is {n} positions/sec",
+        illegal="Illegal Command Entered",
+        out_of_range="Illegal Command Entered",
+        uncalibrated="Axis Error",
+        independent=("PTU is in Independent Mode", "Independent speed control mode"),
+        velocity=("PTU is in Pure Velocity Mode", "Pure Velocity speed control mode"),
+        regular="REG",
+    ),
+)
+PROFILES = {unit.name: unit for unit in (D46_STOCK, D46_PAPER, E_SERIES)}
+
+
+# --- d46_axis ---
+
+# Stands for "at once": a step motor that starts below its base speed needs no ramp [steps/s^2].
+INSTANT = 1e6
+# Steps that a step of each mode W is divided into, against half steps: full, half, quarter, eighth, automatic (which
+# counts in its finest steps).
+FINENESS = {"F": 0.5, "H": 1.0, "Q": 2.0, "E": 4.0, "A": 4.0}
+# A command that takes time yields what it prints meanwhile, "" for nothing yet, and returns its answer.
+Task = Generator[str, None, str]
+
+
+def plain_acceleration(distance: float, speed: float, base: float, acceleration: float) -> float:
+    """Acceleration of the plain trapezoid that takes as long, from rest, as one that starts and ends at a base speed.
+
+    The plant knows no base speed; this keeps the duration of its moves.
+
+    Args:
+        distance: of the move [steps].
+        speed: highest on the way [steps/s].
+        base: reached at once [steps/s].
+        acceleration: above it [steps/s^2].
+    """
+    if base <= 0:
+        return acceleration
+    if speed <= base or distance <= 0:
+        return INSTANT
+    ramps = (speed**2 - base**2) / acceleration  # distance on both ramps
+    if distance >= ramps:
+        duration = 2 * (speed - base) / acceleration + (distance - ramps) / speed
+    else:
+        duration = 2 * (math.sqrt(base**2 + acceleration * distance) - base) / acceleration
+    plain = 4 * distance / duration**2
+    if plain * distance > speed**2:  # it would be faster than allowed halfway
+        plain = speed / (duration - distance / speed)
+    return min(plain, INSTANT)
+
+
+@dataclass
+class AxisSettings:
+    """What can be set of an axis, and saved by DS; in positions of its step mode, and seconds."""
+
+    speed: int
+    acceleration: int
+    base: int
+    upper: int
+    lower: int
+    user_lowest: int
+    user_highest: int
+    hold: str = "REGULAR"
+    move: str = "REGULAR"
+    step_mode: str = "H"
+
+
+class UnitAxis:
+    """An axis of the unit.
+
+    Args:
+        name: "Pan" or "Tilt".
+        plant: its mechanics, in half steps.
+        unit: the model of the unit.
+        limits: lowest and highest position that a reset finds [half steps].
+    """
+
+    def __init__(self, name: str, plant: AxisPlant, unit: UnitProfile, limits: Range) -> None:
+        self.name = name
+        self.letter = name[0]
+        self.plant = plant
+        self.settings = AxisSettings(
+            unit.speed, unit.acceleration, unit.base_speed, unit.highest_speed, unit.lowest_speed, *limits
+        )
+        self.calibrated = True
+        self.pending: int | None = None  # goal that waits for A or I
+        self.velocity = 0  # desired, in pure velocity mode
+        self.endless = False  # continuous pan of a slip ring
+        self._unit = unit
+        self._limits = limits
+        self._goal: int | None = None  # None where it was halted
+        self._shift = 0  # what the count is above the truth, after steps were lost or the power was gone
+        self._into_stop = 0  # direction in which the present move meets a stop
+
+    @property
+    def fineness(self) -> float:
+        """Positions a half step."""
+        return FINENESS[self.settings.step_mode]
+
+    @property
+    def resolution(self) -> float:
+        """Of a position [arc seconds]."""
+        return self._unit.step / self.fineness
+
+    @property
+    def factory_limits(self) -> Range:
+        """Lowest and highest position that the reset found; both 0 before a reset."""
+        if not self.calibrated:
+            return 0, 0
+        if self.endless:
+            turn = round(360 * 3600 / self.resolution)
+            return 1 - turn, turn
+        return int(self._limits[0] * self.fineness), int(self._limits[1] * self.fineness)
+
+    @property
+    def position(self) -> int:
+        """Where the unit believes to be."""
+        return round(self.plant.position() * self.fineness) + self._shift
+
+    @property
+    def speed(self) -> float:
+        """How fast it turns, signed [positions/s]."""
+        return self.plant.speed() * self.fineness
+
+    @property
+    def desired(self) -> int:
+        """Where it is to go, now or on A or I."""
+        if self.pending is not None:
+            return self.pending
+        return self.position if self._goal is None else self._goal
+
+    def moving(self) -> bool:
+        """Whether it turns, or is about to."""
+        return self.plant.moving()
+
+    def go(self, goal: int, speed: int | None = None) -> None:
+        """Move to a position, on the fly; a stop on the way is run into."""
+        self._goal, self.pending = goal, None
+        self._set_out(goal, self.settings.speed if speed is None else speed)
+
+    def change_speed(self) -> None:
+        """Let the present move go on at the speed that is set now."""
+        if self._goal is not None and self.moving():
+            self._set_out(self._goal, self.settings.speed)
+
+    def drive(self, velocity: int, limits: Range | None) -> None:
+        """Turn at a signed speed, until the limit or, without one, the stop; 0 halts."""
+        self.velocity = velocity
+        if velocity == 0:
+            self.halt()
+            return
+        side = velocity > 0
+        if limits is not None:
+            self.go(limits[side], abs(velocity))
+        else:  # a step past the stop, so that it is met
+            past = self._stops()[side] + (1 if side else -1)
+            self.go(round(past * self.fineness) + self._shift, abs(velocity))
+
+    def halt(self) -> None:
+        """Brake, and forget the goal."""
+        speed, base, acceleration = abs(self.speed), self.settings.base, float(self.settings.acceleration)
+        if 0 < base < speed:  # the braking distance of a motor that stands as soon as it is down to its base speed
+            acceleration *= speed**2 / (speed**2 - base**2)
+        elif base >= speed:
+            acceleration = INSTANT if base else acceleration
+        self._goal = self.pending = None
+        self._into_stop = 0
+        self.plant.halt(min(acceleration / self.fineness, INSTANT))
+
+    def stopped_at_stop(self) -> bool:
+        """Whether the present move has just met its stop; steps were lost then."""
+        if not self._into_stop or self.moving():
+            return False
+        self.lose_steps(self._into_stop)
+        return True
+
+    def lose_steps(self, direction: int) -> None:
+        """Stand against something: the motor was driven on in ``direction``, the axis did not follow."""
+        self.plant.halt(INSTANT)
+        self._goal = self.pending = None
+        self._into_stop = self.velocity = 0
+        self._shift += direction * self._unit.slip
+
+    def lose_power(self) -> None:
+        """Stand, and take for 0 where that is."""
+        self.plant.halt(INSTANT)
+        self._goal = self.pending = None
+        self._into_stop = self.velocity = 0
+        self.calibrated = self.endless = False
+        self._shift = 0
+        self._shift = -self.position
+
+    def reset(self) -> Task:
+        """Run into both stops, find the limits from them, and go to 0."""
+        self.velocity = 0
+        for stop in self._stops():
+            self._send(stop, self._unit.reset_speed)
+            while self.moving():
+                yield ""
+            yield f"!{self.letter}"
+        self._shift, self._goal, self.pending, self._into_stop = 0, 0, None, 0
+        self.calibrated = True
+        self._send(0, self._unit.reset_speed)
+        while self.moving():
+            yield ""
+        return ""
+
+    def _stops(self) -> Range:
+        """Where the mechanics end [half steps]."""
+        margin = self._unit.stop_margin
+        return self._limits[0] - margin, self._limits[1] + margin
+
+    def _set_out(self, goal: int, speed: int) -> None:
+        """Move at a speed [positions/s] to where the unit believes a position to be, or to the stop before it."""
+        aim = (goal - self._shift) / self.fineness
+        lowest, highest = (-math.inf, math.inf) if self.endless else self._stops()
+        self._into_stop = (aim > highest) - (aim < lowest)
+        self._send(min(max(aim, lowest), highest), speed / self.fineness)
+
+    def _send(self, aim: float, speed: float) -> None:
+        """Command the plant: half steps and half steps a second."""
+        acceleration, base = self.settings.acceleration / self.fineness, self.settings.base / self.fineness
+        distance = abs(aim - self.plant.position())
+        self.plant.command(round(aim), speed, plain_acceleration(distance, speed, base, acceleration))
+
+
+BAUD = 9600  # of the serial line, as it leaves the factory [S1]
+
+
+class RefusalError(Exception):
+    """A command that the unit answers with an exclamation mark and this message."""
+
+
+@dataclass
+class Settings:
+    """What DS saves, and DR and power-up restore.
+
+    Attributes:
+        pan: of the pan axis.
+        tilt: of the tilt axis.
+        echo: whether it returns every character.
+        verbose: whether replies to queries are sentences.
+        limits: E factory's, D none, U the user's.
+        reset: axes that R and power-up reset, of "PT".
+        immediate: whether positions are gone to at once, rather than on A or I.
+        scan_at_power_up: whether it scans by itself when it gets power.
+        network_id: 0 for a unit that has the line for itself.
+    """
+
+    pan: AxisSettings
+    tilt: AxisSettings
+    echo: bool = True
+    verbose: bool = True
+    limits: str = "E"
+    reset: str = "PT"
+    immediate: bool = True
+    scan_at_power_up: bool = False
+    network_id: int = 0
+
+
+class Unit:
+    """The state of a unit, and what more than one command does with it.
+
+    Args:
+        pan: mechanics of pan, in half steps.
+        tilt: mechanics of tilt.
+        profile: the model.
+        now: clock of the unit [s].
+    """
+
+    def __init__(self, pan: AxisPlant, tilt: AxisPlant, profile: UnitProfile, now: Callable[[], float]) -> None:
+        self.profile = profile
+        self.now = now
+        self.pan = UnitAxis("Pan", pan, profile, profile.pan)
+        self.tilt = UnitAxis("Tilt", tilt, profile, profile.tilt)
+        self.settings = Settings(self.pan.settings, self.tilt.settings)
+        self._factory = copy.deepcopy(self.settings)
+        self._saved = copy.deepcopy(self.settings)
+        self.velocity_mode = False
+        self.selected = True  # whether commands on the network are for this unit
+        self.routed = False  # whether the line goes on to an expansion port
+        self.presets: dict[int, tuple[int, int]] = {}
+        self.scan: list[Task] = []  # what the autoscan does, an axis each
+        self.baud = self.baud_at_power_up = BAUD
+        self.byte_delay_s = 0.0
+
+    @property
+    def axes(self) -> tuple[UnitAxis, UnitAxis]:
+        """Pan and tilt."""
+        return self.pan, self.tilt
+
+    def axis(self, letter: str) -> UnitAxis:
+        """The axis that P or T stands for."""
+        return self.pan if letter == "P" else self.tilt
+
+    def say(self, sentence: str, axis: UnitAxis, n: int) -> str:
+        """The answer to a query of a number."""
+        return sentence.format(axis=axis.name, n=n) if self.settings.verbose else str(n)
+
+    def limits(self, axis: UnitAxis) -> Range | None:
+        """The positions allowed now; None if all are."""
+        match self.settings.limits, axis.calibrated:
+            case "D", _:
+                return None
+            case "U", True:
+                lowest, highest = axis.factory_limits
+                return max(lowest, axis.settings.user_lowest), min(highest, axis.settings.user_highest)
+            case _:
+                return axis.factory_limits
+
+    def move(self, axis: UnitAxis, goal: int) -> str:
+        """Go to a position, now or on A or I.
+
+        Raises:
+            RefusalError: it is beyond a limit, or the unit is in pure velocity mode.
+        """
+        wording, limits = self.profile.wording, self.limits(axis)
+        if self.velocity_mode:
+            raise RefusalError(wording.illegal)
+        if limits is not None:
+            if not axis.calibrated and wording.uncalibrated is not None:
+                raise RefusalError(wording.uncalibrated)
+            if goal > limits[1]:
+                raise RefusalError(f"Maximum allowable {axis.name} position is {limits[1]}")
+            if goal < limits[0]:
+                raise RefusalError(f"Minimum allowable {axis.name} position is {limits[0]}")
+        if self.settings.immediate:
+            axis.go(goal)
+        else:
+            axis.pending = goal
+        return ""
+
+    def set_speed(self, axis: UnitAxis, speed: int) -> str:
+        """Take a speed, on the fly; in pure velocity mode it has a sign, and drives.
+
+        Raises:
+            RefusalError: it is out of bounds.
+        """
+        upper, lower = axis.settings.upper, max(axis.settings.lower, 1)
+        size = abs(speed) if self.velocity_mode else speed
+        if size > upper:
+            raise RefusalError(self.profile.wording.too_fast.format(axis=axis.name, n=upper))
+        if size < lower and not (self.velocity_mode and speed == 0):
+            raise RefusalError(f"Motor speed cannot be less than {lower} pos/sec")
+        if self.velocity_mode:
+            axis.drive(speed, self.limits(axis))
+        else:
+            axis.settings.speed = speed
+            axis.change_speed()
+        return ""
+
+    def set_velocity_mode(self, on: bool) -> None:
+        """Change the control mode; the axes halt."""
+        if on != self.velocity_mode:
+            self.velocity_mode = on
+            for axis in self.axes:
+                axis.drive(0, None)
+
+    def release_pending(self) -> None:
+        """Set out to the positions that waited."""
+        for axis in self.axes:
+            if axis.pending is not None:
+                axis.go(axis.pending)
+
+    def standing(self, axes: Iterable[UnitAxis]) -> Task:
+        """Wait until axes stand."""
+        waited = tuple(axes)
+        while any(axis.moving() for axis in waited):
+            yield ""
+        return ""
+
+    def compute_tables(self, axis: UnitAxis, change: Callable[[], None]) -> Task:
+        """Change what is not changed on the fly: once the axis stands, and it takes its time."""
+        yield from self.standing([axis])
+        ready = self.now() + self.profile.tables_s
+        while self.now() < ready:
+            yield ""
+        change()
+        return ""
+
+    def reset(self, letters: str) -> Task:
+        """Find the limits of the axes named, tilt first, as the replies of real units show."""
+        for axis in (self.tilt, self.pan):
+            if axis.letter in letters:
+                yield from axis.reset()
+        return ""
+
+    def start_scan(self, ranges: dict[str, Range]) -> None:
+        """Go to and fro between two positions of each axis named, until `end_scan`."""
+
+        def sweep(axis: UnitAxis, ends: Range) -> Task:
+            while True:
+                for end in ends:
+                    axis.go(end)
+                    yield from self.standing([axis])
+                    yield ""
+
+        self.scan = [sweep(self.axis(letter), ends) for letter, ends in ranges.items()]
+
+    def end_scan(self) -> None:
+        """Stop the scan and go home."""
+        self.scan = []
+        for axis in self.axes:
+            axis.go(0)
+
+    def save(self) -> None:
+        """Keep the settings for the next power-up."""
+        self._saved = copy.deepcopy(self.settings)
+
+    def restore(self, factory: bool = False) -> None:
+        """Take the saved settings again, or the factory's; the control mode is independent then."""
+        self.settings = copy.deepcopy(self._factory if factory else self._saved)
+        self.pan.settings, self.tilt.settings = self.settings.pan, self.settings.tilt
+        self.set_velocity_mode(False)
+
+    def lose_power(self) -> None:
+        """What a gap in the power does: all but the saved settings is forgotten, above all where the axes are."""
+        self.velocity_mode = False
+        self.restore()
+        self.selected, self.routed = self.settings.network_id == 0, False
+        self.scan = []
+        self.baud, self.byte_delay_s = self.baud_at_power_up, 0.0
+        for axis in self.axes:
+            axis.lose_power()

@@ -1,0 +1,467 @@
+"""What both environments share: the rig, an episode's world, its frames and their pictures.
+
+What the environments are given, checked: whoever gives something else is told so in one line.
+
+What commands and states of a rig are as numbers between -1 and 1.
+"""
+
+import math
+import reprlib
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from numbers import Real
+from pathlib import Path
+from typing import Any, Generic, Literal, TypeVar
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+
+from cotarget.calibration import Calibration, load_calibration
+from cotarget.config import (
+    DEFAULT_TARGETS,
+    RigConfig,
+    SimConfig,
+    SimEffects,
+    Size,
+    TargetConfig,
+    Waypoint,
+    check_config,
+    load_config,
+)
+from cotarget.errors import ConfigError, choices
+from cotarget.evaluation import TruthDetector, TruthNoise, counted, true_calibration
+from cotarget.geometry import Array
+from cotarget.pipeline import PATIENCE_S
+from cotarget.rig import PanTiltState, ZoomState
+from cotarget.sim.model import has_clutter
+from cotarget.sim.render.pictures import Pictures
+from cotarget.sim.targets.random_paths import SECONDS, in_view
+from cotarget.sim.truth import CameraName, Outlines, part_seen
+from cotarget.sim.world import SimWorld
+
+# Sides of pictures: fewer pixels show nothing, and more are hardly meant, as one such picture takes 50 MB.
+SMALLEST_PX, LARGEST_PX = 8, 4096
+# Of the ways of a few episodes, this part at least is to be seen in another scene than the one that they are made for.
+TRIED_SEEDS, LEAST_SEEN, EVERY_KNOT = range(3), 0.5, 5
+# The rig where none is given: the default one, without what makes pictures costly.
+DEFAULT_RIG = RigConfig(
+    sim=SimConfig(effects=SimEffects(noise=False, jpeg=False, distortion=False, blur=False, multisampling=False))
+)
+
+
+def told(given: object) -> str:
+    """What was given, for messages: on one line, and not all of it where that is long."""
+    return " ".join(reprlib.repr(given).split())
+
+
+def name_of(what: str, given: object, known: Collection[str]) -> str:
+    """A name of those that there are.
+
+    Raises:
+        ConfigError: it is another.
+    """
+    if isinstance(given, str) and given in known:
+        return given
+    raise ConfigError(f"{what}: unknown {told(given)}; there {'are' if len(known) > 1 else 'is'}: {choices(known)}")
+
+
+def rig_of(given: object) -> RigConfig:
+    """The simulated rig that is meant: one, or its rig.toml; the default one for None.
+
+    Its head goes no farther than the soft limits.
+
+    Raises:
+        ConfigError: it is none, not simulated, impossible, or too slow.
+    """
+    if isinstance(given, Path | str):
+        given = load_config(Path(given))
+    config = DEFAULT_RIG if given is None else given
+    if not isinstance(config, RigConfig):
+        raise ConfigError(f"rig: {told(given)} is neither a cotarget.config.RigConfig nor the path of a rig.toml")
+    if config.backend != "sim":
+        raise ConfigError(f"rig: its backend is '{config.backend}'; environments are on 'sim' alone")
+    if given is not None:
+        check_config(config)  # one made in Python was not
+        _check_waits(config.sim)
+    pan_deg, tilt_deg = config.head_limits_deg
+    head = replace(config.sim.head, pan_deg=pan_deg, tilt_deg=tilt_deg)
+    return replace(config, sim=replace(config.sim, head=head))
+
+
+def _check_waits(sim: SimConfig) -> None:
+    """Refuse cameras whose frames are longer in coming than anybody waits."""
+    waits_s = {"fixed.rate_hz": 1 / sim.fixed.rate_hz}
+    if sim.effects.latency:
+        waits_s |= {"fixed.latency_s": sim.fixed.latency_s, "zoom.latency_s": sim.zoom.latency_s}
+    for name, wait_s in waits_s.items():
+        if wait_s > PATIENCE_S:
+            raise ConfigError(f"rig: sim.{name}: makes a frame {wait_s:g} s late; nobody waits above {PATIENCE_S:g} s")
+
+
+def check_scene(sim: SimConfig, name: str, paths: Callable[[str, int], Mapping[str, Sequence[Waypoint]]]) -> None:
+    """Refuse a scene in which a target is seldom to be seen, where it would be in the outdoor one.
+
+    Args:
+        sim: its scene.
+        name: of the target.
+        paths: the ways of an episode, by name and seed.
+
+    Raises:
+        ConfigError: it is such a scene.
+    """
+    if sim.scene == SimConfig.scene:
+        return
+    ways = [way[::EVERY_KNOT] for seed in TRIED_SEEDS for way in paths(name, seed).values()]
+    places = np.array([x for way in ways for t, *x in way if 0 <= t <= SECONDS])
+    seen = part_seen(sim, places[in_view(places)])
+    if seen < LEAST_SEEN:
+        raise ConfigError(
+            f"rig: in the scene '{sim.scene}' {seen:.0%} of a {name}'s ways can be seen; they are made for "
+            f"'{SimConfig.scene}': fixed_mount at (0, 0, 1.6), looking along +y and 9 degrees up, over open ground"
+        )
+
+
+def calibration_of(given: object) -> Calibration | None:
+    """The calibration that is meant: one, or its file; None for none.
+
+    Raises:
+        ConfigError: it is something else.
+        CalibrationError: the file is no calibration.
+    """
+    if isinstance(given, Path | str):
+        return load_calibration(Path(given))
+    if given is None or isinstance(given, Calibration):
+        return given
+    raise ConfigError(f"calibration: {told(given)} is neither a cotarget.calibration.Calibration nor the path of one")
+
+
+def noise_of(given: object) -> TruthNoise:
+    """The noise that is meant.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    if isinstance(given, TruthNoise):
+        return given
+    raise ConfigError(f"noise: {told(given)} is no cotarget.evaluation.TruthNoise")
+
+
+def seconds_of(given: object) -> float:
+    """How long an episode takes [s].
+
+    Raises:
+        ConfigError: that is no time, or longer than targets have ways for.
+    """
+    if isinstance(given, Real) and 0 < float(given) <= SECONDS:
+        return float(given)
+    raise ConfigError(f"seconds: {told(given)} is not above 0 and up to {SECONDS:g}, for which there are ways to go")
+
+
+def size_of(given: object) -> Size:
+    """The size of pictures (width, height) [px].
+
+    Raises:
+        ConfigError: it is none.
+    """
+    size = tuple(given) if isinstance(given, list | tuple) else ()
+    whole = all(isinstance(side, int | np.integer) and SMALLEST_PX <= side <= LARGEST_PX for side in size)
+    if len(size) != 2 or not whole:
+        raise ConfigError(
+            f"image_size: {told(given)} is not (width, height) of {SMALLEST_PX} to {LARGEST_PX} pixels each"
+        )
+    return int(size[0]), int(size[1])
+
+
+def reward_of(given: object) -> float:
+    """A reward.
+
+    Raises:
+        ConfigError: it is no finite number.
+    """
+    if isinstance(given, Real) and math.isfinite(given):
+        return float(given)
+    raise ConfigError(f"served_reward: {told(given)} is not a finite number")
+
+
+def check_options(given: object) -> None:
+    """Refuse options of an episode; there are none.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    if given is not None and not (isinstance(given, Mapping) and not given):
+        first = next(iter(given)) if isinstance(given, Mapping) else given
+        raise ConfigError(f"options: reset knows no {told(first)}; it takes a seed only")
+
+
+# --- units ---
+
+Vector = npt.NDArray[np.float32]
+Command = tuple[float, float, float]  # pan and tilt [rad], nominal focal length [px]
+LONGEST_AGE_S = 1.0  # ages are told up to this [s]
+
+
+def box(ranges: Iterable[tuple[float, float]], rows: int | None = None) -> gymnasium.spaces.Box:
+    """A space of numbers within these ranges (lowest, highest), (n,), or of so many rows of them, (rows, n)."""
+    low, high = np.array(list(ranges), dtype=np.float32).T
+    if rows is not None:
+        low, high = np.tile(low, (rows, 1)), np.tile(high, (rows, 1))
+    return gymnasium.spaces.Box(low, high, dtype=np.float32)
+
+
+def within(values: Sequence[float] | Sequence[Sequence[float]], space: gymnasium.spaces.Box) -> Vector:
+    """Values as an element of a space, clipped to its ranges."""
+    return np.minimum(np.maximum(np.array(values, dtype=np.float32), space.low), space.high)
+
+
+@dataclass(frozen=True)
+class Units:
+    """The ranges of head and lens, which -1 to 1 stand for.
+
+    Attributes:
+        pan: lowest and highest [rad].
+        tilt: likewise.
+        focal_px: shortest and longest nominal focal length [px]; between them evenly in the logarithm.
+    """
+
+    pan: tuple[float, float]
+    tilt: tuple[float, float]
+    focal_px: tuple[float, float]
+
+    @classmethod
+    def of(cls, config: RigConfig) -> "Units":
+        """Those of a rig: the head's limits, the soft ones included."""
+        return cls(*config.head_limits, config.focal_range_px)
+
+    def command(self, action: npt.ArrayLike) -> Command:
+        """What an action (pan, tilt, focal length) from -1 to 1 commands; beyond that it is clipped.
+
+        Raises:
+            ConfigError: it is not three finite numbers.
+        """
+        try:
+            given = np.asarray(action, dtype=float)
+        except (TypeError, ValueError):
+            given = np.empty(0)
+        if given.shape != (3,) or not all(map(math.isfinite, given.tolist())):
+            raise ConfigError(f"action: {told(action)} is not three finite numbers, of pan, tilt and focal length")
+        parts = [(min(max(number, -1.0), 1.0) + 1) / 2 for number in given.tolist()]
+        (low_pan, high_pan), (low_tilt, high_tilt), (short, long) = self.pan, self.tilt, self.focal_px
+        return (
+            low_pan + parts[0] * (high_pan - low_pan),
+            low_tilt + parts[1] * (high_tilt - low_tilt),
+            short * (long / short) ** parts[2],
+        )
+
+    def action(self, command: Command) -> Vector:
+        """The action that commands this, (3,)."""
+        return np.array(self.numbers(*command), dtype=np.float32)
+
+    def numbers(self, pan: float, tilt: float, focal_px: float) -> tuple[float, float, float]:
+        """Pan, tilt [rad] and nominal focal length [px] as numbers, which are from -1 to 1 within the ranges."""
+        (low_pan, high_pan), (low_tilt, high_tilt), (short, long) = self.pan, self.tilt, self.focal_px
+        return (
+            2 * (pan - low_pan) / (high_pan - low_pan) - 1,
+            2 * (tilt - low_tilt) / (high_tilt - low_tilt) - 1,
+            2 * math.log(focal_px / short) / math.log(long / short) - 1,
+        )
+
+
+# What a rig tells of itself, and the range of each number.
+RIG_FEATURES = {
+    "pan": (-1.0, 1.0),  # of the head, as in an action
+    "tilt": (-1.0, 1.0),
+    "focal": (-1.0, 1.0),  # of the lens, as in an action
+    "pan_commanded": (-1.0, 1.0),  # what was commanded last, after rounding to steps
+    "tilt_commanded": (-1.0, 1.0),
+    "focal_commanded": (-1.0, 1.0),
+    "head_moves": (0.0, 1.0),
+    "lens_moves": (0.0, 1.0),
+    "age_s": (0.0, LONGEST_AGE_S),  # of the wide camera's frame
+    "closeup_age_s": (0.0, LONGEST_AGE_S),  # of the zoom camera's
+    "gone": (0.0, 1.0),  # part of the episode
+}
+
+
+def rig_numbers(
+    units: Units, head: PanTiltState, lens: ZoomState, commanded: Command, ages_s: tuple[float, float], gone: float
+) -> list[float]:
+    """The numbers of RIG_FEATURES.
+
+    Args:
+        units: of the rig.
+        head: its state.
+        lens: likewise.
+        commanded: last.
+        ages_s: of the wide camera's newest frame and of the zoom camera's [s].
+        gone: part of the episode.
+    """
+    return [
+        *units.numbers(head.pan, head.tilt, lens.focal_px),
+        *units.numbers(*commanded),
+        float(head.moving),
+        float(lens.moving),
+        *ages_s,
+        gone,
+    ]
+
+
+Picture = npt.NDArray[np.uint8]
+Observation = TypeVar("Observation")
+Action = TypeVar("Action")
+Kind = Literal["tracks", "images"]
+KINDS: tuple[Kind, ...] = ("tracks", "images")
+IMAGE_SIZE: Size = (64, 64)
+DETECTOR_NOISE = TruthNoise()
+RENDER_SIZE: Size = (320, 240)  # of each of the two pictures that `render` puts side by side [px]
+
+
+class Episode:
+    """A world from one reset to the next."""
+
+    def __init__(self, config: RigConfig, noise: TruthNoise) -> None:
+        """Build it.
+
+        Args:
+            config: the rig, and who is in its world.
+            noise: of the detections.
+        """
+        self.config = config
+        self.world = SimWorld(config, rendered=())
+        self.rig, self.truth = self.world.rig, self.world.truth()
+        self.outlines = Outlines(self.truth, still=not has_clutter(config.sim))
+        self.detector = TruthDetector(self.outlines, config.sim.seed, noise, numbers=counted)
+        fixed = self.truth.T_world_fixed
+        self._eye, self._to_fixed = fixed.translation, fixed.rotation.as_matrix().T
+
+    def direction(self, name: str, t: float) -> Array:
+        """Where a target's middle truly is from the wide camera, in its frame, a unit vector, (3,)."""
+        way = self._to_fixed @ (self.outlines.center(name, t) - self._eye)
+        return way / math.sqrt(way @ way)
+
+
+class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
+    """An environment on the simulated rig; see `Follow` and `Schedule`.
+
+    Attributes:
+        config: the rig; its targets and seed are an episode's.
+        units: what actions and observations of the rig stand for.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012  as gymnasium has it
+
+    def __init__(
+        self,
+        observation: Kind,
+        rig: RigConfig | Path | str | None,
+        calibration: Calibration | Path | str | None,
+        seconds: float,
+        image_size: Size,
+        noise: TruthNoise,
+        render_mode: str | None,
+    ) -> None:
+        """Check what all have in common.
+
+        Raises:
+            ConfigError: an argument makes no sense.
+        """
+        name_of("observation", observation, KINDS)
+        if render_mode is not None:
+            name_of("render_mode", render_mode, self.metadata["render_modes"])
+        self.config = rig_of(rig)
+        self.units = Units.of(self.config)
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": self.config.rate_hz}
+        self._calibration, self._noise = calibration_of(calibration), noise_of(noise)
+        self._observation, self._size = observation, size_of(image_size)
+        self._last = max(round(seconds_of(seconds) * self.config.rate_hz), 1)
+        self._episode: Episode | None = None
+        self._opened: dict[Size, Pictures] = {}  # of the episode
+
+    @property
+    def episode(self) -> Episode:
+        """The one that runs.
+
+        Raises:
+            ResetNeeded: there is none.
+        """
+        if self._episode is None:
+            raise gymnasium.error.ResetNeeded("there is no episode: call reset() first, and again after close()")
+        return self._episode
+
+    @property
+    def calibration(self) -> Calibration:
+        """The one given, or that which is exactly true of the episode's rig."""
+        return true_calibration(self.episode.world) if self._calibration is None else self._calibration
+
+    @property
+    def times(self) -> tuple[float, float]:
+        """When the newest frame of the wide camera was exposed, and of the zoom camera [s]."""
+        raise NotImplementedError
+
+    def told_of(self, name: str) -> TargetConfig:
+        """What the pipeline is told of a target, whose detections are the truth with noise whatever its detector is."""
+        return replace(self.config.target(name), detector=DEFAULT_TARGETS[name].detector)
+
+    def render(self) -> Picture | None:
+        """Both views side by side, RGB, where the render mode is "rgb_array"."""
+        if self.render_mode is None:
+            return None
+        return np.hstack(self._look(RENDER_SIZE))
+
+    def close(self) -> None:
+        """Release everything; more than once does no harm."""
+        for pictures in self._opened.values():
+            pictures.close()
+        self._opened.clear()
+        self._end()
+
+    def _begin(self, seed: int | None, options: Mapping[str, Any] | None) -> int:
+        """End the episode before; the seed of the next one's world.
+
+        Raises:
+            ConfigError: options are given; there are none.
+        """
+        check_options(options)
+        super().reset(seed=seed)
+        return int(self.np_random.integers(2**31))
+
+    def _open(self, paths: Mapping[str, tuple[Waypoint, ...]], seed: int) -> Episode:
+        """Begin an episode with targets on these paths, drawn by what drew the one before."""
+        self._end()
+        sim = replace(self.config.sim, seed=seed, targets=tuple(paths), paths=paths)
+        self._episode = Episode(replace(self.config, sim=sim), self._noise)
+        for size, before in self._opened.items():
+            self._opened[size] = self._episode.world.pictures(size, before)
+        return self._episode
+
+    def _end(self) -> None:
+        """Let go of the episode, if there is one."""
+        if self._episode is not None:
+            self._episode.rig.close()
+            self._episode = None
+
+    def _picture_spaces(self) -> dict[str, gymnasium.Space[Any]]:
+        """Of the pictures in an observation."""
+        width, height = self._size
+        return {name: gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8) for name in ("wide", "closeup")}
+
+    def _pictures(self) -> dict[str, Picture]:
+        """The newest, for an observation."""
+        return dict(zip(("wide", "closeup"), self._look(self._size), strict=True))
+
+    def _look(self, size: Size) -> list[Picture]:
+        """Through the wide camera and through the zoom camera, RGB."""
+        episode = self.episode
+        if size not in self._opened:
+            self._opened[size] = episode.world.pictures(size)
+        pictures = self._opened[size]
+        names: tuple[CameraName, ...] = ("fixed", "zoom")
+        images = [pictures.take(name, t) for name, t in zip(names, self.times, strict=True)]
+        return [np.ascontiguousarray(image[:, :, ::-1]) for image in images]
+
+
+def corners(box: tuple[Array, Array] | None) -> Array:
+    """Left, top, right and bottom of a box [px], (4,); at infinity where there is none."""
+    return np.full(4, np.inf) if box is None else np.concatenate(box)

@@ -1,0 +1,209 @@
+"""The project's own pipeline as policies of the environments, to compare others with.
+
+Policies are called with an observation and give an action. These do not read the observation: they look at what it is
+made from. Of the truth they know no more than that, and the environment's calibration of its rig, which is exact by
+default.
+
+The rig as the pipeline wants it, in front of an environment: frames are those of the last step, commands are wishes.
+
+An environment's action says where the head shall go and not how fast, but the pipeline turns it at the target's own
+speed. So each step sends it to where, going as fast as it can, it is by the next step where the wish would have it.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium
+from scipy.optimize import brentq
+
+from cotarget.control.head import HeadCommand, HeadModel, axis_at
+from cotarget.control.selection import POLICIES
+from cotarget.detection import Detection
+from cotarget.env.common import Command, Episode, Vector, name_of
+from cotarget.env.follow import Follow
+from cotarget.env.schedule import Schedule
+from cotarget.errors import ConfigError
+from cotarget.pipeline import FollowSettings, Step, follow
+from cotarget.rig import Board, Clock, Frame, Image, PanTiltLimits, PanTiltState, Speed
+from cotarget.safety.safe_rig import clipped
+
+NEAR = 1e-6  # of an angle [rad]
+
+
+class Desk:
+    """A rig and a detector for `cotarget.pipeline.follow`, which wants them."""
+
+    mask: Image | None = None
+
+    def __init__(self, env: Follow) -> None:
+        """Sit down before an environment that was reset.
+
+        Args:
+            env: its episode is the rig's.
+        """
+        rig = env.episode.rig
+        self._env, self._interval = env, 1 / env.config.rate_hz
+        self.clock: Clock = rig.clock
+        self.board: Board = rig.board
+        self.fixed = Eye(lambda: env.wide, rig.fixed.size)
+        self.head, self.zoom = WishedHead(rig.head.limits, rig.head.state), WishedLens(env)
+        self._model = HeadModel(rig.head.limits)
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """What was found in the newest frame."""
+        return self._env.detections
+
+    def command(self) -> Command:
+        """What to command now, so that the wishes come true."""
+        state, wish = self.head.state(), self.head.wish
+        self._model.saw(state)
+        if wish is None:
+            return *clipped(state.pan, state.tilt, self.head.limits), self.zoom.wish
+        pan, tilt = wish.pan, wish.tilt
+        effect = self.clock.now() + self._env.config.command_delay_s
+        if wish.speed is not None:
+            speeds = self.head.limits.capped(wish.speed)
+            axes = zip(self._model.at(effect), (pan, tilt), speeds, strict=True)
+            pan, tilt = (self._hurried(x, v, goal, speed) for (x, v), goal, speed in axes)
+            pan, tilt = clipped(pan, tilt, self.head.limits)
+        self._model.obeys(effect, HeadCommand(pan, tilt, None))
+        return pan, tilt, self.zoom.wish
+
+    def _hurried(self, x: float, v: float, goal: float, speed: float) -> float:
+        """The goal that has an axis as far by the next step as another one, to which it goes more slowly [rad].
+
+        Args:
+            x: where it is [rad].
+            v: how fast [rad/s].
+            goal: the other one [rad].
+            speed: that it would go at [rad/s].
+        """
+        limits, interval = self.head.limits, self._interval
+        there, _ = axis_at(interval, x, v, goal, speed, limits.acceleration)
+
+        def beyond(end: float) -> float:
+            return axis_at(interval, x, v, end, limits.speed, limits.acceleration)[0] - there
+
+        far = abs(goal - x) + v * v / limits.acceleration + limits.speed * interval
+        if beyond(x - far) >= 0 or beyond(x + far) <= 0:
+            return goal
+        return float(brentq(beyond, x - far, x + far, xtol=NEAR))
+
+    def close(self) -> None:
+        """Nothing is its own."""
+
+    def __enter__(self) -> "Desk":
+        """Give the rig itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing is its own."""
+
+
+class Eye:
+    """A camera whose newest frame is the environment's."""
+
+    def __init__(self, newest: Callable[[], Frame], size: tuple[int, int]) -> None:
+        self._newest, self.size = newest, size
+
+    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
+        """The newest frame."""
+        return self._newest()
+
+
+class WishedLens(Eye):
+    """The zoom camera, whose lens goes nowhere before the next step."""
+
+    def __init__(self, env: Follow) -> None:
+        lens = env.episode.rig.zoom
+        super().__init__(lambda: env.closeup, lens.size)
+        self.still_size, self.focal_range, self.state = lens.still_size, lens.focal_range, lens.state
+        self.wish = lens.state().focal_px
+
+    def zoom(self, focal_px: float) -> float:
+        """Note the wish."""
+        shortest, longest = self.focal_range
+        self.wish = min(max(focal_px, shortest), longest)
+        return self.wish
+
+    def capture(self) -> Frame:
+        """The newest frame."""
+        return self.read()
+
+
+class WishedHead:
+    """The head, which goes nowhere before the next step."""
+
+    def __init__(self, limits: PanTiltLimits, state: Callable[[], PanTiltState]) -> None:
+        self.limits, self.state = limits, state
+        self.wish: HeadCommand | None = None
+
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
+        """Note the wish, within the limits."""
+        pan, tilt = clipped(pan, tilt, self.limits)
+        self.wish = HeadCommand(pan, tilt, speed)
+        return pan, tilt
+
+    def halt(self) -> None:
+        """Take the wish back."""
+        self.wish = None
+
+
+class PipelinePolicy:
+    """`cotarget.pipeline.follow` as a policy of `cotarget/Follow-v0`, by the wide view alone."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Begin.
+
+        Args:
+            env: to act in, wrapped or not.
+
+        Raises:
+            ConfigError: it is another environment.
+        """
+        if not isinstance(env.unwrapped, Follow):
+            raise ConfigError(f"env: the pipeline is a policy of cotarget/Follow-v0, and not of {env.unwrapped}")
+        self._env = env.unwrapped
+        self._episode: Episode | None = None
+        self._seen: Frame | None = None
+
+    def __call__(self, observation: object) -> Vector:
+        """What the pipeline commands after the newest frames; asked again before the next step, the same."""
+        env = self._env
+        if env.episode is not self._episode:
+            self._episode, self._desk = env.episode, Desk(env)
+            settings = FollowSettings.of(env.config, closed_loop=False)
+            self._steps: Iterator[Step] = follow(
+                self._desk, env.calibration, env.target, self._desk, seconds=math.inf, settings=settings
+            )
+        if env.wide is not self._seen:
+            next(self._steps)
+            self._seen, self._action = env.wide, env.units.action(self._desk.command())
+        return self._action
+
+
+class SchedulingPolicy:
+    """One of `cotarget.control.selection` as a policy of `cotarget/Schedule-v0`."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], policy: str = "most-served") -> None:
+        """Begin.
+
+        Args:
+            env: to act in, wrapped or not.
+            policy: its name.
+
+        Raises:
+            ConfigError: it is another environment, or there is no such policy.
+        """
+        if not isinstance(env.unwrapped, Schedule):
+            raise ConfigError(f"env: policies choose in cotarget/Schedule-v0, and not in {env.unwrapped}")
+        self._env, self._make = env.unwrapped, POLICIES[name_of("policy", policy, POLICIES)]
+        self._episode: Episode | None = None
+
+    def __call__(self, observation: object) -> int:
+        """The number of the slot of whom the policy looks at; the first where it looks at nobody."""
+        env = self._env
+        if env.episode is not self._episode:
+            self._episode, self._policy = env.episode, self._make()
+        return env.slot_of(self._policy.select(env.candidates, env.head, env.limits))

@@ -1,0 +1,611 @@
+"""Scores, computed from rows alone: whoever has a steps.csv can recompute every figure.
+
+A row says, for one zoom frame, what was commanded and what was really so. `cotarget.evaluation` makes rows from Steps
+and
+the simulation's truth; the scores only read rows.
+
+The field's figures: of a target that was held, by the truth, and of tracks on a film, by labels.
+
+What one zoom frame truly shows of a target, and whether that is a good close-up.
+
+What is so in each zoom frame beside what was commanded: the rows of which every figure is made, and steps.csv.
+
+How well the wide view's tracks keep to a target that somebody labelled: scores of a table of tracks beside labels.
+
+The table is the one that `cotarget.detect_video.run_on_film` writes, and a label a box around the target in one frame;
+a frame
+may have several, and frames without any say nothing of what is found in them, but that a track which is never on a
+label is false. Where there are labels a track is false as it is beside the truth: off all of them for half a second on
+end.
+"""
+
+import csv
+import dataclasses
+import math
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cotarget.errors import ConfigError
+from cotarget.geometry import Array
+
+# In frame: at least half of the silhouette visible, and at least half as large as wanted.
+VISIBLE_IN_FRAME = 0.5
+SIZE_IN_FRAME = 0.5
+# A close-up is good with the whole target visible at 0.8 to 1.25 of the wanted size.
+GOOD_SIZE = (0.8, 1.25)
+SERVED_S = 1.0  # of good close-up in all, and a target counts as served
+WHOLLY_VISIBLE = 0.999  # the silhouette's area is counted on a grid; a rim of less is rounding
+
+
+@dataclass(frozen=True)
+class Closeup:
+    """A target in a zoom frame.
+
+    Attributes:
+        u_px: true position of the target's body centre in the zoom image [px]; nan behind the camera.
+        v_px: likewise.
+        width_px: width of the zoom image [px].
+        height_px: its height [px].
+        size_px: true size of the wanted dimension in the zoom image [px]; nan behind the camera.
+        wanted_px: size wanted, or what the longest focal length gives where that is less [px].
+        visible: fraction of the true silhouette visible in the zoom image.
+    """
+
+    u_px: float
+    v_px: float
+    width_px: int
+    height_px: int
+    size_px: float
+    wanted_px: float
+    visible: float
+
+    @property
+    def inside(self) -> bool:
+        """Whether the body centre is inside the image."""
+        return -0.5 <= self.u_px <= self.width_px - 0.5 and -0.5 <= self.v_px <= self.height_px - 0.5
+
+    @property
+    def size_ratio(self) -> float:
+        """True size over the size wanted; 0 for a target behind the camera, which shows nothing of it."""
+        return 0.0 if math.isnan(self.size_px) else self.size_px / self.wanted_px
+
+    @property
+    def in_frame(self) -> bool:
+        """Whether the target is in the close-up, by the definition above."""
+        return self.inside and self.visible >= VISIBLE_IN_FRAME and self.size_ratio >= SIZE_IN_FRAME
+
+    @property
+    def good(self) -> bool:
+        """Whether the whole target is visible at about the wanted size."""
+        return self.inside and self.visible >= WHOLLY_VISIBLE and GOOD_SIZE[0] <= self.size_ratio <= GOOD_SIZE[1]
+
+    @property
+    def tpo_px(self) -> float:
+        """Target point offset: distance from the image's centre; half the diagonal for a frame without it [px]."""
+        if not self.inside:
+            return math.hypot(self.width_px, self.height_px) / 2
+        return math.hypot(self.u_px - (self.width_px - 1) / 2, self.v_px - (self.height_px - 1) / 2)
+
+
+# --- rows ---
+
+
+@dataclass(frozen=True)
+class Row:
+    """One new zoom frame, and the fixed frame that the loop had acted on when it came.
+
+    What is said of the wide view is at that fixed frame's own time; all else is at the zoom frame's.
+
+    Attributes:
+        t_s: middle of the zoom frame's exposure [s].
+        t_fixed_s: middle of the fixed frame's exposure [s].
+        state: what the loop was doing.
+        track: number of the track followed; -1 for none.
+        u_px: true position of the target's body centre in the zoom image [px]; nan behind the camera.
+        v_px: likewise.
+        width_px: width of the zoom image [px].
+        height_px: its height [px].
+        size_px: true size of the wanted dimension in the zoom image [px]; nan behind the camera.
+        wanted_px: size wanted, or what the longest focal length gives where that is less [px].
+        visible: fraction of the true silhouette visible in the zoom image.
+        in_wide: whether the target is wholly in the wide view.
+        u_wide_px: true position in the wide image [px].
+        v_wide_px: likewise.
+        u_detected_px: middle of the followed track's detection in the wide image [px]; nan where it is not seen alone.
+        v_detected_px: likewise.
+        decoded: whether the target's marker decodes in the zoom image.
+        decoded_wide: whether it decodes in the wide image.
+        off_target: numbers of the confirmed tracks that are off every target, as "3 7".
+        range_m: true distance from the zoom camera [m].
+        depth_m: estimated depth [m]; nan where nothing was aimed at.
+        pan_commanded_deg: last command [degrees].
+        tilt_commanded_deg: likewise.
+        focal_commanded_px: last command, nominal [px].
+        pan_deg: true pan at the zoom frame's time [degrees].
+        tilt_deg: likewise.
+        focal_px: true focal length at the zoom frame's time [px].
+        target: name of the target that is followed.
+        head_commands: how many the head was sent until then, whether its goal changed or not.
+        lens_commands: how many the lens was sent until then.
+        on_target: the confirmed tracks that the fixed frame shows alone, each with every target that it is on, the
+            nearest first, as "3:bird 3:bird2 7:bird".
+    """
+
+    t_s: float
+    t_fixed_s: float
+    state: str
+    track: int
+    u_px: float
+    v_px: float
+    width_px: int
+    height_px: int
+    size_px: float
+    wanted_px: float
+    visible: float
+    in_wide: bool
+    u_wide_px: float
+    v_wide_px: float
+    u_detected_px: float
+    v_detected_px: float
+    decoded: bool
+    decoded_wide: bool
+    off_target: str
+    range_m: float
+    depth_m: float
+    pan_commanded_deg: float
+    tilt_commanded_deg: float
+    focal_commanded_px: float
+    pan_deg: float
+    tilt_deg: float
+    focal_px: float
+    target: str = ""
+    head_commands: int = 0
+    lens_commands: int = 0
+    on_target: str = ""
+
+    @property
+    def closeup(self) -> Closeup:
+        """What the zoom frame shows."""
+        return Closeup(self.u_px, self.v_px, self.width_px, self.height_px, self.size_px, self.wanted_px, self.visible)
+
+    @property
+    def inside(self) -> bool:
+        """Whether the body centre is inside the zoom image."""
+        return self.closeup.inside
+
+    @property
+    def size_ratio(self) -> float:
+        """True size over the size wanted; 0 for a target behind the camera, which shows nothing of it."""
+        return self.closeup.size_ratio
+
+    @property
+    def in_frame(self) -> bool:
+        """Whether the target is in the close-up."""
+        return self.closeup.in_frame
+
+    @property
+    def good_closeup(self) -> bool:
+        """Whether the whole target is visible at about the wanted size."""
+        return self.closeup.good
+
+    @property
+    def tpo_px(self) -> float:
+        """Target point offset: distance from the image's centre; half the diagonal for a frame without it [px]."""
+        return self.closeup.tpo_px
+
+    @property
+    def tpo_deg(self) -> float:
+        """The same as an angle [degrees]."""
+        return math.degrees(math.atan(self.tpo_px / self.focal_px))
+
+    @property
+    def tpe_px(self) -> float:
+        """Target point error: distance from the detection to the truth in the wide view [px]; nan without one."""
+        return math.hypot(self.u_wide_px - self.u_detected_px, self.v_wide_px - self.v_detected_px)
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write steps.csv, one line a zoom frame."""
+    names = [f.name for f in dataclasses.fields(Row)]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(names)
+        writer.writerows([getattr(row, name) for name in names] for row in rows)
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Read steps.csv.
+
+    Raises:
+        ConfigError: the file is missing, or is not a steps.csv.
+    """
+    kinds = {f.name: f.type for f in dataclasses.fields(Row)}
+    parse: dict[object, Callable[[str], object]] = {int: int, float: float, str: str, bool: _truth_value}
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            if missing := [name for name in kinds if name not in (reader.fieldnames or ())]:
+                raise ValueError(f"it has no column '{missing[0]}'")
+            lines = list(reader)
+        if any(None in line.values() for line in lines):
+            raise ValueError("a line of it was cut off")
+        return [
+            Row(**{name: parse[kind](line[name]) for name, kind in kinds.items()})  # type: ignore[arg-type]
+            for line in lines
+        ]
+    except (OSError, csv.Error, ValueError) as error:
+        raise ConfigError(f"{path}: is not a steps.csv: {error}") from None
+
+
+def _truth_value(text: str) -> bool:
+    if text not in ("True", "False"):
+        raise ValueError(f"'{text}' is not True or False")
+    return text == "True"
+
+
+# --- tracked ---
+
+LABELS = ("frame", "x_px", "y_px", "width_px", "height_px")
+# Frames that no detector is judged by: the background has a second to be learnt.
+LEARNING_FRAMES = 30
+
+
+@dataclass(frozen=True)
+class Label:
+    """A box around a target: its middle (u, v), (2,), and width and height, (2,) [px]."""
+
+    center_px: Array
+    size_px: Array
+
+    @property
+    def larger_side_px(self) -> float:
+        """The larger of its sides."""
+        return float(self.size_px.max())
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A confirmed track in one frame: the frame's number and time, the track's number, and its middle (u, v) [px]."""
+
+    frame: int
+    t: float
+    track: int
+    center_px: Array
+
+
+@dataclass(frozen=True)
+class TrackScore:
+    """How well tracks keep to what is labelled. Each is None where nothing is labelled, or nothing was found.
+
+    A track is on a target when it is no farther from the label's middle than the label's larger side.
+
+    Attributes:
+        labelled_frames: that are judged: those after LEARNING_FRAMES, up to the film's last.
+        on_target_ratio: of these, in how many a track is on a label.
+        numbers: how many different tracks were on a label in them.
+        offset_px_median: of the track on it, from the label's middle [px].
+        fragmentation_per_min: how often no track was on a label for longer than 0.2 s, a minute of labelled frames.
+        false_tracks: tracks that were off every label for 0.5 s on end in frames that have labels, or that lived for
+            0.5 s and were never on one.
+        false_tracks_per_min: the same, a minute of the film.
+        labels_beyond_end: labelled frames that the film does not have; they are not judged, and of another film maybe.
+    """
+
+    labelled_frames: int
+    on_target_ratio: float | None
+    numbers: int
+    offset_px_median: float | None
+    fragmentation_per_min: float | None
+    false_tracks: int
+    false_tracks_per_min: float | None
+    labels_beyond_end: int = 0
+
+
+def score_tracks(
+    tracks: Iterable[Tracked],
+    labels: Mapping[int, Sequence[Label]],
+    rate_hz: float,
+    frames: int,
+    learning_frames: int = LEARNING_FRAMES,
+) -> TrackScore:
+    """Score tracks.
+
+    Args:
+        tracks: the confirmed ones of every frame.
+        labels: by the frame's number, from 0; those of frames that the film does not have are left out, and counted.
+        rate_hz: frames a second.
+        frames: how many the film has.
+        learning_frames: so many at its beginning are not judged.
+    """
+    offsets: dict[int, dict[int, float]] = {}  # by frame and track, of those on a label
+    lives: dict[int, list[Tracked]] = {}
+    for each in tracks:
+        lives.setdefault(each.track, []).append(each)
+        for label in labels.get(each.frame, ()):
+            offset = float(np.linalg.norm(each.center_px - label.center_px))
+            if offset <= label.larger_side_px:
+                on = offsets.setdefault(each.frame, {})
+                on[each.track] = min(offset, on.get(each.track, math.inf))
+    false = sum(_is_false(life, labels, offsets) for life in lives.values())
+    labelled = sorted(frame for frame, boxes in labels.items() if boxes)
+    judged = [frame for frame in labelled if learning_frames <= frame < frames]
+    hits = [offsets[frame] for frame in judged if frame in offsets]
+    minutes, labelled_minutes = frames / rate_hz / 60, len(judged) / rate_hz / 60
+    breaks = _gaps([frame in offsets for frame in judged], judged, rate_hz)
+    return TrackScore(
+        labelled_frames=len(judged),
+        on_target_ratio=len(hits) / len(judged) if judged else None,
+        numbers=len({track for on in hits for track in on}),
+        offset_px_median=float(np.median([min(on.values()) for on in hits])) if hits else None,
+        fragmentation_per_min=breaks / labelled_minutes if hits else None,
+        false_tracks=false,
+        false_tracks_per_min=false / minutes if frames else None,
+        labels_beyond_end=sum(frame >= frames for frame in labelled),
+    )
+
+
+def _is_false(
+    life: Sequence[Tracked], labels: Mapping[int, Sequence[Label]], offsets: Mapping[int, Mapping[int, float]]
+) -> bool:
+    """Whether a track was off every label for half a second on end; a frame without labels ends what was before it."""
+    if not any(each.track in offsets.get(each.frame, ()) for each in life):
+        return life[-1].t - life[0].t >= FALSE_S - ROUNDING_S
+    since: Tracked | None = None
+    last = -1
+    for each in life:
+        if not labels.get(each.frame) or each.track in offsets.get(each.frame, ()):
+            since = None
+        elif since is None or each.frame != last + 1:
+            since = each
+        elif each.t - since.t >= FALSE_S - ROUNDING_S:
+            return True
+        last = each.frame
+    return False
+
+
+def _gaps(on: Sequence[bool], frames: Sequence[int], rate_hz: float) -> int:
+    """How often there was no track for longer than 0.2 s, in frames that are labelled one after the other."""
+    breaks, lacking = 0, 0
+    for i, is_on in enumerate(on):
+        if is_on or (i and frames[i] != frames[i - 1] + 1):
+            lacking = 0
+        if not is_on:
+            lacking += 1
+            # Counted once, when it has lasted for long enough.
+            breaks += lacking / rate_hz > BREAK_S + ROUNDING_S >= (lacking - 1) / rate_hz
+    return breaks
+
+
+def read_labels(path: Path) -> dict[int, list[Label]]:
+    """Read labels: a csv with frame (from 0), x_px, y_px (of the top-left pixel, from 0), width_px and height_px.
+
+    Raises:
+        ConfigError: the file is missing, is no such table, or has no row.
+    """
+    labels: dict[int, list[Label]] = {}
+    for row in _table(path, LABELS, "labels"):
+        frame, x, y, width, height = (row[name] for name in LABELS)
+        if not (width > 0 and height > 0 and frame >= 0 and frame == int(frame)):
+            raise ConfigError(f"{path}: a label wants a whole frame from 0 and a width and height above 0, not {row}")
+        size = np.array([width, height])
+        # A box of w pixels from column x covers columns x to x + w - 1.
+        labels.setdefault(int(frame), []).append(Label(np.array([x, y]) + (size - 1) / 2, size))
+    if not labels:
+        raise ConfigError(f"{path}: holds no label, but for the names of its columns; it wants a row for each box")
+    return labels
+
+
+def read_tracks(path: Path) -> list[Tracked]:
+    """Read the table that `cotarget.detect_video.run_on_film` writes.
+
+    Raises:
+        ConfigError: the file is missing, or is no such table.
+    """
+    names = ("frame", "t", "track", "u_px", "v_px")
+    return [
+        Tracked(int(row["frame"]), row["t"], int(row["track"]), np.array([row["u_px"], row["v_px"]]))
+        for row in _table(path, names, "tracks")
+    ]
+
+
+def _table(path: Path, names: Sequence[str], what: str) -> list[dict[str, float]]:
+    """The numbers of a csv's columns.
+
+    Raises:
+        ConfigError: the file is missing, lacks a column, or holds something else.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # as spreadsheets write it
+            reader = csv.DictReader(file)
+            if missing := [name for name in names if name not in (reader.fieldnames or ())]:
+                raise ValueError(f"it has no column '{missing[0]}'; it wants {', '.join(names)}")
+            rows = [{name: float(row[name] or "nan") for name in names} for row in reader]
+        for line, row in enumerate(rows, start=2):
+            if odd := [name for name, value in row.items() if not math.isfinite(value)]:
+                raise ValueError(f"line {line} has no number for {odd[0]}")
+        return rows
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; give a csv with {','.join(names)}") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except (csv.Error, ValueError, TypeError) as error:
+        raise ConfigError(f"{path}: is no table of {what}: {error}") from None
+
+
+# Acquired: in frame for this long on end [s].
+ACQUIRED_S = 0.5
+# The clock starts when the target is wholly in the wide view, after the background had this long to be learnt, from
+# the first row on [s].
+BACKGROUND_S = 2.0
+# In-frame runs broken for longer than this count as fragmentation [s].
+BREAK_S = 0.2
+# A track counts as false when it was confirmed and off every target for this long on end [s].
+FALSE_S = 0.5
+ROUNDING_S = 1e-6  # frame times are sums and differences of binary fractions
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well a target was held; None where it was never acquired, or never there.
+
+    Wear, false tracks and ID switches are counted, like the yield, from when the target was wholly in the wide view.
+
+    Attributes:
+        frames: zoom frames since the target was wholly in the wide view.
+        time_to_acquire_s: from then to the first half second in frame [s].
+        closeup_yield: good close-ups over all those frames, acquisition included.
+        in_frame_ratio: frames in frame over all frames after acquisition, the lost ones too.
+        tpo_px_median: of the frames after acquisition [px].
+        tpo_width_median: the same over the width of the image.
+        tpo_deg_median: the same as an angle [degrees].
+        size_ratio_median: of the frames after acquisition; one with the target behind the camera counts as 0.
+        wanted_px: size wanted [px], median.
+        range_m: true range [m], median.
+        tpe_px_median: the detection's error in the wide view, of the frames that have one [px].
+        fragmentation_per_min: in-frame runs broken for more than 0.2 s [1/min].
+        identification: frames in which the marker decodes in the close-up, over all those that the yield counts. It is
+            helped: the marker is looked for about the target's true box alone, in a part of the image that was enlarged
+            twice, and a bird carries it on either flank, under its belly, and on its wings above and below.
+        identification_wide: the same in the wide view, for comparison, and helped in the same ways.
+        commands_per_min: commands that the head was sent, whether its goal changed or not [1/min].
+        reversals_per_min: changes of direction of its goals from row to row, both axes together [1/min].
+        false_tracks_per_min: tracks that were confirmed and off every target for 0.5 s on end [1/min].
+        lens_commands_per_min: commands that the lens was sent [1/min].
+        id_switches_per_min: how often a track was on another target than before, of all tracks (ID switches after Li,
+            Huang and Nevatia 2009, "Learning to associate") [1/min]. One that is off every target after it was on one
+            is a false track.
+    """
+
+    frames: int
+    time_to_acquire_s: float | None
+    closeup_yield: float | None
+    in_frame_ratio: float | None
+    tpo_px_median: float | None
+    tpo_width_median: float | None
+    tpo_deg_median: float | None
+    size_ratio_median: float | None
+    wanted_px: float | None
+    range_m: float | None
+    tpe_px_median: float | None
+    fragmentation_per_min: float | None
+    identification: float | None = None
+    identification_wide: float | None = None
+    commands_per_min: float | None = None
+    reversals_per_min: float | None = None
+    false_tracks_per_min: float | None = None
+    lens_commands_per_min: float | None = None
+    id_switches_per_min: float | None = None
+
+
+def score(rows: Sequence[Row]) -> Score:
+    """Score one run of following one target; see the fields of `Score` for the definitions."""
+    learnt_s = rows[0].t_s + BACKGROUND_S - ROUNDING_S if rows else 0.0
+    start = next((i for i, row in enumerate(rows) if row.in_wide and row.t_s >= learnt_s), None)
+    if start is None:
+        return Score(0, *[None] * 11)
+    counted = rows[start:]
+    acquired = _acquired(counted)
+    after = counted[acquired:] if acquired is not None else []
+
+    def median(values: Iterable[float]) -> float | None:
+        finite = [v for v in values if math.isfinite(v)]
+        return float(np.median(finite)) if finite else None
+
+    return Score(
+        frames=len(counted),
+        time_to_acquire_s=after[0].t_s - counted[0].t_s if after else None,
+        closeup_yield=float(np.mean([r.good_closeup for r in counted])),
+        in_frame_ratio=float(np.mean([r.in_frame for r in after])) if after else None,
+        tpo_px_median=median(r.tpo_px for r in after),
+        tpo_width_median=median(r.tpo_px / r.width_px for r in after),
+        tpo_deg_median=median(r.tpo_deg for r in after),
+        size_ratio_median=median(r.size_ratio for r in after),
+        wanted_px=median(r.wanted_px for r in counted),
+        range_m=median(r.range_m for r in counted),
+        tpe_px_median=median(r.tpe_px for r in counted),
+        fragmentation_per_min=_per_minute(_breaks(after), after),
+        identification=float(np.mean([r.decoded for r in counted])),
+        identification_wide=float(np.mean([r.decoded_wide for r in counted])),
+        commands_per_min=_per_minute(counted[-1].head_commands - counted[0].head_commands, counted),
+        reversals_per_min=_per_minute(_reversals(counted), counted),
+        false_tracks_per_min=_per_minute(false_tracks((r.t_s, r.off_target.split()) for r in counted), counted),
+        lens_commands_per_min=_per_minute(counted[-1].lens_commands - counted[0].lens_commands, counted),
+        id_switches_per_min=_per_minute(id_switches(map(_on, counted)), counted),
+    )
+
+
+def _acquired(rows: Sequence[Row]) -> int | None:
+    """Index of the first row of the first half second in frame on end."""
+    begin: int | None = None
+    for i, row in enumerate(rows):
+        if not row.in_frame:
+            begin = None
+        else:
+            begin = i if begin is None else begin
+            if row.t_s - rows[begin].t_s >= ACQUIRED_S - ROUNDING_S:
+                return begin
+    return None
+
+
+def _per_minute(count: int, rows: Sequence[Row]) -> float | None:
+    """Events over the time from the first row to the last [1/min]; None for no time."""
+    return count / ((rows[-1].t_s - rows[0].t_s) / 60) if len(rows) > 1 else None
+
+
+def _breaks(rows: Sequence[Row]) -> int:
+    """How often the target was out of frame for longer than 0.2 s."""
+    breaks, since = 0, None
+    for row in rows:
+        if row.in_frame:
+            breaks += since is not None and row.t_s - since > BREAK_S + ROUNDING_S
+            since = None
+        elif since is None:
+            since = row.t_s
+    return breaks + (since is not None and rows[-1].t_s - since > BREAK_S + ROUNDING_S)
+
+
+def _reversals(rows: Sequence[Row]) -> int:
+    """How often an axis's commanded changes turned round, pauses aside."""
+    changes = np.diff([[row.pan_commanded_deg, row.tilt_commanded_deg] for row in rows], axis=0)
+    return int(sum(np.count_nonzero(np.diff(np.sign(axis[axis != 0]))) for axis in changes.T))
+
+
+def _on(row: Row) -> list[tuple[str, str]]:
+    """Which track is on which target in a row."""
+    return [(track, target) for track, target in (pair.split(":") for pair in row.on_target.split())]
+
+
+def false_tracks(off: Iterable[tuple[float, Collection[Hashable]]]) -> int:
+    """How many tracks were confirmed and off every target for half a second on end.
+
+    Args:
+        off: of each frame its time [s], and which tracks were.
+    """
+    false: set[Hashable] = set()
+    since: dict[Hashable, float] = {}
+    for t, tracks in off:
+        since = {track: since.get(track, t) for track in tracks}
+        false |= {track for track, begin in since.items() if t - begin >= FALSE_S - ROUNDING_S}
+    return len(false)
+
+
+def id_switches(on: Iterable[Iterable[tuple[Hashable, str]]]) -> int:
+    """How often a track was on another target than before: on that no more, and on one.
+
+    Args:
+        on: of each frame which track was on which target; one on several is told with each, the nearest first.
+    """
+    switches = 0
+    was_on: dict[Hashable, str] = {}
+    for pairs in on:
+        now: dict[Hashable, list[str]] = {}
+        for track, target in pairs:
+            now.setdefault(track, []).append(target)
+        for track, targets in now.items():
+            switches += was_on.get(track, targets[0]) not in targets
+            if was_on.get(track) not in targets:
+                was_on[track] = targets[0]
+    return switches

@@ -1,0 +1,1 @@
+"""Record a run's device calls, and replay them."""

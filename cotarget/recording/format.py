@@ -1,0 +1,434 @@
+"""The folder of a recorded run: who wrote what, and one line for every answer that the rig gave.
+
+    recording.json         schema, versions, when, target, whom, config; written last of what comes before
+    calibration.json       the very bytes that the run was started with
+    template.*             the target's picture, where it is found by one
+    log.jsonl              one JSON object a line, appended and flushed: what the rig is, then calls with their
+                           arguments, results and times
+    fixed/ and zoom/       the frames as PNG, by number; a line that names one is written after the image is complete
+
+So whatever moment the program dies at, the log up to there is whole but for its last line, and every image that it
+names is on disk. The last line of a run that was ended, and did not just stop, is an `end`.
+
+Opens the folder of a recorded run and reads as much of it as is whole.
+"""
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from cotarget.config import RigConfig, expect_table, parse_config
+from cotarget.control.selection import Whom, parse_whom
+from cotarget.errors import ConfigError, choices
+from cotarget.rig import PanTiltLimits, Speed
+
+SCHEMA = 1
+META, LOG, CALIBRATION, TEMPLATE = "recording.json", "log.jsonl", "calibration.json", "template"
+FIXED, ZOOM = "fixed", "zoom"  # the frames' folders
+COMPLETE = "complete"  # what the `end` says of a run that nothing interrupted
+Number = float | bool | None
+# The calls on a rig: how many arguments and how many numbers of a result each has. A frame's result is its time.
+CALLS: Mapping[str, tuple[tuple[int, ...], int]] = {
+    "fixed.read": ((2,), 1),  # newer_than, timeout -> t
+    "zoom.read": ((2,), 1),
+    "zoom.capture": ((0,), 1),
+    "zoom.zoom": ((1,), 1),  # focal_px -> focal_px
+    "zoom.state": ((0,), 3),  # -> focal_px, moving, t
+    "head.move": ((4, 5), 2),  # pan, tilt, speed (of both axes or of each), wait -> pan, tilt
+    "head.state": ((0,), 4),  # -> pan, tilt, moving, t
+    "head.halt": ((0,), 0),
+    "clock.now": ((0,), 1),
+    "clock.sleep_until": ((1,), 0),
+    "board.present": ((0, 6), 0),  # translation and rotation vector [rad], or no board
+    "board.swing": ((6,), 0),
+}
+FRAMES = frozenset({"fixed.read", "zoom.read", "zoom.capture"})
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One call on the rig and what came of it.
+
+    Attributes:
+        call: which, one of `CALLS`.
+        at: the rig's clock when it returned [s].
+        args: as they were given.
+        result: numbers of the answer; none where it failed.
+        image: file of a frame's image; None where it could not be kept.
+        size_bytes: of that file.
+        error: the exception's name and message, where it failed.
+        aside: whether another thread than the run's own called, such as a watchdog.
+    """
+
+    call: str
+    at: float
+    args: tuple[Number, ...] = ()
+    result: tuple[Number, ...] = ()
+    image: str | None = None
+    size_bytes: int = 0
+    error: tuple[str, str] | None = None
+    aside: bool = False
+
+
+@dataclass(frozen=True)
+class RigFacts:
+    """What a rig says of itself once and for all.
+
+    Attributes:
+        fixed_size: (width, height) of the fixed camera's frames [px].
+        zoom_size: the same of the zoom camera's.
+        still_size: the same of its stills.
+        focal_range: shortest and longest nominal focal length [px].
+        limits: what the head can do.
+        real_time: whether its time passes by itself, which the safety layer wants to know.
+    """
+
+    fixed_size: tuple[int, int]
+    zoom_size: tuple[int, int]
+    still_size: tuple[int, int]
+    focal_range: tuple[float, float]
+    limits: PanTiltLimits
+    real_time: bool
+
+
+def move_args(pan: float, tilt: float, speed: Speed | None, wait: bool) -> tuple[Number, ...]:
+    """The arguments of `head.move` as an event has them."""
+    return (pan, tilt, *(speed if isinstance(speed, tuple) else (speed,)), wait)
+
+
+def event_line(event: Event) -> str:
+    """Write an event as a line of the log, without its end; floats keep every bit."""
+    row: dict[str, Any] = {"call": event.call, "at": event.at}
+    if event.args:
+        row["args"] = [_plain(value) for value in event.args]
+    if event.result:
+        row["result"] = [_plain(value) for value in event.result]
+    if event.image is not None:
+        row |= {"image": event.image, "bytes": event.size_bytes}
+    if event.error is not None:
+        row["error"] = list(event.error)
+    if event.aside:
+        row["aside"] = True
+    return json.dumps(row, allow_nan=False)
+
+
+def parse_event(row: Mapping[str, Any]) -> Event:
+    """Read an event.
+
+    Raises:
+        ValueError: it is none.
+    """
+    call = row.get("call")
+    if not isinstance(call, str) or call not in CALLS:
+        raise ValueError(f"unknown call {call!r}")
+    error = None
+    if (failure := row.get("error")) is not None:
+        name, message = failure
+        error = str(name), str(message)
+    args, result = (tuple(_number(value) for value in row.get(key, ())) for key in ("args", "result"))
+    arities, numbers = CALLS[call]
+    if len(args) not in arities or len(result) != (0 if error else numbers) or None in result:
+        raise ValueError(f"{call} has other numbers")
+    image, size = row.get("image"), row.get("bytes", 0)
+    if image is not None and not (isinstance(image, str) and _is_inside(image) and call in FRAMES):
+        raise ValueError("image is no file of the recording")
+    if type(size) is not int:
+        raise ValueError("bytes is not a whole number")
+    at = float(row["at"])
+    if not math.isfinite(at):
+        raise ValueError("at is not finite")
+    return Event(call, at, args, result, image, size, error, row.get("aside") is True)
+
+
+def facts_table(facts: RigFacts) -> dict[str, Any]:
+    """Write what a rig says of itself."""
+    limits = facts.limits
+    return {
+        "fixed_size": list(facts.fixed_size),
+        "zoom_size": list(facts.zoom_size),
+        "still_size": list(facts.still_size),
+        "focal_range_px": [_plain(value) for value in facts.focal_range],
+        "pan": [_plain(value) for value in limits.pan],
+        "tilt": [_plain(value) for value in limits.tilt],
+        "speed": _plain(limits.speed),
+        "acceleration": _plain(limits.acceleration),
+        "step": _plain(limits.step),
+        "real_time": facts.real_time,
+    }
+
+
+def parse_facts(table: Mapping[str, Any]) -> RigFacts:
+    """Read what a rig said of itself.
+
+    Raises:
+        KeyError: something is missing.
+        TypeError, ValueError: something is of another kind.
+    """
+
+    def pair(key: str) -> tuple[float, float]:
+        first, second = map(float, table[key])
+        return first, second
+
+    def size(key: str) -> tuple[int, int]:
+        width, height = (int(value) for value in table[key])
+        if min(width, height) <= 0:
+            raise ValueError(f"{key} is not greater than zero")
+        return width, height
+
+    return RigFacts(
+        size("fixed_size"),
+        size("zoom_size"),
+        size("still_size"),
+        pair("focal_range_px"),
+        PanTiltLimits(
+            pair("pan"), pair("tilt"), float(table["speed"]), float(table["acceleration"]), float(table["step"])
+        ),
+        bool(table["real_time"]),
+    )
+
+
+def read_json(path: Path) -> Mapping[str, Any]:
+    """Read recording.json and check its schema.
+
+    Raises:
+        ConfigError: it is missing, is none, or is another version's.
+    """
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path.parent}: is no recording: it holds no {path.name}") from None
+    except NotADirectoryError:
+        raise ConfigError(f"{path.parent}: is a file; give the folder of a recording") from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise ConfigError(f"{path}: cannot be read: {reason}") from None
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: is not JSON: {error}") from None
+    if not isinstance(table, dict):
+        raise ConfigError(f"{path}: holds no JSON object")
+    if "schema" not in table:
+        raise ConfigError(f"{path}: missing key 'schema'; this version reads schema {SCHEMA}")
+    if table["schema"] != SCHEMA or isinstance(table["schema"], bool):
+        raise ConfigError(f"{path}: schema {table['schema']!r} is not {SCHEMA}, the one that this version reads")
+    keys = ("cotarget", "target", "config")
+    if missing := [key for key in keys if key not in table]:
+        raise ConfigError(f"{path}: missing key '{missing[0]}'; needed here: {choices(keys)}")
+    return table
+
+
+def _plain(value: Number) -> Any:
+    """A number as JSON can say it: infinity, which unlimited heads have, becomes a text that `float` reads."""
+    if value is None or isinstance(value, bool):
+        return value
+    return float(value) if math.isfinite(value) else str(float(value))
+
+
+def _number(value: Any) -> Number:
+    if value is None or isinstance(value, bool):
+        return value
+    if not isinstance(value, int | float | str):
+        raise ValueError(f"{value!r} is not a number")
+    return float(value)
+
+
+def _is_inside(name: str) -> bool:
+    """Whether a file's name stays inside the recording's folder."""
+    return not Path(name).is_absolute() and ".." not in Path(name).parts
+
+
+# --- recordreader ---
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recorded run.
+
+    Attributes:
+        directory: its folder.
+        config: of the rig that was recorded; its backend is that rig's.
+        calibration: the run's calibration.json.
+        target: name of the target that was followed.
+        whom: which one, where there were several; nothing is said where an older version recorded it.
+        facts: what the rig said of itself.
+        events: every call on the rig, in order.
+        ending: "complete"; or the error that ended the run; or, where it just stops, what it stops with.
+        truncated: whether it just stops; then the last step, which may be half a one, is left out.
+        notes: one line each for what a user should know.
+    """
+
+    directory: Path
+    config: RigConfig
+    calibration: Path
+    target: str
+    whom: Whom
+    facts: RigFacts
+    events: tuple[Event, ...]
+    ending: str
+    truncated: bool
+    notes: tuple[str, ...]
+
+    @property
+    def steps(self) -> int:
+        """How many frames of the fixed camera the run looked at."""
+        return sum(event.call == "fixed.read" and event.image is not None for event in self.events)
+
+    @property
+    def pictures(self) -> dict[float, int]:
+        """The numbers of the fixed camera's pictures, from 0, by when they were exposed [s]."""
+        frames = [event for event in self.events if event.call == "fixed.read"]
+        return {float(e.result[0] or 0.0): int(Path(e.image).stem) for e in frames if e.image is not None}
+
+    @property
+    def seconds(self) -> float:
+        """From the first call to the last, on the rig's clock [s]."""
+        return self.events[-1].at - self.events[0].at if self.events else 0.0
+
+
+def open_recording(directory: Path) -> Recording:
+    """Read a recording, up to where it is whole; its images are looked for, but not read.
+
+    Raises:
+        ConfigError: it is none, is another version's, or holds nothing that can be replayed.
+    """
+    if not directory.exists():
+        raise ConfigError(f"{directory}: no such folder; give the folder of a recording")
+    meta = read_json(directory / META)
+    target, whom, config = _parse_meta(directory, meta)
+    if not (directory / CALIBRATION).is_file():
+        raise ConfigError(f"{directory / CALIBRATION}: no such file; the recording is not whole")
+    facts, rows, ending = None, [], ""
+    stop = "the run stopped without an end"
+    try:
+        for number, row in _rows(directory / LOG):
+            if "rig" in row:
+                facts = _facts(row["rig"], number)
+            elif "end" in row:
+                ending = str(row["end"])
+            else:
+                rows.append(_whole(directory, _event(row, number)))
+    except _DamageError as damage:
+        stop = str(damage)
+    if facts is None:
+        raise ConfigError(f"{directory}: holds nothing to replay: {stop}")
+    notes = []
+    if truncated := not ending:
+        rows = _without_last_step(rows)
+        if not any(event.call == "fixed.read" for event in rows):
+            raise ConfigError(f"{directory}: is cut short before its first step was complete: {stop}")
+        notes.append(f"is cut short, and replays up to {rows[-1].at - rows[0].at:.2f} s: {stop}")
+    elif ending != COMPLETE:
+        notes.append(f"the run was ended by {ending}")
+    if missing := sum(event.call in ("zoom.read", "zoom.capture") and _imageless(event) for event in rows):
+        notes.append(f"{missing} frames of the zoom camera lack their image; the one before stands in")
+    if meta["cotarget"] != version("cotarget"):
+        notes.append(f"was recorded by cotarget {meta['cotarget']}; this is {version('cotarget')}")
+    return Recording(
+        directory,
+        config,
+        directory / CALIBRATION,
+        target,
+        whom,
+        facts,
+        tuple(rows),
+        ending or stop,
+        truncated,
+        tuple(notes),
+    )
+
+
+class _DamageError(Exception):
+    """Where a log stops being whole."""
+
+
+def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, Whom, RigConfig]:
+    """The target's name, which one, and the configuration, whose picture of the target lies in the recording."""
+    path = directory / META
+    name, table = meta["target"], meta["config"]
+    try:
+        if not isinstance(name, str):
+            raise ConfigError("target: is not a text")
+        expect_table(table, "config")
+        config = parse_config(table, recorded=True)
+        target = config.target(name)
+        whom = parse_whom(meta.get("whom", {}))
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    except (ValueError, OverflowError) as error:
+        raise ConfigError(f"{path}: whom: {error}") from None
+    recorded = table.get("targets", {}).get(name, {}).get("template")
+    template = None if recorded is None else directory / Path(recorded).name
+    if template is not None and not template.is_file():
+        raise ConfigError(f"{template}: no such file; the recording is not whole")
+    target = replace(target, template=template)
+    return name, whom, dataclasses.replace(config, targets={**config.targets, name: target})
+
+
+def _rows(path: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:
+    """The log's lines as objects, with their numbers from 1."""
+    try:
+        file = path.open("rb")
+    except FileNotFoundError:
+        raise _DamageError(f"there is no {path.name}") from None
+    except OSError as error:
+        raise _DamageError(f"{path.name} cannot be read: {error.strerror}") from None
+    with file:
+        for number, line in enumerate(file, start=1):
+            if not line.endswith(b"\n"):
+                raise _DamageError("the run stopped while a line was written")
+            try:
+                row = json.loads(line)
+            except (ValueError, RecursionError):
+                row = None
+            if not isinstance(row, dict):
+                raise _DamageError(f"line {number} of {path.name} is damaged")
+            yield number, row
+
+
+def _event(row: Mapping[str, Any], number: int) -> Event:
+    try:
+        return parse_event(row)
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
+        raise _DamageError(f"line {number} of {LOG} is damaged: {_words(error)}") from None
+
+
+def _facts(table: Any, number: int) -> RigFacts:
+    try:
+        return parse_facts(table)
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
+        raise _DamageError(f"line {number} of {LOG} is damaged: {_words(error)}") from None
+
+
+def _words(error: Exception) -> str:
+    return f"missing key {error}" if isinstance(error, KeyError) else str(error)
+
+
+def _whole(directory: Path, event: Event) -> Event:
+    """An event whose image is on disk; a frame of the zoom camera can do without."""
+    if event.image is None:
+        if event.call == "fixed.read" and event.error is None:
+            raise _DamageError("a frame of the fixed camera has no image")
+        return event
+    try:
+        size = (directory / event.image).stat().st_size
+    except OSError:
+        size = -1
+    if size == event.size_bytes:
+        return event
+    if event.call == "fixed.read":
+        raise _DamageError(f"{event.image} is {'missing' if size < 0 else 'damaged'}")
+    return replace(event, image=None)
+
+
+def _imageless(event: Event) -> bool:
+    return event.image is None and event.error is None
+
+
+def _without_last_step(events: list[Event]) -> list[Event]:
+    """What comes before the last frame of the fixed camera."""
+    looks = [i for i, event in enumerate(events) if event.call == "fixed.read" and not event.aside]
+    return events[: looks[-1]] if looks else []

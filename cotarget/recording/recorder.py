@@ -1,0 +1,556 @@
+"""Writes what a run did: a table of its Steps, and a recording of all that its rig saw and was told.
+
+A rig that notes every call on it and every answer, in order; it changes neither.
+
+Writes the log and the images of a recording on a thread of its own, so that the run is not held up.
+"""
+
+import collections
+import contextlib
+import dataclasses
+import json
+import logging
+import math
+import platform
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+
+from cotarget.config import RigConfig, config_table
+from cotarget.control.selection import ANYBODY, Whom, whom_table
+from cotarget.errors import ConfigError, CotargetError
+from cotarget.files import CsvFile
+from cotarget.geometry import RigidTransform
+from cotarget.pipeline import Step
+from cotarget.recording.format import (
+    CALIBRATION,
+    COMPLETE,
+    FIXED,
+    LOG,
+    META,
+    SCHEMA,
+    TEMPLATE,
+    ZOOM,
+    Event,
+    Number,
+    RigFacts,
+    event_line,
+    facts_table,
+    move_args,
+)
+from cotarget.rig import (
+    Board,
+    Camera,
+    Clock,
+    Frame,
+    Image,
+    PanTilt,
+    PanTiltLimits,
+    PanTiltState,
+    Rig,
+    Speed,
+    ZoomCamera,
+    ZoomState,
+)
+
+log = logging.getLogger(__name__)
+# Images that may wait for the disk [bytes]; 640x480 takes 0.92 MB. Frames of the zoom camera, from which nothing is
+# decided, go without their image when there is no more room; the fixed camera's never do: the run waits instead.
+ZOOM_ROOM = 64_000_000
+ROOM = 128_000_000
+# Without search for repetitions, which noise has none of, and with the one filter that pays: a noisy 640x480 image
+# takes 6 ms and 375 kB where zlib's level 1 with every filter takes 13 ms and 370 kB, and raw 922 kB.
+PNG_OPTIONS = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # older versions of OpenCV use that filter anyway
+    PNG_OPTIONS += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
+
+
+@dataclass(eq=False)
+class _Picture:
+    """An image on its way to the disk; ``image`` is None once it is there, or if it will never be."""
+
+    name: str
+    image: Image | None
+    size_bytes: int = 0
+    dropped: bool = False
+
+
+class RecordWriter:
+    """Takes events in order and writes them in that order, each image before the line that names it.
+
+    Attributes:
+        dropped: images of the zoom camera that were not kept, because the disk was too slow.
+        failure: why nothing is written any more; empty as long as all is well.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        """Begin the log in a folder.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self.dropped = 0
+        self.failure = ""
+        self._directory = directory
+        for name in (FIXED, ZOOM):
+            (directory / name).mkdir()
+        self._log = (directory / LOG).open("xb", buffering=0)  # a line is with the system as soon as it is written
+        self._queue: collections.deque[tuple[Event | dict[str, Any], _Picture | None]] = collections.deque()
+        self._changed = threading.Condition()
+        self._waiting = 0
+        self._closing = False
+        self._last: dict[str, tuple[float, Image, _Picture]] = {}
+        self._numbers = {FIXED: 0, ZOOM: 0}
+        self._thread = threading.Thread(target=self._work, name="recording", daemon=True)
+        self._thread.start()
+
+    def put(self, event: Event | dict[str, Any], camera: str = "", image: Image | None = None) -> None:
+        """Take an event, or another object for a line; with an image, that of a frame exposed at its result.
+
+        Args:
+            event: what to log.
+            camera: the image's folder.
+            image: (H, W, 3) BGR, which nobody may change any more.
+        """
+        with self._changed:
+            picture = None
+            if image is not None and not self.failure:
+                assert isinstance(event, Event)
+                picture = self._picture(camera, image, float(event.result[0] or 0.0))
+            if not self.failure:  # which may have come about while there was no room
+                self._queue.append((event, picture))
+                self._changed.notify_all()
+
+    @property
+    def waiting(self) -> int:
+        """How many events are still on their way to the disk."""
+        return len(self._queue)
+
+    def close(self) -> None:
+        """Write what still waits, and end."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join()
+        self._log.close()
+
+    def _picture(self, camera: str, image: Image, t: float) -> _Picture:
+        """The image's place on disk: that of the last one, if it is the same frame again."""
+        if camera in self._last:
+            last_t, last_image, last = self._last[camera]
+            if last_t == t and (last_image is image or np.array_equal(last_image, image)):
+                return last
+        picture = _Picture(f"{camera}/{self._numbers[camera]:06d}.png", image)
+        self._numbers[camera] += 1
+        if camera == ZOOM and self._waiting + image.nbytes > ZOOM_ROOM:
+            picture = replace(picture, image=None, dropped=True)
+            if self.dropped == 0:
+                log.warning("the disk is too slow for the recording: images of the zoom camera are left out")
+            self.dropped += 1
+        else:
+            self._changed.wait_for(lambda: not self._waiting or self._waiting + image.nbytes <= ROOM or self.failure)
+            self._waiting += image.nbytes
+        self._last[camera] = (t, image, picture)
+        return picture
+
+    def _work(self) -> None:
+        try:
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._queue or self._closing)
+                    if not self._queue:
+                        return
+                    event, picture = self._queue[0]
+                self._write(event, picture)
+                self._queue.popleft()  # only now, so that the queue holds whatever is not written yet
+        except (OSError, cv2.error) as error:
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error).strip()
+            log.warning("the recording ends here; it cannot be written: %s", reason)
+            self._fail(reason)
+        except BaseException as error:
+            self._fail(f"{type(error).__name__}: {error}")  # nobody may wait for a thread that is gone
+            raise
+
+    def _fail(self, reason: str) -> None:
+        with self._changed:
+            self.failure = reason
+            self._queue.clear()
+            self._changed.notify_all()
+
+    def _write(self, event: Event | dict[str, Any], picture: _Picture | None) -> None:
+        if picture is not None:
+            if picture.image is not None:
+                picture.size_bytes = self._write_image(picture.name, picture.image)
+                with self._changed:
+                    self._waiting -= picture.image.nbytes
+                    picture.image = None
+                    self._changed.notify_all()
+            if not picture.dropped:
+                assert isinstance(event, Event)
+                event = replace(event, image=picture.name, size_bytes=picture.size_bytes)
+        text = event_line(event) if isinstance(event, Event) else json.dumps(event, allow_nan=False)
+        self._log.write(text.encode() + b"\n")
+
+    def _write_image(self, name: str, image: Image) -> int:
+        """Write an image under its name only when it is complete; its size on disk [bytes]."""
+        data = cv2.imencode(".png", image, PNG_OPTIONS)[1].tobytes()
+        path = self._directory / name
+        part = path.with_suffix(".part")
+        part.write_bytes(data)
+        part.replace(path)
+        return len(data)
+
+
+# --- recordingrig ---
+
+T = TypeVar("T")
+
+
+class _Notebook:
+    """Where all of a rig's devices note their calls; the thread that opens it is the run's own."""
+
+    def __init__(self, clock: Clock, writer: RecordWriter) -> None:
+        self._clock, self._writer, self._thread = clock, writer, threading.get_ident()
+
+    def ask(
+        self, call: str, args: tuple[Number, ...], answer: Callable[[], T], numbers: Callable[[T], tuple[Number, ...]]
+    ) -> T:
+        """Call and note what came of it."""
+        return self._ask(call, args, answer, lambda given: (numbers(given), "", None))
+
+    def look(self, call: str, camera: str, args: tuple[Number, ...], answer: Callable[[], Frame]) -> Frame:
+        """Ask for a frame and note it with its image."""
+        return self._ask(call, args, answer, lambda frame: ((frame.t,), camera, frame))
+
+    def _ask(
+        self,
+        call: str,
+        args: tuple[Number, ...],
+        answer: Callable[[], T],
+        parts: Callable[[T], tuple[tuple[Number, ...], str, Frame | None]],
+    ) -> T:
+        aside = threading.get_ident() != self._thread
+        if aside and call == "clock.now":  # a watchdog asks for it all the time
+            return answer()
+        try:
+            given = answer()
+        except Exception as error:
+            failure = (type(error).__name__, str(error))
+            self._writer.put(Event(call, self._clock.now(), args, error=failure, aside=aside))
+            raise
+        result, camera, frame = parts(given)
+        at = float(result[0] or 0.0) if call == "clock.now" else self._clock.now()
+        event = Event(call, at, args, result, aside=aside)
+        self._writer.put(event, camera, None if frame is None else frame.image)
+        return given
+
+
+class _Camera:
+    def __init__(self, camera: Camera, notes: _Notebook, name: str) -> None:
+        self._camera, self._notes, self._name = camera, notes, name
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self._camera.size
+
+    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
+        args = (newer_than, timeout)
+        return self._notes.look(f"{self._name}.read", self._name, args, lambda: self._camera.read(newer_than, timeout))
+
+
+class _ZoomCamera(_Camera):
+    def __init__(self, camera: ZoomCamera, notes: _Notebook) -> None:
+        super().__init__(camera, notes, ZOOM)
+        self._lens = camera
+
+    @property
+    def still_size(self) -> tuple[int, int]:
+        return self._lens.still_size
+
+    @property
+    def focal_range(self) -> tuple[float, float]:
+        return self._lens.focal_range
+
+    def zoom(self, focal_px: float) -> float:
+        return self._notes.ask("zoom.zoom", (focal_px,), lambda: self._lens.zoom(focal_px), lambda reached: (reached,))
+
+    def state(self) -> ZoomState:
+        return self._notes.ask(
+            "zoom.state", (), self._lens.state, lambda state: (state.focal_px, state.moving, state.t)
+        )
+
+    def capture(self) -> Frame:
+        return self._notes.look("zoom.capture", ZOOM, (), self._lens.capture)
+
+
+class _Head:
+    def __init__(self, head: PanTilt, notes: _Notebook) -> None:
+        self._head, self._notes = head, notes
+
+    @property
+    def limits(self) -> PanTiltLimits:
+        return self._head.limits
+
+    def state(self) -> PanTiltState:
+        return self._notes.ask(
+            "head.state", (), self._head.state, lambda state: (state.pan, state.tilt, state.moving, state.t)
+        )
+
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
+        args = move_args(pan, tilt, speed, wait)
+        return self._notes.ask("head.move", args, lambda: self._head.move(pan, tilt, speed, wait), lambda both: both)
+
+    def halt(self) -> None:
+        self._notes.ask("head.halt", (), self._head.halt, lambda _: ())
+
+
+class _Clock:
+    def __init__(self, clock: Clock, notes: _Notebook) -> None:
+        self._clock, self._notes = clock, notes
+
+    def now(self) -> float:
+        return self._notes.ask("clock.now", (), self._clock.now, lambda t: (t,))
+
+    def sleep_until(self, t: float) -> None:
+        self._notes.ask("clock.sleep_until", (t,), lambda: self._clock.sleep_until(t), lambda _: ())
+
+
+class _Board:
+    def __init__(self, board: Board, notes: _Notebook) -> None:
+        self._board, self._notes = board, notes
+
+    @property
+    def patience(self) -> float:
+        return self._board.patience
+
+    def present(self, T_fixed_board: RigidTransform | None) -> None:
+        args = () if T_fixed_board is None else _numbers(T_fixed_board)
+        self._notes.ask("board.present", args, lambda: self._board.present(T_fixed_board), lambda _: ())
+
+    def swing(self, T_fixed_board: RigidTransform) -> None:
+        args = _numbers(T_fixed_board)
+        self._notes.ask("board.swing", args, lambda: self._board.swing(T_fixed_board), lambda _: ())
+
+
+def _numbers(T: RigidTransform) -> tuple[float, ...]:
+    return tuple(float(v) for v in (*T.translation, *T.rotation.as_rotvec()))
+
+
+class RecordingRig:
+    """Any rig, with everything noted that is asked of its devices and what they answer.
+
+    It belongs below the safety layer, next to the devices, so that what is noted is what they really did.
+    """
+
+    def __init__(self, rig: Rig, writer: RecordWriter) -> None:
+        self._rig = rig
+        try:
+            zoom = rig.zoom
+            self.real_time = bool(getattr(rig, "real_time", False))
+            facts = RigFacts(
+                rig.fixed.size, zoom.size, zoom.still_size, zoom.focal_range, rig.head.limits, self.real_time
+            )
+            writer.put({"rig": facts_table(facts)})
+        except BaseException:
+            rig.close()
+            raise
+        notes = _Notebook(rig.clock, writer)
+        self.fixed: Camera = _Camera(rig.fixed, notes, FIXED)
+        self.zoom: ZoomCamera = _ZoomCamera(rig.zoom, notes)
+        self.head: PanTilt = _Head(rig.head, notes)
+        self.clock: Clock = _Clock(rig.clock, notes)
+        self.board: Board = _Board(rig.board, notes)
+
+    def close(self) -> None:
+        """Close the rig, which halts its head."""
+        self._rig.close()
+
+    def __enter__(self) -> "RecordingRig":
+        """Give the rig itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Halt, then close."""
+        self.close()
+
+
+COLUMNS = (
+    "index", "t_s", "t_fixed_s", "t_zoom_s", "state", "reason", "track", "u_px", "v_px", "width_px", "height_px",
+    "depth_m", "range_m", "pan_commanded_deg", "tilt_commanded_deg", "focal_commanded_px", "pan_deg", "tilt_deg",
+    "focal_px",
+)  # fmt: skip
+
+
+class StepTable:
+    """A table of Steps, one line each; appears under its name only when complete. A context manager."""
+
+    def __init__(self, path: Path | None, *, keep: bool = False) -> None:
+        """Prepare to write to ``path``, or nowhere.
+
+        Args:
+            path: the file.
+            keep: whether the Steps so far are kept where the block ends in an error.
+
+        Raises:
+            ConfigError: the file cannot be written.
+        """
+        self._file = None if path is None else CsvFile(path, COLUMNS, keep=keep)
+
+    def write(self, step: Step) -> None:
+        """Append a line.
+
+        Raises:
+            ConfigError: the disk is full.
+        """
+        if self._file is None:
+            return
+        track, aim, (pan, tilt, focal) = step.target, step.aim, step.commanded
+        box = ["", "", "", "", ""] if track is None else [track.id, *track.center_px, *track.size_px]
+        row = (
+            [step.index, step.t, step.fixed.t, step.zoom.t, step.state, step.reason, *box]
+            + (["", ""] if aim is None else [aim.depth, aim.range])
+            + [math.degrees(pan), math.degrees(tilt), focal]
+            + [math.degrees(step.head.pan), math.degrees(step.head.tilt), step.lens.focal_px]
+        )
+        self._file.write(cell + 0.0 if isinstance(cell, float) else cell for cell in row)  # no -0.0
+
+    def __enter__(self) -> "StepTable":
+        """Give the table itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Complete the file and give it its name; after an error, remove it or keep what there is.
+
+        Raises:
+            ConfigError: the file could not be completed, as on a full disk.
+        """
+        if self._file is not None:
+            self._file.__exit__(kind, error, trace)
+
+
+class Recorder:
+    """Records a run into a folder, so that `cotarget.recording.replay` can open it as a rig. A context manager.
+
+    Wrap the rig below the safety layer and close it before the recorder:
+
+        with Recorder(folder, config, calibration, target) as recorder:
+            with SafeRig(recorder.wrap(open_rig(config)), config.safety) as rig:
+                ...
+    """
+
+    def __init__(
+        self, directory: Path, config: RigConfig, calibration: Path, target: str, whom: Whom = ANYBODY
+    ) -> None:
+        """Make the folder and write down what the run begins with.
+
+        Args:
+            directory: the recording's; it must not exist yet, or be empty.
+            config: of the rig; passwords in it are not recorded.
+            calibration: calibration.json, of which the recording gets a copy.
+            target: name of the target that will be followed.
+            whom: which one, where there are several.
+
+        Raises:
+            ConfigError: the folder is not empty, something cannot be read or written, or there is no such target.
+        """
+        self._directory = directory
+        self._wrapped = False
+        try:
+            self._made = not directory.exists()
+            directory.mkdir(parents=True, exist_ok=True)
+            if any(directory.iterdir()):
+                raise ConfigError(f"{directory}: is not empty; give a new folder for the recording")
+        except OSError as error:
+            raise ConfigError(f"{directory}: cannot hold a recording: {error.strerror}") from None
+        try:
+            self._write_beginning(config, calibration, target, whom)
+            self._writer = RecordWriter(directory)
+        except BaseException as error:
+            self._remove()
+            if isinstance(error, OSError):
+                raise ConfigError(f"{error.filename or directory}: cannot be recorded: {error.strerror}") from None
+            raise
+
+    @property
+    def dropped(self) -> int:
+        """Images of the zoom camera that were left out so far, because the disk was too slow."""
+        return self._writer.dropped
+
+    @property
+    def waiting(self) -> int:
+        """Answers of the rig that are still on their way to the disk; a crash would lose these and no others."""
+        return self._writer.waiting
+
+    def wrap(self, rig: Rig) -> Rig:
+        """Give a rig that records; one a recording. The rig is closed with it, and at once if this fails."""
+        assert not self._wrapped, "a recording is of one rig"
+        self._wrapped = True
+        return RecordingRig(rig, self._writer)
+
+    def __enter__(self) -> "Recorder":
+        """Give the recorder itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Write what still waits and how the run ended; remove a recording of a rig that was never opened.
+
+        Raises:
+            CotargetError: the recording is not complete, as on a full disk.
+        """
+        ending = COMPLETE if kind is None else f"{kind.__name__}: {error}".removesuffix(": ")
+        self._writer.put({"end": ending, "dropped": self._writer.dropped})
+        self._writer.close()
+        if not self._wrapped:
+            self._remove()
+        elif self._writer.failure and kind is None:
+            raise CotargetError(f"{self._directory}: the recording is cut short: {self._writer.failure}")
+
+    def _write_beginning(self, config: RigConfig, calibration: Path, target: str, whom: Whom) -> None:
+        chosen = config.target(target)
+        if chosen.template is not None:
+            copy = TEMPLATE + chosen.template.suffix
+            (self._directory / copy).write_bytes(chosen.template.read_bytes())
+            chosen = dataclasses.replace(chosen, template=Path(copy))
+        # By hand: where the disk is full shutil's copy blames the file that it reads.
+        (self._directory / CALIBRATION).write_bytes(calibration.read_bytes())
+        table = {
+            "schema": SCHEMA,
+            "cotarget": version("cotarget"),
+            "python": platform.python_version(),
+            "machine": platform.machine(),
+            "opencv": cv2.__version__,
+            "numpy": np.__version__,
+            "when": datetime.now(UTC).isoformat(timespec="seconds"),
+            "target": target,
+            "whom": whom_table(whom),
+            "config": config_table(dataclasses.replace(config, targets={**config.targets, target: chosen})),
+        }
+        part = self._directory / f"{META}.part"
+        part.write_text(json.dumps(table, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        part.replace(self._directory / META)
+
+    def _remove(self) -> None:
+        """Take away what was made: nothing in it can be replayed, and it would be in the way of the next try."""
+        for folder in (FIXED, ZOOM):
+            with contextlib.suppress(OSError):
+                (self._directory / folder).rmdir()
+        for path in self._directory.iterdir():
+            if path.name in (META, f"{META}.part", LOG, CALIBRATION) or path.stem == TEMPLATE:
+                path.unlink(missing_ok=True)
+        if self._made:
+            with contextlib.suppress(OSError):
+                self._directory.rmdir()

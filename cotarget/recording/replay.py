@@ -1,0 +1,532 @@
+"""Opens a recording as a rig: the same cameras, lens, head and clock again, without the devices.
+
+What is commanded moves nothing: it is compared with what was commanded then, and the head goes where it went.
+
+What was recorded, dealt out again: call by call as long as the run asks the same, by time where it does not.
+
+A run that is what it was when it was recorded asks the same calls in the same order and gets the very same answers, so
+it does the same to the last bit. Where it has changed, the frames of the fixed camera still come one after the other,
+each with what was asked between it and the next; whatever else is asked gets what was so at that time.
+"""
+
+import math
+import threading
+from collections import defaultdict, deque
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+import cotarget.errors
+from cotarget.errors import CotargetError, DeviceError, StaleFrameError
+from cotarget.geometry import RigidTransform
+from cotarget.recording.format import COMPLETE, Event, Recording, move_args
+from cotarget.rig import (
+    Board,
+    Camera,
+    Clock,
+    Frame,
+    Image,
+    PanTilt,
+    PanTiltLimits,
+    PanTiltState,
+    Speed,
+    ZoomCamera,
+    ZoomState,
+)
+
+COMMANDS = ("head.move", "zoom.zoom", "head.halt")
+
+
+class RecordingEndedError(CotargetError):
+    """The recording holds nothing beyond this; every replay ends with it."""
+
+
+@dataclass(frozen=True)
+class Differences:
+    """How a replay's commands differ from those that were recorded.
+
+    Attributes:
+        moves: of the head, that were compared.
+        moves_differing: of them.
+        largest_deg: difference of pan or tilt between them [degrees].
+        zooms: of the lens, that were compared.
+        zooms_differing: of them.
+        largest_px: difference of focal length between them [px].
+        missing: commands that were given then and not now, between the same two frames.
+        extra: moves of head and lens that were given now and not then.
+        frames: of the fixed camera, up to the newest.
+        frames_differing: of them, after which another command was given, or one more, or one less.
+        first_frame: the picture's number of the first of those; None where there is none.
+        first_s: when it came, from the beginning of the recording [s].
+    """
+
+    moves: int = 0
+    moves_differing: int = 0
+    largest_deg: float = 0.0
+    zooms: int = 0
+    zooms_differing: int = 0
+    largest_px: float = 0.0
+    missing: int = 0
+    extra: int = 0
+    frames: int = 0
+    frames_differing: int = 0
+    first_frame: int | None = None
+    first_s: float | None = None
+
+    @property
+    def same(self) -> bool:
+        """Whether the replay commanded exactly what was commanded then."""
+        return not (self.moves_differing or self.zooms_differing or self.missing or self.extra)
+
+    def __str__(self) -> str:
+        """Say it in one line."""
+        if self.same:
+            return f"all {self.moves + self.zooms} commands as recorded"
+        since = "" if self.first_frame is None else f", from frame {self.first_frame} ({self.first_s:.2f} s) on"
+        return (
+            f"the commands of {self.frames_differing} of {self.frames} frames differ from those recorded{since}: "
+            f"{self.moves_differing} of {self.moves} moves differ, by {self.largest_deg:.3g} degrees at most; "
+            f"{self.zooms_differing} of {self.zooms} focal lengths, by {self.largest_px:.3g} px at most; "
+            f"{self.missing} commands missing, {self.extra} more"
+        )
+
+
+class _Span:
+    """What was asked from one frame of the fixed camera to the next, each kind of call in its order.
+
+    A look at the clock was between two other calls; it is given again only there. So a run that looks more often or
+    less often than the recorded one has the right time again as soon as it asks for something else.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[str, deque[tuple[int, Event]]] = defaultdict(deque)
+        self._size = 0
+        self._progress = 0  # behind the furthest of the other calls that was given again
+
+    def add(self, event: Event) -> None:
+        """Append a call."""
+        self._waiting[event.call].append((self._size, event))
+        self._size += event.call != "clock.now"
+
+    def take(self, call: str) -> Event | None:
+        """The next event of a call, if there is one and it is its turn."""
+        waiting, looks = self._waiting[call], self._waiting["clock.now"]
+        if not waiting or (call == "clock.now" and waiting[0][0] > self._progress):
+            return None
+        place, event = waiting.popleft()
+        if call != "clock.now":
+            self._progress = max(self._progress, place + 1)
+            while looks and looks[0][0] <= place:
+                looks.popleft()
+        return event
+
+    def left(self, call: str) -> int:
+        """How many events of a call were not taken."""
+        return len(self._waiting[call])
+
+    def forget(self, call: str) -> None:
+        """Take all events of a call."""
+        self._waiting[call].clear()
+
+
+class Tape:
+    """A recording that runs.
+
+    Attributes:
+        now: the replay's clock [s].
+        differences: between the commands so far and those recorded; those recorded after the newest frame are not
+            missed yet.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._spans, self._frames = _cut(recording.events)
+        self._differing: set[int] = set()  # places of those frames,
+        self._first: int | None = None  # and the first of them
+        self._broke_off = not recording.truncated and recording.ending != COMPLETE
+        self._index = 0
+        self._ended = False
+        self._thread = threading.get_ident()
+        self.differences = Differences()
+        self.now = recording.events[0].at if recording.events else 0.0
+
+    @property
+    def is_aside(self) -> bool:
+        """Whether another thread than the run's own asks, such as a watchdog; it has what is so at this time."""
+        return threading.get_ident() != self._thread
+
+    @property
+    def _breaks_off(self) -> bool:
+        """Whether the run was ended by an error after the newest frame, so that nothing is known of what followed."""
+        return self._broke_off and self._index == len(self._spans) - 1
+
+    def take(self, call: str) -> Event | None:
+        """The recorded event of a call that the run asked then too, between the same two frames; else None.
+
+        Raises:
+            RecordingEndedError: the run broke off before it.
+        """
+        if self.is_aside:
+            return None
+        span = self._spans[self._index]
+        event = span.take(call)
+        if event is None and self._breaks_off and not span.left(call) and not self._ended and call not in COMMANDS:
+            raise self._end()
+        return event
+
+    def play(self, event: Event) -> Event:
+        """Let the time of an event come, and its error.
+
+        Raises:
+            CotargetError: as recorded.
+        """
+        self.pass_to(event.at)
+        if event.error is not None:
+            raise _recorded_error(*event.error)
+        return event
+
+    def answer(self, call: str) -> Event | None:
+        """Take an event and play it, where there is one."""
+        event = self.take(call)
+        return None if event is None else self.play(event)
+
+    def next_frame(self, newer_than: float | None, timeout: float) -> Event:
+        """The next frame of the fixed camera; the newest at this time, where the replay has fallen behind.
+
+        Args:
+            newer_than: exposed after this time [s].
+            timeout: how long to wait [s].
+
+        Raises:
+            RecordingEndedError: there are no more.
+            DeviceError: no such frame came within ``timeout``.
+            CotargetError: as recorded.
+        """
+        for index in range(self._index + 1, len(self._spans)):
+            frame, following = self._frames[index - 1], self._frames[index : index + 1]
+            overtaken = bool(following) and following[0].at < self.now
+            too_old = newer_than is not None and frame.error is None and time_of(frame) <= newer_than
+            if frame.error is not None or not (overtaken or too_old):
+                break
+        else:
+            self._miss(range(self._index, len(self._spans)))
+            raise self._end()
+        if frame.args != (newer_than, timeout) and frame.at > self.now + timeout:
+            self.now += timeout
+            raise StaleFrameError(f"no frame within {timeout:g} s")
+        self._miss(range(self._index, index))
+        self._index = index
+        self.differences = replace(self.differences, frames=index)
+        return self.play(frame)
+
+    def compare(self, call: str, recorded: Event | None, args: Sequence[float | bool | None]) -> None:
+        """Count a command, and by how much it differs from the one recorded."""
+        if self.is_aside:
+            return
+        counts = self.differences
+        if recorded is None:
+            if not (self._ended or self._breaks_off):
+                self.differences = replace(counts, extra=counts.extra + 1)
+                self._note(self._index)
+            return
+        differs = tuple(args) != recorded.args
+        axes = 2 if call == "head.move" else 1
+        pairs = zip(recorded.args[:axes], args[:axes], strict=True)
+        off = max(abs(float(now or 0.0) - float(then or 0.0)) for then, now in pairs)
+        if call == "head.move":
+            self.differences = replace(
+                counts,
+                moves=counts.moves + 1,
+                moves_differing=counts.moves_differing + differs,
+                largest_deg=max(counts.largest_deg, math.degrees(off)),
+            )
+        else:
+            self.differences = replace(
+                counts,
+                zooms=counts.zooms + 1,
+                zooms_differing=counts.zooms_differing + differs,
+                largest_px=max(counts.largest_px, off),
+            )
+        if differs:
+            self._note(self._index)
+
+    def pass_to(self, t: float) -> None:
+        """Let the clock show at least ``t`` [s]."""
+        self.now = max(self.now, t)
+
+    def _miss(self, over: range) -> None:
+        """Count the commands of spans that are over; the last one's halts are not due before the rig is closed."""
+        for index in over:
+            span = self._spans[index]
+            due = COMMANDS[:-1] if span is self._spans[-1] else COMMANDS
+            missing = sum(span.left(call) for call in due)
+            for call in due:
+                span.forget(call)
+            if missing:
+                self.differences = replace(self.differences, missing=self.differences.missing + missing)
+                self._note(index)
+
+    def _note(self, index: int) -> None:
+        """Count the frame that a span begins with; what is asked before the first frame is counted to it."""
+        place = max(index - 1, 0)
+        self._differing.add(place)
+        found = replace(self.differences, frames_differing=len(self._differing))
+        if self._frames and (self._first is None or place < self._first):
+            self._first = place
+            frame, number = self._frames[place], sum(each.image is not None for each in self._frames[:place])
+            if frame.image is not None:
+                number = int(Path(frame.image).stem)
+            found = replace(found, first_frame=number, first_s=frame.at - self._recording.events[0].at)
+        self.differences = found
+
+    def _end(self) -> RecordingEndedError:
+        self._ended = True
+        return RecordingEndedError(f"{self._recording.directory}: the recording ends here, at {self.now:.2f} s")
+
+
+def time_of(frame: Event) -> float:
+    """When a frame was exposed [s]."""
+    return float(frame.result[0] or 0.0)
+
+
+def _cut(events: Sequence[Event]) -> tuple[list[_Span], list[Event]]:
+    """Spans from frame to frame, the first before any, and the frames; other threads' calls are left out."""
+    spans, frames = [_Span()], []
+    for event in events:
+        if event.aside:
+            continue
+        if event.call == "fixed.read":
+            spans.append(_Span())
+            frames.append(event)
+        else:
+            spans[-1].add(event)
+    return spans, frames
+
+
+def _recorded_error(name: str, message: str) -> CotargetError:
+    """The exception that was raised then; one that is not cotarget's own is a device's failure."""
+    kind = getattr(cotarget.errors, name, None)
+    if isinstance(kind, type) and issubclass(kind, CotargetError):
+        return kind(message)
+    return DeviceError(f"{name}: {message}")
+
+
+T = TypeVar("T")
+
+
+def until_end(steps: Iterable[T]) -> Iterator[T]:
+    """Pass on what a run on a `ReplayRig` yields, until the recording ends."""
+    with suppress(RecordingEndedError):
+        yield from steps
+
+
+class _Camera:
+    """What both cameras share: frames from files, the same object for the same frame."""
+
+    def __init__(self, tape: Tape, directory: Path, size: tuple[int, int]) -> None:
+        self._tape, self._directory, self._size = tape, directory, size
+        self._newest: tuple[str, Image] | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self._size
+
+    def _frame(self, event: Event, name: str | None) -> Frame:
+        if name is None:
+            image: Image = np.zeros((self._size[1], self._size[0], 3), np.uint8)
+        elif self._newest is not None and self._newest[0] == name:
+            image = self._newest[1]
+        else:
+            read = cv2.imread(str(self._directory / name), cv2.IMREAD_COLOR)
+            if read is None:
+                raise DeviceError(f"{self._directory / name}: is damaged, so the replay ends here")
+            image = np.asarray(read, dtype=np.uint8)
+            image.flags.writeable = False
+            self._newest = (name, image)
+        return Frame(image, time_of(event))
+
+
+class _FixedCamera(_Camera):
+    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
+        event = self._tape.next_frame(newer_than, timeout)
+        return self._frame(event, event.image)
+
+
+class _ZoomCamera(_Camera):
+    def __init__(self, tape: Tape, recording: Recording) -> None:
+        super().__init__(tape, recording.directory, recording.facts.zoom_size)
+        self._facts = recording.facts
+        self._frames = [e for e in recording.events if e.call == "zoom.read" and e.error is None]
+        self._kept = [e for e in self._frames if e.image is not None]
+        states = [e for e in recording.events if e.call == "zoom.state" and e.error is None]
+        self._states = _Track(states)
+
+    @property
+    def still_size(self) -> tuple[int, int]:
+        return self._facts.still_size
+
+    @property
+    def focal_range(self) -> tuple[float, float]:
+        return self._facts.focal_range
+
+    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
+        event = self._tape.answer("zoom.read")
+        if event is None or (newer_than is not None and time_of(event) <= newer_than):
+            event = self._by_time(newer_than, timeout)
+        return self._frame(event, event.image or self._stand_in(event))
+
+    def capture(self) -> Frame:
+        event = self._tape.answer("zoom.capture") or self._by_time(None, 1.0)
+        return self._frame(event, event.image or self._stand_in(event))
+
+    def zoom(self, focal_px: float) -> float:
+        recorded = self._tape.take("zoom.zoom")
+        self._tape.compare("zoom.zoom", recorded, (focal_px,))
+        if recorded is not None:
+            self._tape.play(recorded)
+            if recorded.args == (focal_px,):
+                return float(recorded.result[0] or 0.0)
+        if not 0 < focal_px < math.inf:
+            raise DeviceError(f"the lens cannot go to a focal length of {focal_px} px")
+        return min(max(focal_px, self.focal_range[0]), self.focal_range[1])
+
+    def state(self) -> ZoomState:
+        event = self._tape.answer("zoom.state")
+        if event is None:
+            (focal,), moving = self._states.at(self._tape.now, "lens")
+            return ZoomState(focal, moving, self._tape.now)
+        then = event.result
+        return ZoomState(float(then[0] or 0.0), bool(then[1]), float(then[2] or 0.0))
+
+    def _by_time(self, newer_than: float | None, timeout: float) -> Event:
+        """The newest frame that had been read by now, or the first that was within ``timeout``."""
+        fresh = [e for e in self._frames if newer_than is None or time_of(e) > newer_than]
+        if before := [e for e in fresh if e.at <= self._tape.now]:
+            return before[-1]
+        if fresh and fresh[0].at <= self._tape.now + timeout:
+            self._tape.pass_to(fresh[0].at)
+            return fresh[0]
+        self._tape.pass_to(self._tape.now + timeout)
+        raise StaleFrameError(f"no frame of the zoom camera within {timeout:g} s")
+
+    def _stand_in(self, event: Event) -> str | None:
+        """The image of the last frame before that has one."""
+        before = [e.image for e in self._kept if e.at <= event.at]
+        return before[-1] if before else None
+
+
+class _Head:
+    def __init__(self, tape: Tape, recording: Recording) -> None:
+        self._tape, self._limits = tape, recording.facts.limits
+        self._states = _Track([e for e in recording.events if e.call == "head.state" and e.error is None])
+
+    @property
+    def limits(self) -> PanTiltLimits:
+        return self._limits
+
+    def state(self) -> PanTiltState:
+        event = self._tape.answer("head.state")
+        if event is None:
+            (pan, tilt), moving = self._states.at(self._tape.now, "head")
+            return PanTiltState(pan, tilt, moving, self._tape.now)
+        then = event.result
+        return PanTiltState(float(then[0] or 0.0), float(then[1] or 0.0), bool(then[2]), float(then[3] or 0.0))
+
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
+        recorded = self._tape.take("head.move")
+        args = move_args(pan, tilt, speed, wait)
+        self._tape.compare("head.move", recorded, args)
+        if recorded is not None:
+            self._tape.play(recorded)
+            if recorded.args == args:
+                return float(recorded.result[0] or 0.0), float(recorded.result[1] or 0.0)
+        if not (math.isfinite(pan) and math.isfinite(tilt)):
+            raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
+        return self._possible(pan, self._limits.pan), self._possible(tilt, self._limits.tilt)
+
+    def halt(self) -> None:
+        self._tape.answer("head.halt")
+
+    def _possible(self, angle: float, limits: tuple[float, float]) -> float:
+        step = self._limits.step
+        low, high = limits
+        if step <= 0:
+            return min(max(angle, low), high)
+        return min(max(round(angle / step), math.ceil(low / step)), math.floor(high / step)) * step
+
+
+class _Clock:
+    def __init__(self, tape: Tape) -> None:
+        self._tape = tape
+
+    def now(self) -> float:
+        event = self._tape.answer("clock.now")
+        return self._tape.now if event is None else float(event.result[0] or 0.0)
+
+    def sleep_until(self, t: float) -> None:
+        if self._tape.answer("clock.sleep_until") is None and not self._tape.is_aside:
+            self._tape.pass_to(t)
+
+
+class _Board:
+    patience = 0.0
+
+    def present(self, T_fixed_board: RigidTransform | None) -> None:
+        """Nothing to do: whatever was wished for is in the pictures."""
+
+    def swing(self, T_fixed_board: RigidTransform) -> None:
+        """Nothing to do."""
+
+
+class _Track:
+    """States of a device over time: numbers, whether it moved, and the time, as they were recorded."""
+
+    def __init__(self, events: Sequence[Event]) -> None:
+        rows = np.array([[float(value or 0.0) for value in e.result] for e in events], dtype=float)
+        self._rows = rows[np.argsort(rows[:, -1], kind="stable")] if len(rows) else rows
+
+    def at(self, t: float, device: str) -> tuple[list[float], bool]:
+        """The numbers at a time [s], between two states on the straight line, and whether it moved."""
+        if not len(self._rows):
+            raise DeviceError(f"the recording holds no state of the {device}")
+        times = self._rows[:, -1]
+        before = max(int(np.searchsorted(times, t, side="right")) - 1, 0)
+        values = [float(np.interp(t, times, column)) for column in self._rows[:, :-2].T]
+        return values, bool(self._rows[before, -2])
+
+
+class ReplayRig:
+    """A recording as a rig; wrap it as the recorded rig was wrapped. This module's docstring says what it answers."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._tape = Tape(recording)
+        self.real_time = recording.facts.real_time
+        self.fixed: Camera = _FixedCamera(self._tape, recording.directory, recording.facts.fixed_size)
+        self.zoom: ZoomCamera = _ZoomCamera(self._tape, recording)
+        self.head: PanTilt = _Head(self._tape, recording)
+        self.clock: Clock = _Clock(self._tape)
+        self.board: Board = _Board()
+
+    @property
+    def differences(self) -> Differences:
+        """Between the commands so far and those recorded."""
+        return self._tape.differences
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def __enter__(self) -> "ReplayRig":
+        """Give the rig itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close."""
+        self.close()

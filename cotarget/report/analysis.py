@@ -1,0 +1,542 @@
+"""What the stored corners say: residuals, where they were seen, how far away the boards were and how they were held.
+
+The zoom lens over its focal lengths, with the standard deviation of every curve.
+
+What a calibration predicts of its own pointing, all over the wide view, and which parameters that comes from.
+"""
+
+import itertools
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from cotarget.board import board_points
+from cotarget.calibration.bundle import (
+    EVERY_BLOCK,
+    POSE_PARAMETERS,
+    Fit,
+    fit,
+    parameter_names,
+    predict_pixels,
+    robust_sigma,
+    stepped,
+)
+from cotarget.calibration.calibrate import tells_pose
+from cotarget.calibration.initialization import place_boards
+from cotarget.calibration.model import Calibration, CameraName, Covariance, View, stop_of
+from cotarget.calibration.observability import name_directions, weak_directions
+from cotarget.calibration.uncertainty import STEP, miss_derivatives, model_of, predicted_pointing
+from cotarget.camera import ZoomLens
+from cotarget.errors import CalibrationError
+from cotarget.geometry import Array
+
+POINTS = 61
+# What is drawn: true over nominal focal length, principal point [px], the image's distortion, the pupil [mm].
+CURVES = ("ratio_x", "ratio_y", "cx", "cy", "kappa1", "pupil_mm")
+
+
+@dataclass(frozen=True, eq=False)
+class LensCurves:
+    """Curves over the nominal focal length.
+
+    Attributes:
+        nominal_px: where they are evaluated, (n,) [px].
+        stops_px: the stops' own nominal focal lengths [px].
+        values: by the names of `CURVES`, (n,) each.
+        sigmas: likewise; empty without a covariance.
+        at_stops: the values at the stops themselves.
+    """
+
+    nominal_px: Array
+    stops_px: tuple[float, ...]
+    values: dict[str, Array]
+    sigmas: dict[str, Array]
+    at_stops: dict[str, Array]
+
+
+def lens_curves(calibration: Calibration) -> LensCurves:
+    """Evaluate the zoom lens between its stops.
+
+    Standard deviations are by linear propagation of the covariance, and of what is in doubt between stops.
+    """
+    lens = calibration.zoom
+    nominal = np.geomspace(lens.nominal_px[0], lens.nominal_px[-1], POINTS)
+    return LensCurves(
+        nominal,
+        lens.nominal_px,
+        dict(zip(CURVES, _evaluate(lens, nominal), strict=True)),
+        _sigmas(calibration, nominal),
+        dict(zip(CURVES, _evaluate(lens, np.array(lens.nominal_px)), strict=True)),
+    )
+
+
+def _evaluate(lens: ZoomLens, nominal_px: Array) -> Array:
+    """All curves, (6, n)."""
+    rows = []
+    for nominal in nominal_px:
+        here = lens.at(float(nominal))
+        (fx, fy), (cx, cy) = here.focal_px, here.center_px
+        kappa1 = here.distortion[0] * (lens.nominal_px[0] / nominal) ** 2
+        rows.append([fx / nominal, fy / nominal, cx, cy, kappa1, 1000 * lens.pupil_at(float(nominal))])
+    return np.array(rows).T
+
+
+def _sigmas(calibration: Calibration, nominal_px: Array) -> dict[str, Array]:
+    covariance = calibration.covariance
+    if covariance is None:
+        return {}
+    model = model_of(calibration)
+    known = parameter_names(EVERY_BLOCK, model.stops)
+    own = [i for i, name in enumerate(covariance.parameters) if name.startswith("zoom[")]
+    columns = []
+    for i in own:
+        step = np.zeros(len(known))
+        step[known.index(covariance.parameters[i])] = STEP
+        ends = [stepped(model, s, np.empty((0, POSE_PARAMETERS)), EVERY_BLOCK).zoom for s in (step, -step)]
+        plus, minus = (_evaluate(lens, nominal_px) for lens in ends if lens is not None)
+        columns.append((plus - minus) / (2 * STEP))
+    J = np.array(columns)  # (parameters, 6, n)
+    variance = np.einsum("pcn,pq,qcn->cn", J, covariance.matrix[np.ix_(own, own)], J)
+    sigmas = dict(zip(CURVES, np.sqrt(np.maximum(variance, 0.0)), strict=True))
+    doubt = np.array([calibration.zoom.center_doubt_px(float(n)) for n in nominal_px])
+    return sigmas | {name: np.hypot(sigmas[name], doubt[:, i]) for i, name in enumerate(("cx", "cy"))}
+
+
+# --- pointing ---
+
+DEPTHS = (4.0, 30.0)  # where targets are [m]
+POINTING_CELLS = (9, 7)  # across and down the wide view, at whose middles pointing is predicted
+DEPTH_STEPS = 5
+FARTHER = 1.1  # times the longest focal length calibrated, up to which a lens may go without a word
+MORE_PLACEMENTS = 10  # of which people are told what they would bring
+BETWEEN_STOPS = 4  # focal lengths to look at between the stops, shared out, but never fewer than one each
+# Groups of parameters in the order of the page: how people call them, and how their names begin.
+GROUPS = (
+    ("the fixed camera's lens", ("fixed.",)),
+    ("the zoom lens's pupil", ("zoom.pupil",)),
+    ("the zoom camera's lens", ("zoom.",)),
+    ("the offset between the cameras", ("T_zoom0_fixed.",)),
+    ("the zoom camera's place on the head", ("T_head_zoom.",)),
+    ("the encoders", ("head.pan_", "head.tilt_")),
+    ("the head's axes", ("head.",)),
+    ("the board's bend", ("board.",)),
+)
+JITTER_GROUP = "the head's jitter"
+
+
+@dataclass(frozen=True)
+class AtFocal:
+    """Pointing at one stop of the zoom lens, rms over the wide view and the depths.
+
+    Attributes:
+        nominal_px: the stop's nominal focal length [px].
+        focal_px: its true one, the mean of both directions [px].
+        rms: predicted angle [rad].
+    """
+
+    nominal_px: float
+    focal_px: float
+    rms: float
+
+    @property
+    def rms_px(self) -> float:
+        """The same in the zoom image, near its middle [px]."""
+        return float(np.tan(self.rms)) * self.focal_px
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """What one group of parameters adds to the error: the rms that would be left if it were known exactly [rad]."""
+
+    group: str
+    left: float
+
+
+def sample_pixels(calibration: Calibration, cells: tuple[int, int] = POINTING_CELLS) -> Array:
+    """Middles of cells all over the wide view, (n, 2) [px]."""
+    across, down = (
+        (np.arange(n) + 0.5) / n * side - 0.5 for n, side in zip(cells, calibration.fixed.size, strict=True)
+    )
+    return np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+
+
+def sample_depths(count: int = DEPTH_STEPS) -> Array:
+    """Depths from the nearest to the farthest target, evenly over their logarithm [m]."""
+    return np.geomspace(*DEPTHS, count)
+
+
+def sigma_of(calibration: Calibration, name: str) -> float | None:
+    """Standard deviation of a parameter; None where the calibration tells none."""
+    covariance = calibration.covariance
+    return covariance.sigma(name) if covariance is not None and name in covariance.parameters else None
+
+
+def uncalibrated_px(calibration: Calibration) -> float | None:
+    """The longest focal length of a lens that was not calibrated so far [px]; None where it was, or is not known."""
+    told = calibration.provenance.get("focal_range_px")
+    longest = told[-1] if isinstance(told, list) and told and isinstance(told[-1], int | float) else None
+    return longest if longest is not None and longest > calibration.zoom.nominal_px[-1] * FARTHER else None
+
+
+def can_point(calibration: Calibration) -> bool:
+    """Whether pointing can be predicted at all."""
+    return calibration.T_head_zoom is not None and calibration.covariance is not None
+
+
+def pointing(calibration: Calibration, nominal_px: Sequence[float] | None = None) -> tuple[AtFocal, ...]:
+    """Predict the pointing at focal lengths, by default at every stop of the zoom lens.
+
+    Returns:
+        One each; nan where the head reaches nothing; empty where nothing can be predicted.
+    """
+    if not can_point(calibration):
+        return ()
+    found = []
+    for nominal in calibration.zoom.nominal_px if nominal_px is None else nominal_px:
+        focal = float(np.mean(calibration.zoom.at(nominal).focal_px))
+        found.append(AtFocal(nominal, focal, _over_the_view(calibration, nominal)))
+    return tuple(found)
+
+
+def placements(calibration: Calibration) -> int:
+    """How many placements of the board are stored with a calibration."""
+    return len({view.board for view in calibration.views})
+
+
+def what_stays(calibration: Calibration, at: AtFocal) -> float:
+    """What placements take nothing from: the head's jitter, and what the zoom lens's stops leave in doubt [rad]."""
+    covariance = calibration.covariance
+    assert covariance is not None
+    known = replace(covariance, matrix=np.zeros_like(covariance.matrix))
+    return _over_the_view(replace(calibration, covariance=known), at.nominal_px)
+
+
+def with_more_placements(calibration: Calibration, at: AtFocal, more: int = MORE_PLACEMENTS) -> float:
+    """What the error would be with so many more placements of the same kind [rad].
+
+    Their part of it, the parameters' covariance, goes with 1 / placements.
+    """
+    here, stays2 = placements(calibration), what_stays(calibration, at) ** 2
+    return float(np.sqrt(stays2 + max(at.rms**2 - stays2, 0.0) * here / (here + more)))
+
+
+def between_stops(calibration: Calibration) -> list[float]:
+    """Nominal focal lengths between the stops of the zoom lens, where it is only interpolated [px]."""
+    stops = calibration.zoom.nominal_px
+    each = max(1, BETWEEN_STOPS // max(len(stops) - 1, 1))
+    return [float(n) for a, b in itertools.pairwise(stops) for n in np.geomspace(a, b, each + 2)[1:-1]]
+
+
+def _over_the_view(calibration: Calibration, nominal_px: float) -> float:
+    """Rms of the predicted angle over all pixels and depths that can be reached [rad]."""
+    pixels, depths = sample_pixels(calibration), sample_depths()
+    errors = predicted_pointing(calibration, pixels[None], depths[:, None], nominal_px=nominal_px)
+    reached = errors[np.isfinite(errors)]
+    return float(np.sqrt(np.mean(reached**2))) if len(reached) else np.nan
+
+
+def corner_errors(calibration: Calibration, nominal_px: float) -> tuple[float, dict[str, float]]:
+    """Predicted angle in the middle of the wide view, and by name in its corners that can be reached [rad].
+
+    Depths are those of `sample_depths`, rms over them.
+    """
+    right, bottom = np.array(calibration.fixed.size) - 1.0
+    places = {"upper left": (0.0, 0.0), "upper right": (right, 0.0), "lower left": (0.0, bottom)}
+    places |= {"lower right": (right, bottom)}
+    pixels = np.array([calibration.fixed.image_center_px, *places.values()])
+    errors = predicted_pointing(calibration, pixels[None], sample_depths()[:, None], nominal_px=nominal_px)
+    middle, *rms = np.sqrt(np.mean(errors**2, axis=0)).tolist()
+    return middle, {name: error for name, error in zip(places, rms, strict=True) if np.isfinite(error)}
+
+
+def group_of(parameter: str) -> str:
+    """The group that a parameter belongs to."""
+    owner, _, kind = parameter.rpartition(".")
+    plain = f"{owner.partition('[')[0]}.{kind}"
+    return next((name for name, begins in GROUPS if plain.startswith(begins)), parameter)
+
+
+def contributions(calibration: Calibration) -> tuple[Contribution, ...]:
+    """What each group adds to the error at the longest focal length, the largest first.
+
+    A group is taken as known exactly: what the others then leave, given it, is the conditional covariance. To clear
+    its rows instead would count what it shares with the others twice.
+    """
+    covariance = calibration.covariance
+    if not can_point(calibration) or covariance is None:
+        return ()
+    pixels, depths = sample_pixels(calibration), sample_depths()
+    by_parameter, by_turn = miss_derivatives(
+        model_of(calibration),
+        covariance.parameters,
+        np.tile(pixels, (len(depths), 1)),
+        np.repeat(depths, len(pixels)),
+        calibration.zoom.nominal_px[-1],
+    )
+    reached = np.isfinite(by_parameter).all(axis=(1, 2))
+    if not reached.any():
+        return ()
+    J, turned = by_parameter[reached], by_turn[reached]
+    weights = np.einsum("nik,nil->kl", J, J) / len(J)  # the mean of trace(J C J^T) is the sum of weights * C
+    turns = float(np.sum(turned**2)) / len(J)
+
+    def rms(matrix: Array, jitter: float) -> float:
+        return float(np.sqrt(max(np.sum(weights * matrix) + jitter**2 * turns, 0.0)))
+
+    found = []
+    for group in dict.fromkeys(group_of(name) for name in covariance.parameters):
+        known = np.array([group_of(name) == group for name in covariance.parameters])
+        found.append(Contribution(group, rms(given(covariance, known).matrix, calibration.jitter)))
+    if calibration.jitter:
+        found.append(Contribution(JITTER_GROUP, rms(covariance.matrix, 0.0)))
+    return tuple(sorted(found, key=lambda c: c.left))
+
+
+def given(covariance: Covariance, known: npt.NDArray[np.bool_]) -> Covariance:
+    """The covariance left when some parameters, (n,) booleans, are known exactly."""
+    C = covariance.matrix
+    scale = np.sqrt(np.maximum(np.diagonal(C), np.finfo(float).tiny))
+    R = C / np.outer(scale, scale)
+    rest = ~known
+    left = np.zeros_like(R)
+    through = R[np.ix_(rest, known)]
+    left[np.ix_(rest, rest)] = R[np.ix_(rest, rest)] - through @ np.linalg.pinv(R[np.ix_(known, known)]) @ through.T
+    return Covariance(covariance.parameters, left * np.outer(scale, scale))
+
+
+def undetermined(calibration: Calibration) -> str:
+    """Say what the covariance leaves undetermined, and what to add; empty where all is determined.
+
+    What captures kept out have widened it by is taken out: that tells of a model that is wrong, and no views mend it.
+    """
+    covariance, held_out = calibration.covariance, calibration.held_out
+    if covariance is None or not covariance.matrix.any():
+        return ""
+    focal = model_of(calibration).focal_px
+    matrix = covariance.matrix / (1.0 if held_out is None else held_out.widened**2)
+    normal = np.asarray(np.linalg.pinv(matrix, hermitian=True, rcond=np.finfo(float).tiny), dtype=float)
+    return name_directions(covariance.parameters, weak_directions(normal, covariance.parameters, 1.0, focal), focal)
+
+
+TITLES = {"fixed": "fixed camera", "zoom": "zoom camera"}
+
+
+log = logging.getLogger(__name__)
+CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
+CELLS = (16, 12)  # across and down an image, in which residuals are averaged
+FEWEST_IN_CELL = 5  # corners, below which an average says nothing
+BEYOND_CHANCE = 3.0  # standard deviations of an average of two coordinates, which chance exceeds at one cell in 90
+SHAPE_CHI2 = 16.3  # chi-square of three, which chance exceeds once in a thousand
+WRONG_SHARE = 0.1  # of a board's corners
+POINT_STEP = 1e-5  # [m]; pixels change by their derivatives, to rounding
+COVER = (10, 8)  # cells in which corners are counted, as the capture plan does
+# How the thirds of an image are called.
+ROWS, COLUMNS = ("upper", "", "lower"), ("left", "", "right")
+
+
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """All corners that one camera saw.
+
+    Attributes:
+        size: (width, height) of its image [px].
+        seen_px: where they were seen, (n, 2).
+        residuals: predicted minus seen [px], (n, 2); what the head's jitter explains is taken out.
+    """
+
+    size: tuple[int, int]
+    seen_px: Array
+    residuals: Array
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of a coordinate of the residuals, told by their median [px]."""
+        return robust_sigma(self.residuals) if len(self.residuals) else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Residuals averaged over the cells of an image; nan where a cell has too few.
+
+    Attributes:
+        middles: of the corners in the cell [px], (cells, 2).
+        means: [px], (cells, 2).
+        beyond_chance: which averages are larger than noise alone makes them, (cells,).
+    """
+
+    middles: Array
+    means: Array
+    beyond_chance: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class BoardShape:
+    """How the board departs from what everybody believes, told by the residuals.
+
+    Attributes:
+        offsets: of every corner, right, down and out of the board [m], (N, 3); 0 where it is hardly seen.
+        beyond_chance: which are larger than noise alone makes them, (N,).
+    """
+
+    offsets: Array
+    beyond_chance: npt.NDArray[np.bool_]
+
+    @property
+    def wrong(self) -> bool:
+        """Whether so many corners are off that the board is not what it is believed to be."""
+        return bool(self.beyond_chance.mean() > WRONG_SHARE)
+
+    @property
+    def within(self) -> float:
+        """Rms offset within the board [m]."""
+        return float(np.sqrt(np.mean(np.sum(self.offsets[:, :2] ** 2, axis=1))))
+
+    @property
+    def out(self) -> float:
+        """Rms offset out of the board [m]."""
+        return float(np.std(self.offsets[:, 2]))
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Everything told by the corners.
+
+    Attributes:
+        views: those that were used.
+        corners: of both cameras.
+        distances: of the boards' middles from the fixed camera, one a placement [m].
+        leanings: by which boards were turned from facing the fixed camera [rad].
+        per_stop: how many views each stop of the zoom lens has.
+        shape: of the board.
+    """
+
+    views: tuple[View, ...]
+    corners: dict[CameraName, Corners]
+    distances: Array
+    leanings: Array
+    per_stop: tuple[int, ...]
+    shape: BoardShape
+
+
+def gather(calibration: Calibration) -> Evidence | None:
+    """Fit the boards' poses, and nothing else, to the stored corners; None where a calibration stores none.
+
+    Views whose corners do not tell a pose are left out: of those in a fit, too many may have been wrong.
+
+    Raises:
+        CalibrationError: the stored corners do not belong to this calibration.
+    """
+    if calibration.board is None:
+        return None
+    points = board_points(calibration.board)
+    views = tuple(view for view in calibration.views if tells_pose(view, points))
+    for view in calibration.views:
+        if view not in views:
+            log.warning("%s: not in the report: its corners are too few, or all on one line", view.name)
+    if not views:
+        return None
+    try:
+        model = place_boards(model_of(calibration), views, points)
+        found = fit(model, views, points, (), jitter=calibration.jitter)
+    except np.linalg.LinAlgError:
+        raise CalibrationError("the stored corners do not tell where their boards were") from None
+    boards = list(found.model.boards.values())
+    middles = np.array([T.apply(points.mean(axis=0)) for T in boards])
+    normals = np.array([T.rotation.as_matrix()[:, 2] for T in boards])
+    distances = np.linalg.norm(middles, axis=-1)
+    facing = np.abs(np.sum(normals * middles, axis=-1)) / distances
+    stops = [stop_of(calibration.zoom.nominal_px, view) for view in views if view.camera == "zoom"]
+    return Evidence(
+        views=views,
+        corners={name: _corners(calibration, found, name) for name in CAMERAS},
+        distances=distances,
+        leanings=np.arccos(np.clip(facing, 0.0, 1.0)),
+        per_stop=tuple(np.bincount(stops, minlength=len(calibration.zoom.stops)).tolist()),
+        shape=_shape(found, points),
+    )
+
+
+def _corners(calibration: Calibration, found: Fit, name: CameraName) -> Corners:
+    mine = [i for i, view in enumerate(found.views) if view.camera == name]
+    seen = [found.views[i].seen for i in mine]
+    size = calibration.fixed.size if name == "fixed" else calibration.zoom.size
+    at = [found.views[i].corners_px[s] for i, s in zip(mine, seen, strict=True)]
+    off = [found.left[i][s] for i, s in zip(mine, seen, strict=True)]
+    return Corners(size, np.concatenate([np.empty((0, 2)), *at]), np.concatenate([np.empty((0, 2)), *off]))
+
+
+def _shape(found: Fit, points: Array) -> BoardShape:
+    """Fit an offset to every corner of the board, of what the boards' poses left; it is that or less.
+
+    With residuals r = predicted - seen and their derivatives J by the corner's place, the offset is -J^+ r, and
+    r^T J J^+ r over the variance is chi-square of three where there is only noise.
+    """
+    seen = np.isfinite(found.left[..., 0])
+    ends = [[predict_pixels(found.model, found.views, points + d) for d in (e, -e)] for e in POINT_STEP * np.eye(3)]
+    J = np.stack([(plus - minus) / (2 * POINT_STEP) for plus, minus in ends], axis=-1)  # (views, N, 2, 3)
+    J, r = np.where(seen[..., None, None], J, 0.0), np.where(seen[..., None], found.left, 0.0)
+    normal, gradient = np.einsum("vnki,vnkj->nij", J, J), np.einsum("vnki,vnk->ni", J, r)
+    offsets, beyond = np.zeros((len(points), 3)), np.zeros(len(points), dtype=bool)
+    enough = np.count_nonzero(seen, axis=0) >= FEWEST_IN_CELL
+    variance = robust_sigma(found.left[seen]) ** 2
+    for i in np.flatnonzero(enough):
+        offsets[i] = -np.linalg.pinv(normal[i]) @ gradient[i]
+        beyond[i] = -offsets[i] @ gradient[i] > SHAPE_CHI2 * variance
+    return BoardShape(offsets, beyond)
+
+
+def averaged(corners: Corners) -> Cells:
+    """Average the residuals over cells: a pattern that remains is what the lens's model leaves out."""
+    owner = _cell(corners, CELLS)
+    cells = CELLS[0] * CELLS[1]
+    number = np.bincount(owner, minlength=cells)
+    with np.errstate(invalid="ignore"):
+        middles, means = (
+            np.stack([np.bincount(owner, values[:, k], cells) / number for k in range(2)], axis=-1)
+            for values in (corners.seen_px, corners.residuals)
+        )
+    means[number < FEWEST_IN_CELL] = np.nan
+    limit = BEYOND_CHANCE * corners.sigma / np.sqrt(np.maximum(number, 1))
+    with np.errstate(invalid="ignore"):
+        return Cells(middles, means, np.linalg.norm(means, axis=-1) > limit)
+
+
+def counts(corners: Corners, cells: tuple[int, int] = COVER) -> Array:
+    """How many corners were seen in each cell of the image, (down, across)."""
+    found = np.bincount(_cell(corners, cells), minlength=cells[0] * cells[1])
+    return found.reshape(cells[1], cells[0]).astype(float)
+
+
+def _cell(corners: Corners, cells: tuple[int, int]) -> npt.NDArray[np.intp]:
+    """Number of the cell that each corner is in, row by row."""
+    at = ((corners.seen_px + 0.5) / np.array(corners.size) * np.array(cells)).astype(np.intp)
+    across, down = np.clip(at, 0, np.array(cells) - 1).T
+    return np.asarray(down * cells[0] + across)
+
+
+def empty_places(corners: Corners) -> list[str]:
+    """Name the corners and edges of the image where no board was seen in any of the outermost cells nearby."""
+    seen = counts(corners) > 0
+    down, across = np.indices(seen.shape)
+    rim = (down == 0) | (down == seen.shape[0] - 1) | (across == 0) | (across == seen.shape[1] - 1)
+    third_down, third_across = down * 3 // seen.shape[0], across * 3 // seen.shape[1]
+    found = []
+    for i, row in enumerate(ROWS):
+        for j, column in enumerate(COLUMNS):
+            here = rim & (third_down == i) & (third_across == j)
+            if here.any() and not (seen & here).any():
+                found.append(f"{row} {column} corner" if row and column else f"{row or column} edge")
+    return found
+
+
+def share_beyond(residuals: Array, sigma: float, times: float = 3.0) -> float:
+    """Share of coordinates beyond so many standard deviations; of Gaussian ones, 0.27 % are beyond three."""
+    return float(np.mean(np.abs(residuals) > times * sigma)) if residuals.size else 0.0
+
+
+def head_poses(views: Sequence[View]) -> Array:
+    """Pan and tilt of the zoom camera's views, (n, 2) [rad]."""
+    return np.array([(view.pan, view.tilt) for view in views if view.camera == "zoom"]).reshape(-1, 2)

@@ -1,0 +1,697 @@
+"""Whether to trust a calibration, in one sentence.
+
+What to do to make a calibration better, told by its own figures.
+
+The parameters of a calibration with their uncertainty, and its key figures, as rows of text.
+
+Numbers as people read them.
+"""
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from cotarget.calibration.bundle import LENS_NAMES
+from cotarget.calibration.model import Calibration
+from cotarget.calibration.observability import BOTH, NEARER, OUTWARD, TILT_BOARDS
+from cotarget.calibration.planning import distance
+from cotarget.camera import Intrinsics
+from cotarget.geometry import RigidTransform
+from cotarget.pantilt import IDEAL_HEAD
+from cotarget.report.analysis import (
+    CAMERAS,
+    DEPTHS,
+    JITTER_GROUP,
+    MORE_PLACEMENTS,
+    TITLES,
+    AtFocal,
+    BoardShape,
+    Contribution,
+    Evidence,
+    averaged,
+    between_stops,
+    corner_errors,
+    empty_places,
+    gather,
+    head_poses,
+    placements,
+    pointing,
+    sigma_of,
+    uncalibrated_px,
+    undetermined,
+    what_stays,
+    with_more_placements,
+)
+
+ACTIONS = {
+    "the fixed camera's lens": f"in the fixed camera's view, {OUTWARD}, and {TILT_BOARDS}",
+    "the zoom camera's lens": f"in the zoom camera's view, {OUTWARD}, and {TILT_BOARDS}",
+    "the zoom lens's pupil": "show boards near and far at the long focal lengths",
+    "the offset between the cameras": BOTH,
+    "the zoom camera's place on the head": NEARER,
+    "the head's axes": NEARER,
+    "the encoders": "calibrate with --encoders, and move both pan and tilt from end to end",
+}
+WORTH_SAYING = 0.1  # share of the squared error
+MUCH_WORSE = 3.0  # than in the middle
+PATTERN = 0.1  # share of averages beyond chance, ten times what chance gives or more
+FAR_SHARE, FEW_FAR = 0.5, 0.25  # farther than half-way on the plan's scale; fewer placements than this are few
+LEAST_TURN = np.radians(10.0)  # of each axis of the head, over all poses
+TURNED, FEW_TURNED = np.radians(20.0), 1 / 3  # boards that tell the focal length, and fewer than this are few
+FEWEST_AT_STOP = 6  # views
+FEWEST_SHARED = 5  # placements seen by both cameras, so that some can be kept out
+MANY_REJECTED, MANY_WRONG = 0.2, 0.01  # of the images, of the corners
+
+
+def advice(
+    calibration: Calibration,
+    at: tuple[AtFocal, ...],
+    between: tuple[AtFocal, ...],
+    parts: tuple[Contribution, ...],
+    evidence: Evidence | None,
+) -> list[str]:
+    """Say what would help most, in that order; empty where nothing stands out."""
+    items = [*_disagreement(calibration), *_missing(calibration), *_unconfirmed(calibration)]
+    items += [*_largest_part(at, parts), *_between_stops(at, between), *_worst_corner(calibration, at)]
+    if evidence is not None:
+        items += [*_images(calibration, evidence), *_patterns(evidence), *_situation(calibration, evidence)]
+        items += _more_of_the_same(calibration, at)
+    return items
+
+
+def _missing(calibration: Calibration) -> Iterator[str]:
+    """What is not there at all."""
+    if open_ := undetermined(calibration):
+        yield f"Add what is missing: {open_}."
+    if calibration.T_head_zoom is None:
+        yield "Calibrate on a rig whose head moves: two cameras alone cannot be pointed."
+    if calibration.provenance.get("method") == "sequential":
+        yield "Calibrate again by the joint method, from the same captures: it points better and says how well."
+    elif calibration.covariance is None:
+        yield "Add captures until the method can tell an uncertainty: more placements, near and far, in both cameras."
+
+
+def _disagreement(calibration: Calibration) -> Iterator[str]:
+    """What captures kept out of the fit find wrong."""
+    held_out = calibration.held_out
+    if held_out is not None and held_out.widened > 1:
+        yield (
+            f"Captures kept out miss {digits(held_out.widened)} times as far as they should, so that something is not "
+            "as the model has it: a board that is bent or not printed to scale, a mount that gives way, a lens that "
+            "moved between captures. More captures will not mend that."
+        )
+
+
+def _unconfirmed(calibration: Calibration) -> Iterator[str]:
+    """What is missing so that captures could be kept out."""
+    if calibration.held_out is None and calibration.covariance is not None and calibration.provenance.get("folds"):
+        shared = [{v.board for v in calibration.views if v.camera == camera} for camera in CAMERAS]
+        number = len(shared[0] & shared[1])
+        yield (
+            f"Show both cameras {FEWEST_SHARED} placements or more ({number} so far), so that some can be kept out of "
+            "the fit and confirm it."
+        )
+
+
+def _largest_part(at: tuple[AtFocal, ...], parts: tuple[Contribution, ...]) -> Iterator[str]:
+    """Where the error comes from."""
+    total = at[-1].rms if at else 0.0
+    if not total > 0:
+        return
+    for part in parts[:2]:
+        share = 1 - (part.left / total) ** 2
+        if not share > WORTH_SAYING:
+            return
+        gain = f"the error would be {_degrees(part.left)} instead of {_degrees(total)} degrees"
+        if part.group == JITTER_GROUP:
+            yield (
+                f"The head itself makes {percent(share)} of the squared error; without its jitter {gain}. Look for "
+                "play in the gears, cables that pull, a mount that gives way, and wait longer after a move; more "
+                "captures will not help."
+            )
+        else:
+            action = ACTIONS.get(part.group, BOTH)
+            yield f"Were {part.group} known exactly, {gain}: {action}."
+
+
+def _between_stops(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Iterator[str]:
+    """Where the zoom lens is interpolated too far."""
+    worst = max(between, key=lambda one: one.rms, default=None)
+    if worst is not None and worst.rms > MUCH_WORSE * max(stop.rms for stop in at):
+        yield (
+            f"Between the zoom lens's stops it is only interpolated: at {worst.nominal_px:.0f} px by the lens's own "
+            f"account the error is {_degrees(worst.rms)} degrees. Add a stop there."
+        )
+
+
+def _worst_corner(calibration: Calibration, at: tuple[AtFocal, ...]) -> Iterator[str]:
+    """Where in the wide view pointing is much worse than in its middle."""
+    if not at:
+        return
+    middle, corners = corner_errors(calibration, at[-1].nominal_px)
+    name, error = max(corners.items(), key=lambda item: item[1], default=("", 0.0))
+    if error > MUCH_WORSE * middle:
+        yield (
+            f"In the {name} corner of the wide view the error is {_degrees(error)} degrees, {digits(error / middle)} "
+            "times that in the middle: hold boards there, as far out as they are still seen."
+        )
+
+
+def _images(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
+    """Images and corners that were left out."""
+    residuals = calibration.residuals
+    if residuals is None:
+        return
+    used, rejected = residuals.fixed_views + residuals.zoom_views, len(residuals.rejected)
+    if rejected > MANY_REJECTED * (used + rejected):
+        yield f"{rejected} of {used + rejected} images were not used; the reasons are above."
+    corners = sum(len(evidence.corners[name].seen_px) for name in CAMERAS)
+    if residuals.outliers > MANY_WRONG * corners:
+        yield (
+            f"{count(residuals.outliers, 'corner')} of {corners + residuals.outliers} were left out as wrong: look for "
+            "blur, glare, and a board that is not flat."
+        )
+
+
+def board_in_words(shape: BoardShape) -> str:
+    """Say how far the board's corners are off."""
+    number = int(shape.beyond_chance.sum())
+    if not number:
+        return "The board's corners are where they are believed to be, as far as noise lets see."
+    return (
+        f"{number} of the board's {len(shape.beyond_chance)} corners are off by more than chance makes them: of all "
+        f"corners {digits(1000 * shape.within)} mm within the board and {digits(1000 * shape.out)} mm out of it (rms)."
+    )
+
+
+def _patterns(evidence: Evidence) -> Iterator[str]:
+    """What the residuals have in common."""
+    if evidence.shape.wrong:
+        yield (
+            f"{board_in_words(evidence.shape)} Measure the board, and mount it on something flat: what is predicted "
+            "here does not count it."
+        )
+    for name in CAMERAS:
+        cells = averaged(evidence.corners[name])
+        known, beyond = int(np.isfinite(cells.means[:, 0]).sum()), int(cells.beyond_chance.sum())
+        if beyond > PATTERN * known:
+            yield (
+                f"The {TITLES[name]}'s residuals keep a pattern: {beyond} of {known} averages are larger than chance "
+                "makes them. The lens may bend the image as its model cannot, or the board is bent."
+            )
+
+
+def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
+    """Where boards were not, and how the head did not move."""
+    for name in CAMERAS:
+        places = empty_places(evidence.corners[name])
+        if places:
+            yield (
+                f"Hold boards where the {TITLES[name]} saw none: at the {listed(places)} of its image. What is "
+                "predicted there is an extrapolation."
+            )
+    number = len(evidence.distances)
+    turned = int(np.count_nonzero(evidence.leanings >= TURNED))
+    if turned < FEW_TURNED * number:
+        yield f"Only {turned} of {count(number, 'placement')} were turned by 20 degrees or more: {TILT_BOARDS}."
+    if calibration.T_head_zoom is None or calibration.board is None:
+        return
+    limit = distance(calibration.board, calibration.fixed, FAR_SHARE)
+    far = int(np.count_nonzero(evidence.distances > limit))
+    if far < FEW_FAR * number:
+        yield (
+            f"Only {far} of {count(number, 'placement')} are farther than {digits(limit)} m: add far ones, which tell "
+            "the directions of the cameras best."
+        )
+    poses = head_poses(evidence.views)
+    for axis, turn in zip(("pan", "tilt"), np.ptp(poses, axis=0) if len(poses) else (), strict=False):
+        if turn < LEAST_TURN:
+            yield f"The head's {axis} changed by {digits(np.degrees(turn))} degrees in all: {NEARER}."
+    for nominal, views in zip(calibration.zoom.nominal_px, evidence.per_stop, strict=True):
+        if views < FEWEST_AT_STOP:
+            yield f"The stop at {nominal:.0f} px has {count(views, 'view')}: add some, {FEWEST_AT_STOP} at least."
+    if (longest := uncalibrated_px(calibration)) is not None:
+        yield (
+            f"The lens goes to {longest:.0f} px by its own account, but was calibrated to "
+            f"{calibration.zoom.nominal_px[-1]:.0f} px: no part of a board was seen beyond. Hold boards far away "
+            "where the head reaches, with squares that still show several corners there."
+        )
+    zooms = any(view.focal_px is not None for view in evidence.views if view.camera == "zoom")
+    if zooms and len(calibration.zoom.stops) == 1:
+        yield (
+            f"Only one focal length was calibrated, {calibration.zoom.nominal_px[0]:.0f} px by the lens's own account. "
+            "If the lens zooms, capture boards at several: the longest is where an error shows most, and nothing here "
+            "speaks of it."
+        )
+
+
+def _more_of_the_same(calibration: Calibration, at: tuple[AtFocal, ...]) -> Iterator[str]:
+    """What more placements of the same kind would bring."""
+    total = at[-1].rms if at else 0.0
+    if not total > 0:
+        return
+    number = placements(calibration)
+    text = (
+        f"{MORE_PLACEMENTS} more placements of the same kind as these {number} would bring the error from "
+        f"{_degrees(total)} to {_degrees(with_more_placements(calibration, at[-1]))} degrees"
+    )
+    stays2 = what_stays(calibration, at[-1]) ** 2
+    if 4 * stays2 < total**2:
+        more = int(np.ceil(number * ((total**2 - stays2) / (total**2 / 4 - stays2) - 1)))
+        yield f"{text}; {more} more would halve it."
+    else:
+        yield f"{text}; no number of them would halve it, because the head's jitter stays."
+
+
+def _degrees(angle: float) -> str:
+    return digits(float(np.degrees(angle)))
+
+
+# --- tables ---
+
+LENS_WORDS = {
+    "fx": ("focal length across", "px"),
+    "fy": ("focal length down", "px"),
+    "cx": ("principal point, u", "px"),
+    "cy": ("principal point, v", "px"),
+    "k1": ("radial distortion k1", ""),
+    "k2": ("radial distortion k2", ""),
+    "p1": ("tangential distortion p1", ""),
+    "p2": ("tangential distortion p2", ""),
+}
+HEAD_WORDS = {  # words, factor to the unit shown, unit
+    "axis_offset": ("offset of the axes", 1000.0, "mm"),
+    "squareness": ("axes off the right angle", 180 / np.pi, "degrees"),
+    "pan_scale": ("scale of pan", 1.0, ""),
+    "tilt_scale": ("scale of tilt", 1.0, ""),
+    "pan_zero": ("zero of pan", 180 / np.pi, "degrees"),
+    "tilt_zero": ("zero of tilt", 180 / np.pi, "degrees"),
+}
+STRONG = 0.95  # a correlation worth a word
+MOST_CORRELATIONS = 8
+STOP = re.compile(r"\[\d+\]")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text, with what is to be known of it."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+
+
+def parameter_tables(calibration: Calibration) -> list[Table]:
+    """All parameters, value ± one standard deviation, in groups."""
+    header = ("parameter", "value ± σ", "unit")
+    fixed = Table("Fixed camera", header, tuple(_lens(calibration, calibration.fixed, "fixed")), _about_k3(calibration))
+    tables = [fixed, *_zoom(calibration)]
+    tables.append(_pose_table(calibration, "Offset between the cameras", "T_zoom0_fixed", calibration.T_zoom0_fixed))
+    if calibration.T_head_zoom is not None:
+        title = "Place of the zoom camera on the head"
+        tables.append(_pose_table(calibration, title, "T_head_zoom", calibration.T_head_zoom))
+        tables.append(Table("Pan-tilt head", header, tuple(_head(calibration))))
+    if calibration.board is not None:
+        rows = zip(("x", "y"), calibration.board_warp, strict=True)
+        tables.append(Table("Board", header, tuple(_bend(calibration, axis, value) for axis, value in rows)))
+    return tables
+
+
+def _bend(calibration: Calibration, axis: str, value: float) -> tuple[str, ...]:
+    sigma = sigma_of(calibration, f"board.warp_{axis}")
+    return f"bulge of its middle along {axis}", value_and_sigma(1000 * value, sigma and 1000 * sigma), "mm"
+
+
+def _held(lens: Intrinsics) -> str:
+    return f"k3 is held at {digits(lens.distortion[4], 3)}." if lens.distortion[4] else "k3 is held at 0."
+
+
+def _about_k3(calibration: Calibration) -> str:
+    k3, sigma = calibration.fixed.distortion[4], sigma_of(calibration, "fixed.k3")
+    if sigma is None:
+        return _held(calibration.fixed)
+    if not k3:
+        return f"k3 is held at 0; the corners lean to one of {digits(sigma, 1)}, a doubt that is counted everywhere."
+    return f"The corners ask for k3: it is {value_and_sigma(k3, sigma)}. Beyond the boards such a lens is less certain."
+
+
+def _numbers(lens: Intrinsics) -> dict[str, float]:
+    return dict(zip(LENS_NAMES, (*lens.focal_px, *lens.center_px, *lens.distortion), strict=False))
+
+
+def _lens(calibration: Calibration, lens: Intrinsics, owner: str) -> Iterator[tuple[str, ...]]:
+    for name, value in _numbers(lens).items():
+        words, unit = LENS_WORDS[name]
+        yield words, value_and_sigma(value, sigma_of(calibration, f"{owner}.{name}")), unit
+
+
+def _zoom(calibration: Calibration) -> list[Table]:
+    lens = calibration.zoom
+    if len(lens.stops) == 1:
+        title = f"Zoom camera (nominal focal length {lens.nominal_px[0]:.0f} px)"
+        rows = tuple(_lens(calibration, lens.stops[0], "zoom[0]"))
+        return [Table(title, ("parameter", "value ± σ", "unit"), rows, _held(lens.stops[0]))]
+    lengths, bent = [], []
+    for i, (nominal, stop, pupil) in enumerate(zip(lens.nominal_px, lens.stops, lens.pupil, strict=True)):
+        cells = {
+            name: value_and_sigma(value, sigma_of(calibration, f"zoom[{i}].{name}"))
+            for name, value in _numbers(stop).items()
+        }
+        sigma = sigma_of(calibration, f"zoom[{i}].pupil")
+        moved = "0" if i == 0 else value_and_sigma(1000 * pupil, None if sigma is None else 1000 * sigma)
+        first = f"{nominal:.0f}"
+        lengths.append((first, cells["fx"], cells["fy"], cells["cx"], cells["cy"], moved))
+        bent.append((first, *(cells[name] for name in ("k1", "k2", "p1", "p2"))))
+    return [
+        Table("Zoom camera", ("nominal px", "fx [px]", "fy [px]", "cx [px]", "cy [px]", "pupil [mm]"), tuple(lengths)),
+        Table(
+            "Zoom camera's distortion",
+            ("nominal px", "k1", "k2", "p1", "p2"),
+            tuple(bent),
+            "In units of the focal length: the same bend in the image has a k1 that grows with its square.",
+        ),
+    ]
+
+
+def _pose_table(calibration: Calibration, title: str, name: str, T: RigidTransform) -> Table:
+    rows = []
+    for axis, value in zip("xyz", 1000 * T.translation, strict=True):
+        sigma = sigma_of(calibration, f"{name}.t{axis}")
+        rows.append((f"position {axis}", value_and_sigma(value, sigma and 1000 * sigma), "mm"))
+    for axis, value in zip("xyz", T.rotation.as_rotvec(degrees=True), strict=True):
+        sigma = sigma_of(calibration, f"{name}.r{axis}")
+        rows.append((f"rotation vector {axis}", value_and_sigma(value, sigma and np.degrees(sigma)), "degrees"))
+    length = 1000 * float(np.linalg.norm(T.translation))
+    rows.append(("distance", value_and_sigma(length, _length_sigma_mm(calibration, name, T)), "mm"))
+    note = "The uncertainty of the rotation is that of a turn about the axes of the frame that the transform leads to."
+    return Table(f"{title} ({name})", ("parameter", "value ± σ", "unit"), tuple(rows), note)
+
+
+def _length_sigma_mm(calibration: Calibration, name: str, T: RigidTransform) -> float | None:
+    covariance, length = calibration.covariance, np.linalg.norm(T.translation)
+    names = [f"{name}.t{axis}" for axis in "xyz"]
+    if covariance is None or not length or any(n not in covariance.parameters for n in names):
+        return None
+    where = [covariance.parameters.index(n) for n in names]
+    along = T.translation / length
+    return float(1000 * np.sqrt(along @ covariance.matrix[np.ix_(where, where)] @ along))
+
+
+def _head(calibration: Calibration) -> Iterator[tuple[str, ...]]:
+    for name, (words, factor, unit) in HEAD_WORDS.items():
+        value, sigma = getattr(calibration.head, name), sigma_of(calibration, f"head.{name}")
+        if sigma is None and name.startswith(("pan", "tilt")) and value == getattr(IDEAL_HEAD, name):
+            continue
+        yield words, value_and_sigma(factor * value, sigma and factor * sigma), unit
+    yield "jitter of each axis", digits(float(np.degrees(calibration.jitter))), "degrees"
+
+
+def correlations(calibration: Calibration) -> list[str]:
+    """The strongest correlations between parameters, in words."""
+    covariance = calibration.covariance
+    if covariance is None:
+        return []
+    scale = np.sqrt(np.diagonal(covariance.matrix))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        R = covariance.matrix / np.outer(scale, scale)
+    pairs = [
+        (float(R[i, j]), covariance.parameters[i], covariance.parameters[j])
+        for i, j in zip(*np.triu_indices(len(scale), 1), strict=True)
+        if abs(R[i, j]) > STRONG
+    ]
+    pairs.sort(key=lambda pair: -abs(pair[0]))
+    # Of the same two parameters of several stops, the strongest speaks for all.
+    kinds = {tuple(STOP.sub("[]", name) for name in pair[1:]): pair for pair in reversed(pairs)}
+    strongest = sorted(kinds.values(), key=lambda pair: -abs(pair[0]))[:MOST_CORRELATIONS]
+    return [f"{a} with {b}: {r:+.4f}" for r, a, b in strongest]
+
+
+def key_figures(calibration: Calibration) -> list[tuple[str, str]]:
+    """Name and value of what is asked first."""
+    found: list[tuple[str, str]] = []
+    board, residuals, held_out = calibration.board, calibration.residuals, calibration.held_out
+    if board is not None:
+        columns, rows = board.corners
+        side = digits(1000 * board.square, 4)
+        found.append(("Board", f"{board.kind}, {columns} × {rows} inner corners, squares of {side} mm"))
+    if calibration.views:
+        found.append(("Placements", str(len({view.board for view in calibration.views}))))
+    if residuals is not None:
+        used = f"{residuals.fixed_views} of the fixed camera, {residuals.zoom_views} of the zoom camera"
+        found.append(("Views used", used))
+        found.append(("Placements seen by both at home", str(residuals.pairs)))
+        not_used = f"{count(len(residuals.rejected), 'image')}, {count(residuals.outliers, 'single corner')}"
+        found.append(("Not used", not_used))
+        parts = {
+            "Rms, fixed camera alone": residuals.fixed_rms_px,
+            "Rms, zoom camera alone": residuals.zoom_rms_px,
+            "Rms, both cameras at home": residuals.stereo_rms_px,
+            "Rms, zoom camera through the head": residuals.handeye_rms_px,
+        }
+        found += [(name, f"{digits(value, 3)} px") for name, value in parts.items() if value is not None]
+    if held_out is not None:
+        against = f"{digits(held_out.measured_px)} px measured, {digits(held_out.predicted_px)} px predicted"
+        found.append(("Kept out of the fit", against))
+    jitter = f"{digits(float(np.degrees(calibration.jitter)))} degrees an axis" if calibration.jitter else "none found"
+    found.append(("Head's jitter", jitter))
+    for name, camera in (("fixed", calibration.fixed), ("zoom", calibration.zoom.stops[0])):
+        across = 2 * np.degrees(np.arctan(camera.size[0] / 2 / camera.focal_px[0]))
+        found.append((f"Image, {name} camera", f"{camera.size[0]} × {camera.size[1]} px, about {across:.0f}° across"))
+    if calibration.pitch_mm is not None:
+        found.append(("Pixel of the zoom camera", f"{digits(1000 * calibration.pitch_mm, 3)} µm"))
+    names = {"method": "Method", "when": "Made", "cotarget": "Version of cotarget"}
+    found += [(word, str(calibration.provenance[key])) for key, word in names.items() if key in calibration.provenance]
+    return found
+
+
+def provenance(calibration: Calibration) -> Table:
+    """Everything that the calibration tells of where it comes from."""
+    rows = tuple((str(key), str(value)) for key, value in calibration.provenance.items())
+    return Table("", ("what", "value"), rows)
+
+
+# --- wording ---
+
+MOST_DECIMALS = 9
+UNCERTAINTY_DIGITS = 2  # more of a standard deviation is not known
+VALUE_DIGITS = 6  # of a value whose uncertainty is not known
+
+
+def digits(value: float, count: int = 2) -> str:
+    """Write a number with so many significant digits and, unless it is tiny, without an exponent: 0.0021, 12, 7200."""
+    if not math.isfinite(value):
+        return "unknown"
+    if value == 0:
+        return "0"
+    decimals = _decimals(value, count)
+    if decimals > MOST_DECIMALS:
+        return f"{value:.{count - 1}e}"
+    return f"{round(value, decimals):.{max(decimals, 0)}f}"
+
+
+def _decimals(value: float, count: int) -> int:
+    """How many decimals show so many significant digits, once the value is rounded to them: 0.0996 becomes 0.10."""
+    decimals = count - 1 - math.floor(math.log10(abs(value)))
+    return count - 1 - math.floor(math.log10(abs(round(value, decimals))))
+
+
+def value_and_sigma(value: float, sigma: float | None) -> str:
+    """Write a value to the decimals that its standard deviation leaves: 692.31 ± 0.24."""
+    if sigma is None or not math.isfinite(sigma) or sigma <= 0:
+        return digits(value, VALUE_DIGITS)
+    shown = min(max(_decimals(sigma, UNCERTAINTY_DIGITS), 0), MOST_DECIMALS)
+    return f"{value:.{shown}f} ± {digits(sigma, UNCERTAINTY_DIGITS)}"
+
+
+def count(number: int, one: str, many: str | None = None) -> str:
+    """Write a number of things: 1 view, 2 views."""
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+def percent(share: float) -> str:
+    """Write a share: 0.04 %, 3 %, 62 %."""
+    if 0 < share < 0.01:
+        return f"{digits(100 * share, 1)} %"
+    return f"{100 * share:.0f} %"
+
+
+def listed(items: Sequence[str]) -> str:
+    """Join words: a, b and c."""
+    return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
+
+
+Level = Literal["good", "care", "bad", "unknown"]
+LABELS: dict[Level, str] = {
+    "good": "It points, and says how well",
+    "care": "It points, but read on",
+    "bad": "Do not rely on it",
+    "unknown": "It does not say how well it points",
+}
+# Stops whose errors differ by less than this factor are spoken of together.
+ALIKE = 1.25
+# Shares of the close-up's width by which a target may be off the middle: beyond the first it is worth a word, beyond
+# the second it is not in the picture.
+FAR_OFF, OUT_OF_SIGHT = 0.05, 0.5
+# Corners explained so many times worse than was recorded are other corners; exact ones are rounded to the floor.
+CONTRADICTION, RECORDED_FLOOR_PX = 3.0, 1e-3
+TOO_CAREFUL = 0.6  # misses below this share of what was predicted are no chance either
+MOSTLY = 0.5  # share of the squared error
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The sentence, and how it is meant."""
+
+    text: str
+    level: Level
+
+
+def verdict(calibration: Calibration) -> str:
+    """Say in one sentence how well a calibration points, and whether captures kept out of its fit agree."""
+    return judge(calibration).text
+
+
+def judge(
+    calibration: Calibration,
+    at: tuple[AtFocal, ...] | None = None,
+    between: tuple[AtFocal, ...] | None = None,
+    evidence: Evidence | None = None,
+) -> Verdict:
+    """Give the verdict on a calibration.
+
+    Args:
+        calibration: of any kind.
+        at: what `pointing` gives of its stops, where that is known already.
+        between: what it gives of `between_stops`, likewise.
+        evidence: what `gather` gives of it, likewise.
+    """
+    if calibration.T_head_zoom is None:
+        return Verdict(_without_head(calibration), "unknown")
+    if calibration.covariance is None:
+        return _without_covariance(calibration)
+    mismatch = _mismatch(calibration)
+    if open_ := undetermined(calibration):
+        return Verdict(_sentence([*mismatch, f"does not determine the rig: {open_}"]), "bad")
+    evidence = gather(calibration) if evidence is None else evidence
+    if evidence is not None and _contradicts(calibration, evidence):
+        return Verdict(
+            "Does not explain the corners that are stored with it: they are not what it was made from.", "bad"
+        )
+    at = pointing(calibration) if at is None else at
+    between = pointing(calibration, between_stops(calibration)) if between is None else between
+    if not np.isfinite(at[-1].rms):
+        return Verdict("Reaches no point of the wide view with the head: its geometry cannot be right.", "bad")
+    width = calibration.zoom.size[0]
+    level: Level = "care" if mismatch or calibration.held_out is None else "good"
+    parts = [*mismatch, _how_well(at, between)]
+    if at[-1].rms_px > FAR_OFF * width:
+        level = "bad" if at[-1].rms_px > OUT_OF_SIGHT * width else "care"
+        parts.append(f"that is {percent(at[-1].rms_px / width)} of the close-up's width")
+    if (longest := uncalibrated_px(calibration)) is not None:
+        level = "care" if level == "good" else level
+        parts.append(f"the lens goes to {longest:.0f} px by its own account, and nothing is known of it beyond these")
+    if calibration.jitter:
+        level = "care" if level == "good" else level
+        parts.append(_jitter(calibration, at[-1]))
+    if evidence is not None and evidence.shape.wrong:
+        level = "care" if level == "good" else level
+        size = digits(1000 * np.hypot(evidence.shape.within, evidence.shape.out))
+        parts.append(f"not counting that the board's corners are {size} mm off where they are believed to be")
+    if calibration.held_out is None:
+        parts.append("no captures were kept out of the fit to confirm it")
+    elif calibration.held_out.ratio < TOO_CAREFUL:
+        level = "care" if level == "good" else level
+        parts.append(
+            f"captures kept out of the fit miss only {digits(calibration.held_out.ratio)} times as far as that"
+        )
+    elif not mismatch:
+        parts.append("captures kept out of the fit agree")
+    return Verdict(_sentence(parts), level)
+
+
+def _sentence(parts: list[str]) -> str:
+    text = "; ".join(parts)
+    return f"{text[0].upper()}{text[1:]}."
+
+
+def _contradicts(calibration: Calibration, evidence: Evidence) -> bool:
+    """Whether the stored corners are explained far worse than was recorded."""
+    r = calibration.residuals
+    if r is None:
+        return False
+    recorded = (r.fixed_rms_px, r.zoom_rms_px, r.stereo_rms_px or 0.0, r.handeye_rms_px or 0.0, RECORDED_FLOOR_PX)
+    sigma = max(corners.sigma for corners in evidence.corners.values())
+    return np.sqrt(2) * sigma > CONTRADICTION * max(recorded)
+
+
+def _how_well(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> str:
+    last = at[-1]
+    which = "the longest focal length calibrated" if len(at) > 1 else "the one focal length calibrated"
+    in_px = f"{digits(last.rms_px)} px at {last.focal_px:.0f} px, {which}"
+    text = f"points to {digits(np.degrees(last.rms))} degrees ({in_px})"
+    worst = max((*at, *between), key=lambda one: one.rms)
+    if worst.rms > ALIKE * last.rms:
+        where = f"between its stops, at {worst.focal_px:.0f} px" if worst in between else f"at {worst.focal_px:.0f} px"
+        text += f" and to {digits(np.degrees(worst.rms))} degrees ({digits(worst.rms_px)} px) {where}"
+    near, far = DEPTHS
+    return f"{text}, one standard deviation, all over the wide view from {near:g} to {far:g} m"
+
+
+def _jitter(calibration: Calibration, last: AtFocal) -> str:
+    share = min(2 * calibration.jitter**2 / last.rms**2, 1.0)
+    angle = digits(np.degrees(calibration.jitter))
+    if share > MOSTLY:
+        return f"most of it because the head misses what it reports by {angle} degrees an axis, at every pose anew"
+    return f"in it the {angle} degrees by which each axis of the head misses what it reports"
+
+
+def _mismatch(calibration: Calibration) -> list[str]:
+    """That captures kept out of the fit disagree, where they do, which comes before all that it makes wider."""
+    held_out = calibration.held_out
+    if held_out is None or held_out.widened <= 1:
+        return []
+    factor = digits(held_out.widened)
+    return [
+        f"captures kept out of the fit miss {factor} times as far as was predicted, and the uncertainty is widened so"
+    ]
+
+
+def _without_head(calibration: Calibration) -> str:
+    parts = ["cannot point, because it was made without a head", *_mismatch(calibration)]
+    residuals, covariance = calibration.residuals, calibration.covariance
+    if residuals is not None and residuals.stereo_rms_px is not None:
+        parts.append(f"the two cameras agree on the corners to {digits(residuals.stereo_rms_px)} px")
+    if covariance is not None:
+        if open_ := undetermined(calibration):
+            parts.append(f"it does not determine the cameras either: {open_}")
+        else:
+            turn, shift = (
+                np.sqrt(sum((sigma_of(calibration, f"T_zoom0_fixed.{kind}{axis}") or 0.0) ** 2 for axis in "xyz"))
+                for kind in "rt"
+            )
+            parts.append(
+                f"the offset between them is known to {digits(1000 * shift)} mm and {digits(np.degrees(turn))} degrees"
+            )
+    return _sentence(parts)
+
+
+def _without_covariance(calibration: Calibration) -> Verdict:
+    method = calibration.provenance.get("method")
+    residuals = calibration.residuals
+    fits = ""
+    if residuals is not None and residuals.handeye_rms_px is not None:
+        fits = f"; its corners are explained to {digits(residuals.handeye_rms_px)} px, which tells little of pointing"
+    if method == "sequential":
+        return Verdict(
+            f"Does not say how well it points, because the sequential method gives no uncertainty{fits}.", "unknown"
+        )
+    if method == "joint":
+        return Verdict(
+            f"Leaves some of its parameters undetermined, so that it cannot say how well it points{fits}.", "bad"
+        )
+    return Verdict(f"Does not say how well it points, because it carries no uncertainty{fits}.", "unknown")

@@ -1,0 +1,221 @@
+"""MuJoCo with an offscreen OpenGL that works without a screen; import mujoco from here before anything renders."""
+
+import contextlib
+import ctypes.util
+import importlib
+import os
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from cotarget.errors import DeviceError
+from cotarget.geometry import Array
+from cotarget.rig import Image
+
+__all__ = ["BACKEND", "TALLY", "Canvas", "make_renderer", "mujoco", "renderer_version"]
+INSTALL = {
+    "egl": "install it: apt-get install -y libegl1 libgl1-mesa-dri libgl1",
+    "osmesa": "install it: apt-get install -y libosmesa6, or unset MUJOCO_GL",
+}
+OTHERWISE = "unset MUJOCO_GL to render without a screen"
+# An environment variable: a file that each picture makes longer by a byte, drawn by whatever process. It counts what a
+# program's processes draw, those included that are killed.
+TALLY = "COTARGET_TALLY"
+
+
+def choose_backend() -> str:
+    """Set MUJOCO_GL, where the user has not, to the first offscreen backend whose library is on this machine.
+
+    Must run before mujoco is imported, because it reads the variable then.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "")
+    if not chosen and sys.platform == "linux":
+        chosen = "osmesa" if not ctypes.util.find_library("EGL") and ctypes.util.find_library("OSMesa") else "egl"
+        os.environ["MUJOCO_GL"] = chosen
+    return chosen
+
+
+BACKEND = choose_backend()
+try:
+    import mujoco
+except RuntimeError as error:
+    raise DeviceError(f"MUJOCO_GL={BACKEND}: {error}; unset MUJOCO_GL, or set it to egl, osmesa or glfw") from None
+except (ImportError, AttributeError, OSError) as error:
+    raise DeviceError(
+        f"no OpenGL library for rendering without a screen ({BACKEND}): {error}; {INSTALL.get(BACKEND, OTHERWISE)}"
+    ) from None
+
+
+def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.Renderer":
+    """Open an offscreen renderer on this thread.
+
+    Raises:
+        DeviceError: the machine has no OpenGL that can do it, or this process has inherited one.
+    """
+    if _first_process() != os.getpid() and BACKEND != "osmesa":  # it would wait for threads that were not inherited
+        raise DeviceError(
+            "a process that was forked after something was rendered cannot render; start it with the method 'spawn', "
+            "as AsyncVectorEnv(..., context='spawn') does"
+        )
+    try:
+        return mujoco.Renderer(model, height, width)
+    except Exception as error:  # PyOpenGL and the backends raise whatever they meet
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if "ramebuffer" in reason:
+            raise DeviceError(
+                f"OpenGL ({BACKEND}) renders no picture of {width}x{height}: {reason}; give the cameras a smaller size"
+            ) from None
+        raise DeviceError(
+            f"OpenGL ({BACKEND}) cannot render without a screen: {reason}; {INSTALL.get(BACKEND, OTHERWISE)}"
+        ) from None
+
+
+@cache
+def _first_process() -> int:
+    """The number of the first process that opens OpenGL, which those that it forks inherit."""
+    return os.getpid()
+
+
+@cache
+def renderer_version() -> str:
+    """Who draws, and its version, as OpenGL names them: pictures differ with it; empty where there is none."""
+    with contextlib.suppress(Exception):  # PyOpenGL and the backends raise whatever they meet
+        context = mujoco.GLContext(8, 8)
+        try:
+            context.make_current()
+            gl = importlib.import_module("OpenGL.GL")
+            return ", ".join(gl.glGetString(name).decode() for name in (gl.GL_RENDERER, gl.GL_VERSION))
+        finally:
+            context.free()
+    return ""
+
+
+class Canvas:
+    """An offscreen renderer that draws any pinhole view, or a part of one, of a size up to its own.
+
+    Attributes:
+        drawn: how many pictures all canvases of this process have drawn so far, for those who count the cost; a part of
+            a picture counts as that part.
+    """
+
+    drawn: ClassVar[float] = 0.0
+
+    def __init__(self, model: "mujoco.MjModel", size: tuple[int, int], shadows: bool) -> None:
+        """Open OpenGL on this thread.
+
+        Args:
+            model: what is drawn.
+            size: (width, height) of the largest picture [px].
+            shadows: whether lights cast them.
+
+        Raises:
+            DeviceError: the machine has no OpenGL that can do it.
+        """
+        self._model, self._size, self._shadows, self._told = model, size, shadows, _told(model)
+        self._renderer: Any = make_renderer(model, *size)
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        self._option, self._untouched = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._option.sitegroup[:] = 0
+        self._others: list[Canvas] = []
+
+    def without_multisampling(self) -> "Canvas":
+        """Another one that does not antialias, closed with this one."""
+        if self._others:
+            return self._others[0]
+        quality = self._model.vis.quality
+        before, quality.offsamples = quality.offsamples, 0
+        try:
+            self._others.append(Canvas(self._model, self._size, self._shadows))
+        finally:
+            quality.offsamples = before
+        return self._others[0]
+
+    def turn_to(self, model: "mujoco.MjModel") -> bool:
+        """Draw another model from now on, if it differs from the one before in its meshes' measures at most.
+
+        To open OpenGL anew, with all textures, takes some hundred times as long.
+
+        Returns:
+            Whether it does; nothing is changed where not.
+        """
+        told = _told(model)
+        if told != self._told or not np.array_equal(model.tex_data, self._model.tex_data):
+            return False
+        for canvas in (self, *self._others):
+            renderer, canvas._model = canvas._renderer, model
+            renderer._model = model
+            if renderer._gl_context:
+                renderer._gl_context.make_current()
+            for mesh in range(model.nmesh):
+                mujoco.mjr_uploadMesh(model, renderer._mjr_context, mesh)
+        return True
+
+    def look(self, data: "mujoco.MjData", camera_id: int, layers: int) -> None:
+        """Take the scene as a camera of the model has it.
+
+        Args:
+            data: with everything's pose.
+            camera_id: the camera's number.
+            layers: geoms of so many groups are drawn, from group 0 on one group after the other.
+        """
+        self._option.geomgroup[:] = np.arange(mujoco.mjNGROUP) == 0
+        self._renderer.update_scene(data, camera_id, self._option)
+        for layer in range(1, layers):
+            self._option.geomgroup[:] = np.arange(mujoco.mjNGROUP) == layer
+            everything = mujoco.mjtCatBit.mjCAT_ALL.value
+            mujoco.mjv_addGeoms(self._model, data, self._option, self._untouched, everything, self._renderer.scene)
+
+    def draw(
+        self,
+        eye: Array,
+        axes: Array,
+        tangents: tuple[float, float, float, float],
+        size: tuple[int, int],
+        part: float = 1.0,
+    ) -> Image:
+        """Draw the scene, RGB.
+
+        Args:
+            eye: optical centre in the world [m], (3,).
+            axes: the world's coordinates of right, down and forward, as columns, (3, 3).
+            tangents: of the picture's borders: left, right, bottom, top; right and up are positive.
+            size: (width, height) [px].
+            part: as how much of a picture it counts.
+        """
+        renderer, (left, right, bottom, top) = self._renderer, tangents
+        for camera in renderer.scene.camera:  # two for stereo; their mean is the view
+            near = camera.frustum_near
+            camera.pos, camera.forward, camera.up = eye, axes[:, 2], -axes[:, 1]
+            camera.frustum_center, camera.frustum_width = near * (left + right) / 2, near * (right - left) / 2
+            camera.frustum_bottom, camera.frustum_top = near * bottom, near * top
+        rect = mujoco.MjrRect(0, 0, *size)
+        image = np.empty((size[1], size[0], 3), dtype=np.uint8)
+        # mujoco.Renderer draws whole pictures of its own size only.
+        if renderer._gl_context:
+            renderer._gl_context.make_current()
+        mujoco.mjr_render(rect, renderer.scene, renderer._mjr_context)
+        mujoco.mjr_readPixels(image, None, rect, renderer._mjr_context)
+        before = int(Canvas.drawn)
+        Canvas.drawn += part
+        if (tally := os.environ.get(TALLY)) and (more := int(Canvas.drawn) - before):
+            with Path(tally).open("ab", buffering=0) as file:
+                file.write(b"." * more)
+        return image[::-1]  # OpenGL's rows begin at the bottom
+
+    def close(self) -> None:
+        """Release OpenGL; more than once does no harm."""
+        for canvas in (*self._others, self):
+            canvas._renderer.close()
+
+
+def _told(model: "mujoco.MjModel") -> tuple[object, ...]:
+    """What OpenGL is told of a model once and for all, the textures aside: not where its meshes' vertices are."""
+    visual, planes = model.vis, model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    return (
+        *(model.ntex, model.nmesh, model.nhfield, model.nskin, model.stat.extent),
+        *(visual.global_.offwidth, visual.global_.offheight, visual.quality.offsamples, visual.quality.shadowsize),
+        *(model.geom_size[planes].tobytes(), model.mesh_vertnum.tobytes(), model.mesh_face.tobytes()),
+    )

@@ -1,0 +1,406 @@
+"""What the simulated lenses see: renders of the world, bent into the lens's image, with the blur of an exposure.
+
+An exposure is the mean of four renders spread over it, but only where something moves by more than a fraction of a
+pixel meanwhile. If the camera turns or zooms that is the whole picture: four renders without multisampling, shifted by
+parts of a pixel against each other, so that their mean is antialiased as well. If only a target moves it is a window
+around it. At rest it is a single render.
+
+Frames rendered before they are asked for, on a thread with an OpenGL of its own.
+
+The world up to now is settled: commands act from now on. As frames arrive late, the frame after the newest one is
+often already exposed when that one is read, and can be rendered while the reader is at work. What is rendered does
+not depend on it.
+"""
+
+import copy
+import math
+import os
+import queue
+import threading
+import weakref
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cotarget.geometry import Array
+from cotarget.rig import Image
+from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, RIG, RIG_GROUP
+from cotarget.sim.render.opengl import Canvas, mujoco
+from cotarget.sim.render.optics import Pinhole, TrueLens, bend, covering_view
+from cotarget.sim.state import WorldState
+
+# A blurred image is the mean of this many renders spread over the exposure.
+BLUR_RENDERS = 4
+# What moves less than this during an exposure is as sharp as at rest [px].
+SHARP_PX = 0.3
+# Where those renders look beside the middle of a pixel [px]: the rotated grid that multisampling uses too.
+JITTER = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
+SOFT_MARGIN_PX = 3  # of a render that is resampled half a pixel aside
+WINDOW_MARGIN_PX = 4  # around what moves
+LARGEST_WINDOWS = 0.3  # of the picture; where more of it moves, all of it is rendered four times
+NEAREST = 3.0  # nothing is nearer to a camera than this, for what its own shifts do to the picture [m]
+LAYERS = mujoco.mjNGROUP - 1  # of geoms, drawn from the nearest to the farthest; the last group is not drawn
+PROBES = 3  # directions on each side of the picture that tell how the camera turned
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of a picture: its top-left pixel, and its size."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Where the camera and every geom is at one time.
+
+    Attributes:
+        eye: the camera's optical centre in the world [m], (3,).
+        axes: the world's coordinates of the camera's x (right), y (down) and z (forward), as columns, (3, 3).
+        positions: of the geoms [m], (n, 3).
+        turns: their axes, (n, 3, 3).
+        view: the camera's.
+    """
+
+    eye: Array
+    axes: Array
+    positions: Array
+    turns: Array
+    view: Pinhole
+
+    def pixels(self, x_world: Array) -> Array:
+        """Where points (..., 3) are in the view, (..., 2) [px]; nan behind the camera."""
+        return self.toward(x_world - self.eye)
+
+    def toward(self, way_world: Array) -> Array:
+        """Where directions (..., 3) are in the view, (..., 2) [px]; nan behind the camera."""
+        way = way_world @ self.axes
+        depth = np.where(way[..., 2:] > 0, way[..., 2:], np.nan)
+        return way[..., :2] / depth * self.view.focal_px + self.view.center_px
+
+
+class Views:
+    """Renders both cameras of a world; ``canvas`` draws."""
+
+    def __init__(
+        self,
+        model: "mujoco.MjModel",
+        state: WorldState,
+        size: tuple[int, int],
+        shadows: bool,
+        multisampling: bool,
+        canvas: Canvas | None = None,
+        soft: bool = True,
+    ) -> None:
+        """Open OpenGL.
+
+        Args:
+            model: the compiled world.
+            state: brings it to a time.
+            size: (width, height) of the largest render [px].
+            shadows: whether lights cast them.
+            multisampling: whether a single render is antialiased.
+            canvas: that draws this model; its own by default.
+            soft: whether a lens without distortion is resampled like every other.
+
+        Raises:
+            DeviceError: the machine cannot render.
+        """
+        self._model, self._state, self._size, self._shadows = model, state, size, shadows
+        self.canvas = canvas or Canvas(model, size, shadows)
+        self._plain = self.canvas  # without multisampling; made when first needed
+        self._multisampling, self._soft = multisampling, soft
+        corners = np.stack(np.meshgrid(*([-1, 1],) * 3), axis=-1).reshape(-1, 3)
+        self._corners = model.geom_aabb[:, None, :3] + corners * model.geom_aabb[:, None, 3:]
+        self._endless = model.geom_rbound == 0  # planes
+        self._groups = np.array(model.geom_group)
+        self._shown = ~np.isin(self._groups, (BOARD_GROUP, RIG_GROUP, FRAME_GROUP))
+        self._blurs = self._shown & ~np.isin(np.arange(model.ngeom), state.faint)
+
+    def apart(self) -> "Views":
+        """Another one of the same world, which shares nothing that either of them changes: for the calling thread."""
+        model = copy.copy(self._model)
+        other = Views(model, self._state.apart(model), self._size, self._shadows, self._multisampling)
+        if self._multisampling:
+            other._plain = other.canvas.without_multisampling()
+        return other
+
+    def close(self) -> None:
+        """Release OpenGL; more than once does no harm."""
+        self.canvas.close()
+
+    def sharp(self, camera: str, lens: TrueLens, t: float) -> Image:
+        """What a lens sees in an instant, BGR."""
+        view = self._view(lens)
+        return self._through(lens, view, self._render(camera, lens, view, t))
+
+    def exposed(self, camera: str, lens_at: Callable[[float], TrueLens], t: float, exposure: float) -> Image:
+        """What a lens gathers during an exposure around time t, BGR.
+
+        Args:
+            camera: its name.
+            lens_at: its optics at a time.
+            t: middle of the exposure [s].
+            exposure: how long it is [s].
+        """
+        lens = lens_at(t)
+        if exposure == 0.0:
+            return self.sharp(camera, lens, t)
+        view = self._view(lens)
+        times = (t - exposure / 2, t + exposure / 2)
+        ends = [self._moment(camera, now, when, _as_if(view, lens, now)) for when in times for now in [lens_at(when)]]
+        moments = (t + exposure * ((np.arange(BLUR_RENDERS) + 0.5) / BLUR_RENDERS - 0.5)).tolist()
+        windows = self._moving(ends, t) if _camera_moved(*ends) < SHARP_PX else None
+        if windows is None:
+            jitters = JITTER if self._multisampling else ((0.0, 0.0),) * BLUR_RENDERS
+            total = np.zeros((*view.size[::-1], 3), dtype=np.float32)
+            for moment, jitter in zip(moments, jitters, strict=True):
+                now = lens_at(moment)
+                aside = _shifted(_as_if(view, lens, now), jitter)
+                cv2.accumulate(self._render(camera, now, aside, moment, plain=self._multisampling), total)
+            return self._through(lens, view, cv2.convertScaleAbs(total, alpha=1 / BLUR_RENDERS))
+        image = np.ascontiguousarray(self._render(camera, lens, view, t))
+        parts = [np.zeros((window.height, window.width, 3), dtype=np.float32) for window in windows]
+        for moment in moments:  # each once: to put everything in its place takes as long as to draw a small window
+            for window, part in zip(windows, parts, strict=True):
+                cv2.accumulate(self._render(camera, lens, view, moment, window), part)
+        for window, part in zip(windows, parts, strict=True):
+            rows, columns = window.top + np.arange(2) * window.height, window.left + np.arange(2) * window.width
+            image[slice(*rows), slice(*columns)] = cv2.convertScaleAbs(part, alpha=1 / BLUR_RENDERS)
+        return self._through(lens, view, image)
+
+    def _view(self, lens: TrueLens) -> Pinhole:
+        """The render that a lens's image is made from.
+
+        Where softness is wanted, it is resampled as softly whether the lens distorts or not.
+        """
+        if not any(lens.distortion):
+            (w, h), (cx, cy), margin = lens.size, lens.center_px, SOFT_MARGIN_PX * self._soft
+            return Pinhole((w + margin, h + margin), lens.focal_px, (cx + margin / 2, cy + margin / 2))
+        return covering_view(lens, self._size)
+
+    def _through(self, lens: TrueLens, view: Pinhole, image: Image) -> Image:
+        """Bend a render, RGB, into a lens's image, BGR."""
+        if view != Pinhole(lens.size, lens.focal_px, lens.center_px):
+            image = bend(np.ascontiguousarray(image), view, lens)
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), dtype=np.uint8)
+
+    def _render(
+        self, camera: str, lens: TrueLens, view: Pinhole, t: float, window: Window | None = None, plain: bool = False
+    ) -> Image:
+        """Render a view, or a window of it, RGB."""
+        moment = self._moment(camera, lens, t, view)
+        data = self._state.lit(t)
+        if plain and self._plain is self.canvas:
+            self._plain = self.canvas.without_multisampling()
+        canvas = self._plain if plain else self.canvas
+        shown = window or Window(0, 0, *view.size)
+        self._model.geom_group[:] = self._layers(moment, shown, self._visible(t))
+        try:
+            canvas.look(data, self._model.camera(RIG + camera).id, LAYERS)
+        finally:
+            self._model.geom_group[:] = self._groups
+        (fx, fy), (cx, cy) = view.focal_px, view.center_px
+        left, top = shown.left - 0.5 - cx, shown.top - 0.5 - cy
+        tangents = (left / fx, (left + shown.width) / fx, -(top + shown.height) / fy, -top / fy)
+        size = (shown.width, shown.height)
+        return canvas.draw(moment.eye, moment.axes, tangents, size, math.prod(size) / math.prod(view.size))
+
+    def _moment(self, camera: str, lens: TrueLens, t: float, view: Pinhole) -> Moment:
+        data = self._state.at(t)
+        body = self._model.body(RIG + camera).id
+        axes = np.array(data.xmat[body].reshape(3, 3))
+        eye = data.xpos[body] + axes[:, 2] * lens.pupil
+        turns = np.array(data.geom_xmat.reshape(-1, 3, 3))
+        return Moment(eye, axes, np.array(data.geom_xpos), turns, view)
+
+    def _visible(self, t: float) -> npt.NDArray[np.bool_]:
+        """Which geoms are there to be seen; (n,) bool."""
+        return self._shown if self._state.board_at(t) is None else self._shown | (self._groups == BOARD_GROUP)
+
+    def _layers(self, moment: Moment, window: Window, visible: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+        """When to draw each geom: the nearest first, so that what they hide need not be painted; (n,) int.
+
+        What a window cannot show, by its bounding sphere, is left out.
+        """
+        (fx, fy), (cx, cy) = moment.view.focal_px, moment.view.center_px
+        x, y, z = ((moment.positions - moment.eye) @ moment.axes).T
+        radius = np.where(self._endless, np.inf, self._model.geom_rbound)
+        inside = visible & (z >= -radius)
+        # Signed distance to each side of the frustum, whose planes go through the eye.
+        for along, tangent, sign in (
+            (x, (window.left - 0.5 - cx) / fx, -1),
+            (x, (window.left + window.width - 0.5 - cx) / fx, 1),
+            (y, (window.top - 0.5 - cy) / fy, -1),
+            (y, (window.top + window.height - 0.5 - cy) / fy, 1),
+        ):
+            inside &= sign * (along - tangent * z) <= radius * np.hypot(1.0, tangent)
+        drawn = np.flatnonzero(inside)
+        layers = np.full(len(z), LAYERS)
+        layers[drawn[np.argsort((z + radius)[drawn])]] = np.arange(len(drawn)) * LAYERS // max(len(drawn), 1)
+        return layers
+
+    def _moving(self, ends: list[Moment], t: float) -> list[Window] | None:
+        """Windows around what moves during an exposure while the camera does not; None if they are too large."""
+        before, after = ends
+        moved = (before.positions != after.positions).any(axis=1) | (before.turns != after.turns).any(axis=(1, 2))
+        moved &= self._blurs | ((self._groups == BOARD_GROUP) & self._visible(t))
+        if not moved.any():
+            return []
+        seen = [
+            end.pixels(end.positions[moved, None] + np.einsum("gij,gkj->gki", end.turns[moved], self._corners[moved]))
+            for end in ends
+        ]
+        far = np.linalg.norm(seen[1] - seen[0], axis=-1).max(axis=1)
+        if not np.isfinite(far).all():
+            return None
+        both = np.concatenate(seen, axis=1)[far >= SHARP_PX]
+        size = np.array(before.view.size)
+        low = np.floor(both.min(axis=1) - WINDOW_MARGIN_PX).clip(0, size)
+        high = np.ceil(both.max(axis=1) + WINDOW_MARGIN_PX + 1).clip(0, size)
+        boxes = _merged([(a, b) for a, b in zip(low, high, strict=True) if (b > a).all()])
+        if sum(float(np.prod(b - a)) for a, b in boxes) > LARGEST_WINDOWS * float(np.prod(size)):
+            return None
+        return [Window(*map(int, (*a, *(b - a)))) for a, b in boxes]
+
+
+def _camera_moved(before: Moment, after: Moment) -> float:
+    """How far the picture of what stands still moves between two moments [px]."""
+    u, v = (np.linspace(-0.5, n - 0.5, PROBES) for n in before.view.size)
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    rays = np.append((pixels - before.view.center_px) / before.view.focal_px, np.ones((len(pixels), 1)), axis=1)
+    turned = float(np.linalg.norm(after.toward(rays @ before.axes.T) - pixels, axis=1).max())
+    shifted = float(np.linalg.norm(after.eye - before.eye)) / NEAREST * max(before.view.focal_px)
+    return turned + shifted if np.isfinite(turned) else np.inf
+
+
+def _merged(boxes: list[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
+    """Boxes that cover the same, none of which overlap."""
+    found: list[tuple[Array, Array]] = []
+    for low, high in boxes:
+        while hit := next((b for b in found if (b[0] < high).all() and (low < b[1]).all()), None):
+            found = [b for b in found if b is not hit]
+            low, high = np.minimum(low, hit[0]), np.maximum(high, hit[1])
+        found.append((low, high))
+    return found
+
+
+def _as_if(view: Pinhole, lens: TrueLens, now: TrueLens) -> Pinhole:
+    """The view that, bent as if by ``lens``, gives what the lens ``now`` sees.
+
+    While a zoom lens travels, its focal length and centre change during an exposure. The change of its distortion alone
+    is neglected: at most 0.3 px in the corners, at 129 positions a second and 1/100 s, where zooming moves them by 5.
+    """
+    if now is lens or now == lens:
+        return view
+    gain = np.divide(now.focal_px, lens.focal_px)
+    aside = np.subtract(now.center_px, lens.center_px) * np.divide(view.focal_px, lens.focal_px)
+    (fx, fy), (cx, cy) = (gain * view.focal_px).tolist(), (aside + view.center_px).tolist()
+    return replace(view, focal_px=(fx, fy), center_px=(cx, cy))
+
+
+def _shifted(view: Pinhole, by_px: tuple[float, float]) -> Pinhole:
+    """A view whose pixels look a little aside."""
+    return replace(view, center_px=(view.center_px[0] - by_px[0], view.center_px[1] - by_px[1]))
+
+
+# --- ahead ---
+
+Job = Callable[[Views], Image]
+Jobs = queue.SimpleQueue[tuple[Job, "Future[Image]"] | None]
+# So many frames must have been read one after the other, none left out, before the next one is expected to be: opening
+# another OpenGL takes as long as it saves in some 20 frames.
+READ_IN_TURN = 10
+# An environment variable; "0" where every core has work of its own, such as one of many runs side by side.
+ALLOWED = "COTARGET_AHEAD"
+
+
+def is_allowed() -> bool:
+    """Whether frames may be rendered on another thread at all."""
+    return os.environ.get(ALLOWED) != "0"
+
+
+class Ahead:
+    """Renders the next frame of a camera whose frames are read one after the other.
+
+    Args:
+        open_views: opens the renderer; called on the thread that will use and close it.
+    """
+
+    def __init__(self, open_views: Callable[[], Views]) -> None:
+        self._open_views = open_views
+        self._jobs: Jobs = queue.SimpleQueue()
+        self._finish: Callable[[], object] | None = None
+        self._last, self._in_turn = -1, 0
+        self._begun: tuple[int, Future[Image]] | None = None
+
+    def take(self, index: int) -> Image | None:
+        """Frame number ``index``, waited for if it was begun; None if it was not."""
+        self._in_turn = self._in_turn + 1 if index == self._last + 1 else 0
+        begun, self._begun, self._last = self._begun, None, index
+        return begun[1].result() if begun is not None and begun[0] == index else None
+
+    def begin(self, index: int, job: Job) -> None:
+        """Begin to render frame number ``index``, if it is expected to be read next.
+
+        Raises:
+            DeviceError: the machine cannot render.
+        """
+        if self._in_turn < READ_IN_TURN or index != self._last + 1:
+            return
+        if self._finish is None:
+            self._start()
+        future: Future[Image] = Future()
+        self._begun = index, future
+        self._jobs.put((job, future))
+
+    def close(self) -> None:
+        """Release OpenGL, once what was begun is ready; more than once does no harm."""
+        if self._finish is not None:
+            self._finish()
+        self._finish, self._in_turn, self._begun = None, 0, None
+
+    def _start(self) -> None:
+        """Open the renderer; waited for, because nothing may be rendered while another OpenGL is being opened."""
+        opened: Future[None] = Future()
+        work = (self._jobs, self._open_views, opened)
+        thread = threading.Thread(target=_render, args=work, name="render ahead", daemon=True)
+        thread.start()
+        opened.result()
+        # Also if nobody closes it, and at the interpreter's end.
+        self._finish = weakref.finalize(self, _end, self._jobs, thread)
+
+
+def _render(jobs: Jobs, open_views: Callable[[], Views], opened: "Future[None]") -> None:
+    """Open a renderer, do jobs with it until there is None, and close it."""
+    try:
+        views = open_views()
+    except Exception as error:
+        opened.set_exception(error)
+        return
+    opened.set_result(None)
+    del opened
+    while (work := jobs.get()) is not None:
+        _do(views, *work)
+        del work  # it knows the world, which shall not live on while there is nothing to do
+    views.close()
+
+
+def _do(views: Views, job: Job, future: "Future[Image]") -> None:
+    try:
+        future.set_result(job(views))
+    except Exception as error:
+        future.set_exception(error)
+
+
+def _end(jobs: Jobs, thread: threading.Thread) -> None:
+    jobs.put(None)
+    if thread is not threading.current_thread():
+        thread.join()

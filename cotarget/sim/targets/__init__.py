@@ -1,0 +1,1 @@
+"""The simulated targets: pose, gait and path."""

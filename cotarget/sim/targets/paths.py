@@ -1,0 +1,211 @@
+"""Smooth ways through the simulated world, and the ones that book, person and bird take where nobody says otherwise.
+
+Paths are in the scene's world: z up, the fixed camera 1.6 m above the origin, looking along +y. Moving targets stay out
+of the wide view while the background is learnt, then come in and stay in.
+"""
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+
+from cotarget.config import Waypoint
+from cotarget.errors import ConfigError
+from cotarget.geometry import Array
+
+MOUNT = np.array([0.0, 0.0, 1.6])  # where the fixed camera is in every scene of sim_assets [m]
+VIEW_EDGE = np.tan(np.radians(25.0))  # half the wide view's width at unit distance
+PATH_SECONDS = 600.0  # a loop is laid out for this long; from then on one of its last laps is gone again and again
+
+
+@dataclass(frozen=True)
+class Path:
+    """A smooth way through the world.
+
+    Attributes:
+        spline: position [m] as a function of time [s].
+        length: distance travelled [m] as a function of time [s].
+        lap: begin and end [s] of a lap that is gone again and again after its end; None for a way that ends.
+    """
+
+    spline: CubicSpline
+    length: CubicSpline
+    lap: tuple[float, float] | None = None
+
+    def within(self, t: float) -> float:
+        """The time within the path's at which all is as at ``t``: in the lap, or else held at both ends."""
+        if self.lap is not None and t > self.lap[1]:
+            begin, end = self.lap
+            return begin + (t - begin) % (end - begin)
+        return min(max(t, self._knots[0]), self._knots[-1])
+
+    def position(self, t: float) -> Array:
+        """Position [m], (3,)."""
+        (a, b, c, d), s = self._piece(self.within(t))
+        return ((a * s + b) * s + c) * s + d
+
+    def velocity(self, t: float) -> Array:
+        """Direction and speed of travel [m/s], (3,); while the target is held, a trace of how it moves just inside."""
+        first, last = self._knots[0], self._knots[-1]
+        inside = 1e-3 * (last - first)
+        (a, b, c, _), s = self._piece(min(max(self.within(t), first + inside), last - inside))
+        return (3 * a * s + 2 * b) * s + c
+
+    def acceleration(self, t: float) -> Array:
+        """Acceleration [m/s^2], (3,)."""
+        (a, b, _, _), s = self._piece(self.within(t))
+        return 6 * a * s + 2 * b
+
+    def motion(self, t: float) -> tuple[list[float], list[float], list[float]]:
+        """Position [m], velocity [m/s] and acceleration [m/s^2] at once, (3,) each; the same, and quicker in floats."""
+        first, last = self._knots[0], self._knots[-1]
+        inside = 1e-3 * (last - first)
+        at = self.within(t)
+        if not first + inside <= at <= last - inside:  # it is held, or nearly
+            return self.position(t).tolist(), self.velocity(t).tolist(), self.acceleration(t).tolist()
+        piece, s = self._piece(at)
+        axes = list(zip(*piece.tolist(), strict=True))
+        x = [((a * s + b) * s + c) * s + d for a, b, c, d in axes]
+        return x, [(3 * a * s + 2 * b) * s + c for a, b, c, _ in axes], [6 * a * s + 2 * b for a, b, _, _ in axes]
+
+    @cached_property
+    def _knots(self) -> list[float]:
+        return self.spline.x.tolist()
+
+    @cached_property
+    def _pieces(self) -> Array:
+        """Each piece's cubic, highest power first, (pieces, 4, 3)."""
+        return np.ascontiguousarray(np.moveaxis(self.spline.c, 1, 0))
+
+    def _piece(self, t: float) -> tuple[Array, float]:
+        """The cubic at a time within the path's, (4, 3), and the time since its beginning: quicker than the spline."""
+        i = min(bisect_right(self._knots, t) - 1, len(self._pieces) - 1)
+        return self._pieces[i], t - self._knots[i]
+
+    def travelled(self, t: float) -> float:
+        """Distance since the path's start [m]."""
+        here = float(self.length(self.within(t)))
+        if self.lap is None or t <= self.lap[1]:
+            return here
+        begin, end = self.lap
+        return here + (t - begin) // (end - begin) * float(self.length(end) - self.length(begin))
+
+
+def waypoint_path(waypoints: Sequence[Waypoint], where: str = "waypoints") -> Path:
+    """Lay a smooth path through [t, x, y, z], at rest at both ends.
+
+    Raises:
+        ConfigError: no waypoint, or times that do not increase.
+    """
+    table = np.asarray(waypoints, dtype=float)
+    if table.ndim != 2 or table.shape[1] != 4 or not np.all(np.isfinite(table)):
+        raise ConfigError(f"{where}: needs at least one waypoint [t, x, y, z]")
+    if np.any(np.diff(table[:, 0]) <= 0):
+        raise ConfigError(f"{where}: the waypoints' times must increase")
+    if len(table) == 1:
+        table = np.vstack([table, table + np.array([1.0, 0.0, 0.0, 0.0])])
+    return _measured(CubicSpline(table[:, 0], table[:, 1:], bc_type="clamped"))
+
+
+def _measured(spline: CubicSpline, lap: tuple[float, float] | None = None) -> Path:
+    """Add the distance travelled to a path."""
+    first, last = spline.x[0], spline.x[-1]
+    t = np.linspace(first, last, max(int((last - first) / 0.05), 50))
+    speed = np.linalg.norm(spline(t, 1), axis=1)
+    return Path(spline, CubicSpline(t, speed).antiderivative(), lap)
+
+
+def _loop_path(
+    loop: Array,
+    speed: float,
+    spacing: float,
+    soften: float,
+    lead_in: float = 0.0,
+    edge: tuple[float, float] | None = None,
+) -> Path:
+    """Go round a closed line for ever at constant speed, where wanted after a straight way in.
+
+    Args:
+        loop: closed line, first point not repeated, [m], (N, 3).
+        speed: [m/s].
+        spacing: between the path's knots [m].
+        soften: scale over which curvature is evened out [m].
+        lead_in: length of the straight way in, tangent to the loop at its first point [m].
+        edge: time [s] at which the target shall pass the coordinate x [m] of its way in.
+    """
+    count = int(PATH_SECONDS * speed / spacing)
+    line = _even(np.vstack([loop, loop[:1]]), spacing)[:-1]
+    start = line[1] - line[-1]
+    start = start / np.linalg.norm(start)
+    laps = np.tile(line, (count // len(line) + 2, 1))
+    straight = line[0] - start * np.arange(int(lead_in / spacing), 0, -1)[:, None] * spacing
+    points = gaussian_filter1d(np.vstack([straight, laps]), soften / spacing, axis=0, mode="nearest")[:count]
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    t = s / speed
+    if edge is not None:
+        time, x = edge
+        way_in = points[: len(straight) + 1, 0]
+        inward = np.sign(way_in[-1] - way_in[0])
+        t = t + time - np.interp(inward * x, inward * way_in, t[: len(straight) + 1])
+    # The last lap but one: what the end of the line does to smoothing and spline does not reach so far back.
+    begin, end = t[-2 * len(line) - 1], t[-len(line) - 1]
+    return _measured(CubicSpline(t, points), (float(begin), float(end)))
+
+
+def _even(points: Array, spacing: float) -> Array:
+    """Sample a line evenly, about ``spacing`` apart, both ends kept."""
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    at = np.linspace(0.0, s[-1], round(s[-1] / spacing) + 1)
+    return np.stack([np.interp(at, s, points[:, k]) for k in range(3)], axis=1)
+
+
+def _angles(count: int = 720) -> Array:
+    return np.linspace(0.0, 2 * np.pi, count, endpoint=False)
+
+
+def book_path(scene: str, rng: np.random.Generator) -> Path:
+    """Carry the book slowly round an ellipse about 10 m away, in view from the start."""
+    a, phase = _angles(), rng.uniform(0, 2 * np.pi)
+    wide, deep, high = rng.uniform(1.2, 1.6), rng.uniform(0.3, 0.5), rng.uniform(0.25, 0.4)
+    center = np.array([rng.uniform(-0.3, 0.3), rng.uniform(9.8, 10.2), rng.uniform(1.5, 1.7)])
+    tilt = rng.uniform(0, 2 * np.pi)
+    shape = [wide * np.cos(a + phase), deep * np.sin(a + phase), high * np.sin(a + phase + tilt)]
+    return _loop_path(center + np.stack(shape, axis=1), rng.uniform(0.22, 0.28), 0.05, 0.1)
+
+
+def person_path(scene: str, rng: np.random.Generator) -> Path:
+    """Walk in from one side at about 1.5 m/s, then weave a figure of eight; z is the ground's."""
+    # Outdoors the camera looks up: nearer than 13 m it does not see the feet.
+    near, reach, deep = (13.4, 4.4, 2.2) if scene == "outdoor" else (8.95, 2.65, 1.0)
+    side = rng.choice([-1.0, 1.0])
+    a = _angles() - np.pi / 4  # starts at the nearest point of the figure's first half, heading inwards
+    reach, deep = reach * rng.uniform(0.94, 1.0), deep * rng.uniform(0.9, 1.05)
+    figure = np.stack([-side * reach * np.sin(a), near + deep + deep * np.sin(2 * a), np.zeros_like(a)], axis=1)
+    edge = (rng.uniform(2.7, 3.0), side * VIEW_EDGE * near)
+    return _loop_path(figure, rng.uniform(1.42, 1.55), 0.15, 0.25, 14.0, edge)
+
+
+def bird_path(scene: str, rng: np.random.Generator) -> Path:
+    """Fly in from one side at about 5 m/s, then round after round; indoors a smaller and slower round.
+
+    Rounds are two half circles and two straights across the view, so that the bird shows its side most of the time.
+    """
+    a = _angles()
+    side = rng.choice([-1.0, 1.0])
+    if scene == "indoor":
+        radius, across, near, height, rise, speed, soften = rng.uniform(2.0, 2.2), 0.8, 7.4, 2.3, 0.25, 2.9, 0.5
+    else:
+        radius, across, near, height, rise, speed, soften = rng.uniform(2.5, 2.8), 4.4, 19.4, 7.8, 1.6, 5.0, 0.6
+    height += 0.3 * rise * rng.uniform(-1, 1)
+    start, lift = rng.uniform(0, 2 * np.pi), rise * rng.uniform(0.7, 1.0)
+    x = side * (radius * np.sin(a) + across * np.where(a < np.pi, 1.0, -1.0))
+    y = near + radius * (1 - np.cos(a))
+    flat = _even(np.stack([[*x, x[0]], [*y, y[0]], np.zeros(len(a) + 1)], axis=1), 0.02)[:-1]
+    flat[:, 2] = height + lift * np.sin(start + _angles(len(flat)))
+    speed *= rng.uniform(0.96, 1.04)
+    edge = (rng.uniform(2.4, 2.8), -side * VIEW_EDGE * near)
+    return _loop_path(flat, speed, 0.1 * speed, soften, 8.0 * speed, edge)

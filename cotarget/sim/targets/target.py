@@ -1,0 +1,239 @@
+"""The simulated targets: where a book, a person or a bird is at a time, how its joints stand, and how large it is.
+
+There may be several of a kind: ``bird2`` is a second bird. The ways that they take are in `cotarget.sim.targets.paths`,
+the
+models in sim_assets/targets.
+"""
+
+import math
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cotarget.config import TARGETS, Waypoint, split_name, told_targets
+from cotarget.errors import ConfigError
+from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.sim.targets.gait import (
+    STRIDE,
+    WALK_SPEED,
+    WING_BEAT_HZ,
+    Axes,
+    bank,
+    face_mount,
+    flap,
+    heading,
+    turned,
+    walk,
+)
+from cotarget.sim.targets.paths import MOUNT, Path, bird_path, book_path, person_path, waypoint_path
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+__all__ = [
+    "MOUNT",
+    "TARGETS",
+    "Target",
+    "TargetPose",
+    "change_marker",
+    "draw_size",
+    "kind_of",
+    "make_target",
+    "marker_of",
+    "scale_spec",
+    "target_rng",
+    "waypoint_path",
+]
+# The markers that they carry, ids in DICT_4X4_50: those of the first of a kind, and what is added for each further one;
+# the models' textures are drawn for five of a kind, after which the ids repeat. All books carry the same.
+MARKERS = {"book": 1, "person": 2, "bird": 3}
+MARKER_STEP, MARKERS_OF_A_KIND = 10, 5
+RANDOM = 3  # the stream of random numbers of the targets, apart from the world's others
+PERSON_HEIGHT = 1.75  # of the model [m]
+SCATTER = {"book": 0.0, "person": 0.04, "bird": 0.15}  # of the true sizes, relative; all within this
+SCATTER_SIGMA = 0.5  # the range above is two standard deviations
+
+
+@dataclass(frozen=True)
+class TargetPose:
+    """Where a target is in the world: its body's position [m], its rotation, and each joint's angle [rad] by name."""
+
+    position: Array
+    rotation: Rotation
+    joints: Mapping[str, float]
+
+    @property
+    def T_world_target(self) -> RigidTransform:
+        """The body's pose."""
+        return RigidTransform.from_components(self.position, self.rotation)
+
+
+@dataclass(frozen=True)
+class Target:
+    """One target of the simulated world.
+
+    Attributes:
+        name: its kind, and a number where it is not the first of its kind.
+        beat_s: period of its limbs' motion [s]; 0 for a rigid target.
+        size: true size over the model's.
+        path: where it goes.
+        phase: where in its limbs' motion it starts [rad].
+        grounded: whether its height follows from its size, because it stands on the ground.
+        own: file of a user's own model; it has no moving parts, and its true size is the model's.
+    """
+
+    name: str
+    beat_s: float
+    size: float
+    path: Path = field(repr=False)
+    phase: float = 0.0
+    grounded: bool = False
+    own: FilePath | None = None
+
+    @property
+    def kind(self) -> str:
+        """One of TARGETS, or of a user's own; also the name of the model's body."""
+        return split_name(self.name)[0]
+
+    @property
+    def body(self) -> str:
+        """The name of its body in the compiled world."""
+        return f"{self.name}/{self.kind}"
+
+    def pose(self, t: float) -> TargetPose:
+        """Tell pose and joints at time ``t`` [s]."""
+        if self.kind == "book":
+            place = self.path.position(t)
+            return TargetPose(place, Rotation.from_euler("ZYX", face_mount(place, t, self.phase)), {})
+        position, axes, joints = self.stance(t, self.beat(t))
+        return TargetPose(np.array(position), Rotation.from_matrix(np.transpose(axes), assume_valid=True), joints)
+
+    def stance(self, t: float, beat: float) -> tuple[list[float], Axes, Mapping[str, float]]:
+        """The same in floats, which is quicker.
+
+        Args:
+            t: the time [s].
+            beat: of its limbs then, as `beat` tells it [rad].
+
+        Returns:
+            Its body's position [m], (3,); the body's axes in the world; each joint's angle [rad].
+        """
+        position, velocity, acceleration = self.path.motion(t)
+        kind = self.kind
+        if kind == "book":
+            return position, turned(*face_mount(position, t, self.phase)), {}
+        if kind == "bird":
+            return position, bank(heading(position, velocity), acceleration), flap(beat)
+        if self.own is not None:
+            return position, heading(position, velocity), {}
+        joints, bob = walk(beat, min(math.hypot(*velocity) / WALK_SPEED, 1.0))
+        axes = heading(position, [*velocity[:2], 0.0 * velocity[2]])  # whoever walks stays upright
+        position[2] += bob * self.size + (0.5 * PERSON_HEIGHT * self.size if self.grounded else 0.0)
+        return position, axes, joints
+
+    def beat(self, t: float) -> float:
+        """Where its limbs are in their motion at time ``t`` [s], as an angle that grows without end [rad]."""
+        if self.kind == "person":
+            return self.phase + 2 * np.pi * self.path.travelled(t) / (STRIDE * self.size)
+        return self.phase + 2 * np.pi * WING_BEAT_HZ * t
+
+
+def make_target(
+    name: str,
+    scene: str,
+    rng: np.random.Generator,
+    scatter: bool,
+    waypoints: Sequence[Waypoint] | None = None,
+    own: FilePath | None = None,
+) -> Target:
+    """Make one target.
+
+    Args:
+        name: one of TARGETS, with a number from 2 on for a further one of its kind.
+        scene: name or path of the scene; any but the built-in ones has the book and the person as indoors and the
+            bird as outdoors.
+        rng: source of the small differences between one run and the next; same seed, same path.
+        scatter: whether the true size differs from what the pipeline is told.
+        waypoints: [t, x, y, z] of the body's centre in the world [s, m] to go through instead.
+        own: file of a user's own model, which needs waypoints.
+
+    Raises:
+        ConfigError: no such target, or waypoints that do not advance in time.
+    """
+    if own is not None:
+        if waypoints is None:
+            raise ConfigError(f"sim.targets: a {name} of your own needs a way: [sim.paths] {name}")
+        return Target(name, 0.0, 1.0, waypoint_path(waypoints, f"sim.paths.{name}"), own=own)
+    kind = kind_of(name)
+    # Drawn whether used or not, so that no switch changes the path.
+    size = draw_size(name, rng, scatter)
+    phase = float(rng.uniform(0.0, 2 * np.pi))
+    make = {"book": book_path, "person": person_path, "bird": bird_path}[kind]
+    path = make(scene, rng) if waypoints is None else waypoint_path(waypoints, f"sim.paths.{name}")
+    beat_s = {"book": 0.0, "person": STRIDE / WALK_SPEED, "bird": 1 / WING_BEAT_HZ}[kind]
+    grounded = kind == "person" and waypoints is None
+    return Target(name, beat_s, size, path, phase, grounded)
+
+
+def target_rng(seed: int, name: str) -> np.random.Generator:
+    """The random numbers of one target, whatever else is in the scene."""
+    return np.random.default_rng((seed, RANDOM, zlib.crc32(name.encode())))
+
+
+def draw_size(name: str, rng: np.random.Generator, scatter: bool) -> float:
+    """Draw a target's true size over what the pipeline is told; the first number that its rng gives."""
+    return 1.0 + SCATTER[kind_of(name)] * SCATTER_SIGMA * float(np.clip(rng.standard_normal(), -2.0, 2.0)) * scatter
+
+
+def kind_of(name: str) -> str:
+    """The kind of a target by its name: ``bird`` of ``bird`` and of ``bird2``.
+
+    Raises:
+        ConfigError: no such target.
+    """
+    return TARGETS[_place_of(name)[0]]
+
+
+def marker_of(name: str) -> int:
+    """The marker that a target carries, an id in DICT_4X4_50.
+
+    Raises:
+        ConfigError: no such target.
+    """
+    kind, number = _place_of(name)
+    marker = MARKERS[TARGETS[kind]]
+    return marker if kind == 0 else marker + MARKER_STEP * ((number - 1) % MARKERS_OF_A_KIND)
+
+
+@lru_cache(maxsize=256)
+def _place_of(name: str) -> tuple[int, int]:
+    """Index of a target's kind in TARGETS, and its number among its kind, from 1 on."""
+    kind, number = split_name(name)
+    if kind not in TARGETS:
+        raise ConfigError(f"unknown target '{name}'; {told_targets()}")
+    return TARGETS.index(kind), number
+
+
+def change_marker(spec: "mujoco.MjSpec", name: str) -> None:
+    """Give a target's model the marker of that name; do it before attaching."""
+    kind, number = _place_of(name)
+    if kind and (number - 1) % MARKERS_OF_A_KIND:
+        spec.texture(f"{TARGETS[kind]}_marker").file = f"{TARGETS[kind]}_marker_{marker_of(name)}.png"
+
+
+def scale_spec(spec: "mujoco.MjSpec", factor: float) -> None:
+    """Make every length of a target's model ``factor`` times as large; do it before attaching."""
+    for mesh in spec.meshes:
+        mesh.scale = np.asarray(mesh.scale) * factor
+    for geom in spec.geoms:
+        geom.size = np.asarray(geom.size) * factor
+        geom.pos = np.asarray(geom.pos) * factor
+        geom.fromto = np.asarray(geom.fromto) * factor  # nan where it is not used
+    for element in [*spec.bodies[1:], *spec.sites, *spec.joints]:
+        element.pos = np.asarray(element.pos) * factor

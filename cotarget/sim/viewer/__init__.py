@@ -1,0 +1,1 @@
+"""Windows on a simulated world: desktop and browser."""

@@ -1,0 +1,141 @@
+"""What every window on a world needs: a copy of its model that may be shown, its state, and the lines to be drawn.
+
+The cameras' frusta in the world, and one moment of a world as somebody who watches it from outside sees it.
+"""
+
+import copy
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cotarget.geometry import Array, RigidTransform
+from cotarget.rig import Image
+from cotarget.sim.model import RIG_GROUP
+from cotarget.sim.render.opengl import mujoco
+from cotarget.sim.render.optics import TrueLens
+from cotarget.sim.truth import CameraName, Truth
+
+# Where a frustum ends that nobody says better of, along the axis [m]; the wide one's before it meets the floor.
+FAR: Mapping[CameraName, float] = {"fixed": 4.0, "zoom": 8.0}
+SIDE_POINTS = 8  # segments of each side of a frustum's end, which distortion bends
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One moment of a world, for a window that shows it.
+
+    Attributes:
+        t: on the rig's clock [s].
+        caption: what goes on, in words.
+        pictures: what each camera shows, (H, W, 3) BGR.
+        lines: each camera's frustum, begin and end of each line in the world [m], (n, 2, 3).
+    """
+
+    t: float
+    caption: str
+    pictures: Mapping[CameraName, Image]
+    lines: Mapping[CameraName, Array]
+
+
+def frustum_rim(T_world_camera: RigidTransform, lens: TrueLens, depth: float) -> Array:
+    """Where the border of a camera's image is in the world at a depth: the frustum's end.
+
+    Args:
+        T_world_camera: pose of the optical centre, in OpenCV's axes.
+        lens: the camera's true optics.
+        depth: along the camera's axis [m].
+
+    Returns:
+        Points around the border [m], (4 n, 3); each n-th is a corner, the first the top left one's.
+    """
+    width, height = lens.size
+    # The image's border, half a pixel outside of the outermost pixels' centres.
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+    along = np.linspace(0.0, 1.0, SIDE_POINTS, endpoint=False)[:, None]
+    border = np.concatenate([a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
+    x_camera = np.column_stack([lens.directions(border), np.ones(len(border))]) * depth
+    return T_world_camera.apply(x_camera)
+
+
+def frustum_lines(T_world_camera: RigidTransform, lens: TrueLens, depth: float) -> Array:
+    """A camera's frustum as lines in the world [m], (n, 2, 3): its end, then its four edges from the optical centre."""
+    rim = frustum_rim(T_world_camera, lens, depth)
+    corners = rim[::SIDE_POINTS]
+    edges = np.stack([np.broadcast_to(T_world_camera.translation, corners.shape), corners], axis=1)
+    return np.concatenate([np.stack([rim, np.roll(rim, -1, axis=0)], axis=1), edges])
+
+
+def frusta_of(truth: Truth, t: float, depths: Mapping[CameraName, float] | None = None) -> dict[CameraName, Array]:
+    """Both cameras' frusta as they truly are at a time [s]; the zoom camera's follows pan, tilt and focal length.
+
+    Args:
+        truth: of the world.
+        t: up to now [s].
+        depths: where they end, along each camera's axis [m].
+    """
+    ends = {**FAR, **(depths or {})}
+    return {name: frustum_lines(truth.T_world_camera(name, t), truth.lens(name, t), end) for name, end in ends.items()}
+
+
+COLOURS = {"fixed": (0.1, 0.45, 1.0, 1.0), "zoom": (1.0, 0.55, 0.05, 1.0)}  # of the frusta
+LINE_PX = 2.0
+SHOWN_GROUPS = (0, 1, 2, RIG_GROUP)
+# From where the scene is looked at first: from behind the rig, its cameras' way.
+AHEAD, DISTANCE, ASIDE_DEG, ELEVATION_DEG = 3.0, 7.0, 25.0, -22.0  # [m], [m], [degrees]
+
+
+class Onlooker:
+    """A world's model and state apart from the world's own, which move whenever somebody asks for another time."""
+
+    def __init__(self, truth: Truth) -> None:
+        """Copy the model.
+
+        Args:
+            truth: of the world that is shown.
+        """
+        self._truth = truth
+        self.model = copy.copy(truth.model)
+        self.data = mujoco.MjData(self.model)
+        self.come_to(0.0)
+        mujoco.mj_forward(self.model, self.data)
+
+    def come_to(self, t: float) -> None:
+        """Take over everything's pose at a time up to now [s]."""
+        state = self._truth.set_bodies(t)
+        self.data.time = t
+        self.data.qpos[:] = state.qpos
+        self.data.mocap_pos[:], self.data.mocap_quat[:] = state.mocap_pos, state.mocap_quat
+
+    def aim(self, camera: "mujoco.MjvCamera", option: "mujoco.MjvOption") -> None:
+        """Put a free camera behind the rig, and let the rig be seen."""
+        T = self._truth.T_world_fixed
+        ahead = T.rotation.apply([0.0, 0.0, 1.0])
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        camera.lookat[:] = T.translation + AHEAD * ahead
+        camera.distance, camera.elevation = DISTANCE, ELEVATION_DEG
+        camera.azimuth = float(np.degrees(np.arctan2(ahead[1], ahead[0]))) + ASIDE_DEG
+        option.geomgroup[:] = np.isin(np.arange(mujoco.mjNGROUP), SHOWN_GROUPS)
+        option.sitegroup[:] = 0
+
+
+def line_geoms(sight: Sight, geoms: "Iterator[mujoco.MjvGeom]") -> int:
+    """Make geoms the lines of a sight's frusta.
+
+    Args:
+        sight: what is shown.
+        geoms: to be changed, one for each line.
+
+    Returns:
+        How many there are.
+    """
+    drawn = 0
+    kind = int(mujoco.mjtGeom.mjGEOM_LINE)
+    for name, lines in sight.lines.items():
+        colour = np.array(COLOURS[name], dtype=np.float32)
+        for (begin, end), geom in zip(lines, geoms, strict=False):
+            mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), colour)
+            geom.emission = 1.0  # as bright in the shade
+            mujoco.mjv_connector(geom, kind, LINE_PX, begin, end)
+            drawn += 1
+    return drawn

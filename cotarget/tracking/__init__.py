@@ -1,0 +1,1 @@
+"""Track detections over time in the fixed view."""
