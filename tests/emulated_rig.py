@@ -15,7 +15,7 @@ import tomli_w
 
 from cotarget.calibration import save_calibration
 from cotarget.config import load_config
-from tests.test_cli import true_calibration
+from tests.cli.test_commands import true_calibration
 
 DEADLINE_S = 60.0  # for whatever must happen at all, on a machine that is busy with other things
 START_S = 120.0  # for an emulator to say where it listens

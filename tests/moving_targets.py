@@ -1,6 +1,6 @@
 """Targets that move, and what a synthetic rig measures of them: boxes in the wide view, middles in the zoom view.
 
-Nothing here uses the package's camera or head model: everything comes from `experiments.synthetic`.
+Nothing here uses the package's camera or head model: everything comes from `experiments.calibration.synthetic`.
 """
 
 import math
@@ -14,8 +14,8 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.pantilt import HeadGeometry
-from experiments.synthetic.aims import aimed
-from experiments.synthetic.rig import LONGEST_PX, NOMINAL_PX, SIZE, Truth
+from experiments.calibration.synthetic.aims import aimed
+from experiments.calibration.synthetic.rig import LONGEST_PX, NOMINAL_PX, SIZE, Truth
 
 RATE = 25.0
 APART = 0.013  # the zoom camera's frames come that much after the wide one's [s]

@@ -14,7 +14,7 @@ from cotarget.config import BoardConfig
 from cotarget.errors import StaleFrameError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
-from experiments.synthetic.rig import NOMINAL_PX, SIZE, Lens, Stop, Truth
+from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Lens, Stop, Truth
 
 PERIOD = 0.04
 LATENCY = 0.05

@@ -17,8 +17,8 @@ from cotarget.evaluation import true_calibration
 from cotarget.recording.recorder import COLUMNS as STEP_COLUMNS
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
-from experiments.cases import choose, known_experiments
-from experiments.command import main
+from experiments.engine.cases import choose, known_experiments
+from experiments.engine.command import main
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 # `cotarget NAME ... --option ...` up to where a line of code or of a shell ends.
@@ -118,7 +118,7 @@ def python_with(word):
 
 
 def test_target_and_scene_of_ones_own_are_there_as_shown(tmp_path):
-    from tests.test_own_models import BOX
+    from tests.sim.test_own_models import BOX
 
     (tmp_path / "rig.toml").write_text(block_after("own", "toml"))
     (tmp_path / "yard.xml").write_text(block_after("yard", "xml"))

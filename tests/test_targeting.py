@@ -13,7 +13,7 @@ from cotarget.errors import CalibrationError, CotargetError, UnreachableError
 from cotarget.geometry import RigidTransform, Rotation
 from cotarget.pantilt import HeadGeometry
 from cotarget.targeting import METHODS, Closeup, Reach, aim, depth_of, error_budget, point_at
-from experiments.synthetic.rig import SIZE, Lens, Truth
+from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
 
 # The solver accepts a miss of 1e-11 rad, which is 1e-7 px at the longest focal length of 8000 px.
 PIXEL = 1e-6

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.harness import Experiment, Preparation, Settings, seeds_of
-from experiments.results import code_version
+from experiments.engine.harness import Experiment, Preparation, Settings, seeds_of
+from experiments.engine.results import code_version
 
 SIZE = 300  # of matrices that are large enough for linear algebra to share its sums among threads
 
@@ -113,6 +113,6 @@ LACKING = replace(TINY, name="lacking", purpose="Lacks something.", needs=lambda
 KNOWN = {each.name: lambda each=each: each for each in (TINY, SHARING, VAIN, ALONE, LACKING)}
 
 if __name__ == "__main__":
-    from experiments.command import main
+    from experiments.engine.command import main
 
     sys.exit(main(known=KNOWN))

@@ -323,7 +323,8 @@ WARP_SHARE = 0.004
 # thousand; below that it is doubted (`considered`).
 K3_SIGMAS, K3_WIDE = 4.0, 1.0
 # A lens that asks for k3 is not of this model, and departs from it further where no board was seen: the uncertainty is
-# widened by this, which covers rational and fisheye lenses whose nearest fit is 0.2 px off (experiments.mismatch).
+# widened by this, which covers rational and fisheye lenses whose nearest fit is 0.2 px off
+# (experiments.calibration.mismatch).
 K3_WIDENED = 1.4
 # Held where they are not found, and doubted where the corners speak against that.
 CONSIDERED: tuple[Block, ...] = ("k3", "scale")

@@ -414,7 +414,7 @@ LEAST_SIGNAL = 4.5
 # So many specks are looked at in a frame, those that stand out most first; it bounds the time of a frame.
 MOST_SPECKS = 40
 # What is found to have changed of things that stand, nine times in ten less, after each of AGES_S; measured on films of
-# the collection that tests/test_real_clips.py names, each seen through air and a codec.
+# the collection that tests/detection/test_real_clips.py names, each seen through air and a codec.
 STANDING_CHANGE = (0.05, 0.08, 0.15, 0.20)
 # Added to a change before its logarithm is taken: less than this cannot be measured.
 LEAST_CHANGE = 0.02

@@ -18,12 +18,7 @@ from collections.abc import Callable
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.plant import AxisPlant
 from cotarget.emulators.ptu_d46.commands import execute
-from cotarget.emulators.ptu_d46.unit import (
-    RefusalError,
-    Task,
-    Unit,
-    UnitProfile,
-)
+from cotarget.emulators.ptu_d46.unit import RefusalError, Task, Unit, UnitProfile
 
 SPACE, CR, LF, AT = 0x20, 0x0D, 0x0A, 0x40
 NEWLINE = "\r\n"

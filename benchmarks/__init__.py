@@ -1,0 +1,1 @@
+"""What measures times: the simulation, the pipeline, sweeps, environments."""

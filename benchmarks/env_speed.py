@@ -1,0 +1,213 @@
+"""How fast the environments are, beside MuJoCo alone on the same model: stepping it, and stepping and rendering it.
+
+An environment's step is a frame of the wide camera: commands to head and lens, what the cameras saw, detection,
+tracking, the observation, the reward and the truth in `info`. MuJoCo alone does a frame's time in steps of the model's
+own (`mj_step`, 20 of 2 ms), the targets' poses being ready and put in once a frame; with pictures, `mujoco.Renderer`
+then draws both cameras as large, with the same antialiasing and shadows. Both take turns within one run. The actions
+are those by which the pipeline holds the target, noted beforehand: that the target is in the close-up costs most.
+
+Steps without pictures need one thread and are timed by its processor time, those with pictures by the clock. What a
+reset takes, which builds a world, is told beside.
+
+    python -m benchmarks.env_speed [--seeds 1] [--seed-base 0] [--quick] [--out DIR]
+"""
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.plain_renderer import PlainRenderer
+from cotarget.config import RigConfig
+from cotarget.env import Follow, PipelinePolicy
+from cotarget.env.common import Vector
+from cotarget.sim.render.opengl import mujoco
+from cotarget.sim.world import SimWorld
+from experiments.engine.checks import check_above, check_least, check_ways
+from experiments.engine.harness import Experiment, Row, Settings, seeds_of
+from experiments.engine.texts import table
+
+SIZE = (64, 64)
+BLOCK = 25  # steps of each, by turns: alone each finds the caches as the other left them
+# At least so many steps of an environment in the time of one of MuJoCo's.
+WANTED = {"tracks": 0.5, "images": 0.8}
+
+
+@dataclass(frozen=True)
+class EnvSpeedSettings(Settings):
+    """How many seeds, which targets, and for how long.
+
+    Attributes:
+        targets: book, person, bird.
+        seconds: of an episode without pictures [s].
+        seconds_seen: of one with pictures [s].
+    """
+
+    seeds: int = 1
+    targets: tuple[str, ...] = ("book", "person", "bird")
+    seconds: float = 20.0
+    seconds_seen: float = 6.0
+
+    def __post_init__(self) -> None:
+        """Refuse what the environments do, and what is too short to be timed."""
+        super().__post_init__()
+        check_least(BLOCK / RigConfig().rate_hz, self, "seconds")
+        check_above(0, self, "seconds_seen")
+        check_ways(self, "seconds", "seconds_seen")
+
+
+class Alone:
+    """MuJoCo and nothing else, on the model of a world and with its targets' poses."""
+
+    def __init__(self, world: SimWorld, model: "mujoco.MjModel", times: Sequence[float]) -> None:
+        """Work out the poses.
+
+        Args:
+            world: whose.
+            model: of it.
+            times: of its frames [s].
+        """
+        self._model, self._data = model, mujoco.MjData(model)
+        self._steps = round(1 / world.config.rate_hz / model.opt.timestep)
+        truth = world.truth()
+        poses = (truth.set_bodies(t) for t in times)
+        self._poses = [(data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()) for data in poses]
+
+    def step(self, index: int) -> None:
+        """From one frame to the next."""
+        data, model = self._data, self._model
+        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = self._poses[index]
+        data.qvel[:] = 0.0
+        for _ in range(self._steps):
+            mujoco.mj_step(model, data)
+
+
+def one(shared: None, settings: EnvSpeedSettings, seed: int) -> list[Row]:
+    """Time everything once."""
+    return [row for name in settings.targets for row in (*tracks(settings, name, seed), *images(settings, name, seed))]
+
+
+def tracks(settings: EnvSpeedSettings, name: str, seed: int) -> Iterator[Row]:
+    """Blocks of steps without pictures, and of MuJoCo's."""
+    env = Follow(name, seconds=settings.seconds)
+    actions, times = held(env, seed)
+    began = time.perf_counter()
+    env.reset(seed=seed)
+    reset_ms = 1e3 * (time.perf_counter() - began)
+    world = env.episode.world
+    alone = Alone(world, world.truth().model, times)
+    for first in range(0, len(actions) - BLOCK + 1, BLOCK):
+        block = range(first, first + BLOCK)
+        yield {
+            "seed": seed,
+            "target": name,
+            "what": "tracks",
+            "env_us": timed(time.thread_time, lambda i: env.step(actions[i]), block),
+            "alone_us": timed(time.thread_time, alone.step, block),
+            "reset_ms": reset_ms,
+        }
+    env.close()
+
+
+def images(settings: EnvSpeedSettings, name: str, seed: int) -> Iterator[Row]:
+    """Steps with pictures, and MuJoCo's with its own renderer's."""
+    env = Follow(name, "images", seconds=settings.seconds_seen, image_size=SIZE)
+    actions, times = held(env, seed)
+    began = time.perf_counter()
+    env.reset(seed=seed)
+    reset_ms = 1e3 * (time.perf_counter() - began)
+    plain = PlainRenderer(env.episode.world, SIZE)
+    alone = Alone(env.episode.world, plain.model, times)
+    for i, action in enumerate(actions):
+        env_us = timed(time.perf_counter, lambda i: env.step(action), range(i, i + 1))  # noqa: B023  used at once
+        stepped_us = timed(time.perf_counter, alone.step, range(i, i + 1))
+        alone_us = stepped_us + 1e6 * plain.draw(env.times[1])
+        yield {
+            "seed": seed,
+            "target": name,
+            "what": "images",
+            "env_us": env_us,
+            "alone_us": alone_us,
+            "reset_ms": reset_ms,
+        }
+    plain.close()
+    env.close()
+
+
+def held(env: Follow, seed: int) -> tuple[list[Vector], list[float]]:
+    """What the pipeline does in an episode, and the times of the frames [s]."""
+    policy, actions, times, over = PipelinePolicy(env), list[Vector](), list[float](), False
+    observation, _ = env.reset(seed=seed)
+    while not over:
+        actions.append(policy(observation))
+        observation, _, _, over, info = env.step(actions[-1])
+        times.append(info["t"])
+    return actions, times
+
+
+def timed(clock: Callable[[], float], step: Callable[[int], object], block: Sequence[int]) -> float:
+    """How long each step of a block takes, on the mean [us]."""
+    began = clock()
+    for i in block:
+        step(i)
+    return 1e6 * (clock() - began) / len(block)
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """For each kind of observation and target: medians, and steps a second as a part of MuJoCo's."""
+    found = {}
+    for what, name in dict.fromkeys((row["what"], row["target"]) for row in rows):
+        own = [row for row in rows if (row["what"], row["target"]) == (what, name)]
+        env_us, alone_us = (float(np.median([row[key] for row in own])) for key in ("env_us", "alone_us"))
+        found[f"{what}, {name}"] = {
+            "steps_per_s": 1e6 / env_us,
+            "alone_per_s": 1e6 / alone_us,
+            "ratio": float(np.median([row["alone_us"] / row["env_us"] for row in own])),
+            "reset_ms": float(np.median([row["reset_ms"] for row in own])),
+        }
+    return found
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """Where an environment is slower than wanted."""
+    return [name for name, found in summary.items() if not found["ratio"] >= WANTED[name.split(",")[0]]]
+
+
+def describe(settings: EnvSpeedSettings, summary: Mapping[str, Any]) -> str:
+    """A line for each kind of observation and target."""
+    head = ("cotarget/Follow-v0", "steps/s", "MuJoCo alone", "ratio", "reset [ms]", "wanted")
+    lines = [[name, *found.values(), f">= {WANTED[name.split(',')[0]]:g}"] for name, found in summary.items()]
+    return f"steps a second beside MuJoCo alone, {seeds_of(settings)}; medians\n" + table(head, lines)
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Steps a second, each pair of bars an environment and MuJoCo alone."""
+    found = summarise(rows)
+    at, ax = np.arange(len(found)), figure.subplots()
+    ax.bar(at - 0.2, [each["steps_per_s"] for each in found.values()], 0.4, label="environment")
+    ax.bar(at + 0.2, [each["alone_per_s"] for each in found.values()], 0.4, label="MuJoCo alone")
+    ax.set(ylabel="steps a second", yscale="log", xticks=at, xticklabels=list(found))
+    ax.tick_params(axis="x", rotation=20)
+    ax.legend(frameon=False)
+
+
+SETTINGS = EnvSpeedSettings()
+EXPERIMENT = Experiment(
+    "env_speed",
+    "The environments' speed, beside MuJoCo alone.",
+    SETTINGS,
+    replace(SETTINGS, seeds=1, targets=("bird",), seconds=4.0, seconds_seen=0.4),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    alone=True,
+    cost_s=60.0,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

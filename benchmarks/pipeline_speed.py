@@ -1,0 +1,196 @@
+"""How long the pipeline takes for a frame, beside the background subtraction that it is built from.
+
+A film of a real bird (V_BIRD_036 of Svanstroem et al., doi 10.5281/zenodo.5500576, CC0-1.0, looked for in
+../shared/data/birds beside the project). On each of its frames, in turns because a machine's pace drifts:
+`cv2.createBackgroundSubtractorMOG2().apply` alone on BGR, and what the loop does with a wide frame, each timed: detect,
+track in the image and in 3D, and aim exactly at where the target will be; what drives head and lens after that is left
+out, and so is the zoom view. On as many threads as OpenCV takes.
+
+    python -m benchmarks.pipeline_speed [--seeds 1: times through the film] [--quick] [--out DIR]
+"""
+
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration
+from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetConfig
+from cotarget.control.selection import FirstCome
+from cotarget.detection import Detector, make_detector
+from cotarget.errors import ConfigError
+from cotarget.evaluation import true_calibration
+from cotarget.fusion import Pursuit
+from cotarget.rig import Frame, PanTiltLimits
+from cotarget.sim.world import SimWorld
+from cotarget.targeting import Reach, aim
+from cotarget.tracking.track import settings_for
+from cotarget.tracking.tracker import Tracker
+from cotarget.video import Film
+from experiments.engine.harness import Experiment, Row, Settings
+from experiments.engine.texts import table
+
+FILM = Path(__file__).resolve().parents[2] / "shared" / "data" / "birds" / "V_BIRD_036.mp4"
+ALONE = "MOG2 alone"
+# The aim leads the target by this [s].
+LEAD_S = 0.1
+STAGES = ("detect_ms", "track_ms", "aim_ms")
+WANTED = {"motion": 1.5, "speck": 2.5}  # times as long as the subtraction alone: at most
+
+
+@dataclass(frozen=True)
+class PipelineSpeedSettings(Settings):
+    """Times through the film as seeds; its first frames are not timed, for a model that learns costs more or less."""
+
+    seeds: int = 1
+    frames: int = 300
+    untimed: int = 60
+
+    def __post_init__(self) -> None:
+        """Refuse to time nothing."""
+        super().__post_init__()
+        if self.untimed >= self.frames:
+            raise ConfigError(f"untimed: {self.untimed} is not below frames = {self.frames}, so that none is timed")
+
+
+class Pipeline:
+    """Detect, track and aim, as the loop does with a frame."""
+
+    def __init__(self, kind: str, film: Film) -> None:
+        """Begin anew.
+
+        Args:
+            kind: of detector.
+            film: gives size and rate.
+        """
+        self.target: TargetConfig = replace(DEFAULT_TARGETS["bird"], detector=kind)  # type: ignore[arg-type]
+        self.detector: Detector = make_detector(self.target, film.rate_hz)
+        self.calibration = calibration_of(film.size)
+        self.tracker, self.policy = Tracker(settings_for(self.target), film.size), FirstCome()
+        self.pursuit = Pursuit(self.calibration, self.target, film.size)
+        config = RigConfig()
+        pan, tilt = config.head_limits
+        self.reach = Reach(pan, tilt, config.focal_range_px)
+        self.limits = PanTiltLimits(pan, tilt, math.inf, math.inf, 0.0)
+
+    def __call__(self, frame: Frame) -> Row:
+        """Do a frame; the milliseconds of each stage, and whether there was a target to aim at."""
+        began = time.perf_counter()
+        detections = self.detector.detect(frame)
+        detected = time.perf_counter()
+        tracks = self.tracker.update(detections, frame.t)
+        self.pursuit.see_wide(frame, tracks, self.detector.mask)
+        number = self.policy.select(self.pursuit.candidates(tracks, frame.t), np.zeros(2), self.limits)
+        self.pursuit.follow(number)
+        estimate = None if number is None else self.pursuit.estimate(number, frame.t + LEAD_S)
+        tracked = time.perf_counter()
+        if estimate is not None:
+            aim(self.calibration, estimate.x_fixed, self.reach, closeup=estimate.closeup)
+        ended = time.perf_counter()
+        times = (began, detected, tracked, ended)
+        stages = {name: 1e3 * (b - a) for name, a, b in zip(STAGES, times[:-1], times[1:], strict=True)}
+        return {"ms": 1e3 * (ended - began), "aimed": estimate is not None, **stages}
+
+
+def calibration_of(size: tuple[int, int]) -> Calibration:
+    """The default rig's calibration, with a wide view of that size."""
+    calibration = true_calibration(SimWorld(RigConfig(), rendered=()))
+    middle = ((size[0] - 1) / 2, (size[1] - 1) / 2)
+    return replace(calibration, fixed=replace(calibration.fixed, size=size, center_px=middle))
+
+
+def needs(settings: PipelineSpeedSettings) -> str:
+    """Say what is missing."""
+    if not FILM.is_file():
+        return f"needs {FILM}, which is not part of the project"
+    with Film(FILM) as film:
+        there = film.count
+    few = there is not None and there < settings.frames
+    return f"needs {settings.frames} frames, and {FILM} has {there}" if few else ""
+
+
+def one(_: None, settings: PipelineSpeedSettings, seed: int) -> list[Row]:
+    """Go through the film once; one row for each frame and way."""
+    rows: list[Row] = []
+    with Film(FILM) as film:
+        subtractor = cv2.createBackgroundSubtractorMOG2()
+
+        def alone(frame: Frame) -> Row:
+            began = time.perf_counter()
+            subtractor.apply(frame.image)
+            return {"ms": 1e3 * (time.perf_counter() - began), "aimed": True}
+
+        ways: list[tuple[str, Callable[[Frame], Row]]] = [(ALONE, alone)]
+        ways += [(kind, Pipeline(kind, film)) for kind in ("mog2", "motion", "speck")]
+        for index, frame in enumerate(film):
+            if index >= settings.frames:
+                break
+            for k in range(len(ways)):  # the first to touch a frame pays for fetching it: each is first in turn
+                way, work = ways[(k + index) % len(ways)]
+                done = work(frame)
+                if index >= settings.untimed:
+                    rows.append({"seed": seed, "frame": index, "way": way, **done})
+    return rows
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Median milliseconds of the frames with something to aim at, and how many times as long as the subtraction."""
+    found = {}
+    alone = float(np.median([row["ms"] for row in rows if row["way"] == ALONE]))
+    for way in dict.fromkeys(sorted((row["way"] for row in rows), key=lambda way: way != ALONE)):
+        mine = [row for row in rows if row["way"] == way]
+        aimed = [row for row in mine if row["aimed"]]
+        found[way] = {"frames_aimed": len(aimed) / len(mine)}
+        for name in ("ms", *STAGES):
+            found[way][name] = float(np.median([row.get(name, np.nan) for row in aimed] or [np.nan]))
+        found[way]["ratio"] = found[way]["ms"] / alone
+    return found
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The ways that take longer than is wanted."""
+    return [way for way, most in WANTED.items() if not summary[way]["ratio"] <= most]
+
+
+def describe(settings: PipelineSpeedSettings, summary: Mapping[str, Any]) -> str:
+    """The table."""
+    return f"{FILM.name}, {settings.frames - settings.untimed} frames, {settings.seeds} times; medians\n" + table(
+        ("way", "frames aimed", "ms a frame", "detect", "track", "aim", "of MOG2 alone", "wanted"),
+        ([way, *found.values(), f"<= {WANTED[way]:g}" if way in WANTED else ""] for way, found in summary.items()),
+    )
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Milliseconds of each frame."""
+    ax = figure.subplots()
+    for way in dict.fromkeys(row["way"] for row in rows):
+        ms = np.sort([row["ms"] for row in rows if row["way"] == way])
+        ax.plot(ms, np.linspace(0, 1, len(ms)), label=way)
+    ax.set(xlabel="milliseconds a frame", ylabel="part of the frames that take less", xscale="log")
+    ax.legend(frameon=False)
+
+
+SETTINGS = PipelineSpeedSettings()
+EXPERIMENT = Experiment(
+    "pipeline_speed",
+    "Milliseconds of detect, track and aim for a frame, beside MOG2 alone.",
+    SETTINGS,
+    replace(SETTINGS, seeds=1, frames=120),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    alone=True,
+    cost_s=60.0,
+    needs=needs,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

@@ -1,0 +1,275 @@
+"""How fast the simulated rig is: beside mujoco.Renderer on the same frames, effect by effect, and against real time.
+
+A step is what the loop does to the rig at 25 Hz without detecting anything: a frame of each camera, the states of head
+and lens, a command to each. What is compared takes turns within one run, because a machine's pace drifts, and medians
+over the steps are given.
+
+1. Image effects off: a step, and mujoco.Renderer drawing the same two frames of the same world, as large, with the same
+   antialiasing, focal length and pose, the poses being ready.
+2. Each image effect alone, and all of them, beside none. Blur is that of 1/100 s under a turning head.
+3. Seconds of simulated time a second of the whole pipeline holding a bird, as `experiments.following.hold` does it:
+   both cameras rendered, all effects on; and nothing rendered, detections from the truth. Of the latter also what the
+   simulation alone takes.
+
+    python -m benchmarks.sim_speed [--seeds 1] [--seed-base 0] [--quick] [--out DIR]
+"""
+
+import math
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.plain_renderer import PlainRenderer
+from cotarget.calibration import Calibration
+from cotarget.config import RigConfig
+from cotarget.evaluation import TruthDetector
+from cotarget.pipeline import FollowSettings, Step
+from cotarget.sim.truth import Truth
+from cotarget.sim.world import SimWorld
+from experiments.engine.checks import check_above, check_ways
+from experiments.engine.harness import Experiment, Row, seeds_of
+from experiments.engine.texts import table
+from experiments.following.field import FieldSettings, calibrated, target_of, watched, watched_in
+from experiments.following.field_scenes import hold_config
+
+IMAGE_EFFECTS = ("noise", "jpeg", "distortion", "blur", "clutter")
+TARGET = "bird"
+TURN, TURN_S = 0.15, 1.5  # the head swings so far [rad], and takes so long there and back [s]
+ZOOMED = 3.0  # times the shortest focal length
+SETTLED_S = 1.0  # before anything is timed; the lens is there then
+RENDERER, LOOP, ALL = "mujoco.Renderer", "loop", "all of them"
+# What is wanted, at least and at most.
+WANTED: Mapping[str, tuple[float, float]] = {
+    "loop_over_renderer": (0.0, 1.15),
+    "real_time_rendered": (0.5, math.inf),
+    "real_time_unrendered": (20.0, math.inf),
+}
+
+
+@dataclass(frozen=True)
+class SimSpeedSettings(FieldSettings):
+    """How many seeds; steps timed of each world; for how long a bird is held with pictures.
+
+    Attributes:
+        seconds: without pictures [s].
+        steps: timed of each world.
+        seconds_rendered: with pictures [s].
+    """
+
+    seeds: int = 1
+    steps: int = 60
+    seconds_rendered: float = 6.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_above(self.lasting_s[0], self, "seconds_rendered")
+        check_ways(self, "seconds_rendered")
+
+    @property
+    def lasting_s(self) -> tuple[float, float]:
+        """What is timed is counted from when the target has settled; ways last that much longer than a run."""
+        return 0.0, super().lasting_s[1]
+
+
+def one(calibration: Calibration, settings: SimSpeedSettings, seed: int) -> list[Row]:
+    """Time everything once; a row for each step."""
+    rows = _beside_renderer(settings, seed)
+    for effects in (*((name,) for name in IMAGE_EFFECTS), IMAGE_EFFECTS):
+        rows += _beside_none(settings, seed, effects)
+    for what, steps in (
+        ("rendered", held(calibration, settings.seconds_rendered, seed)),
+        ("unrendered", held_unrendered(calibration, settings.seconds, seed)),
+    ):
+        rows.append({"seed": seed, "what": what, "factor": real_time_factor(steps)})
+    rows.append({"seed": seed, "what": "simulation alone", "ms": _alone(settings, seed)})
+    return rows
+
+
+def config_with(seed: int, on: Sequence[str]) -> RigConfig:
+    """The bird to hold, with these image effects only; all others are as ever."""
+    config = hold_config(TARGET, seed)
+    effects = replace(config.sim.effects, **{name: name in on for name in IMAGE_EFFECTS})
+    return replace(config, sim=replace(config.sim, effects=effects))
+
+
+class Stepper:
+    """Does to a rig what the loop does, without detecting anything."""
+
+    def __init__(self, config: RigConfig) -> None:
+        self.world = SimWorld(config, ahead=False)  # whose thread would render during other worlds' turns
+        rig = self.world.rig
+        rig.zoom.zoom(ZOOMED * rig.zoom.focal_range[0])
+        rig.clock.sleep_until(SETTLED_S)
+        self.t = SETTLED_S - config.sim.fixed.latency_s
+
+    def step(self) -> float:
+        """One step; how long it took [s]."""
+        rig = self.world.rig
+        began = time.perf_counter()
+        self.t = rig.fixed.read(newer_than=self.t).t
+        rig.zoom.read()
+        rig.head.state()
+        rig.zoom.state()
+        swing = TURN * math.sin(2 * math.pi * rig.clock.now() / TURN_S)
+        rig.head.move(swing, 0.3 * swing)
+        rig.zoom.zoom(ZOOMED * rig.zoom.focal_range[0])
+        return time.perf_counter() - began
+
+
+def _beside_renderer(settings: SimSpeedSettings, seed: int) -> list[Row]:
+    """Steps without image effects, and mujoco.Renderer on their frames, by turns."""
+    stepper = Stepper(config_with(seed, ()))
+    plain = PlainRenderer(stepper.world)
+    rows = []
+    with stepper.world.rig:
+        for i in range(settings.steps + 1):
+            loop = stepper.step()
+            renderer = plain.draw(stepper.t)
+            if i:  # the first one fills caches
+                rows += [
+                    {"seed": seed, "what": LOOP, "step": i, "ms": 1e3 * loop},
+                    {"seed": seed, "what": RENDERER, "step": i, "ms": 1e3 * renderer},
+                ]
+    plain.close()
+    return rows
+
+
+def _beside_none(settings: SimSpeedSettings, seed: int, effects: Sequence[str]) -> list[Row]:
+    """Steps with these image effects and with none, by turns."""
+    with_them, without = Stepper(config_with(seed, effects)), Stepper(config_with(seed, ()))
+    what = effects[0] if len(effects) == 1 else ALL
+    rows = []
+    with with_them.world.rig, without.world.rig:
+        for i in range(settings.steps + 1):
+            took, bare = with_them.step(), without.step()
+            if i:
+                rows.append({"seed": seed, "what": what, "step": i, "ms": 1e3 * took, "without_ms": 1e3 * bare})
+    return rows
+
+
+def held(calibration: Calibration, seconds: float, seed: int) -> Iterator[tuple[Step, Truth]]:
+    """Hold the bird, both cameras rendered, for so long after it has settled."""
+    config = hold_config(TARGET, seed)
+    return watched(calibration, config, target_of(config, TARGET), SETTLED_S + seconds)
+
+
+def held_unrendered(calibration: Calibration, seconds: float, seed: int) -> Iterator[tuple[Step, Truth]]:
+    """The same with nothing rendered, so that there is nothing to be looked for in the zoom view either."""
+    config = hold_config(TARGET, seed)
+    world = SimWorld(config, rendered=())
+    settings = FollowSettings.of(config, closed_loop=False)
+    detector = TruthDetector(world.truth(), seed)
+    return watched_in(world, detector, calibration, target_of(config, TARGET), SETTLED_S + seconds, settings)
+
+
+def real_time_factor(steps: Iterable[tuple[Step, Any]]) -> float:
+    """Simulated over real time of a run, from its first Step later than SETTLED_S on."""
+    began = start = end = math.nan
+    for step, _ in steps:
+        end = step.t
+        if math.isnan(start) and end >= SETTLED_S:
+            start, began = end, time.perf_counter()
+    return (end - start) / (time.perf_counter() - began)
+
+
+def _alone(settings: SimSpeedSettings, seed: int) -> float:
+    """What the simulation itself takes of a step when nothing is rendered: rig calls, poses, one box of truth [ms]."""
+    config = hold_config(TARGET, seed)
+    world = SimWorld(config, rendered=())
+    truth: Truth = world.truth()
+    took = []
+    with world.rig as rig:
+        t = 0.0
+        for i in range(10 * settings.steps):
+            began = time.perf_counter()
+            t = rig.fixed.read(newer_than=t).t
+            truth.box(TARGET, "fixed", t)
+            rig.head.state()
+            rig.zoom.read()
+            rig.zoom.state()
+            rig.head.move(0.1 * math.sin(i), 0.0)
+            took.append(time.perf_counter() - began)
+    return 1e3 * float(np.median(took))
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Medians over the steps of all seeds."""
+
+    def of(what: str, key: str = "ms") -> Any:
+        return np.array([row[key] for row in rows if row["what"] == what], dtype=float)
+
+    shares = {
+        name: {
+            "ms": float(np.median(of(name))),
+            "without_ms": float(np.median(of(name, "without_ms"))),
+            "more_ms": float(np.median(of(name) - of(name, "without_ms"))),
+        }
+        for name in (*IMAGE_EFFECTS, ALL)
+    }
+    return {
+        "loop_ms": float(np.median(of(LOOP))),
+        "renderer_ms": float(np.median(of(RENDERER))),
+        "loop_over_renderer": float(np.median(of(LOOP) / of(RENDERER))),
+        "effects": shares,
+        "real_time_rendered": float(np.median(of("rendered", "factor"))),
+        "real_time_unrendered": float(np.median(of("unrendered", "factor"))),
+        "simulation_alone_ms": float(np.median(of("simulation alone"))),
+    }
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The figures that are not what is wanted."""
+    return [key for key, (low, high) in WANTED.items() if not low <= summary[key] <= high]
+
+
+def describe(settings: SimSpeedSettings, summary: Mapping[str, Any]) -> str:
+    """The tables."""
+    lines = [
+        f"a step: a frame of each camera, states and commands; medians of {settings.steps} steps, {seeds_of(settings)}",
+        f"image effects off: {summary['loop_ms']:.1f} ms, mujoco.Renderer {summary['renderer_ms']:.1f} ms, ratio "
+        f"{summary['loop_over_renderer']:.2f}; at most {WANTED['loop_over_renderer'][1]:g} is wanted",
+        table(
+            ("image effect", "ms", "without", "its share [ms]"),
+            ([n, *v.values()] for n, v in summary["effects"].items()),
+        ),
+        f"real-time factor of the pipeline: both cameras rendered, all effects {summary['real_time_rendered']:.2f}; "
+        f"nothing rendered {summary['real_time_unrendered']:.1f}, of which the simulation itself takes "
+        f"{summary['simulation_alone_ms']:.2f} ms a step; at least {WANTED['real_time_rendered'][0]:g} and "
+        f"{WANTED['real_time_unrendered'][0]:g} are wanted",
+    ]
+    return "\n".join(lines)
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Milliseconds of each effect."""
+    found = summarise(rows)
+    ax = figure.subplots()
+    names = [RENDERER, LOOP, *found["effects"]]
+    values = [found["renderer_ms"], found["loop_ms"], *(v["ms"] for v in found["effects"].values())]
+    ax.bar(names, values)
+    ax.set(ylabel="ms a step, two frames")
+    ax.tick_params(axis="x", rotation=20)
+
+
+SETTINGS = SimSpeedSettings()
+EXPERIMENT = Experiment(
+    "sim_speed",
+    "The simulation's speed, beside mujoco.Renderer, effect by effect and against real time.",
+    SETTINGS,
+    replace(SETTINGS, seeds=1, steps=3, seconds_rendered=0.4, seconds=2.0, calibrated=False),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    prepare=calibrated,
+    alone=True,
+    cost_s=120.0,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

@@ -1,0 +1,143 @@
+"""How long the joint fit takes, beside OpenCV's calibration of the same corners.
+
+40 views of a board by two cameras, 20 pairs with the head at home: both cameras' intrinsics and Gamma are wanted. Once
+`calibrate_views`, without captures held out; once cv2.calibrateCamera for each camera, then cv2.stereoCalibrate, once
+with the intrinsics held and once with everything free, as in the joint fit. They take turns, because a machine's pace
+drifts; medians over the seeds, on as many threads as each takes.
+
+    python -m benchmarks.speed [--seeds 5] [--seed-base 0] [--quick] [--out DIR]
+"""
+
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.board import board_points
+from cotarget.calibration import Options, View, calibrate_views
+from cotarget.calibration.initialization import FEWEST_VIEWS
+from cotarget.config import BoardConfig
+from experiments.calibration.synthetic.rig import SIZE, SIZES, Truth
+from experiments.calibration.synthetic.views import synthetic_views
+from experiments.engine.checks import check_least
+from experiments.engine.harness import Experiment, Row, Settings, seeds_of
+from experiments.engine.texts import table
+
+BOARD = BoardConfig()
+POINTS = board_points(BOARD)
+TRUTH = Truth()
+JOINT, HELD, FREE = "joint fit", "OpenCV, intrinsics held", "OpenCV, everything free"
+
+
+@dataclass(frozen=True)
+class SpeedSettings(Settings):
+    """How many seeds, pairs of views; noise of corners [px]."""
+
+    seeds: int = 5
+    pairs: int = 20
+    noise_px: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_least(FEWEST_VIEWS, self, "pairs")
+
+
+def one(_: None, settings: SpeedSettings, seed: int) -> list[Row]:
+    """Time each way once; one row each."""
+    views = synthetic_views(
+        TRUTH,
+        POINTS,
+        np.random.default_rng((seed, 10)),
+        boards=settings.pairs,
+        noise_px=settings.noise_px,
+        moved=0,
+        pan_range=0.0,
+        tilt_range=0.0,
+    )
+    ways: dict[str, Callable[[Sequence[View]], float]] = {
+        JOINT: _joint,
+        HELD: lambda views: _opencv(views, cv2.CALIB_FIX_INTRINSIC),
+        FREE: lambda views: _opencv(views, cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3),
+    }
+    rows = []
+    for way, work in ways.items():
+        began = time.perf_counter()
+        baseline = work(views)
+        seconds = time.perf_counter() - began
+        off_mm = 1e3 * (baseline - float(np.linalg.norm(TRUTH.gamma.translation)))
+        rows.append({"seed": seed, "way": way, "seconds": seconds, "views": len(views), "baseline_off_mm": off_mm})
+    return rows
+
+
+def _joint(views: Sequence[View]) -> float:
+    calibration = calibrate_views(views, BOARD, SIZES, options=Options(folds=0))
+    return float(np.linalg.norm(calibration.T_zoom0_fixed.translation))
+
+
+def _opencv(views: Sequence[View], flags: int) -> float:
+    """The baseline [m] by OpenCV."""
+    left, right = (
+        [v.corners_px.astype(np.float32) for v in views if v.camera == camera] for camera in ("fixed", "zoom")
+    )
+    objects = [POINTS.astype(np.float32)] * len(left)
+    cameras = []
+    for mine in (left, right):
+        _, K, distortion, _, _ = cv2.calibrateCamera(
+            objects, mine, SIZE, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3
+        )
+        cameras.append((K, distortion))
+    (K_l, d_l), (K_r, d_r) = cameras
+    t = cv2.stereoCalibrate(objects, left, right, K_l, d_l, K_r, d_r, SIZE, flags=flags)[6]
+    return float(np.linalg.norm(t))
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Median seconds, the ratio to the joint fit's, and the baseline's rms error."""
+    joint = np.median([row["seconds"] for row in rows if row["way"] == JOINT])
+    found = {}
+    for way in (JOINT, HELD, FREE):
+        mine = [row for row in rows if row["way"] == way]
+        seconds = float(np.median([row["seconds"] for row in mine]))
+        off = float(np.sqrt(np.mean([row["baseline_off_mm"] ** 2 for row in mine])))
+        found[way] = {"seconds": seconds, "joint_over_this": float(joint / seconds), "baseline_off_mm": off}
+    return found
+
+
+def describe(settings: SpeedSettings, summary: Mapping[str, Any]) -> str:
+    """The table."""
+    return f"{2 * settings.pairs} views of two cameras, median of {seeds_of(settings)}\n" + table(
+        ("way", "seconds", "joint / this", "baseline off, rms [mm]"),
+        ([way, *found.values()] for way, found in summary.items()),
+    )
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Seconds of each seed."""
+    ax = figure.subplots()
+    for way in (JOINT, HELD, FREE):
+        ax.semilogy([row["seconds"] for row in rows if row["way"] == way], "o-", label=way)
+    ax.set(xlabel="seed", ylabel="seconds")
+    ax.legend(frameon=False)
+
+
+SETTINGS = SpeedSettings()
+EXPERIMENT = Experiment(
+    "speed",
+    "Seconds of the joint fit of 40 views of two cameras, beside OpenCV's.",
+    SETTINGS,
+    replace(SETTINGS, seeds=1, pairs=8),
+    one,
+    summarise,
+    describe,
+    plot,
+    alone=True,
+    cost_s=5.0,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

@@ -1,0 +1,198 @@
+"""What corners' noise and the number of placements of a calibration leave of pointing error, beside what it predicts.
+
+Boards of 9 x 6 corners hang at 2.5 to 8 m all over the wide view, each looked at from four head poses; everything is
+unknown. The default rig, calibrated once for each noise and each number of placements, every seed with boards, poses
+and noise of its own. The pointing error is the angle between the line of sight and the true target, for targets all
+over the wide view at 4 to 30 m, pixel and depth given exactly; times 7155 it is what the longest focal length makes of
+it in pixels. The error should grow as the noise does, and shrink as one over the root of the placements, or faster
+where few of them leave parts of the view unseen; what it does are the exponents of a plane fitted to the logarithms.
+
+    python -m experiments.calibration.calibration_budget [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out
+    DIR]
+"""
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.board import board_points
+from cotarget.calibration import Options, calibrate_views, predicted_pointing
+from cotarget.config import BoardConfig
+from experiments.calibration.synthetic.aims import draw_targets, misses
+from experiments.calibration.synthetic.rig import LONGEST_PX, SIZES, Truth
+from experiments.calibration.synthetic.views import Placing, spread_views
+from experiments.engine.checks import check_above, check_session
+from experiments.engine.harness import Experiment, Row, Settings, seeds_of
+from experiments.engine.texts import rms, table
+
+BOARD = BoardConfig()
+RIG = Truth()
+# The noise alone makes the error. More placements lessen it as one over their root, or more where few leave parts of
+# the view unseen: to a third from 6 to 12. What two seeds of a quick run tell of that is allowed for.
+WANTED = {"exponent_noise": (0.75, 1.25), "exponent_placements": (-1.6, -0.3), "reached_over_predicted": (0.67, 1.5)}
+
+
+@dataclass(frozen=True)
+class BudgetSettings(Settings):
+    """What is varied, and what is not.
+
+    Attributes:
+        noises_px: of corners [px].
+        placements: how many of the board.
+        looks: head poses for each.
+        targets: on which the error is measured.
+    """
+
+    seeds: int = 5
+    noises_px: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5)
+    placements: tuple[int, ...] = (6, 12, 24, 48)
+    looks: int = 4
+    targets: int = 100
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_above(0, self, "noises_px", "placements", "looks", "targets")
+        check_session(self, "placements", "looks")
+
+
+def one(_: None, settings: BudgetSettings, seed: int) -> list[Row]:
+    """A calibration, and a row, for each number of placements and each noise; boards differ by their number alone."""
+    rows: list[Row] = []
+    for boards in settings.placements:
+        for number, noise_px in enumerate(settings.noises_px):
+            rng = np.random.default_rng((seed, 24, boards, number))
+            placing = Placing(boards=boards, looks=settings.looks)
+            views = spread_views(RIG, board_points(BOARD), rng, noise_px, placing)
+            calibration = calibrate_views(views, BOARD, SIZES, options=Options(folds=0))
+            targets = draw_targets(rng, settings.targets)
+            rows.append(
+                {
+                    "seed": seed,
+                    "noise_px": noise_px,
+                    "placements": boards,
+                    "poses": boards * settings.looks,
+                    "reached_px": LONGEST_PX * rms(misses(calibration, RIG, *targets)),
+                    "predicted_px": LONGEST_PX * rms(predicted_pointing(calibration, *targets)),
+                }
+            )
+    return rows
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Rms over the seeds for each noise and number, and how the error grows with either."""
+    cells = {}
+    for boards, noise_px in dict.fromkeys((row["placements"], row["noise_px"]) for row in rows):
+        mine = [row for row in rows if (row["placements"], row["noise_px"]) == (boards, noise_px)]
+        reached, predicted = (rms(row[f"{key}_px"] for row in mine) for key in ("reached", "predicted"))
+        cells[_cell(noise_px, boards)] = {
+            "reached_px": reached,
+            "predicted_px": predicted,
+            "reached_deg": float(np.degrees(reached / LONGEST_PX)),
+            "ratio": reached / predicted,
+        }
+    with_noise, with_placements = exponents(rows)
+    return {
+        "cells": cells,
+        "exponent_noise": with_noise,
+        "exponent_placements": with_placements,
+        "reached_over_predicted": rms(row["reached_px"] / row["predicted_px"] for row in rows),
+    }
+
+
+def exponents(rows: Sequence[Row], key: str = "reached_px") -> tuple[float, float]:
+    """How an error grows with the noise and with the number of placements: 1 and -0.5 in theory.
+
+    Returns:
+        The exponents; nan of what was the same in all rows.
+    """
+    terms = [[np.log(row["noise_px"]), np.log(row["placements"]), 1.0] for row in rows]
+    slopes, *_ = np.linalg.lstsq(np.array(terms), np.log([row[key] for row in rows]), rcond=None)
+    varied = [len({row[of] for row in rows}) > 1 for of in ("noise_px", "placements")]
+    with_noise, with_placements = (float(s) if so else math.nan for s, so in zip(slopes[:2], varied, strict=True))
+    return with_noise, with_placements
+
+
+def _cell(noise_px: float, boards: int) -> str:
+    return f"corners {noise_px:g} px, {boards} placements"
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """What is not as theory has it, or as the calibrations predict for themselves; of what was measured."""
+    return [
+        f"{name} is {summary[name]:.2f}, not {low:g} to {high:g}"
+        for name, (low, high) in WANTED.items()
+        if not (math.isnan(summary[name]) or low <= summary[name] <= high)
+    ]
+
+
+def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Each cell's error, and how much larger than predicted it is."""
+    cells = {cell: found["reached_px"] for cell, found in summary["cells"].items()}
+    return {"reached_px": cells, "reached_over_predicted": summary["reached_over_predicted"]}
+
+
+def describe(settings: BudgetSettings, summary: Mapping[str, Any]) -> str:
+    """A line for each number of placements: reached / predicted of each noise."""
+    cells = summary["cells"]
+    lines = []
+    for boards in settings.placements:
+        found = [cells[_cell(noise_px, boards)] for noise_px in settings.noises_px]
+        texts = [f"{each['reached_px']:.3f} / {each['predicted_px']:.3f}" for each in found]
+        lines.append([f"{boards} placements, {boards * settings.looks} poses", *texts])
+    return "\n".join(
+        [
+            f"rms pointing error, reached / predicted [px at f = {LONGEST_PX:g} px], {seeds_of(settings)}",
+            table(["", *(f"corners {noise_px:g} px" for noise_px in settings.noises_px)], lines),
+            f"grows as noise^{summary['exponent_noise']:.2f} and placements^{summary['exponent_placements']:.2f}; "
+            f"reached over predicted {summary['reached_over_predicted']:.2f}",
+        ]
+    )
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """The error over the noise and over the placements: each seed's reached, and the predicted as lines."""
+    figure.set_size_inches(10, 4.5)
+    panels = (
+        ("noise_px", "placements", "noise of corners [px]"),
+        ("placements", "noise_px", "placements of the board"),
+    )
+    for ax, (x_key, of, label) in zip(figure.subplots(1, 2, sharey=True), panels, strict=True):
+        for i, value in enumerate(sorted({row[of] for row in rows})):
+            mine = [row for row in rows if row[of] == value]
+            xs = sorted({row[x_key] for row in mine})
+            found = [[row for row in mine if row[x_key] == x] for x in xs]
+            name = f"{value:g} px" if of == "noise_px" else f"{value:g} placements"
+            values = [np.percentile([row["reached_px"] for row in f], [25, 50, 75]) for f in found]
+            low, mid, high = np.array(values).T
+            ax.errorbar(xs, mid, [mid - low, high - mid], fmt="o", ms=4, capsize=2, color=f"C{i}", label=name)
+            ax.plot(xs, [np.median([row["predicted_px"] for row in f]) for f in found], color=f"C{i}", lw=1)
+        ax.set(xscale="log", yscale="log", xlabel=label)
+        ax.set_xticks(xs, [f"{x:g}" for x in xs], minor=False)
+        ax.minorticks_off()
+        place = "upper left" if x_key == "noise_px" else "lower left"
+        ax.legend(loc=place, frameon=False, fontsize="small", title="points: reached, quartiles\nlines: predicted")
+    figure.axes[0].set_ylabel(f"rms pointing error [px at f = {LONGEST_PX:g} px]")
+
+
+SETTINGS = BudgetSettings()
+EXPERIMENT = Experiment(
+    "calibration_budget",
+    "What corners' noise and the number of placements leave of pointing error, beside what is predicted.",
+    SETTINGS,
+    replace(SETTINGS, seeds=2, noises_px=(0.05, 0.2), placements=(6, 12)),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    cost_s=30.0,
+    bounded=bounded,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

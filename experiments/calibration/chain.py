@@ -1,0 +1,149 @@
+"""The whole chain from synthetic corners: how well a rig points, beside what it predicts and what is possible.
+
+15 boards of 0.88 x 0.68 m (14 x 11 corners) at 2.5 to 8 m, all over the wide view, each seen from six head poses, with
+corners of 0.2 px. Everything is unknown: both cameras' intrinsics, Gamma, T, the head's geometry. The pointing error is
+the angle between the line of sight and the true target at the shortest focal length, for targets all over the wide
+view at 4 to 30 m, pixel and depth given exactly; times 7155 it is what the longest focal length makes of it in pixels.
+Beside the joint fit stand its own prediction, the Cramer-Rao bound with the true noise, that bound if the intrinsics
+were known, and the sequential method. The default rig; one with a wide baseline, toed in and rolled, with a long lever;
+and the default rig with the usual board of 9 x 6 corners.
+
+    python -m experiments.calibration.chain [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.board import board_points
+from cotarget.calibration import Calibration, Covariance, Options, calibrate_views, predicted_pointing
+from cotarget.calibration.bundle import ALL_BLOCKS, Block, fit, parameter_names
+from cotarget.calibration.initialization import place_boards
+from cotarget.calibration.uncertainty import model_of
+from cotarget.config import BoardConfig
+from cotarget.geometry import Array
+from experiments.calibration.synthetic.aims import draw_targets, misses
+from experiments.calibration.synthetic.rig import LONGEST_PX, SIZES, Truth, other_rig
+from experiments.calibration.synthetic.views import Placing, spread_views
+from experiments.engine.checks import check_session
+from experiments.engine.harness import Experiment, Row, Settings, seeds_of
+from experiments.engine.texts import rms, table
+
+FINE_BOARD = BoardConfig(corners=(14, 11), square=0.068)
+CASES = {
+    "default rig": (Truth(), FINE_BOARD),
+    "toed-in rig": (other_rig(), FINE_BOARD),
+    "default rig, 9x6 board": (Truth(), BoardConfig()),
+}
+KNOWN_INTRINSICS: tuple[Block, ...] = ("gamma", "hand", "head")
+FIGURES = ("joint", "predicted", "bound", "bound_intrinsics_known", "sequential")
+
+
+@dataclass(frozen=True)
+class ChainSettings(Settings):
+    """How many seeds; noise of corners [px], boards, head poses for each, targets for each seed, and which cases."""
+
+    seeds: int = 20
+    noise_px: float = 0.2
+    boards: int = 15
+    looks: int = 6
+    targets: int = 100
+    cases: tuple[str, ...] = tuple(CASES)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_session(self, "boards", "looks")
+
+
+def one(_: None, settings: ChainSettings, seed: int) -> list[Row]:
+    """Calibrate every case once; one row each."""
+    return [_row(settings, seed, case) for case in settings.cases]
+
+
+def _row(settings: ChainSettings, seed: int, case: str) -> Row:
+    truth, board = CASES[case]
+    placing = Placing(boards=settings.boards, looks=settings.looks)
+    views = spread_views(truth, board_points(board), np.random.default_rng((seed, 2)), settings.noise_px, placing)
+    joint = calibrate_views(views, board, SIZES, options=Options(folds=0))
+    sequential = calibrate_views(views, board, SIZES, options=Options("sequential"))
+    targets = draw_targets(np.random.default_rng((seed, 3)), settings.targets)
+    errors = {
+        "joint": misses(joint, truth, *targets),
+        "predicted": predicted_pointing(joint, *targets),
+        "bound": bound(joint, settings.noise_px, ALL_BLOCKS, *targets),
+        "bound_intrinsics_known": bound(joint, settings.noise_px, KNOWN_INTRINSICS, *targets),
+        "sequential": misses(sequential, truth, *targets),
+    }
+    return {
+        "seed": seed,
+        "case": case,
+        **{f"{name}_px": LONGEST_PX * rms(values) for name, values in errors.items()},
+    }
+
+
+def bound(calibration: Calibration, noise_px: float, blocks: tuple[Block, ...], pixels: Array, depths: Array) -> Array:
+    """Cramer-Rao bound of the pointing error towards targets [rad], (n,).
+
+    Args:
+        calibration: from views whose corners' coordinates have this noise and no other.
+        noise_px: its standard deviation.
+        blocks: what is unknown.
+        pixels: of the targets, (n, 2).
+        depths: of the targets [m], (n,).
+    """
+    assert calibration.board is not None
+    points = board_points(calibration.board)
+    model = place_boards(model_of(calibration), calibration.views, points)
+    found = fit(model, calibration.views, points, blocks)
+    covariance = Covariance(parameter_names(blocks), np.asarray(np.linalg.inv(found.normal) * noise_px**2, float))
+    return predicted_pointing(replace(calibration, covariance=covariance, jitter=0.0), pixels, depths)
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Rms over the seeds [px at f = 7155 px]."""
+    return {
+        case: {f"{name}_px": rms(row[f"{name}_px"] for row in mine) for name in FIGURES}
+        for case in CASES
+        if (mine := [row for row in rows if row["case"] == case])
+    }
+
+
+def describe(settings: ChainSettings, summary: Mapping[str, Any]) -> str:
+    """The table."""
+    return f"rms pointing error [px at f = 7155 px], {seeds_of(settings)}\n" + table(
+        ("case", "joint", "predicted", "Cramer-Rao", "intrinsics known", "sequential"),
+        ([case, *(found[f"{name}_px"] for name in FIGURES)] for case, found in summary.items()),
+    )
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Measured beside predicted error of each seed."""
+    ax = figure.subplots()
+    for case in CASES:
+        mine = [row for row in rows if row["case"] == case]
+        ax.plot([row["predicted_px"] for row in mine], [row["joint_px"] for row in mine], ".", label=case)
+    top = max(row["joint_px"] for row in rows)
+    ax.plot([0, top], [0, top], "k", lw=0.8)
+    ax.set(xlabel="predicted [px at f = 7155 px]", ylabel="measured")
+    ax.legend(frameon=False)
+
+
+SETTINGS = ChainSettings()
+EXPERIMENT = Experiment(
+    "chain",
+    "Pointing of a rig calibrated from synthetic corners, beside the prediction and the Cramer-Rao bound.",
+    SETTINGS,
+    replace(SETTINGS, seeds=2, boards=10, looks=4, cases=("toed-in rig", "default rig, 9x6 board")),
+    one,
+    summarise,
+    describe,
+    plot,
+    cost_s=15.0,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

@@ -1,0 +1,167 @@
+"""T from 20 poses of one board, everything else known: how near each method comes to the Cramer-Rao bound.
+
+A board of 0.89 x 0.67 m stands 3 m away, the head turns as far as the board stays in the image (f = 693 px), and
+corners have noise of 0.2 px. Park and Martin's closed form and the weighted fit over poses are given the board's pose
+in each view; the joint fit works on the corners themselves. Root mean squares over the seeds; the bound is that of
+each seed's own poses.
+
+    python -m experiments.calibration.hand_eye [--seeds 100] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import chi2
+
+from cotarget.calibration.bundle import fit
+from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye_from_poses
+from cotarget.calibration.initialization import board_pose
+from cotarget.calibration.model import RigModel, View
+from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.geometry import Array, RigidTransform, Rotation
+from cotarget.pantilt import base_head
+from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Lens, Truth
+from experiments.calibration.synthetic.views import noisy, seen_from
+from experiments.engine.checks import check_above, check_least
+from experiments.engine.harness import Experiment, Row, Settings, seeds_of
+from experiments.engine.texts import rms, table
+
+LENS = Lens(693.0, 693.0, 319.5, 239.5)
+COLUMNS, ROWS, WIDTH, HEIGHT = 14, 11, 0.89, 0.67  # corners, and between the outer ones [m]
+DISTANCE = 3.0  # [m]
+BOARD_TURNED = (20.0, -15.0, 5.0)  # [degrees]
+REACH = (np.radians(40.0), np.radians(30.0))  # more than the image lets see
+LEVEL = 0.9
+METHODS = ("Park and Martin", "poses, weighted", "joint fit")
+DRAWN = 400  # head poses at a time, of which the first are taken that see the board
+FEWEST_POSES = 3  # that tell T: from two of them the head turns about one axis only
+
+
+@dataclass(frozen=True)
+class HandEyeSettings(Settings):
+    """How many poses, and the noise of corners [px]."""
+
+    poses: int = 20
+    noise_px: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_least(FEWEST_POSES, self, "poses")
+        check_above(0, self, "noise_px")  # or there would be no bound to come near to
+
+
+def one(_: None, settings: HandEyeSettings, seed: int) -> list[Row]:
+    """Draw poses and noise, solve by each method; one row each."""
+    rng = np.random.default_rng((seed, 1))
+    truth = Truth(zoom=LENS, dz=0.0, eps=0.0)
+    v, u = np.mgrid[:ROWS, :COLUMNS]
+    points = np.c_[u.ravel() * WIDTH / (COLUMNS - 1), v.ravel() * HEIGHT / (ROWS - 1), np.zeros(u.size)]
+    middle = points.mean(axis=0)
+    turned = Rotation.from_rotvec(BOARD_TURNED, degrees=True)
+    x_zoom0 = RigidTransform.from_components([0.0, 0.0, DISTANCE], turned).apply(points - middle)
+    x_fixed = truth.gamma.inv().apply(x_zoom0)
+    poses = np.empty((0, 2))
+    while len(poses) < settings.poses:
+        drawn = rng.uniform(np.negative(REACH), REACH, (DRAWN, 2))
+        poses = np.r_[poses, drawn[seen_from(truth, x_fixed, drawn)]]
+    poses = poses[: settings.poses]
+    views = [
+        View("zoom", noisy(LENS.project(truth.in_zoom(x_fixed, *q)), settings.noise_px, rng), 0, q[0], q[1], NOMINAL_PX)
+        for q in poses
+    ]
+    lens = Intrinsics(SIZE, (LENS.fx, LENS.fy), (LENS.cx, LENS.cy))
+    heads = [base_head(view.pan, view.tilt) for view in views]
+    seen = [board_pose(lens, view.corners_px, points) for view in views]
+    closed = park_martin(*motions(heads, seen))
+    weighted = solve_hand_eye_from_poses(heads, seen, middle=middle)
+    board = (truth.gamma.inv() * closed.inv() * heads[0] * closed) * seen[0]
+    start = RigModel({0: board}, zoom=ZoomLens((NOMINAL_PX,), (lens,)), gamma=truth.gamma, hand=closed)
+    joint = fit(start, views, points, {"hand"})
+    inverse = np.asarray(np.linalg.inv(joint.normal), float)
+    assert joint.variance is not None
+    found: dict[str, tuple[RigidTransform, Array | None]] = {
+        "Park and Martin": (closed, None),
+        "poses, weighted": (weighted.X, weighted.covariance),
+        "joint fit": (joint.model.hand, inverse * joint.variance),
+    }
+    bound = inverse * settings.noise_px**2
+    return [_row(seed, method, X, covariance, bound, truth.hand) for method, (X, covariance) in found.items()]
+
+
+def _row(
+    seed: int, method: str, X: RigidTransform, covariance: Array | None, bound: Array, hand: RigidTransform
+) -> Row:
+    error = np.concatenate([(hand.rotation * X.rotation.inv()).as_rotvec(), hand.translation - X.translation])
+    inside = None
+    if covariance is not None:
+        inside = bool(error @ np.linalg.solve(covariance, error) < chi2.ppf(LEVEL, len(error)))
+    return {
+        "seed": seed,
+        "method": method,
+        "rotation_deg": float(np.degrees(np.linalg.norm(error[:3]))),
+        "translation_mm": float(1e3 * np.linalg.norm(error[3:])),
+        "bound_deg": float(np.degrees(np.sqrt(np.trace(bound[:3, :3])))),
+        "bound_mm": float(1e3 * np.sqrt(np.trace(bound[3:, 3:]))),
+        "inside": inside,
+    }
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Rms errors, their ratios to the bound, and how many of the 90 % ellipsoids hold the truth."""
+    found = {}
+    for method in METHODS:
+        mine = [row for row in rows if row["method"] == method]
+        rotation, translation, bound_deg, bound_mm = (
+            rms(row[key] for row in mine) for key in ("rotation_deg", "translation_mm", "bound_deg", "bound_mm")
+        )
+        told = [row["inside"] for row in mine if row["inside"] is not None]
+        found[method] = {
+            "rotation_deg": rotation,
+            "translation_mm": translation,
+            "rotation_ratio": rotation / bound_deg,
+            "translation_ratio": translation / bound_mm,
+            "inside": float(np.mean(told)) if told else float("nan"),
+        }
+    found["Cramer-Rao"] = {"rotation_deg": bound_deg, "translation_mm": bound_mm}
+    return found
+
+
+def describe(settings: HandEyeSettings, summary: Mapping[str, Any]) -> str:
+    """The table."""
+    keys = ("rotation_deg", "translation_mm", "rotation_ratio", "translation_ratio", "inside")
+    return f"T from {settings.poses} poses, rms over {seeds_of(settings)}\n" + table(
+        ("method", "rotation [deg]", "translation [mm]", "x bound", "x bound", "in 90 % ellipsoid"),
+        ([method, *(found.get(key, float("nan")) for key in keys)] for method, found in summary.items()),
+    )
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Cumulative errors of the methods."""
+    for ax, key, unit in zip(figure.subplots(1, 2), ("rotation_deg", "translation_mm"), ("deg", "mm"), strict=True):
+        for method in METHODS:
+            errors = np.sort([row[key] for row in rows if row["method"] == method])
+            ax.semilogx(errors, np.linspace(0, 1, len(errors)), label=method)
+        ax.axvline(rms(row[f"bound_{unit}"] for row in rows), color="k", lw=0.8, label="Cramer-Rao, rms")
+        ax.set(xlabel=f"{key.split('_')[0]} [{unit}]", ylabel="share of seeds")
+    ax.legend(frameon=False)
+
+
+SETTINGS = HandEyeSettings()
+EXPERIMENT = Experiment(
+    "hand_eye",
+    "T from 20 poses of one board, by each method, beside the Cramer-Rao bound.",
+    SETTINGS,
+    replace(SETTINGS, seeds=5),
+    one,
+    summarise,
+    describe,
+    plot,
+    cost_s=0.3,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

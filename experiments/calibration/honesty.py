@@ -1,0 +1,165 @@
+"""Whether a calibration is as uncertain as it says: how many 90 % ellipses hold the truth.
+
+12 boards of 9 x 6 corners at 2.5 to 8 m, four head poses each, corners of 0.1 px; the default rig and one with a wide
+baseline, toed in and rolled. Each seed draws its own boards, poses and noise. Captures are not held out, because what
+they say could only widen the ellipses. Beside the ellipses stand the measured and the predicted pointing error, on the
+same targets.
+
+    python -m experiments.calibration.honesty [--seeds 60] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import chi2
+
+from cotarget.board import board_points
+from cotarget.calibration import Calibration, Options, calibrate_views, predicted_pointing
+from cotarget.calibration.bundle import ALL_BLOCKS, parameter_names
+from cotarget.config import BoardConfig
+from experiments.calibration.synthetic.aims import draw_targets, misses
+from experiments.calibration.synthetic.rig import LONGEST_PX, SIZES, Truth, other_rig
+from experiments.calibration.synthetic.views import Placing, spread_views
+from experiments.engine.checks import check_session
+from experiments.engine.harness import Experiment, Row, Settings, seeds_of
+from experiments.engine.texts import rms, table
+
+BOARD = BoardConfig()
+RIGS = {"default rig": Truth(), "toed-in rig": other_rig()}
+LEVEL = 0.9
+GROUPS = {
+    "T": tuple(n for n in parameter_names(ALL_BLOCKS) if n.startswith("T_head_zoom")),
+    "Gamma": tuple(n for n in parameter_names(ALL_BLOCKS) if n.startswith("T_zoom0_fixed")),
+    "wide focal length": ("fixed.fx", "fixed.fy"),
+    "zoom focal length": ("zoom[0].fx", "zoom[0].fy"),
+    "everything": parameter_names(ALL_BLOCKS),
+}
+
+
+@dataclass(frozen=True)
+class HonestySettings(Settings):
+    """How many seeds, boards, head poses for each, targets; noise of corners [px]."""
+
+    seeds: int = 60
+    boards: int = 12
+    looks: int = 4
+    noise_px: float = 0.1
+    targets: int = 20
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_session(self, "boards", "looks")
+
+
+def one(_: None, settings: HonestySettings, seed: int) -> list[Row]:
+    """Calibrate both rigs once; one row each."""
+    return [_row(settings, seed, rig) for rig in RIGS]
+
+
+def _row(settings: HonestySettings, seed: int, rig: str) -> Row:
+    truth = RIGS[rig]
+    placing = Placing(boards=settings.boards, looks=settings.looks)
+    rng = np.random.default_rng((seed, 8))
+    views = spread_views(truth, board_points(BOARD), rng, settings.noise_px, placing)
+    calibration = calibrate_views(views, BOARD, SIZES, options=Options(folds=0))
+    targets = draw_targets(np.random.default_rng((seed, 9)), settings.targets)
+    return {
+        "seed": seed,
+        "rig": rig,
+        **{name: inside(calibration, truth, parameters, LEVEL) for name, parameters in GROUPS.items()},
+        "measured_px": LONGEST_PX * rms(misses(calibration, truth, *targets)),
+        "predicted_px": LONGEST_PX * rms(predicted_pointing(calibration, *targets)),
+        "jitter_deg": float(np.degrees(calibration.jitter)),
+    }
+
+
+def inside(calibration: Calibration, truth: Truth, names: Sequence[str], level: float) -> bool:
+    """Whether the truth lies within the ellipsoid of a level that these parameters span."""
+    covariance, error = calibration.covariance, error_of(calibration, truth)
+    assert covariance is not None
+    rows = [covariance.parameters.index(name) for name in names]
+    e = np.array([error[name] for name in names])
+    return bool(e @ np.linalg.solve(covariance.matrix[np.ix_(rows, rows)], e) < chi2.ppf(level, len(rows)))
+
+
+def error_of(calibration: Calibration, truth: Truth) -> dict[str, float]:
+    """Truth less what was found, by name; a transform's as a turn exp(w) in front of R and a shift of t."""
+    pairs = [("fixed", truth.fixed, calibration.fixed), ("zoom[0]", truth.zoom, calibration.zoom.stops[0])]
+    error = {
+        f"{camera}.{name}": a - b
+        for camera, true, lens in pairs
+        for name, a, b in zip(
+            ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+            (true.fx, true.fy, true.cx, true.cy, *true.distortion[:4]),
+            (*lens.focal_px, *lens.center_px, *lens.distortion[:4]),
+            strict=True,
+        )
+    }
+    transforms = [
+        ("T_zoom0_fixed", truth.gamma, calibration.T_zoom0_fixed),
+        ("T_head_zoom", truth.hand, calibration.hand_eye()),
+    ]
+    for transform, true_T, found in transforms:
+        turn, shift = (true_T.rotation * found.rotation.inv()).as_rotvec(), true_T.translation - found.translation
+        error |= {
+            f"{transform}.{k}": float(v)
+            for k, v in zip(("rx", "ry", "rz", "tx", "ty", "tz"), (*turn, *shift), strict=True)
+        }
+    error["head.axis_offset"] = truth.dz - calibration.head.axis_offset
+    error["head.squareness"] = truth.eps - calibration.head.squareness
+    error |= {f"board.warp_{axis}": -warp for axis, warp in zip("xy", calibration.board_warp, strict=True)}
+    return error
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Fractions of ellipses that hold the truth, and rms pointing errors."""
+    return {
+        rig: {
+            **{name: float(np.mean([row[name] for row in mine])) for name in GROUPS},
+            "measured_px": rms(row["measured_px"] for row in mine),
+            "predicted_px": rms(row["predicted_px"] for row in mine),
+            "measured_over_predicted": rms(r["measured_px"] for r in mine) / rms(r["predicted_px"] for r in mine),
+            "jittered": float(np.mean([row["jitter_deg"] > 0 for row in mine])),
+        }
+        for rig in RIGS
+        if (mine := [row for row in rows if row["rig"] == rig])
+    }
+
+
+def describe(settings: HonestySettings, summary: Mapping[str, Any]) -> str:
+    """The table, a column a rig."""
+    names = list(dict.fromkeys(name for found in summary.values() for name in found))
+    lines = ([name.replace("_", " "), *(float(found[name]) for found in summary.values())] for name in names)
+    head = f"{100 * LEVEL:.0f} % ellipses that hold the truth; pointing at f = 7155 px, {seeds_of(settings)}"
+    return head + "\n" + table(("of", *summary), lines)
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Measured over predicted pointing error of each seed."""
+    ax = figure.subplots()
+    for rig in RIGS:
+        ratios = [row["measured_px"] / row["predicted_px"] for row in rows if row["rig"] == rig]
+        ax.hist(ratios, bins=np.linspace(0, 3, 31).tolist(), histtype="step", label=rig)
+    ax.set(xlabel="measured / predicted pointing error", ylabel="seeds")
+    ax.legend(frameon=False)
+
+
+SETTINGS = HonestySettings()
+EXPERIMENT = Experiment(
+    "honesty",
+    "How many 90 % ellipses hold the truth.",
+    SETTINGS,
+    replace(SETTINGS, seeds=2, boards=8),
+    one,
+    summarise,
+    describe,
+    plot,
+    cost_s=5.0,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

@@ -1,0 +1,165 @@
+"""How well a rig points after it was calibrated from rendered boards, and what simpler models lose.
+
+Two rigs, of which the software is told nothing: the default one, and one with a wide baseline, toed in and rolled,
+with a long lever arm; or one's own, `--set pointing.rig=rig.toml`. Each is calibrated from rendered boards with all
+effects on, once a seed. The pointing error is the angle between the zoom camera's line of sight and the true target,
+for targets all over the wide view at 4 to 30 m, pixel and depth given exactly, at the shortest focal length. Beside the
+full model stand the paper's shortcut in its two readings and a model that ignores the offsets between fixed camera,
+head and zoom camera.
+
+    python -m experiments.calibration.pointing [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration, calibrate_rig
+from cotarget.config import RigConfig, SimConfig
+from cotarget.control.controller import reach_of
+from cotarget.evaluation import pointing_errors
+from cotarget.geometry import RigidTransform, pose
+from cotarget.safety import SafeRig
+from cotarget.sim.world import SimWorld
+from cotarget.targeting import Method
+from experiments.engine.harness import Experiment, Row, seeds_of
+from experiments.engine.spread import in_words, points, spread
+from experiments.engine.texts import table
+from experiments.following.own_rig import OwnRig
+
+RIGS = {
+    "default": SimConfig(scene="indoor"),
+    "toed in": SimConfig(
+        scene="indoor",
+        # 1.5 m beside the fixed camera, turned 12 degrees towards its axis, rolled by 5
+        T_zoom0_fixed=pose([-1.46, 0.05, 0.31], [0.0, 12.0, 5.0]),
+        T_head_zoom=pose([0.08, -0.15, 0.105], [1.0, -2.0, 1.5]),  # a lever arm of 0.2 m
+    ),
+}
+FULL = "full model"
+MODELS: dict[str, tuple[Method, bool]] = {
+    FULL: ("exact", False),
+    "offsets ignored": ("exact", True),
+    "paper's shortcut, depth of Table 1": ("paper-table", False),
+    "paper's shortcut, depth of Section 4.2": ("paper-example", False),
+}
+OWN = "own"  # name of a rig of one's own
+STREAM = 5  # of random numbers, apart from the world's own
+# What is wanted of the full model's median over the seeds, at most [degrees].
+WANTED = {"median_deg": 0.003, "p95_deg": 0.006}
+
+
+@dataclass(frozen=True)
+class Settings(OwnRig):
+    """How many seeds, how many targets for each, and which rigs, where none of one's own is given."""
+
+    seeds: int = 3
+    targets: int = 400
+    rigs: tuple[str, ...] = tuple(RIGS)
+
+
+def one(_: None, settings: Settings, seed: int) -> list[Row]:
+    """Calibrate every rig once; one row for each model's error then [degrees]."""
+    rows: list[Row] = []
+    for rig in (OWN,) if settings.rig else settings.rigs:
+        config = (
+            RigConfig(sim=dataclasses.replace(RIGS[rig], seed=seed))
+            if rig in RIGS
+            else settings.config("indoor", (), seed)
+        )
+        world = SimWorld(config)
+        with SafeRig(world.rig, config.safety) as opened:
+            calibration = calibrate_rig(opened, config.board, seed=seed)
+            reach = reach_of(opened)
+            for model, (method, ignoring) in MODELS.items():
+                judged = without_offsets(calibration) if ignoring else calibration
+                rng = np.random.default_rng((seed, STREAM))
+                errors = np.degrees(pointing_errors(judged, world.truth(), reach, rng, settings.targets, method))
+                rows.append(
+                    {
+                        "rig": rig,
+                        "seed": seed,
+                        "model": model,
+                        "targets": len(errors),
+                        "median_deg": float(np.median(errors)),
+                        "p95_deg": float(np.percentile(errors, 95)),
+                    }
+                )
+    return rows
+
+
+def without_offsets(calibration: Calibration) -> Calibration:
+    """The model of those who ignore where the cameras are: the same rotations, everything in one place."""
+    return dataclasses.replace(
+        calibration,
+        T_zoom0_fixed=RigidTransform.from_rotation(calibration.T_zoom0_fixed.rotation),
+        T_head_zoom=RigidTransform.from_rotation(calibration.hand_eye().rotation),
+    )
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
+    """Of each rig's and model's median and 95th percentile the median over the seeds, least and largest [degrees]."""
+    return {
+        rig: {
+            model: {
+                key: spread([row for row in rows if row["rig"] == rig and row["model"] == model], key) for key in WANTED
+            }
+            for model in MODELS
+        }
+        for rig in dict.fromkeys(row["rig"] for row in rows)
+    }
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The figures of the full model that are larger than wanted."""
+    return [
+        f"{rig}: {key}"
+        for rig, models in summary.items()
+        for key, most in WANTED.items()
+        if not models[FULL][key]["median"] <= most
+    ]
+
+
+def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
+    """A line for each rig and model."""
+    lines = [
+        [f"{rig}: {model}", *(in_words(found[key], ".4f") for key in WANTED)]
+        for rig, models in summary.items()
+        for model, found in models.items()
+    ]
+    wanted = ["wanted of the full model", *(f"<= {most:g}" for most in WANTED.values())]
+    head = ("pointing error [degrees]", "median", "95th percentile")
+    return f"median (least to largest) of {seeds_of(settings)}\n" + table(head, [*lines, wanted])
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Median errors by model: the median over the seeds, least to largest, each seed a point."""
+    rigs = tuple(dict.fromkeys(row["rig"] for row in rows))
+    for ax, rig in zip(figure.subplots(1, len(rigs), sharey=True, squeeze=False)[0], rigs, strict=True):
+        for i, model in enumerate(MODELS):
+            errors = [row["median_deg"] for row in rows if row["rig"] == rig and row["model"] == model]
+            points(ax, i, errors, color=f"C{i}", label=model)
+        ax.set(title=rig, yscale="log", ylabel="median pointing error [degrees]", xticks=[])
+    ax.legend(frameon=False)
+
+
+SETTINGS = Settings()
+EXPERIMENT = Experiment(
+    "pointing",
+    "How well a rig points after it was calibrated from rendered boards, and what simpler models lose.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, targets=50, rigs=("default",)),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    cost_s=90.0,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

@@ -1,0 +1,262 @@
+"""What a synthetic rig's cameras see of boards that are held before them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cotarget.calibration import View
+from cotarget.geometry import Array, Rotation
+from experiments.calibration.synthetic.aims import aimed
+from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Stop, Truth, undistorted
+
+BOARD_DEPTHS = (2.5, 8.0)  # [m]
+MARGIN_PX = 40.0  # the middle of a board stays so far inside the wide view
+# Of the head in use: pan and tilt [rad].
+HEAD_LIMITS = ((np.radians(-158.9), np.radians(158.9)), (np.radians(-46.6), np.radians(31.1)))
+CELLS = (5, 3)  # of the wide view, in columns and rows, over which boards are spread
+CELL_STEP = 7  # cells are taken in this step, so that a few boards reach all over as well
+FLATTEST = np.cos(np.radians(65.0))  # a board is not found that is seen at a flatter angle
+FARTHER = 0.03  # by which a board moves away that is not wholly seen, relative to its depth
+GOLDEN = (np.sqrt(5) - 1) / 2  # multiples of it, modulo 1, are evenly spread from the first on
+LOOKS_DRAWN = 80  # head poses among which those far apart are chosen
+FEWEST_CORNERS = 12  # of a board seen in part, through a longer focal length
+TRIES = 200  # head poses drawn for a placement
+PLACEMENT_TRIES = 100_000
+
+
+def synthetic_views(
+    truth: Truth,
+    points: Array,
+    rng: np.random.Generator,
+    boards: int = 30,
+    noise_px: float = 0.1,
+    moved: int = 3,
+    pan_range: float = 0.5,
+    tilt_range: float = 0.4,
+    far: float = BOARD_DEPTHS[1],
+    shape: Array | None = None,
+    first: int = 0,
+) -> list[View]:
+    """Views of boards held at random where the fixed camera sees them, home and moved.
+
+    Args:
+        truth: the rig.
+        points: the board's corners as everybody believes them to be [m], (N, 3).
+        rng: draws everything.
+        boards: how many placements.
+        noise_px: standard deviation of a corner's coordinate.
+        moved: how many head poses for each placement, besides one at home where that sees it.
+        pan_range: how far the head turns either way [rad].
+        tilt_range: likewise.
+        far: the farthest depth [m].
+        shape: where the corners really are on the board [m], (N, 3); by default the same.
+        first: number of the first placement.
+    """
+    views: list[View] = []
+    center = points.mean(axis=0)
+    true_points = points if shape is None else shape
+    number, stood = first, np.zeros(2)
+    for _ in range(PLACEMENT_TRIES):
+        if number == first + boards:
+            break
+        depth = np.exp(rng.uniform(np.log(BOARD_DEPTHS[0]), np.log(far)))
+        uv = rng.uniform(MARGIN_PX, np.array(SIZE) - MARGIN_PX)
+        ray = np.array([(uv[0] - truth.fixed.cx) / truth.fixed.fx, (uv[1] - truth.fixed.cy) / truth.fixed.fy, 1.0])
+        R = Rotation.from_rotvec(np.radians(rng.uniform([-35, -35, -20], [35, 35, 20])))
+        x_fixed = R.apply(true_points - center) + ray * depth
+        if not truth.fixed.sees(x_fixed):
+            continue
+        reach = [pan_range, tilt_range]
+        poses = np.concatenate([np.zeros((1, 2)), rng.uniform(np.negative(reach), reach, (TRIES, 2))])
+        seen = poses[seen_from(truth, x_fixed, poses)]
+        if not len(seen) or (len(seen) < 2 and moved):
+            continue
+        views.append(View("fixed", noisy(truth.fixed.project(x_fixed), noise_px, rng), number))
+        for reported in seen[: moved + 1]:
+            views.append(zoom_view(truth, x_fixed, number, reported, stood, noise_px, rng))
+            stood = reported
+        number += 1
+    return views
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Where boards are put, and from where they are looked at.
+
+    Attributes:
+        boards: how many placements, one in each cell of the wide view in turn.
+        looks: head poses for each placement, as far apart as the zoom camera's view and the head's limits allow; the
+            one at home is among them where it sees the board.
+        depths: of the boards, even in their logarithm [m].
+        turned: how far a board is turned out of the direction halfway between both cameras [rad].
+        limits: of pan and of tilt [rad].
+    """
+
+    boards: int = 15
+    looks: int = 4
+    depths: tuple[float, float] = BOARD_DEPTHS
+    turned: float = np.radians(45.0)
+    limits: tuple[tuple[float, float], tuple[float, float]] = HEAD_LIMITS
+
+
+DEFAULT_PLACING = Placing()
+
+
+def spread_views(
+    truth: Truth,
+    points: Array,
+    rng: np.random.Generator,
+    noise_px: float,
+    placing: Placing = DEFAULT_PLACING,
+    shape: Array | None = None,
+) -> list[View]:
+    """Views of boards all over the wide view, each looked at from head poses that bring it all over the zoom view.
+
+    Args:
+        truth: the rig.
+        points: the board's corners as everybody believes them to be [m], (N, 3).
+        rng: draws everything.
+        noise_px: standard deviation of a corner's coordinate.
+        placing: where boards are put.
+        shape: where the corners really are on the board [m], (N, 3); by default the same.
+
+    Raises:
+        AssertionError: there is no room for a board.
+    """
+    views: list[View] = []
+    stood = np.zeros(2)
+    for number in range(placing.boards):
+        x_fixed, poses = placed(truth, points if shape is None else shape, rng, placing, number)
+        views.append(View("fixed", noisy(truth.fixed.project(x_fixed), noise_px, rng), number))
+        for reported in poses:
+            views.append(zoom_view(truth, x_fixed, number, reported, stood, noise_px, rng))
+            stood = reported
+    return views
+
+
+def placed(truth: Truth, points: Array, rng: np.random.Generator, placing: Placing, number: int) -> tuple[Array, Array]:
+    """Find a place for a board: its corners in the fixed camera's frame [m], (N, 3), and head poses (n, 2) [rad].
+
+    A board too near for its cell moves away from the camera; a cell that the zoom camera cannot see gives way to any.
+
+    Raises:
+        AssertionError: there is none.
+    """
+    centered = points - points.mean(axis=0)
+    row, column = divmod(number * CELL_STEP % (CELLS[0] * CELLS[1]), CELLS[0])
+    near, far = np.log(np.array(placing.depths))
+    depth = near + (far - near) * (GOLDEN * number % 1)
+    zoom_at = truth.gamma.inv().translation
+    for i in range(PLACEMENT_TRIES // TRIES):
+        cell = np.array([column, row]) + rng.uniform(0, 1, 2) if i < TRIES else rng.uniform([0, 0], CELLS)
+        x = np.append(undistorted(cell / CELLS * (np.array(SIZE) - 1.0), truth.fixed), 1.0) * np.exp(depth)
+        facing = _unit(_unit(x) + _unit(x - zoom_at))
+        turn = Rotation.from_rotvec(rng.uniform(-1, 1, 3) * placing.turned)
+        x_fixed = (turn * _towards(facing)).apply(centered) + x
+        normal = turn.apply(facing)
+        sideways = min(normal @ _unit(x), normal @ _unit(x - zoom_at)) < FLATTEST
+        if sideways or not truth.fixed.sees(x_fixed):
+            depth = min(depth + FARTHER, far) if depth < far else rng.uniform(near, far)
+            continue
+        looking = np.concatenate([np.zeros((1, 2)), _looks(truth, x, rng)])
+        inside = ((looking >= np.array(placing.limits)[:, 0]) & (looking <= np.array(placing.limits)[:, 1])).all(axis=1)
+        seen = looking[inside]
+        seen = seen[seen_from(truth, x_fixed, seen)]
+        if len(seen) >= placing.looks:
+            return x_fixed, _apart(seen, placing.looks)
+        depth = rng.uniform(near, far)
+    raise AssertionError("no room for a board that both cameras see")
+
+
+def _looks(truth: Truth, x_fixed: Array, rng: np.random.Generator) -> Array:
+    """Head poses that bring a point (3,) to pixels all over the zoom view, (n, 2)."""
+    pixels = rng.uniform([0, 0], np.array(SIZE) - 1.0, (LOOKS_DRAWN, 2))
+    rays = np.c_[(pixels - [truth.zoom.cx, truth.zoom.cy]) / [truth.zoom.fx, truth.zoom.fy], np.ones(LOOKS_DRAWN)]
+    return aimed(truth, np.tile(x_fixed, (LOOKS_DRAWN, 1)), rays)
+
+
+def _apart(poses: Array, count: int) -> Array:
+    """So many of the poses (n, 2), the first one and each time the one farthest from all taken."""
+    taken = [0]
+    while len(taken) < count:
+        away = np.linalg.norm(poses[:, None] - poses[taken][None], axis=-1).min(axis=1)
+        taken.append(int(np.argmax(away)))
+    return poses[taken]
+
+
+def _towards(direction: Array) -> Rotation:
+    """The smallest rotation that turns +z into a direction (3,)."""
+    return Rotation.align_vectors(direction[None], np.array([[0.0, 0.0, 1.0]]))[0]
+
+
+def _unit(v: Array) -> Array:
+    return np.asarray(v / np.linalg.norm(v))
+
+
+def seen_from(truth: Truth, x_fixed: Array, poses: Array) -> npt.NDArray[np.bool_]:
+    """From which head poses (n, 2) the zoom camera sees all points (N, 3)."""
+    x_zoom = truth.in_zoom(x_fixed, poses[:, :1], poses[:, 1:])
+    inside = truth.zoom.inside(x_zoom.reshape(-1, 3)).reshape(x_zoom.shape[:2])
+    return np.asarray(inside.all(axis=1))
+
+
+def zoom_view(
+    truth: Truth,
+    x_fixed: Array,
+    number: int,
+    reported: Array,
+    before: Array | None,
+    noise_px: float,
+    rng: np.random.Generator,
+    stop: Stop | None = None,
+) -> View:
+    """What the zoom camera sees of a board's corners (N, 3), in part perhaps, from a pose that the head reports.
+
+    Args:
+        truth: the rig.
+        x_fixed: where the corners are [m], (N, 3).
+        number: of the placement.
+        reported: pan and tilt [rad], (2,).
+        before: where the head came from, likewise.
+        noise_px: standard deviation of a corner's coordinate.
+        rng: draws noise and jitter.
+        stop: the zoom lens's; the shortest focal length by default.
+    """
+    lens, pupil, nominal = (truth.zoom, 0.0, NOMINAL_PX) if stop is None else (stop.lens, stop.pupil, stop.nominal_px)
+    x = truth.in_zoom(x_fixed, *truth.stands(reported, before, rng)) - [0.0, 0.0, pupil]
+    px = noisy(lens.project(x), noise_px, rng)
+    if stop is not None:
+        px = np.where(lens.inside(x)[:, None], px, np.nan)
+    return View("zoom", px, number, float(reported[0]), float(reported[1]), focal_px=nominal)
+
+
+def views_at_stops(
+    truth: Truth, placements: Sequence[Array], rng: np.random.Generator, noise_px: float = 0.1, looks: int = 2
+) -> list[View]:
+    """Views of boards through the zoom lens's further stops, seen in part where they fill more than the image.
+
+    Args:
+        truth: with stops.
+        placements: corners of each placement in the fixed camera's frame [m], (N, 3); their numbers count from 0.
+        rng: draws which corner is looked at, and the noise.
+        noise_px: standard deviation of a corner's coordinate.
+        looks: how many head poses for each placement and stop.
+    """
+    views: list[View] = []
+    before = np.zeros(2)
+    for stop in truth.stops:
+        for number, x_fixed in enumerate(placements):
+            for _ in range(looks):
+                reported = aimed(truth, x_fixed[rng.integers(len(x_fixed))][None], np.array([0.0, 0.0, 1.0]))[0]
+                view = zoom_view(truth, x_fixed, number, reported, before, noise_px, rng, stop)
+                if np.isfinite(reported).all() and view.seen.sum() >= FEWEST_CORNERS:
+                    views.append(view)
+                    before = reported
+    return views
+
+
+def noisy(corners_px: Array, noise_px: float, rng: np.random.Generator) -> Array:
+    """Corners (N, 2) with Gaussian noise."""
+    return corners_px + rng.normal(0, noise_px, corners_px.shape)

@@ -1,0 +1,222 @@
+"""How well a rig points over its whole zoom range, calibrated from rendered boards, with an ideal head and with steps.
+
+The default rig with all effects on, once a seed with a head that stands wherever it is sent and once with one of
+0.0514 degree steps. The pointing error is stated at the shortest focal length and over all others (the angle between
+the line of sight and targets all over the wide view at 4 to 30 m, pixel and depth given exactly); beside it how far
+focal length and boresight are off at and between the stops. With steps, the aim is rounded to them, and the error
+stands beside that of a true calibration rounded alike.
+
+    python -m experiments.calibration.zoom_range [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import functools
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+
+from cotarget.calibration import Calibration, calibrate_rig, predicted_pointing
+from cotarget.config import RigConfig, SimConfig, SimEffects
+from cotarget.control.controller import reach_of
+from cotarget.evaluation import pointing_errors, true_calibration
+from cotarget.geometry import RigidTransform, angle_between
+from cotarget.safety import SafeRig
+from cotarget.sim.truth import Truth
+from cotarget.sim.world import SimWorld
+from experiments.engine import harness
+from experiments.engine.harness import Experiment, Row, seeds_of
+from experiments.engine.spread import spread_of
+from experiments.engine.texts import rms, table
+
+# What is wanted of each head's figures, at least and at most; of an ideal head nothing is rounded.
+WANTED: Mapping[str, tuple[float, float]] = {
+    "shortest_median_deg": (0.0, 0.003),
+    "shortest_p95_deg": (0.0, 0.006),
+    "range_median_deg": (0.0, 0.003),
+    "range_p95_deg": (0.0, 0.006),
+    "rms_over_predicted": (0.4, 1.5),
+    "ratio": (0.0, 1.1),
+}
+STREAM = 6  # of random numbers, apart from the world's own
+FOCAL_LENGTHS = 15  # over the range, evenly in the logarithm: every stop and the middle between any two
+HEADS = {"ideal": False, "steps": True}
+# A grid of targets for the prediction: pixels as shares of the image, and depths [m].
+SHARES, DEPTHS = np.linspace(0.05, 0.95, 4), np.array([5.0, 10.0, 25.0])
+
+
+@dataclass(frozen=True)
+class Settings(harness.Settings):
+    """How many seeds, how many targets at each focal length, and which heads."""
+
+    seeds: int = 3
+    targets: int = 60
+    heads: tuple[str, ...] = tuple(HEADS)
+
+
+def one(_: None, settings: Settings, seed: int) -> list[Row]:
+    """Calibrate with each head; one row for each focal length."""
+    rows: list[Row] = []
+    for head in settings.heads:
+        sim = SimConfig(scene="indoor", seed=seed, effects=SimEffects(steps=HEADS[head]))
+        config = RigConfig(sim=sim)
+        world = SimWorld(config)
+        with SafeRig(world.rig, config.safety) as rig:
+            calibration = calibrate_rig(rig, config.board, seed=seed)
+            reach, truth, exact = reach_of(rig), world.truth(), true_calibration(world, stops=FOCAL_LENGTHS)
+            for i, nominal in enumerate(np.geomspace(*reach.focal_px, FOCAL_LENGTHS)):
+                judged = functools.partial(
+                    pointing_errors, truth=truth, reach=reach, nominal_px=float(nominal), count=settings.targets
+                )
+                errors = judged(calibration, rng=np.random.default_rng((seed, STREAM, i)))
+                row: Row = {
+                    "head": head,
+                    "seed": seed,
+                    "nominal_px": float(nominal),
+                    "median_deg": float(np.degrees(np.median(errors))),
+                    "p95_deg": float(np.degrees(np.percentile(errors, 95))),
+                    "rms_deg": rms(np.degrees(errors)),
+                    "predicted_deg": float(np.degrees(predicted(calibration, float(nominal)))),
+                    **lens_errors(calibration, truth, float(nominal)),
+                }
+                if HEADS[head]:
+                    for name, one_calibration in (("rounded", calibration), ("rounding", exact)):
+                        rng = np.random.default_rng((seed, STREAM, i))
+                        rounded = judged(one_calibration, rng=rng, step=reach.step)
+                        row[f"{name}_rms_deg"] = rms(np.degrees(rounded))
+                rows.append(row)
+    return rows
+
+
+def predicted(calibration: Calibration, nominal_px: float) -> float:
+    """Predicted rms pointing error over the wide view and depth [rad]."""
+    u, v, z = np.meshgrid(SHARES, SHARES, DEPTHS)
+    pixels = np.stack([u.ravel(), v.ravel()], axis=-1) * (np.array(calibration.fixed.size) - 1)
+    return rms(predicted_pointing(calibration, pixels, z.ravel(), nominal_px=nominal_px))
+
+
+def lens_errors(calibration: Calibration, truth: Truth, nominal_px: float) -> dict[str, float]:
+    """How far off the focal length is [%], and the ray through the image's middle in the head's frame [degrees]."""
+    found, true = calibration.zoom.at(nominal_px), truth.zoom_lens_for(nominal_px)
+    middle = found.image_center_px
+    here = calibration.hand_eye().rotation.apply(found.ray(middle))
+    there = truth_hand(truth).rotation.apply(np.append(true.directions(middle), 1.0))
+    return {
+        "focal_off_percent": 100 * abs(found.focal_px[0] / true.focal_px[0] - 1),
+        "boresight_off_deg": float(np.degrees(angle_between(here, there))),
+    }
+
+
+def truth_hand(truth: Truth) -> RigidTransform:
+    """The true T_head_zoom, from the world's own poses at home."""
+    return truth.T_world_base.inv() * truth.T_world_camera("zoom", 0.0)
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Medians over the seeds, of the error over the range least and largest too, and the worst of the lens."""
+    summary: dict[str, Any] = {}
+    for head in dict.fromkeys(row["head"] for row in rows):
+        mine = [row for row in rows if row["head"] == head]
+        shortest = min(row["nominal_px"] for row in mine)
+        at_shortest = [row for row in mine if row["nominal_px"] == shortest]
+        by_seed: dict[int, list[Row]] = {}
+        for row in mine:
+            by_seed.setdefault(row["seed"], []).append(row)
+        found = {
+            "calibrations": len(by_seed),
+            "shortest_median_deg": median(row["median_deg"] for row in at_shortest),
+            "shortest_p95_deg": median(row["p95_deg"] for row in at_shortest),
+            **_over_range(
+                "range_median_deg", [np.median([r["median_deg"] for r in same]) for same in by_seed.values()]
+            ),
+            **_over_range(
+                "range_p95_deg", [np.percentile([r["p95_deg"] for r in same], 95) for same in by_seed.values()]
+            ),
+            "worst_seed_range_p95_deg": max(max(r["p95_deg"] for r in same) for same in by_seed.values()),
+            "rms_over_predicted": rms(r["rms_deg"] for r in mine) / rms(r["predicted_deg"] for r in mine),
+            "focal_off_percent": median(max(r["focal_off_percent"] for r in same) for same in by_seed.values()),
+            "worst_focal_off_percent": max(r["focal_off_percent"] for r in mine),
+            "boresight_off_deg": median(max(r["boresight_off_deg"] for r in same) for same in by_seed.values()),
+            "worst_boresight_off_deg": max(r["boresight_off_deg"] for r in mine),
+        }
+        if "rounded_rms_deg" in mine[0]:
+            found["rounded_rms_deg"] = rms(row["rounded_rms_deg"] for row in mine)
+            found["rounding_alone_rms_deg"] = rms(row["rounding_rms_deg"] for row in mine)
+            found["ratio"] = found["rounded_rms_deg"] / found["rounding_alone_rms_deg"]
+        summary[head] = found
+    return summary
+
+
+def _over_range(key: str, values: Sequence[Any]) -> dict[str, float]:
+    """A figure's median over the seeds under its own name, and least and largest beside it."""
+    found = spread_of(map(float, values))
+    return {key: found["median"], f"{key}, least": found["least"], f"{key}, largest": found["largest"]}
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The figures that are not what is wanted."""
+    return [
+        f"{head}: {key}"
+        for head, found in summary.items()
+        for key, (low, high) in WANTED.items()
+        if key in found and not low <= found[key] <= high
+    ]
+
+
+def median(values: Any) -> float:
+    """Median of an iterable."""
+    return float(np.median(list(values)))
+
+
+def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
+    """A line for each figure, a column for each head."""
+    names = list(dict.fromkeys(name for found in summary.values() for name in found))
+    lines = [
+        [
+            name,
+            *(found.get(name, float("nan")) for found in summary.values()),
+            "{:g}-{:g}".format(*WANTED[name]) if name in WANTED else "",
+        ]
+        for name in names
+    ]
+    return "\n".join([f"over the zoom range, {seeds_of(settings)}", table(["", *summary, "wanted"], lines)])
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Rms pointing error over the focal length and what each calibration predicts: medians, half the seeds shaded."""
+    heads = list(dict.fromkeys(row["head"] for row in rows))
+    for ax, head in zip(figure.subplots(1, len(heads), sharey=True, squeeze=False)[0], heads, strict=True):
+        mine = [row for row in rows if row["head"] == head]
+        focal = sorted({row["nominal_px"] for row in mine})
+        for key, words in (("rms_deg", "measured"), ("predicted_deg", "predicted")):
+            values = [[row[key] for row in mine if row["nominal_px"] == f] for f in focal]
+            low, middle, high = (np.array([np.percentile(each, q) for each in values]) for q in (25, 50, 75))
+            (line,) = ax.loglog(focal, middle, label=words)
+            ax.fill_between(focal, low, high, color=line.get_color(), alpha=0.25, lw=0)
+        ax.set(title=f"head: {head}", xlabel="nominal focal length [px]", ylabel="rms pointing error [degrees]")
+        octaves = focal[0] * 2.0 ** np.arange(1 + math.floor(math.log2(focal[-1] / focal[0])))
+        ax.set_xticks(octaves, [f"{each:.0f}" for each in octaves])
+        ax.xaxis.set_minor_locator(NullLocator())
+        ax.legend(frameon=False)
+
+
+SETTINGS = Settings()
+EXPERIMENT = Experiment(
+    "zoom_range",
+    "How well a rig points over its whole zoom range, calibrated from rendered boards.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, targets=20, heads=("steps",)),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    cost_s=120.0,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

@@ -1,0 +1,1 @@
+"""Run experiments over seeds, keep their rows, compare figures with bounds, write the report."""

@@ -1,0 +1,307 @@
+"""What all experiments share: what they consist of, a command for each, a table, and the files of a run.
+
+An experiment is a module with a dataclass of settings and some functions: `one(shared, settings, seed)` gives the rows
+of one seed, whichever process does it and whatever was done before; `prepare(settings)`, where there is one, gives what
+all seeds share; `summarise(rows)` the figures, `describe` a text to print, `plot` a picture. Rows are flat dictionaries
+of numbers, texts and truth values; everything reported is made from them alone, but for pictures that `one` may give
+beside them (`experiments.engine.pictured`).
+
+    python -m experiments.NAME [--seeds N] [--seed-base B] [--processes P] [--quick] [--out DIR]
+
+`python -m experiments` does many of them at once, and goes on where it was broken off: `experiments.engine.runner`.
+"""
+
+import csv
+import dataclasses
+import functools
+import io
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from tqdm import tqdm
+
+from cotarget.cli.common import count, not_negative
+from cotarget.cli.main import Parser
+from cotarget.errors import ConfigError, CotargetError, DeviceError
+from cotarget.files import write_whole
+from experiments.engine.arguments import check_folder
+from experiments.engine.pictured import Pictured, parted, shown
+from experiments.engine.texts import in_one_line, plain
+from experiments.engine.versions import versions
+from experiments.engine.workers import Died, Engine, here, in_processes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+Row = dict[str, Any]
+INTERRUPTED, TERMINATED = 130, 143  # exit status of Ctrl-C and of SIGTERM
+FIGURE = "figure"  # the plot's file
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How many seeds, from which on, and over how many processes.
+
+    Raises:
+        ConfigError: no seeds, no processes, or a seed below zero.
+    """
+
+    seeds: int = 100
+    seed_base: int = 0
+    processes: int = 1
+
+    def __post_init__(self) -> None:
+        for name, least in (("seeds", 1), ("seed_base", 0), ("processes", 1)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"{name} = {getattr(self, name)}: at least {least} is needed")
+
+
+def seeds_of(settings: Settings) -> str:
+    """Which seeds, in words."""
+    return f"seeds {settings.seed_base} to {settings.seed_base + settings.seeds - 1}"
+
+
+def seeds_in(settings: Settings) -> Sequence[int]:
+    """The seeds."""
+    return range(settings.seed_base, settings.seed_base + settings.seeds)
+
+
+S = TypeVar("S", bound=Settings)
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What seeds share, told by less than all settings, so that it is made once for all who share it.
+
+    Attributes:
+        make: a function at the top of a module.
+        arguments: gives its arguments, from the settings; at the top of a module too.
+    """
+
+    make: Callable[..., Any]
+    arguments: Callable[[Any], tuple[Any, ...]]
+
+    def __call__(self, settings: Any) -> Any:
+        """Make it."""
+        return self.make(*self.arguments(settings))
+
+
+@dataclass(frozen=True)
+class Experiment(Generic[S]):
+    """What an experiment consists of; all functions that other processes call are at the top of a module.
+
+    Attributes:
+        name: of its module.
+        purpose: one line, for --help.
+        settings: as it is reported.
+        quick: the same with less of everything.
+        one: gives the rows of a seed: (what `prepare` gave, settings, seed) -> rows, or rows with pictures.
+        summarise: gives the figures, from the rows alone; nan where nothing was measured.
+        describe: gives settings and figures as a text to print.
+        plot: draws the rows.
+        missed: names the figures that are not what is wanted; the command fails where there is one.
+        prepare: gives what all seeds share, from the settings; a `Preparation` where several experiments share it.
+        jobs: gives the numbers that `one` is called with, where these are not the seeds.
+        alone: whether it measures times: nothing else may be done meanwhile, and it may take all cores.
+        cost_s: about how long one seed takes on one core [s]; the longest are begun first.
+        bounded: gives the figures as the file of bounds names them, where these are not the summary.
+        needs: says what the experiment lacks to be done with these settings; nothing, if it lacks nothing.
+    """
+
+    name: str
+    purpose: str
+    settings: S
+    quick: S
+    one: Callable[[Any, S, int], list[Row] | Pictured]
+    summarise: Callable[[Sequence[Row]], Mapping[str, Any]]
+    describe: Callable[[S, Mapping[str, Any]], str]
+    plot: "Callable[[Sequence[Row], Figure], None] | None" = None
+    missed: Callable[[Mapping[str, Any]], Sequence[str]] | None = None
+    prepare: Callable[[S], Any] | None = None
+    jobs: Callable[[S], Sequence[int]] = seeds_in
+    alone: bool = False
+    cost_s: float = 1.0
+    bounded: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None
+    needs: Callable[[S], str] | None = None
+
+    def main(self, arguments: Sequence[str] | None = None) -> int:
+        """The command: run, print the figures, and write the files where asked to."""
+        parser = Parser(prog=f"python -m {self._module()}", description=self.purpose)
+        seeds, processes = self.settings.seeds, os.cpu_count() or 1
+        parser.add_argument("--seeds", type=count, metavar="N", help=f"how many ({seeds}; {self.quick.seeds} if quick)")
+        parser.add_argument("--seed-base", type=not_negative, default=0, metavar="B", help="the first seed (0)")
+        parser.add_argument(
+            "--processes",
+            type=count,
+            default=processes,
+            metavar="P",
+            help=f"jobs at a time, but one where time is measured ({processes})",
+        )
+        parser.add_argument("--quick", action="store_true", help=f"a look only: {_less(self.settings, self.quick)}")
+        files = "result.json and rows.csv" if self.plot is None else "result.json, rows.csv and pictures"
+        parser.add_argument("--out", type=Path, metavar="DIR", help=f"write {files} there")
+        given = parser.parse_args(arguments)
+        settings = self.quick if given.quick else self.settings
+        settings = dataclasses.replace(settings, seed_base=given.seed_base, processes=given.processes)
+        if given.seeds is not None:
+            settings = dataclasses.replace(settings, seeds=given.seeds)
+        return self.report(settings, given.out, quick=given.quick)
+
+    def _module(self) -> str:
+        spec = sys.modules["__main__"].__spec__
+        return spec.name if spec is not None and spec.name.endswith(f".{self.name}") else f"experiments.{self.name}"
+
+    def report(self, settings: S, out: Path | None, *, quick: bool = False) -> int:
+        """Run with these settings, print the figures, and write the files where there is a folder for them.
+
+        Returns:
+            The exit status: 1 where a seed failed, a figure is missed (but for a quick run, which is too short for
+            that), something is lacking or the folder cannot be written to, 130 on Ctrl-C.
+        """
+        failed: dict[int, str] = {}
+        try:
+            if out is not None:
+                check_folder(out)
+            rows, pictures = parted(self.run_pictured(settings, failed=failed))
+            for number, why in failed.items():
+                print(f"experiments.{self.name}: seed {number} failed: {why}", file=sys.stderr)
+            if failed and not rows:
+                return 1
+            try:
+                summary = self.summarise(rows)
+                text, picture = self.describe(settings, summary), None if out is None else self.picture(rows)
+            except Exception as error:
+                if not failed:
+                    raise
+                raise CotargetError(f"the rows without those seeds give no figures ({error})") from error
+            print(text)
+            if out is not None:
+                self.write(out, settings, rows, summary, picture, pictures)
+        except CotargetError as error:
+            print(f"experiments.{self.name}: {error}", file=sys.stderr)
+            return 1
+        except KeyboardInterrupt:
+            print(f"experiments.{self.name}: interrupted", file=sys.stderr)
+            return INTERRUPTED
+        lost = not quick and self.missed is not None and self.missed(summary)
+        return 1 if failed or lost else 0
+
+    def shares(self, settings: S) -> tuple[Callable[..., Any], tuple[Any, ...]] | None:
+        """The function that makes what all seeds share, and its arguments; None where they share nothing."""
+        if isinstance(self.prepare, Preparation):
+            return self.prepare.make, self.prepare.arguments(settings)
+        return None if self.prepare is None else (self.prepare, (settings,))
+
+    def run(self, settings: S, engine: Engine = in_processes) -> list[Row]:
+        """All rows, in the order of the seeds; see `run_pictured`."""
+        return self.run_pictured(settings, engine).rows
+
+    def run_pictured(
+        self, settings: S, engine: Engine = in_processes, failed: dict[int, str] | None = None
+    ) -> Pictured:
+        """All rows, in the order of the seeds, and the pictures of the first seed that has any.
+
+        Args:
+            settings: how many seeds, and over how many processes.
+            engine: does the jobs; those that measure times are done in this process, one after the other.
+            failed: gets, of each seed that fails, why; the others go on. Without it the first that fails ends all.
+
+        Raises:
+            ConfigError: something is missing that it needs.
+            DeviceError: a process died.
+        """
+        if self.needs is not None and (lack := self.needs(settings)):
+            raise ConfigError(lack)
+        engine = here if self.alone else engine
+        # By a worker too: whoever does it, it has one thread of linear algebra, and the same last digits.
+        shared = None if self.prepare is None else _all(engine, self.prepare, [settings], 1)[0]
+        jobs = functools.partial(self.one, shared, settings)
+        if failed is not None:
+            jobs = functools.partial(_tried, jobs)
+        numbers, found = self.jobs(settings), []
+        for number, each in zip(numbers, _all(engine, jobs, numbers, settings.processes), strict=True):
+            if isinstance(each, Exception) and failed is not None:
+                failed[number] = in_one_line(each)
+            else:
+                found.append(parted(each))
+        return Pictured([row for rows, _ in found for row in rows], shown(pictures for _, pictures in found))
+
+    def write(
+        self,
+        out: Path,
+        settings: S,
+        rows: Sequence[Row],
+        summary: Mapping[str, Any],
+        picture: bytes | None,
+        pictures: Mapping[str, bytes] = MappingProxyType({}),
+    ) -> None:
+        """Write result.json, rows.csv and, where there is a plot, figure.png; and the pictures of the jobs.
+
+        Raises:
+            ConfigError: one of them cannot be written.
+        """
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"{out}: cannot be made: {error.strerror}") from None
+        result = {
+            "experiment": self.name,
+            "settings": dataclasses.asdict(settings),
+            "versions": versions(),
+            "summary": summary,
+        }
+        write_whole(out / "result.json", (json.dumps(plain(result), indent=2) + "\n").encode())
+        table = io.StringIO(newline="")
+        writer = csv.DictWriter(table, fieldnames=list(dict.fromkeys(key for row in rows for key in row)))
+        writer.writeheader()
+        writer.writerows(rows)
+        write_whole(out / "rows.csv", table.getvalue().encode())
+        for name, png in {**({} if picture is None else {FIGURE: picture}), **pictures}.items():
+            write_whole(out / f"{name}.png", png)
+
+    def picture(self, rows: Sequence[Row]) -> bytes | None:
+        """The plot as a PNG, where there is one."""
+        if self.plot is None:
+            return None
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(8, 4.5), layout="constrained")
+        FigureCanvasAgg(figure)
+        self.plot(rows, figure)
+        png = io.BytesIO()
+        figure.savefig(png, format="png", dpi=110)
+        return png.getvalue()
+
+
+def _tried(one: Callable[[int], Any], number: int) -> Any:
+    """What a seed gives, or why it gives nothing."""
+    try:
+        return one(number)
+    except Exception as error:
+        return error.with_traceback(None)
+
+
+def _all(engine: Engine, work: Callable[[Any], Any], jobs: Sequence[Any], processes: int) -> list[Any]:
+    """What each job gives, in the order of the jobs."""
+    found: dict[int, Any] = {}
+    for number, result in tqdm(engine(work, jobs, processes), total=len(jobs), disable=None, leave=False):
+        if result is Died:
+            raise DeviceError(f"the process of job {number + 1} of {len(jobs)} died; is there memory enough?")
+        found[number] = result
+    return [found[number] for number in sorted(found)]
+
+
+def _less(settings: Settings, quick: Settings) -> str:
+    """What a quick run has other than the whole one, for --help."""
+    parts = {field.name: getattr(quick, field.name) for field in dataclasses.fields(quick)}
+    other = {name: value for name, value in parts.items() if value != getattr(settings, name)}
+    texts = (f"{name} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in other.items())
+    return ", ".join(texts).replace("%", "%%") or "the same"

@@ -1,0 +1,139 @@
+"""What the rows of a case come to: its figures, in words and as a picture, beside what is wanted and the bounds."""
+
+import inspect
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from experiments.engine.bounds import EXPECTED, Bound, compare
+from experiments.engine.cases import Case
+from experiments.engine.harness import Row
+from experiments.engine.pictured import shown
+from experiments.engine.results import NOTHING, Record, Spent, code_version
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A case that was run, wholly or in part.
+
+    Attributes:
+        case: what was to be run.
+        records: what came of its jobs, by number.
+        summary: the figures; None where there are none.
+        text: the same, to print.
+        missed: the figures that are not what is wanted; None where nothing is.
+        bounds: the figures that have bounds, beside them; of other settings than the quick ones there are none.
+        picture: the plot as a PNG.
+        caption: what it shows.
+        broken: why there are no figures, or no picture.
+        pictures: of the first job that has any, PNGs by name.
+        shared: what it took to prepare what its jobs share.
+    """
+
+    case: Case
+    records: Mapping[int, Record]
+    summary: Mapping[str, Any] | None = None
+    text: str = ""
+    missed: tuple[str, ...] | None = None
+    bounds: tuple[Bound, ...] = ()
+    picture: bytes | None = None
+    caption: str = ""
+    broken: str = ""
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
+    shared: Spent = NOTHING
+
+    @property
+    def failed(self) -> dict[int, Record]:
+        """The jobs that failed."""
+        return {number: record for number, record in sorted(self.records.items()) if record.failed}
+
+    @property
+    def pictured(self) -> int | None:
+        """The first job that has pictures."""
+        return next((number for number, record in sorted(self.records.items()) if record.pictures), None)
+
+    @property
+    def undone(self) -> int:
+        """How many jobs were not done yet."""
+        return len(self.case.numbers) - len(self.records)
+
+    @property
+    def worse(self) -> tuple[Bound, ...]:
+        """The figures beyond their bounds."""
+        return tuple(bound for bound in self.bounds if not bound.kept)
+
+    @property
+    def seconds(self) -> list[float]:
+        """That the jobs took [s]."""
+        return [record.seconds for record in self.records.values()]
+
+    @property
+    def cpu_s(self) -> float:
+        """Processor time of the jobs and of what they share [s]."""
+        return self.shared.cpu_s + sum(record.cpu_s for record in self.records.values())
+
+    @property
+    def renders(self) -> int:
+        """How many pictures MuJoCo drew for the jobs and for what they share."""
+        return self.shared.renders + sum(record.renders for record in self.records.values())
+
+    @property
+    def other_code(self) -> tuple[str, ...]:
+        """Versions of the code that jobs were done by, where that is not this one."""
+        return tuple(sorted({record.version for record in self.records.values()} - {code_version()}))
+
+    @property
+    def ok(self) -> bool:
+        """Whether all was done and, as far as these settings can tell, is as it should be.
+
+        A quick run is too short for what is wanted; it is held to its bounds instead.
+        """
+        lost = () if self.case.quick else self.missed
+        return not (self.failed or self.undone or self.broken or lost or self.worse)
+
+
+def conclude(
+    case: Case, records: Mapping[int, Record], folder: Path, expected: Path = EXPECTED, shared: Spent = NOTHING
+) -> Outcome:
+    """Work out a case's figures from its rows, and write result.json, rows.csv, figure.png and other pictures.
+
+    Args:
+        case: that was run.
+        records: what came of its jobs.
+        folder: for the files.
+        expected: where the bounds are.
+        shared: what it took to prepare what the jobs share.
+
+    Raises:
+        ConfigError: a file of bounds cannot be read.
+    """
+    rows = [row for _, record in sorted(records.items()) for row in record.rows or ()]
+    if not rows:
+        return Outcome(case, records, broken="no job has given any rows", shared=shared)
+    experiment = case.experiment
+    try:
+        summary = experiment.summarise(rows)
+        text = experiment.describe(case.settings, summary)
+        missed = None if experiment.missed is None else tuple(experiment.missed(summary))
+    except Exception as error:  # of an incomplete run, which lacks what the figures are made of
+        return Outcome(case, records, broken=f"the rows give no figures: {_where(error)}", shared=shared)
+    picture, broken = _draw(case, rows)
+    pictures = shown(record.pictures for _, record in sorted(records.items()))
+    experiment.write(folder, case.settings, rows, summary, picture, pictures)
+    bounds = tuple(compare(experiment, summary, expected)) if case.has_bounds else ()
+    caption = (inspect.getdoc(experiment.plot) or "").partition("\n")[0]
+    return Outcome(case, records, summary, text, missed, bounds, picture, caption, broken, pictures, shared)
+
+
+def _draw(case: Case, rows: list[Row]) -> tuple[bytes | None, str]:
+    try:
+        return case.experiment.picture(rows), ""
+    except Exception as error:
+        return None, f"the rows cannot be drawn: {_where(error)}"
+
+
+def _where(error: Exception) -> str:
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({Path(last.filename).name}, line {last.lineno})"

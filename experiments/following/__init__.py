@@ -1,0 +1,1 @@
+"""How well a target is held in the close-up."""

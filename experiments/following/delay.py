@@ -1,0 +1,190 @@
+"""What prediction is worth: the offset in the close-up with it and without, over the delay of cameras and head.
+
+A person walks and a bird flies in the field of `experiments.following.field_scenes`, and the delay from light to the
+start of
+motion goes from none to 600 ms, of which three fifths are the cameras' and the rest the head's and the lens's, as in
+the field's 120 + 80 ms. Without prediction the head is sent where the target was seen. The curve is of the wide view
+alone, so that nothing is rendered but its frames, once a seed; at one delay, the field's, both are compared once more
+with the correction from the zoom view where that is asked for (`--set delay.closed_loop=true`). A run in which the
+target was never acquired counts with half the diagonal.
+
+    python -m experiments.following.delay [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration
+from cotarget.config import RigConfig, SimZoomCamera
+from cotarget.metrics import score
+from cotarget.pipeline import FollowSettings
+from experiments.engine.harness import Experiment, Row, seeds_of
+from experiments.engine.spread import in_words, spread_of
+from experiments.engine.texts import table
+from experiments.following.field import FieldSettings, calibrated, held, target_of
+from experiments.following.field_scenes import COMMAND_DELAY_S, LATENCY_S, hold_config
+from experiments.following.wide_view import record
+
+FIELD_S = LATENCY_S + COMMAND_DELAY_S
+LIGHT_PART = LATENCY_S / FIELD_S  # of a delay, that from light to frame
+WIDTH, HEIGHT = SimZoomCamera().size
+NEVER = math.hypot(WIDTH, HEIGHT) / 2 / WIDTH  # offset over the width, of a target that is never acquired
+WANTED = 3.0  # times smaller with prediction than without, at the field's delay
+
+
+@dataclass(frozen=True)
+class DelaySettings(FieldSettings):
+    """How many seeds, which targets, and at which delays.
+
+    Attributes:
+        targets: person, bird.
+        delays: from light to the start of motion [s]; what is wanted is held against the field's, if it is among them.
+        closed_loop: whether both ways are compared with the zoom view's correction too, at the field's delay.
+    """
+
+    seeds: int = 2
+    targets: tuple[str, ...] = ("person", "bird")
+    delays: tuple[float, ...] = (0.0, 0.1, FIELD_S, 0.4, 0.6)
+    closed_loop: bool = False
+
+
+def one(calibration: Calibration, settings: DelaySettings, seed: int) -> list[Row]:
+    """Follow each target at each delay, with prediction and without; one row each."""
+    cases = [(delay, predict, False) for delay in settings.delays for predict in (True, False)]
+    if settings.closed_loop:
+        cases += [(FIELD_S, predict, True) for predict in (True, False)]
+    rows: list[Row] = []
+    for name in settings.targets:
+        config = hold_config(name, seed)
+        view = record(config, target_of(config, name), settings.seconds)
+        for delay, predict, closed_loop in cases:
+            late = delayed(config, delay)
+            how = FollowSettings.of(late, predict=predict, closed_loop=closed_loop)
+            found = score(held(calibration, late, name, settings.seconds, how, view))
+            rows.append(
+                {
+                    "seed": seed,
+                    "target": name,
+                    "delay_s": delay,
+                    "predict": predict,
+                    "closed_loop": closed_loop,
+                    "tpo_width": NEVER if found.tpo_width_median is None else found.tpo_width_median,
+                    "tpo_deg": found.tpo_deg_median,
+                    "closeup_yield": found.closeup_yield,
+                    "in_frame_ratio": found.in_frame_ratio or 0.0,
+                }
+            )
+    return rows
+
+
+def delayed(config: RigConfig, delay: float) -> RigConfig:
+    """The same rig with another delay from light to the start of motion [s]."""
+    sim, latency_s = config.sim, LIGHT_PART * delay
+    head = dataclasses.replace(sim.head, command_delay_s=(1 - LIGHT_PART) * delay)
+    fixed = dataclasses.replace(sim.fixed, latency_s=latency_s)
+    zoom = dataclasses.replace(sim.zoom, latency_s=latency_s)
+    return dataclasses.replace(config, sim=dataclasses.replace(sim, fixed=fixed, zoom=zoom, head=head))
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Of each target the curve, over the seeds, and how many times prediction makes the median offset smaller."""
+    return {name: _of_target([row for row in rows if row["target"] == name]) for name in _targets(rows)}
+
+
+def _targets(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(row["target"] for row in rows))
+
+
+def _of_target(rows: Sequence[Row]) -> dict[str, Any]:
+    def both(delay: float, closed_loop: bool) -> dict[str, Any]:
+        ways = [
+            [
+                r["tpo_width"]
+                for r in rows
+                if (r["delay_s"], r["closed_loop"], r["predict"]) == (delay, closed_loop, way)
+            ]
+            for way in (True, False)
+        ]
+        found = dict(zip(("with", "without"), map(spread_of, ways), strict=True))
+        return found | {"times": found["without"]["median"] / found["with"]["median"]}
+
+    delays = sorted({row["delay_s"] for row in rows})
+    curve = {f"{1e3 * delay:.0f} ms": both(delay, False) for delay in delays}
+    return {"wide view alone": curve, "closed loop": both(FIELD_S, True)}
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The targets for which prediction is not worth what is wanted; of the whole pipeline, where that was measured.
+
+    Where the field's delay was not asked for, nothing is wanted.
+    """
+    lost = []
+    for name, figures in summary.items():
+        field = figures["wide view alone"].get(f"{1e3 * FIELD_S:.0f} ms")
+        times = figures["closed loop"]["times"]
+        if math.isnan(times) and field is not None:
+            times = field["times"]
+        elif math.isnan(times):
+            continue
+        if not times >= WANTED:
+            lost.append(name)
+    return lost
+
+
+def describe(settings: DelaySettings, summary: Mapping[str, Any]) -> str:
+    """A line for each target and delay."""
+    lines: list[list[Any]] = []
+    for name, figures in summary.items():
+        shown = {f"{name}, {delay}": found for delay, found in figures["wide view alone"].items()}
+        if settings.closed_loop:
+            shown[f"{name}, {1e3 * FIELD_S:.0f} ms, closed loop"] = figures["closed loop"]
+        lines += [
+            [words, in_words(found["with"]), in_words(found["without"]), found["times"]]
+            for words, found in shown.items()
+        ]
+    return (
+        "median offset over the width, with prediction and without: "
+        f"median (least to largest) of {seeds_of(settings)}; "
+        f"at least {WANTED:g} times is wanted at {1e3 * FIELD_S:.0f} ms\n"
+        + table(("", "with", "without", "times"), lines)
+    )
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Offset over the delay: medians joined, bars from the least seed to the largest."""
+    names = _targets(rows)
+    for ax, name in zip(np.ravel(figure.subplots(1, len(names), sharey=True)), names, strict=True):
+        for predict, label in ((True, "with prediction"), (False, "without")):
+            mine = [r for r in rows if (r["target"], r["predict"], r["closed_loop"]) == (name, predict, False)]
+            delays = sorted({row["delay_s"] for row in mine})
+            found = [spread_of(row["tpo_width"] for row in mine if row["delay_s"] == delay) for delay in delays]
+            low, middle, high = (np.array([each[key] for each in found]) for key in ("least", "median", "largest"))
+            ax.errorbar(1e3 * np.array(delays), middle, yerr=(middle - low, high - middle), capsize=3, label=label)
+        ax.set_yscale("log")
+        ax.set(title=name, xlabel="delay from light to motion [ms]", ylabel="median offset / width")
+    ax.legend(frameon=False)
+
+
+SETTINGS = DelaySettings()
+EXPERIMENT = Experiment(
+    "delay",
+    "The offset in the close-up with prediction and without, over the delay of cameras and head.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, targets=("bird",), delays=(FIELD_S,), seconds=10.0, calibrated=False),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    prepare=calibrated,
+    cost_s=250.0,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

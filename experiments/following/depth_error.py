@@ -1,0 +1,255 @@
+"""How an error of the depth becomes a pointing error, over depth and baseline: first order beside Monte Carlo.
+
+The depth comes from a size known beforehand, z = f x_size / u_measured, and errs by the same part as either of them:
+
+    wrong size      all targets are believed to be 10 % larger than they are
+    scatter         true sizes scatter by 10 % about the one believed
+    pixels          the measured size has 0.5 px of noise
+    together        scatter and pixels
+
+A target seen at x [m] from the fixed camera, x_zoom from the turned zoom camera, is then looked for at x (1 + e): to
+first order that turns the line of sight by e |x_zoom x x| / |x_zoom|^2, about e b / z for a baseline b across the view.
+Since e is u_noise z / (f x_size) for pixels, their part does not depend on the depth. Monte Carlo has the whole way: a
+bar of the target's true size is projected, measured, and aimed at through `cotarget.camera.depth_from_size`, on rigs
+mounted by eye (`experiments.following.mounted`) that are known exactly. The part of the close-up's width is at the
+focal length
+at which a bird of 0.8 m is 160 px wide, within the lens's range.
+
+    python -m experiments.following.depth_error [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration
+from cotarget.camera import depth_from_size
+from cotarget.errors import ConfigError
+from cotarget.geometry import Array
+from experiments.calibration.synthetic.aims import aim, looking_off
+from experiments.calibration.synthetic.rig import SIZE, Truth
+from experiments.engine.checks import check_above, check_least
+from experiments.engine.harness import Experiment, Row, Settings, seeds_of
+from experiments.engine.texts import rms, table
+from experiments.following.mounted import TARGET, at, cell_name, exact_calibration, mounted, off_px, wanted_focal_px
+
+CAUSES = ("wrong size", "scatter", "pixels", "together")
+# Monte Carlo over first order, the median over all: a size 10 % too large turns by 1 / 1.1 of what first order says.
+AGREES = (0.88, 1.12)
+# Nearer than this some bird at the image's edge, half of it outside, reaches where the lens's model tells no depth.
+NEAREST_M = 2.0
+SHOWN_BASELINE, SHOWN_DEPTH = 0.4, 10.0  # [m]
+
+
+@dataclass(frozen=True)
+class DepthSettings(Settings):
+    """What is mounted, where targets are, and what errs.
+
+    Attributes:
+        baselines: of the rigs of each seed [m].
+        depths: of the targets [m].
+        targets: at each depth.
+        wrong: by how much the known size is too large, relative.
+        scatter: standard deviation of true sizes, relative.
+        noise_px: of the measured size [px].
+    """
+
+    seeds: int = 20
+    baselines: tuple[float, ...] = (0.1, 0.4, 1.5, 3.0)
+    depths: tuple[float, ...] = (5.0, 10.0, 20.0, 50.0, 100.0)
+    targets: int = 100
+    wrong: float = 0.1
+    scatter: float = 0.1
+    noise_px: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_above(0, self, "baselines", "depths", "targets", "scatter", "noise_px")
+        check_least(NEAREST_M, self, "depths")
+        check_above(-1, self, "wrong")
+        if self.wrong == 0:
+            raise ConfigError("wrong: 0 is no error; give one above -1 that is not 0, such as 0.1")
+
+
+def one(_: None, settings: DepthSettings, seed: int) -> list[Row]:
+    """A rig of each baseline; a row for each depth and cause."""
+    return [row for i in range(len(settings.baselines)) for row in _of_rig(settings, seed, i)]
+
+
+def _of_rig(settings: DepthSettings, seed: int, number: int) -> list[Row]:
+    rng = np.random.default_rng((seed, 23, number))
+    baseline = settings.baselines[number]
+    truth = mounted(rng, baseline)
+    calibration = exact_calibration(truth)
+    rows: list[Row] = []
+    for depth in settings.depths:
+        pixels = rng.uniform(0, np.array(SIZE) - 1.0, (settings.targets, 2))
+        scattered, noise_px = rng.normal(0, settings.scatter, settings.targets), rng.normal(0, 1, settings.targets)
+        x_fixed = at(truth, pixels, depth)
+        focal_px, arm = wanted_focal_px(truth, x_fixed), turned_by(calibration, truth, x_fixed)
+        by_pixels = settings.noise_px * depth / (truth.fixed.fx * TARGET.size)
+        # Of each cause: true sizes [m], noise of the measured ones [px], and the relative error to first order.
+        still, right = np.zeros(settings.targets), np.full(settings.targets, TARGET.size)
+        causes = {
+            "wrong size": (right / (1 + settings.wrong), still, settings.wrong),
+            "scatter": (right * (1 + scattered), still, settings.scatter),
+            "pixels": (right, settings.noise_px * noise_px, by_pixels),
+            "together": (right * (1 + scattered), settings.noise_px * noise_px, np.hypot(settings.scatter, by_pixels)),
+        }
+        for cause, (sizes, noise, relative) in causes.items():
+            depths = measured_depths(calibration, truth, pixels, x_fixed, sizes, noise)
+            off = looking_off(truth, x_fixed, aim(calibration, x_fixed * (depths / depth)[:, None]))
+            rows.append(
+                {
+                    "seed": seed,
+                    "baseline_m": baseline,
+                    "depth_m": depth,
+                    "cause": cause,
+                    "relative": float(rms(depths / depth - 1)),
+                    "reached_deg": float(np.degrees(rms(off))),
+                    "first_order_deg": float(np.degrees(rms(relative * arm))),
+                    "width": float(np.median(off_px(off, focal_px)) / SIZE[0]),
+                }
+            )
+    return rows
+
+
+def turned_by(calibration: Calibration, truth: Truth, x_fixed: Array) -> Array:
+    """Turn of the line of sight per relative error of the depth, to first order [rad], (n,).
+
+    Args:
+        calibration: exactly that of the rig.
+        truth: the rig.
+        x_fixed: targets (n, 3) [m].
+    """
+    q = aim(calibration, x_fixed)
+    looking = truth.zoom_fixed(q[:, 0], q[:, 1])
+    x_zoom = truth.in_zoom(x_fixed, q[:, 0], q[:, 1])
+    along = np.einsum("nij,nj->ni", looking[:, :3, :3], x_fixed)
+    return np.asarray(np.linalg.norm(np.cross(x_zoom, along), axis=1) / np.sum(x_zoom**2, axis=1))
+
+
+def measured_depths(
+    calibration: Calibration, truth: Truth, pixels: Array, x_fixed: Array, sizes: Array, noise_px: Array
+) -> Array:
+    """Depths from how wide targets appear, (n,) [m].
+
+    Args:
+        calibration: gives the camera that measures.
+        truth: through whose lens bars as wide as the targets are seen.
+        pixels: of their middles, (n, 2).
+        x_fixed: where these are [m], (n, 3).
+        sizes: their true ones [m], (n,).
+        noise_px: of the measured size, (n,).
+    """
+    half = np.c_[sizes / 2, np.zeros((len(sizes), 2))]
+    wide = truth.fixed.project(x_fixed + half)[:, 0] - truth.fixed.project(x_fixed - half)[:, 0] + noise_px
+    return np.array(
+        [
+            depth_from_size(calibration.fixed, TARGET.size, size_px, pixel, vertical=False)
+            for size_px, pixel in zip(wide, pixels, strict=True)
+        ]
+    )
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Medians over the seeds by cause, depth and baseline, and how well first order agrees."""
+    summary: dict[str, Any] = {}
+    for cause in dict.fromkeys(row["cause"] for row in rows):
+        mine = [row for row in rows if row["cause"] == cause]
+        cells: dict[str, dict[str, float]] = {}
+        for depth, baseline in dict.fromkeys((row["depth_m"], row["baseline_m"]) for row in mine):
+            found = [row for row in mine if (row["depth_m"], row["baseline_m"]) == (depth, baseline)]
+            keys = ("relative", "reached_deg", "first_order_deg", "width")
+            cells[cell_name(depth, baseline)] = {key: float(np.median([row[key] for row in found])) for key in keys}
+        ratio = [row["reached_deg"] / row["first_order_deg"] for row in mine]
+        summary[cause] = {
+            "cells": cells,
+            "over_first_order": dict(zip(("low", "median", "high"), np.percentile(ratio, [5, 50, 95]), strict=True)),
+        }
+    return summary
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The causes of which first order tells another story than Monte Carlo."""
+    low, high = AGREES
+    return [
+        f"{cause}: {median:.2f} times first order"
+        for cause, found in summary.items()
+        if not low <= (median := found["over_first_order"]["median"]) <= high
+    ]
+
+
+def describe(settings: DepthSettings, summary: Mapping[str, Any]) -> str:
+    """A line for each cause, depth and baseline; then how well first order agrees."""
+    lines = [
+        [f"{cause}, {cell}", 100 * v["relative"], v["reached_deg"], v["first_order_deg"], 100 * v["width"]]
+        for cause, found in summary.items()
+        for cell, v in found["cells"].items()
+    ]
+    ratios = (
+        f"{cause}: {r['median']:.3f} ({r['low']:.3f} to {r['high']:.3f})"
+        for cause, found in summary.items()
+        if (r := found["over_first_order"])
+    )
+    return "\n".join(
+        [
+            f"from errors of the depth, medians over {seeds_of(settings)}; % of width: median over the targets",
+            table(("cause", "depth, rms %", "reached [deg]", "first order [deg]", "% of width"), lines),
+            "Monte Carlo over first order, median and 5 to 95 %: " + "; ".join(ratios),
+        ]
+    )
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Errors over depth and over baseline: Monte Carlo with quartiles over the seeds, first order as lines."""
+    figure.set_size_inches(13, 4.8)
+    over_depth, over_baseline, width = figure.subplots(1, 3)
+    depth = _nearest(rows, "depth_m", SHOWN_DEPTH)
+    baseline = _nearest(rows, "baseline_m", SHOWN_BASELINE)
+    panels = (
+        (over_depth, "depth_m", "baseline_m", baseline, "reached_deg", "pointing error [degrees]"),
+        (over_baseline, "baseline_m", "depth_m", depth, "reached_deg", "pointing error [degrees]"),
+        (width, "depth_m", "baseline_m", baseline, "width", "median offset / width of the close-up"),
+    )
+    for ax, x_key, held, value, y_key, label in panels:
+        for i, cause in enumerate(CAUSES):
+            mine = [row for row in rows if row["cause"] == cause and row[held] == value]
+            xs = sorted({row[x_key] for row in mine})
+            found = [[row for row in mine if row[x_key] == x] for x in xs]
+            low, mid, high = np.array([np.percentile([r[y_key] for r in f], [25, 50, 75]) for f in found]).T
+            ax.errorbar(xs, mid, [mid - low, high - mid], fmt="o", ms=4, capsize=2, color=f"C{i}", label=cause)
+            if y_key == "reached_deg":
+                ax.plot(xs, [np.median([r["first_order_deg"] for r in f]) for f in found], color=f"C{i}", lw=1)
+        named = "baseline" if held == "baseline_m" else "depth"
+        ax.set(
+            xscale="log", yscale="log", xlabel=x_key.replace("_m", " [m]"), ylabel=label, title=f"{named} {value:g} m"
+        )
+    over_depth.legend(frameon=False, title="points: Monte Carlo\nlines: first order", fontsize="small")
+
+
+def _nearest(rows: Sequence[Row], key: str, wanted: float) -> float:
+    """The value there is that is nearest to the one wanted."""
+    return float(min({row[key] for row in rows}, key=lambda value: abs(value - wanted)))
+
+
+SETTINGS = DepthSettings()
+EXPERIMENT = Experiment(
+    "depth_error",
+    "How an error of the depth becomes a pointing error, over depth and baseline.",
+    SETTINGS,
+    replace(SETTINGS, seeds=2, baselines=(0.4, 1.5), depths=(5.0, 20.0, 50.0), targets=50),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    cost_s=3.0,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

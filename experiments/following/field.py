@@ -1,0 +1,140 @@
+"""What all experiments in the field share: its calibration, who is followed there, and every frame judged by the truth.
+
+`experiments.following.field_scenes` says where that is.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from cotarget.calibration import Calibration, calibrate_rig
+from cotarget.config import RigConfig, TargetConfig
+from cotarget.detection import Detector, make_detector
+from cotarget.evaluation import add_row, true_calibration
+from cotarget.metrics import BACKGROUND_S
+from cotarget.metrics import Row as Judged
+from cotarget.pipeline import FollowSettings, Step, follow
+from cotarget.safety import SafeRig
+from cotarget.sim.targets.random_paths import SECONDS
+from cotarget.sim.truth import Truth
+from cotarget.sim.world import SimWorld
+from experiments.engine import harness
+from experiments.engine.checks import check_above, check_ways
+from experiments.following.own_rig import OwnRig, RigText
+from experiments.following.wide_view import WideView, open_on
+from experiments.paper.paper_loop import Follow
+
+
+@dataclass(frozen=True)
+class FieldSettings(harness.Settings):
+    """How many runs in the field, how long they are, and what is known of the rig.
+
+    Attributes:
+        seconds: of each run [s].
+        calibrated: whether the rig is calibrated from rendered boards; otherwise it is known exactly.
+
+    Raises:
+        ConfigError: the clock does not start in a run, or targets' ways end before it.
+    """
+
+    seconds: float = SECONDS
+    calibrated: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        starts_s, ends_s = self.lasting_s
+        check_above(starts_s, self, "seconds")
+        check_ways(self, "seconds", end_s=ends_s)
+
+    @property
+    def lasting_s(self) -> tuple[float, float]:
+        """When there begins to be something to be told of a run, and how long its targets have ways to go [s]."""
+        return BACKGROUND_S, SECONDS
+
+
+@dataclass(frozen=True)
+class OwnRigInField(OwnRig, FieldSettings):
+    """The same for an experiment that takes a rig of one's own."""
+
+
+def _of_calibration(settings: FieldSettings) -> tuple[bool, int, RigText]:
+    rig = settings.text if isinstance(settings, OwnRig) else RigText()
+    return settings.calibrated, settings.seed_base, rig
+
+
+@functools.cache
+def _calibrated(from_boards: bool, seed: int, rig: RigText) -> Calibration:
+    config = rig.config("indoor", (), seed)
+    if not from_boards:
+        return true_calibration(SimWorld(config, rendered=()))
+    world = SimWorld(config)
+    with SafeRig(world.rig, config.safety) as safe:
+        return calibrate_rig(safe, config.board, pitch_mm=config.pitch_mm, seed=config.sim.seed)
+
+
+# A rig's calibration, from rendered boards or exact; the same for all experiments in the field with that rig.
+calibrated = harness.Preparation(_calibrated, _of_calibration)
+
+
+def held(
+    calibration: Calibration,
+    config: RigConfig,
+    name: str,
+    seconds: float,
+    settings: FollowSettings | None = None,
+    view: WideView | None = None,
+) -> list[Judged]:
+    """Hold a target of a simulated rig, and judge every frame.
+
+    Args:
+        calibration: what is known of the rig.
+        config: the rig and its world.
+        name: of the target.
+        seconds: for how long [s].
+        settings: how it is followed; as always, by default.
+        view: what the wide camera sees, where that was recorded.
+    """
+    target, rows = target_of(config, name), list[Judged]()
+    for step, truth in watched(calibration, config, target, seconds, settings, view):
+        add_row(rows, step, truth, name, target)
+    return rows
+
+
+def watched(
+    calibration: Calibration,
+    config: RigConfig,
+    target: TargetConfig,
+    seconds: float,
+    settings: FollowSettings | None = None,
+    view: WideView | None = None,
+) -> Iterator[tuple[Step, Truth]]:
+    """Follow a target of a simulated rig; each Step, and the truth to judge it by. See `held`."""
+    settings = settings or FollowSettings.of(config)
+    if view is None:
+        world, detector = SimWorld(config), make_detector(target, config.rate_hz)
+    else:
+        world, detector = open_on(view, config, closed_loop=settings.closed_loop)
+    yield from watched_in(world, detector, calibration, target, seconds, settings)
+
+
+def watched_in(
+    world: SimWorld,
+    detector: Detector,
+    calibration: Calibration,
+    target: TargetConfig,
+    seconds: float,
+    settings: FollowSettings,
+    how: Follow = follow,
+) -> Iterator[tuple[Step, Truth]]:
+    """The same in a world that is open, with a detector and perhaps a loop of one's own."""
+    truth = world.truth()
+    with SafeRig(world.rig, world.config.safety) as rig:
+        for step in how(rig, calibration, target, detector, seconds=seconds, settings=settings):
+            yield step, truth
+
+
+def target_of(config: RigConfig, name: str) -> TargetConfig:
+    """What is told of a target in the field, where clutter that moves by itself drowns a bird for all but `speck`."""
+    target = config.target(name)
+    return dataclasses.replace(target, detector="speck") if target.dimension == "wingspan" else target

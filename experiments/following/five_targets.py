@@ -1,0 +1,174 @@
+"""Of five targets at once, how many get a good close-up under each policy.
+
+Five persons, or five birds, cross the wide view in the field of `experiments.following.field_scenes`: all at once for a
+while,
+each gone after a time. A target counts as served when it was well in the close-up, by the metrics' definition, for a
+second in all. What the wide camera sees is rendered and searched once a seed and kind, and followed under each policy;
+by the wide view alone, unless the zoom view's correction is asked for (`--set five_targets.closed_loop=true`).
+
+    python -m experiments.following.five_targets [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration
+from cotarget.config import RigConfig, TargetConfig
+from cotarget.control.selection import POLICIES
+from cotarget.evaluation import closeup_of
+from cotarget.metrics import SERVED_S
+from cotarget.pipeline import FollowSettings
+from cotarget.sim.targets.random_paths import GROUP
+from cotarget.sim.truth import Truth
+from experiments.engine.harness import Experiment, Row, seeds_of
+from experiments.engine.spread import BESIDE
+from experiments.engine.texts import table
+from experiments.following.field import FieldSettings, calibrated, target_of, watched
+from experiments.following.field_scenes import five_targets_config
+from experiments.following.wide_view import WideView, record
+
+FIRST = "first-come"
+WANTED = 1.5  # times as many served by the best policy as by first-come
+
+
+@dataclass(frozen=True)
+class FiveSettings(FieldSettings):
+    """How many seeds, and which kinds.
+
+    Attributes:
+        kinds: person, bird.
+        closed_loop: whether the zoom view corrects.
+    """
+
+    seeds: int = 2
+    kinds: tuple[str, ...] = ("person", "bird")
+    closed_loop: bool = False
+
+
+def one(calibration: Calibration, settings: FiveSettings, seed: int) -> list[Row]:
+    """Follow five of each kind under each policy; one row each."""
+    rows: list[Row] = []
+    for kind in settings.kinds:
+        config = five_targets_config(seed, kind)
+        target = target_of(config, kind)
+        view = record(config, target, settings.seconds)
+        for policy, make in POLICIES.items():
+            how = FollowSettings.of(config, policy=make, closed_loop=settings.closed_loop)
+            seconds = good_seconds(calibration, config, target, settings.seconds, how, view)
+            rows.append(
+                {
+                    "seed": seed,
+                    "kind": kind,
+                    "policy": policy,
+                    "served": sum(value >= SERVED_S for value in seconds.values()),
+                    "good_s": sum(seconds.values()),
+                    **{f"good_{i}_s": value for i, value in enumerate(seconds.values(), 1)},
+                }
+            )
+    return rows
+
+
+def good_seconds(
+    calibration: Calibration,
+    config: RigConfig,
+    target: TargetConfig,
+    seconds: float,
+    how: FollowSettings,
+    view: WideView,
+) -> dict[str, float]:
+    """How long each target of a world was well in the close-up, by the truth [s]."""
+    good = dict.fromkeys(config.sim.targets, 0.0)
+    last: float | None = None
+    for step, truth in watched(calibration, config, target, seconds, how, view):
+        t = step.zoom.t
+        if last is not None and t > last:  # a frame stands for the time since the one before
+            for name in good:
+                if _near(truth, name, t) and closeup_of(truth, name, target, t).good:
+                    good[name] += t - last
+        last = t
+    return good
+
+
+def _near(truth: Truth, name: str, t: float) -> bool:
+    """Whether a target's middle is in the zoom image; quicker than all that a row says."""
+    width, height = truth.lens("zoom", t).size
+    u, v = truth.pixel("zoom", truth.center(name, t), t)
+    return bool(-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5)
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """Targets served under each policy, mean, least and most over the seeds, and the best mean over first-come's."""
+    found: dict[str, dict[str, Any]] = {}
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        served = {
+            policy: _of([row["served"] for row in rows if (row["kind"], row["policy"]) == (kind, policy)])
+            for policy in POLICIES
+        }
+        best, first = max(each["mean"] for each in served.values()), served[FIRST]["mean"]
+        found[kind] = served | {"best over first": best / first if first else math.inf * best}
+    return found
+
+
+def _of(served: Sequence[int]) -> dict[str, float]:
+    return {"mean": float(np.mean(served)), "least": float(min(served)), "most": float(max(served))}
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The kinds for which no policy serves enough more than first-come."""
+    return [kind for kind, found in summary.items() if not found["best over first"] >= WANTED]
+
+
+def describe(settings: FiveSettings, summary: Mapping[str, Any]) -> str:
+    """A line for each kind."""
+    head = ("", *POLICIES, "best / first-come", "wanted")
+    lines = [
+        [
+            f"five {kind}s",
+            *("{mean:.3g} ({least:g} to {most:g})".format(**found[policy]) for policy in POLICIES),
+            found["best over first"],
+            f">= {WANTED:g}",
+        ]
+        for kind, found in summary.items()
+    ]
+    return (
+        f"targets of five with {SERVED_S:g} s of good close-up or more, mean (least to most) of {seeds_of(settings)}, "
+        f"{settings.seconds:g} s each\n" + table(head, lines)
+    )
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """How many were served under each policy: the mean, with bars from the least seed to the most, and each seed."""
+    kinds = list(dict.fromkeys(row["kind"] for row in rows))
+    for ax, kind in zip(np.ravel(figure.subplots(1, len(kinds), sharey=True)), kinds, strict=True):
+        for i, policy in enumerate(POLICIES):
+            served = [row["served"] for row in rows if (row["kind"], row["policy"]) == (kind, policy)]
+            mean = float(np.mean(served))
+            ax.bar(i, mean, 0.6, yerr=[[mean - min(served)], [max(served) - mean]], capsize=4, alpha=0.6)
+            ax.plot(i + np.linspace(-BESIDE, BESIDE, len(served)), served, "k.")
+        ax.set(title=f"five {kind}s", ylabel="targets served", ylim=(0, GROUP + 0.2))
+        ax.set_xticks(range(len(POLICIES)), POLICIES)
+
+
+SETTINGS = FiveSettings()
+EXPERIMENT = Experiment(
+    "five_targets",
+    "Of five targets at once, how many get a good close-up under each policy.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, kinds=("person",), seconds=12.0, calibrated=False),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    prepare=calibrated,
+    cost_s=250.0,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

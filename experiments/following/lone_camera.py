@@ -1,0 +1,245 @@
+"""A single pan-tilt-zoom camera that finds a target, follows it and finds it again by itself, after Cai and Dinh.
+
+It scans the field of view that it is given with the lens at its shortest, until it detects something in its own view.
+That is believed by the rule by which the pair believes what its wide view shows, the pipeline's own tracker; until then
+it waits, or turns back to what it saw in passing. Then it centres it, leads it by a constant velocity, and zooms in as
+far as it is sure of it. A target out of sight is expected where it would be for a moment, then sought with the lens
+out, about that place, and then everywhere again; while it is sought there, whatever turns up is believed at once.
+Head and lens are driven as the pair's are: by the same steering and the same zoom policy, with the same delays. Where
+head and lens were when a frame's light fell it is told exactly, which makes it better than a real one.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from cotarget.calibration import Calibration
+from cotarget.config import TargetConfig
+from cotarget.control.controller import NO_CHANGE
+from cotarget.control.head import Steering
+from cotarget.control.zoom import Expected, ZoomPolicy
+from cotarget.detection import Detection, Detector
+from cotarget.errors import UnreachableError
+from cotarget.geometry import Array
+from cotarget.pantilt import base_head, nearest, solve
+from cotarget.rig import Angles, Frame, Rig
+from cotarget.sim.truth import Truth
+from cotarget.tracking.track import settings_for
+from cotarget.tracking.tracker import Tracker
+from experiments.following.lone_course import SEARCH_S, Course, Sighting
+
+COAST_S = 0.6  # so long a target out of sight is expected where it would be [s]
+SIZE_SIGMA = 0.1  # relative standard deviation of a size, for the zoom policy
+FIRST_INTERVAL_S = 0.04  # until a second frame has come [s]
+OVERLAP = 0.1  # of neighbouring views of a scan
+RING = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))  # half views about a place
+
+
+class LoneCamera:
+    """The camera, its head and its lens, after one target.
+
+    Attributes:
+        mode: what it does: "scanning", "waiting", "following" or "searching".
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        truth: Truth,
+        calibration: Calibration,
+        target: TargetConfig,
+        detector: Detector,
+        delay_s: float,
+        noise_px: float,
+        field: Sequence[Angles],
+        lasts_s: float | None = None,
+    ) -> None:
+        """Begin with a scan, at the pose that is nearest to where it looks.
+
+        Args:
+            rig: of which its fixed camera is not used.
+            truth: says where head and lens were.
+            calibration: of the zoom camera, its place on the head, and the head.
+            target: what is known of it.
+            detector: searches the zoom camera's frames.
+            delay_s: from a command to motion [s].
+            noise_px: standard deviation of the detector's middle [px].
+            field: poses of the scan [rad]; see `scan_of`.
+            lasts_s: see `Course`.
+        """
+        self._rig, self._truth, self._calibration, self._target = rig, truth, calibration, target
+        self._detector, self._delay_s, self._field = detector, delay_s, list(field)
+        self._zoom = calibration.zoom
+        self._shortest, longest = (self._zoom.at(f).focal_px[0] for f in rig.zoom.focal_range)
+        self._policy = ZoomPolicy((self._shortest, longest), rig.zoom.size)
+        self._steering = Steering(rig.head.limits)
+        self._course, self._tracker = Course(target, noise_px, lasts_s), Tracker(settings_for(target))
+        self._focal = rig.zoom.zoom(rig.zoom.focal_range[0])
+        self._next, self._round, self._set_out = 0, self._field, -math.inf
+        self.mode = ""
+
+    def run(self, seconds: float) -> Iterator[Frame]:
+        """Each frame of the zoom camera, after what it led to."""
+        end, last = self._rig.clock.now() + seconds, None
+        while self._rig.clock.now() < end:
+            frame = self._rig.zoom.read(newer_than=last)
+            interval = FIRST_INTERVAL_S if last is None else frame.t - last
+            last = frame.t
+            found = [self._sighting(frame.t, each) for each in self._detector.detect(frame)]
+            doubted = self._take(frame.t, found)
+            unseen = frame.t - self._course.seen_t
+            if self._course.known and unseen <= COAST_S:
+                mode = "following"
+                self._follow(interval)
+            elif doubted is not None:
+                mode = "waiting"
+                if self._rig.head.state().moving and self.mode != mode:
+                    self._go((doubted.pan, doubted.tilt))
+            else:
+                mode = "searching" if unseen <= SEARCH_S else "scanning"
+                self._look_around(mode, frame.t)
+            self.mode = mode
+            yield frame
+
+    def _take(self, t: float, found: Sequence[tuple[Sighting, float]]) -> Sighting | None:
+        """Take a frame's sightings into account; the one that is not believed yet, if there is one."""
+        boxes = [Detection(*self._at_shortest(seen), 1.0, seen.clipped) for seen, _ in found]
+        tracks = self._tracker.update(boxes, t)
+        if not found:
+            return None
+        believed = any(track.confirmed and not track.missed for track in tracks)
+        if believed or t - self._course.seen_t <= SEARCH_S:
+            self._course.saw(*found[0])
+            return None
+        return found[0][0]
+
+    def _at_shortest(self, seen: Sighting) -> tuple[Array, Array]:
+        """Middle and sides as a view of all directions at the shortest focal length would have them [px], (2,) each."""
+        return self._shortest * np.array([seen.pan, -seen.tilt]), self._shortest * np.array(seen.sides)
+
+    def _sighting(self, t: float, found: Detection) -> tuple[Sighting, float]:
+        """A detection as directions, and the focal length then [px]."""
+        (pan, tilt), nominal = self._truth.head_at(t), self._truth.nominal_at(t)
+        lens = self._zoom.at(nominal)
+        (fx, fy), (w, h) = lens.focal_px, found.size_px.tolist()
+        sides = (w / fx, h / fy)
+        distance = self._course.range if self._course.known else self._target.size / max(sides)
+        ray = lens.ray(found.center_px)
+        hand = self._calibration.hand_eye(nominal)
+        x_base = (base_head(pan, tilt, self._calibration.head) * hand).apply(ray / np.linalg.norm(ray) * distance)
+        limits = self._rig.head.limits
+        ways = solve(
+            x_base,
+            self._calibration.hand_eye(),
+            self._calibration.head,
+            lens.ray(lens.image_center_px),
+            pupil=self._zoom.pupil_at(nominal),
+        )
+        try:
+            pointing = nearest(ways, limits.pan, limits.tilt, (pan, tilt), self._calibration.head)
+            pan, tilt = float(pointing.pan), float(pointing.tilt)
+        except UnreachableError:  # beyond the head's limits: as far as it goes
+            pan, tilt = (min(max(q, low), high) for q, (low, high) in ((pan, limits.pan), (tilt, limits.tilt)))
+        return Sighting(t, pan, tilt, sides, found.clipped), fx
+
+    def _follow(self, interval: float) -> None:
+        """Send the head after the target, and the lens in as far as it surely stays in view."""
+        course, rig = self._course, self._rig
+        now = rig.clock.now()
+        effect = now + self._delay_s
+        self._steering.head.saw(rig.head.state())
+        wanted, _ = course.at(effect)
+        true_px = self._zoom.at(self._focal).focal_px[0]
+        field = rig.zoom.size[0] / true_px
+        command = self._steering.decide(effect, interval, wanted, course.rates, field, effect - course.seen_t)
+        if command is not None:
+            rig.head.move(command.pan, command.tilt, command.speed)
+        exposed = effect + interval
+        (pan, tilt), (pan_variance, tilt_variance) = course.at(exposed)
+        (head_pan, _), (head_tilt, _) = self._steering.head.at(exposed)
+        scale = math.cos(tilt)
+        expected = Expected(
+            np.array([(pan - head_pan) * scale, head_tilt - tilt]),
+            np.diag([pan_variance * scale**2, tilt_variance]),
+            np.array(course.sides) / 2,
+            SIZE_SIGMA,
+        )
+        now_px = self._zoom.at(rig.zoom.state().focal_px).focal_px[0]
+        wanted_px = self._target.wanted_px / course.size
+        if not course.whole:  # not nearer, before all of it was seen
+            wanted_px = min(wanted_px, true_px)
+        choice = self._policy.choose(expected, wanted_px, true_px, now, now_px)
+        if abs(choice.focal_px / true_px - 1) > NO_CHANGE:
+            self._focal = rig.zoom.zoom(self._zoom.nominal_for(choice.focal_px))
+
+    def _look_around(self, mode: str, frame_t: float) -> None:
+        """With the lens out, from one pose to the next, as soon as a frame from there has shown nothing."""
+        rig = self._rig
+        shortest = rig.zoom.focal_range[0]
+        if self._focal > shortest:
+            self._focal = rig.zoom.zoom(shortest)
+        if mode != self.mode:
+            self._round = self._field if mode == "scanning" else self._about(frame_t)
+            self._next, self._set_out = 0, -math.inf
+            if mode == "scanning":
+                away = np.subtract(self._round, (rig.head.state().pan, rig.head.state().tilt))
+                self._next = int(np.argmin(np.abs(away).max(axis=1)))
+            self._go(self._round[self._next])
+            return
+        now, state = rig.clock.now(), rig.head.state()
+        if now <= self._set_out + self._delay_s or state.moving:
+            self._arrived = math.inf
+        elif math.isinf(self._arrived):
+            self._arrived = state.t
+        if frame_t > self._arrived:
+            self._next = (self._next + 1) % len(self._round)
+            self._go(self._round[self._next])
+
+    def _go(self, pose: Angles) -> None:
+        """Turn the head there, as fast as it can."""
+        self._rig.head.move(*pose)
+        self._set_out, self._arrived = self._rig.clock.now(), math.inf
+
+    def _about(self, t: float) -> list[Angles]:
+        """Poses about where the target should be by now, half a view apart."""
+        (pan, tilt), _ = self._course.at(t)
+        width, height = self._rig.zoom.size
+        steps = math.atan(width / 2 / self._shortest), math.atan(height / 2 / self._shortest)
+        limits = self._rig.head.limits
+        return [
+            tuple(  # type: ignore[misc]
+                min(max(q + part * step, low), high)
+                for q, part, step, (low, high) in zip((pan, tilt), parts, steps, (limits.pan, limits.tilt), strict=True)
+            )
+            for parts in RING
+        ]
+
+
+def scan_of(rig: Rig, calibration: Calibration) -> list[Angles]:
+    """Poses whose views at the shortest focal length cover the wide camera's field, overlapping, row by row [rad].
+
+    Args:
+        rig: gives the limits.
+        calibration: tells where the wide camera looks, and how much it sees.
+    """
+    width, height = rig.zoom.size
+    fx, fy = calibration.zoom.stops[0].focal_px
+    views = (1 - OVERLAP) * 2 * math.atan(width / 2 / fx), (1 - OVERLAP) * 2 * math.atan(height / 2 / fy)
+    fixed = calibration.fixed
+    width, height = fixed.size
+    edges = fixed.ray(
+        np.array([[0.0, height / 2], [width - 1.0, height / 2], [width / 2, 0.0], [width / 2, height - 1]])
+    )
+    axis_base = calibration.T_base_fixed.rotation.apply(edges)
+    pans, tilts = np.arctan2(axis_base[:2, 0], axis_base[:2, 2]), np.arctan2(-axis_base[2:, 1], axis_base[2:, 2])
+    stops = []
+    for angles, view, (low, high) in zip(
+        (pans, tilts), views, (rig.head.limits.pan, rig.head.limits.tilt), strict=True
+    ):
+        begin, end = float(angles.min()), float(angles.max())
+        count = max(1, math.ceil((end - begin) / view))
+        middle, step = (begin + end) / 2, (end - begin) / count
+        stops.append([min(max(middle + (i - (count - 1) / 2) * step, low), high) for i in range(count)])
+    rows = [[(pan, tilt) for pan in stops[0]] for tilt in stops[1]]
+    return [pose for i, row in enumerate(rows) for pose in (row[::-1] if i % 2 else row)]

@@ -1,0 +1,276 @@
+"""What the models of the related work lose beside the full one, over depth and baseline.
+
+Rigs are mounted by eye (`experiments.following.mounted`), their baselines given; each is calibrated from synthetic
+corners, and
+that calibration is the full model. The others (`experiments.following.simpler` says which) know less; those that leave
+out or
+misjudge a turn are there as they are and `zeroed`, with pan and tilt set on one target. Targets lie all over the wide
+view.
+The pointing error is the angle between the line of sight and the true target; in the close-up it is a part of the
+image's width at the focal length at which a bird of 0.8 m is 160 px wide, within the lens's range.
+
+Twice: `exact`, pixel and depth given as they are, the head without steps: what the models alone lose; and `seen`, the
+pixel with 0.5 px of noise, the depth with 5 %, the head in steps of 0.0514 degrees, the same for all models.
+
+    python -m experiments.following.models [--seeds 10] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.board import board_points
+from cotarget.calibration import Options, calibrate_views
+from cotarget.config import BoardConfig, SimHead
+from cotarget.geometry import Array
+from experiments.calibration.synthetic.aims import looking_off
+from experiments.calibration.synthetic.rig import SIZE, SIZES
+from experiments.calibration.synthetic.views import Placing, spread_views
+from experiments.engine.checks import check_above, check_session
+from experiments.engine.harness import Experiment, Row, Settings, seeds_of
+from experiments.engine.texts import rms, table
+from experiments.following.mounted import MOUNTED_DEG, at, cell_name, mounted, off_px, wanted_focal_px
+from experiments.following.regimes import FACTOR, ratios, reach, regime
+from experiments.following.simpler import CENTRING, FULL, IGNORED, MODELS, TABLE, TURNED, ZEROED, models_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+BOARD = BoardConfig()
+STEP = np.radians(SimHead().step_deg)
+CONDITIONS = ("exact", "seen")
+OPPONENTS = (IGNORED, ZEROED[IGNORED])
+SHOWN = ((10.0, 0.4), (20.0, 1.5), (50.0, 0.4))  # depth and baseline [m] of the printed table
+
+
+@dataclass(frozen=True)
+class ModelsSettings(Settings):
+    """What is mounted, how it is calibrated, and what is looked at.
+
+    Attributes:
+        baselines: of the rigs of each seed [m].
+        depths: of the targets [m].
+        targets: at each depth.
+        mounted_deg: standard deviation of each angle of a mounting that should be zero [degrees].
+        boards: placements of the calibration's board, each looked at from `looks` head poses.
+        looks: head poses.
+        corner_px: noise of corners [px].
+        pixel_px: noise of the target's pixel [px].
+        depth_error: relative error of its depth.
+        zero_depth: of the target on which pan and tilt are set [m].
+    """
+
+    seeds: int = 10
+    baselines: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.5, 3.0)
+    depths: tuple[float, ...] = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
+    targets: int = 60
+    mounted_deg: float = MOUNTED_DEG
+    boards: int = 12
+    looks: int = 4
+    corner_px: float = 0.2
+    pixel_px: float = 0.5
+    depth_error: float = 0.05
+    zero_depth: float = CENTRING.zero_depth
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_above(0, self, "baselines", "depths", "targets", "boards", "looks")
+        check_above(0, self, "mounted_deg", "corner_px", "pixel_px", "depth_error", "zero_depth")
+        check_session(self, "boards", "looks")
+
+
+def one(_: None, settings: ModelsSettings, seed: int) -> list[Row]:
+    """A rig of each baseline; a row for each depth and model."""
+    return [row for i in range(len(settings.baselines)) for row in _of_rig(settings, seed, i)]
+
+
+def _of_rig(settings: ModelsSettings, seed: int, number: int) -> list[Row]:
+    rng = np.random.default_rng((seed, 21, number))
+    baseline = settings.baselines[number]
+    truth = mounted(rng, baseline, settings.mounted_deg)
+    placing = Placing(boards=settings.boards, looks=settings.looks)
+    views = spread_views(truth, board_points(BOARD), rng, settings.corner_px, placing)
+    calibration = calibrate_views(views, BOARD, SIZES, options=Options(folds=0))
+    models = models_of(truth, calibration, rng, centring=replace(CENTRING, zero_depth=settings.zero_depth))
+    rows: list[Row] = []
+    for depth in settings.depths:
+        pixels, depths = rng.uniform(0, np.array(SIZE) - 1.0, (settings.targets, 2)), np.full(settings.targets, depth)
+        x_fixed = at(truth, pixels, depths)
+        seen_px = pixels + rng.normal(0, settings.pixel_px, pixels.shape)
+        seen_depths = depths * np.exp(rng.normal(0, settings.depth_error, depths.shape))
+        focal_px = wanted_focal_px(truth, x_fixed)
+        exactly, as_seen = models.poses(pixels, depths), models.poses(seen_px, seen_depths)
+        for name in MODELS:
+            exact = looking_off(truth, x_fixed, exactly[name])
+            seen = looking_off(truth, x_fixed, np.round(as_seen[name] / STEP) * STEP)
+            row = {"seed": seed, "baseline_m": baseline, "depth_m": depth, "model": name}
+            row["reach"] = reach(depth, baseline, settings.zero_depth if name in ZEROED.values() else math.inf)
+            rows.append(row | _figures("exact", exact, focal_px) | _figures("seen", seen, focal_px))
+    return rows
+
+
+def _figures(condition: str, angles: Array, focal_px: Array) -> Row:
+    """Of the errors at one depth; a model that finds no pose has lost its target."""
+    lost = np.isnan(angles)
+    angles = np.where(lost, np.pi / 2, angles)
+    return {
+        f"{condition}_deg": float(np.degrees(rms(angles))),
+        f"{condition}_width": float(np.median(off_px(angles, focal_px)) / SIZE[0]),
+    }
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Medians over the seeds of each model's error by condition, depth and baseline, and the regime."""
+    summary: dict[str, Any] = {}
+    for condition in CONDITIONS:
+        cells: dict[str, dict[str, dict[str, float]]] = {}
+        for depth, baseline in dict.fromkeys((row["depth_m"], row["baseline_m"]) for row in rows):
+            mine = [row for row in rows if (row["depth_m"], row["baseline_m"]) == (depth, baseline)]
+            cells[cell_name(depth, baseline)] = {
+                name: {key: float(np.median(_of(mine, name, f"{condition}_{key}"))) for key in ("deg", "width")}
+                for name in MODELS
+            }
+        summary[condition] = {
+            "errors": cells,
+            "regime": {
+                name: dict(zip(("from", "to"), regime(rows, condition, name), strict=True)) for name in OPPONENTS
+            },
+        }
+    summary["of"] = {"seeds": len({row["seed"] for row in rows})}
+    return summary
+
+
+def _of(rows: Sequence[Row], model: str, key: str) -> list[float]:
+    return [row[key] for row in rows if row["model"] == model]
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The conditions in which no regime was found where the full model beats "offset ignored" as wanted."""
+    return [
+        f"{condition}: full model {FACTOR:g} times better than {name}"
+        for condition in CONDITIONS
+        for name in OPPONENTS
+        if math.isnan(summary[condition]["regime"][name]["to"])
+    ]
+
+
+def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Each model's errors: one that gets worse makes the full model look better."""
+    return {
+        condition: {
+            name: {cell: found[name]["deg"] for cell, found in summary[condition]["errors"].items()} for name in MODELS
+        }
+        for condition in CONDITIONS
+    }
+
+
+def describe(settings: ModelsSettings, summary: Mapping[str, Any]) -> str:
+    """A line a model, a column for each depth and baseline, in degrees and in % of the close-up's width."""
+    texts = []
+    for condition in CONDITIONS:
+        errors = summary[condition]["errors"]
+        cells = [cell for pair in SHOWN if (cell := cell_name(*pair)) in errors] or list(errors)[:3]
+        lines = [
+            [name, *(value for c in cells for value in (errors[c][name]["deg"], 100 * errors[c][name]["width"]))]
+            for name in MODELS
+        ]
+        head = [
+            "model",
+            *(text for cell in cells for text in (cell.replace("depth ", "").replace("baseline ", ""), "% width")),
+        ]
+        texts += [
+            f"{condition}: rms pointing error [degrees] and median offset in the close-up [% of its width]",
+            table(head, lines),
+        ]
+        for name in OPPONENTS:
+            found = summary[condition]["regime"][name]
+            off = "" if name == IGNORED else f" - 1 / {settings.zero_depth:g} m"
+            texts.append(
+                f"at least {FACTOR:g} times better than with the {name}: 1 / (baseline |1 / depth{off}|) of "
+                f"{found['from']:.3g} {_up_to(found['to'])}"
+            )
+    zeros = f"zeroed on a target at {settings.zero_depth:g} m"
+    return "\n".join([f"medians over {seeds_of(settings)}; {zeros}", *texts])
+
+
+def _up_to(reach: float) -> str:
+    return "on" if math.isinf(reach) else f"to {reach:.4g}"
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Each model's error over depth at one baseline, as they are and zeroed; and the regimes."""
+    figure.set_size_inches(14, 10)
+    baselines = sorted({row["baseline_m"] for row in rows})
+    near = min(baselines, key=lambda b: abs(b - SHOWN[0][1]))
+    axes = figure.subplots(2, 3)
+    colours = {name: f"C{i}" for i, name in enumerate((*TURNED, TABLE))} | {FULL: "k"}
+    for line, names, words in (
+        (axes[0], {name: name for name in (FULL, *TURNED, TABLE)}, ""),
+        (axes[1], {FULL: FULL} | ZEROED, ", zeroed"),
+    ):
+        for ax, condition in zip(line, CONDITIONS, strict=False):
+            for i, (name, model) in enumerate(names.items()):
+                mine = [row for row in rows if row["model"] == model and row["baseline_m"] == near]
+                _over_depth(ax, mine, f"{condition}_deg", i, color=colours[name], label=model)
+            ax.set(xscale="log", yscale="log", xlabel="depth [m]", title=f"{condition}{words}, baseline {near:g} m")
+            ax.sharey(axes[0, 0])
+        line[0].set_ylabel("rms pointing error [degrees]")
+        line[1].legend(loc="lower left", frameon=False, fontsize="small")
+    for ax, model in zip(axes[:, 2], OPPONENTS, strict=True):
+        _regimes(ax, rows, model)
+    axes[0, 2].set_xlabel("depth / baseline")
+    axes[1, 2].set_xlabel("1 / (baseline |1 / depth - 1 / depth of the zero|)")
+
+
+def _over_depth(ax: "Axes", rows: Sequence[Row], key: str, number: int, **style: Any) -> None:
+    """One model's medians and quartiles over the seeds; a little aside, and smaller, the later it is drawn."""
+    depths = sorted({row["depth_m"] for row in rows})
+    values = [[row[key] for row in rows if row["depth_m"] == depth] for depth in depths]
+    low, mid, high = np.array([np.percentile(v, [25, 50, 75]) for v in values]).T
+    dashes = "-" if number % 2 == 0 else "--"
+    aside = np.array(depths) * 1.03 ** (number - 3)
+    ax.errorbar(aside, mid, [mid - low, high - mid], fmt="o", ls=dashes, lw=3 - number / 3, ms=4, capsize=2, **style)
+
+
+def _regimes(ax: "Axes", rows: Sequence[Row], model: str) -> None:
+    """By how much a model's error is larger than the full one's, quartiles over the seeds, and where it is FACTOR."""
+    for condition, colour in zip(CONDITIONS, ("C0", "C1"), strict=True):
+        by_reach = {far: values for far, values in ratios(rows, condition, model).items() if math.isfinite(far)}
+        if not by_reach:  # all targets are as far away as the one on which the zeros were set
+            continue
+        low, mid, high = np.array([np.percentile(values, [25, 50, 75]) for values in by_reach.values()]).T
+        error = [mid - low, high - mid]
+        ax.errorbar(list(by_reach), mid, error, fmt="o", ms=4, capsize=2, color=colour, label=condition)
+        begin, end = regime(rows, condition, model)
+        if end >= begin:
+            label = f"{condition}: {FACTOR:g} x and more from {begin:.3g} {_up_to(end)}"
+            ax.axvspan(begin, min(end, max(by_reach)), color=colour, alpha=0.12, label=label)
+    ax.axhline(FACTOR, color="k", lw=0.8)
+    ax.set(xscale="log", yscale="log", ylabel="times the error of the full model", title=model)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(frameon=False, fontsize="small")
+
+
+SETTINGS = ModelsSettings()
+EXPERIMENT = Experiment(
+    "models",
+    "What the models of the related work lose beside the full one, over depth and baseline.",
+    SETTINGS,
+    replace(SETTINGS, seeds=2, baselines=(0.4, 1.5), depths=(10.0, 50.0, 200.0), targets=20, boards=10),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    cost_s=10.0,
+    bounded=bounded,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

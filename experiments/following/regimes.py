@@ -1,0 +1,57 @@
+"""Where the full model beats one that ignores the offset, over depths and baselines by what these make of it."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from cotarget.geometry import Array
+from experiments.engine.harness import Row
+from experiments.following.simpler import FULL, IGNORED
+
+FACTOR = 5.0  # by which the full model is to beat "offset ignored" somewhere
+
+
+def reach(depth: float, baseline: float, zero_depth: float = math.inf) -> float:
+    """How far away a target is for who ignores the offset, in baselines.
+
+    The baseline is seen from the target at an angle of 1 / this [rad], or at another than from the target on which the
+    zeros were set.
+    """
+    angle = baseline * abs(1 / depth - 1 / zero_depth)
+    return 1 / angle if angle else math.inf
+
+
+def ratios(rows: Sequence[Row], condition: str, model: str = IGNORED) -> dict[float, Array]:
+    """By how much a model's rms error is larger than the full model's, by `reach`.
+
+    Returns:
+        For each reach in rising order, of each seed; where several depths and baselines have the same reach, those of
+        the one with the least median.
+    """
+    errors = {(r["depth_m"], r["baseline_m"], r["seed"]): r[f"{condition}_deg"] for r in rows if r["model"] == FULL}
+    cells: dict[tuple[float, float, float], list[float]] = {}
+    for row in rows:
+        if row["model"] == model:
+            cell = row["depth_m"], row["baseline_m"]
+            cells.setdefault((row["reach"], *cell), []).append(row[f"{condition}_deg"] / errors[*cell, row["seed"]])
+    found: dict[float, Array] = {}
+    for (far, *_), values in sorted(cells.items()):
+        same = next((known for known in found if math.isclose(known, far)), far)
+        found[same] = min(found.get(same, np.array(values)), np.array(values), key=np.median)
+    return found
+
+
+def regime(rows: Sequence[Row], condition: str, model: str = IGNORED) -> tuple[float, float]:
+    """The `reach` up to which the full model's error is FACTOR times smaller than another's.
+
+    Returns:
+        The smallest reach measured, and the largest up to which the median over the seeds of every depth and baseline
+        says so; both nan where even the smallest does not.
+    """
+    within: list[float] = []
+    for far, values in ratios(rows, condition, model).items():
+        if np.median(values) < FACTOR:
+            break
+        within.append(far)
+    return (within[0], within[-1]) if within else (math.nan, math.nan)

@@ -1,0 +1,318 @@
+"""The exact range beside the paper's shortcut over the wide view: where a depth in the range's place fails.
+
+Two kinds of rigs, both known exactly, on a head whose axes cross at a right angle, with the zoom camera's axis in the
+middle of its image: the shortcut takes both for granted. `mounted` by eye (`experiments.following.mounted`) at a
+baseline of 0.4
+m, as the default one; and `Section 4.2`, whose zoom camera stands where the paper's worked example has it, 2.2 m aside
+and 0.46 m ahead, the example's T beside it (`experiments.paper.worked_example`), with lenses drawn as those of the
+others.
+
+Targets stand at several depths, on a grid over the wide image and all over a disc about the zoom camera's axis at home.
+Each is aimed at by `cotarget.targeting.aim` with the exact range and with both readings of the shortcut; the error is
+the angle between the line of sight and the target, and what that is in pixels at the focal length at which the paper's
+book of 0.234 m is 160 px wide, within the lens's range: 7155 px at 10.5 m and beyond. Off the axis means off the zoom
+camera's at home.
+
+    python -m experiments.following.shortcut [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+import numpy as np
+from matplotlib.figure import Figure, SubFigure
+
+from cotarget.config import DEFAULT_TARGETS
+from cotarget.errors import UnreachableError
+from cotarget.geometry import Array, RigidTransform
+from cotarget.targeting import METHODS, Method, Reach, aim
+from experiments.calibration.synthetic.aims import looking_off
+from experiments.calibration.synthetic.rig import LONGEST_PX, NOMINAL_PX, SIZE, Truth
+from experiments.engine.checks import check_above
+from experiments.engine.harness import Experiment, Row, Settings, seeds_of
+from experiments.engine.texts import rms, table
+from experiments.following.mounted import at, exact_calibration, idealised, mounted, off_px, wanted_focal_px
+from experiments.paper.worked_example import X_FIXED_MM, X_ZOOM0_MM, stand_in
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+BOOK = DEFAULT_TARGETS["book"]
+ANYWHERE = (-np.pi, np.pi)  # both axes: what a head's limits forbid is no matter of the range
+EXACT, TABLE, EXAMPLE = METHODS
+READINGS = (TABLE, EXAMPLE)
+NAMES: Mapping[Method, str] = {EXACT: "exact range", TABLE: "depth of Table 1", EXAMPLE: "depth of Section 4.2"}
+NEAR_DEG, AT_DEG, AROUND_DEG = 4.0, 20.0, 2.0  # off the axis: near it; at 20 degrees, within these
+REGIONS = ("near the axis", "at 20 degrees", "whole view")
+RIGS = MOUNTED, PAPERS = "mounted", "Section 4.2"
+GAMMA_MM = np.subtract(X_ZOOM0_MM, X_FIXED_MM)  # of the worked example, if its cameras are parallel
+ROUNDING_DEG = 1e-6  # arctan2 tells no smaller angles from zero
+
+
+@dataclass(frozen=True)
+class ShortcutSettings(Settings):
+    """Which rigs, and where targets stand.
+
+    Attributes:
+        baseline: of the rigs [m].
+        depths: of the targets [m].
+        grid: columns and rows of their pixels in the wide image, from edge to edge.
+        near: how many more stand near the zoom camera's axis.
+        rigs: of RIGS.
+    """
+
+    seeds: int = 20
+    baseline: float = 0.4
+    depths: tuple[float, ...] = (5.0, 10.0, 20.0, 50.0)
+    grid: tuple[int, int] = (13, 9)
+    near: int = 60
+    rigs: tuple[Literal["mounted", "Section 4.2"], ...] = ("mounted", "Section 4.2")
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_above(0, self, "baseline", "depths", "near")
+        check_above(1, self, "grid")
+
+
+def one(_: None, settings: ShortcutSettings, seed: int) -> list[Row]:
+    """A rig of each kind; a row for each target, with the error of each method."""
+    return [row for rig in settings.rigs for depth in settings.depths for row in _at_depth(settings, seed, rig, depth)]
+
+
+def rig_of(name: str, seed: int, baseline: float) -> Truth:
+    """One of RIGS, `mounted` at a baseline [m] or with the offsets of the worked example."""
+    truth = idealised(mounted(np.random.default_rng((seed, 22)), baseline))
+    if name == MOUNTED:
+        return truth
+    T = stand_in()
+    hand = RigidTransform.from_components(T.translation / 1000, T.rotation)
+    return replace(truth, gamma=RigidTransform.from_translation(GAMMA_MM / 1000), hand=hand)
+
+
+def _at_depth(settings: ShortcutSettings, seed: int, rig: str, depth: float) -> list[Row]:
+    truth = rig_of(rig, seed, settings.baseline)
+    calibration = exact_calibration(truth)
+    reach = Reach(ANYWHERE, ANYWHERE, (NOMINAL_PX, LONGEST_PX))
+    columns, rows_px = (np.linspace(0.0, side - 1.0, count) for side, count in zip(SIZE, settings.grid, strict=True))
+    pixels = np.stack(np.meshgrid(columns, rows_px), axis=-1).reshape(-1, 2)
+    x_fixed = np.r_[at(truth, pixels, depth), near_axis(truth, depth, settings.near, np.random.default_rng(seed))]
+    pixels = np.r_[pixels, np.full((settings.near, 2), np.nan)]
+    x_zoom0 = truth.gamma.apply(x_fixed)
+    off_axis = np.degrees(np.arctan2(np.linalg.norm(x_zoom0[:, :2], axis=1), x_zoom0[:, 2]))
+    focal_px = wanted_focal_px(truth, x_fixed, BOOK.size, BOOK.wanted_px)
+    errors = {}
+    for method in METHODS:
+        q = np.array([_aimed(calibration, x, reach, method) for x in x_fixed])
+        errors[method] = looking_off(truth, x_fixed, q)
+    return [
+        {
+            "seed": seed,
+            "rig": rig,
+            "depth_m": depth,
+            "u_px": float(pixels[i, 0]),
+            "v_px": float(pixels[i, 1]),
+            "off_axis_deg": float(off_axis[i]),
+            "focal_px": float(focal_px[i]),
+            **{f"{method}_deg": float(np.degrees(errors[method][i])) for method in METHODS},
+        }
+        for i in range(len(pixels))
+    ]
+
+
+def near_axis(truth: Truth, depth: float, count: int, rng: np.random.Generator) -> Array:
+    """Targets at a depth [m] all over the disc of NEAR_DEG about the zoom camera's axis, (count, 3) [m]."""
+    radius, angle = np.tan(np.radians(NEAR_DEG)) * np.sqrt(rng.uniform(size=count)), rng.uniform(0, 2 * np.pi, count)
+    home = truth.gamma.inv()
+    rays = home.rotation.apply(np.c_[radius * np.cos(angle), radius * np.sin(angle), np.ones(count)])
+    return np.asarray(home.translation + rays * ((depth - home.translation[2]) / rays[:, 2])[:, None])
+
+
+def _aimed(calibration: Any, x_fixed: Array, reach: Reach, method: Method) -> tuple[float, float]:
+    """Pan and tilt [rad]; nan where the method has no solution."""
+    try:
+        found = aim(calibration, x_fixed, reach, method=method)
+    except UnreachableError:
+        return np.nan, np.nan
+    return found.pan, found.tilt
+
+
+def region(row: Row, name: str) -> bool:
+    """Whether a target is in one of REGIONS; those that were put near the axis are in no other."""
+    off: float = row["off_axis_deg"]
+    on_grid = math.isfinite(row["u_px"])
+    return {REGIONS[0]: not on_grid, REGIONS[1]: on_grid and abs(off - AT_DEG) <= AROUND_DEG, REGIONS[2]: on_grid}[name]
+
+
+def px(row: Row, method: Method) -> float:
+    """A target's error at the wanted focal length [px]."""
+    return float(off_px(np.radians(row[f"{method}_deg"]), row["focal_px"]))
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """By rig, method, region and depth: rms over the targets of a seed, median and quartiles of that over the seeds."""
+    summary: dict[str, Any] = {}
+    for rig in dict.fromkeys(row["rig"] for row in rows):
+        of_rig, found = [row for row in rows if row["rig"] == rig], summary.setdefault(rig, {})
+        for method in METHODS:
+            unsolved = [not np.isfinite(row[f"{method}_deg"]) for row in of_rig]
+            found[method] = {"unsolved": float(np.mean(unsolved))}
+            for name in REGIONS:
+                mine = [row for row in of_rig if region(row, name)]
+                depths = {f"{depth:g} m": [r for r in mine if r["depth_m"] == depth] for depth in _depths(rows)}
+                found[method][name] = {key: _figures(each, method) for key, each in ({"all": mine} | depths).items()}
+    return summary
+
+
+def _depths(rows: Sequence[Row]) -> list[float]:
+    return list(dict.fromkeys(row["depth_m"] for row in rows))
+
+
+def _figures(rows: Sequence[Row], method: Method) -> dict[str, float]:
+    """Of a region in which there are targets; a coarse grid may have none at 20 degrees."""
+    if not rows:
+        return dict.fromkeys(("deg", "deg_low", "deg_high", "worst_deg", "px"), math.nan)
+    seeds: dict[int, list[Row]] = {}
+    for row in rows:
+        seeds.setdefault(row["seed"], []).append(row)
+    degrees = [rms(row[f"{method}_deg"] for row in mine) for mine in seeds.values()]
+    pixels = [rms(px(row, method) for row in mine) for mine in seeds.values()]
+    low, middle, high = np.nanpercentile(degrees, [25, 50, 75])
+    return {
+        "deg": float(middle),
+        "deg_low": float(low),
+        "deg_high": float(high),
+        "worst_deg": float(np.nanmax([row[f"{method}_deg"] for row in rows])),
+        "px": float(np.nanmedian(pixels)),
+    }
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """Whether the exact range is not exact, or has no solution somewhere."""
+    unsolved = any(found[EXACT]["unsolved"] > 0 for found in summary.values())
+    return [
+        text
+        for text, bad in (
+            (f"exact range: {_worst(summary):g} degrees", not _worst(summary) <= ROUNDING_DEG),
+            ("exact range: no solution somewhere", unsolved),
+        )
+        if bad
+    ]
+
+
+def _worst(summary: Mapping[str, Any]) -> float:
+    """The exact range's worst error [degrees]; on the grid and near the axis there are always targets."""
+    return float(np.nanmax([found[EXACT][name]["all"]["worst_deg"] for found in summary.values() for name in REGIONS]))
+
+
+def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """What each reading of the shortcut errs by [degrees]; the exact range's rounding is nobody's bound."""
+    return {
+        rig: {method: {name: found[method][name]["all"]["deg"] for name in REGIONS} for method in READINGS}
+        for rig, found in summary.items()
+    }
+
+
+def describe(settings: ShortcutSettings, summary: Mapping[str, Any]) -> str:
+    """A line for each rig, region and depth."""
+    head = ["where", *(text for name in NAMES.values() for text in (f"{name} [deg]", "px"))]
+    lines = [
+        [f"{rig}, {name}, {depth}", *(text for m in METHODS for text in _texts(methods[m][name][depth]))]
+        for rig, methods in summary.items()
+        for name in REGIONS
+        for depth in methods[EXACT][name]
+    ]
+    unsolved = "; ".join(
+        f"{rig}: " + ", ".join(f"{NAMES[m]} {100 * found[m]['unsolved']:.2g} %" for m in METHODS)
+        for rig, found in summary.items()
+    )
+    return "\n".join(
+        [
+            f"rms pointing error, medians and quartiles over {seeds_of(settings)}; px at the wanted focal length",
+            table(head, lines),
+            f"without a solution: {unsolved}; the exact range's worst error: {_worst(summary):.1e} degrees",
+        ]
+    )
+
+
+def _texts(found: Mapping[str, float]) -> tuple[str, float]:
+    if math.isnan(found["deg"]):
+        return "-", math.nan
+    return f"{found['deg']:.2g} ({found['deg_low']:.2g} to {found['deg_high']:.2g})", found["px"]
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Maps of both readings' errors over the wide image of mounted rigs, medians over the seeds; then all regions."""
+    depths, rigs = _depths(rows), list(dict.fromkeys(row["rig"] for row in rows))
+    figure.set_size_inches(3.2 * len(depths) + 5, 5)
+    maps, regions = cast(list[SubFigure], figure.subfigures(1, 2, width_ratios=(3.2 * len(depths) + 1, 4)))
+    axes = maps.subplots(len(READINGS), len(depths), squeeze=False, sharex=True, sharey=True)
+    levels = np.geomspace(0.01, 10.0, 13)
+    for line, method in zip(axes, READINGS, strict=True):
+        for ax, depth in zip(line, depths, strict=True):
+            u, v, values = _map([row for row in rows if row["rig"] == rigs[0]], method, depth)
+            filled = ax.contourf(u, v, np.clip(values, levels[0], levels[-1]), levels, norm="log", cmap="viridis")
+            lines = ax.contour(u, v, values, [0.1, 0.3, 1.0, 3.0], colors="w", linewidths=0.8)
+            ax.clabel(lines, fmt="%g", fontsize="small")
+            ax.set(aspect="equal", title=f"{NAMES[method]}, {depth:g} m")
+            ax.title.set_fontsize("medium")
+        line[0].set(ylabel="v [px]", ylim=(SIZE[1], 0))
+    for ax in axes[-1]:
+        ax.set_xlabel("u [px]")
+    bar = maps.colorbar(filled, ax=axes, ticks=[0.01, 0.1, 1.0, 10.0], format="%g")
+    bar.set_label(f"pointing error [degrees], {rigs[0]}")
+    _by_region(regions.subplots(), summarise(rows))
+
+
+def _by_region(ax: "Axes", summary: Mapping[str, Any]) -> None:
+    """The error in each region at all depths, quartiles over the seeds."""
+    for i, (rig, found) in enumerate(summary.items()):
+        for j, method in enumerate(READINGS):
+            figures = [found[method][name]["all"] for name in REGIONS]
+            low, mid, high = (np.array([each[key] for each in figures]) for key in ("deg_low", "deg", "deg_high"))
+            x = np.arange(len(REGIONS)) + 0.1 * (2 * i + j - 1.5)
+            ax.errorbar(
+                x,
+                mid,
+                [mid - low, high - mid],
+                fmt="os"[i],
+                mfc=f"C{j}" if i == 0 else "w",
+                color=f"C{j}",
+                capsize=2,
+                label=f"{NAMES[method]}; rig: {rig}",
+            )
+    ax.set_xticks(range(len(REGIONS)), [name.replace(" ", "\n", 1) for name in REGIONS])
+    ax.set(yscale="log", ylabel="rms pointing error, all depths [degrees]")
+    ax.legend(frameon=False, fontsize="small")
+
+
+def _map(rows: Sequence[Row], method: Method, depth: float) -> tuple[Array, Array, Array]:
+    """Columns and rows [px], and the median over the seeds of the error there [degrees]."""
+    cells: dict[tuple[float, float], list[float]] = {}
+    for row in rows:
+        if row["depth_m"] == depth and math.isfinite(row["u_px"]):
+            cells.setdefault((row["v_px"], row["u_px"]), []).append(row[f"{method}_deg"])
+    v, u = (np.array(sorted({cell[i] for cell in cells})) for i in (0, 1))
+    return u, v, np.array([[np.nanmedian(cells[y, x]) for x in u] for y in v])
+
+
+SETTINGS = ShortcutSettings()
+EXPERIMENT = Experiment(
+    "shortcut",
+    "The exact range beside the paper's shortcut over the wide view.",
+    SETTINGS,
+    replace(SETTINGS, seeds=2, depths=(5.0, 20.0), grid=(9, 7), near=20),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    cost_s=3.0,
+    bounded=bounded,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

@@ -1,0 +1,209 @@
+"""A single pan-tilt-zoom camera that has to find and follow its target by itself, against the pair: time on target.
+
+The field of `experiments.following.field_scenes` without its clutter: the same unit, lens, delays, ways and sizes, the
+rig known
+exactly. Nothing is rendered: detections are the truth with a detector's noise (`cotarget.evaluation`), for the pair in
+its
+wide camera, for the lone camera (`experiments.following.lone_camera`) in its own view; either believes them by the same
+tracker
+with the same settings, those of a detector that goes by what a target looks like, as a lone camera has no background.
+The pair finds the target in its zoom view besides. What is missed there while the picture moves, because head or lens
+do, is what users of lone cameras fight with; three cases, of the pair's zoom view as well: 5 %, as of a camera that
+stands, a half, and nine of ten.
+
+Both are judged by the truth. The clock starts when the target is wholly in the wide view, after the first 2 s. Until
+then neither looks: the head stands in a direction drawn from all over the wide view, with the lens at its shortest, so
+that the target has to be found. What a lone camera costs besides is the view of all else: `watched` is how much of the
+wide camera's field its own view is as large as, where the pair always sees all of it.
+
+    python -m experiments.following.single_ptz [--seeds 6] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.config import SimConfig
+from cotarget.errors import ConfigError
+from cotarget.metrics import BACKGROUND_S, score
+from cotarget.metrics import Row as Judged
+from cotarget.sim.targets.random_paths import LONE, SECONDS
+from experiments.engine.checks import check_above, check_ways
+from experiments.engine.harness import Experiment, Row, Settings, seeds_of
+from experiments.engine.spread import bars, mean_of
+from experiments.engine.texts import table
+from experiments.following.single_runs import PAIR, WAYS, held
+
+WIDE_PX = SimConfig().fixed.focal_px[0]
+LEAST_MISS = 0.05
+HELD = 0.85  # least part of the frames after acquisition in which either has any target, if hardly anything is missed
+FIGURES = ("closeup_yield", "in_frame_ratio", "in_frame_of_all", "tpo_width_median", "watched")
+
+
+@dataclass(frozen=True)
+class SingleSettings(Settings):
+    """How many runs, of what.
+
+    Attributes:
+        seconds: of each run [s].
+        targets: book, person, bird.
+        misses: parts of the zoom camera's frames in which the target is missed while the picture moves.
+        lasts_s: of the lone camera's manoeuvres [s], see `experiments.following.lone_course`; each target's own by
+        default.
+    """
+
+    seeds: int = 6
+    seconds: float = SECONDS
+    targets: tuple[str, ...] = LONE
+    misses: tuple[float, ...] = (0.05, 0.5, 0.9)
+    lasts_s: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be."""
+        super().__post_init__()
+        check_above(BACKGROUND_S, self, "seconds")  # when the clock starts
+        check_ways(self, "seconds")
+        if parts := [miss for miss in self.misses if not 0 <= miss <= 1]:
+            raise ConfigError(f"misses: {parts[0]:g} is no part of the frames, which is 0 to 1")
+        check_above(0, self, *(() if self.lasts_s is None else ("lasts_s",)))
+
+
+def one(_: None, settings: SingleSettings, seed: int) -> list[Row]:
+    """Each target held by the pair and by the lone camera; a row each."""
+    rows: list[Row] = []
+    for name in settings.targets:
+        for way in WAYS:
+            for miss in settings.misses:
+                judged = held(way, name, seed, settings.seconds, miss, settings.lasts_s)
+                rows.append({"seed": seed, "target": name, "way": case(way, miss)} | figures(judged, way))
+    return rows
+
+
+def case(way: str, miss: float) -> str:
+    """What a way is called that misses the target in so many frames of the zoom camera while the picture moves."""
+    return f"{way}, misses {100 * miss:g} %"
+
+
+def figures(judged: Sequence[Judged], way: str) -> Row:
+    """Of one run of PAIR or LONE_CAMERA; what never came to be, as an acquisition, is None."""
+    found = score(judged)
+    since = judged[-found.frames :] if found.frames else []
+    return {
+        "closeup_yield": found.closeup_yield,
+        "in_frame_ratio": found.in_frame_ratio if found.in_frame_ratio is not None else 0.0,
+        "in_frame_of_all": float(np.mean([row.in_frame for row in since])) if since else None,
+        "time_to_acquire_s": found.time_to_acquire_s,
+        "tpo_width_median": found.tpo_width_median,
+        "watched": _watched(since, way),
+    }
+
+
+def _watched(since: Sequence[Judged], way: str) -> float | None:
+    """Which part of the wide camera's field is in view, in the mean; None of no frame."""
+    if way == PAIR:
+        return 1.0
+    return float(np.mean([min(1.0, (WIDE_PX / row.focal_px) ** 2) for row in since])) if since else None
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
+    """Of each target and way the means over the seeds with their standard errors; quartiles of the time to acquire."""
+    summary: dict[str, dict[str, dict[str, float]]] = {}
+    for name, way in dict.fromkeys((row["target"], row["way"]) for row in rows):
+        mine = [row for row in rows if (row["target"], row["way"]) == (name, way)]
+        found: dict[str, float] = {}
+        for key in FIGURES:
+            found[key], found[f"{key}_error"] = mean_of(_told(mine, key))
+        times = [math.inf if row["time_to_acquire_s"] is None else row["time_to_acquire_s"] for row in mine]
+        at = dict(zip(("low", "median", "high"), np.quantile(times, (0.25, 0.5, 0.75), method="nearest"), strict=True))
+        found |= {f"time_to_acquire_s_{part}": float(value) for part, value in at.items()}
+        summary.setdefault(name, {})[way] = found | {"never_acquired": float(np.mean(np.isinf(times)))}
+    return summary
+
+
+def _told(rows: Sequence[Row], key: str) -> list[float]:
+    """A figure's values in the rows that have it."""
+    return [float(row[key]) for row in rows if row[key] is not None]
+
+
+def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Every close-up yield: one of the lone camera's that falls makes the pair look better."""
+    return {name: {way: v["closeup_yield"] for way, v in ways.items()} for name, ways in summary.items()}
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """Whatever is not found and held even if hardly anything is missed: then one of the two is not at its best."""
+    return [
+        f"{name}, {way}: {what}"
+        for name, ways in summary.items()
+        for way, found in ways.items()
+        if way in {case(each, LEAST_MISS) for each in WAYS}
+        for what, bad in (
+            (f"in frame {found['in_frame_ratio']:.2f}", not found["in_frame_ratio"] >= HELD),
+            ("not acquired in every run", found["never_acquired"] > 0),
+        )
+        if bad
+    ]
+
+
+def describe(settings: SingleSettings, summary: Mapping[str, Any]) -> str:
+    """A line for each target and way."""
+    head = ("", "close-up yield", "in frame", "of all", "offset / width", "watched", "to acquire [s]", "never")
+    lines = [
+        [f"{name}, {way}"]
+        + [f"{found[key]:.2f} +- {found[f'{key}_error']:.2f}" for key in FIGURES[:3]]
+        + [f"{found[key]:.3f} +- {found[f'{key}_error']:.3f}" for key in FIGURES[3:]]
+        + [
+            "{median:.2f} ({low:.2f} to {high:.2f})".format(
+                **{part: found[f"time_to_acquire_s_{part}"] for part in ("low", "median", "high")}
+            ),
+            found["never_acquired"],
+        ]
+        for name, ways in summary.items()
+        for way, found in ways.items()
+    ]
+    words = "means with standard errors; to acquire: median and quartiles; never: part of the runs"
+    return f"pair and lone camera, {settings.seconds:g} s, {seeds_of(settings)}; {words}\n" + table(head, lines)
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Close-up yield, frames in frame and time to acquire of each way: seeds as points, means with errors as bars."""
+    targets, ways = (list(dict.fromkeys(row[key] for row in rows)) for key in ("target", "way"))
+    figure.set_size_inches(14, 4.8)
+    labels = {
+        "closeup_yield": "close-up yield",
+        "in_frame_of_all": "in frame, of all frames",
+        "time_to_acquire_s": "time to acquire, where it was [s]",
+    }
+    shades = np.linspace(0.95, 0.35, len(ways) // len(WAYS))
+    styles = [{"color": f"C{i}", "alpha": float(shade)} for i in range(len(WAYS)) for shade in shades]
+    for ax, (key, label) in zip(figure.subplots(1, 3), labels.items(), strict=True):
+        for i, way in enumerate(ways):
+            mine = [[r for r in rows if (r["target"], r["way"]) == (name, way)] for name in targets]
+            x = np.arange(len(targets)) + (i - (len(ways) - 1) / 2) * 0.8 / len(ways)
+            bars(ax, x.tolist(), [_told(each, key) for each in mine], 0.75 / len(ways), label=way, **styles[i])
+        ax.set(ylabel=label, ylim=(0, None if key.endswith("_s") else 1.02))
+        ax.set_xticks(range(len(targets)), targets)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+
+
+SETTINGS = SingleSettings()
+EXPERIMENT = Experiment(
+    "single_ptz",
+    "A single pan-tilt-zoom camera that finds and follows its target by itself, against the pair.",
+    SETTINGS,
+    replace(SETTINGS, seeds=1, seconds=8.0, targets=("person", "bird"), misses=(0.05, 0.9)),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    cost_s=30.0,
+    bounded=bounded,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

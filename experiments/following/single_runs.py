@@ -1,0 +1,143 @@
+"""The pair and a lone camera on the same targets, each from where nobody looks yet, judged by the truth."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cotarget.calibration import Calibration
+from cotarget.config import RigConfig, TargetConfig
+from cotarget.evaluation import TruthDetector, TruthFinder, closeup_of, counted, true_calibration
+from cotarget.metrics import BACKGROUND_S, ROUNDING_S, WHOLLY_VISIBLE
+from cotarget.metrics import Row as Judged
+from cotarget.pantilt import towards
+from cotarget.pipeline import FollowSettings, follow
+from cotarget.rig import Rig
+from cotarget.safety import SafeRig
+from cotarget.sim.truth import Outlines
+from cotarget.sim.world import SimWorld
+from experiments.following.field_scenes import hold_config
+from experiments.following.lone_camera import LoneCamera, scan_of
+from experiments.following.shaken import NOISE, Shaken
+
+WAYS = PAIR, LONE_CAMERA = "pair", "lone"
+FAR = 1000.0  # where the cameras' offset does not count [m]
+STREAM = 25  # of random numbers
+
+
+def config_of(name: str, seed: int) -> RigConfig:
+    """The field without clutter, which detections from the truth do not see, and its target as looks tell it."""
+    config = hold_config(name, seed)
+    config = replace(config, sim=replace(config.sim, effects=replace(config.sim.effects, clutter=False)))
+    target = config.target(name)
+    # As a thing that moves it would have to come some way before it is believed, which the lone camera cannot tell.
+    looks = target if target.detector == "colour" else replace(target, detector="speck")
+    return replace(config, targets={**config.targets, name: looks})
+
+
+def held(way: str, name: str, seed: int, seconds: float, miss: float, lasts_s: float | None = None) -> list[Judged]:
+    """A run from when nobody looks yet on, judged at each zoom frame.
+
+    Args:
+        way: PAIR or LONE_CAMERA.
+        name: of the target.
+        seed: of everything random.
+        seconds: of the run [s].
+        miss: part of the zoom camera's frames in which the target is missed while the picture moves.
+        lasts_s: of the lone camera's manoeuvres, see `Course`.
+    """
+    world = SimWorld(config_of(name, seed), rendered=())
+    target, calibration = world.config.target(name), true_calibration(world)
+    outlines = Outlines(world.truth(), still=True)
+    shaken = Shaken(outlines, world.truth(), seed, miss)
+    rows: list[Judged] = []
+    with SafeRig(world.rig, world.config.safety) as rig:
+        rig.head.move(*any_pose(rig, calibration, seed))
+        last = None
+        while not begun(rows) and rig.clock.now() < seconds:
+            last = rig.zoom.read(newer_than=last).t
+            rows.append(judge(outlines, name, target, last))
+        left, delay_s = seconds - rig.clock.now(), world.config.command_delay_s
+        if way == PAIR:
+            times = by_pair(rig, calibration, target, outlines, name, seed, shaken, left, delay_s)
+        else:
+            field = scan_of(rig, calibration)
+            lone = (rig, world.truth(), calibration, target, shaken, delay_s, NOISE.center_px, field, lasts_s)
+            times = (frame.t for frame in LoneCamera(*lone).run(left))
+        for t in times:
+            if t > rows[-1].t_s:
+                rows.append(judge(outlines, name, target, t))
+    return rows
+
+
+def any_pose(rig: Rig, calibration: Calibration, seed: int) -> tuple[float, float]:
+    """Pan and tilt at which the zoom camera looks somewhere into the wide view [rad]."""
+    rng = np.random.default_rng((seed, STREAM))
+    pixel = rng.uniform(0.0, np.array(rig.fixed.size) - 1.0)
+    pan, tilt = towards(calibration.T_base_fixed.apply(FAR * calibration.fixed.ray(pixel)))
+    limits = rig.head.limits
+    return float(np.clip(pan, *limits.pan)), float(np.clip(tilt, *limits.tilt))
+
+
+def begun(rows: Sequence[Judged]) -> bool:
+    """Whether the clock has started, as `cotarget.metrics.score` has it."""
+    return bool(rows) and rows[-1].in_wide and rows[-1].t_s >= rows[0].t_s + BACKGROUND_S - ROUNDING_S
+
+
+def by_pair(
+    rig: Rig,
+    calibration: Calibration,
+    target: TargetConfig,
+    outlines: Outlines,
+    name: str,
+    seed: int,
+    shaken: Shaken,
+    seconds: float,
+    delay_s: float,
+) -> Iterator[float]:
+    """Both cameras, by the project's own pipeline; the times of the zoom frames, some of them again."""
+
+    def finder(calibration: Calibration, target: TargetConfig) -> TruthFinder:
+        return TruthFinder(calibration, target, outlines, name, seed, shaken.misses)
+
+    settings = FollowSettings(command_delay_s=delay_s, finder=finder)
+    detector = TruthDetector(outlines, seed, NOISE, numbers=counted)
+    for step in follow(rig, calibration, target, detector, seconds=seconds, settings=settings):
+        yield step.zoom.t
+
+
+def judge(outlines: Outlines, name: str, target: TargetConfig, t: float) -> Judged:
+    """What a zoom frame truly shows, as a row to be scored; what is said of commands and tracks is left out."""
+    closeup = closeup_of(outlines, name, target, t)
+    wide = outlines.silhouette(name, "fixed", t)
+    lens = outlines.lens("zoom", t)
+    return Judged(
+        t_s=t,
+        t_fixed_s=t,
+        state="",
+        track=-1,
+        u_px=closeup.u_px,
+        v_px=closeup.v_px,
+        width_px=closeup.width_px,
+        height_px=closeup.height_px,
+        size_px=closeup.size_px,
+        wanted_px=closeup.wanted_px,
+        visible=closeup.visible,
+        in_wide=wide is not None and wide.visible >= WHOLLY_VISIBLE,
+        u_wide_px=math.nan,
+        v_wide_px=math.nan,
+        u_detected_px=math.nan,
+        v_detected_px=math.nan,
+        decoded=False,
+        decoded_wide=False,
+        off_target="",
+        range_m=math.nan,
+        depth_m=math.nan,
+        pan_commanded_deg=0.0,
+        tilt_commanded_deg=0.0,
+        focal_commanded_px=0.0,
+        pan_deg=0.0,
+        tilt_deg=0.0,
+        focal_px=lens.focal_px[0],
+    )

@@ -1,0 +1,228 @@
+"""Fig. 4 of the paper: indoors, a book about 10 m away, found by its colours: before, centred, and close up.
+
+Each seed puts the book somewhere, and after a while elsewhere (`cotarget.sim.targets.random_paths.lone_path`). At
+either place
+the zoom camera begins where pan = tilt = 0; it is turned to the book with the lens kept at its shortest, as in the
+paper's Fig. 4(c), and then goes on to the close-up: once by this project's pipeline, and once as the paper does it
+(`experiments.paper.paper_loop`), with the same calibration. What each zoom view shows is judged by the simulation's
+truth:
+the target point offset (a view without the book counts half the diagonal), the size over the one wanted, and whether
+the book's marker decodes.
+
+    python -m experiments.paper.fig4_book [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import math
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration
+from cotarget.detection import make_detector
+from cotarget.drawing import draw_wide, draw_zoom
+from cotarget.errors import ConfigError
+from cotarget.evaluation import observe
+from cotarget.metrics import Row as Judged
+from cotarget.pipeline import FollowSettings, Step
+from cotarget.safety import SafeRig
+from cotarget.sim.targets.random_paths import BOOK_MOVED_AT, BOOK_TAKES, lone_path
+from cotarget.sim.world import SimWorld
+from experiments.engine.harness import Experiment, Row, seeds_of
+from experiments.engine.panels import laid_out
+from experiments.engine.pictured import Pictured
+from experiments.engine.spread import in_words, points, spread, ways_of
+from experiments.engine.texts import table
+from experiments.following.field import OwnRigInField, calibrated
+from experiments.paper.paper_loop import OURS, WAYS, picture_name
+
+NAME = "book"
+TURN_S = 1.2  # that the head is given to turn to the book, all latencies included [s]
+ARRIVES_S = (0.0, BOOK_MOVED_AT[1] + BOOK_TAKES[1])  # the book is at either place from then on, at the latest [s]
+LEAST_S = 0.2  # of a run, in which both cameras give several frames [s]
+# So small that the lens never leaves its shortest focal length for it [px].
+SPECK_PX = 1.0
+KEYS = ("tpo_px", "tpo_percent", "size_ratio", "focal_px")  # of each stage
+STAGES = ("before", "centred", "close up")
+WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
+    "centred": {"tpo_percent": (0.0, 2.0)},
+    "close up": {"tpo_percent": (0.0, 2.0), "size_ratio": (0.9, 1.1), "decoded": (0.9, 1.0)},
+}
+
+
+@dataclass(frozen=True)
+class BookSettings(OwnRigInField):
+    """How many seeds, and how long head and lens are given.
+
+    Attributes:
+        seconds: from centred to close up [s].
+        places: one or two of the book.
+
+    Raises:
+        ConfigError: more places, no time to see anything, or so much that the book is taken elsewhere meanwhile.
+    """
+
+    seeds: int = 2
+    seconds: float = 2.0
+    places: int = 2
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.places <= len(ARRIVES_S):
+            raise ConfigError(f"places = {self.places}: the book is at 1 or {len(ARRIVES_S)}")
+        if self.seconds < LEAST_S:
+            raise ConfigError(
+                f"seconds = {self.seconds:g}: at least {LEAST_S:g} are needed for a frame of both cameras"
+            )
+        super().__post_init__()
+
+    @property
+    def lasting_s(self) -> tuple[float, float]:
+        """At its first place the book stays until it is taken elsewhere, at its second one for good."""
+        return 0.0, BOOK_MOVED_AT[0] - TURN_S
+
+
+def one(calibration: Calibration, settings: BookSettings, seed: int) -> Pictured:
+    """Show the book at each place in either way; a row each, and of the first seed the last place in pictures."""
+    rows: list[Row] = []
+    pictures: dict[str, bytes] = {}
+    for way in WAYS:
+        mine, shown = _shown(calibration, settings, seed, way)
+        rows += mine
+        if seed == settings.seed_base:
+            pictures[picture_name("fig4", way)] = _picture(shown)
+    return Pictured(rows, pictures)
+
+
+def _shown(
+    calibration: Calibration, settings: BookSettings, seed: int, way: str
+) -> tuple[list[Row], Mapping[str, Step]]:
+    """A row a place, and the Steps of the last one by stage."""
+    config = settings.config("indoor", (NAME,), seed)
+    config = dataclasses.replace(config, sim=dataclasses.replace(config.sim, paths=lone_path(NAME, seed)))
+    target, how = config.target(NAME), FollowSettings.of(config)
+    speck = dataclasses.replace(target, wanted_px=SPECK_PX)
+    world = SimWorld(config)
+    truth = world.truth()
+    rows: list[Row] = []
+    shown: dict[str, Step] = {}
+    with SafeRig(world.rig, config.safety) as rig:
+        for place, arrives in enumerate(ARRIVES_S[: settings.places]):
+            rig.head.move(0.0, 0.0, wait=True)
+            rig.zoom.zoom(rig.zoom.focal_range[0])
+            rig.clock.sleep_until(arrives)
+            ends: list[Step] = []
+            for wanted, seconds in ((speck, TURN_S), (target, settings.seconds)):
+                detector = make_detector(target, config.rate_hz)
+                ends += _ends(WAYS[way](rig, calibration, wanted, detector, seconds=seconds, settings=how))
+            shown = dict(zip(STAGES, (ends[0], ends[1], ends[3]), strict=True))
+            row = {"seed": seed, "place": place, "way": way}
+            for stage, step in shown.items():
+                row |= {f"{stage} {key}": value for key, value in _told(observe(step, truth, NAME, target)).items()}
+            rows.append(row)
+    return rows, shown
+
+
+def _ends(steps: Iterator[Step]) -> tuple[Step, Step]:
+    """The first of a run in which the book is found, before the head has turned, and the last; no others are kept."""
+    first = last = next(steps)
+    for last in steps:
+        if first.target is None and last.target is not None:
+            first = last
+    return first, last
+
+
+def _told(judged: Judged) -> dict[str, Any]:
+    return {
+        "tpo_px": judged.tpo_px,
+        "tpo_percent": 100 * judged.tpo_px / judged.width_px,
+        "size_ratio": judged.size_ratio if math.isfinite(judged.size_ratio) else None,
+        "focal_px": judged.focal_px,
+        "decoded": judged.decoded,
+    }
+
+
+def _picture(shown: Mapping[str, Step]) -> bytes:
+    """As Fig. 4 of the paper: (a), (b) above (c), (d)."""
+    before, centred, close = (shown[stage] for stage in STAGES)
+    return laid_out(
+        [
+            [(draw_wide(before), "(a) stationary camera, before"), (before.zoom.image, "(b) moving camera, before")],
+            [
+                (draw_zoom(centred), f"(c) turned to the book, at {centred.lens.focal_px:.0f} px"),
+                (draw_zoom(close), f"(d) close-up, at {close.lens.focal_px:.0f} px"),
+            ],
+        ]
+    )
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Of either way and each stage median, least and largest over all places, and the share of markers that decode."""
+    return {
+        way: {
+            stage: {key: spread(mine, f"{stage} {key}") for key in KEYS}
+            | {"decoded": float(np.mean([row[f"{stage} decoded"] for row in mine]))}
+            for stage in STAGES
+        }
+        for way, mine in ways_of(rows).items()
+    }
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The figures of this project that are not what is wanted."""
+    return [
+        f"{stage}: {key}"
+        for stage, wanted in WANTED.items()
+        for key, (low, high) in wanted.items()
+        if not low <= (found["median"] if isinstance(found := summary[OURS][stage][key], Mapping) else found) <= high
+    ]
+
+
+def describe(settings: BookSettings, summary: Mapping[str, Any]) -> str:
+    """A line a way and stage."""
+    lines = [
+        [f"{way}: {stage}", *(in_words(found[key]) for key in KEYS), found["decoded"]]
+        for way, stages in summary.items()
+        for stage, found in stages.items()
+    ]
+    head = ("zoom view", "offset, px", "% of width", "size / wanted", "focal length, px", "decoded")
+    what = f"a book, {settings.places} places a seed, median (least to largest) of {seeds_of(settings)}"
+    return f"{what}\n{table(head, lines)}"
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Offset from the middle of the zoom view and size over the one wanted: medians, least to largest, each place."""
+    ways = ways_of(rows)
+    for ax, key, label in zip(
+        figure.subplots(1, 2),
+        ("tpo_percent", "size_ratio"),
+        ("offset [% of the width]", "size / wanted size"),
+        strict=True,
+    ):
+        for i, (way, mine) in enumerate(ways.items()):
+            for k, stage in enumerate(STAGES):
+                values = [value for row in mine if (value := row[f"{stage} {key}"]) is not None]
+                points(ax, k + i / 3, values, color=f"C{i}", label=way if k == 0 else None)
+        ax.set(yscale="log", ylabel=label, xticks=range(len(STAGES)), xticklabels=STAGES)
+        ax.legend(frameon=False)
+
+
+SETTINGS = BookSettings()
+EXPERIMENT = Experiment(
+    "fig4_book",
+    "Fig. 4: a book about 10 m away, found by its colours: before, centred, close up.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, places=1, calibrated=False),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    prepare=calibrated,
+    cost_s=40.0,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

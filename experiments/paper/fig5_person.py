@@ -1,0 +1,179 @@
+"""Fig. 5 of the paper: indoors, a person who walks, found by an adaptive Gaussian mixture and connected components.
+
+He is followed once by this project's pipeline and once as the paper does it (`experiments.paper.paper_loop`), with the
+same
+calibration and with the paper's plain detector, `mog2`; `--set fig5_person.detector=motion` gives this project's
+pipeline its own. The person walks in after the background was learnt for some two seconds and goes to and fro about 10
+m away. Figures are medians over the seeds, with the least and the largest, of what `cotarget.metrics` defines, by the
+simulation's truth.
+
+    python -m experiments.paper.fig5_person [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
+"""
+
+import dataclasses
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.calibration import Calibration
+from cotarget.detection import make_detector
+from cotarget.drawing import draw_wide, draw_zoom
+from cotarget.errors import ConfigError
+from cotarget.evaluation import add_row
+from cotarget.metrics import Row as Judged
+from cotarget.metrics import score
+from cotarget.pipeline import FollowSettings, Step
+from cotarget.sim.world import SimWorld
+from experiments.engine.harness import Experiment, Row, seeds_of
+from experiments.engine.panels import laid_out
+from experiments.engine.pictured import Pictured
+from experiments.engine.spread import by_way, spread, ways_of, ways_table
+from experiments.following.field import OwnRigInField, calibrated, watched_in
+from experiments.paper.paper_loop import OURS, WAYS, picture_name
+
+NAME = "person"
+MOMENTS, FIRST_S = 3, 4.4  # in the picture, the first of them then and the last at the end; he is there from 3 s on [s]
+FIGURES = {  # of a run, with words
+    "tpe_px_median": "detection's error in the fixed view, px",
+    "tpo_px_median": "target point offset in the close-up, px",
+    "tpo_percent_median": "target point offset in the close-up, % of width",
+    "size_ratio_median": "size / wanted size",
+    "in_frame_ratio": "in frame, after acquisition",
+    "time_to_acquire_s": "time to acquire, s",
+    "closeup_yield": "close-up yield, acquisition included",
+    "identification": "marker decoded in the close-up",
+    "identification_wide": "marker decoded in the fixed view",
+    "false_tracks_per_min": "false tracks a minute",
+}
+SHOWN = ("tpe_px_median", "tpo_percent_median", "size_ratio_median", "closeup_yield")
+WANTED: Mapping[str, tuple[float, float]] = {
+    "tpo_percent_median": (0.0, 4.0),
+    "size_ratio_median": (0.85, 1.15),
+    "in_frame_ratio": (0.99, 1.0),
+    "time_to_acquire_s": (0.0, 2.0),
+}
+
+
+@dataclass(frozen=True)
+class PersonSettings(OwnRigInField):
+    """How many seeds, for how long, and how the person is found.
+
+    Attributes:
+        detector: mog2 or motion, of this project's pipeline.
+
+    Raises:
+        ConfigError: it ends before there is anything to be shown.
+    """
+
+    seeds: int = 2
+    seconds: float = 7.0
+    detector: Literal["mog2", "motion"] = "mog2"
+
+    def __post_init__(self) -> None:
+        if self.seconds <= FIRST_S:
+            raise ConfigError(
+                f"seconds = {self.seconds:g}: more than {FIRST_S:g} are needed, when the person has come in"
+            )
+        super().__post_init__()
+
+    @property
+    def lasting_s(self) -> tuple[float, float]:
+        """The person goes to and fro for good (`cotarget.sim.targets.paths`)."""
+        return FIRST_S, math.inf
+
+
+def one(calibration: Calibration, settings: PersonSettings, seed: int) -> Pictured:
+    """Follow a person in either way; a row each, and pictures of the first seed."""
+    rows: list[Row] = []
+    pictures: dict[str, bytes] = {}
+    for way in WAYS:
+        row, moments = _followed(calibration, settings, seed, way)
+        rows.append(row)
+        if seed == settings.seed_base:
+            pictures[picture_name("fig5", way)] = _picture(moments)
+    return Pictured(rows, pictures)
+
+
+def _followed(calibration: Calibration, settings: PersonSettings, seed: int, way: str) -> tuple[Row, list[Step]]:
+    """The figures, and some moments."""
+    config = settings.config("indoor", (NAME,), seed)
+    found_by = settings.detector if way == OURS else "mog2"
+    target = dataclasses.replace(config.target(NAME), detector=found_by)
+    how = FollowSettings.of(config)
+    judged: list[Judged] = []
+    moments: list[Step] = []
+    # The last step is done a frame before the end, or later.
+    due = np.linspace(FIRST_S, settings.seconds - 1 / config.rate_hz, MOMENTS).tolist()
+    detector, world = make_detector(target, config.rate_hz), SimWorld(config)
+    for step, truth in watched_in(world, detector, calibration, target, settings.seconds, how, WAYS[way]):
+        add_row(judged, step, truth, NAME, target)
+        if due and step.t >= due[0]:
+            moments.append(step)
+            due.pop(0)
+    found = dataclasses.asdict(score(judged))
+    offset = found["tpo_width_median"]
+    found["tpo_percent_median"] = None if offset is None else 100 * offset
+    return {"seed": seed, "way": way, "detector": found_by, **{key: found[key] for key in FIGURES}}, moments
+
+
+def _picture(moments: Sequence[Step]) -> bytes:
+    """As Fig. 5 of the paper, for some moments: (a) above (b)."""
+    return laid_out(
+        [
+            [(draw_wide(step), f"(a) stationary camera, t = {step.fixed.t:.1f} s") for step in moments],
+            [(draw_zoom(step), f"(b) moving camera, at {step.lens.focal_px:.0f} px") for step in moments],
+        ]
+    )
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
+    """Of either way's figures the median over the seeds, least and largest; a run without it is told apart."""
+    return {
+        way: {
+            key: spread(mine, key) | {"not measured": float(sum(row[key] is None for row in mine))} for key in FIGURES
+        }
+        for way, mine in ways_of(rows).items()
+    }
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The figures of this project that are not what is wanted, or were not measured in some run."""
+    return [
+        key
+        for key, (low, high) in WANTED.items()
+        if summary[OURS][key]["not measured"] or not low <= summary[OURS][key]["median"] <= high
+    ]
+
+
+def describe(settings: PersonSettings, summary: Mapping[str, Any]) -> str:
+    """A line a figure, a column a way."""
+    what = f"a person, {settings.detector}, median (least to largest) of {seeds_of(settings)}"
+    return ways_table(what, summary, FIGURES)
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """Error in the fixed view, offset, size and yield in the close-up: medians, least to largest, each seed a point."""
+    by_way(np.ravel(figure.subplots(2, 2)), rows, {key: FIGURES[key] for key in SHOWN})
+
+
+SETTINGS = PersonSettings()
+EXPERIMENT = Experiment(
+    "fig5_person",
+    "Fig. 5: a person who walks indoors, found by an adaptive Gaussian mixture: fixed view, close-up.",
+    SETTINGS,
+    dataclasses.replace(SETTINGS, seeds=1, seconds=5.0, calibrated=False),
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    prepare=calibrated,
+    cost_s=30.0,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

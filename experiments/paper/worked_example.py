@@ -1,0 +1,292 @@
+"""Section 4.2 of the paper, step by step, beside the numbers that it prints.
+
+A book is found at pixel (529, 275), taken to be 10 m away, and is to be 160 px wide in the close-up. What the paper
+prints of that is worked out again from its own printed inputs. The entries of its Gamma and T are lost, so that
+what they do to a point cannot be; what survives of their results can still be checked for agreement with itself,
+because T and P move points rigidly.
+
+Beside it stands the exact method, with a T that gives every printed digit with the least rotation: one of many that do,
+as the printed results leave T's rotation about the line of sight, and its first translation, open. What it says is not
+held against the paper, which does not claim it.
+
+    python -m experiments.paper.worked_example [--out DIR]
+"""
+
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cotarget.camera import Intrinsics, focal_for_size
+from cotarget.geometry import Array, RigidTransform, Rotation, angle_between
+from cotarget.pantilt import base_head, shortcut, solve
+from experiments.engine import harness
+from experiments.engine.harness import Experiment, Row
+from experiments.engine.texts import table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+# Table 2 as (u, v); the paper lists [v, u].
+FIXED = Intrinsics((640, 480), (686.0, 684.0), (325.0, 239.0))
+ZOOM_SHORTEST_MM, PITCH_MM = 6.237, 0.009
+# Section 4.2, in millimetres; what is lost is nan.
+PIXEL, DEPTH_MM = (529.0, 275.0), 10000.0
+X_FIXED_MM = (2973.0, 519.0, 10000.0)
+X_ZOOM0_MM = (811.0, 563.0, 10464.0)
+X_HEAD_MM = (math.nan, 79.54, 10424.0)  # T (0, 0, 10464)
+X_BASE_MM = (661.92, math.nan, 10426.0)  # T Gamma x_fixed
+ANGLE_DEG = 3.08
+BOOK_MM, WANTED_PX = 234.0, 160.0
+ZOOM_FACTOR, LARGEST_ZOOM = 10.3, 12.0
+CLOSEUP_PX = 7155.0  # the focal length of the paper's close-up, at which misses are told in pixels
+OFF_MM = 20.0  # by so much and more both norms of a rigid motion differ
+KNOWN = "x_fixed: y [mm]"  # what does not follow from the paper's own numbers
+BESIDE = ("exact", "stand-in T")  # steps that the paper does not have
+RIGHT, WRONG, OTHER = "#1f6f8b", "#d9534f", "#999999"
+
+
+@dataclass(frozen=True)
+class Settings(harness.Settings):
+    """There is nothing to choose, and nothing random."""
+
+    seeds: int = 1
+
+
+def once(settings: Settings) -> Sequence[int]:
+    """One job, whatever the seeds."""
+    return (settings.seed_base,)
+
+
+def one(_: None, settings: Settings, seed: int) -> list[Row]:
+    """Every step; one row a number: what is printed (nan where nothing is), what follows, and what is to be said."""
+    return [
+        {"step": step, "quantity": quantity, "unit": unit, "printed": printed, "last_digit": digit, "found": found}
+        | {"difference": found - printed, "remark": remark}
+        for step, quantity, unit, printed, digit, found, remark in [*_paper(), *_norms(), *_exactly()]
+    ]
+
+
+Line = tuple[str, str, str, float, float, float, str]  # as in `one`; the digit is the unit of the last one printed
+
+
+def _paper() -> list[Line]:
+    """What can be worked out from the printed inputs."""
+    x, y, _ = FIXED.ray(np.array(PIXEL)) * DEPTH_MM
+    y_half = float((PIXEL[1] - 239.5) / FIXED.focal_px[1] * DEPTH_MM)
+    focal_px = focal_for_size(BOOK_MM, WANTED_PX, X_ZOOM0_MM[2])
+    focal_mm = focal_px * PITCH_MM
+    angle = math.degrees(math.atan(X_ZOOM0_MM[1] / X_ZOOM0_MM[2]))
+    return [
+        ("x_fixed", "x", "mm", X_FIXED_MM[0], 1.0, float(x), "cut, not rounded"),
+        ("x_fixed", "y", "mm", X_FIXED_MM[1], 1.0, float(y), "disagrees with Table 2's centre of 239"),
+        ("x_fixed", "y, centre 239.5", "mm", X_FIXED_MM[1], 1.0, y_half, "what the printed one needs"),
+        ("angle", "atan(563 / 10464)", "deg", ANGLE_DEG, 0.01, angle, "the tilt's size if T hardly rotates"),
+        ("focal", "f", "px", 7155.0, 1.0, focal_px, "Eq. 17 with the depth 10464"),
+        ("focal", "f", "mm", math.nan, 0.1, focal_mm, "the printed one is lost"),
+        ("focal", "zoom factor", "x", ZOOM_FACTOR, 0.1, focal_mm / ZOOM_SHORTEST_MM, f"of {LARGEST_ZOOM:g}"),
+    ]
+
+
+def _norms() -> list[Line]:
+    """What must be equal, because P is a rotation: |x_head| and |x_base|."""
+    base = math.hypot(X_BASE_MM[0], X_BASE_MM[2])
+    head_x = X_BASE_MM[0] - X_ZOOM0_MM[0]  # of a T that does not rotate
+    head = math.hypot(head_x, *X_HEAD_MM[1:])
+    pan = math.radians(ANGLE_DEG)
+    head_x_pan = (X_BASE_MM[0] - math.sin(pan) * X_HEAD_MM[2]) / math.cos(pan)  # (14), the tilt left out
+    head_pan = math.hypot(head_x_pan, *X_HEAD_MM[1:])
+    nan, mm = math.nan, "mm"
+    return [
+        ("rigid", "|x_base|, at least", mm, nan, 1.0, base, "its y is lost"),
+        ("rigid", "|x_head|, T hardly rotated", mm, nan, 1.0, head, "its x is lost; then it is 661.92 - 811"),
+        ("rigid", "short of |x_base| by", mm, nan, 1.0, base - head, "and P must not change it"),
+        ("rigid", "|x_head|, if pan is 3.08", mm, nan, 1.0, head_pan, f"then its x is {head_x_pan:.0f} mm, by (14)"),
+        ("rigid", "short of |x_base| by", mm, nan, 1.0, base - head_pan, "the contradiction stays"),
+    ]
+
+
+def stand_in() -> RigidTransform:
+    """The T of least rotation that gives all the printed digits of x_head and x_base [mm]."""
+    # T takes (811, 563, 0), what x_zoom0 is beside the axis, to x_base - x_head, whose z is 2 mm: about what is across.
+    x, y, _ = X_ZOOM0_MM
+    aside = math.hypot(x, y)
+    angle = math.asin((X_BASE_MM[2] - X_HEAD_MM[2]) / aside)
+    turn = Rotation.from_rotvec(angle * np.array([y, -x, 0.0]) / aside)
+    beside = turn.apply([x, y, 0.0])
+    head = np.array([X_BASE_MM[0] - beside[0], *X_HEAD_MM[1:]])
+    return RigidTransform.from_components(head - turn.apply([0.0, 0.0, X_ZOOM0_MM[2]]), turn)
+
+
+def _exactly() -> list[Line]:
+    """The exact method, and what both readings of the shortcut make of the same T."""
+    T, x_zoom0 = stand_in(), np.array(X_ZOOM0_MM)
+    nearly = float(np.linalg.norm(x_zoom0))
+    found = solve(T.apply(x_zoom0), T)
+    pan, tilt, reach = (float(each[0]) for each in (found.pan, found.tilt, found.range))
+    nan = math.nan
+    lines: list[Line] = [
+        ("exact", "range = |x_zoom0|", "mm", 10464.0, 1.0, nearly, "the depth after centring; 10510 where cut"),
+        (
+            "exact",
+            "f at 10510 mm",
+            "px",
+            7155.0,
+            1.0,
+            focal_for_size(BOOK_MM, WANTED_PX, 10510.0),
+            "what the exact method asks for",
+        ),
+        ("stand-in T", "pan", "deg", nan, 0.01, math.degrees(pan), "exact"),
+        ("stand-in T", "tilt", "deg", nan, 0.01, math.degrees(tilt), "exact; down is negative"),
+        ("stand-in T", "range", "mm", 10464.0, 1.0, reach, "exact; the turned camera has moved too"),
+        (
+            "stand-in T",
+            "f",
+            "px",
+            7155.0,
+            1.0,
+            focal_for_size(BOOK_MM, WANTED_PX, reach),
+            "what the exact method asks for",
+        ),
+    ]
+    gamma = RigidTransform.from_translation(x_zoom0 - np.array(X_FIXED_MM))  # for the depth in x_fixed alone
+    for words, reading in (("Table 1", "table"), ("Section 4.2", "example")):
+        short = shortcut(np.array(X_FIXED_MM), gamma, T, reading)  # type: ignore[arg-type]
+        off = _miss(T, x_zoom0, float(short.pan), float(short.tilt))
+        lines += [
+            ("shortcut", f"pan, depth of {words}", "deg", nan, 0.01, math.degrees(float(short.pan)), ""),
+            ("shortcut", f"tilt, depth of {words}", "deg", nan, 0.01, math.degrees(float(short.tilt)), ""),
+            ("shortcut", f"misses, depth of {words}", "px", nan, 1.0, CLOSEUP_PX * math.tan(off), "in the close-up"),
+        ]
+    return lines
+
+
+def _miss(T: RigidTransform, x_zoom0: Array, pan: float, tilt: float) -> float:
+    """Angle between the zoom camera's axis, with the head at pan and tilt, and a point [rad]."""
+    x_zoom = (T.inv() * base_head(pan, tilt).inv() * T).apply(x_zoom0)  # (2)
+    return float(angle_between(np.array([0.0, 0.0, 1.0]), x_zoom))
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Every number by step and quantity, and which of the printed ones do not follow."""
+    found: dict[str, Any] = {}
+    for i, row in enumerate(rows, 1):
+        key = f"{i}. {row['step']}: {row['quantity']} [{row['unit']}]"
+        found[key] = {name: row[name] for name in ("printed", "found", "difference", "last_digit")}
+        found[key] |= {"remark": row["remark"], "agrees": agrees(row)}
+    return found
+
+
+def agrees(row: Row) -> bool | None:
+    """Whether a printed number is what follows, cut or rounded to its last digit; None where none is printed."""
+    if math.isnan(row["printed"]):
+        return None
+    return bool(abs(row["difference"]) < row["last_digit"])
+
+
+def _is_beside(key: str) -> bool:
+    """Whether a figure is one that the paper does not have."""
+    return any(f". {step}: " in key for step in BESIDE)
+
+
+def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
+    """A line a number."""
+    words = {True: "as printed", False: "NOT as printed", None: ""}
+    lines = [
+        (
+            key,
+            _number(line["printed"], line),
+            _number(line["found"], line),
+            "" if _is_beside(key) else words[line["agrees"]],
+            line["remark"],
+        )
+        for key, line in summary.items()
+    ]
+    return "Section 4.2, step by step\n" + table(("", "printed", "follows", "", "remark"), lines)
+
+
+def _number(value: float, line: Mapping[str, Any]) -> str:
+    """A number with one digit more than is printed."""
+    decimals = 1 - round(math.log10(line["last_digit"]))
+    return "-" if math.isnan(value) else f"{value:.{decimals}f}"
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """What follows from the paper otherwise than is said of it here."""
+    own = {key: line for key, line in summary.items() if not _is_beside(key)}
+    wrong = [
+        key for key, line in own.items() if line["agrees"] is not (KNOWN not in key) and line["agrees"] is not None
+    ]
+    short = [line["found"] for key, line in summary.items() if "short of |x_base|" in key]
+    off = [line["found"] for key, line in summary.items() if ": misses" in key]
+    texts = [f"{key}: {'not ' * (not own[key]['agrees'])}as printed" for key in wrong]
+    if min(short) < OFF_MM:
+        texts.append(f"|x_head| is only {min(short):.1f} mm short of |x_base|")
+    if min(off) < 1:
+        texts.append(f"the shortcut misses by only {min(off):.2f} px")
+    return texts
+
+
+def plot(rows: Sequence[Row], figure: Figure) -> None:
+    """The printed numbers beside what follows, what a rigid motion may not change, and what the shortcut misses by."""
+    figure.set_size_inches(13, 4.8)
+    printed, rigid, misses = figure.subplots(1, 3, width_ratios=(2, 1, 1))
+    _printed(printed, [row for row in rows if not math.isnan(row["printed"])])
+    norms = [row for row in rows if row["quantity"].startswith("|x_")]
+    for i, row in enumerate(norms):
+        rigid.plot([norms[0]["found"], row["found"]], [i, i], color=WRONG)
+        rigid.plot(row["found"], i, "o", color="k")
+        rigid.annotate(f"{row['found']:.1f}", (row["found"], i), (0, 8), textcoords="offset points", ha="center")
+    rigid.axvline(norms[0]["found"], color="k", lw=0.8)
+    rigid.set_yticks(range(len(norms)), [row["quantity"].replace(", ", ",\n") for row in norms])
+    rigid.set(xlabel="[mm]", xticks=[10420, 10450], xlim=(10410, 10460), ylim=(-0.7, len(norms) - 0.5))
+    rigid.set_title("a rotation takes one to the other", size="medium")
+    off = [row for row in rows if row["quantity"].startswith("misses")]
+    bars = misses.bar([row["quantity"].split(" of ")[1] for row in off], [row["found"] for row in off], color=WRONG)
+    misses.bar_label(bars, fmt="%.1f")
+    misses.set(ylabel=f"[px at f = {CLOSEUP_PX:g} px]", xlabel="the depth taken for the range")
+    misses.set_title("shortcut's miss, stand-in T", size="medium")
+    for ax in (rigid, printed):
+        ax.invert_yaxis()
+
+
+def _printed(ax: "Axes", rows: Sequence[Row]) -> None:
+    """What follows, less what is printed, in units of the last digit printed; within the band both agree."""
+    ax.axvspan(-1, 1, color="#dddddd", lw=0)
+    colours = [OTHER if row["step"] in BESIDE else RIGHT if agrees(row) else WRONG for row in rows]
+    for colour, words in (
+        (RIGHT, "as printed"),
+        (WRONG, "not as printed"),
+        (OTHER, "exact, where the paper has a depth"),
+    ):
+        at = [i for i, each in enumerate(colours) if each == colour]
+        units = [rows[i]["difference"] / rows[i]["last_digit"] for i in at]
+        ax.barh(at, units, color=colour, label=words)
+    ax.set_yticks(range(len(rows)), [f"{row['step']}: {row['quantity']} [{row['unit']}]" for row in rows])
+    ax.set_xscale("symlog")
+    ax.set_xticks([-1, 0, 1, 10], ["-1", "0", "1", "10"])
+    ax.set(xlabel="what follows - what is printed [units of the last digit]")
+    ax.legend(frameon=False, fontsize="small")
+
+
+SETTINGS = Settings()
+EXPERIMENT = Experiment(
+    "worked_example",
+    "Section 4.2 of the paper, step by step, beside the numbers that it prints.",
+    SETTINGS,
+    SETTINGS,
+    one,
+    summarise,
+    describe,
+    plot,
+    missed,
+    jobs=once,
+    cost_s=0.1,
+)
+if __name__ == "__main__":
+    sys.exit(EXPERIMENT.main())

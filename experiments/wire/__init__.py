@@ -1,0 +1,1 @@
+"""The figures of drivers and emulators over the wire."""

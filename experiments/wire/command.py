@@ -1,0 +1,176 @@
+"""From a frame's arrival to the first byte of the command that follows from it, through an emulated rig, in its parts.
+
+The pipeline runs as it is: what is timed are the calls that it makes, by devices and a detector that note when they
+are called, and the serial port.
+"""
+
+import bisect
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from cotarget.backends import open_rig
+from cotarget.config import RigConfig
+from cotarget.detection import Detection, Detector, make_detector
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.pipeline import FollowSettings, follow
+from cotarget.rig import Camera, Clock, Frame, Image, PanTilt, PanTiltLimits, PanTiltState, Rig, Speed
+from cotarget.safety import SafeRig
+from experiments.engine.harness import Row
+from experiments.wire.rig import EmulatedRig, Tap, exact_calibration, load, tapped
+
+SCENES = {"book": "indoor", "person": "outdoor"}
+ORDER = re.compile(rb"[PT][PS]-?\d+ ")  # the first bytes of a move; questions have no number
+
+
+@dataclass
+class Turn:
+    """When one turn of the loop came to what [s]; None where it did not."""
+
+    arrived: float
+    read: float
+    detecting: float | None = None
+    detected: float | None = None
+    called: float | None = None
+
+
+@dataclass
+class Notes:
+    """All turns so far."""
+
+    clock: Clock
+    latency_s: float
+    turns: list[Turn] = field(default_factory=list)
+
+
+class TimedCamera:
+    """Notes when a frame arrived, and when it was in hand."""
+
+    def __init__(self, camera: Camera, notes: Notes) -> None:
+        self._camera, self._notes = camera, notes
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px]."""
+        return self._camera.size
+
+    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
+        """The camera's."""
+        frame = self._camera.read(newer_than, timeout)
+        self._notes.turns.append(Turn(frame.t + self._notes.latency_s, self._notes.clock.now()))
+        return frame
+
+
+class TimedHead:
+    """Notes when a move is commanded."""
+
+    def __init__(self, head: PanTilt, notes: Notes) -> None:
+        self._head, self._notes = head, notes
+
+    @property
+    def limits(self) -> PanTiltLimits:
+        """The head's."""
+        return self._head.limits
+
+    def state(self) -> PanTiltState:
+        """The head's."""
+        return self._head.state()
+
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
+        """The head's."""
+        self._notes.turns[-1].called = self._notes.clock.now()
+        return self._head.move(pan, tilt, speed, wait)
+
+    def halt(self) -> None:
+        """The head's."""
+        self._head.halt()
+
+
+class TimedDetector:
+    """Notes when a frame is looked at."""
+
+    def __init__(self, detector: Detector, notes: Notes) -> None:
+        self._detector, self._notes = detector, notes
+
+    @property
+    def mask(self) -> Image | None:
+        """The detector's."""
+        return self._detector.mask
+
+    def detect(self, frame: Frame) -> list[Detection]:
+        """The detector's."""
+        turn, clock = self._notes.turns[-1], self._notes.clock
+        turn.detecting = clock.now()
+        found = self._detector.detect(frame)
+        turn.detected = clock.now()
+        return found
+
+
+class TimedRig:
+    """A rig whose fixed camera and head note when they are called; its owner closes it."""
+
+    def __init__(self, rig: Rig, notes: Notes) -> None:
+        self.fixed, self.head = TimedCamera(rig.fixed, notes), TimedHead(rig.head, notes)
+        self.zoom, self.clock, self.board = rig.zoom, rig.clock, rig.board
+
+
+def run(folder: Path, targets: tuple[str, ...], seconds: float) -> list[Row]:
+    """One row for each command that was sent."""
+    rows = []
+    for name in targets:
+        tables = {"sim": {"scene": SCENES[name], "targets": [name]}}
+        with EmulatedRig(folder / f"command_{name}", tables) as emulated:
+            rows += [{"figure": "command", "target": name, **row} for row in _follow(emulated, name, seconds)]
+    return rows
+
+
+def _follow(emulated: EmulatedRig, name: str, seconds: float) -> list[Row]:
+    config = emulated.config()
+    taps: list[Tap] = []
+    with SafeRig(open_tapped(config, taps), config.safety) as rig:
+        notes = Notes(rig.clock, config.hardware.fixed.latency_s)
+        target = config.target(name)
+        detector = TimedDetector(make_detector(target, config.rate_hz), notes)
+        settings = FollowSettings.of(config)
+        timed, calibration = TimedRig(rig, notes), exact_calibration(emulated.sim)
+        steps = follow(timed, calibration, target, detector, seconds=seconds, settings=settings)  # type: ignore[arg-type]
+        for _ in steps:
+            pass
+    return [row | {"load": load()} for row in _parts(notes.turns, taps[0])]
+
+
+def open_tapped(config: RigConfig, taps: list[Tap]) -> Rig:
+    """Open a rig with the line to its head tapped."""
+    with tapped(MonotonicClock()) as found:
+        rig = open_rig(config)
+    taps += found
+    return rig
+
+
+def _parts(turns: list[Turn], tap: Tap) -> list[Row]:
+    """The parts of each turn whose command reached the wire before the next one was given."""
+    orders = [t for t, data in tap.written if ORDER.fullmatch(data)]
+    calls = [turn for turn in turns if turn.called is not None]
+    rows = []
+    for turn, after in zip(calls, [*calls[1:], None], strict=True):
+        assert turn.called is not None
+        assert turn.detecting is not None
+        assert turn.detected is not None
+        next_order = bisect.bisect_left(orders, turn.called)
+        # Nothing is sent where the head is on its way there already.
+        if next_order == len(orders) or (after is not None and orders[next_order] >= (after.called or 0.0)):
+            continue
+        first_byte = orders[next_order]
+        detection = turn.detected - turn.detecting
+        rows.append(
+            {
+                "t_s": turn.arrived - turns[0].arrived,
+                "in_hand_s": turn.read - turn.arrived,
+                "detection_s": detection,
+                "aiming_s": turn.called - turn.detected + turn.detecting - turn.read,
+                "line_s": first_byte - turn.called,
+                "total_s": first_byte - turn.arrived,
+                "beyond_s": first_byte - turn.arrived - detection,
+            }
+        )
+    return rows

@@ -1,0 +1,149 @@
+"""What the rows of `experiments.wire.wire` come to: each figure beside what is wanted, and what lies behind it."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments.engine.harness import Row
+
+MS = 1e3
+SHARE = 0.9  # of the line's rate, at least
+AGE_MS, DRIFT_MS = 60.0, 10.0  # at most; a median of a third of the frames varies by some 3 ms
+BEYOND_MS = 25.0  # p95 of a command, beyond detection itself
+SETTLED_S = 0.5  # from a fault to a head that stands, or to recovery
+LATENCY_MS = 10.0
+PARITY_STEPS = 1.0
+ROUNDING = 1e-6  # of steps that were angles in between
+PARTS = ("in_hand", "detection", "aiming", "line", "total", "beyond")
+PART_COLUMNS = ("median [ms]", "p95 [ms]", "max [ms]")
+FAULT_COLUMNS = (
+    "outcome", "settled [s]", "halted [s]", "recovered [s]", "moved [deg]", "beyond [deg]", "ended [s]", "hangs",
+    "tracebacks", "runs",
+)  # fmt: skip
+AGAIN = "measured"  # how often, in the rows of what was measured more than once
+Figure = dict[str, Any]
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """Each figure, the parts of commands and ages, and each fault."""
+    of: dict[str, list[Row]] = {}
+    for row in rows:
+        of.setdefault(row["figure"], []).append(row)
+    figures: dict[str, Figure] = {}
+    for row in of.get("polls", []):
+        figures[f"polls, {row['case']}"] = at_least(row["share"], SHARE, f"of {row['pairs_s'] / row['share']:.1f}/s")
+    if ages := of.get("age"):
+        age = np.array([row["age_s"] for row in ages]) * MS
+        thirds = [float(np.median(third)) for third in np.array_split(age, 3)]
+        figures["age of the newest frame, longest"] = at_most(float(age.max()), AGE_MS, "ms")
+        figures["age, last third less first"] = at_most(abs(thirds[2] - thirds[0]), DRIFT_MS, "ms")
+    for name, mine in _by(of.get("command", []), "target").items():
+        beyond = float(np.percentile([row["beyond_s"] for row in mine], 95)) * MS
+        figures[f"command, {name}: p95 beyond detection"] = at_most(beyond, BEYOND_MS, "ms")
+    faults = {name: _fault(mine) for name, mine in _by(of.get("faults", []), "fault", "way").items()}
+    figures |= _of_faults(faults)
+    for row in of.get("latency", []):
+        off = abs(row["measured_s"] - row["truth_s"]) * MS
+        name = f"latency, {row['what']}: {row['measured_s'] * MS:.1f} for {row['truth_s'] * MS:.1f}, off"
+        figures[name] = at_most(off, LATENCY_MS, "ms")
+    if places := of.get("parity"):
+        apart = max(max(row["pan_steps"], row["tilt_steps"]) for row in places)
+        figures["parity, farthest apart"] = at_most(round(apart / ROUNDING) * ROUNDING, PARITY_STEPS, "steps")
+    loads = [row["load"] for row in rows]
+    return {
+        "figures": figures,
+        "parts": _parts(of),
+        "faults": faults,
+        "again": {name: mine[0][AGAIN] for name, mine in of.items() if AGAIN in mine[0]},
+        "load": [min(loads, default=math.nan), max(loads, default=math.nan)],
+    }
+
+
+def missed(summary: Mapping[str, Any]) -> list[str]:
+    """The figures that are not what is wanted."""
+    return [name for name, figure in summary["figures"].items() if not figure["reached"]]
+
+
+def bounded(summary: Mapping[str, Any]) -> dict[str, float]:
+    """What was measured, under names that do not tell what it was measured to be."""
+    return {
+        name.partition(":")[0] if name.startswith("latency") else name: figure["measured"]
+        for name, figure in summary["figures"].items()
+    }
+
+
+def at_most(measured: float, wanted: float, unit: str) -> Figure:
+    """A figure that shall not be larger."""
+    return {"measured": measured, "wanted": f"<= {wanted:g}", "unit": unit, "reached": bool(measured <= wanted)}
+
+
+def at_least(measured: float, wanted: float, unit: str) -> Figure:
+    """A figure that shall not be smaller."""
+    return {"measured": measured, "wanted": f">= {wanted:g}", "unit": unit, "reached": bool(measured >= wanted)}
+
+
+def _by(rows: Iterable[Row], *names: str) -> dict[str, list[Row]]:
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        found.setdefault(" ".join(str(row[name]) for name in names), []).append(row)
+    return found
+
+
+def _parts(of: dict[str, list[Row]]) -> dict[str, dict[str, float]]:
+    """Median, p95 and longest of what a command and an age consist of."""
+    values = {
+        f"{name}: {part}": [row[f"{part}_s"] for row in mine]
+        for name, mine in _by(of.get("command", []), "target").items()
+        for part in PARTS
+    }
+    values |= {f"age: {part}": [row[f"{part}_s"] for row in of["age"]] for part in ("age", "read") if "age" in of}
+    return {
+        name: dict(
+            zip(PART_COLUMNS, (float(v) * MS for v in (np.median(x), np.percentile(x, 95), max(x))), strict=True)
+        )
+        for name, x in values.items()
+    }
+
+
+def _fault(rows: Sequence[Row]) -> dict[str, Any]:
+    """The worst of a fault's repetitions."""
+
+    def worst(name: str) -> float:
+        values = [float(row.get(name, math.nan)) for row in rows]
+        return float(np.nanmax(values)) if np.isfinite(values).any() else math.nan
+
+    # Who never began to follow has settled nothing.
+    started = all("settled_s" in row for row in rows)
+    said = (
+        "/".join(sorted({row["outcome"] for row in rows})),
+        worst("settled_s") if started else math.inf,
+        worst("halted_s"),
+        worst("recovered_s"),
+        worst("moved_deg"),
+        worst("beyond_deg"),
+        worst("ended_s"),
+        sum(row.get("hang", 0) for row in rows),
+        sum(row.get("traceback", 0) for row in rows),
+        len(rows),
+    )
+    return dict(zip(FAULT_COLUMNS, said, strict=True))
+
+
+def _of_faults(faults: dict[str, dict[str, Any]]) -> dict[str, Figure]:
+    if not faults:
+        return {}
+    late = sum(not fault["settled [s]"] <= SETTLED_S for fault in faults.values())
+    worst = {
+        "from a fault to a standing head or recovery, longest": ("settled [s]", SETTLED_S, "s"),
+        "motion beyond the soft limits after a fault": ("beyond [deg]", 0.0, "degrees"),
+    }
+    found = {
+        name: at_most(max(f[column] for f in faults.values()), most, unit)
+        for name, (column, most, unit) in worst.items()
+    }
+    found[f"faults of {len(faults)} for which that took longer"] = at_most(late, 0, "faults")
+    for column in ("hangs", "tracebacks"):
+        found[f"{column} after a fault"] = at_most(sum(f[column] for f in faults.values()), 0, "runs")
+    return found

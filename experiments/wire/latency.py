@@ -1,0 +1,162 @@
+"""The latencies that `cotarget latency` finds over the wire, beside what they really are.
+
+Truth of a camera's frame is when it arrived less when its light fell: a thread asks the emulator all the time when the
+light of each camera's newest picture fell and when it was published, and a frame shows the newest picture that had been
+published when it arrived: what the wire adds is far shorter than a period.
+Truth of a command is when its last byte was on the wire, and the configured delay from there, after it was given.
+"""
+
+import bisect
+import math
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from cotarget.latency import measure_fixed, measure_head
+from cotarget.rig import Frame, Rig, Speed, ZoomCamera, ZoomState
+from cotarget.safety import SafeRig
+from experiments.engine.harness import Row
+from experiments.wire.command import ORDER, Notes, TimedHead, Turn, open_tapped
+from experiments.wire.polls import BYTES_S
+from experiments.wire.rig import EmulatedRig, Tap, exact_calibration, load
+
+LOOK_S = 0.01  # between questions for the newest exposures [s]
+CAMERAS = ("fixed", "zoom")
+
+
+@dataclass
+class Exposures:
+    """Those of one camera: when each picture was published, and when its light fell, in order [s]."""
+
+    published: list[float] = field(default_factory=list)
+    exposed: list[float] = field(default_factory=list)
+
+    def add(self, exposed: float, published: float) -> None:
+        """Note the newest."""
+        if not self.published or published > self.published[-1]:
+            self.published.append(published)
+            self.exposed.append(exposed)
+
+    def before(self, arrived: float) -> float:
+        """The newest that could be seen by then [s]; nan if none could."""
+        found = bisect.bisect_right(self.published, arrived)
+        return self.exposed[found - 1] if found else math.nan
+
+
+class Watcher:
+    """Asks an emulator for exposures, on a connection and a thread of its own; a context manager."""
+
+    def __init__(self, emulated: EmulatedRig) -> None:
+        self._emulated = emulated
+        self.exposures = {name: Exposures() for name in CAMERAS}
+        self._leave = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="exposures", daemon=True)
+
+    def __enter__(self) -> "Watcher":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._leave.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._leave.wait(LOOK_S):
+            for name, moments in self._emulated.truth()["pictures"].items():
+                if moments is not None:
+                    self.exposures[name].add(*moments)
+
+
+class NotedCamera:
+    """A camera that keeps the times of its frames."""
+
+    def __init__(self, camera: ZoomCamera) -> None:
+        self._camera = camera
+        self.times: set[float] = set()
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._camera, name)
+
+    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
+        """The camera's."""
+        frame = self._camera.read(newer_than, timeout)
+        self.times.add(frame.t)
+        return frame
+
+    def state(self) -> ZoomState:
+        """The camera's."""
+        return self._camera.state()
+
+
+class NotedRig:
+    """A rig whose cameras and head note what is asked of them; its owner closes it."""
+
+    def __init__(self, rig: Rig, notes: Notes) -> None:
+        self.fixed, self.zoom = NotedCamera(rig.fixed), NotedCamera(rig.zoom)  # type: ignore[arg-type]
+        self.head, self.clock, self.board = NotedHead(rig.head, notes), rig.clock, rig.board
+
+
+class NotedHead(TimedHead):
+    """Notes each move as a turn of its own."""
+
+    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
+        """The head's."""
+        now = self._notes.clock.now()
+        self._notes.turns.append(Turn(now, now))
+        return super().move(pan, tilt, speed, wait)
+
+
+def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
+    """One row for each camera and for the head's commands."""
+    with EmulatedRig(folder / "latency", {"sim": {"scene": "outdoor"}}) as emulated, Watcher(emulated) as watcher:
+        config = emulated.config()
+        hardware = config.hardware
+        taps: list[Tap] = []
+        with SafeRig(open_tapped(config, taps), config.safety) as rig:
+            notes = Notes(rig.clock, 0.0)
+            noted = NotedRig(rig, notes)
+            found = measure_head(noted, head_seconds)  # type: ignore[arg-type]
+            orders = _commands(notes, taps[0], emulated.sim.sim.head.command_delay_s)
+            calibration = exact_calibration(emulated.sim)
+            swing, _ = measure_fixed(noted, calibration, config.board, board_seconds)  # type: ignore[arg-type]
+        truth = {
+            "fixed": _truth(noted.fixed, hardware.fixed.latency_s, watcher.exposures["fixed"]),
+            "zoom": _truth(noted.zoom, hardware.zoom.latency_s, watcher.exposures["zoom"]),
+            "command": orders,
+        }
+    measured = {
+        "fixed": hardware.fixed.latency_s + swing.seconds + found.zoom.seconds,
+        "zoom": hardware.zoom.latency_s + found.zoom.seconds,
+        "command": found.command,
+    }
+    return [
+        {
+            "figure": "latency",
+            "what": name,
+            "measured_s": value,
+            "truth_s": float(np.nanmedian(truth[name])),
+            "truth_spread_s": float(np.nanpercentile(truth[name], 95) - np.nanpercentile(truth[name], 5)),
+            "samples": len(truth[name]),
+            "load": load(),
+        }
+        for name, value in measured.items()
+    ]
+
+
+def _truth(camera: NotedCamera, latency_s: float, exposures: Exposures) -> list[float]:
+    """From light to each frame of a camera [s]."""
+    arrived = [t + latency_s for t in sorted(camera.times)]
+    return [t - exposures.before(t) for t in arrived]
+
+
+def _commands(notes: Notes, tap: Tap, delay_s: float) -> list[float]:
+    """From each move's call to the motion that its pan ordered [s]."""
+    pans = [(t, len(data)) for t, data in tap.written if ORDER.fullmatch(data) and data.startswith(b"PP")]
+    found = []
+    for turn in notes.turns:
+        sent = next(((t, size) for t, size in pans if t >= turn.read), None)
+        if sent is not None:
+            found.append(sent[0] + sent[1] / BYTES_S + delay_s - turn.read)
+    return found

@@ -1,0 +1,69 @@
+"""Whether the simulation opened directly and through the wire ends up aiming alike at a book that hangs still.
+
+A still book is turned a little to and fro by the simulation, so both look at the same times of the world. The wire's
+zoom camera streams smaller pictures: the book is wanted smaller there by as much, or the lens would stand elsewhere,
+and with it its optical axis.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from cotarget.backends import open_rig
+from cotarget.calibration import Calibration
+from cotarget.config import RigConfig
+from cotarget.detection import make_detector
+from cotarget.emulators.world import paced
+from cotarget.pipeline import FollowSettings, follow
+from cotarget.rig import Rig
+from cotarget.safety import SafeRig
+from cotarget.sim.world import SimWorld
+from experiments.engine.harness import Row
+from experiments.wire.rig import LONGEST_S, MOUNT, EmulatedRig, exact_calibration, load
+
+NAME = "book"
+DISTANCE = (5.0, 9.0)  # of the book [m]
+SIDE, HEIGHT = 0.3, 0.12  # of its distance, to each side of the fixed camera's axis
+SETTLED_S = 1.0  # at the end, over which the head's angles count [s]
+
+
+def run(folder: Path, places: int, seconds: float, seed: int) -> list[Row]:
+    """One row a place."""
+    rng = np.random.default_rng(seed)
+    return [_one(folder / f"parity_{number}", number, place(rng), seconds) for number in range(places)]
+
+
+def place(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Somewhere in view, x, y, z in the world [m]."""
+    y = rng.uniform(*DISTANCE)
+    return float(rng.uniform(-SIDE, SIDE) * y), float(y), float(MOUNT + rng.uniform(-HEIGHT, HEIGHT) * y)
+
+
+def _one(folder: Path, number: int, at: tuple[float, float, float], seconds: float) -> Row:
+    tables = {"sim": {"scene": "indoor", "targets": [NAME], "paths": {NAME: [[0.0, *at], [float(LONGEST_S), *at]]}}}
+    with EmulatedRig(folder, tables) as emulated:
+        calibration = exact_calibration(emulated.sim)
+        config = emulated.config()
+        with SafeRig(open_rig(config), config.safety) as rig:
+            before = emulated.truth()
+            begins = before["world"] + rig.clock.now() - before["t"]
+            wire = _aims(rig, config, calibration, seconds)
+        step = np.radians(emulated.sim.sim.head.step_deg)
+        world = SimWorld(paced(emulated.sim))
+        with SafeRig(world.rig, emulated.sim.safety) as rig:
+            rig.clock.sleep_until(begins)
+            direct = _aims(rig, emulated.sim, calibration, seconds)
+    row = {"figure": "parity", "place": number, "x": at[0], "y": at[1], "z": at[2], "load": load()}
+    for axis, name in enumerate(("pan", "tilt")):
+        row[f"{name}_steps"] = float(abs(wire[-1][axis] - direct[-1][axis]) / step)
+        row[f"{name}_median_steps"] = float(abs(np.median(wire[:, axis]) - np.median(direct[:, axis])) / step)
+    return row
+
+
+def _aims(rig: Rig, config: RigConfig, calibration: Calibration, seconds: float) -> np.ndarray:
+    """Pan and tilt of the head at the end of following, (n, 2) [rad]."""
+    target = config.target(NAME)
+    detector = make_detector(target, config.rate_hz)
+    settings = FollowSettings.of(config)
+    steps = list(follow(rig, calibration, target, detector, seconds=seconds, settings=settings))
+    return np.array([(s.head.pan, s.head.tilt) for s in steps if s.t >= steps[-1].t - SETTLED_S])

@@ -1,0 +1,96 @@
+"""How often the pan-tilt unit's position is polled over a paced pseudo-terminal, beside what the line could carry."""
+
+import time
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from cotarget.config import HardwareHead
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.polled_head import D46Head
+from cotarget.emulators.faults import Faults
+from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
+from cotarget.emulators.ptu_d46.unit import D46_PAPER
+from cotarget.emulators.serve import SerialLine
+from experiments.engine.harness import Row
+from experiments.wire.rig import EmulatedRig, Tap, beside, load, tapped
+
+BAUD, BITS = 9600, 10
+BYTES_S = BAUD / BITS
+NEAR, FAR = (0, 0), (-3000, -1500)  # steps of pan and tilt; the latter take the most digits that a D46's can
+PAN_DEG, TILT_DEG = (-180.0, 180.0), (-79.97, 29.98)  # of D46_PAPER
+UNIT = HardwareHead(baud=BAUD, pan_deg=PAN_DEG, tilt_deg=TILT_DEG, speed_deg_s=100.0)
+QUESTION = b"PP "  # each begins a pair
+
+
+class Standing:
+    """An axis that stands; an `AxisPlant`."""
+
+    def __init__(self, position: int) -> None:
+        self._position = position
+
+    def command(self, goal: int, speed: float, acceleration: float) -> None:
+        """Be there."""
+        self._position = goal
+
+    def halt(self, acceleration: float) -> None:
+        """Stand on."""
+
+    def position(self) -> int:
+        """Where it is."""
+        return self._position
+
+    def speed(self) -> float:
+        """None."""
+        return 0.0
+
+    def moving(self) -> bool:
+        """Never."""
+        return False
+
+
+def serve(pipe: Connection, position: tuple[int, int]) -> None:
+    """A unit on a pseudo-terminal in a process of its own, until somebody says something."""
+    pan, tilt = map(Standing, position)
+    with SerialLine(D46(pan, tilt, D46_PAPER, Faults(D46_FAULTS), time.monotonic), BAUD) as line:
+        pipe.send(line.port)
+        pipe.recv()
+
+
+def poll_alone(position: tuple[int, int], seconds: float) -> Row:
+    """Poll a unit that stands there, with nothing beside it."""
+    with beside(serve, position) as port:
+        name = "alone, {} and {} steps".format(*position)
+        return _poll(name, replace(UNIT, port=port), seconds)
+
+
+def poll_in_world(folder: Path, seconds: float) -> Row:
+    """Poll the unit of an emulated rig, which renders both cameras meanwhile."""
+    with EmulatedRig(folder, {"sim": {"scene": "outdoor", "targets": ["person"]}}) as emulated:
+        return _poll("beside the rendering world", emulated.config().hardware.head, seconds)
+
+
+def run(folder: Path, seconds: float) -> list[Row]:
+    """One row each."""
+    rows = [poll_alone(NEAR, seconds), poll_alone(FAR, seconds), poll_in_world(folder / "polls", seconds)]
+    return [{"figure": "polls", **row, "load": load()} for row in rows]
+
+
+def _poll(case: str, config: HardwareHead, seconds: float) -> Row:
+    clock = MonotonicClock()
+    with tapped(clock) as taps:
+        head = D46Head(config, clock)
+        try:
+            begun, (first, received) = clock.now(), _count(taps[0])
+            clock.sleep_until(begun + seconds)
+            took, (last, received_then) = clock.now() - begun, _count(taps[0])
+        finally:
+            head.close()
+    sent = taps[0].written[first:last]
+    pairs = sum(data == QUESTION for _, data in sent)
+    size = (sum(len(data) for _, data in sent) + received_then - received) / pairs
+    return {"case": case, "pairs_s": pairs / took, "bytes": size, "share": pairs / took / (BYTES_S / size)}
+
+
+def _count(tap: Tap) -> tuple[int, int]:
+    return len(tap.written), tap.received

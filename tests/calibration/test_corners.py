@@ -1,0 +1,127 @@
+"""Corners: found to a fraction of a pixel, and numbered by the board and not by the image."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.board import board_points, check_board, draw_board
+from cotarget.calibration.corners import another_board, find_corners, guess_corners, smallest_spacing
+from cotarget.config import BoardConfig
+from cotarget.errors import ConfigError
+from cotarget.geometry import RigidTransform, Rotation
+from experiments.calibration.synthetic.rig import Truth
+from tests.synthetic_rig import draw, pixel_rays
+
+BOARD = BoardConfig()
+PHOTOS = Path(__file__).parents[3] / "shared" / "data" / "opencv_stereo"
+CORNER_TOLERANCE_PX = 0.15  # the drawing blurs edges only roughly; a mistake of numbering is ten pixels and more
+LENS = Truth().fixed
+RAYS = pixel_rays(LENS)
+
+
+def seen_from(turn: Rotation, depth: float = 3.0):
+    """The board's image at a pose, and where its corners really are."""
+    points = board_points(BOARD)
+    T = RigidTransform.from_components(np.array([0.0, 0.0, depth]) - turn.apply(points.mean(axis=0)), turn)
+    return draw(LENS, T.as_matrix(), BOARD, RAYS).astype(np.uint8), LENS.project(T.apply(points))
+
+
+@pytest.mark.parametrize("roll", [0, 45, 90, 135, 180, 225, 270, 315])
+def test_corners_are_numbered_by_the_colours_whatever_the_roll(roll):
+    turn = Rotation.from_euler("xyz", [20.0, 10.0, 0.0], degrees=True) * Rotation.from_euler("z", roll, degrees=True)
+    image, truth = seen_from(turn)
+    corners = find_corners(image, BOARD)
+    assert corners is not None
+    assert np.abs(corners - truth).max() < CORNER_TOLERANCE_PX
+
+
+@pytest.mark.parametrize("corners", [(9, 6), (6, 9), (4, 3)])
+def test_the_drawn_board_starts_at_its_first_corner_with_a_black_square(corners):
+    board = BoardConfig(corners=corners)
+    image = draw_board(board, 40)
+    assert image.shape == (40 * (corners[1] + 3), 40 * (corners[0] + 3), 3)
+    assert image[60, 60, 0] == 0  # the square diagonally outside the first corner
+    found = find_corners(image, board)
+    expected = board_points(board)[:, :2] / board.square * 40 + 79.5  # the first corner lies between pixels 79 and 80
+    assert found is not None
+    assert np.abs(found - expected).max() < CORNER_TOLERANCE_PX
+
+
+def test_the_upside_down_picture_is_numbered_backwards():
+    image = draw_board(BOARD, 30)
+    corners, turned = find_corners(image, BOARD), find_corners(cv2.rotate(image, cv2.ROTATE_180), BOARD)
+    size = np.array(image.shape[1::-1])
+    assert np.abs((size - 1 - turned) - corners).max() < CORNER_TOLERANCE_PX
+
+
+def test_no_board_is_none():
+    assert find_corners(np.full((480, 640, 3), 128, np.uint8), BOARD) is None
+
+
+@pytest.mark.parametrize("corners", [(8, 6), (9, 7)])
+def test_a_board_that_looks_the_same_upside_down_is_refused(corners):
+    with pytest.raises(ConfigError, match="upside down"):
+        check_board(BoardConfig(corners=corners))
+
+
+LARGER = [(6, 5), (7, 4), *(pytest.param(it, marks=pytest.mark.slow) for it in ((8, 5), (9, 4), (10, 7), (9, 8)))]
+
+
+@pytest.mark.parametrize("corners", LARGER)
+def test_part_of_a_larger_board_is_no_board(corners):
+    """OpenCV's finders do report the inner part of one, which would be numbered differently in every picture."""
+    board = BoardConfig(corners=corners)
+    pictures = [
+        seen_from(Rotation.from_euler("xyz", angles, degrees=True))[0] for angles in ([20, 10, 5], [0, -25, 80])
+    ]
+    for picture in (*pictures, draw_board(BOARD, 30)):
+        assert find_corners(picture, board) is None
+        assert guess_corners(picture) == (9, 6)
+
+
+def test_nothing_is_guessed_of_nothing():
+    assert guess_corners(np.full((480, 640, 3), 128, np.uint8)) is None
+    assert guess_corners(np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)) is None
+
+
+@pytest.mark.parametrize("kind", ["chessboard", "charuco"])
+def test_a_second_board_in_the_picture_is_seen(kind):
+    board = BoardConfig(kind)
+    one = draw_board(board, 30)
+    two = np.concatenate([one, cv2.rotate(one, cv2.ROTATE_180)], axis=1)
+    corners = find_corners(one, board)
+    assert not another_board(one, board, corners)
+    assert another_board(two, board, corners)
+    assert another_board(two, board, corners + np.array([one.shape[1], 0]))
+
+
+def test_a_picture_of_two_boards_gives_one_and_tells_of_the_other():
+    one = draw_board(BOARD, 30)
+    two = np.concatenate([one, one], axis=0)
+    corners = find_corners(two, BOARD)
+    assert corners is None or another_board(two, BOARD, corners)
+
+
+def test_spacing_is_of_the_corners_that_are_seen():
+    corners = board_points(BoardConfig(corners=(3, 4)))[:, :2] * 100
+    corners[0] = np.nan
+    assert smallest_spacing(corners, (3, 4)) == pytest.approx(10.0)
+    assert np.isnan(smallest_spacing(np.full((12, 2), np.nan), (3, 4)))
+
+
+@pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"the real stereo photos are not at {PHOTOS}")
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.slow), 4])
+def test_real_photos_show_the_board_they_show(every):
+    """Its outer squares are cut short, and a screen behind it shows two small boards in some."""
+    guesses = []
+    for path in sorted(PHOTOS.glob("left*.jpg"))[::every]:
+        image = cv2.imread(str(path))
+        corners = find_corners(image, BOARD)
+        assert corners is not None
+        assert not another_board(image, BOARD, corners)
+        assert find_corners(image, BoardConfig(corners=(6, 5))) is None
+        guesses.append(guess_corners(image))
+    assert set(guesses) <= {(9, 6), None}
+    assert guesses.count((9, 6)) >= 0.6 * len(guesses)

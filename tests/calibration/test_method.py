@@ -1,0 +1,204 @@
+"""The sequential method on corners of a known truth, and on real photos."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cotarget.board import board_points
+from cotarget.calibration import Options, calibrate_photos, calibrate_views
+from cotarget.calibration.bundle import EVERY_BLOCK, batches_of, difference, fit, parameter_names, predict, stepped
+from cotarget.calibration.model import RigModel, View
+from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.config import DEFAULT_GAMMA, DEFAULT_T, BoardConfig
+from cotarget.errors import CalibrationError, ConfigError
+from cotarget.geometry import pose
+from cotarget.pantilt import HeadGeometry
+from experiments.calibration.synthetic.aims import pointing_errors
+from experiments.calibration.synthetic.rig import SIZE, Truth, other_rig
+from experiments.calibration.synthetic.views import synthetic_views
+
+BOARD = BoardConfig()
+POINTS = board_points(BOARD)
+SIZES = {"fixed": SIZE, "zoom": SIZE}
+PHOTOS = Path(__file__).parents[3] / "shared" / "data" / "opencv_stereo"
+PHOTO_BOARD = BoardConfig(corners=(9, 6), square=0.025)
+
+
+def test_exact_corners_give_the_truth_exactly():
+    truth = Truth()
+    views = synthetic_views(truth, POINTS, np.random.default_rng(0), boards=8, noise_px=0.0)
+    calibration = calibrate_views(views, BOARD, SIZES)
+    lens = calibration.zoom.stops[0]
+    # Corners are exact to rounding; the solver stops at a relative fall of the cost of 1e-10.
+    assert np.allclose([*lens.focal_px, *lens.center_px], [692, 693, 326, 235], atol=1e-3)
+    assert np.allclose(calibration.T_zoom0_fixed.as_matrix(), truth.gamma.as_matrix(), atol=1e-6)
+    assert np.allclose(calibration.T_head_zoom.as_matrix(), truth.hand.as_matrix(), atol=1e-6)
+    assert calibration.head.axis_offset == pytest.approx(truth.dz, abs=1e-6)
+    assert calibration.head.squareness == pytest.approx(truth.eps, abs=1e-6)
+
+
+@pytest.mark.parametrize(("truth", "bounds", "refined_bounds"), [
+    # Median and p95 [degrees] at 0.1 px noise from 30 boards; the refined ones are five times what is usual.
+    (Truth(), (0.05, 0.10), (0.010, 0.020)),
+    pytest.param(other_rig(), (0.08, 0.16), (0.010, 0.020), marks=pytest.mark.slow),
+], ids=["default", "other"])  # fmt: skip
+def test_noisy_corners_point_well_enough(truth, bounds, refined_bounds):
+    views = synthetic_views(truth, POINTS, np.random.default_rng(1))
+    for method, (median, p95) in (("sequential", bounds), ("joint", refined_bounds)):
+        calibration = calibrate_views(views, BOARD, SIZES, options=Options(method, folds=0))
+        errors = pointing_errors(calibration, truth, np.random.default_rng(5), 40)
+        assert np.median(errors) < median
+        assert np.percentile(errors, 95) < p95
+        # Two coordinates of 0.1 px noise each, less what the parameters take up.
+        assert 0.12 < calibration.residuals.handeye_rms_px < 0.16
+
+
+def test_the_derivatives_are_those_of_the_predictions():
+    rng = np.random.default_rng(0)
+    lens = Intrinsics(SIZE, (686.0, 684.0), (325.0, 239.0), (-0.2, 0.03, 0.001, -0.002, 0.01))
+    boards = {i: pose(np.add(rng.normal(0, 0.3, 3), [-0.4, -0.25, 4]), rng.normal(0, 15, 3)) for i in range(2)}
+    zoom = ZoomLens((667.0, 1334.0), (lens, lens.scaled(2.0)), (0.0, -0.03))
+    head = HeadGeometry(0.05, 0.02, 1.01, 0.98, 0.02, -0.03)
+    model = RigModel(boards, lens, zoom, DEFAULT_GAMMA, DEFAULT_T, head)
+    blank = np.zeros((54, 2))
+    views = [
+        View("fixed", blank, 0),
+        View("zoom", blank, 0, 0.1, -0.2, 667.0),
+        View("zoom", blank, 1, -0.3, 0.1, 667.0),
+        View("zoom", blank, 1, -0.2, 0.1, 1334.0),
+    ]
+    count, still = len(parameter_names(EVERY_BLOCK, 2)), np.zeros((2, 6))
+    h = 1e-5  # central differences err by h^2 of the third derivative, relative to the largest of a column
+    batches = batches_of(model, views)
+    assert [batch.stop for batch in batches] == [None, 0, 1]
+    for batch in batches:
+
+        def change(high, low, batch=batch):
+            return (predict(high, batch, POINTS, ()).pixels - predict(low, batch, POINTS, ()).pixels) / (2 * h)
+
+        found = predict(model, batch, POINTS, EVERY_BLOCK)
+        by_shared = np.zeros((*found.pixels.shape, count))
+        by_shared[..., found.columns] = found.by_shared
+        for k in range(count):
+            steps = (stepped(model, s * h * np.eye(count)[k], still, EVERY_BLOCK) for s in (1, -1))
+            largest = max(1, np.abs(by_shared[..., k]).max())
+            assert np.allclose(change(*steps), by_shared[..., k], atol=1e-6 * largest)
+        for k in range(6):
+            steps = (
+                stepped(model, np.zeros(count), s * h * np.tile(np.eye(6)[k], (2, 1)), EVERY_BLOCK) for s in (1, -1)
+            )
+            assert np.allclose(change(*steps), found.by_board[..., k], atol=1e-6 * np.abs(found.by_board).max())
+        if found.by_turn is not None:
+            for k, axis in enumerate(("pan_zero", "tilt_zero")):
+                heads = (replace(head, **{axis: getattr(head, axis) + s * h}) for s in (1, -1))
+                high, low = (replace(model, head=one) for one in heads)
+                assert np.allclose(change(high, low), found.by_turn[..., k], atol=1e-6 * np.abs(found.by_turn).max())
+
+
+def test_a_step_and_the_difference_are_inverse():
+    lens = Intrinsics(SIZE, (686.0, 684.0), (325.0, 239.0))
+    zoom = ZoomLens((667.0, 1334.0), (lens, lens.scaled(2.0)))
+    model = RigModel({}, lens, zoom, DEFAULT_GAMMA, DEFAULT_T)
+    step = np.random.default_rng(0).normal(0, 0.01, len(parameter_names(EVERY_BLOCK, 2)))
+    there = stepped(model, step, np.zeros((0, 6)), EVERY_BLOCK)
+    assert np.allclose(difference(there, model, EVERY_BLOCK), step, atol=1e-12)
+
+
+def test_only_pan_is_refused():
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=8, tilt_range=0.0)
+    with pytest.raises(CalibrationError, match="only pan moved"):
+        calibrate_views(views, BOARD, SIZES)
+
+
+def test_gamma_comes_from_moved_head_poses_where_there_is_no_common_view_at_home():
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=20)
+    moved = [view for view in views if view.camera == "fixed" or view.pan != 0]
+    calibration = calibrate_views(moved, BOARD, SIZES)
+    assert calibration.residuals.pairs == 0
+    assert calibration.residuals.stereo_rms_px is None
+    assert np.median(pointing_errors(calibration, Truth(), np.random.default_rng(5), 40)) < 0.005
+    with pytest.raises(CalibrationError, match=r"no placement .* at pan = tilt = 0, which the sequential method needs"):
+        calibrate_views(moved, BOARD, SIZES, options=Options("sequential"))
+    apart = [v for v in moved if (v.camera == "fixed") == (v.board % 2 == 0)]
+    with pytest.raises(CalibrationError, match=r"no placement of the board is seen by both cameras"):
+        calibrate_views(apart, BOARD, SIZES)
+
+
+def test_a_bent_board_is_fitted_with_its_bend():
+    """Bulging by 4 mm along x and -2 mm along y, on a board of 0.8 by 0.5 m."""
+    middle, half = POINTS.mean(axis=0), np.ptp(POINTS, axis=0) / 2
+    u, v = ((POINTS - middle)[:, :2] / half[:2]).T
+    bent = POINTS + np.outer(0.004 * (1 - u**2) - 0.002 * (1 - v**2), [0, 0, 1])
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(2), boards=15, shape=bent)
+    calibration = calibrate_views(views, BOARD, SIZES)
+    for name, found, true in zip(("warp_x", "warp_y"), calibration.board_warp, (0.004, -0.002), strict=True):
+        sigma = calibration.covariance.sigma(f"board.{name}")
+        assert found == pytest.approx(true, abs=4 * sigma)
+        assert sigma < 0.0005
+    # A flat board's model leaves 0.01 degrees with it.
+    assert np.median(pointing_errors(calibration, Truth(), np.random.default_rng(5), 40)) < 0.004
+
+
+def test_an_outlying_view_is_left_out_and_named():
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=8)
+    bad = replace(
+        views[5], corners_px=views[5].corners_px + np.random.default_rng(1).normal(0, 5, (54, 2)), source="b.png"
+    )
+    residuals = calibrate_views([*views[:5], bad, *views[6:]], BOARD, SIZES).residuals
+    assert [r.name for r in residuals.rejected] == ["b.png"]
+    assert "px off" in residuals.rejected[0].reason
+
+
+def without_a_head(turned):
+    """Pairs of views of ten placements; in the first so many the zoom camera has been turned, and nobody says so."""
+    truth, rng = Truth(), np.random.default_rng(4)
+    views = synthetic_views(truth, POINTS, rng, boards=30, moved=1, pan_range=0.1, tilt_range=0.1)
+    pairs = []
+    for board in dict.fromkeys(view.board for view in views):
+        fixed, *zoomed = (view for view in views if view.board == board)
+        if len(zoomed) == 2 and zoomed[0].pan == 0 and len(pairs) < 20:
+            pairs += [fixed, replace(zoomed[1 if len(pairs) < 2 * turned else 0], pan=0.0, tilt=0.0)]
+    assert len(pairs) == 20
+    return pairs
+
+
+@pytest.mark.parametrize("method", ["joint", "sequential"])
+@pytest.mark.parametrize("turned", [4, 10])
+def test_two_cameras_that_did_not_stand_still_are_refused(turned, method):
+    with pytest.raises(CalibrationError, match=r"contradict each other: .* must stand still"):
+        calibrate_views(without_a_head(turned), BOARD, SIZES, options=Options(method, folds=0))
+
+
+def test_two_cameras_that_stood_still_are_not():
+    found = calibrate_views(without_a_head(0), BOARD, SIZES, options=Options(folds=0))
+    off = found.T_zoom0_fixed.translation - Truth().gamma.translation
+    assert (np.abs(off) < 3 * np.array([found.covariance.sigma(f"T_zoom0_fixed.t{axis}") for axis in "xyz"])).all()
+
+
+def test_what_cannot_be_calibrated_is_refused_in_words():
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=3)
+    with pytest.raises(CalibrationError, match=r"fixed camera: 0 usable views.*at least 3"):
+        calibrate_views([], BOARD, SIZES)
+    with pytest.raises(CalibrationError, match="the methods are: joint, sequential"):
+        calibrate_views(views, BOARD, SIZES, options=Options("magic"))
+    with pytest.raises(ConfigError, match="upside down"):
+        calibrate_views(views, BoardConfig(corners=(8, 6)), SIZES)
+    with pytest.raises(CalibrationError, match="40 finite corners"):
+        calibrate_views(views, BoardConfig(corners=(8, 5)), SIZES)
+    with pytest.raises(CalibrationError, match="no views"):
+        fit(RigModel({}), [], POINTS, ())
+
+
+@pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"the real stereo photos are not at {PHOTOS}")
+def test_real_photos():
+    calibration = calibrate_photos(PHOTOS, "left*.jpg", "right*.jpg", PHOTO_BOARD)
+    residuals = calibration.residuals
+    assert (residuals.fixed_views, residuals.zoom_views, residuals.pairs) == (13, 13, 13)
+    assert residuals.rejected == ()
+    # Known to be possible with these corners: 0.177, 0.182 and 0.196 px; mrcal's baseline is 83.15 mm.
+    assert max(residuals.fixed_rms_px, residuals.zoom_rms_px, residuals.stereo_rms_px) < 0.20
+    assert np.linalg.norm(calibration.T_zoom0_fixed.translation) == pytest.approx(0.08315, abs=0.0005)
+    assert calibration.T_head_zoom is None
+    assert residuals.handeye_rms_px is None

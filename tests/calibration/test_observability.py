@@ -1,0 +1,150 @@
+"""What views leave undetermined: null spaces of a rig made of numbers, differentiated numerically, in words."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.calibration.observability import name_directions, weak_directions
+from cotarget.errors import CalibrationError
+from cotarget.geometry import RigidTransform, Rotation, pose
+from experiments.calibration.synthetic.rig import Truth
+
+POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
+LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+SIGMA_PX = 0.2
+STEP = 1e-6  # rad and m
+GRID = np.array([[x, y, 0.0] for y in np.linspace(-0.3, 0.3, 6) for x in np.linspace(-0.4, 0.4, 8)])  # [m]
+
+
+def moved(T, step):
+    return RigidTransform.from_components(T.translation + step[3:], Rotation.from_rotvec(step[:3]) * T.rotation)
+
+
+def without_boards(by_shared, by_board):
+    """Normal matrix of the shared parameters, every view's own board eliminated; lists of derivatives."""
+    total = 0
+    for S, B in zip(by_shared, by_board, strict=True):
+        Q = np.linalg.qr(B)[0]
+        S = S - Q @ (Q.T @ S)
+        total = total + S.T @ S
+    return total
+
+
+def lens_normal(board_poses, focal=692.0):
+    """Of fx fy cx cy k1 k2 p1 p2, from OpenCV's derivatives."""
+    K = np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1.0]])
+    parts = []
+    for T in board_poses:
+        J = cv2.projectPoints(GRID, T.rotation.as_rotvec(), T.translation, K, np.array([-0.1, 0, 0, 0, 0.0]))[1]
+        parts.append((J[:, 6:14], J[:, :6]))
+    return without_boards(*zip(*parts, strict=True))
+
+
+LENS_NAMES = [f"fixed.{name}" for name in LENS]
+
+
+def test_boards_that_face_the_camera_say_nothing_of_its_focal_length():
+    flat = [pose([x, y, 3.0], [0, 0, turn]) for x, y, turn in ((0.5, 0.3, 0), (-0.6, 0.2, 40), (0.1, -0.5, -70))]
+    weak = weak_directions(lens_normal(flat), LENS_NAMES, SIGMA_PX**2)
+    text = name_directions(LENS_NAMES, weak)
+    assert text.startswith("the fixed camera's focal length")
+    assert "tilt the boards" in text
+    tilted = [pose([0.1, 0.1, 3.0], [a, b, 0]) for a, b in ((30, 0), (0, 30), (-30, 20), (20, -30))]
+    assert not len(weak_directions(lens_normal(flat + tilted), LENS_NAMES, SIGMA_PX**2))
+
+
+def test_at_a_long_focal_length_the_limits_are_those_of_the_image():
+    """At 7000 px k1 bends the picture so little that nobody misses it."""
+    boards = [
+        pose([x, y, z], [a, b, 0])
+        for x, y, z, a, b in (
+            (0.3, 0.1, 20, 30, 0),
+            (-0.3, 0.2, 25, 0, 30),
+            (0.2, -0.1, 15, -30, 20),
+            (0, 0, 18, 20, -30),
+        )
+    ]
+    normal = lens_normal(boards, 7000.0)
+    assert "distortion" in name_directions(LENS_NAMES, weak_directions(normal, LENS_NAMES, SIGMA_PX**2))
+    focal_px = {"fixed": 7000.0}
+    weak = weak_directions(normal, LENS_NAMES, SIGMA_PX**2, focal_px)
+    assert "distortion" not in name_directions(LENS_NAMES, weak, focal_px)
+
+
+HAND_NAMES = [f"T_head_zoom.{name}" for name in POSE] + ["head.axis_offset", "head.squareness"]
+
+
+def hand_normal(angles):
+    """Of T_head_zoom, axis offset and squareness; two boards that the fixed camera sees as well place themselves."""
+    truth = Truth()
+    parts = []
+    for board in (pose([0.3, -0.1, 3.5], [10, -20, 5]), pose([-0.8, 0.3, 6.0], [20, 15, 0])):
+
+        def seen(step, board=board):
+            at = replace(truth, hand=moved(truth.hand, step[:6]), dz=truth.dz + step[6], eps=truth.eps + step[7])
+            x = moved(board, step[8:]).apply(GRID)
+            images = [at.fixed.project(x)] + [at.zoom.project(at.in_zoom(x, *q)) for q in angles]
+            return np.concatenate(images).ravel()
+
+        J = np.stack([(seen(STEP * e) - seen(-STEP * e)) / (2 * STEP) for e in np.eye(14)], axis=1)
+        parts.append((J[:, :8], J[:, 8:]))
+    return without_boards(*zip(*parts, strict=True))
+
+
+@pytest.mark.parametrize(("angles", "expected"), [
+    ([(0.0, 0.0), (0.2, 0.0), (-0.3, 0.0)],
+     "only pan moved: T_head_zoom's position along the pan axis, T_head_zoom's rotation about the pan axis, "
+     "the head's axis offset and the head's squareness are free; add tilt"),
+    ([(0.0, 0.0), (0.0, 0.2), (0.0, -0.1)],
+     "only tilt moved: T_head_zoom's position along the tilt axis, T_head_zoom's rotation about the tilt axis, "
+     "the head's axis offset and the head's squareness are free; add pan"),
+    ([(0.0, 0.0)], "T_head_zoom's position, T_head_zoom's rotation, the head's axis offset"),
+    ([(0.0, 0.0), (0.2, 0.0), (-0.3, 0.1), (0.1, 0.25)], ""),
+])  # fmt: skip
+def test_a_head_that_moves_too_little(angles, expected):
+    normal = hand_normal(angles)
+    weak = weak_directions(normal, HAND_NAMES, SIGMA_PX**2)
+    text = name_directions(HAND_NAMES, weak)
+    assert text.startswith(expected)
+    assert bool(text) == bool(expected)
+
+
+def test_directions_are_the_null_space_whatever_spans_it():
+    rng = np.random.default_rng(0)
+    normal = hand_normal([(0.0, 0.0), (0.2, 0.0), (-0.3, 0.0)])
+    weak = weak_directions(normal, HAND_NAMES, SIGMA_PX**2)
+    assert weak.shape == (4, 8)  # rotation, shift, axis offset, squareness
+    step = rng.normal(size=(3, 4)) @ weak
+    assert (np.einsum("ki,ij,kj->k", step, normal, step) < SIGMA_PX**2 * np.sum((step / weak.max()) ** 2)).all()
+    mixed = np.array([[1.0, 1, 0, 0], [0, 1, 1, 0], [0, 0, 1, 1], [1, 0, 0, 5]]) @ weak
+    assert name_directions(HAND_NAMES, mixed) == name_directions(HAND_NAMES, weak)
+
+
+@pytest.mark.parametrize(("sigma", "weak"), [(4.9, 0), (5.1, 1)])
+def test_the_limit_is_five_degrees(sigma, weak):
+    names = ["T_zoom0_fixed.ry"]
+    normal = np.array([[1.0]]) / np.radians(sigma) ** 2
+    assert len(weak_directions(normal, names, 1.0)) == weak
+
+
+@pytest.mark.parametrize(("name", "text"), [
+    ("T_zoom0_fixed.tz",
+     "T_zoom0_fixed's position is free; show both cameras the same placements, near and far"),
+    ("zoom[2].pupil", "the zoom camera's stop 2's pupil's shift is free; "
+                      "show boards near and far at that focal length"),
+    ("zoom.k1", "the zoom camera's distortion is free; show boards out to the image's corners"),
+    ("head.pan_scale", "the head's scale of pan is free; add pan"),
+    ("T_head_zoom.tz", "T_head_zoom's position is free; move both pan and tilt further, with boards nearer"),
+])  # fmt: skip
+def test_one_parameter_alone(name, text):
+    names = ["fixed.fx", name]
+    weak = weak_directions(np.diag([1.0, 0.0]), names, 0.0)
+    assert name_directions(names, weak) == text
+
+
+def test_nothing_weak_and_names_nobody_knows():
+    assert name_directions(["fixed.fx"], np.empty((0, 1))) == ""
+    with pytest.raises(CalibrationError, match=r"'fixed\.k9' is no parameter"):
+        weak_directions(np.eye(1), ["fixed.k9"], 1.0)

@@ -1,0 +1,219 @@
+"""A calibration's covariance: honest over many noises, carried through the file, the streams and the aim's budget."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from cotarget.board import board_points
+from cotarget.calibration import (
+    Calibration,
+    Covariance,
+    Options,
+    calibrate_views,
+    line_of_sight_covariance,
+    load_calibration,
+    predicted_pointing,
+    save_calibration,
+)
+from cotarget.calibration.bundle import ALL_BLOCKS, Fit, coordinate_variance, fit, parameter_names
+from cotarget.calibration.initialization import at_home
+from cotarget.calibration.joint import joint
+from cotarget.calibration.model import RigModel
+from cotarget.calibration.uncertainty import covariance_of
+from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.config import BoardConfig
+from cotarget.errors import CalibrationError
+from cotarget.geometry import RigidTransform
+from cotarget.targeting import Reach, aim, error_budget, point_at
+from experiments.calibration.honesty import GROUPS, error_of, inside
+from experiments.calibration.synthetic.aims import draw_targets, pointing_errors
+from experiments.calibration.synthetic.rig import SIZE, Truth, other_rig
+from experiments.calibration.synthetic.views import synthetic_views
+
+BOARD = BoardConfig()
+POINTS = board_points(BOARD)
+SIZES = {"fixed": SIZE, "zoom": SIZE}
+SIGMA_PX = 0.1
+SEEDS = 64
+TARGETS = 8
+# Fractions that a true 90 % leaves once in five hundred times, on either side.
+BY_CHANCE = 0.001
+
+
+def noisy(views, rng, outliers=0.0):
+    """The same views with Gaussian noise; a fraction of the corners is off by ten times as much."""
+    sigmas = [np.where(rng.random((len(POINTS), 1)) < outliers, 10 * SIGMA_PX, SIGMA_PX) for _ in views]
+    return [
+        replace(v, corners_px=v.corners_px + rng.normal(0, 1, v.corners_px.shape) * s)
+        for v, s in zip(views, sigmas, strict=True)
+    ]
+
+
+def calibrated(model, covariance):
+    return Calibration(model.fixed, model.zoom, model.gamma, model.hand, model.head, covariance=covariance)
+
+
+def honesty(truth, seeds, outliers=0.0):
+    """Fraction of 90 % ellipsoids that hold the truth, of each group; measured and predicted rms pointing error."""
+    exact = synthetic_views(truth, POINTS, np.random.default_rng(7), boards=8, noise_px=0.0)
+    start = joint(exact, POINTS, SIZES, [667.0]).model  # the same optimum as from elsewhere
+    hits = dict.fromkeys(GROUPS, 0)
+    measured, predicted = [], []
+    for seed in range(seeds):
+        result = fit(start, noisy(exact, np.random.default_rng([seed, 1]), outliers), POINTS, ALL_BLOCKS)
+        calibration = calibrated(result.model, covariance_of(result))
+        for name, parameters in GROUPS.items():
+            hits[name] += inside(calibration, truth, parameters, 0.9)
+        measured.append(np.radians(pointing_errors(calibration, truth, np.random.default_rng(seed), TARGETS)))
+        predicted.append(predicted_pointing(calibration, *draw_targets(np.random.default_rng(seed), TARGETS)))
+    rms = [float(np.sqrt(np.mean(np.square(errors)))) for errors in (measured, predicted)]
+    return {name: count / seeds for name, count in hits.items()}, *rms
+
+
+# 32 seeds know an rms to 8 %, so that this is three standard deviations.
+POINTING_TOLERANCE = 0.25
+
+
+@pytest.mark.slow
+def test_the_covariance_is_honest():
+    half = SEEDS // 2
+    rigs = [honesty(truth, half, outliers) for truth, outliers in ((Truth(), 0.0), (other_rig(), 0.05))]
+    lowest, highest = (binom.ppf(p, SEEDS, 0.9) / SEEDS for p in (BY_CHANCE, 1 - BY_CHANCE))
+    for name in GROUPS:
+        fraction = np.mean([fractions[name] for fractions, _, _ in rigs])
+        assert lowest <= fraction <= highest, f"{name}: {fraction:.2f} of the 90 % ellipsoids hold the truth"
+    for _, measured, predicted in rigs:
+        assert measured == pytest.approx(predicted, rel=POINTING_TOLERANCE)
+
+
+def ideal(parameters, matrix):
+    """Both cameras in one place that looks along +z, on a head whose axes cross there; f = 500 px."""
+    lens = Intrinsics((641, 481), (500.0, 500.0), (320.0, 240.0))
+    still = RigidTransform.identity()
+    return Calibration(
+        lens, ZoomLens((500.0,), (lens,)), still, still, covariance=Covariance(parameters, np.array(matrix, float))
+    )
+
+
+WANDERED = 5 * 641 / 640
+
+
+@pytest.mark.parametrize(("parameters", "matrix", "nominal", "expected"), [
+    # Straight ahead at 10 m: a pixel is 1/500 rad, a metre 1/10 rad.
+    (("fixed.cx",), [[4.0]], 500.0, [[(2 / 500) ** 2, 0], [0, 0]]),
+    (("zoom[0].cy",), [[4.0]], 500.0, [[0, 0], [0, (2 / 500) ** 2]]),
+    # At twice the only focal length calibrated, the axis may have wandered by 5 px of 640; the image has 641.
+    (("zoom[0].cy",), [[4.0]], 1000.0, [[WANDERED**2 / 1000**2, 0], [0, (2**2 + WANDERED**2) / 1000**2]]),
+    (("fixed.cx", "zoom[0].cx"), [[4.0, 4.0], [4.0, 4.0]], 500.0, [[0, 0], [0, 0]]),  # the same error in both cancels
+    (("fixed.cx", "fixed.cy"), [[4.0, 2.0], [2.0, 1.0]], 500.0, [[4 / 500**2, 2 / 500**2], [2 / 500**2, 1 / 500**2]]),
+    (("fixed.fx", "fixed.k1"), [[4.0, 0], [0, 1.0]], 500.0, [[0, 0], [0, 0]]),  # in the middle neither shows
+    (("T_zoom0_fixed.tx",), [[0.01]], 500.0, [[0.0001, 0], [0, 0]]),
+    (("T_zoom0_fixed.ry",), [[0.01]], 500.0, [[0.01, 0], [0, 0]]),
+    (("T_zoom0_fixed.tz", "T_zoom0_fixed.rz"), [[0.01, 0], [0, 0.01]], 500.0, [[0, 0], [0, 0]]),
+    (("T_head_zoom.tx", "T_head_zoom.ry"), [[0.01, 0], [0, 0.01]], 500.0, [[0, 0], [0, 0]]),  # the head has not moved
+])  # fmt: skip
+def test_worked_by_hand(parameters, matrix, nominal, expected):
+    found = line_of_sight_covariance(ideal(parameters, matrix), np.array([320.0, 240.0]), 10.0, nominal_px=nominal)
+    assert np.allclose(found, expected, rtol=1e-6, atol=1e-12)  # by differences of 1e-5
+
+
+def test_many_targets_at_once_and_out_of_reach():
+    pixels, depths = np.array([[[320.0, 240.0], [100.0, 50.0], [600.0, 400.0]]]), np.array([[10.0, 4.0, 30.0]])
+    calibration = ideal(("T_zoom0_fixed.tx", "fixed.cx", "T_head_zoom.tx"), np.diag([1e-4, 1.0, 1e-4]))
+    together = predicted_pointing(calibration, pixels, depths)
+    assert together.shape == (1, 3)
+    alone = [float(predicted_pointing(calibration, p, z)) for p, z in zip(pixels[0], depths[0], strict=True)]
+    assert np.allclose(together[0], alone, rtol=1e-9)
+    lever = RigidTransform.from_translation([0.0, 0.5, 0.0])  # with the fixed camera where the axes cross
+    calibration = replace(calibration, T_head_zoom=lever, T_zoom0_fixed=lever.inv())
+    near_and_far = predicted_pointing(calibration, pixels[0, 0], [0.1, 10.0])
+    assert np.isnan(near_and_far).tolist() == [True, False]  # nearer than the lever arm
+
+
+@pytest.fixture(scope="module")
+def views():
+    return synthetic_views(Truth(), POINTS, np.random.default_rng(3), boards=8, noise_px=SIGMA_PX)
+
+
+@pytest.fixture(scope="module")
+def calibration(views):
+    return calibrate_views(views, BOARD, SIZES)
+
+
+def test_every_free_parameter_has_its_place(calibration):
+    covariance = calibration.covariance
+    assert covariance.parameters == parameter_names(ALL_BLOCKS)
+    assert len(covariance.parameters) == 8 + 8 + 6 + 6 + 2 + 2
+    assert not [name for name in covariance.parameters if "k3" in name]  # it is held
+    assert np.linalg.eigvalsh(covariance.matrix / np.sqrt(np.multiply.outer(*2 * [np.diag(covariance.matrix)])))[0] > 0
+    error = error_of(calibration, Truth())
+    sigmas = np.sqrt(np.diag(covariance.matrix))
+    assert max(abs(error[n]) / s for n, s in zip(covariance.parameters, sigmas, strict=True)) < 5
+
+
+def test_it_goes_through_the_file_and_stays_small(calibration, tmp_path):
+    with_it, without = tmp_path / "with.json", tmp_path / "without.json"
+    save_calibration(with_it, calibration)
+    save_calibration(without, replace(calibration, covariance=None))
+    after = load_calibration(with_it)
+    assert after.covariance.parameters == calibration.covariance.parameters
+    assert (after.covariance.matrix == calibration.covariance.matrix).all()
+    assert with_it.stat().st_size - without.stat().st_size < 28_000  # 1024 numbers
+
+
+def test_a_scaled_stream_points_as_well(calibration):
+    pixel = np.array([500.0, 100.0])
+    half = calibration.for_streams((320, 240), (320, 240))
+    assert float(predicted_pointing(half, (pixel + 0.5) / 2 - 0.5, 8.0)) == pytest.approx(
+        float(predicted_pointing(calibration, pixel, 8.0)), rel=1e-5
+    )
+
+
+def test_the_budget_of_an_aim_includes_it(calibration):
+    pixel, reach = np.array([500.0, 100.0]), Reach((-1.5, 1.5), (-1.0, 1.0), (667.0, 7000.0), step=0.001)
+    found = aim(calibration, point_at(calibration, pixel, 8.0), reach, nominal_px=2000.0)
+    budget = error_budget(calibration, pixel, found, reach, size_px=40.0)
+    assert set(budget) == {"steps", "pixel", "size", "calibration", "total"}
+    assert budget["calibration"] == pytest.approx(float(predicted_pointing(calibration, pixel, 8.0, nominal_px=2000.0)))
+    assert budget["total"] ** 2 == pytest.approx(sum(v**2 for name, v in budget.items() if name != "total"))
+    without = error_budget(replace(calibration, covariance=None), pixel, found, reach)
+    assert set(without) == {"steps", "pixel", "total"}
+
+
+def test_where_there_is_none(views, calibration):
+    sequential_only = calibrate_views(views, BOARD, SIZES, options=Options(method="sequential"))
+    assert sequential_only.covariance is None
+    with pytest.raises(CalibrationError, match="no covariance"):
+        predicted_pointing(sequential_only, np.array([320.0, 240.0]), 8.0)
+    pair_only = calibrate_views([v for v in views if v.camera == "fixed" or at_home(v)], BOARD, SIZES)
+    assert pair_only.covariance.parameters == parameter_names(("fixed", "zoom", "gamma", "warp"))
+    with pytest.raises(CalibrationError, match="no T_head_zoom"):
+        predicted_pointing(pair_only, np.array([320.0, 240.0]), 8.0)
+    strange = replace(calibration, covariance=Covariance(("fixed.k4",), np.eye(1)))
+    with pytest.raises(CalibrationError, match=r"'fixed.k4' is no parameter; they are: fixed.fx, "):
+        predicted_pointing(strange, np.array([320.0, 240.0]), 8.0)
+
+
+def test_what_the_views_leave_open_has_no_covariance():
+    lens = Intrinsics(SIZE, (686.0, 684.0), (325.0, 239.0))
+    model, off = RigModel({0: RigidTransform.identity()}, lens), np.full((2, 20, 2), 0.1)
+
+    def found(normal, variance=0.01):
+        return covariance_of(Fit(model, ("fixed",), off, off, normal, variance, 0.0, ()))
+
+    assert found(np.eye(8)) is not None
+    assert found(np.ones((8, 8))) is None
+    assert found(np.zeros((8, 8))) is None
+    assert found(np.eye(8), None) is None
+    assert coordinate_variance(off[0, :7], 14) is None  # 14 coordinates, 14 parameters
+
+
+def test_the_variance_of_a_coordinate():
+    residuals = np.random.default_rng(0).normal(0, SIGMA_PX, (5400, 2))
+    clean = coordinate_variance(residuals, 0)
+    assert clean == pytest.approx(SIGMA_PX**2, rel=0.05)  # known to 1.4 %, and 1 % more by Huber's cut
+    assert coordinate_variance(residuals, residuals.size // 2) == pytest.approx(2 * clean)
+    residuals[::54] += 5.0  # one corner in 54, fifty times off, where the mean of squares would grow fiftyfold
+    assert coordinate_variance(residuals, 0) < 2 * clean

@@ -1,0 +1,217 @@
+"""What commands keep when they end early, and what they say of a run in which much went wrong."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cotarget.cli.common import FEW, MANY, Reasons, folded
+from cotarget.drawing import side_by_side
+from cotarget.errors import DeviceError
+from cotarget.pipeline import State, follow
+from cotarget.video import Film, FilmWriter
+from tests.cli.test_commands import OLD, call
+from tests.recorded_run import Bright, ToyRig, calibration_file, record
+from tests.test_drawing import step
+
+FOLLOW = ("follow", "--rig", "rig.toml", "--calibration", "rig_calibration.json", "--target", "bird",
+          "--csv", "out.csv", "--video", "out.mp4")  # fmt: skip
+EARLY = "; out.mp4 holds what there was until then; out.csv holds what there was until then\n"
+FRAMES = 9  # before it ends
+
+
+class WatchedRig(ToyRig):
+    """Notes what was written when the head was halted and the rig was closed."""
+
+    def __init__(self, folder, failing):
+        super().__init__(failing)
+        self.path, self.written = folder / "out.csv", []
+
+    def close(self):
+        assert self.calls["head.halt"]
+        self.written.append(self.path.read_text())
+        super().close()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A working folder with a rig, a calibration and a result of before."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("cotarget.detection.make_detector", lambda *_: Bright())
+    (tmp_path / "rig.toml").write_text('[sim]\ntargets = ["bird"]\n[safety]\nstop_file = "stop"\n')
+    calibration_file(tmp_path)
+    (tmp_path / "out.csv").write_text(OLD)
+    return tmp_path
+
+
+def frames_of(path):
+    with Film(path) as film:
+        return len(list(film))
+
+
+def rows_of(path):
+    return len(path.read_text().splitlines()) - 1
+
+
+@pytest.mark.parametrize(("error", "status", "said"), [
+    (KeyboardInterrupt(), 130, "interrupted"),
+    (SystemExit(143), 143, "terminated"),
+    (DeviceError("the camera is gone"), 1, "the camera is gone"),
+])  # fmt: skip
+def test_follow_keeps_what_was_seen_until_it_ended_and_halts_the_head_first(
+    folder, capsys, monkeypatch, error, status, said
+):
+    error.__dict__.pop("__notes__", None)
+    rig = WatchedRig(folder, {("fixed.read", FRAMES + 1): error})
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: rig)
+    assert call(capsys, *FOLLOW) == (status, "", f"cotarget follow: {said}{EARLY}")
+    assert rig.written == [OLD]
+    assert rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") == FRAMES
+    assert not [path for path in folder.iterdir() if ".part" in path.name]
+
+
+def test_an_emergency_stop_keeps_what_was_seen(folder, capsys, monkeypatch):
+    class Stopped(ToyRig):
+        def count(self, what):
+            super().count(what)
+            if self.calls["fixed.read"] == FRAMES:
+                (folder / "stop").write_text("the cat\n")
+
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: Stopped())
+    status, out, err = call(capsys, *FOLLOW)
+    assert (status, out) == (1, "")
+    assert "emergency stop: the cat" in err
+    assert err.endswith(EARLY)
+    assert rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") > 0
+
+
+def test_a_run_that_ends_before_its_first_step_leaves_the_old_table(folder, capsys, monkeypatch):
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: ToyRig({("fixed.read", 1): DeviceError("gone")}))
+    assert call(capsys, *FOLLOW) == (1, "", "cotarget follow: gone\n")
+    assert (folder / "out.csv").read_text() == OLD
+    assert not (folder / "out.mp4").exists()
+
+
+def test_a_replay_keeps_what_was_seen(folder, capsys, monkeypatch):
+    def interrupted(*args, **options):
+        for number, each in enumerate(follow(*args, **options)):
+            if number == FRAMES:
+                raise KeyboardInterrupt
+            yield each
+
+    record(folder / "run", folder / "rig_calibration.json", seconds=0.6)
+    monkeypatch.setattr("cotarget.pipeline.follow", interrupted)
+    status, out, err = call(capsys, "replay", "run", *FOLLOW[-4:])
+    assert (status, out, err) == (130, "", f"cotarget replay: interrupted{EARLY}")
+    assert rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") == FRAMES
+
+
+def test_detect_keeps_what_was_found(folder, capsys, monkeypatch):
+    with FilmWriter(folder / "film.mp4", 25.0) as film:
+        for index in range(2 * FRAMES):
+            film.write(ToyRig().fixed.expose(index))
+    seen = []
+
+    def detect(self, frame, plain=Bright.detect):
+        seen.append(frame.t)
+        if len(seen) > FRAMES:
+            raise KeyboardInterrupt
+        return plain(self, frame)
+
+    monkeypatch.setattr(Bright, "detect", detect)
+    monkeypatch.setattr("cotarget.detect_video.make_detector", lambda *_: Bright())
+    status, out, err = call(capsys, "detect", "film.mp4", *FOLLOW[-6:])
+    assert (status, out, err) == (130, "", f"cotarget detect: interrupted{EARLY}")
+    assert frames_of(folder / "out.mp4") == FRAMES
+    assert 0 < rows_of(folder / "out.csv") <= FRAMES
+
+
+def test_what_went_wrong_is_told_at_the_end_and_in_json(folder, capsys, monkeypatch):
+    """A head that may hardly turn: the bird, 10 to 15 degrees off the axis, is beyond its limits."""
+    with (folder / "rig.toml").open("a") as file:
+        file.write("pan_deg = [-1, 1]\n")
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: ToyRig())
+    status, out, err = call(capsys, *FOLLOW, "--seconds", "1")
+    assert status == 0
+    told = json.loads(out)
+    assert list(told["reasons"].values()) == sorted(told["reasons"].values(), reverse=True)
+    [line] = err.splitlines()
+    beyond, count = next((name, count) for name, count in told["reasons"].items() if "beyond the limits" in name)
+    assert beyond.startswith("the point needs pan #, tilt #")
+    assert line.startswith("cotarget follow: ")
+    assert f"{count} of {told['steps']} frames: the point needs pan " in line
+    assert "beyond the limits pan -1 to 1," in line
+
+
+@pytest.mark.parametrize(("reason", "name"), [
+    ("out of sight for 0.5 s", "out of sight for # s"),
+    ("out of sight for 10.6 s", "out of sight for # s"),
+    ("needs pan -4.20, tilt 1.06 or pan 173.18, tilt -1.5e-05 degrees", "needs pan #, tilt # degrees"),
+    ("needs pan -4.20, tilt 1.06 degrees", "needs pan #, tilt # degrees"),
+    ("zoom: unsure", "zoom: unsure"),
+])  # fmt: skip
+def test_numbers_make_no_other_reason(reason, name):
+    assert folded(reason) == name
+
+
+def reasons_of(*runs):
+    """Of runs of (how many Steps, their reason, whether there is a target)."""
+    reasons, plain = Reasons(), step(0.0)
+    for count, reason, seen in runs:
+        for _ in range(count):
+            reasons.see(_with(plain, reason, seen))
+    return reasons
+
+
+def _with(plain, reason, seen):
+    state = State.FOLLOWING if seen else State.SEARCHING
+    return replace(plain, reason=reason, state=state, target=plain.target if seen else None)
+
+
+@pytest.mark.parametrize("runs", [
+    [(500, "nothing is detected", False)],  # told in other words
+    [(300, "nothing is detected", False), (100, "", True)],
+    [(10, "what is detected is not believed yet", False), (90, "", True), (40, "zoom: unsure", True)],
+    [(60, "", True), (50, "out of sight for 0.5 s; looked for where it should be", True)],
+    [(3, "", True), (MANY - 1, "zoom: unsure", True)],  # so short a run tells nothing
+    [(50, "", True), (FEW - 1, "both views make it 0.1 m", True)],
+    [(1000, "", True), (40, "both views make it 0.1 m", True)],
+])  # fmt: skip
+def test_what_is_usual_is_no_warning(runs):
+    assert reasons_of(*runs).warning == ""
+
+
+@pytest.mark.parametrize(("runs", "said"), [
+    ([(83, "", True), (60, "needs pan 3", True), (7, "needs pan 9.5", True)], "67 of 150 frames: needs pan 9.5"),
+    ([(90, "a is 1; b", True), (10, "b", True)], "100 of 100 frames: b; 90 of 100 frames: a is 1"),
+    ([(10, "", True), (40, "out of sight for 2 s", True)], "40 of 50 frames: out of sight for 2 s"),
+    ([(10, "says\n1 thing", True)], "10 of 10 frames: says 1 thing"),
+])  # fmt: skip
+def test_what_is_wrong_for_many_frames_is_told_most_frequent_first(runs, said):
+    assert reasons_of(*runs).warning == said
+
+
+def test_the_table_counts_every_frame():
+    table = reasons_of((2, "a 1; zoom: unsure", True), (3, "a 2", True), (1, "", True)).table
+    assert table == {"a #": 5, "zoom: unsure": 2}
+
+
+def test_the_film_shows_the_reason():
+    """At the foot of the wide view, in more lines for more words."""
+    bright = np.full((480, 640, 3), 255, np.uint8)
+    plain = step(0.0)
+    plain = replace(plain, fixed=replace(plain.fixed, image=bright), zoom=replace(plain.zoom, image=bright))
+    without = side_by_side(plain, "bird").astype(int)
+
+    def rows(reason):
+        """Which rows of which view show anything else."""
+        changed = np.any(side_by_side(replace(plain, reason=reason), "bird").astype(int) != without, axis=2)
+        assert not changed[:, 640:].any()
+        assert not changed[:, 630:].any()
+        return np.flatnonzero(changed.any(axis=1))
+
+    short, long = rows("zoom: unsure"), rows("the head points 1.3 degrees beside " * 4)
+    assert 440 < short.min() < short.max() < 480
+    assert long.min() < short.min() - 10
+    assert long.max() < 480

@@ -1,0 +1,207 @@
+"""No result replaces what a command reads: whatever is named, everything stays as it was, and one line says why."""
+
+import os
+
+import cv2
+import pytest
+
+from cotarget.calibration import save_calibration
+from cotarget.config import RigConfig
+from cotarget.files import PartFile
+from tests.cli.test_commands import OLD, call, draw_photo, true_calibration, write_index
+from tests.recorded_run import ToyRig, calibration_file, record
+from tests.test_video import bird_film
+
+RIG = """
+backend = "{backend}"
+recording = "run"
+[sim]
+scene = "hall.xml"
+targets = ["bird"]
+[safety]
+stop_file = "stop"
+[targets.book]
+template = "cover.png"
+"""
+INPUTS = ("rig.toml", "rig_calibration.json", "hall.xml", "stop", "cover.png", "film.mp4", "labels.csv", "link")
+RECORDING = ("run/log.jsonl", "run/meta.json", "run/fixed/000000.png", "run/fixed/whatever.csv", "run/new.csv")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Everything that commands read."""
+    folder = tmp_path_factory.mktemp("made")
+    record(folder / "run", calibration_file(folder), seconds=0.2)
+    (folder / "rig.toml").write_text(RIG.format(backend="sim"))
+    (folder / "replay.toml").write_text(RIG.format(backend="replay"))
+    (folder / "hall.xml").write_text("<mujoco/>")
+    (folder / "cover.png").write_bytes(b"a cover")
+    (folder / "labels.csv").write_text("frame,x_px,y_px,width_px,height_px\n")
+    bird_film(folder / "film.mp4", 5)
+    (folder / "link").symlink_to("rig.toml")
+    (folder / "loop").symlink_to("loop")
+    (folder / "way").symlink_to("run")
+    (folder / "captures").mkdir()
+    (folder / "captures" / "a.png").write_bytes(b"a photo")
+    row = {"file": "a.png", "camera": "fixed", "board": 0, "pan": 0.0, "tilt": 0.0, "focal_px": None, "t": 0.0}
+    write_index(folder / "captures", [row])
+    save_calibration(folder / "captures" / "calibration.json", true_calibration(RigConfig()))
+    return folder
+
+
+@pytest.fixture
+def folder(made, monkeypatch):
+    """It is the working folder, and nothing in it has changed afterwards."""
+    monkeypatch.chdir(made)
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: ToyRig())
+    before = contents(made)
+    yield made
+    assert contents(made) == before
+
+
+def contents(folder):
+    return {path: path.readlink() if path.is_symlink() else path.is_file() and path.read_bytes()
+            for path in folder.rglob("*")}  # fmt: skip
+
+
+FOLLOW = ("follow", "--rig", "rig.toml", "--calibration", "rig_calibration.json", "--target", "bird", "--seconds", "1")
+REPLAYED = ("follow", "--rig", "replay.toml", *FOLLOW[3:])
+DETECT = ("detect", "film.mp4", "--rig", "rig.toml", "--target", "bird", "--labels", "labels.csv", "--csv")
+CALIBRATE = ("calibrate", "--rig", "rig.toml")
+REFUSED = [
+    *(((*FOLLOW, option), name) for option in ("--csv", "--video") for name in INPUTS if name not in DETECT),
+    *(((*FOLLOW, "--record", "new", option), "new") for option in ("--csv", "--video")),
+    *(((*REPLAYED, option), name) for option in ("--csv", "--video", "--record") for name in RECORDING),
+    *((("replay", "run", option), name) for option in ("--csv", "--video") for name in (*RECORDING, "way/log.jsonl")),
+    (("replay", "run", "--labels", "labels.csv", "--csv"), "labels.csv"),
+    *((DETECT, name) for name in INPUTS if name != "rig_calibration.json"),
+    *(((*DETECT, "new.csv", "--video"), name) for name in INPUTS if name != "rig_calibration.json"),
+    *(((*CALIBRATE, "--out"), name) for name in ("rig.toml", "hall.xml", "stop", "cover.png", "link")),
+    (("calibrate", "--rig", "replay.toml", "--out"), "run/log.jsonl"),
+    (("calibrate", "--rig", "replay.toml", "--captures"), "run/captures"),
+    ((*CALIBRATE, "--captures", "captures", "--out"), "captures/index.json"),
+    (("calibrate", "--from", "captures", "--out"), "captures/index.json"),
+    (("calibrate", "--from", "captures", "--out"), "captures/a.png"),
+    (("report", "rig_calibration.json", "--out"), "rig_calibration.json"),
+    (("emulate", "--rig", "rig.toml", "--write"), "hall.xml"),
+    (("point", "--rig", "replay.toml", "--pictures"), "run"),
+]
+
+
+@pytest.mark.parametrize(("command", "name"), REFUSED, ids=lambda value: value if isinstance(value, str) else value[-1])
+def test_what_is_read_is_not_written(folder, capsys, command, name):
+    status, out, err = call(capsys, *command, name)
+    assert (status, out) == (1, "")
+    [line] = err.splitlines()
+    assert line.startswith(f"cotarget {command[0]}: {name}")
+    assert "is read or written" in line
+
+
+@pytest.mark.parametrize(("command", "said"), [
+    (("point",), "a recording's head and lens cannot be sent anywhere"),
+    (("calibrate", "--out", "new.json"), "what a session has captured is calibrated by --from DIR"),
+    (("aim", "--calibration", "rig_calibration.json", "--pixel", "9", "9", "--depth", "9"), "of the rig that was rec"),
+])  # fmt: skip
+def test_a_recording_is_no_rig_to_be_driven(folder, capsys, command, said):
+    status, out, err = call(capsys, *command, "--rig", "replay.toml")
+    assert (status, out) == (1, "")
+    [line] = err.splitlines()
+    assert line.startswith(f"cotarget {command[0]}: replay.toml: backend is 'replay'; ")
+    assert said in line
+
+
+@pytest.mark.parametrize("name", ["loop", "pipe", "/dev/null", "run"])
+def test_what_is_no_file_is_not_replaced(folder, capsys, name):
+    if name == "pipe":
+        os.mkfifo(folder / "pipe")
+    try:
+        for command in ((*FOLLOW, "--csv"), (*FOLLOW, "--video"), DETECT, ("board", "--out")):
+            status, out, err = call(capsys, *command, name)
+            assert (status, out) == (1, "")
+            assert len(err.splitlines()) == 1
+            assert f"{name}: is a " in err
+        assert name != "pipe" or (folder / "pipe").is_fifo()
+    finally:
+        (folder / "pipe").unlink(missing_ok=True)
+
+
+def test_where_the_result_is_printed_no_other_is_written(folder, capsys, tmp_path):
+    """As with `--csv /dev/stdout > file`."""
+    with (tmp_path / "said").open("w") as file:
+        for stream in (1, 2):
+            kept = os.dup(stream)
+            try:
+                os.dup2(file.fileno(), stream)
+                status, _, err = call(capsys, *FOLLOW, "--csv", tmp_path / "said")
+            finally:
+                os.dup2(kept, stream)
+                os.close(kept)
+            assert status == 1
+            assert "is where this command's own words go" in err
+
+
+def test_a_link_to_a_result_is_written_through(folder, capsys, tmp_path):
+    goal, link = tmp_path / "goal.csv", tmp_path / "link.csv"
+    goal.write_text(OLD)
+    link.symlink_to(goal)
+    assert call(capsys, *DETECT[:-3], "--csv", link)[0] == 0
+    assert link.is_symlink()
+    assert goal.read_text().startswith("frame,t,track")
+
+
+def test_a_calibration_through_a_link_keeps_the_one_of_before(tmp_path):
+    from cotarget.cli.common import previous_kept
+
+    goal, link = tmp_path / "goal.json", tmp_path / "link.json"
+    goal.write_text(OLD)
+    link.symlink_to(goal)
+    with previous_kept(link):
+        save_calibration(link, true_calibration(RigConfig()))
+    assert link.is_symlink()
+    assert (tmp_path / "goal.previous-1.json").read_text() == OLD
+    assert not (tmp_path / "goal.previous-1.json").is_symlink()
+    assert goal.read_text() != OLD
+
+
+@pytest.mark.parametrize("name", ["calibration.json", "calib", "left.txt"])
+def test_a_calibration_may_lie_beside_the_captures_it_is_from(folder, capsys, tmp_path, name):
+    """There is one already, which is what is to be replaced; what is wrong here are the photos."""
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for photo in ("left1.png", "right1.png"):
+        cv2.imwrite(str(photos / photo), draw_photo())
+    (photos / name).write_text(OLD)
+    status, _, err = call(
+        capsys, "calibrate", "--from", photos, "--fixed", "left*.png", "--zoom", "right*.png", "--board", "9x6",
+        "--square", "0.1", "--out", photos / name,
+    )  # fmt: skip
+    assert status == 1
+    assert "at least 3" in err
+
+
+@pytest.mark.parametrize("name", ["left1.png", "calib"])
+def test_a_calibration_takes_the_place_of_no_photo_and_of_nothing_in_an_index(folder, capsys, tmp_path, name):
+    """Of captures with an index, what it lists is read."""
+    cv2.imwrite(str(tmp_path / "left1.png"), draw_photo())
+    row = {"file": "left1.png", "camera": "fixed", "board": 0, "pan": 0.0, "tilt": 0.0, "focal_px": None, "t": 0.0}
+    write_index(tmp_path, [row])
+    (tmp_path / "calib").write_text(OLD)
+    status, _, err = call(capsys, "calibrate", "--from", tmp_path, "--out", tmp_path / name)
+    assert (status, "is read or written" in err) == (1, name == "left1.png")
+    assert (tmp_path / "calib").read_text() == OLD
+
+
+def test_a_calibration_that_could_not_be_written_is_told_before_the_session(folder, capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: pytest.fail("opened"))
+    out = tmp_path / "c.json"
+    writing = PartFile(out)
+    try:
+        status, _, err = call(capsys, *CALIBRATE, "--out", out)
+    finally:
+        with writing.ending(keep=False):
+            pass
+    assert (status, err.count("\n")) == (1, 1)
+    assert "is being written by another run" in err
+    (tmp_path / ".c.part.json").mkdir()
+    status, _, err = call(capsys, *CALIBRATE, "--out", out)
+    assert (status, err) == (1, f"cotarget calibrate: {out}: cannot be written: Is a directory\n")

@@ -1,0 +1,245 @@
+"""What commands leave behind: earlier results kept, progress where nobody looks, numbers as people write them."""
+
+import json
+import math
+import os
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.cli.common import previous_kept, print_json, progress_bar
+from cotarget.config import RigConfig
+from cotarget.errors import CalibrationError, DeviceError
+from cotarget.rig import Frame, ZoomState
+from tests.cli.test_commands import OLD, call, true_calibration
+from tests.safety_rigs import SimulatedRig
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A working folder with a rig."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text("[sim]\n")
+    return tmp_path
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir() if path.name != "rig.toml")
+
+
+def test_a_result_of_before_is_kept_beside_the_new_one(folder, capsys):
+    path = folder / "c.json"
+    for text in ("first", "second", "third"):
+        with previous_kept(path):
+            path.with_name("new").write_text(text)
+            path.with_name("new").replace(path)
+    assert {name: (folder / name).read_text() for name in names(folder)} == {
+        "c.json": "third",
+        "c.previous-1.json": "first",
+        "c.previous-2.json": "second",
+    }
+    assert capsys.readouterr().err.splitlines() == [
+        f"{path}: the one of before is kept as {folder / 'c.previous-1.json'}",
+        f"{path}: the one of before is kept as {folder / 'c.previous-2.json'}",
+    ]
+
+
+def test_a_result_that_fails_leaves_no_second_name_behind(folder, capsys):
+    path = folder / "c.json"
+    path.write_text(OLD)
+    with pytest.raises(CalibrationError), previous_kept(path):
+        raise CalibrationError("the disk is full")
+    assert names(folder) == ["c.json"]
+    assert path.read_text() == OLD
+    assert capsys.readouterr().err == ""
+
+
+def test_a_file_system_without_links_keeps_a_copy(folder, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    path = folder / "c.json"
+    path.write_text(OLD)
+    with previous_kept(path):
+        path.write_text("new")  # in place, which a link would follow
+    assert (folder / "c.previous-1.json").read_text() == OLD
+
+
+class Session:
+    """A capture session that takes an image and then fails, or not."""
+
+    def __init__(self, error=None):
+        self.error, self.told = error, {}
+
+    def __call__(self, rig, board, *, captures_dir, **told):
+        self.told = told
+        if captures_dir is not None:
+            captures_dir.mkdir(exist_ok=True)
+            (captures_dir / "index.json").write_text("{}")
+        if self.error is not None:
+            raise self.error
+        return true_calibration(RigConfig())
+
+
+@pytest.fixture
+def sessions(monkeypatch):
+    """Lets `calibrate --rig` open a rig without a world; its session is what a test says."""
+    rig = SimulatedRig()
+    rig.zoom.still_size, rig.zoom.focal_range = rig.zoom.size, RigConfig().focal_range_px  # 12 x zoom
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: rig)
+    return lambda error=None: monkeypatch.setattr("cotarget.calibration.calibrate_rig", Session(error))
+
+
+CALIBRATE = ("calibrate", "--rig", "rig.toml", "--captures", "kept")
+HINT = "the captures so far are in kept: cotarget calibrate --from kept fits them"
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (DeviceError("the camera is gone"), 1, "cotarget calibrate: the camera is gone"),
+        (CalibrationError("the motions leave T open"), 1, "cotarget calibrate: the motions leave T open"),
+        (KeyboardInterrupt(), 130, "cotarget calibrate: interrupted"),
+        (SystemExit(143), 143, None),
+    ],
+)
+def test_a_session_that_ends_early_says_how_to_go_on(folder, capsys, sessions, error, status, said):
+    sessions(error)
+    assert call(capsys, *CALIBRATE) == (status, "", "\n".join([HINT, *([said] if said else [])]) + "\n")
+
+
+def test_captures_of_another_session_are_not_taken_for_its_own(folder, capsys, sessions):
+    (folder / "kept").mkdir()
+    (folder / "kept" / "index.json").write_text("{}")
+    sessions(CalibrationError("kept: already holds captures; give another folder"))
+    status, _, err = call(capsys, *CALIBRATE)
+    assert (status, err) == (1, "cotarget calibrate: kept: already holds captures; give another folder\n")
+
+
+@pytest.mark.parametrize(
+    ("stops", "taken", "said"),
+    [
+        (None, None, None),  # as many as the session has by default
+        (1, 1, None),
+        (2, 4, "2 stops of the zoom lens are 12 times apart"),
+        (3, 4, "3 stops of the zoom lens are 3.5 times apart"),
+        (4, 4, None),
+        (9, 9, None),
+    ],
+)
+def test_stops_that_are_too_far_apart_have_others_between_them(
+    folder, capsys, monkeypatch, sessions, stops, taken, said
+):
+    """Each at most 2.5 times the one before: from 1 to 12 by 2.29 takes three steps."""
+    sessions()
+    session = Session(CalibrationError("enough"))
+    monkeypatch.setattr("cotarget.calibration.calibrate_rig", session)
+    status, _, err = call(capsys, "calibrate", "--rig", "rig.toml", *([] if stops is None else ["--stops", stops]))
+    assert status == 1
+    assert session.told.get("stops") == taken
+    lines = err.splitlines()
+    assert lines[-1] == "cotarget calibrate: enough"
+    assert len(lines) == 1 + (said is not None)
+    assert said is None or lines[0].startswith(said)
+    assert said is None or lines[0].endswith("; 4 are taken")
+
+
+def test_an_earlier_calibration_is_kept(folder, capsys, sessions, monkeypatch):
+    monkeypatch.setattr("cotarget.cli.calibrating.summary", lambda found, path: {"zero": -0.0})
+    found = true_calibration(RigConfig())
+    sessions()
+    monkeypatch.setattr("cotarget.calibration.calibrate_rig", lambda *_, **__: _with_residuals(found))
+    (folder / "calibration.json").write_text(OLD)
+    status, out, err = call(capsys, "calibrate", "--rig", "rig.toml")
+    assert (status, out) == (0, '{\n  "zero": 0.0\n}\n')
+    assert err == "calibration.json: the one of before is kept as calibration.previous-1.json\n"
+    assert (folder / "calibration.previous-1.json").read_text() == OLD
+    assert "schema" in json.loads((folder / "calibration.json").read_text())
+
+
+def _with_residuals(found):
+    from dataclasses import replace
+
+    from cotarget.calibration.model import Residuals
+
+    return replace(found, residuals=Residuals(0.1, 0.1, 0.1, 0.1, 1, 1, 1, 0))
+
+
+def test_progress_is_a_line_now_and_then_where_nobody_looks(capsys):
+    time = iter([0.0, 29.0, 31.0, 45.0, 62.0])
+    with progress_bar(lambda: next(time)) as progress:
+        for done in range(4):
+            progress(f"board {done}", done, 8)
+    assert capsys.readouterr().err.splitlines() == ["board 1 (12 %, 31 s)", "board 3 (38 %, 62 s)"]
+
+
+def test_zeros_have_no_sign(capsys):
+    print_json({"a": -0.0, "b": [-0.0, {"c": np.float64(-0.0)}], "d": -1.5, "e": None, "f": "-0.0", "g": True})
+    assert json.loads(capsys.readouterr().out) == {
+        "a": 0.0, "b": [0.0, {"c": 0.0}], "d": -1.5, "e": None, "f": "-0.0", "g": True,
+    }  # fmt: skip
+    print_json({"a": -0.0})
+    assert capsys.readouterr().out == '{\n  "a": 0.0\n}\n'
+
+
+@pytest.fixture
+def pointed(folder, monkeypatch):
+    """A rig for `point`, with pictures and a lens of 6 to 72 mm."""
+    rig = SimulatedRig()
+    image = np.zeros((2, 2, 3), np.uint8)
+    range_px = RigConfig().focal_range_px
+    rig.zoom = SimpleNamespace(
+        size=(2, 2),
+        focal_range=range_px,
+        state=lambda: ZoomState(range_px[0], moving=False, t=rig.clock.now()),
+        capture=lambda: Frame(image, rig.clock.now()),
+        zoom=lambda focal: rig.head.log.append(("zoom", focal)),
+    )
+    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: rig)
+    return rig
+
+
+@pytest.mark.parametrize(
+    ("wish", "said"),
+    [
+        (["--pan-deg", "200"], "--pan-deg: 200 is beyond the head's -158.9 to 158.9 degrees"),
+        (["--pan-deg", "-159"], "--pan-deg: -159 is beyond the head's -158.9 to 158.9 degrees"),
+        (["--tilt-deg", "-80"], "--tilt-deg: -80 is beyond the head's -46.6 to 31.1 degrees"),
+        (["--pan-deg", "5", "--tilt-deg", "85", "--focal-mm", "9"], "--tilt-deg: 85 is beyond the head's"),
+        (["--pan-deg", "5", "--focal-mm", "100"], "--focal-mm: 100 is beyond the lens's 6 to 72 mm"),
+    ],
+)
+def test_what_is_beyond_the_end_stops_moves_nothing(pointed, capsys, wish, said):
+    status, out, err = call(capsys, "point", "--rig", "rig.toml", *wish)
+    assert (status, out) == (1, "")
+    assert err.startswith(f"cotarget point: {said}")
+    assert len(err.splitlines()) == 1
+    assert not [what for what, _ in pointed.head.log if what != "halt"]
+
+
+def test_soft_limits_are_limits(pointed, capsys, folder):
+    (folder / "rig.toml").write_text("[safety]\npan_deg = [-90, 90]\n")
+    assert (
+        "--pan-deg: 91 is beyond the head's -90 to 90 degrees"
+        in call(capsys, "point", "--rig", "rig.toml", "--pan-deg", "91")[2]
+    )
+    status, out, _ = call(capsys, "point", "--rig", "rig.toml", "--pan-deg", "90")
+    assert status == 0
+    assert json.loads(out)["pan_deg"] == pytest.approx(90, abs=math.degrees(pointed.head.limits.step))
+
+
+def test_earlier_pictures_are_kept(pointed, capsys, folder):
+    point = ("point", "--rig", "rig.toml", "--pan-deg", "0", "--pictures", ".")
+    status, out, err = call(capsys, *point)
+    assert (status, err) == (0, "")
+    assert "-0.0" not in out
+    first = (folder / "zoom.png").read_bytes()
+    assert cv2.imdecode(np.frombuffer(first, np.uint8), cv2.IMREAD_COLOR).shape == (2, 2, 3)
+    status, _, err = call(capsys, *point)
+    assert status == 0
+    assert [line.partition(":")[0] for line in err.splitlines()] == ["fixed.png", "zoom.png"]
+    assert names(folder) == ["fixed.png", "fixed.previous-1.png", "zoom.png", "zoom.previous-1.png"]
+    assert (folder / "zoom.previous-1.png").read_bytes() == first

@@ -1,0 +1,249 @@
+"""A program that is ended by signals, at its end or by surprise: the head is halted, and the devices are released."""
+
+import contextlib
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from cotarget.calibration import save_calibration
+from cotarget.config import RigConfig
+from tests.cli.test_commands import true_calibration
+from tests.safety_rigs import DEADLINE_S
+
+# A program with a rig in real time that says what its devices are told; a halt waits for a line on stdin.
+PROGRAM = """
+import sys, time
+from tests.safety_rigs import RealRig
+from cotarget.config import SafetyConfig
+from cotarget.safety import SafeRig
+
+def say(word):
+    print(word, flush=True)
+
+def halt():
+    say("halting")
+    sys.stdin.readline()
+    say("halted")
+
+rig = RealRig()
+rig.head.halt = halt
+rig.close = lambda: say("closed")
+"""
+WORK = """
+with SafeRig(rig, SafetyConfig(watchdog_s=1000.0)) as safe:
+    safe.head.move(0.5, 0.0)
+    say("working")
+    time.sleep(1000)
+"""
+# The command on the simulation, in which each halt waits for a line too.
+FOLLOW = """
+import sys
+from cotarget import cli
+from cotarget.sim.devices import SimPanTilt, SimRig
+
+def noted(cls, name, before, after, wait=False):
+    act = getattr(cls, name)
+    def noting(self, *args, **kwargs):
+        print(before, flush=True)
+        if wait:
+            sys.stdin.readline()
+        said = act(self, *args, **kwargs)
+        print(after, flush=True)
+        return said
+    setattr(cls, name, noting)
+
+noted(SimPanTilt, "move", "moving", "moved")
+noted(SimPanTilt, "halt", "halting", "halted", wait=True)
+noted(SimRig, "close", "closing", "closed")
+sys.exit(cli.main(["follow", "--rig", "rig.toml", "--calibration", "good.json", "--target", "book",
+                   "--seconds", "1000", "--csv", "steps.csv"]))
+"""
+ROOT = Path(__file__).parents[2]
+
+
+class Child:
+    """A program whose lines are waited for with a deadline."""
+
+    def __init__(self, program, folder):
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", program], cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)},
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, bufsize=0,
+        )  # fmt: skip
+        self.lines, self.rest = [], b""
+
+    def wait_for(self, line):
+        """Read until a line comes that was not there before."""
+        seen, deadline = len(self.lines), time.monotonic() + 3 * DEADLINE_S
+        with selectors.DefaultSelector() as selector:
+            selector.register(self.process.stdout, selectors.EVENT_READ)
+            while line not in self.lines[seen:]:
+                assert selector.select(max(deadline - time.monotonic(), 0.0)), f"no '{line}': {self.lines}"
+                data = os.read(self.process.stdout.fileno(), 65536)
+                assert data, f"ended without '{line}': {self.lines}, {self.process.stderr.read().decode()}"
+                *whole, self.rest = (self.rest + data).split(b"\n")
+                self.lines += [text.decode() for text in whole]
+
+    def signal(self, number):
+        self.process.send_signal(number)
+
+    def answer(self):
+        """Let the head be halted once."""
+        self.process.stdin.write(b"\n")
+
+    def is_suspended(self):
+        return Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
+
+    def wait_until_suspended(self):
+        deadline = time.monotonic() + DEADLINE_S
+        while not self.is_suspended():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+    def finish(self, answers=8):
+        """Answer every halt from now on; its exit status, all of its lines and what it said on stderr."""
+        out, err = self.process.communicate(b"\n" * answers, timeout=3 * DEADLINE_S)
+        self.lines += (self.rest + out).decode().splitlines()
+        return self.process.returncode, self.lines, err.decode()
+
+    def close(self):
+        self.process.kill()
+        self.process.communicate()
+
+
+@pytest.fixture
+def start(tmp_path):
+    children = []
+
+    def start(program):
+        children.append(Child(program, tmp_path))
+        return children[-1]
+
+    yield start
+    for child in children:
+        child.close()
+
+
+@pytest.mark.parametrize(("number", "status", "again"), [
+    (signal.SIGINT, -signal.SIGINT, 0),  # python's own way to end after Ctrl-C
+    (signal.SIGINT, -signal.SIGINT, 4),
+    (signal.SIGTERM, 128 + signal.SIGTERM, 1),
+    (signal.SIGHUP, 128 + signal.SIGHUP, 1),  # a terminal that was closed, a connection that broke
+    (signal.SIGQUIT, 128 + signal.SIGQUIT, 1),  # Ctrl-\
+])  # fmt: skip
+def test_a_signal_halts_the_head_and_further_ones_do_not_keep_it_from_that(start, number, status, again):
+    child = start(PROGRAM + WORK)
+    child.wait_for("working")
+    child.signal(number)
+    child.wait_for("halting")
+    for _ in range(again):
+        child.signal(number)
+    returned, lines, _ = child.finish()
+    assert lines == ["working", "halting", "halted", "closed"]
+    assert returned == status
+
+
+@pytest.mark.parametrize("number", [signal.SIGTSTP, signal.SIGTTOU])
+def test_ctrl_z_halts_the_head_before_it_suspends_the_program(start, number):
+    child = start(PROGRAM + WORK)
+    child.wait_for("working")
+    child.signal(number)
+    child.wait_for("halting")
+    assert not child.is_suspended()
+    child.answer()
+    child.wait_until_suspended()
+    child.signal(signal.SIGCONT)
+    child.signal(signal.SIGTERM)
+    returned, lines, _ = child.finish()
+    assert lines == ["working", "halting", "halted", "halting", "halted", "closed"]
+    assert returned == 128 + signal.SIGTERM
+
+
+def test_a_program_whose_head_cannot_be_halted_is_not_suspended(start):
+    """Its watchdog goes on trying."""
+    broken = (
+        "tries = []\ndef halt():\n    tries.append(1)\n    say('tried')\n    if len(tries) < 3: raise OSError('dead')\n"
+    )
+    child = start(PROGRAM + broken + "rig.head.halt = halt\n" + WORK)
+    child.wait_for("working")
+    child.signal(signal.SIGTSTP)
+    for _ in range(3):
+        child.wait_for("tried")
+    child.signal(signal.SIGTERM)
+    returned, lines, err = child.finish()
+    assert lines == ["working", *["tried"] * 4, "closed"]
+    assert "not suspended, because the head could not be halted: dead" in err
+    assert returned == 128 + signal.SIGTERM
+
+
+def test_a_signal_while_a_good_end_halts_the_head_acts_afterwards(start):
+    child = start(PROGRAM + "with SafeRig(rig, SafetyConfig()):\n    pass\nsay('never')")
+    child.wait_for("halting")
+    child.signal(signal.SIGTERM)
+    returned, lines, _ = child.finish()
+    assert lines == ["halting", "halted", "closed"]
+    assert returned in (128 + signal.SIGTERM, -signal.SIGTERM)
+
+
+def test_devices_that_do_not_let_go_do_not_hold_the_program_for_ever(start):
+    """Once the head is halted, enough of Ctrl-C ends the wait for a device that hangs."""
+    child = start(PROGRAM + "rig.close = lambda: (say('closing'), time.sleep(1000))" + WORK)
+    child.wait_for("working")
+    child.signal(signal.SIGINT)
+    child.process.stdin.write(b"\n")
+    child.wait_for("closing")
+    deadline = time.monotonic() + DEADLINE_S
+    while child.process.poll() is None:  # as a person would
+        assert time.monotonic() < deadline
+        child.signal(signal.SIGINT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.process.wait(0.05)
+    returned, lines, _ = child.finish()
+    assert lines == ["working", "halting", "halted", "closing"]
+    assert returned == -signal.SIGINT
+
+
+def test_a_rig_that_nobody_closes_is_halted_at_the_end(start):
+    child = start(PROGRAM + "safe = SafeRig(rig, SafetyConfig(watchdog_s=1000.0))\nsafe.head.move(0.5, 0.0)")
+    returned, lines, err = child.finish()
+    assert (returned, lines, err) == (0, ["halting", "halted", "closed"], "")
+
+
+def test_a_program_that_sets_its_own_handlers_keeps_them(start):
+    own = "import signal\nsignal.signal(signal.SIGTERM, lambda *_: say('mine'))\n"
+    child = start(PROGRAM + own + WORK.replace("sleep(1000)", "sleep(0)"))
+    child.wait_for("halting")
+    child.signal(signal.SIGTERM)
+    returned, lines, err = child.finish()
+    assert (returned, lines, err) == (0, ["working", "halting", "halted", "closed", "mine"], "")
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(("number", "status", "said"), [
+    (signal.SIGINT, 130, "interrupted"),
+    pytest.param(signal.SIGTERM, 143, "terminated", marks=pytest.mark.slow),
+    pytest.param(signal.SIGHUP, 129, "terminated", marks=pytest.mark.slow),
+])  # fmt: skip
+def test_following_is_ended_by_a_signal_with_the_head_halted(start, tmp_path, number, status, said):
+    """A second signal comes while the head is being halted; only then is the table completed, with what there is."""
+    (tmp_path / "rig.toml").write_text('[sim]\nscene = "indoor"\ntargets = ["book"]\n')
+    save_calibration(tmp_path / "good.json", true_calibration(RigConfig()))
+    child = start(FOLLOW)
+    child.wait_for("moved")
+    child.signal(number)
+    child.wait_for("halting")
+    child.signal(number)
+    assert not (tmp_path / "steps.csv").exists()
+    returned, lines, err = child.finish()
+    last = len(lines) - lines[::-1].index("moving") if "moving" in lines else 0
+    assert lines[last:] in (
+        ["moved", "halting", "halted", "closing", "halting", "halted", "closed"],
+        ["halting", "halted", "closing", "halting", "halted", "closed"],  # ended in the middle of a command
+    )
+    assert (returned, err) == (status, f"cotarget follow: {said}; steps.csv holds what there was until then\n")
+    assert len((tmp_path / "steps.csv").read_text().splitlines()) > 1

@@ -1,0 +1,306 @@
+"""The scene as somebody watches it: frusta that end where the images do, a page on this machine, and clean endings."""
+
+import gc
+import itertools
+import socket
+import urllib.error
+import urllib.request
+import warnings
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.cli import running
+from cotarget.config import RigConfig, SimConfig
+from cotarget.errors import DeviceError
+from cotarget.sim.render.opengl import mujoco
+from cotarget.sim.viewer import browser, desktop
+from cotarget.sim.viewer.scene import FAR, SIDE_POINTS, Onlooker, Sight, frusta_of, frustum_rim, line_geoms
+from cotarget.sim.world import SimWorld
+from tests.cli.test_commands import call
+
+NEAR_PX = 1e-6  # rounding, and the inverse of the distortion
+NEAR_M = 1e-5  # MjvGeom has floats of 32 bits
+ANSWER_S = 5.0
+
+
+@pytest.fixture(scope="module")
+def world():
+    made = SimWorld(RigConfig(sim=SimConfig(scene="indoor", targets=("book",))), rendered=())
+    made.rig.head.move(0.3, -0.1)
+    made.rig.zoom.zoom(3000.0)
+    made.rig.clock.sleep_until(5.0)
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("depth", [2.0, 30.0])
+@pytest.mark.parametrize("camera", ["fixed", "zoom"])
+@pytest.mark.parametrize("t", [0.0, 5.0])
+def test_a_frustum_ends_at_the_corners_of_the_image(world, camera, t, depth):
+    truth = world.truth()
+    lens, T = truth.lens(camera, t), truth.T_world_camera(camera, t)
+    rim = frustum_rim(T, lens, depth)
+    (w, h), (fx, fy), (cx, cy) = lens.size, lens.focal_px, lens.center_px
+    border = truth.pixel(camera, rim, t)
+    corners = [[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5]]
+    np.testing.assert_allclose(border[::SIDE_POINTS], corners, atol=NEAR_PX)
+    x_camera = T.inv().apply(rim)
+    np.testing.assert_allclose(x_camera[:, 2], depth)
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    independent, _ = cv2.projectPoints(x_camera.copy(), np.zeros(3), np.zeros(3), K, np.array(lens.distortion))
+    np.testing.assert_allclose(independent[:, 0], border, atol=NEAR_PX)
+
+
+def test_the_zoom_cameras_frustum_follows_head_and_lens_and_the_wide_ones_does_not(world):
+    before, after = (frusta_of(world.truth(), t, {"zoom": 10.0}) for t in (0.0, 5.0))
+    np.testing.assert_array_equal(before["fixed"], after["fixed"])
+
+    def span(lines):
+        return np.linalg.norm(lines[0, 0] - lines[2 * SIDE_POINTS, 0])  # the end's diagonal
+
+    pitch = world.config.sim.zoom.pitch_mm
+    factor = 3000.0 / (world.config.sim.zoom.focal_mm[0] / pitch)
+    assert span(before["zoom"]) / span(after["zoom"]) == pytest.approx(factor, rel=0.03)  # the lens's own curve
+    middle = np.mean(after["zoom"][: 4 * SIDE_POINTS, 0], axis=0) - np.mean(
+        before["zoom"][: 4 * SIDE_POINTS, 0], axis=0
+    )
+    right, up = world.truth().T_world_camera("zoom", 0.0).rotation.as_matrix()[:, :2].T @ middle * [1, -1]
+    assert (right, up) == (pytest.approx(10 * np.sin(0.3), rel=0.05), pytest.approx(-10 * np.sin(0.1), rel=0.3))
+
+
+def test_lines_are_drawn_from_end_to_end(world):
+    lines = frusta_of(world.truth(), 5.0)
+    geoms = [mujoco.MjvGeom() for _ in range(100)]
+    assert line_geoms(Sight(5.0, "", {}, lines), iter(geoms)) == 2 * (4 * SIDE_POINTS + 4)
+    for (begin, end), geom in zip(itertools.chain(*lines.values()), geoms, strict=False):
+        along = geom.mat.reshape(3, 3)[:, 2] * geom.size[2]
+        np.testing.assert_allclose(geom.pos, begin, atol=NEAR_M)
+        np.testing.assert_allclose(geom.pos + along, end, atol=NEAR_M)
+
+
+def test_an_onlookers_state_is_the_worlds_and_stays_when_the_world_moves_on(world):
+    onlooker, truth = Onlooker(world.truth()), world.truth()
+    onlooker.come_to(5.0)
+    mujoco.mj_kinematics(onlooker.model, onlooker.data)
+    eye = np.array(onlooker.data.body("rig/zoom").xpos)
+    np.testing.assert_allclose(eye, truth.set_bodies(5.0).body("rig/zoom").xpos)
+    truth.set_bodies(0.0)
+    np.testing.assert_array_equal(onlooker.data.body("rig/zoom").xpos, eye)
+
+
+class People:
+    """People's time, which passes only when somebody waits."""
+
+    def __init__(self):
+        self.t = 0.0
+
+    def now(self):
+        return self.t
+
+    def sleep(self, s):
+        self.t += s
+
+
+class Window:
+    """Notes when it was shown what; closed by somebody after so many moments."""
+
+    def __init__(self, clock, closed_after=1000):
+        self.clock, self.shown, self._closed_after = clock, [], closed_after
+
+    def show(self, sight):
+        self.shown.append((sight.t, self.clock.now()))
+
+    def is_open(self):
+        return len(self.shown) < self._closed_after
+
+
+def moments(clock, took):
+    for index, s in enumerate(took):
+        clock.sleep(s)  # the machine's work
+        yield Sight(index * 0.1, "", {}, {})
+
+
+def test_nothing_happens_quicker_than_it_does_and_a_slow_moment_is_not_made_up_for():
+    clock = People()
+    window = Window(clock)
+    running.watch(moments(clock, [0.0, 0.02, 0.02, 0.5, 0.02]), window, clock.now, clock.sleep)
+    np.testing.assert_allclose([at for _, at in window.shown], [0.0, 0.02, 0.12, 0.7, 0.72])
+    np.testing.assert_allclose(clock.now(), 0.8)
+
+
+def test_it_ends_when_the_window_is_closed():
+    clock = People()
+    window = Window(clock, closed_after=2)
+    running.watch(moments(clock, [0.0] * 9), window, clock.now, clock.sleep)
+    assert len(window.shown) == 2
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    (tmp_path / "hw.toml").write_text('backend = "hardware"\n')
+    (tmp_path / "rig.toml").write_text('[sim]\ntargets = ["book"]\n')
+    return tmp_path
+
+
+@pytest.mark.parametrize(("arguments", "said"), [
+    ((), "this machine has no display; --browser shows the scene in a web browser instead"),
+    (("--port", "8080"), "--port: is of the page that --browser serves; give both"),
+    (("--calibration", "c.json"), "--calibration: is for following a target; name it: --target NAME"),
+    (("--target", "cow"), "unknown target 'cow'; the targets are: bird, book, person"),
+    (("--rig", "hw.toml"), "hw.toml: backend is 'hardware'; what is viewed is a simulated rig"),
+    (("--rig", "none.toml"), "none.toml: no such file; give the path of a rig.toml"),
+    (("--rig", "rig.toml", "--target", "bird"),
+     'rig.toml: the simulated scene has no bird; add it: [sim] targets = ["book", "bird"]'),
+])  # fmt: skip
+def test_what_cannot_be_shown_is_refused_in_one_line(folder, capsys, arguments, said):
+    assert call(capsys, "view", *arguments) == (1, "", f"cotarget view: {said}\n")
+
+
+def test_a_port_that_is_taken_is_refused_in_one_line(folder, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        status, out, err = call(capsys, "view", "--browser", "--port", port)
+    assert (status, out) == (1, "")
+    assert err.startswith(f"cotarget view: --port {port}: ")
+    assert err.endswith("give another one, or 0 for any that is free\n")
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("target", [(), ("--target", "book")])
+def test_the_command_shows_the_rig_at_rest_or_the_pipeline_at_work(folder, capsys, monkeypatch, target):
+    clock, shown = People(), []
+
+    class Shown(Window):
+        where = "the test"
+
+        def show(self, sight):
+            shown.append(sight)
+
+        def close(self):
+            shown.append("closed")
+
+    black = SimWorld(RigConfig(sim=SimConfig(scene="indoor", targets=("book",))), rendered=())
+    monkeypatch.setattr("cotarget.sim.world.SimWorld", lambda config: black)
+    monkeypatch.setattr(running, "_opener", lambda options: lambda truth: Shown(clock))
+    monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=clock.now, sleep=clock.sleep))
+    assert call(capsys, "view", "--rig", "rig.toml", "--seconds", "0.3", *target) == (
+        0, "", "the test shows the scene; Ctrl-C ends it\n"
+    )  # fmt: skip
+    *sights, end = shown
+    assert end == "closed"
+    assert len(sights) == 7  # from 0.06 s, when the first frame is there, to 0.3 s, 25 a second
+    assert sights[-1].pictures["zoom"].shape == (480, 640, 3)
+    assert set(sights[-1].lines) == set(FAR)
+    assert sights[-1].caption.endswith("book: searching" if target else f"{sights[-1].t:.1f} s")
+
+
+@pytest.fixture
+def unserved(monkeypatch):
+    """A web viewer whose thread ends at once; it notes what was closed."""
+    closed = []
+
+    def launch(serve):
+        if serves:
+            serve(None)
+        return SimpleNamespace(close=lambda: closed.append("viewer"))
+
+    serves = []
+    monkeypatch.setattr(browser.launch_thread, "launch_thread", launch)
+    monkeypatch.setattr(browser, "START_S", 0.0)
+    return serves, closed
+
+
+@pytest.mark.parametrize(("fails", "said"), [
+    (None, "MuJoCo's web viewer does not start within 0 s; try again"),
+    (OSError("no more threads"), "MuJoCo's web viewer does not start: no more threads"),
+])  # fmt: skip
+def test_a_page_that_does_not_come_up_leaves_nothing_behind(world, monkeypatch, unserved, fails, said):
+    serves, closed = unserved
+
+    def refuse(*_):
+        raise fails
+
+    if fails:
+        serves.append(True)
+        monkeypatch.setattr(browser.BrowserWindow, "_viewer", refuse)
+    listener = browser.listen(0)
+    with pytest.raises(DeviceError, match=said):
+        browser.BrowserWindow(world.truth(), listener)
+    assert closed == ["viewer"]
+    assert listener.fileno() == -1
+
+
+@pytest.mark.parametrize("window", [(1200, 900), (333, 777), (90, 70)])
+def test_pictures_in_a_window_are_as_large_as_their_places_and_one_above_the_other(window):
+    """MuJoCo draws as many pixels as the place has, whatever the picture's own size."""
+    blue, red = np.zeros((480, 640, 3), np.uint8), np.zeros((200, 320, 3), np.uint8)
+    blue[..., 0] = red[..., 2] = 255
+    placed = desktop._placed([blue, red], *window)
+    for (place, picture), shape, colour in zip(
+        placed, ((480, 640), (200, 320)), ((0, 0, 255), (255, 0, 0)), strict=True
+    ):
+        assert picture.shape == (place.height, place.width, 3)
+        assert place.width / place.height == pytest.approx(shape[1] / shape[0], rel=2 / place.height)  # whole pixels
+        assert (picture == colour).all()  # RGB
+        assert place.left + place.width <= window[0]
+        assert place.bottom >= 0
+    (above, _), (below, _) = placed
+    assert window[1] >= above.bottom + above.height
+    assert above.bottom >= below.bottom + below.height
+
+
+@pytest.mark.wire
+def test_the_page_is_served_to_this_machine_alone_with_the_model_and_ends_with_the_window(world):
+    from mujoco.studio.web import state_payload
+
+    listener = browser.listen(0)
+    assert listener.getsockname()[0] == browser.HOST
+    window = browser.BrowserWindow(world.truth(), listener)
+    try:
+        window.show(Sight(5.0, "", {}, frusta_of(world.truth(), 5.0)))
+        assert window.is_open()
+        with urllib.request.urlopen(window.where, timeout=ANSWER_S) as page:
+            assert page.headers["Content-Type"].startswith("text/html")
+            assert b"web_client" in page.read()
+        with urllib.request.urlopen(f"{window.where}model", timeout=ANSWER_S) as served:
+            assert served.read() == state_payload.serialize_model_bundle(window._onlooker.model)
+    finally:
+        window.close()
+        where = window.where
+        del window
+        with warnings.catch_warnings():  # MuJoCo's server leaves its own inner connection to be collected
+            warnings.simplefilter("ignore", ResourceWarning)
+            gc.collect()
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(where, timeout=ANSWER_S)
+
+
+def test_the_overlay_hands_over_lines_and_pictures_that_are_new(world):
+    sent = []
+
+    def upload(texture, pixels, width, height, bytes_a_pixel):
+        sent.append((texture, pixels[:4], width, height))
+        assert len(pixels) == width * height * bytes_a_pixel
+        return texture or len(sent)
+
+    overlay = browser.Overlay(lambda *_: None)
+    overlay.viewer = SimpleNamespace(extra_geoms=[], upload_image=upload)
+    overlay.on_update(None)
+    assert not sent
+    red = np.zeros((480, 640, 3), np.uint8)
+    red[..., 2] = 255
+    lines = frusta_of(world.truth(), 5.0)
+    overlay.sight = Sight(5.0, "", {"fixed": red, "zoom": red}, lines)
+    for _ in range(2):
+        overlay.on_update(None)
+        assert len(overlay.viewer.extra_geoms) == sum(map(len, lines.values()))
+    assert sent == [(0, b"\xff\0\0\xff", browser.PICTURE_PX, 300)] * 2
+    overlay.sight = Sight(5.1, "", {"fixed": red}, lines)
+    overlay.on_update(None)
+    assert [texture for texture, *_ in sent] == [0, 0, 1]

@@ -1,0 +1,791 @@
+"""The driver of the Axis video server against a scripted server on loopback, which shares no code with it."""
+
+import base64
+import contextlib
+import hashlib
+import itertools
+import logging
+import queue
+import re
+import socket
+import socketserver
+import sys
+import threading
+import time
+from urllib.parse import parse_qs, urlsplit
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.config import HardwareFixed
+from cotarget.drivers import axis
+from cotarget.drivers import axis as axis_module
+from cotarget.drivers.axis import AxisCamera, probe
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.emulators.axis_241q import AxisServer
+from cotarget.emulators.plant import Feed, Picture
+from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
+
+pytestmark = pytest.mark.wire
+PARAM, STATUS, VIDEO = "/axis-cgi/param.cgi", "/axis-cgi/videostatus.cgi", "/axis-cgi/mjpg/video.cgi"
+SIZE = (64, 48)
+PASSWORD = "hunter2 & co"
+PATIENCE_S = 10.0  # for what should come at once, on a machine that has much else to do
+HANG_S = 120.0  # longer than any test takes; then a mistake is no hang, but a failure
+SHORT_SILENCE_S = 0.4  # instead of the driver's two seconds
+LATENCY_S = 0.06
+# The figure is 60 ms; a loaded machine may be slow to run a thread.
+LOOSE_AGE_S = 0.25
+
+
+def jpeg(index, size=SIZE):
+    """A picture that no other index has."""
+    image = np.random.default_rng(index).integers(0, 255, (size[1] // 8, size[0] // 8, 3), dtype=np.uint8)
+    return cv2.imencode(".jpg", cv2.resize(image, size))[1].tobytes()
+
+
+def part(body):
+    return b"--myboundary\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n%b\r\n" % (len(body), body)
+
+
+def reply(status="200 OK", body=b"", kind="text/plain", *lines):
+    head = [f"HTTP/1.0 {status}", f"Content-Type: {kind}", f"Content-Length: {len(body)}", *lines, "", ""]
+    return "\r\n".join(head).encode() + body
+
+
+BRAND = b"root.Brand.Brand=AXIS\nroot.Brand.ProdNbr=241Q\nroot.Brand.ProdFullName=AXIS 241Q Video Server\n"
+PROPERTIES = b"root.Properties.API.HTTP.Version=2\nroot.Properties.Firmware.Version=4.48\n"
+SOURCES = b"root.ImageSource.NbrOfSources=4\n"
+STREAM = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=myboundary\r\n\r\n"
+
+
+def parameters(request):
+    texts = {"root.Brand": BRAND, "root.Properties": PROPERTIES, "root.ImageSource": SOURCES}
+    return reply(body=texts.get(request.query["group"], b"# Error: Error -1 getting param in group\n"))
+
+
+class Request:
+    def __init__(self, lines):
+        self.target = lines[0].split()[1]
+        self.path = urlsplit(self.target).path
+        self.query = {name: values[-1] for name, values in parse_qs(urlsplit(self.target).query).items()}
+        self.headers = {name.lower(): value.strip() for name, _, value in (line.partition(":") for line in lines[1:])}
+
+
+class Viewer:
+    """A stream under way, in the hands of the test."""
+
+    def __init__(self, connection):
+        self._connection, self.over = connection, threading.Event()
+
+    def send(self, data):
+        self._connection.sendall(data)
+
+    def cut(self):
+        with contextlib.suppress(OSError):
+            self._connection.shutdown(socket.SHUT_RDWR)
+        self.over.set()
+
+    def gone(self):
+        """Wait until the client has closed."""
+        self._connection.settimeout(PATIENCE_S)
+        return self._connection.recv(1) == b""
+
+
+class Handler(socketserver.StreamRequestHandler):
+    timeout = HANG_S  # a client that says nothing, or takes nothing
+
+    def handle(self):
+        lines = []
+        with contextlib.suppress(TimeoutError):
+            while line := self.rfile.readline().decode("latin-1").strip():
+                lines.append(line)
+        if not lines:
+            return
+        request, script = Request(lines), self.server.script
+        script.requests.append(request)
+        answer = script.pages.get(request.path, reply("404 Not Found"))
+        answer = answer(request) if callable(answer) else answer
+        if answer is None:  # hangs
+            script.closing.wait(HANG_S)
+            return
+        with contextlib.suppress(OSError):
+            self.connection.sendall(answer)
+        if answer.startswith(STREAM):
+            viewer = Viewer(self.connection)
+            script.all.append(viewer)
+            script.viewers.put(viewer)
+            if script.closing.is_set():  # a client that came back while the server was ending
+                viewer.cut()
+            viewer.over.wait(HANG_S)
+
+
+class Script:
+    """A server on loopback: what it answers by path, and the streams that were opened."""
+
+    def __init__(self):
+        self.pages = {
+            PARAM: parameters,
+            STATUS: lambda request: reply(body=f"Video {request.query['status']} = video\n".encode()),
+            VIDEO: lambda _: STREAM + part(jpeg(0)),
+        }
+        self.requests, self.viewers, self.all, self.closing = [], queue.Queue(), [], threading.Event()
+
+    def viewer(self):
+        return self.viewers.get(timeout=PATIENCE_S)
+
+    def end(self):
+        self.closing.set()
+        for viewer in self.all:
+            viewer.cut()
+
+
+class Server(socketserver.ThreadingTCPServer):
+    daemon_threads = False  # so that closing waits for them
+    allow_reuse_address = True
+
+
+def ended(thread):
+    """Wait until a thread has ended, as it should at once."""
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+
+
+@pytest.fixture
+def server():
+    script = Script()
+    with Server(("127.0.0.1", 0), Handler) as tcp:
+        tcp.script = script
+        script.url = f"http://127.0.0.1:{tcp.server_address[1]}"
+        thread = threading.Thread(target=tcp.serve_forever, args=(0.01,))
+        thread.start()
+        yield script
+        script.end()
+        tcp.shutdown()
+        ended(thread)
+
+
+@pytest.fixture(autouse=True)
+def tidy(monkeypatch):
+    """No test leaves a thread, and none finds a password."""
+    monkeypatch.delenv("COTARGET_PASSWORD", raising=False)
+    yield
+    assert not [thread for thread in threading.enumerate() if thread.name == "axis"]
+
+
+def config(server, **changes):
+    return HardwareFixed(**{"url": server.url, "size": SIZE, "latency_s": LATENCY_S} | changes)
+
+
+def opened(server, **changes):
+    return contextlib.closing(AxisCamera(config(server, **changes), MonotonicClock()))
+
+
+def refused(server, kind=DeviceError, **changes):
+    """What the driver says when it cannot be opened."""
+    with pytest.raises(kind) as error, opened(server, **changes):
+        pass
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def stale(camera, t, timeout=0.05):
+    with pytest.raises(StaleFrameError) as error:
+        camera.read(t, timeout)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def until(camera, t, words):
+    """Read until the error says so; it may take the driver a moment to know."""
+    deadline = time.monotonic() + PATIENCE_S
+    while words not in (said := stale(camera, t)):
+        assert time.monotonic() < deadline, said
+    return said
+
+
+def test_frames_carry_the_time_of_their_first_byte_and_are_never_handed_out_twice(server):
+    clock = MonotonicClock()
+    with opened(server) as camera:
+        viewer = server.viewer()
+        first = camera.read()
+        assert camera.size == SIZE
+        assert first.image.shape == (48, 64, 3)
+        np.testing.assert_array_equal(first.image, cv2.imdecode(np.frombuffer(jpeg(0), np.uint8), cv2.IMREAD_COLOR))
+        assert not first.image.flags.writeable
+        assert camera.read().t == first.t
+        whole = part(jpeg(1))
+        before = clock.now()
+        viewer.send(whole[:200])
+        stale(camera, first.t, 0.2)
+        between = clock.now()
+        viewer.send(whole[200:])
+        second = camera.read(first.t, PATIENCE_S)
+        assert before <= second.t + LATENCY_S <= between
+        np.testing.assert_array_equal(second.image, cv2.imdecode(np.frombuffer(jpeg(1), np.uint8), cv2.IMREAD_COLOR))
+        stale(camera, second.t)
+        assert (camera.counters.frames, camera.counters.broken, camera.counters.reconnects) == (2, 0, 0)
+
+
+def test_the_newest_of_many_is_read(server):
+    with opened(server) as camera:
+        viewer = server.viewer()
+        t = camera.read().t
+        viewer.send(b"".join(part(jpeg(i)) for i in range(1, 30)))
+        deadline = time.monotonic() + PATIENCE_S
+        while camera.counters.frames < 30:
+            t = camera.read(t, PATIENCE_S).t
+            assert time.monotonic() < deadline
+        newest = cv2.imdecode(np.frombuffer(jpeg(29), np.uint8), cv2.IMREAD_COLOR)
+        np.testing.assert_array_equal(camera.read().image, newest)
+
+
+def test_the_stream_is_asked_for_as_configured(server):
+    with opened(server, camera=3, resolution="CIF", compression=10, rate_hz=12.4):
+        pass
+    asked = server.requests[-1]
+    expected = {"camera": "3", "resolution": "CIF", "compression": "10", "fps": "12", "des_fps": "12"}
+    assert (asked.path, asked.query) == (VIDEO, expected)
+    assert "authorization" not in asked.headers
+    server.pages[PARAM] = reply("404 Not Found")
+    with opened(server, resolution=""):
+        pass
+    assert server.requests[-1].query == {"camera": "1", "compression": "30", "fps": "25"}
+
+
+@pytest.mark.parametrize("missing", [PARAM, STATUS])
+def test_a_server_without_parameters_or_states_is_taken_as_it_is(server, missing):
+    del server.pages[missing]
+    with opened(server) as camera:
+        assert camera.read().image.shape == (48, 64, 3)
+
+
+def test_parameters_that_viewers_may_not_see_are_not_asked_for_again(server):
+    server.pages[PARAM] = reply("401 Unauthorized", b"", "text/html", 'WWW-Authenticate: Basic realm="AXIS_1"')
+    with opened(server, user="viewer", password=PASSWORD) as camera:
+        camera.read()
+    assert [request.path for request in server.requests] == [PARAM, PARAM, STATUS, VIDEO]
+
+
+def digest_is_right(request, user, password):
+    """RFC 2617, 3.2.2.1, with qop=auth."""
+    header = request.headers.get("authorization", "")
+    fields = dict(re.findall(r'(\w+)="?([^",]*)"?', header.removeprefix("Digest ")))
+
+    def md5(*words):
+        return hashlib.md5(":".join(words).encode()).hexdigest()
+
+    if not header.startswith("Digest ") or fields["uri"] != request.target:
+        return False
+    secret = md5(user, "AXIS_00408C000241", password)
+    wanted = md5(secret, "abc", fields["nc"], fields["cnonce"], "auth", md5("GET", request.target))
+    return (fields["username"], fields["response"]) == (user, wanted)
+
+
+def basic_is_right(request, user, password):
+    return request.headers.get("authorization") == "Basic " + base64.b64encode(f"{user}:{password}".encode()).decode()
+
+
+CHALLENGES = {
+    "basic": ['WWW-Authenticate: Basic realm="AXIS_00408C000241"'],
+    "digest": ['WWW-Authenticate: Digest realm="AXIS_00408C000241", nonce="abc", algorithm=MD5, qop="auth"'],
+}
+CHALLENGES["both"] = CHALLENGES["basic"] + CHALLENGES["digest"]
+
+
+def guard(server, scheme, user="root", password=PASSWORD):
+    """Let nobody in without the password."""
+    right = basic_is_right if scheme == "basic" else digest_is_right
+    denied = reply("401 Unauthorized", b"who are you?", "text/html", *CHALLENGES[scheme])
+
+    def guarded(page):
+        answer = page if callable(page) else lambda _: page
+        return lambda request: answer(request) if right(request, user, password) else denied
+
+    for path, page in server.pages.items():
+        server.pages[path] = guarded(page)
+
+
+@pytest.mark.parametrize("place", ["config", "environment", "address"])
+@pytest.mark.parametrize("scheme", CHALLENGES)
+def test_authentication_is_what_the_server_asks_for(server, scheme, place, monkeypatch, caplog):
+    caplog.set_level(logging.DEBUG)
+    guard(server, scheme)
+    given = {"user": "root", "password": PASSWORD}
+    if place == "environment":
+        monkeypatch.setenv("COTARGET_PASSWORD", given.pop("password"))
+    if place == "address":
+        given = {"url": server.url.replace("http://", "http://root:hunter2%20%26%20co@")}
+    with opened(server, **given) as camera:
+        t = camera.read().t
+        server.viewer().cut()
+        server.viewer().send(part(jpeg(1)))
+        assert camera.read(t, PATIENCE_S).t > t
+    assert "hunter2" not in caplog.text
+
+
+@pytest.mark.parametrize("scheme", CHALLENGES)
+def test_a_wrong_password_is_told_without_telling_it(server, scheme, monkeypatch, caplog):
+    caplog.set_level(logging.DEBUG)
+    guard(server, scheme, password="another")
+    said = refused(server, user="root", password=PASSWORD)
+    assert said.startswith(f"{server.url} refuses the user 'root' (401): check hardware.fixed.user and the password")
+    assert "hunter2" not in said + caplog.text
+    said = refused(server, user="root")
+    assert said.endswith("asks for user and password: set the environment variable COTARGET_PASSWORD")
+    assert refused(server).endswith("set hardware.fixed.user and the environment variable COTARGET_PASSWORD")
+
+
+@pytest.mark.parametrize(
+    "challenge",
+    ["Digest realm", 'Digest realm="x", nonce="y", algorithm=ROT13', 'Digest realm="x", nonce="y", qop=z'],
+)
+def test_a_challenge_that_makes_no_sense_is_one_line(server, challenge):
+    server.pages[PARAM] = reply("401 Unauthorized", b"", "text/html", f"WWW-Authenticate: {challenge}")
+    assert refused(server, user="root", password="x").startswith(server.url)
+
+
+REFUSALS = {
+    "nothing there": ({VIDEO: reply("404 Not Found")}, {}, "has no /axis-cgi/mjpg/video.cgi for camera 1 (404): check"),
+    "wrong resolution": ({VIDEO: reply("400 Bad Request")}, {}, "refuses camera 1, resolution '4CIF', compression 30"),
+    "not allowed": ({VIDEO: reply("403 Forbidden")}, {"user": "eve"}, "refuses the user 'eve' (403): check hardware"),
+    "elsewhere": (
+        {VIDEO: reply("302 Found", b"", "text/html", "Location: https://cam/x")},
+        {},
+        "sends on to https://cam/x: set hardware.fixed.url to where the server really is",
+    ),
+    "a page": (
+        {VIDEO: reply(kind="text/html")},
+        {},
+        "sends text/html, no stream of pictures: check hardware.fixed.url",
+    ),
+    "an error in words": (
+        {VIDEO: reply(body=b"# Error: no\nsuch")},
+        {},
+        "sends text/plain '# Error: no such', no stream",
+    ),
+    "another make": (
+        {PARAM: reply(body=b"root.Brand.Brand=Acme\n")},
+        {},
+        "is a 'Acme', no Axis: check hardware.fixed.url",
+    ),
+    "no such input": ({}, {"camera": 5}, "has no camera 5: set hardware.fixed.camera to 1 to 4"),
+    "no signal": ({STATUS: reply(body=b"Video 1 = no video\n")}, {}, "has no video on input 1: check its cable, or"),
+    "no HTTP": ({PARAM: b"220 mail.example.org ESMTP\r\n"}, {}, "does not speak HTTP as it should"),
+    "half a head": ({VIDEO: STREAM[:30]}, {}, "does not speak HTTP as it should"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSALS)
+def test_a_server_that_cannot_serve_is_told_in_a_line(server, name):
+    pages, changes, words = REFUSALS[name]
+    server.pages |= pages
+    assert refused(server, **changes).startswith(f"{server.url} {words}")
+
+
+def test_nobody_at_the_address():
+    with socket.create_server(("127.0.0.1", 0)) as unused:
+        port = unused.getsockname()[1]
+    with pytest.raises(DeviceError, match=rf"http://127.0.0.1:{port} cannot be reached \(.*refused\): check"):
+        AxisCamera(HardwareFixed(url=f"http://127.0.0.1:{port}"), MonotonicClock())
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [("", "missing; give the video server's address"), ("http://[::1", "is not like http"), ("http://a b", "")],
+)
+def test_an_address_that_is_none(url, words):
+    with pytest.raises((ConfigError, DeviceError), match=words or "http"):
+        AxisCamera(HardwareFixed(url=url), MonotonicClock())
+
+
+def test_httpx_is_named_where_it_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "httpx", None)
+    with pytest.raises(MissingPackageError, match=r"need httpx: pip install 'cotarget\[hardware\]'"):
+        AxisCamera(HardwareFixed(url="http://127.0.0.1"), MonotonicClock())
+
+
+def test_another_size_than_configured(server):
+    said = refused(server, ConfigError, size=(704, 576))
+    assert said.startswith(f"hardware.fixed.size: [704, 576] is not what {server.url} sends: write size = [64, 48], or")
+
+
+def test_a_busy_server_is_asked_again(server, monkeypatch):
+    answers = iter([reply("503 Service Unavailable"), reply("503 Service Unavailable"), STREAM + part(jpeg(0))])
+    server.pages[VIDEO] = lambda _: next(answers)
+    with opened(server) as camera:
+        camera.read()
+    monkeypatch.setattr(axis, "OPEN_S", 0.3)
+    server.pages[VIDEO] = reply("503 Service Unavailable")
+    assert refused(server) == f"{server.url} is busy (503), perhaps with too many viewers: close some"
+
+
+@pytest.mark.parametrize("sent", [b"", STREAM, STREAM + b"--myboundary\r\nContent-Type: text/plain\r\n\r\nno"])
+def test_a_server_that_sends_no_picture(server, sent, monkeypatch):
+    monkeypatch.setattr(axis, "OPEN_S", 0.3)
+    monkeypatch.setattr(axis_module, "SILENCE_S", SHORT_SILENCE_S)
+    server.pages[VIDEO] = sent or None
+    assert refused(server).startswith(server.url)
+
+
+def test_a_cut_stream_is_opened_again(server):
+    with opened(server) as camera:
+        viewer = server.viewer()
+        t = camera.read().t
+        viewer.send(part(jpeg(1))[:200])
+        viewer.cut()
+        begun = time.monotonic()
+        server.viewer().send(part(jpeg(2)))
+        t = camera.read(t, PATIENCE_S).t
+        assert time.monotonic() - begun < PATIENCE_S / 2
+        assert (camera.counters.frames, camera.counters.broken, camera.counters.reconnects) == (2, 1, 1)
+        server.pages[VIDEO] = reply("503 Service Unavailable")
+        for viewer in server.all:
+            viewer.cut()
+        said = until(camera, t, "busy")
+        assert re.search(r"no new picture for \d\.\d s: .* is busy \(503\).*; reconnecting", said)
+        server.pages[VIDEO] = STREAM + part(jpeg(3))
+        camera.read(t, PATIENCE_S)
+
+
+def test_a_password_that_changed_is_told_and_not_tried_in_haste(server, monkeypatch):
+    monkeypatch.setattr(axis, "REFUSED_PAUSE_S", 10 * PATIENCE_S)
+    with opened(server) as camera:
+        t = camera.read().t
+        server.pages[VIDEO] = reply("401 Unauthorized", b"", "text/html", *CHALLENGES["basic"])
+        tried = len(server.requests)
+        server.viewer().cut()
+        until(camera, t, "asks for user and password")
+        stale(camera, t, 0.5)
+        assert len(server.requests) == tried + 1
+
+
+def test_a_stalled_stream_is_opened_again(server, monkeypatch):
+    monkeypatch.setattr(axis_module, "SILENCE_S", SHORT_SILENCE_S)
+    monkeypatch.setattr(axis, "FROZEN_S", SHORT_SILENCE_S / 2)
+    with opened(server) as camera:
+        viewer = server.viewer()
+        t = camera.read().t
+        server.pages[STATUS] = reply(body=b"Video 1 = no video\n")
+        viewer.send(part(jpeg(1))[:200])
+        assert viewer.gone()
+        again = server.viewer()
+        assert until(camera, t, "no video").endswith("its input 1 has no video")
+        with pytest.raises(StaleFrameError):  # too old by now, even for whoever takes the newest
+            camera.read(timeout=0.01)
+        again.send(part(jpeg(2)))
+        t = camera.read(t, PATIENCE_S).t
+        assert camera.counters.reconnects == 1
+        assert "video" not in stale(camera, t)
+
+
+def test_a_picture_that_is_not_due_yet_is_told_so(server, monkeypatch):
+    monkeypatch.setattr(axis, "QUIET_S", PATIENCE_S)
+    with opened(server) as camera:
+        server.viewer().send(part(jpeg(1)))
+        camera.read(camera.read().t - 1.0)
+        assert stale(camera, camera.read().t + 100.0, 0.0) == f"{server.url} sent no newer picture within 0 s"
+
+
+def test_silence_is_told_before_the_stream_is_given_up(server):
+    with opened(server) as camera:
+        said = until(camera, camera.read().t, "has sent nothing for")
+        assert re.fullmatch(rf"no new picture for \d\.\d s: {server.url} has sent nothing for \d\.\d s", said)
+
+
+def test_bytes_without_pictures_do_not_go_on_for_ever(server, monkeypatch):
+    monkeypatch.setattr(axis_module, "SILENCE_S", SHORT_SILENCE_S)
+    with opened(server) as camera:
+        t, viewer, end = camera.read().t, server.viewer(), threading.Event()
+
+        def babble():
+            with contextlib.suppress(OSError):
+                while not end.wait(0.05):
+                    viewer.send(bytes(100))
+
+        thread = threading.Thread(target=babble, daemon=True)
+        thread.start()
+        server.viewer().send(part(jpeg(1)))
+        end.set()
+        ended(thread)
+        camera.read(t, PATIENCE_S)
+
+
+def damaged(kind, index):
+    """A picture whose markers are all right and whose data are not."""
+    noise = np.random.default_rng(index).integers(0, 255, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+    picture = cv2.imencode(".jpg", noise)[1].tobytes()
+    data = picture.index(b"\xff\xda") + 14
+    middle = (data + len(picture)) // 2
+    match kind:
+        case "tables":
+            table = picture.index(b"\xff\xc4") + 5
+            return picture[:table] + b"\xfe" * 16 + picture[table + 16 :]
+        case "ends early":
+            return picture[:middle].rstrip(b"\xff") + b"\xff\xd9"
+
+
+@pytest.mark.parametrize("kind", ["tables", "ends early"])
+def test_damaged_pictures_are_dropped_and_counted_when_they_are_read(server, kind, capfd):
+    with opened(server) as camera:
+        viewer = server.viewer()
+        t = camera.read().t
+        viewer.send(part(damaged(kind, 1)))
+        until(camera, t, f"the pictures of {server.url} are broken")
+        assert (camera.counters.frames, camera.counters.broken) == (2, 1)
+        viewer.send(part(jpeg(2)))
+        assert camera.read(t, PATIENCE_S).t > t
+    assert capfd.readouterr() == ("", "")
+
+
+def test_cut_pictures_are_dropped_and_counted(server):
+    with opened(server) as camera:
+        viewer = server.viewer()
+        t = camera.read().t
+        viewer.send(part(jpeg(1)[:-100]) + part(jpeg(2)[:-2]))
+        until(camera, t, f"the pictures of {server.url} are broken")
+        viewer.send(part(jpeg(3)))
+        assert camera.read(t, PATIENCE_S).image.shape == (48, 64, 3)
+        assert (camera.counters.frames, camera.counters.broken) == (2, 2)
+
+
+@pytest.mark.parametrize("padding", [b"\xff" * 10, bytes(777)])
+def test_bytes_too_many_in_all_pictures_do_no_harm(server, padding):
+    """As in issue 51 of axis_camera: extraneous bytes before the last marker."""
+    pictures = [picture[:-2] + padding + picture[-2:] for picture in map(jpeg, range(2))]
+    server.pages[VIDEO] = STREAM + part(pictures[0])
+    with opened(server) as camera:
+        t = camera.read().t
+        picture = jpeg(1)
+        server.viewer().send(part(pictures[1]))
+        image = camera.read(t, PATIENCE_S).image
+        np.testing.assert_array_equal(image, cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR))
+
+
+def test_the_same_picture_again_is_no_new_one(server, monkeypatch):
+    monkeypatch.setattr(axis, "FROZEN_S", 0.3)
+    with opened(server) as camera:
+        t = camera.read().t
+        server.viewer().send(part(jpeg(0)) * 3)
+        until(camera, t, "repeats the same picture")
+        assert camera.counters.repeated >= 3
+        server.pages[STATUS] = reply(body=b"Video 1 = no video\n")
+        deadline = time.monotonic() + PATIENCE_S
+        # It asks once, on the way to a new stream, and stays with that.
+        while not stale(camera, t).endswith("repeats the same picture; its input 1 has no video"):
+            for viewer in server.all:
+                with contextlib.suppress(OSError):
+                    viewer.send(part(jpeg(0)))
+            assert time.monotonic() < deadline
+        server.all[-1].send(part(jpeg(1)))
+        assert camera.read(t, PATIENCE_S).t > t
+        assert (camera.counters.frames, camera.counters.reconnects) == (2, 1)
+
+
+def test_a_changed_size_is_an_error_until_it_is_changed_back(server):
+    with opened(server) as camera:
+        viewer = server.viewer()
+        t = camera.read().t
+        viewer.send(part(jpeg(1, (32, 24))))
+        with pytest.raises(DeviceError, match="now sends 32x24 where it sent 64x48: set its resolution back"):
+            camera.read(t, PATIENCE_S)
+        viewer.send(part(jpeg(2)))
+        deadline, image = time.monotonic() + PATIENCE_S, None
+        while image is None and time.monotonic() < deadline:
+            with contextlib.suppress(DeviceError):
+                image = camera.read(t).image
+        assert image is not None
+
+
+def test_closing_frees_a_reader_at_once_and_ends_the_thread(server):
+    camera = AxisCamera(config(server), MonotonicClock())
+    t, said = camera.read().t, queue.Queue()
+
+    def wait():
+        try:
+            camera.read(t, 10 * PATIENCE_S)
+        except DeviceError as error:
+            said.put(str(error))
+
+    reader = threading.Thread(target=wait, daemon=True)
+    reader.start()
+    begun = time.monotonic()
+    camera.close()
+    assert said.get(timeout=PATIENCE_S) == "the fixed camera is closed"
+    assert time.monotonic() - begun < axis_module.SILENCE_S  # it did not wait for the socket
+    ended(reader)
+    camera.close()
+    assert server.viewer().gone()
+    with pytest.raises(DeviceError, match="closed"):
+        camera.read()
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_a_driver_that_fails_says_so_to_whoever_reads(server, monkeypatch, capfd, at_once):
+    def feed(*_):
+        raise RuntimeError("a mistake")
+
+    if at_once:
+        monkeypatch.setattr(axis.MultipartReader, "feed", feed)
+        assert refused(server) == "the driver of the fixed camera failed: RuntimeError('a mistake')"
+    else:
+        with opened(server) as camera:
+            t = camera.read().t
+            monkeypatch.setattr(axis.MultipartReader, "feed", feed)
+            server.viewer().send(part(jpeg(1)))
+            with pytest.raises(DeviceError, match=r"the driver of the fixed camera failed: RuntimeError"):
+                camera.read(t, PATIENCE_S)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_closing_while_the_server_hangs(server, monkeypatch):
+    monkeypatch.setattr(axis_module, "SILENCE_S", SHORT_SILENCE_S)
+    with opened(server) as camera:
+        server.pages[VIDEO] = None
+        server.viewer().cut()
+        until(camera, camera.read().t, "reconnecting")
+
+
+def test_probe_tells_who_it_is(server):
+    assert probe(config(server)) == "AXIS 241Q, firmware 4.48, input 1 has video"
+    server.pages[STATUS] = reply(body=b"Video 2 = no video\n")
+    assert probe(config(server, camera=2)) == "AXIS 241Q, firmware 4.48, input 2 has no video"
+    assert not [request for request in server.requests if request.path == VIDEO]
+    video = server.pages[VIDEO]
+    server.pages.clear()
+    server.pages[VIDEO] = video
+    assert probe(config(server)) == "tells nothing of itself, but sends pictures"
+    server.pages.clear()
+    with pytest.raises(DeviceError, match=r"\(404\): check hardware\.fixed\.url and hardware\.fixed\.camera"):
+        probe(config(server))
+
+
+def test_a_slow_consumer_sees_fresh_pictures(server):
+    """25 pictures a second, read at 5 Hz: what is read is never older than the interval and a thread's delay."""
+    pictures, clock, ages, end = [part(jpeg(i)) for i in range(50)], MonotonicClock(), [], threading.Event()
+    with opened(server, latency_s=0.0) as camera:
+        viewer = server.viewer()
+
+        def send():
+            for picture in pictures:
+                viewer.send(picture)
+                if end.wait(0.04):
+                    return
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        camera.read(camera.read().t, PATIENCE_S)
+        for _ in range(8):
+            clock.sleep_until(clock.now() + 0.2)
+            frame = camera.read()
+            ages.append(clock.now() - frame.t)
+        end.set()
+        ended(sender)
+    assert float(np.median(ages)) < LOOSE_AGE_S
+
+
+# Against the emulator, which was written by others from the same manuals
+@pytest.fixture
+def emulated():
+    """A 241Q whose input shows a new picture 25 times a second, each with its number in its first pixels."""
+    feed, sent, end = Feed(), {}, threading.Event()
+    rng = np.random.default_rng(0)
+    scene = cv2.resize(rng.integers(0, 255, (15, 20, 3), dtype=np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
+
+    def publish():
+        for index in itertools.count():
+            image = cv2.add(scene, rng.integers(0, 5, scene.shape, dtype=np.uint8))
+            for bit in range(16):
+                image[:16, 16 * bit : 16 * bit + 16] = 255 * (index >> bit & 1)
+            feed.publish(Picture(image, index, time.monotonic()))
+            if end.wait(0.04):
+                return
+
+    publisher = threading.Thread(target=publish, daemon=True)
+    publisher.start()
+    with AxisServer({1: feed}, user="root", password=PASSWORD, sent=sent.__setitem__) as unit:
+        unit.sent = sent
+        yield unit
+    end.set()
+    ended(publisher)
+
+
+def watching(unit, **changes):
+    changes = {"size": (320, 240), "resolution": "320x240", "user": "root", "password": PASSWORD} | changes
+    return opened(unit, **changes)
+
+
+def number(image):
+    return sum(int(image[4:12, 16 * bit + 4 : 16 * bit + 12].mean() > 127) << bit for bit in range(16))
+
+
+def test_emulated_pictures_are_dated_by_their_first_byte(emulated):
+    with watching(emulated) as camera:
+        frame = camera.read()
+        for _ in range(10):
+            frame = camera.read(frame.t, PATIENCE_S)
+            # The driver cannot have seen it before it was sent.
+            delay = frame.t + LATENCY_S - emulated.sent[number(frame.image)]
+            assert 0 <= delay < LOOSE_AGE_S
+        assert camera.counters.broken == 0
+    assert probe(config(emulated, user="root", password=PASSWORD)) == "AXIS 241Q, firmware 4.48, input 1 has video"
+
+
+@pytest.mark.parametrize("fault", ["wrong-length", "no-length", "dashed-boundary"])
+def test_what_the_emulator_writes_oddly_is_read(emulated, fault):
+    emulated.faults.set(fault)
+    with watching(emulated) as camera:
+        frame = camera.read()
+        for _ in range(5):
+            frame = camera.read(frame.t, PATIENCE_S)
+        assert (camera.counters.broken, camera.counters.reconnects) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("stall", "has sent nothing for|has stopped sending"),
+        ("cut", "has closed the stream|sent no newer picture|are broken"),
+        ("unauthorized", r"refuses the user 'root' \(401\)"),
+        ("busy", r"is busy \(503\)"),
+        ("frozen", "repeats the same picture"),
+        ("no-video", "its input 1 has no video"),
+        ("refuse", "cannot be reached|broke off|does not speak HTTP"),
+    ],
+)
+def test_each_fault_is_told_and_recovered_from(emulated, fault, words, monkeypatch):
+    monkeypatch.setattr(axis, "FROZEN_S", 0.3)
+    monkeypatch.setattr(axis, "REFUSED_PAUSE_S", 0.3)
+    with watching(emulated) as camera:
+        emulated.faults.set(fault)
+        t, deadline, said = camera.read().t, time.monotonic() + PATIENCE_S, ""
+        while not re.search(words, said):
+            assert time.monotonic() < deadline, said
+            try:
+                t = camera.read(t, 0.2).t
+            except StaleFrameError as error:
+                said = str(error)
+        assert "\n" not in said
+        emulated.faults.set(fault, False)
+        assert camera.read(t, PATIENCE_S).t > t
+
+
+def test_emulated_damage_is_dropped_and_counted(emulated, capfd):
+    with watching(emulated) as camera:
+        t, deadline = camera.read().t, time.monotonic() + PATIENCE_S
+        emulated.faults.set("corrupt")
+        while camera.counters.broken < 9:
+            with contextlib.suppress(StaleFrameError):
+                t = camera.read(t, 0.2).t
+            assert time.monotonic() < deadline
+        emulated.faults.set("corrupt", False)
+        assert camera.read(t, PATIENCE_S).t > t
+
+
+def test_an_emulated_change_of_resolution(emulated):
+    with watching(emulated) as camera:
+        emulated.faults.set("resolution")
+        server_changes = time.monotonic() + PATIENCE_S
+        with pytest.raises(DeviceError, match="now sends 160x120 where it sent 320x240"):
+            all(camera.read() for _ in iter(lambda: time.monotonic() < server_changes, False))

@@ -1,0 +1,846 @@
+"""The emulated PowerShot S5 IS: what it answers, on pictures and a lens made here, and how it fails on the wire."""
+
+import contextlib
+import os
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.emulators import canon_s5is, ptpip
+from cotarget.emulators.canon_s5is import S5IS_FAULTS, S5isCamera, S5isServer, Shutter, Viewfinder
+from cotarget.emulators.faults import Faults
+from cotarget.emulators.plant import Feed, Picture
+from cotarget.errors import ConfigError, DeviceError
+
+OK, BUSY = 0x2001, 0x2019
+ZOOM, EVENT_MODE = 0xD02A, 0xD045
+DEADLINE_S = 20.0  # for whatever should happen at once: only a hang takes as long
+REPLY_S = 2.5  # that libgphoto2 waits for an answer
+DELAYED_ACK_S = 0.04  # by which Linux acknowledges late
+GREY = 2.0  # grey levels by which JPEG may change an even picture
+FRAME_S = 0.02  # between pictures of the feed
+
+
+class Lens:
+    """Moves at once, and keeps what it was told."""
+
+    last = 128
+
+    def __init__(self, position=0):
+        self.commands = []
+        self._position = position
+
+    def command(self, position):
+        self.commands.append(position)
+        self._position = position
+
+    def position(self):
+        return self._position
+
+    def moving(self):
+        return False
+
+
+def plain(size, grey):
+    return np.full((size[1], size[0], 3), grey, np.uint8)
+
+
+def decoded(jpeg):
+    return cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+
+
+class Bench:
+    """The camera without a wire, in an open session."""
+
+    def __init__(self, still=None, lens=None, shooting=True, shutter_s=0.0):
+        self.closing = threading.Event()
+        self.preview, self.lens, self.faults = Feed(), lens or Lens(), Faults(S5IS_FAULTS)
+        self.shutter = Shutter(still or (lambda: plain((64, 48), 50)), 95, shutter_s, self.closing)
+        viewfinder = Viewfinder(self.preview, (32, 24), 95, self.closing)
+        self.camera = S5isCamera(viewfinder, self.shutter, self.lens, self.faults)
+        self.ask(0x1002, 1)
+        if shooting:
+            self.ask(0x9008)
+            self.events()
+
+    def answer(self, code, *parameters, data=b""):
+        return self.camera.operate(code, (*parameters, 0, 0, 0, 0, 0)[:5], data)
+
+    def ask(self, code, *parameters, data=b""):
+        found = self.answer(code, *parameters, data=data)
+        assert found.code == OK
+        return found.data
+
+    def code(self, code, *parameters, data=b""):
+        return self.answer(code, *parameters, data=data).code
+
+    def set(self, prop, value):
+        return self.code(0x1016, prop, data=struct.pack("<H", value))
+
+    def get(self, prop):
+        return struct.unpack("<H", self.ask(0x1015, prop))[0]
+
+    def events(self):
+        """All events that CheckEvent tells, as (code, parameters)."""
+        found = []
+        while data := self.ask(0x9013):
+            length, kind, code, _ = struct.unpack_from("<IHHI", data)
+            assert (length, kind) == (len(data), 4)  # an event container of PTP over USB
+            found.append((code, struct.unpack(f"<{(length - 12) // 4}I", data[12:])))
+        return found
+
+    def events_when(self, count):
+        deadline, found = time.monotonic() + DEADLINE_S, []
+        while len(found) < count:
+            assert time.monotonic() < deadline
+            found += self.events()
+        return found
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.closing.set()
+        self.shutter.join()
+
+
+def codes(data, at):
+    """An array of 16-bit codes, and where it ends."""
+    (count,) = struct.unpack_from("<I", data, at)
+    return set(struct.unpack_from(f"<{count}H", data, at + 4)), at + 4 + 2 * count
+
+
+def announced(data):
+    """Vendor extension, operations, events, properties of a device info without words on its extension."""
+    (extension,) = struct.unpack_from("<I", data, 2)
+    operations, at = codes(data, 11)
+    events, at = codes(data, at)
+    return extension, operations, events, codes(data, at)[0]
+
+
+def test_it_announces_canons_remote_shooting():
+    with Bench() as bench:
+        info = bench.ask(0x1001)
+        extension, operations, events, properties = announced(info)
+        assert extension == 0xB
+        assert {0x9008, 0x9009, 0x900B, 0x900C, 0x9013, 0x901A, 0x901D, 0x1014, 0x1015, 0x1016, 0x1009} <= operations
+        assert {0xC009, 0x400D} <= events
+        assert {ZOOM, 0xD03D, EVENT_MODE, 0xD029} <= properties
+        assert "Canon PowerShot S5 IS".encode("utf-16-le") in info
+        assert "1-3.2.1.0".encode("utf-16-le") in info
+
+
+def test_play_mode_has_no_zoom():
+    with Bench(shooting=False) as bench:
+        assert not {ZOOM, 0xD006, 0xD03D} & announced(bench.ask(0x1001))[3]
+        assert bench.code(0x1014, ZOOM) == bench.code(0x1015, ZOOM) == bench.set(ZOOM, 5) == 0x200A
+        for code in (0x900B, 0x900C, 0x901A, 0x901D):
+            assert bench.code(code) == 0xA005
+        assert bench.lens.commands == []
+
+
+def test_modes_are_entered_once():
+    with Bench(shooting=False) as bench:
+        assert bench.code(0x9009) == 0xA009
+        assert bench.code(0x9008) == OK
+        assert bench.events() == [(0xC00C, ())]
+        assert bench.code(0x9008) == 0xA009
+        assert bench.code(0x9009) == OK
+        assert ZOOM not in announced(bench.ask(0x1001))[3]
+
+
+def test_the_zoom_is_described():
+    with Bench(lens=Lens(7)) as bench:
+        # code, UINT16, writable, default 0, now 7, a range: 0 to 134 by 1
+        assert bench.ask(0x1014, ZOOM) == bytes.fromhex("2ad0 0400 01 0000 0700 01 0000 8600 0100")
+        assert (bench.get(0xD03D), bench.get(0xD038)) == (129, 27)
+
+
+def test_the_zoom_moves_the_lens():
+    with Bench() as bench:
+        for position in (0, 1, 105, 128):
+            assert bench.set(ZOOM, position) == OK
+            assert bench.lens.position() == bench.get(ZOOM) == position
+
+
+def test_digital_zoom_leaves_the_lens_at_its_end():
+    with Bench() as bench:
+        for position in (129, 134):
+            assert bench.set(ZOOM, position) == OK
+            assert bench.get(ZOOM) == position
+            assert bench.lens.position() == 128
+
+
+def test_values_that_cannot_be():
+    with Bench() as bench:
+        assert bench.set(ZOOM, 135) == bench.set(ZOOM, 0xFFFF) == bench.set(EVENT_MODE, 8) == 0x201C
+        assert bench.code(0x1016, ZOOM, data=b"\x05") == bench.code(0x1016, ZOOM, data=b"\x05\0\0") == 0x201B
+        assert bench.set(0xD03D, 5) == 0x200F
+        assert bench.set(0xDEAD, 5) == 0x200A
+        assert bench.lens.commands == []
+
+
+def test_settings_go_back_to_their_defaults():
+    with Bench() as bench:
+        bench.set(ZOOM, 99)
+        assert bench.code(0x1017, ZOOM) == OK
+        assert (bench.get(ZOOM), bench.lens.position()) == (0, 0)
+
+
+def test_its_clock_can_be_set():
+    with Bench() as bench:
+        assert abs(struct.unpack("<I", bench.ask(0x1015, 0xD034))[0] - time.time()) < DEADLINE_S
+        assert bench.code(0x1016, 0xD034, data=struct.pack("<I", 1000)) == OK
+        assert 1000 <= struct.unpack("<I", bench.ask(0x1015, 0xD034))[0] < 1000 + DEADLINE_S
+
+
+def test_every_announced_property_is_described_and_told():
+    with Bench() as bench:
+        for prop in announced(bench.ask(0x1001))[3]:
+            assert bench.ask(0x1014, prop)[:2] == struct.pack("<H", prop)
+            assert bench.ask(0x1015, prop)
+
+
+def test_sessions():
+    with Bench() as bench:
+        assert bench.code(0x1002, 2) == 0x201E
+        assert bench.code(0x1003) == OK
+        assert bench.code(0x1003) == bench.code(0x1015, ZOOM) == 0x2003
+        assert bench.code(0x1001) == OK  # needs no session
+        assert bench.code(0x1002, 0) == 0x201D
+        assert bench.code(0x1002, 5) == OK
+        assert bench.code(0x9008) == 0xA009  # it went on shooting
+
+
+def test_what_it_cannot_do():
+    with Bench() as bench:
+        assert bench.code(0x100C) == bench.code(0x9801) == bench.code(0x7777) == 0x2005
+
+
+@pytest.mark.parametrize("code", [0x1001, 0x1004, 0x1005, 0x1007, 0x9013])
+def test_operations_that_give_data_give_some_even_if_it_is_empty(code):
+    with Bench() as bench:
+        assert bench.ask(code, 0x80000001) is not None
+
+
+@pytest.mark.parametrize(
+    ("mode", "interrupts", "checked"),
+    [(1, 1, 0), (2, 1, 0), (3, 1, 1), (4, 1, 1), (5, 1, 1), (6, 0, 0), (7, 0, 1)],
+)
+def test_how_events_come(mode, interrupts, checked):
+    with Bench(shooting=False) as bench:
+        interrupted = []
+        bench.camera.interrupt_by(lambda *what: interrupted.append(what))
+        bench.set(EVENT_MODE, mode)
+        bench.ask(0x9008)
+        assert interrupted == [(0xC00C, ())] * interrupts
+        assert bench.events() == [(0xC00C, ())] * checked
+
+
+def test_the_viewfinder_averages_areas():
+    with Bench() as bench:
+        bench.ask(0x900B)
+        chequered = plain((64, 48), 0)
+        chequered[::2, ::2] = chequered[1::2, 1::2] = 200
+        bench.preview.publish(Picture(chequered, 0, time.monotonic()))
+        found = bench.answer(0x901D)
+        assert found.parameters == (len(found.data),)
+        image = decoded(found.data)
+        assert image.shape == (24, 32, 3)
+        np.testing.assert_allclose(image, 100, atol=GREY)
+
+
+def test_the_viewfinder_gives_each_picture_once(monkeypatch):
+    monkeypatch.setattr(canon_s5is, "PICTURE_WAIT_S", 0.05)
+    with Bench() as bench:
+        assert bench.code(0x901D) == BUSY  # it is off
+        bench.preview.publish(Picture(plain((64, 48), 10), 0, time.monotonic()))
+        bench.ask(0x900B)
+        assert bench.code(0x901D) == BUSY  # that one was before it was on
+        bench.preview.publish(Picture(plain((64, 48), 20), 1, time.monotonic()))
+        bench.preview.publish(Picture(plain((64, 48), 30), 2, time.monotonic()))
+        np.testing.assert_allclose(decoded(bench.ask(0x901D)), 30, atol=GREY)
+        bench.ask(0x900B)  # on already
+        assert bench.code(0x901D) == BUSY
+        bench.preview.publish(Picture(plain((64, 48), 40), 3, time.monotonic()))
+        np.testing.assert_allclose(decoded(bench.ask(0x901D)), 40, atol=GREY)
+
+
+def test_the_viewfinder_waits_for_the_next_picture():
+    with Bench() as bench:
+        bench.ask(0x900B)
+        found = []
+        asking = threading.Thread(target=lambda: found.append(bench.answer(0x901D)))
+        asking.start()
+        bench.preview.publish(Picture(plain((64, 48), 60), 0, time.monotonic()))
+        asking.join(DEADLINE_S)
+        np.testing.assert_allclose(decoded(found[0].data), 60, atol=GREY)
+
+
+def half_red(size):
+    image = plain(size, 0)
+    image[:, : size[0] // 2] = (0, 0, 255)
+    return image
+
+
+def test_a_still():
+    with Bench(still=lambda: half_red((640, 480))) as bench:
+        bench.set(EVENT_MODE, 7)
+        bench.ask(0x901A)
+        (transfer, (handle,)), complete = bench.events_when(2)
+        assert (transfer, complete) == (0xC009, (0x400D, ()))
+        info, jpeg = bench.ask(0x1008, handle), bench.ask(0x1009, handle)
+        storage, kind, _, length = struct.unpack_from("<IHHI", info)
+        assert (storage, kind, length) == (0x80000001, 0x3801, len(jpeg))
+        assert struct.unpack_from("<II", info, 26) == (640, 480)
+        assert struct.unpack_from("<I", info, 38) == (0,)  # in no folder
+        image = decoded(jpeg)
+        assert image.shape == (480, 640, 3)
+        np.testing.assert_allclose(image[240, 100], (0, 0, 255), atol=5)
+        np.testing.assert_allclose(image[240, 540], 0, atol=5)
+        assert decoded(bench.ask(0x100A, handle)).shape == (120, 160, 3)
+        assert bench.ask(0x101B, handle, 10, 20) == jpeg[10:30]
+        assert bench.ask(0x101B, handle, len(jpeg) - 5, 20) == jpeg[-5:]
+        assert bench.code(0x1009, handle + 1) == bench.code(0x1008, 0) == 0x2009
+        assert bench.code(0x100B, handle) == OK
+        assert bench.code(0x1009, handle) == bench.code(0x100B, handle) == 0x2009
+
+
+def test_the_next_still_replaces_the_last():
+    with Bench() as bench:
+        handles = []
+        for _ in range(2):
+            bench.ask(0x901A)
+            handles.append(bench.events_when(2)[0][1][0])
+        assert handles[0] != handles[1]
+        assert [bench.code(0x1009, handle) for handle in handles] == [0x2009, OK]
+
+
+def test_the_camera_is_busy_during_a_still_and_its_viewfinder_blind():
+    go = threading.Event()
+
+    def still():
+        assert go.wait(DEADLINE_S)
+        return plain((64, 48), 50)
+
+    with Bench(still=still) as bench:
+        bench.ask(0x900B)
+        bench.ask(0x901A)
+        bench.preview.publish(Picture(plain((64, 48), 70), 0, time.monotonic()))
+        assert bench.code(0x901D) == bench.code(0x901A) == bench.code(0x900B) == bench.set(ZOOM, 5) == BUSY
+        assert bench.events() == []
+        assert bench.get(ZOOM) == 0  # it still tells
+        go.set()
+        bench.events_when(2)
+        bench.preview.publish(Picture(plain((64, 48), 90), 1, time.monotonic()))
+        np.testing.assert_allclose(decoded(bench.ask(0x901D)), 90, atol=GREY)
+
+
+def test_a_still_of_a_feed_was_exposed_after_the_request():
+    feed = Feed()
+    feed.publish(Picture(plain((64, 48), 10), 0, time.monotonic()))
+    with Bench(still=feed) as bench:
+        asked = time.monotonic()
+        bench.ask(0x901A)
+        feed.publish(Picture(plain((64, 48), 20), 1, asked - 0.01))  # came late, and was exposed before
+        assert bench.events() == []
+        feed.publish(Picture(plain((64, 48), 30), 2, time.monotonic() + DEADLINE_S))
+        handle = bench.events_when(2)[0][1][0]
+        np.testing.assert_allclose(decoded(bench.ask(0x1009, handle)), 30, atol=GREY)
+
+
+def test_a_still_that_cannot_be_taken():
+    def still():
+        raise DeviceError("no renderer")
+
+    with Bench(still=still) as bench:
+        bench.ask(0x901A)
+        assert bench.events_when(1) == [(0x400D, ())]
+        assert bench.set(ZOOM, 5) == OK
+
+
+class Stills:
+    """Takes each still when it is let."""
+
+    def __init__(self, count):
+        self.let = [threading.Event() for _ in range(count)]
+        self.begun = [threading.Event() for _ in range(count)]
+        self._calls = iter(range(count))
+
+    def __call__(self):
+        call = next(self._calls)
+        self.begun[call].set()
+        assert self.let[call].wait(DEADLINE_S)
+        return plain((64, 48), 50)
+
+
+def test_a_still_is_lost_when_the_power_goes():
+    stills = Stills(2)
+    with Bench(still=stills) as bench:
+        bench.set(ZOOM, 99)
+        before = set(threading.enumerate())
+        bench.ask(0x901A)
+        (first,) = set(threading.enumerate()) - before
+        assert stills.begun[0].wait(DEADLINE_S)
+        bench.camera.switch_off()
+        assert bench.code(0x1015, ZOOM) == 0x2003
+        bench.ask(0x1002, 1)
+        assert bench.code(0x1015, ZOOM) == 0x200A
+        bench.ask(0x9008)
+        assert bench.get(ZOOM) == bench.lens.position() == 0
+        assert bench.events() == [(0xC00C, ())]
+        bench.ask(0x901A)
+        assert stills.begun[1].wait(DEADLINE_S)
+        stills.let[0].set()
+        first.join(DEADLINE_S)
+        assert bench.events() == []
+        assert bench.set(ZOOM, 5) == BUSY  # the second is still under way
+        stills.let[1].set()
+        assert [code for code, _ in bench.events_when(2)] == [0xC009, 0x400D]
+
+
+def test_the_shutter_goes_after_its_delay():
+    opened = []
+
+    def still():
+        opened.append(time.monotonic())
+        return plain((64, 48), 50)
+
+    with Bench(still=still, shutter_s=0.1) as bench:
+        asked = time.monotonic()
+        bench.ask(0x901A)
+        bench.events_when(2)
+        assert opened[0] - asked >= 0.1
+
+
+def test_whoever_comes_next_starts_anew(monkeypatch):
+    monkeypatch.setattr(canon_s5is, "PICTURE_WAIT_S", 0.05)
+    stills = Stills(1)
+    with Bench(still=stills) as bench:
+        bench.ask(0x900B)
+        bench.ask(0x9009)
+        bench.ask(0x9008)
+        bench.ask(0x900B)
+        bench.camera.disconnected()
+        bench.ask(0x1002, 1)
+        assert bench.events() == []  # those were the one before's
+        bench.preview.publish(Picture(plain((64, 48), 40), 0, time.monotonic()))
+        assert bench.code(0x901D) == BUSY  # the viewfinder is off
+        bench.ask(0x900B)
+        bench.ask(0x901A)
+        bench.camera.disconnected()  # in the middle of a still
+        stills.let[0].set()
+        bench.shutter.join()
+        bench.ask(0x1002, 1)
+        bench.preview.publish(Picture(plain((64, 48), 40), 1, time.monotonic()))
+        assert bench.code(0x901D) == BUSY
+
+
+def test_a_busy_camera_refuses_to_do_and_goes_on_telling():
+    with Bench() as bench:
+        bench.faults.set("busy")
+        for code in (0x1016, 0x9008, 0x9009, 0x900B, 0x900C, 0x901A, 0x901D):
+            assert bench.code(code, ZOOM, data=b"\x05\0") == BUSY
+        assert bench.get(ZOOM) == 0
+        assert bench.lens.commands == []
+        bench.faults.set("busy", False)
+        assert bench.set(ZOOM, 5) == OK
+
+
+# --- on the wire
+@contextlib.contextmanager
+def pictures(size, greys=lambda index: index % 200):
+    """A feed in which a picture appears every `FRAME_S`."""
+    feed, stop = Feed(), threading.Event()
+
+    def run():
+        index = 0
+        while not stop.wait(FRAME_S):
+            feed.publish(Picture(plain(size, greys(index)), index, time.monotonic()))
+            index += 1
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield feed
+    finally:
+        stop.set()
+        thread.join(DEADLINE_S)
+
+
+@pytest.fixture
+def server():
+    """An emulated camera, and its lens and faults as attributes; no thread may be left of it."""
+    before = set(threading.enumerate())
+    lens, faults = Lens(), Faults(S5IS_FAULTS)
+    with (
+        pictures((64, 48)) as feed,
+        S5isServer(feed, lambda: half_red((640, 480)), lens, faults=faults, shutter_s=0.0) as server,
+    ):
+        server.lens, server.faults = lens, faults
+        yield server
+    assert set(threading.enumerate()) <= before
+
+
+class Line:
+    """A connection of an initiator."""
+
+    def __init__(self, port, first):
+        self.socket = socket.create_connection(("127.0.0.1", port), DEADLINE_S)
+        self.send(first)
+
+    def send(self, data):
+        self.socket.sendall(data)
+
+    def exactly(self, count):
+        data = b""
+        while len(data) < count:
+            piece = self.socket.recv(count - len(data))
+            if not piece:
+                raise EOFError
+            data += piece
+        return data
+
+    def packet(self):
+        length, kind = struct.unpack("<II", self.exactly(8))
+        return kind, self.exactly(length - 8)
+
+    def ends(self):
+        """Whether the other side has closed, after whatever it sent."""
+        with contextlib.suppress(ConnectionError):
+            while self.socket.recv(1 << 16):
+                pass
+        return True
+
+    def close(self):
+        self.socket.close()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+
+INIT_COMMAND = bytes.fromhex("20000000 01000000") + bytes(16) + bytes.fromhex("6100 0000 0000 0100")
+
+
+class Initiator(Line):
+    """A command connection in an open session."""
+
+    def __init__(self, port, session=True):
+        super().__init__(port, INIT_COMMAND)
+        kind, body = self.packet()
+        assert kind == 2, f"refused: {kind}"
+        self.number = struct.unpack_from("<I", body)[0]
+        self._transaction = 0
+        if session:
+            assert self.ask(0x1002, 1)[0] == OK
+
+    def request(self, code, *parameters, data=None):
+        self._transaction += 1
+        phase = 1 if data is None else 2
+        body = struct.pack(f"<IHI{len(parameters)}I", phase, code, self._transaction, *parameters)
+        self.send(struct.pack("<II", 8 + len(body), 6) + body)
+        if data is not None:
+            self.send(struct.pack("<IIIQ", 20, 9, self._transaction, len(data)))
+            self.send(struct.pack("<III", 12 + len(data), 12, self._transaction) + data)
+
+    def ask(self, code, *parameters, data=None):
+        self.request(code, *parameters, data=data)
+        return self.answer()
+
+    def answer(self):
+        """(response code, data)."""
+        data = b""
+        while True:
+            kind, body = self.packet()
+            if kind == 7:
+                assert struct.unpack_from("<I", body, 2)[0] == self._transaction
+                return struct.unpack_from("<H", body)[0], data
+            if kind in (10, 12):
+                data += body[4:]
+
+    def shoot(self):
+        assert self.ask(0x1016, EVENT_MODE, data=b"\x07\0")[0] == OK
+        assert self.ask(0x9008)[0] in (OK, 0xA009)
+
+    def zoom(self, position):
+        return self.ask(0x1016, ZOOM, data=struct.pack("<H", position))[0]
+
+
+def listen_to(port, number):
+    return Line(port, struct.pack("<III", 12, 3, number))
+
+
+def comes_back(port):
+    """A new session, as soon as somebody listens again."""
+    deadline = time.monotonic() + DEADLINE_S
+    while True:
+        try:
+            return Initiator(port)
+        except (OSError, EOFError):
+            assert time.monotonic() < deadline
+
+
+@pytest.mark.wire
+def test_a_session_on_the_wire(server):
+    with Initiator(server.port) as camera, listen_to(server.port, camera.number) as events:
+        assert events.packet() == (4, b"")
+        camera.shoot()
+        assert camera.zoom(105) == OK
+        assert server.lens.position() == 105
+        assert camera.zoom(135) == 0x201C
+        assert camera.ask(0x900B)[0] == OK
+        for _ in range(3):
+            code, jpeg = camera.ask(0x901D)
+            assert (code, decoded(jpeg).shape) == (OK, (240, 320, 3))
+        events.send(bytes.fromhex("08000000 0d000000"))
+        assert events.packet() == (14, b"")
+
+
+@pytest.mark.wire
+def test_a_still_on_the_wire_interrupts(server):
+    with Initiator(server.port) as camera, listen_to(server.port, camera.number) as events:
+        assert events.packet() == (4, b"")
+        camera.shoot()
+        assert camera.ask(0x1016, EVENT_MODE, data=b"\x04\0")[0] == OK
+        assert camera.ask(0x901A)[0] == OK
+        kind, body = events.packet()
+        code, _, handle = struct.unpack("<HII", body)
+        assert (kind, code) == (8, 0xC009)
+        assert events.packet()[1][:2] == b"\x0d\x40"
+        assert decoded(camera.ask(0x1009, handle)[1]).shape == (480, 640, 3)
+
+
+@pytest.mark.wire
+def test_one_initiator_at_a_time(server, monkeypatch):
+    with Initiator(server.port):
+        monkeypatch.setattr(ptpip, "SUCCESSION_S", 0.05)
+        with Line(server.port, INIT_COMMAND) as second:
+            assert second.packet() == (5, struct.pack("<I", 2))
+            assert second.ends()
+    monkeypatch.undo()
+    Initiator(server.port).close()
+
+
+@pytest.mark.wire
+def test_who_leaves_may_come_back_at_once(server):
+    for _ in range(20):
+        with Initiator(server.port) as camera:
+            camera.shoot()
+
+
+@pytest.mark.wire
+def test_events_belong_to_a_command_connection(server):
+    with Initiator(server.port) as camera, listen_to(server.port, camera.number + 1) as stranger:
+        assert stranger.packet() == (5, struct.pack("<I", 1))
+        assert stranger.ends()
+        assert camera.ask(0x1001)[0] == OK
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize(
+    "noise", [b"GET / HTTP/1.0\r\n\r\n", bytes(8), b"\xff" * 64, bytes.fromhex("08000000 0d000000")]
+)
+def test_noise_ends_its_own_connection_only(server, noise):
+    with Initiator(server.port) as camera, Line(server.port, noise) as stranger:
+        assert stranger.ends()
+        assert camera.ask(0x1001)[0] == OK
+        camera.send(noise if len(noise) > 8 else bytes(8))
+        assert camera.ends()
+    Initiator(server.port).close()
+
+
+@pytest.mark.wire
+def test_a_hung_camera_neither_does_nor_answers(server):
+    with Initiator(server.port) as camera:
+        camera.shoot()
+        server.faults.set("hung")
+        camera.request(0x1016, ZOOM, data=b"\x05\0")
+        camera.socket.settimeout(0.3)
+        with pytest.raises(TimeoutError):
+            camera.packet()
+        camera.socket.settimeout(DEADLINE_S)
+        server.faults.set("hung", False)
+        assert camera.zoom(7) == OK
+        assert server.lens.commands == [7]
+
+
+@pytest.mark.wire
+def test_a_slow_camera_answers_before_libgphoto2_gives_up(server):
+    with Initiator(server.port) as camera:
+        server.faults.set("slow")
+        began = time.monotonic()
+        assert camera.ask(0x1003)[0] == OK
+        assert time.monotonic() - began >= ptpip.SLOW_S
+        assert ptpip.SLOW_S < REPLY_S / 2
+
+
+@pytest.mark.wire
+def test_data_is_cut_once(server):
+    with Initiator(server.port) as camera:
+        server.faults.set("cut")
+        assert camera.ask(0x1002, 1)[0] == 0x201E  # brings no data
+        camera.request(0x1001)
+        assert camera.packet()[0] == 9
+        with pytest.raises(EOFError):
+            camera.packet()
+    with Initiator(server.port) as camera:
+        assert camera.ask(0x1001)[0] == OK
+
+
+@pytest.mark.wire
+def test_an_unplugged_camera_is_not_there_and_comes_back_in_play_mode(server):
+    with Initiator(server.port) as camera, listen_to(server.port, camera.number) as events:
+        assert events.packet() == (4, b"")
+        camera.shoot()
+        assert camera.zoom(60) == OK
+        server.faults.set("gone")
+        assert camera.ends()
+        assert events.ends()
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", server.port), DEADLINE_S)
+    server.faults.set("gone", False)
+    with comes_back(server.port) as camera:
+        assert camera.ask(0x1015, ZOOM)[0] == 0x200A
+        camera.shoot()
+        assert camera.ask(0x1015, ZOOM) == (OK, b"\x3c\0")
+    assert server.lens.commands == [60]
+
+
+@pytest.mark.wire
+def test_a_camera_that_switches_itself_off_draws_its_lens_in(server):
+    with Initiator(server.port) as camera:
+        camera.shoot()
+        assert camera.zoom(60) == OK
+        server.faults.set("power-off")
+        assert camera.ends()
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", server.port), DEADLINE_S)
+    assert server.lens.position() == 0
+    server.faults.set("power-off", False)
+    with comes_back(server.port) as camera:
+        assert camera.ask(0x1015, EVENT_MODE) == (OK, b"\x04\0")
+        camera.shoot()
+        assert camera.ask(0x1015, ZOOM) == (OK, b"\0\0")
+
+
+@pytest.mark.wire
+def test_it_closes_in_the_middle_of_everything(server):
+    with Initiator(server.port) as camera, listen_to(server.port, camera.number) as events, Line(server.port, b""):
+        assert events.packet() == (4, b"")
+        camera.shoot()
+        camera.request(0x901A)
+        server.faults.set("slow")
+        camera.request(0x1001)
+        began = time.monotonic()
+        server.close()
+        assert time.monotonic() - began < DEADLINE_S
+        assert camera.ends()
+
+
+@pytest.mark.wire
+def test_closing_waits_for_a_still():
+    stills, before = Stills(1), set(threading.enumerate())
+    with S5isServer(Feed(), stills, Lens(), shutter_s=0.0) as server, Initiator(server.port) as camera:
+        camera.shoot()
+        assert camera.ask(0x901A)[0] == OK
+        assert stills.begun[0].wait(DEADLINE_S)
+        letting = threading.Timer(0.1, stills.let[0].set)
+        letting.start()
+        server.close()
+        assert set(threading.enumerate()) - before <= {letting}
+        letting.join(DEADLINE_S)
+
+
+@pytest.mark.wire
+@pytest.mark.skipif(sys.platform != "linux", reason="acknowledging at once is an option of Linux")
+def test_requests_and_their_data_are_not_held_up(server):
+    with Initiator(server.port) as camera:  # which sends them apart and without TCP_NODELAY, as libgphoto2 does
+        camera.shoot()
+        took = []
+        for position in range(30):
+            began = time.monotonic()
+            assert camera.zoom(position) == OK
+            took.append(time.monotonic() - began)
+        assert min(took[10:]) < DELAYED_ACK_S / 2
+
+
+@pytest.mark.wire
+def test_a_port_that_is_taken(server):
+    with pytest.raises(DeviceError, match=f"cannot listen on 127.0.0.1:{server.port}: .*in use"):
+        S5isServer(Feed(), Feed(), Lens(), port=server.port)
+    with pytest.raises(DeviceError, match=r"cannot listen on 127\.0\.0\.1:70000: a port is .* to 65535"):
+        S5isServer(Feed(), Feed(), Lens(), port=70000)
+
+
+def test_faults_that_it_does_not_have(server):
+    with pytest.raises(ConfigError, match="busy, cut, gone, hung, power-off, slow"):
+        server.faults.set("frozen")
+
+
+# What our own driver does, in a process of its own: python-gphoto2 keeps the interpreter's lock while it waits.
+CLIENT = """
+import sys, numpy, cv2, gphoto2
+port = sys.argv[1]
+camera, models, ports = gphoto2.Camera(), gphoto2.CameraAbilitiesList(), gphoto2.PortInfoList()
+models.load(); ports.load()
+camera.set_abilities(models[models.lookup_model("PTP/IP Camera")])
+camera.set_port_info(ports[ports.lookup_path(f"ptpip:127.0.0.1:{port}:{port}")])
+camera.init()
+
+def put(name, value):
+    widget = camera.get_single_config(name)
+    widget.set_value(value)
+    camera.set_single_config(name, widget)
+
+def image(file):
+    data = file.get_data_and_size()
+    return cv2.imdecode(numpy.frombuffer(memoryview(data), numpy.uint8), cv2.IMREAD_COLOR)
+
+print(camera.get_single_config("cameramodel").get_value())
+put("capture", 1)
+put("zoom", 105.0)
+print(camera.get_single_config("zoom").get_value())
+greys = []
+for _ in range(10):
+    picture = image(camera.capture_preview())
+    assert picture.shape == (240, 320, 3), picture.shape
+    greys.append(round(picture.mean()))
+print(*greys)
+path = camera.capture(gphoto2.GP_CAPTURE_IMAGE)
+still = image(camera.file_get(path.folder, path.name, gphoto2.GP_FILE_TYPE_NORMAL))
+print(*still.shape, *still[240, 100], *still[240, 540])
+print(image(camera.capture_preview()).shape[0])
+camera.exit()
+"""
+
+
+@pytest.mark.wire
+def test_python_gphoto2_zooms_looks_and_shoots(server, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", CLIENT, str(server.port)],
+        env={**os.environ, "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    model, zoom, greys, still, again = done.stdout.splitlines()
+    assert (model, zoom, again) == ("Canon PowerShot S5 IS", "105.0", "240")
+    assert server.lens.commands == [105]
+    # Pictures of the feed are a grey level lighter each, until they start again; none is given twice.
+    steps = np.diff([int(grey) for grey in greys.split()])
+    assert np.all((steps > 0) | (steps < -50))
+    height, width, _, *colours = map(int, still.split())
+    assert (width, height) == (640, 480)
+    np.testing.assert_allclose(colours, (0, 0, 255, 0, 0, 0), atol=5)

@@ -1,0 +1,310 @@
+"""The gymnasium environments: their spaces and checks, seeds, what they take and show, and what they refuse."""
+
+import dataclasses
+import math
+import re
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+
+from cotarget.config import RigConfig
+from cotarget.env import FOLLOW, SCHEDULE, Follow, PipelinePolicy, Schedule, SchedulingPolicy
+from cotarget.env.common import RIG_FEATURES, Units
+from cotarget.env.follow import TRACK_FEATURES
+from cotarget.env.schedule import SLOTS
+from cotarget.errors import ConfigError, CotargetError
+from cotarget.evaluation import TruthNoise
+from tests.env_episodes import FRAME_S, field_rig, run
+
+NO_NOISE = TruthNoise(center_px=0.0, size=0.0, miss=0.0)
+STILL = np.zeros(3, np.float32)
+TRACK, RIG = list(TRACK_FEATURES), list(RIG_FEATURES)
+# Without noise the filter is as far off as limbs move a box's edges: a part of the picture; relative, of the median.
+PLACE, WIDTH, HEIGHT = 0.01, 0.5, 0.05
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory):
+    return field_rig(tmp_path_factory.mktemp("field"))
+
+
+def named(observation):
+    """The numbers of a track observation by name."""
+    return dict(zip(TRACK + RIG, observation.tolist(), strict=True))
+
+
+# ---------------------------------------------------------------- gymnasium's own checks
+@pytest.mark.parametrize("make", [Follow, Schedule])
+def test_tracks_pass_the_checker(field, make):
+    env = make("bird", rig=field, seconds=2.0)
+    check_env(env, skip_render_check=True)
+    env.close()
+
+
+def test_both_are_registered():
+    for name, kind in ((FOLLOW, Follow), (SCHEDULE, Schedule)):
+        env = gymnasium.make(name, seconds=1.0)
+        assert isinstance(env.unwrapped, kind)
+        env.close()
+    env = gymnasium.make("cotarget.env:cotarget/Follow-v0", target="book", seconds=0.2)
+    env.reset(seed=0)
+    ends = [env.step(env.action_space.sample())[2:4] for _ in range(5)]
+    assert ends == [(False, False)] * 4 + [(False, True)]
+    env.close()
+
+
+def flat(observation, *index):
+    """All numbers of an observation, or of one of those of a vector of environments."""
+    return np.concatenate([np.ravel(each[index]).astype(float) for each in values(observation)])
+
+
+def assert_agrees_with_one(vector, alone, action=STILL):
+    """The first of two environments does in a vector what it does alone, and the second something else."""
+    observations, _ = vector.reset(seed=[7, 8])
+    np.testing.assert_array_equal(flat(observations, 0), flat(alone[0][0]))
+    for observation, reward, info in alone[1:]:
+        observations, rewards, _, _, infos = vector.step(np.stack([action, action]))
+        np.testing.assert_array_equal(flat(observations, 0), flat(observation))
+        assert rewards[0] == reward
+        np.testing.assert_array_equal(infos["box_wide"][0], info["box_wide"])
+    assert np.abs(flat(observations, 1) - flat(observations, 0)).max() > 0.01
+    vector.close()
+
+
+def make_book():
+    return gymnasium.make(f"cotarget.env:{FOLLOW}", target="book", seconds=1.0)  # a spawned process knows no more
+
+
+def test_a_vector_of_environments_agrees_with_one():
+    assert_agrees_with_one(SyncVectorEnv([make_book] * 2), run(make_book(), lambda _: STILL, seed=7, seconds=0.4))
+
+
+def test_a_vector_of_schedules_agrees_with_one(field):
+    def make():
+        return gymnasium.make(SCHEDULE, kind="bird", rig=field, seconds=4.0)
+
+    alone = run(make(), lambda _: 0, seed=7, seconds=2.0)
+    assert alone[-1][0]["tracks"].any()
+    assert_agrees_with_one(SyncVectorEnv([make] * 2), alone, np.int64(0))
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_a_rig_and_pictures_in_processes_of_their_own(field):
+    chosen = {"target": "book", "observation": "images", "rig": field, "seconds": 1.0}
+    vector = gymnasium.make_vec(
+        FOLLOW, num_envs=2, vectorization_mode="async", vector_kwargs={"context": "spawn"}, **chosen
+    )
+    assert_agrees_with_one(vector, run(gymnasium.make(FOLLOW, **chosen), lambda _: STILL, seed=7, seconds=0.4))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("context", ["spawn", "forkserver"])
+def test_environments_in_processes_of_their_own_agree_with_one(context):
+    alone = run(make_book(), lambda _: STILL, seed=7, seconds=0.4)
+    assert_agrees_with_one(AsyncVectorEnv([make_book] * 2, context=context), alone)
+
+
+def test_a_vector_begins_anew_where_an_episode_ends():
+    vector = gymnasium.make_vec(FOLLOW, num_envs=2, vectorization_mode="sync", target="book", seconds=0.2)
+    vector.reset(seed=3)
+    ends = [vector.step(np.stack([STILL, STILL]))[3].tolist() for _ in range(7)]
+    assert ends == [[False] * 2] * 4 + [[True] * 2] + [[False] * 2] * 2
+    vector.close()
+
+
+# ---------------------------------------------------------------- seeds
+@pytest.mark.parametrize("make", [Follow, Schedule])
+def test_the_same_seed_gives_the_same_episode_and_no_seed_another(field, make):
+    env = make("bird", rig=field, seconds=1.0)
+    env.action_space.seed(1)
+    actions = [env.action_space.sample() for _ in range(20)]
+
+    def told(**seed):
+        observation, info = env.reset(**seed)
+        steps = [env.step(action) for action in actions]
+        arrays = [flat(each) for each in (observation, *(step[0] for step in steps))]
+        return np.array(arrays), [s[1] for s in steps], info["direction"]
+
+    first, again, other, another = told(seed=3), told(seed=3), told(), told()
+    np.testing.assert_array_equal(first[0], again[0])
+    assert first[1] == again[1]
+    directions = [np.ravel(each[2]) for each in (first, other, another)]
+    for i, j in ((0, 1), (1, 2), (0, 2)):
+        assert np.abs(directions[i] - directions[j]).max() > 1e-3
+    repeated = told(seed=3), told()
+    np.testing.assert_array_equal(repeated[1][2], other[2])  # what follows a seed is told by it, too
+    env.close()
+
+
+def values(observation):
+    return [observation[key] for key in sorted(observation)] if isinstance(observation, dict) else [observation]
+
+
+# ---------------------------------------------------------------- actions and observations
+def test_an_action_names_a_place_within_the_ranges():
+    """Pan -1 to 1 rad, tilt -0.5 to 0.5 rad, focal lengths of 100 to 1600 px: the middle of the logarithm is 400 px."""
+    units = Units((-1.0, 1.0), (-0.5, 0.5), (100.0, 1600.0))
+    assert units.command([0, 0, 0]) == pytest.approx((0.0, 0.0, 400.0))
+    assert units.command([-1, 1, -1]) == pytest.approx((-1.0, 0.5, 100.0))
+    assert units.command([0.5, -0.5, 0.5]) == pytest.approx((0.5, -0.25, 800.0))
+    assert units.command([7, -7, 7]) == pytest.approx((1.0, -0.5, 1600.0))
+    assert units.action((0.5, -0.25, 800.0)) == pytest.approx([0.5, -0.5, 0.5])
+
+
+def test_head_and_lens_go_where_the_action_says(field):
+    env = Follow("book", rig=field, seconds=3.0)
+    env.reset(seed=0)
+    action = np.array([0.1, -0.2, 0.5], np.float32)
+    for _ in range(70):
+        observation, *_ = env.step(action)
+    told, limits, lens = named(observation), env.episode.rig.head.limits, env.episode.rig.zoom
+    state = env.episode.rig.head.state()
+    assert state.pan == pytest.approx(0.1 * limits.pan[1], abs=limits.step)  # its range is symmetric
+    assert state.tilt == pytest.approx(limits.tilt[0] + 0.4 * np.ptp(limits.tilt), abs=limits.step)
+    shortest, longest = lens.focal_range
+    assert lens.state().focal_px == pytest.approx(shortest**0.25 * longest**0.75, rel=0.02)  # a lens of 129 positions
+    for name, wanted in zip(("pan", "tilt", "focal"), action, strict=True):
+        assert told[name] == told[f"{name}_commanded"] == pytest.approx(wanted, abs=0.01)
+    assert (told["head_moves"], told["lens_moves"]) == (0.0, 0.0)
+    assert told["age_s"] == told["closeup_age_s"] == pytest.approx(0.06)  # the default latency
+    assert told["gone"] == pytest.approx(70 / 75)
+    env.close()
+
+
+def test_tracks_are_what_the_tracker_knows(field):
+    """Without noise: where the truth is, as large, and as fast as the box has moved in the last half second."""
+    env = Follow("person", rig=field, seconds=5.0, noise=NO_NOISE)
+    told = run(env, lambda _: STILL, seed=1)
+    width, height = env.config.sim.fixed.size
+    assert not any(named(told[0][0])[name] for name in TRACK)  # nobody is there yet
+    (observation, _, info), (_, _, before) = told[-1], told[-1 - 12]
+    track, (left, top, right, bottom) = named(observation), info["box_wide"]
+    assert (track["known"], track["detected"], track["unseen_s"]) == (1.0, 1.0, 0.0)
+    assert track["u"] == pytest.approx((left + right + 1) / width - 1, abs=2 * PLACE)
+    assert track["v"] == pytest.approx((top + bottom + 1) / height - 1, abs=2 * PLACE)
+    assert track["width"] == pytest.approx((right - left) / width, rel=WIDTH)
+    assert track["height"] == pytest.approx((bottom - top) / height, rel=HEIGHT)
+    assert track["larger_side"] == pytest.approx((bottom - top) / width, rel=HEIGHT)
+    assert 0.9 < track["confidence"] < 1.0
+    moved = np.mean((info["box_wide"] - before["box_wide"]).reshape(2, 2), axis=0) / (12 * FRAME_S)
+    assert abs(moved[0]) > 20.0  # px/s: it walks
+    assert track["du"] == pytest.approx(2 * moved[0] / width, rel=0.3)
+    assert track["dv"] == pytest.approx(2 * moved[1] / height, abs=0.05)
+    env.close()
+
+
+def test_a_target_that_is_missed_is_still_known_for_a_while(field):
+    env = Follow("book", rig=field, seconds=2.0, noise=NO_NOISE)
+    env.reset(seed=0)
+    for _ in range(20):
+        observation, *_ = env.step(STILL)
+    sure = named(observation)
+    env.episode.detector.detect = lambda frame: []
+    for k in range(1, 4):
+        unseen = named(env.step(STILL)[0])
+        assert (unseen["known"], unseen["detected"]) == (1.0, 0.0)
+        assert unseen["unseen_s"] == pytest.approx(k * FRAME_S)
+        assert unseen["confidence"] < sure["confidence"]
+    env.close()
+
+
+@pytest.mark.parametrize(("make", "name", "action", "steps"), [
+    (Follow, "book", STILL, 20), (Schedule, "bird", 0, 70),
+])  # fmt: skip
+def test_the_truth_is_in_info_alone(field, make, name, action, steps):
+    """The same detections of another true size: the same observations, and another truth."""
+    told = []
+    for stretch in (1.0, 0.7):
+        env = make(name, rig=field, seconds=4.0)
+        env.reset(seed=4)
+        detector, outlines = env.episode.detector, env.episode.outlines
+        frame = env.episode.rig.fixed.read()
+        found = {k: detector.detect(dataclasses.replace(frame, t=k * FRAME_S)) for k in range(steps + 10)}
+        detector.detect = lambda frame, found=found: found[round(frame.t / FRAME_S)]
+        outlines._points = {each: points * stretch for each, points in outlines._points.items()}
+        outlines._t = math.nan  # what it has worked out is of the other size
+        told.append([env.step(action) for _ in range(steps)])
+        env.close()
+    for one, other in zip(*told, strict=True):
+        np.testing.assert_array_equal(flat(one[0]), flat(other[0]))
+        boxes = [each[4]["box_wide"].reshape(-1, 2, 2) for each in (one, other)]
+        sizes = [box[:, 1] - box[:, 0] for box in boxes]
+        assert sizes[1] == pytest.approx(0.7 * sizes[0], rel=0.03)  # it is far away
+    known = one[0]["tracks"] if make is Schedule else one[0]
+    assert known.any()
+
+
+# ---------------------------------------------------------------- what is refused
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda: Follow("dragon"), "target: unknown 'dragon'; there are: bird, book, person"),
+    (lambda: Schedule("book"), "kind: unknown 'book'; there are: bird, person"),
+    (lambda: Follow(observation="smell"), "observation: unknown 'smell'; there are: images, tracks"),
+    (lambda: Follow(observation=np.zeros(3)), "observation: unknown array([0., 0., 0.]); there are: images, tracks"),
+    (lambda: Schedule(["bird"]), "kind: unknown ['bird']; there are: bird, person"),
+    (lambda: Follow(seconds=21), "seconds: 21 is not above 0 and up to 20"),
+    (lambda: Follow(seconds=math.nan), "seconds: nan is not"),
+    (lambda: Follow(image_size=(4, 64)), "image_size: (4, 64) is not (width, height) of 8 to 4096 pixels each"),
+    (lambda: Follow(image_size=(64, 100_000)), "image_size: (64, 100000) is not"),
+    (lambda: Follow(image_size=64), "image_size: 64 is not"),
+    (lambda: Follow(render_mode="human"), "render_mode: unknown 'human'; there is: rgb_array"),
+    (lambda: Follow(rig="nothing.toml"), "nothing.toml: no such file"),
+    (lambda: Follow(rig=RigConfig(backend="hardware")), "rig: its backend is 'hardware'; environments are on 'sim'"),
+    (lambda: Follow(seconds="5"), "seconds: '5' is not"),
+    (lambda: Follow(rig=3), "rig: 3 is neither a cotarget.config.RigConfig nor the path"),
+    (lambda: Follow(calibration=3), "calibration: 3 is neither a cotarget.calibration.Calibration nor the path"),
+    (lambda: Follow(calibration="nothing.json"), "nothing.json: "),
+    (lambda: Follow(noise=0.5), "noise: 0.5 is no cotarget.evaluation.TruthNoise"),
+    (lambda: Schedule(served_reward=math.inf), "served_reward: inf is not a finite number"),
+    (lambda: Schedule(served_reward="much"), "served_reward: 'much' is not a finite number"),
+    (lambda: PipelinePolicy(Schedule()), "the pipeline is a policy of cotarget/Follow-v0"),
+    (lambda: SchedulingPolicy(Follow()), "policies choose in cotarget/Schedule-v0"),
+    (lambda: SchedulingPolicy(Schedule(), ["best"]), "policy: unknown ['best']; there are: first-come, most-served"),
+    (lambda: SchedulingPolicy(Schedule(), "best"), "policy: unknown 'best'; there are: first-come, most-served"),
+    (lambda: Follow().reset(options={"wind": 3}), "options: reset knows no 'wind'"),
+    (lambda: Follow().reset(options=3), "options: reset knows no 3"),
+    (lambda: Follow().reset(options=np.zeros(3)), "options: reset knows no array([0., 0., 0.])"),
+])  # fmt: skip
+def test_what_makes_no_sense_is_refused_in_a_line(make, said):
+    with pytest.raises(CotargetError, match=re.escape(said)) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_an_argument_that_there_is_not_is_named():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'wind'"):
+        gymnasium.make(FOLLOW, wind=3)
+
+
+def test_actions_that_are_none_are_refused(field):
+    env = Follow("book", rig=field, seconds=1.0)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
+        env.step(STILL)
+    env.reset(seed=0)
+    for action in (
+        [0.0, 0.0],
+        [0.0, math.nan, 0.0],
+        [[0.0, 0.0, 0.0]],
+        np.zeros((40, 40)),
+        "left",
+        None,
+        [[1], [2, 3]],
+    ):
+        with pytest.raises(ConfigError, match="is not three finite numbers") as caught:
+            env.step(action)
+        assert "\n" not in str(caught.value)
+    env.close()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(STILL)
+    several = Schedule("bird", rig=field, seconds=1.0)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        several.step(0)
+    several.reset(seed=0)
+    for action in (SLOTS, -1, 0.5, math.nan, np.zeros((40, 40)), "first", None):
+        with pytest.raises(ConfigError, match="is not the number of a slot, 0 to 7") as caught:
+            several.step(action)
+        assert "\n" not in str(caught.value)
+    several.close()

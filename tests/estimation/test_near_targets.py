@@ -1,0 +1,115 @@
+"""A target that comes so near that the border cuts its box, and stays there: for minutes no size tells its depth."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cotarget.config import DEFAULT_TARGETS
+from cotarget.detection import Detection
+from cotarget.estimation import SpatialFilter
+from cotarget.pipeline import FollowSettings, State, follow
+from experiments.calibration.synthetic.rig import SIZE, Truth
+from tests.moving_targets import calibration_of
+from tests.pipeline.test_follow import CALIBRATION, DELAY, PLAIN, Rig
+
+RATE = 15.0
+LAST = np.array(SIZE) - 0.5  # right and lower edge of the image [px]
+# Where it begins, where it stops [m], and its width over its height; each is cut where it stops.
+WAYS = {"person": (8.0, 2.0, 0.26), "bird": (9.0, 0.6, 1.0), "book": (3.0, 0.2, 0.7)}
+SIDE_PX = 1.0  # noise of each edge
+ROUNDING = 1e-9
+
+
+class Approach:
+    """Comes straight on from the side at a speed and stops; as a detector it gives the part that is in the image."""
+
+    mask = None
+
+    def __init__(self, name, speed, waits_s=1.0):
+        self.target = DEFAULT_TARGETS[name]
+        self.speed, self.waits_s = speed, waits_s
+        self.start, self.stop, self.ratio = WAYS[name]
+        self.rng = np.random.default_rng(0)
+
+    def path(self, t):
+        z = max(self.start - self.speed * max(t - self.waits_s, 0.0), self.stop)
+        aside = 0.6 * math.sin(2 * t) if t < self.waits_s else 0.0  # or nobody would believe that it moves
+        return np.array([0.05 * self.start + aside, 0.02 * self.start, z])
+
+    def box(self, lens, t):
+        x = self.path(t)
+        height = self.target.size / (self.ratio if self.target.dimension == "width" else 1.0)
+        half = np.array([lens.fx * height * self.ratio, lens.fy * height]) / x[2] / 2
+        middle = lens.project(x[None])[0]
+        low, high = middle - half, middle + half
+        cut = (low <= -0.5) | (high >= LAST)
+        noise = self.rng.normal(0.0, SIDE_PX, (2, 2))
+        low, high = np.maximum(low + noise[0], -0.5), np.minimum(high + noise[1], LAST)
+        return Detection((low + high) / 2, high - low, 1.0, bool(cut.any()))
+
+    def detect(self, frame):
+        return [self.box(PLAIN, frame.t)]
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.4, 3.0, 10.0])
+@pytest.mark.parametrize("name", WAYS)
+def test_what_stays_close_and_cut_for_a_minute_is_about_where_it_was_seen_last(name, speed):
+    lens, way = Truth().fixed, Approach(name, speed)
+    estimator = SpatialFilter(calibration_of(Truth()), way.target)
+    arrived = way.waits_s + (way.start - way.stop) / speed
+    depths, sigmas = [], []
+    for t in np.arange(0.0, arrived + 60.0, 1 / RATE):
+        box = way.box(lens, t)
+        estimator.see_wide(box, t)
+        found = estimator.at(t + 0.1)
+        assert np.isfinite(found.state).all()
+        sigma = np.sqrt(np.diag(found.state_covariance))
+        assert np.linalg.eigvalsh(found.state_covariance / np.outer(sigma, sigma)).min() > 0
+        if t > arrived:
+            assert box.clipped
+            depths.append(found.depth)
+            sigmas.append(sigma[2])
+    side = way.box(lens, arrived + 60.0).size_px[0 if way.target.dimension == "width" else 1]
+    farthest = lens.fy * way.target.size / side  # where it would be if that were the whole of it
+    late = depths[len(depths) // 6 :]
+    assert 0.5 * way.target.size - ROUNDING < min(depths)
+    if name != "bird":  # of a bird that is 40 % narrower than its wings are wide the same box says 40 % less
+        assert max(late) < 1.1 * farthest
+    assert max(late) < 1.5 * min(late)  # it stands, and so does the estimate
+    assert max(sigmas) < 1.5 + ROUNDING  # a factor of five, and no more
+
+
+def test_a_box_that_is_cut_brings_a_target_nearer_and_never_moves_it_away():
+    calibration, person = calibration_of(Truth()), DEFAULT_TARGETS["person"]
+    middle = np.array(calibration.fixed.image_center_px)
+    whole = Detection(middle, np.array([31.0, 120.0]), 1.0)
+    found = {}
+    for part in (0.3, 0.9, 1.0, 1.4):
+        estimator = SpatialFilter(calibration, person)
+        for i in range(40):
+            cut = replace(whole, size_px=whole.size_px * part, clipped=True)
+            estimator.see_wide(whole if i < 10 else cut, i / RATE)
+        found[part] = estimator.at(39 / RATE).depth
+    depth = Truth().fixed.fy * person.size / 120.0
+    assert found[0.3] == pytest.approx(depth, rel=0.01)
+    assert found[0.9] == found[0.3]
+    assert 0.9 * depth / 1.4 < found[1.4] < 1.01 * depth / 1.4  # it comes on a little, as it was seen to have come
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", [1.0, 1.4])
+def test_the_head_stands_before_a_person_who_has_come_close(speed):
+    way, rig = Approach("person", speed, waits_s=3.0), Rig()
+    settings = FollowSettings(command_delay_s=DELAY)
+    poses = []
+    for step in follow(rig, CALIBRATION, way.target, way, seconds=25.0, settings=settings):
+        poses.append((step.t, *rig.pose(rig.t)))
+        assert step.state in (State.FOLLOWING, State.SEARCHING)
+    t, pan, tilt = np.array(poses).T
+    assert step.state is State.FOLLOWING
+    cut = t > way.waits_s + (way.start - 2.6) / speed  # from 2.6 m on its feet are out of view
+    for angle in (pan, tilt):
+        assert np.ptp(angle[cut]) < math.radians(12)
+        assert np.ptp(angle[t > 18.0]) < math.radians(2)

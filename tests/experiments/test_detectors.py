@@ -1,0 +1,97 @@
+"""The experiment that compares detectors: its shake, how it judges, and its figures."""
+
+import numpy as np
+import pytest
+
+from cotarget.detection import Detection
+from cotarget.rig import Frame
+from cotarget.sim.targets.random_paths import GROUPED, group_paths, in_view
+from cotarget.sim.truth import Silhouette
+from experiments.following import detectors
+from experiments.following.detectors import MEMORY_S, SHAKES, STANDS, Watch
+from experiments.following.field_scenes import five_targets_config
+
+FRAMES, RATE = 100, 25.0
+HALF_SIZE = 0.5  # of a bird or, across, a person, and more [m]
+SIDE = np.array([20.0, 20.0])
+
+
+def test_the_shake_is_as_strong_and_as_slow_as_it_says():
+    shake = detectors._Shake(1.5, np.random.default_rng(0))
+    at = np.array([shake.at(i / RATE) for i in range(20000)])
+    assert at.std(axis=0) == pytest.approx([1.5, 1.5], rel=0.05)
+    expected = np.exp(-1 / RATE / MEMORY_S)
+    assert np.corrcoef(at[1:, 0], at[:-1, 0])[0, 1] == pytest.approx(expected, abs=0.02)
+
+
+def test_a_shaken_picture_is_where_the_shake_is():
+    picture = np.zeros((60, 80, 3), np.uint8)
+    picture[20:30, 30:45] = 255
+    v, u = np.nonzero(detectors._shifted(picture, np.array([3.0, -2.0]))[..., 0] > 127)
+    assert (u.min(), u.max(), v.min(), v.max()) == (33, 47, 18, 27)
+
+
+@pytest.mark.parametrize("kind", GROUPED)
+def test_the_first_of_five_is_in_view_before_the_shortest_run_ends(kind):
+    for seed in range(50):
+        ways = [np.array(way) for way in group_paths(kind, seed).values()]
+        assert any(in_view(way[way[:, 0] <= detectors.COME_S, 1:], HALF_SIZE).any() for way in ways), seed
+
+
+class Seer:
+    """Finds what it is told."""
+
+    mask = None
+
+    def __init__(self, found):
+        self.found = found
+
+    def detect(self, frame):
+        return [Detection(center, SIDE, 0.9, False) for center in self.found(frame.t)]
+
+
+def watch(found, shift=(0.0, 0.0), camera=STANDS):
+    """Two targets that go to the right, one above the other, from a second after the start until four seconds."""
+    config = five_targets_config(0, "bird")
+    watching = Watch("bird", "motion", camera, config.target("bird"), config)
+    watching._detector = Seer(found)
+    for i in range(FRAMES):
+        t = i / RATE
+        outlines = {name: Silhouette(at(name, t) - SIDE / 2, at(name, t) + SIDE / 2, 1.0) for name in ("a", "b")}
+        watching.see(Frame(np.zeros((480, 640, 3), np.uint8), t), np.array(shift), outlines)
+    return watching.row(7)
+
+
+def at(name, t):
+    return np.array([100 + 60 * t, 100.0 if name == "a" else 300.0])
+
+
+def test_tracks_are_judged_by_the_truth():
+    both = watch(lambda t: [at("a", t), at("b", t)])
+    assert both["found"] == 1.0
+    assert both["false_per_min"] == both["switches_per_min"] == 0
+    assert (both["scene"], both["detector"], both["camera"], both["seed"]) == ("five birds", "motion", STANDS, 7)
+    assert watch(lambda t: [at("a", t)])["found"] == 0.5
+    off = watch(lambda t: [at("a", t), at("b", t) + np.array([0.0, 90.0])])
+    assert off["found"] == 0.5
+    assert off["false_per_min"] == pytest.approx(60 / 1.96, rel=0.01)  # one, from 2 s to 3.96 s
+
+
+def test_a_shaken_camera_is_judged_as_if_it_stood():
+    shift = np.array([40.0, 0.0])
+    assert watch(lambda t: [at("a", t) + shift, at("b", t) + shift], shift, SHAKES)["found"] == 1.0
+    assert watch(lambda t: [at("a", t) + shift, at("b", t) + shift], camera=SHAKES)["found"] == 0.0
+
+
+def test_where_nobody_is_nothing_can_be_found():
+    rows = [
+        {"seed": 0, "scene": "five birds", "detector": "speck", "camera": STANDS, "found": 0.9, "false_per_min": 0.0,
+         "switches_per_min": 1.0},
+        {"seed": 0, "scene": "no bird", "detector": "speck", "camera": STANDS, "found": None, "false_per_min": 3.0,
+         "switches_per_min": None},
+    ]  # fmt: skip
+    summary = detectors.summarise(rows)
+    assert set(summary["no bird"]["speck, stands"]) == {"false_per_min"}
+    assert summary["five birds"]["speck, stands"]["found"]["median"] == 0.9
+    text = detectors.describe(detectors.SETTINGS, summary)
+    assert text.count("no bird") == 1

@@ -1,0 +1,56 @@
+"""The README's pictures: taken from results, all or none, and all of them shown."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from experiments.paper.gallery import PICTURES, SHOWN, WIDEST_PX, main
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def results(tmp_path):
+    """A folder as a full run leaves it, of grey pictures."""
+    for each in SHOWN:
+        path = tmp_path / "results" / each.experiment / f"{each.picture}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), np.full((900, 2 * WIDEST_PX, 3), 127, np.uint8))
+    return tmp_path / "results"
+
+
+def test_each_picture_is_taken_at_the_width_of_a_page(results, tmp_path, capsys):
+    assert main(["--results", str(results), "--out", str(tmp_path / "out")]) == 0
+    written = sorted((tmp_path / "out").iterdir())
+    assert [path.stem for path in written] == sorted(each.name for each in SHOWN)
+    assert {cv2.imread(str(path)).shape for path in written} == {(450, WIDEST_PX, 3)}
+    assert len(capsys.readouterr().out.splitlines()) == len(written)
+
+
+def test_some_are_taken_alone(results, tmp_path, capsys):
+    command = ["--results", str(results), "--out", str(tmp_path / "out")]
+    assert main(["hold", "fig4_book", *command]) == 0
+    assert sorted(path.stem for path in (tmp_path / "out").iterdir()) == ["fig4", "fig4_as_the_paper", "hold"]
+    assert main(["hole", *command]) == 1
+    assert "'hole' is not one of: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("harm", [lambda path: path.unlink(), lambda path: path.write_bytes(b"no picture")])
+def test_without_one_none_is_written(results, tmp_path, capsys, harm):
+    last = SHOWN[-1]
+    lacking = results / last.experiment / f"{last.picture}.png"
+    harm(lacking)
+    assert main(["--results", str(results), "--out", str(tmp_path / "out")]) == 1
+    error = capsys.readouterr().err
+    assert str(lacking) in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_readme_shows_them_all_and_no_other():
+    shown = re.findall(r"\]\((experiments/\S+\.jpg)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert sorted(ROOT / path for path in shown) == sorted(PICTURES / f"{each.name}.jpg" for each in SHOWN)
+    assert all((ROOT / path).is_file() for path in shown)

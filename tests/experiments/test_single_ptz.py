@@ -1,0 +1,229 @@
+"""A lone pan-tilt-zoom camera: where it looks, what it expects, and that it finds what it lost."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cotarget.config import DEFAULT_TARGETS
+from cotarget.evaluation import TruthDetector, TruthNoise, true_calibration
+from cotarget.rig import Frame
+from cotarget.sim.truth import Outlines
+from cotarget.sim.world import SimWorld
+from experiments.engine.bounds import compare
+from experiments.engine.workers import here
+from experiments.following import single_ptz, single_runs
+from experiments.following.lone_camera import COAST_S, LoneCamera, scan_of
+from experiments.following.lone_course import SEARCH_S, Course, Sighting
+from experiments.following.shaken import Shaken
+
+BOOK = DEFAULT_TARGETS["book"]
+STEP = 0.04
+SCAN_POSES = 4  # two rows of two views that are as wide as the wide one, turned and aside
+
+
+def test_a_course_leads_by_its_velocity():
+    course = Course(BOOK, 0.5)
+    assert not course.known
+    side = BOOK.size / 10
+    for i in range(25):
+        t = i * STEP
+        course.saw(Sighting(t, 0.2 * t, 0.1 - 0.1 * t, (side, side / 2), False), 700.0)
+    (pan, tilt), variances = course.at(1.2)
+    assert (pan, tilt) == pytest.approx((0.24, -0.02), abs=2e-3)
+    assert course.rates == pytest.approx((0.2, -0.1), abs=5e-3)
+    assert (course.size, course.range) == (side, pytest.approx(10.0))
+    assert min(variances) > 0
+    assert course.at(2.0)[1][0] > 10 * variances[0]
+    course.saw(Sighting(9.0, 1.0, 0.0, (side, side / 2), False), 700.0)  # after that long, begun anew
+    assert course.at(9.0)[0] == pytest.approx((1.0, 0.0))
+
+
+def test_a_piece_of_a_target_tells_no_size():
+    course = Course(BOOK, 0.5)
+    course.saw(Sighting(0.0, 0.0, 0.0, (0.02, 0.01), False), 700.0)
+    course.saw(Sighting(STEP, 0.0, 0.0, (0.005, 0.01), True), 700.0)
+    assert course.sides == (0.02, 0.01)
+
+
+@pytest.fixture
+def world():
+    with (w := SimWorld(single_runs.config_of("book", 0), rendered=())).rig:
+        yield w
+
+
+@pytest.mark.parametrize("size", [(640, 480), (1280, 960), (320, 240)])
+def test_a_scan_sees_all_that_the_wide_camera_does(size):
+    config = single_runs.config_of("book", 0)
+    scale = size[0] / config.sim.fixed.size[0]
+    focal_px = tuple(scale * focal for focal in config.sim.fixed.focal_px)
+    fixed = replace(config.sim.fixed, size=size, focal_px=focal_px, center_px=tuple((side - 1) / 2 for side in size))
+    world = SimWorld(replace(config, sim=replace(config.sim, fixed=fixed)), rendered=())
+    calibration = true_calibration(world)
+    poses = np.array(scan_of(world.rig, calibration))
+    rim = np.array([[u, v] for u in (0.0, 0.5, 1.0) for v in (0.0, 0.5, 1.0)]) * (np.array(size) - 1.0)
+    far = calibration.fixed.ray(rim) * 1000.0  # where the cameras' offset does not count
+    x = calibration.T_base_fixed.apply(far)
+    pans, tilts = np.arctan2(x[:, 0], x[:, 2]), np.arctan2(-x[:, 1], np.hypot(x[:, 0], x[:, 2]))
+    f = calibration.zoom.stops[0].focal_px[0]
+    across, down = math.atan(320 / f), math.atan(240 / f)
+    for pan, tilt in zip(pans, tilts, strict=True):
+        near = (np.abs(poses[:, 0] - pan) < across) & (np.abs(poses[:, 1] - tilt) < down)
+        assert near.any(), np.degrees([pan, tilt])
+    assert len(poses) == SCAN_POSES  # and no more than that
+
+
+def test_a_run_whose_clock_never_starts_leaves_the_others_their_figures():
+    """A person is not wholly in view yet after the least time that can be asked for."""
+    rows = [
+        {"seed": seed, "target": "person", "way": "pair"} | single_ptz.figures(judged, "pair")
+        for seed, judged in enumerate([single_runs.held("pair", "person", 0, 2.1, 0.05), []])
+    ]
+    assert all(row[key] in (None, 0.0, 1.0) for row in rows for key in single_ptz.FIGURES)
+    well = dict(rows[0], closeup_yield=0.6, in_frame_of_all=0.7, watched=0.1)
+    found = single_ptz.summarise([*rows, well])["person"]["pair"]
+    assert (found["closeup_yield"], found["in_frame_of_all"]) == (0.6, 0.7)
+
+
+class Blind:
+    """Finds the book as the truth has it, until a time; then nothing."""
+
+    mask = None
+
+    def __init__(self, truth, until):
+        self._finder, self._until = TruthDetector(truth, 0, TruthNoise(0.0, 0.0, 0.0), camera="zoom"), until
+
+    def detect(self, frame):
+        return self._finder.detect(frame) if frame.t < self._until else []
+
+
+def looked(world, until, seconds):
+    """Where a camera's head was sent that sees its book until a time, by what it was doing; and its focal lengths."""
+    truth, calibration = world.truth(), true_calibration(world)
+    detector = Blind(Outlines(truth, still=True), until)
+    delay = world.config.command_delay_s
+    field = scan_of(world.rig, calibration)
+    camera = LoneCamera(world.rig, truth, calibration, BOOK, detector, delay, 0.5, field)
+    sent, move = [], world.rig.head.move
+    world.rig.head.move = lambda pan, tilt, speed=None: sent.append((pan, tilt)) or move(pan, tilt, speed)
+    modes = [(frame.t, camera.mode, truth.lens("zoom", frame.t).focal_px[0]) for frame in camera.run(seconds)]
+    return modes, sent, field
+
+
+def test_who_sees_nothing_scans_all_the_field_again_and_again(world):
+    modes, sent, field = looked(world, 0.0, 8.0)
+    assert {mode for _, mode, _ in modes} == {"scanning"}
+    assert sorted(sent[: len(field)]) == sorted(field)
+    assert sent[len(field) : 2 * len(field)] == sent[: len(field)]
+
+
+def test_who_loses_its_target_zooms_out_searches_there_and_then_scans(world):
+    lost = 3.0
+    modes, sent, field = looked(world, lost, lost + SEARCH_S + 2.0)
+    by_time = {t: mode for t, mode, _ in modes}
+    assert {mode for t, mode in by_time.items() if t < lost} == {"waiting", "following"}
+    assert {mode for t, mode in by_time.items() if 0.5 < t < lost} == {"following"}
+    after = [mode for t, mode in by_time.items() if lost + COAST_S < t < lost + SEARCH_S - STEP]
+    assert set(after) == {"searching"}
+    assert modes[-1][1] == "scanning"
+    assert set(sent) & set(field)
+    close = max(focal for t, _, focal in modes if t < lost)
+    assert close > 3 * modes[-1][2]
+
+
+def held(way, name, seconds=5.0, miss=0.05):
+    return single_ptz.figures(single_runs.held(way, name, 1, seconds, miss), way)
+
+
+def test_a_lone_camera_finds_and_holds_a_book():
+    found = held("lone", "book")
+    assert found["in_frame_ratio"] > 0.95
+    assert 0.2 < found["time_to_acquire_s"] < 2.0  # four detections, and the delays
+    assert found["watched"] < 0.4  # of the field, after it was found
+
+
+def test_the_picture_moves_when_the_head_does(world):
+    truth = world.truth()
+    shaken = Shaken(Outlines(truth, still=True), truth, 0, 1.0)
+    image = np.zeros((480, 640, 3), np.uint8)
+    world.rig.clock.sleep_until(1.0)
+    assert not shaken.moves(0.5)
+    world.rig.head.move(0.5, 0.0)
+    world.rig.clock.sleep_until(1.6)
+    assert shaken.moves(1.3)
+    assert shaken.misses(1.3)
+    assert np.mean([shaken.misses(0.5 + i * 1e-3) for i in range(100)]) < 0.2  # of a picture that stands, 5 %
+    assert shaken.detect(Frame(image, 1.3)) == []
+
+
+def test_until_the_clock_starts_nobody_looks_and_then_both_from_the_same_place():
+    runs = [single_runs.held(way, "person", 1, 5.0, 0.05) for way in single_runs.WAYS]
+    begin = [next(i for i in range(len(rows)) if single_runs.begun(rows[: i + 1])) for rows in runs]
+    assert begin[0] == begin[1] > 40  # 2 s of 25 frames, and until it is wholly in view
+    pair, lone = (rows[: begin[0] + 1] for rows in runs)
+    np.testing.assert_array_equal([row.u_px for row in pair], [row.u_px for row in lone])
+    assert np.ptp([row.focal_px for row in lone]) == 0
+    assert [len(rows) - begin[0] for rows in runs] == [single_ptz.score(rows).frames for rows in runs]
+
+
+def test_the_head_stands_anywhere_in_the_wide_view(world):
+    calibration, width, height = true_calibration(world), 640, 480
+    poses = [single_runs.any_pose(world.rig, calibration, seed) for seed in range(200)]
+    pans, tilts = np.degrees(poses).T
+    half_pan, half_tilt = (math.degrees(math.atan(side / 2 / 686)) for side in (width, height))
+    assert pans.std() == pytest.approx(half_pan / math.sqrt(3), rel=0.15)  # 200 tell it to 5 %
+    assert tilts.std() == pytest.approx(half_tilt / math.sqrt(3), rel=0.15)
+
+
+class Once:
+    """Sees the book in one frame alone."""
+
+    mask = None
+
+    def __init__(self, truth):
+        self._finder, self.asked = TruthDetector(truth, 0, TruthNoise(0.0, 0.0, 0.0), camera="zoom"), 0
+
+    def detect(self, frame):
+        self.asked += 1
+        return self._finder.detect(frame) if self.asked == 1 else []
+
+
+def test_what_is_seen_once_is_not_believed(world):
+    truth, calibration = world.truth(), true_calibration(world)
+    field = scan_of(world.rig, calibration)
+    detector = Once(Outlines(truth, still=True))
+    camera = LoneCamera(world.rig, truth, calibration, BOOK, detector, world.config.command_delay_s, 0.5, field)
+    modes = [camera.mode for _ in camera.run(3.0)]
+    assert modes[0] == "waiting"
+    assert set(modes) == {"waiting", "scanning"}
+
+
+def run_row(way, value, seconds):
+    return {"seed": 0, "target": "book", "way": way, "time_to_acquire_s": seconds} | dict.fromkeys(
+        single_ptz.FIGURES, value
+    )
+
+
+def test_summaries_are_means_and_a_run_without_acquisition_counts():
+    pair, lone = (single_ptz.case(way, 0.05) for way in single_runs.WAYS)
+    rows = [run_row(pair, 0.8, 1.0), run_row(pair, 1.0, 3.0), run_row(pair, 0.9, 2.0), run_row(lone, 0.5, None)]
+    summary = single_ptz.summarise(rows)
+    assert summary["book"][pair]["closeup_yield"] == pytest.approx(0.9)
+    assert summary["book"][pair]["closeup_yield_error"] == pytest.approx(0.1 / math.sqrt(3))
+    assert summary["book"][pair]["time_to_acquire_s_median"] == 2.0
+    assert summary["book"][lone]["never_acquired"] == 1.0
+    text = single_ptz.describe(single_ptz.SETTINGS, summary)
+    assert "0.90 +- 0.06" in text
+    assert "2.00 (" in text
+    bad = [f"book, {lone}: in frame 0.50", f"book, {lone}: not acquired in every run"]
+    assert single_ptz.missed(summary) == bad
+
+
+@pytest.mark.slow
+def test_no_figure_gets_worse():
+    experiment = single_ptz.EXPERIMENT
+    bounds = compare(experiment, experiment.summarise(experiment.run(experiment.quick, engine=here)))
+    assert bounds
+    for bound in bounds:
+        assert bound.kept, f"{bound.name} is {bound.reached}, not {bound.text}"

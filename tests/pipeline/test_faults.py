@@ -1,0 +1,527 @@
+"""The loop and what goes wrong: frames, the zoom camera, targets that are many, out of reach or not the chosen one.
+
+Nothing ends in a crash, a head that runs away, or a Step that does not say what is wrong.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from cotarget.calibration import load_calibration
+from cotarget.config import RigConfig as Config
+from cotarget.config import SafetyConfig, SimConfig
+from cotarget.control.selection import POLICIES, Chosen
+from cotarget.detection import Detection
+from cotarget.errors import CotargetError, DeviceError, StaleFrameError
+from cotarget.evaluation import TruthDetector, true_calibration
+from cotarget.fusion import MOST_FILTERS
+from cotarget.pipeline import BLIND_S, FROZEN_S, GONE_S, ZOOM_WAIT_S, FollowSettings, State, follow
+from cotarget.recording.format import open_recording
+from cotarget.recording.replay import ReplayRig, until_end
+from cotarget.rig import Frame
+from cotarget.safety import SafeRig
+from cotarget.sim.world import SimWorld
+from tests.pipeline.test_follow import (
+    BOOK,
+    CALIBRATION,
+    DELAY,
+    LATENCY,
+    PLAIN,
+    RATE_HZ,
+    STEP,
+    WIDE,
+    Rig,
+    Seer,
+    crossing,
+    off,
+    run,
+    spans,
+    still,
+)
+from tests.recorded_run import ToyRig, calibration_file, record
+from tests.recorded_run import run as recorded
+
+FRAME_S = 1 / RATE_HZ
+FAULT = 1.5  # when it happens [s]; by then the target is followed
+# The target crosses at 2 m/s, 10 m away. A command leads the head no farther than 0.15 s of the target's way, what the
+# target has gone since its light fell, and its own way of braking.
+RATE = 0.2
+FARTHEST = RATE * (LATENCY + DELAY + 0.15 + FRAME_S) + RATE**2 / (2 * WIDE.acceleration) + STEP
+
+
+@dataclass
+class Faulty:
+    """A camera whose answers are changed on their way.
+
+    Attributes:
+        camera: the real one.
+        change: makes another answer of ``read``, its arguments and the rig's time; by default none.
+    """
+
+    camera: object
+    change: object = field(default=lambda read, t, newer_than, timeout: read(newer_than, timeout))
+
+    def __getattr__(self, name):
+        return getattr(self.camera, name)
+
+    def read(self, newer_than=None, timeout=1.0):
+        return self.change(self.camera.read, self.camera.rig.t, newer_than, timeout)
+
+
+def attempt(rig, seer, seconds, **settings):
+    """Follow until an error; the Steps before it, and the error."""
+    steps, error = [], None
+    try:
+        for step in follow(rig, CALIBRATION, BOOK, seer, seconds=seconds, settings=settings_of(**settings)):
+            steps.append(step)
+    except CotargetError as raised:
+        error = raised
+    assert "\n" not in str(error)
+    return steps, error
+
+
+def settings_of(**settings):
+    return FollowSettings(command_delay_s=DELAY, **settings)
+
+
+def assert_it_comes_to_rest(rig, since):
+    """The head goes on from where it was at a time for no longer than its last command says, and stands then."""
+    way = rig.pose(math.inf)[0] - rig.pose(since)[0]
+    assert abs(way) < FARTHEST
+    assert rig.pan.motor(since + 0.5)[1] == 0.0
+    assert all(low <= q <= high for q, (low, high) in zip(rig.pose(math.inf), (WIDE.pan, WIDE.tilt), strict=True))
+
+
+# ---------------------------------------------------------------- frames of the fixed camera
+def test_frames_that_stop():
+    rig = Rig(dropped=(FAULT, 100.0))
+    steps, error = attempt(rig, Seer(crossing), 5.0)
+    assert isinstance(error, StaleFrameError)
+    assert steps[-1].state is State.FOLLOWING
+    assert_it_comes_to_rest(rig, steps[-1].t)
+
+
+def again(frames):
+    """The same frame once more, whatever is asked for."""
+
+    def change(read, t, newer_than, timeout):
+        if t > FAULT:
+            return frames[-1]
+        frames.append(read(newer_than, timeout))
+        return frames[-1]
+
+    return change
+
+
+def shifted(by):
+    """Frames whose times jump by so much [s]."""
+
+    def change(read, t, newer_than, timeout):
+        known = newer_than is None or t <= FAULT + LATENCY + FRAME_S or math.isnan(newer_than - by)
+        asked = newer_than if known else newer_than - by
+        frame = read(asked, timeout)
+        return replace(frame, t=frame.t + by) if frame.t > FAULT else frame
+
+    return change
+
+
+@pytest.mark.parametrize(("change", "told"), [
+    (again([]), "its frames repeat, or its clock has jumped"),
+    (shifted(-1.0), "its frames repeat, or its clock has jumped"),
+    (shifted(100.0), "in the future; mind the clock"),
+    (shifted(math.nan), "gave a frame of nan s"),
+])  # fmt: skip
+def test_frames_that_repeat_or_jump_in_time(change, told):
+    rig = Rig()
+    rig.fixed = Faulty(rig.fixed, change)
+    steps, error = attempt(rig, Seer(crossing), 5.0)
+    assert isinstance(error, StaleFrameError)
+    assert told in str(error)
+    assert steps[-1].state is State.FOLLOWING
+    assert_it_comes_to_rest(rig, steps[-1].t)
+    assert all(step.t < FAULT + LATENCY + 2 * FRAME_S for step in steps)  # nobody steers by them
+
+
+@pytest.mark.parametrize(("spoil", "told"), [
+    (lambda last, frame: last, "frames repeat, or its clock has jumped; this one is 0.0"),
+    (lambda last, frame: replace(frame, t=frame.t - 0.2), "frames repeat, or its clock has jumped; this one is 0.0"),
+    (lambda last, frame: replace(frame, t=frame.t + 5.0), "in the future; mind the clock; this one is 0.0"),
+])  # fmt: skip
+@pytest.mark.parametrize("safe", [False, True])
+def test_a_frame_that_repeats_or_jumps_is_passed_over_and_told(spoil, told, safe):
+    rig, frames, spoilt = Rig(), [], []
+
+    def change(read, t, newer_than, timeout):
+        frame = read(newer_than, timeout)
+        if t > FAULT and not spoilt:
+            spoilt.append(spoil(frames[-1], frame))
+            return spoilt[0]
+        frames.append(frame)
+        return frame
+
+    rig.fixed = Faulty(rig.fixed, change)
+    if safe:
+        rig.head.halt = lambda: [axis.halt(rig.t) for axis in (rig.pan, rig.tilt)]
+        rig.board, rig.close = None, lambda: None
+        with SafeRig(rig, SafetyConfig()) as each:
+            steps, error = attempt(each, Seer(crossing), 3.0)
+    else:
+        steps, error = attempt(rig, Seer(crossing), 3.0)
+    assert error is None
+    (said,) = [step for step in steps if "this one is" in step.reason]
+    assert said.t == pytest.approx(FAULT + LATENCY, abs=2 * FRAME_S)
+    assert spoilt[0].t not in {step.fixed.t for step in steps[steps.index(said) :]}
+    if not safe:  # who reads for the safety layer says it in words of its own
+        assert told in said.reason
+    assert np.max(np.diff([step.fixed.t for step in steps])) < 3 * FRAME_S
+    assert {step.state for step in steps if step.t > FAULT} == {State.FOLLOWING}
+    assert off(rig, crossing, rig.t) < RATE * FRAME_S
+
+
+def test_time_that_leaps_for_all():
+    """The program stood still for 5 s, and the target is elsewhere: it is a new one, and nothing is made of the gap."""
+    rig, gone = Rig(), []
+
+    def change(read, t, newer_than, timeout):
+        if t > FAULT and not gone:
+            gone.append(t)
+            rig.t += 5.0
+        return read(newer_than, timeout)
+
+    rig.fixed = Faulty(rig.fixed, change)
+    steps = run(rig, Seer(lambda t: crossing(t) if t < 2 * FAULT else still(t)), 9.0)
+    before, after = ([s for s in steps if (s.t <= gone[0]) == early] for early in (True, False))
+    assert [state for state, _ in spans(after)][-1] is State.FOLLOWING
+    assert [{s.target.id for s in part if s.target is not None} for part in (before, after)] == [{1}, {2}]
+    assert off(rig, still, rig.t) < STEP
+    there = rig.pose(math.inf)[0]
+    low, high = sorted((before[-1].head.pan, there))
+    assert all(low - FARTHEST < pan < high + FARTHEST for t, pan, _ in rig.moves if t > gone[0])
+
+
+def test_times_that_jitter():
+    """A frame of a nanosecond after another is no reason to hurry."""
+    rig, odd = Rig(), []
+
+    def change(read, t, newer_than, timeout):
+        frame = read(newer_than, timeout)
+        if newer_than is not None and len(odd) % 2:
+            frame = replace(frame, t=newer_than + 1e-9)
+        odd.append(frame)
+        return frame
+
+    rig.fixed = Faulty(rig.fixed, change)
+    steps = run(rig, Seer(crossing), 3.0)
+    assert steps[-1].state is State.FOLLOWING
+    ways = np.diff([step.head.pan for step in steps])
+    assert np.abs(ways[-20:]).max() < 2 * RATE * FRAME_S
+
+
+@pytest.mark.parametrize("camera", ["fixed", "zoom"])
+def test_frames_that_change_their_size(camera):
+    rig = Rig()
+    small = np.zeros((240, 320, 3), np.uint8)
+
+    def change(read, t, newer_than, timeout):
+        frame = read(newer_than, timeout)
+        return Frame(small, frame.t) if t > FAULT else frame
+
+    setattr(rig, camera, Faulty(getattr(rig, camera), change))
+    steps, error = attempt(rig, Seer(crossing), 5.0)
+    assert isinstance(error, DeviceError)
+    assert str(error).startswith(f"the {camera} camera gave a frame of 320x240, and not of 640x480")
+    assert_it_comes_to_rest(rig, steps[-1].t)
+
+
+def frozen(rig, camera, since=FAULT):
+    """A rig one of whose cameras gives its first picture again from a fault on, with new times."""
+    kept = []
+
+    def change(read, t, newer_than, timeout):
+        frame = read(newer_than, timeout)
+        kept.append(frame.image)
+        return replace(frame, image=kept[0].copy()) if t > since else frame
+
+    setattr(rig, camera, Faulty(getattr(rig, camera), change))
+    return rig
+
+
+def test_a_picture_that_stays_the_same_is_told():
+    """A server that repeats its last picture with new times: what is seen in it says nothing of what is there."""
+    rig = frozen(Rig(), "fixed")
+    steps = run(rig, Seer(lambda t: crossing(min(t, FAULT))), FAULT + 3.0)
+    told = [step for step in steps if "the fixed camera has shown the same picture for" in step.reason]
+    assert told[0].t == pytest.approx(FAULT + FROZEN_S + LATENCY, abs=2 * FRAME_S)
+    assert told == steps[-len(told) :]
+    assert rig.pan.motor(rig.t)[1] == 0.0
+
+
+# ---------------------------------------------------------------- the zoom camera
+def blind(rig, since, until=math.inf, waits=0.0):
+    """A rig whose zoom camera gives nothing in between, after making who asks wait for a part of the timeout."""
+
+    def change(read, t, newer_than, timeout):
+        if since <= t < until:
+            rig.t += waits * timeout
+            raise StaleFrameError("no frame from the zoom camera: it is lost; reconnecting")
+        return read(newer_than, timeout)
+
+    rig.zoom = Faulty(rig.zoom, change)
+    return rig
+
+
+@pytest.mark.parametrize("waits", [0.0, 1.0])
+def test_a_zoom_camera_that_is_blind_for_a_while_stops_nothing(waits):
+    """The wide view alone keeps the head on the target, and every Step says what is missing."""
+    rig = blind(Rig(), FAULT, FAULT + 1.0, waits)
+    steps, errors = [], []
+    for step in follow(rig, CALIBRATION, BOOK, Seer(crossing), seconds=3.5, settings=settings_of()):
+        steps.append(step)
+        errors.append(off(rig, crossing, step.t))
+    without = [s for s in steps if FAULT <= s.t - waits * ZOOM_WAIT_S < FAULT + 1.0]
+    last = [s for s in steps if s not in without and s.t < FAULT + 0.5][-1]
+    assert len(without) == pytest.approx(1.0 * RATE_HZ, abs=1)  # at every frame of the wide view
+    for step in without:
+        assert step.state is State.FOLLOWING
+        assert step.zoom is last.zoom
+        assert "the zoom camera has shown nothing new for" in step.reason
+        assert step.reason.endswith("it is lost; reconnecting")
+        assert step.found is None
+    assert not [s for s in steps if s not in without and "nothing new" in s.reason]
+    assert steps[-1].zoom.t > last.zoom.t + 1.0
+    assert np.mean(errors[steps.index(without[5]) :]) < RATE * FRAME_S / 4 + STEP  # as in test_loop, where it sees
+
+
+def test_a_zoom_camera_that_repeats_its_frame_is_told():
+    """Some frames the same are usual, where it is slower than the wide one."""
+    rig, kept = Rig(), []
+
+    def change(read, t, newer_than, timeout):
+        if t > FAULT:
+            return kept[-1]
+        kept.append(read(newer_than, timeout))
+        return kept[-1]
+
+    rig.zoom = Faulty(rig.zoom, change)
+    steps = run(rig, Seer(crossing), 3.0)
+    told = [step for step in steps if "the zoom camera has shown nothing new for" in step.reason]
+    assert told[0].t == pytest.approx(FAULT + BLIND_S, abs=2 * FRAME_S)
+    assert told == steps[-len(told) :]
+    assert {step.state for step in told} == {State.FOLLOWING}
+
+
+class Asked:
+    """A finder that notes the times of the zoom frames that it is asked to look at, and finds nothing."""
+
+    def __init__(self):
+        self.times = []
+
+    def see_wide(self, frame, detection, mask=None):
+        del frame, detection, mask
+
+    def sight_at(self, t):
+        return t
+
+    def find(self, frame, expected):
+        del expected
+        self.times.append(frame.t)
+
+
+def test_a_zoom_picture_that_stays_the_same_is_told_and_not_looked_at_again():
+    """What an old picture shows beside the middle would lead the head off a target that the wide view still sees."""
+    rig, asked = frozen(Rig(), "zoom"), Asked()
+    steps = run(rig, Seer(crossing), FAULT + 2.0, finder=lambda *_: asked)
+    told = [step for step in steps if "the zoom camera has shown the same picture for" in step.reason]
+    assert told[0].t == pytest.approx(FAULT + FROZEN_S + LATENCY, abs=2 * FRAME_S)
+    assert told == steps[-len(told) :]
+    assert {step.state for step in told} == {State.FOLLOWING}
+    assert len(asked.times) > 1.0 * RATE_HZ  # until then at every frame
+    assert asked.times[-1] == pytest.approx(FAULT, abs=2 * FRAME_S + LATENCY)
+
+
+def test_pictures_that_stay_the_same_in_both_views_are_looked_at():
+    """As of a scene without noise in which nothing moves."""
+    rig, asked = frozen(frozen(Rig(), "zoom", since=0.0), "fixed", since=0.0), Asked()
+    steps = run(rig, Seer(still), FAULT + 2.0, finder=lambda *_: asked)
+    assert asked.times[-1] == steps[-1].zoom.t
+    assert "the zoom camera has shown the same picture" not in steps[-1].reason
+
+
+def test_a_zoom_camera_that_is_dead_for_good_is_an_error():
+    rig = blind(Rig(), FAULT)
+    steps, error = attempt(rig, Seer(still), 30.0)
+    assert isinstance(error, StaleFrameError)
+    assert str(error).startswith("the zoom camera has shown nothing new for 10.")
+    assert steps[-1].t == pytest.approx(FAULT + GONE_S, abs=0.2)
+    assert all("nothing new" in step.reason for step in steps if step.t > FAULT + ZOOM_WAIT_S)
+    assert rig.pan.motor(rig.t)[1] == 0.0
+
+
+def test_a_zoom_camera_that_never_gave_a_frame_is_refused_before_anything_moves():
+    rig = blind(Rig(), 0.0)
+    steps, error = attempt(rig, Seer(still), 5.0)
+    assert isinstance(error, StaleFrameError)
+    assert not steps
+    assert not rig.moves
+
+
+def test_a_zoom_frame_that_is_there_costs_no_time():
+    """In the simulation, where every wait is time that passes."""
+    config = Config(sim=SimConfig(scene="indoor", targets=("book",)))
+    world = SimWorld(config, rendered=())
+    truth, target = world.truth(), config.target("book")
+    with SafeRig(world.rig, config.safety) as rig:
+        settings = FollowSettings(command_delay_s=config.command_delay_s)
+        detector = TruthDetector(truth, 0)
+        steps = list(follow(rig, true_calibration(world), target, detector, seconds=1.0, settings=settings))
+    assert [step.t - step.fixed.t for step in steps] == pytest.approx([config.sim.fixed.latency_s] * len(steps))
+    assert all(step.zoom.t == pytest.approx(step.fixed.t) for step in steps)
+
+
+def test_a_zoom_camera_that_was_blind_is_so_in_the_replay(tmp_path):
+    """Though the errors came one by one, not one of them ended the run."""
+    path = calibration_file(tmp_path)
+    failing = {("zoom.read", n): StaleFrameError("it is lost") for n in range(9, 20)}
+    steps = record(tmp_path / "run", path, ToyRig(failing))
+    recording = open_recording(tmp_path / "run")
+    played = ReplayRig(recording)
+    again = list(until_end(recorded(played, load_calibration(recording.calibration), seconds=math.inf)))
+    assert sum("it is lost" in step.reason for step in steps) == 11
+    assert [step.reason for step in again] == [step.reason for step in steps]
+    assert [step.zoom.t for step in again] == [step.zoom.t for step in steps]
+    assert played.differences.same
+
+
+# ---------------------------------------------------------------- many, far off, or not the chosen one
+class Crowd:
+    """Sees many books on a grid, 10 m away, all moving to the right and left in step."""
+
+    mask = None
+
+    def __init__(self, columns=10, rows=10, swing=0.3):
+        v, u = np.mgrid[:rows, :columns].reshape(2, -1)
+        self.places = np.stack([(u - (columns - 1) / 2) * 0.85, (v - (rows - 1) / 2) * 0.6, 10.0 + 0.0 * u], axis=1)
+        self.swing = swing
+
+    def at(self, number, t):
+        return self.places[number] + (self.swing * math.sin(2 * t), 0.0, 0.0)
+
+    def detect(self, frame):
+        size = 686 * 0.234 / 10.0
+        pixels = PLAIN.project(np.array([self.at(n, frame.t) for n in range(len(self.places))]))
+        return [Detection(pixel, np.array([size, 1.4 * size]), 1.0) for pixel in pixels]
+
+
+def test_of_a_hundred_moving_things_one_is_followed():
+    rig, crowd = Rig(), Crowd()
+    steps = run(rig, crowd, 2.5)
+    followed = {step.target.id for step in steps if step.target is not None}
+    assert followed == {1}
+    assert steps[-1].state is State.FOLLOWING
+    assert len([track for track in steps[-1].tracks if track.confirmed]) == 100
+    # It is measured at every frame, however many others there are.
+    assert all(step.estimate.measured_t == step.fixed.t for step in steps if step.target is not None)
+    assert off(rig, lambda t: crowd.at(0, t), rig.t) < 0.01
+    assert len({round(pan, 1) for _, pan, _ in rig.moves}) <= 3  # it does not go from one to the other
+
+
+@pytest.mark.parametrize("click", [False, True])
+def test_whoever_is_chosen_of_a_hundred_is_followed(click):
+    """Though there are more tracks than are known in 3D."""
+    rig, crowd, number = Rig(), Crowd(), 77
+    pixel = tuple(PLAIN.project(crowd.at(number, 0.2))[0])
+    policy = partial(Chosen, pixel=pixel, width_px=100.0) if click else partial(Chosen, number=number + 1)
+    steps = run(rig, crowd, 2.0, policy=policy)
+    assert number > MOST_FILTERS
+    assert {step.target.id for step in steps if step.target is not None} == {number + 1}
+    assert steps[-1].state is State.FOLLOWING
+    assert off(rig, lambda t: crowd.at(number, t), rig.t) < 0.01
+
+
+@pytest.mark.parametrize(("policy", "told"), [
+    (partial(Chosen, number=7), "track 7 is not there"),
+    (partial(Chosen, pixel=(20.0, 30.0), width_px=640.0), "no track at the click (20, 30)"),
+])  # fmt: skip
+def test_a_choice_that_meets_nobody_is_told(policy, told):
+    rig = Rig()
+    steps = run(rig, Seer(still), 1.0, policy=policy)
+    assert {(step.state, step.reason) for step in steps} == {(State.SEARCHING, told)}
+    assert any(track.confirmed for track in steps[-1].tracks)
+    assert not rig.moves
+
+
+def test_a_chosen_target_that_has_gone_is_told():
+    rig = Rig()
+    pixel = tuple(PLAIN.project(np.array(still(0)))[0].round())
+    steps = run(rig, Seer(still, lambda t: t < 1.0), 3.0, policy=partial(Chosen, pixel=pixel, width_px=640.0))
+    assert [state for state, _ in spans(steps)] == [
+        State.SEARCHING,
+        State.FOLLOWING,
+        State.COASTING,
+        State.LOST,
+        State.SEARCHING,
+    ]
+    u, v = pixel
+    assert steps[-1].reason == f"track 1, which was at the click ({u:g}, {v:g}), is not there any more"
+    assert_it_comes_to_rest(rig, 1.0)
+
+
+def test_a_chosen_target_that_was_hidden_for_long_is_followed_on():
+    """Its track lives for 0.8 s; then it has another number, and is the same target."""
+    rig = Rig()
+    hidden = run(rig, Seer(still, lambda t: not 1.0 <= t < 2.5), 5.0, policy=partial(Chosen, number=1))
+    assert [(state, number) for (state, number), _ in itertools.groupby(hidden, key=whom)][-2:] == [
+        (State.SEARCHING, None),
+        (State.FOLLOWING, 2),
+    ]
+    assert off(rig, still, rig.t) < STEP
+
+
+def whom(step):
+    return step.state, None if step.target is None else step.target.id
+
+
+class Two:
+    """Sees one book that is out of reach, from the start, and one within it later."""
+
+    mask = None
+
+    def __init__(self):
+        self.far, self.near = Seer(lambda t: (3.0, 0.4, 10.0)), Seer(lambda t: (-0.5, 0.4, 10.0), lambda t: t > 1.0)
+
+    def detect(self, frame):
+        return self.far.detect(frame) + self.near.detect(frame)
+
+
+@pytest.mark.parametrize("policy", sorted(POLICIES))
+def test_a_target_beyond_the_limits_keeps_nobody_from_another(policy):
+    rig = Rig(replace(WIDE, pan=(-0.15, 0.15)))
+    steps = run(rig, Two(), 4.0, policy=POLICIES[policy])
+    alone = [step for step in steps if 0.3 < step.t < 1.0]
+    assert {step.state for step in alone} == {State.UNREACHABLE}
+    assert all("beyond the limits" in step.reason for step in alone)
+    assert {(step.state, step.target.id) for step in steps if step.t > 2.0} == {(State.FOLLOWING, 2)}
+    assert all(-0.15 <= pan <= 0.15 for _, pan, _ in rig.moves)
+    assert rig.pan.motor(rig.t)[1] == 0.0
+
+
+def test_a_chosen_target_beyond_the_limits_is_not_exchanged():
+    rig = Rig(replace(WIDE, pan=(-0.15, 0.15)))
+    steps = run(rig, Two(), 3.0, policy=partial(Chosen, number=1))
+    assert {(step.state, step.target.id) for step in steps if step.t > 0.3} == {(State.UNREACHABLE, 1)}
+    assert not rig.moves
+
+
+def test_frames_that_repeat_end_a_run_behind_the_safety_layer_too():
+    rig = Rig()
+    rig.fixed = Faulty(rig.fixed, again([]))
+    rig.head.halt = lambda: [axis.halt(rig.t) for axis in (rig.pan, rig.tilt)]
+    rig.board, rig.close = None, lambda: None
+    with SafeRig(rig, SafetyConfig()) as safe:
+        steps, error = attempt(safe, Seer(crossing), 5.0)
+    assert isinstance(error, StaleFrameError)
+    assert_it_comes_to_rest(rig, steps[-1].t)

@@ -1,0 +1,679 @@
+"""Replays: the same to the last bit, sensible where the pipeline has changed, and as far as a folder is whole."""
+
+import collections
+import dataclasses
+import itertools
+import json
+import math
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cotarget.calibration import load_calibration
+from cotarget.calibration.file import save_calibration
+from cotarget.cli.main import main
+from cotarget.config import parse_config
+from cotarget.control.selection import Chosen, Whom, parse_whom, whom_table
+from cotarget.detection import make_detector
+from cotarget.errors import ConfigError, CotargetError, DeviceError, StaleFrameError
+from cotarget.estimation import Estimate
+from cotarget.pipeline import FollowSettings, State, follow
+from cotarget.recording.format import COMPLETE, Event, open_recording
+from cotarget.recording.recorder import Recorder
+from cotarget.recording.replay import Differences, RecordingEndedError, ReplayRig, Tape, until_end
+from cotarget.rig import PanTiltState
+from cotarget.safety import SafeRig
+from cotarget.sim.world import SimWorld
+from tests.cli.test_commands import true_calibration
+from tests.recorded_run import (
+    CONFIG,
+    RATE_HZ,
+    SETTINGS,
+    SIZE,
+    STEP,
+    Bright,
+    ToyRig,
+    calibration,
+    calibration_file,
+    record,
+    run,
+)
+
+SECONDS = 2.0
+DEADLINE_S = 60.0  # for what should come at once
+
+
+def assert_same(then, now, where="step"):
+    """Equal to the last bit, through dataclasses and arrays."""
+    assert type(then) is type(now), where
+    if isinstance(then, Estimate):  # what it was made with comes from other files
+        assert_same((then.t, then.state, then.state_covariance), (now.t, now.state, now.state_covariance), where)
+    elif dataclasses.is_dataclass(then):
+        for field in dataclasses.fields(then):
+            assert_same(getattr(then, field.name), getattr(now, field.name), f"{where}.{field.name}")
+    elif isinstance(then, tuple | list):
+        assert len(then) == len(now), where
+        for i, (a, b) in enumerate(zip(then, now, strict=True)):
+            assert_same(a, b, f"{where}[{i}]")
+    elif isinstance(then, np.ndarray):
+        assert np.array_equal(then, now), where
+    else:
+        assert then == now or (then != then and now != now), where
+
+
+def replay(folder, change=lambda rig: rig, **options):
+    """The steps of a replay until the recording ends, and how its commands differ."""
+    recording = open_recording(folder)
+    rig = ReplayRig(recording)
+    options = {"seconds": math.inf} | options
+    steps = list(until_end(run(change(rig), load_calibration(recording.calibration), **options)))
+    return steps, rig.differences
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A recording, its steps, and nothing may change it."""
+    folder = tmp_path_factory.mktemp("recorded")
+    steps = record(folder / "run", calibration_file(folder), seconds=SECONDS)
+    return folder / "run", steps
+
+
+@pytest.fixture
+def copy(recorded, tmp_path):
+    """A copy that may be broken."""
+    return shutil.copytree(recorded[0], tmp_path / "copy")
+
+
+def lines(folder):
+    return (folder / "log.jsonl").read_bytes().splitlines(keepends=True)
+
+
+def test_the_same_pipeline_sees_and_commands_the_same_to_the_last_bit(recorded):
+    folder, steps = recorded
+    recording = open_recording(folder)
+    assert (recording.target, recording.ending, recording.truncated, recording.notes) == ("bird", "complete", False, ())
+    assert recording.steps == len(steps) == 50 + 2  # a frame each 40 ms, the first at once and one under way at the end
+    assert recording.seconds == pytest.approx(SECONDS, abs=0.05)
+    assert {step.state for step in steps} >= {State.FOLLOWING, State.COASTING}
+    again, differences = replay(folder)
+    for then, now in zip(steps, again, strict=True):
+        assert_same(then, now)
+    assert differences.same
+    assert differences.moves > 30
+    assert differences.zooms > 2
+    limited, _ = replay(folder, seconds=SECONDS)  # the recorded clock ends the run as it did then
+    assert len(limited) == len(steps)
+
+
+def test_a_rig_in_real_time_is_replayed_as_such(tmp_path):
+    """Its watchdog, a thread of its own, looks at the clock all the time and changes nothing."""
+    path = calibration_file(tmp_path)
+    steps = record(tmp_path / "run", path, ToyRig(real_time=True), seconds=0.5)
+    again, differences = replay(tmp_path / "run")
+    assert_same(steps, again)
+    assert differences.same
+
+
+class Curious(SimpleNamespace):
+    """A rig whose pipeline looks at the clock twice where it did once."""
+
+    def __init__(self, rig):
+        clock = SimpleNamespace(now=lambda: rig.clock.now() and rig.clock.now(), sleep_until=rig.clock.sleep_until)
+        super().__init__(fixed=rig.fixed, zoom=rig.zoom, head=rig.head, board=rig.board, close=rig.close, clock=clock)
+
+
+def test_more_looks_at_the_clock_move_the_time_by_no_more_than_they_take(recorded):
+    """The bird flies 0.7 px a frame at 100 px focal length, 10 degrees/s; a few ticks of 0.1 ms are 0.005 degrees."""
+    again, _ = replay(recorded[0], Curious)
+    aims = [(then.aim, now.aim) for then, now in zip(recorded[1], again, strict=True)]
+    assert [then is None for then, _ in aims] == [now is None for _, now in aims]
+    apart = [math.hypot(then.pan - now.pan, then.tilt - now.tilt) for then, now in aims if then is not None]
+    assert len(apart) > 30
+    assert 0 < math.degrees(max(apart)) < 0.005
+    assert_same([step.detections for step in recorded[1]], [step.detections for step in again])
+    assert_same([step.head for step in recorded[1]], [step.head for step in again])
+
+
+class Shifted:
+    """A rig whose pipeline wants something else of the head and the lens than before."""
+
+    def __init__(self, rig, pan=0.0, focal_px=0.0, every=1):
+        self.fixed, self.clock, self.board = rig.fixed, rig.clock, rig.board
+        self.zoom, self.head = Proxy(rig.zoom), Proxy(rig.head)
+        self.zoom.zoom = lambda wanted: rig.zoom.zoom(wanted + focal_px)
+        count = itertools.count(1)
+        self.head.move = lambda p, t, speed=None: (p, t) if next(count) % every else rig.head.move(p + pan, t, speed)
+
+
+class Proxy:
+    def __init__(self, device):
+        self._device = device
+
+    def __getattr__(self, name):
+        return getattr(self._device, name)
+
+
+def differences_of(folder, **change):
+    recording = open_recording(folder)
+    rig = ReplayRig(recording)
+    calibration, bird = load_calibration(recording.calibration), CONFIG.target("bird")
+    with SafeRig(rig, CONFIG.safety) as safe:
+        steps = follow(Shifted(safe, **change), calibration, bird, Bright(), seconds=math.inf, settings=SETTINGS)
+        assert list(until_end(steps))
+    return rig.differences
+
+
+def test_commands_that_differ_are_counted_and_measured(recorded):
+    """What is not rounded yet is compared: 0.01 rad are 0.573 degrees."""
+    same = differences_of(recorded[0])
+    assert same.same
+    turned = differences_of(recorded[0], pan=0.01)
+    assert (turned.moves, turned.moves_differing, turned.zooms_differing) == (same.moves, same.moves, 0)
+    assert turned.largest_deg == pytest.approx(0.573, abs=0.0005)
+    assert (turned.missing, turned.extra) == (0, 0)
+    moved = [step.index for step, before in zip(recorded[1][1:], recorded[1], strict=False)
+             if step.head_commands > before.head_commands]  # fmt: skip
+    assert (turned.frames, turned.frames_differing, turned.first_frame) == (len(recorded[1]), len(moved), moved[0])
+    assert turned.first_s == pytest.approx(recorded[1][moved[0]].fixed.t - recorded[1][0].fixed.t, abs=1 / RATE_HZ)
+    zoomed = differences_of(recorded[0], focal_px=7.0)
+    assert zoomed.zooms_differing > 0
+    assert zoomed.largest_px >= 7.0
+    halved = differences_of(recorded[0], every=2)
+    assert (halved.moves, halved.missing) == (same.moves // 2, same.moves - same.moves // 2)
+    assert not halved.same
+    assert halved.first_frame == moved[0]
+    others = halved.moves_differing + halved.zooms_differing + halved.extra  # by the time that the others took
+    assert len(moved[::2]) <= halved.frames_differing <= len(moved[::2]) + others
+
+
+def test_differences_in_words():
+    assert str(Differences(moves=3, zooms=2)) == "all 5 commands as recorded"
+    text = str(Differences(9, 2, 0.5, 4, 1, 30.0, 7, 6, 50, 12, 3, 0.118))
+    assert text == (
+        "the commands of 12 of 50 frames differ from those recorded, from frame 3 (0.12 s) on: "
+        "2 of 9 moves differ, by 0.5 degrees at most; 1 of 4 focal lengths, by 30 px at most; "
+        "7 commands missing, 6 more"
+    )
+
+
+@pytest.fixture(scope="module")
+def of_track_2(tmp_path_factory):
+    """A recording of a run that follows nobody but the second track, which comes late, as the command runs it."""
+    folder = tmp_path_factory.mktemp("of_track_2")
+    path = calibration_file(folder)
+    settings = FollowSettings(
+        command_delay_s=CONFIG.command_delay_s, lens_delay_s=CONFIG.lens_delay_s, policy=partial(Chosen, number=2)
+    )
+    with Recorder(folder / "run", CONFIG, path, "bird", Whom(track=2)) as recorder:
+        steps = list(run(recorder.wrap(ToyRig()), load_calibration(path), SECONDS, settings))
+    assert {step.target.id for step in steps if step.target} == {2}
+    return folder / "run"
+
+
+@pytest.fixture
+def replayed(of_track_2, tmp_path, monkeypatch, capsys):
+    """Runs the command on a copy of it: status, result and what it says."""
+    monkeypatch.setattr("cotarget.detection.make_detector", lambda *_: Bright())
+    folder = shutil.copytree(of_track_2, tmp_path / "copy")
+
+    def command(*options):
+        status = main(["replay", str(folder), *options])
+        out, err = capsys.readouterr()
+        return status, json.loads(out) if out else None, err
+
+    command.folder = folder
+    return command
+
+
+def test_the_command_follows_whom_the_recorded_run_followed(replayed):
+    status, result, said = replayed("--check")
+    assert (status, result["differences"]["frames_differing"]) == (0, 0)
+    assert "differ" not in said
+    assert result["differences"]["frames"] == result["steps"] > 40
+
+
+def test_the_command_tells_of_other_commands_and_fails_where_that_is_asked_for(replayed):
+    status, result, said = replayed("--policy", "first-come")
+    found = result["differences"]
+    assert status == 0
+    line = f"cotarget replay: the commands of {found['frames_differing']} of {result['steps']} frames differ"
+    assert said.splitlines()[-1].startswith(line)
+    assert f"from frame {found['first_frame']} ({found['first_s']:.2f} s) on" in said
+    assert found["first_frame"] < 20  # the first bird is believed by then
+    assert replayed("--policy", "first-come", "--check")[:2] == (1, result)
+
+
+def test_a_recording_that_does_not_say_whom_replays_as_the_first_policy_does(replayed):
+    edit("whom", {})(replayed.folder)
+    then = replayed("--policy", "first-come")
+    table = json.loads((replayed.folder / "recording.json").read_text())
+    del table["whom"]
+    (replayed.folder / "recording.json").write_text(json.dumps(table))
+    assert replayed() == then
+
+
+@pytest.mark.parametrize(("whom", "said"), [
+    ({"policy": "by-name"}, "the recorded policy 'by-name' is unknown; give --policy, one of: first-come"),
+    ({"click": [500.0, 3.0]}, "the recorded click: (500, 3) is not in the wide view's 96x72 image"),
+    ({"click": [float("nan"), 3.0]}, "is not in the wide view"),
+    ({"click": [10**400, 3.0]}, "recording.json: whom: int too large"),
+    ({"click": [1.0]}, "recording.json: whom: click [1.0] is no pixel"),
+    ({"track": 0}, "recording.json: whom: {'track': 0} is no"),
+    ({"policy": 3}, "recording.json: whom: {'policy': 3} is no"),
+    ({"track": 1, "policy": "first-come"}, "is not one of policy, click and track"),
+    (None, "recording.json: whom: None is not one of"),
+])  # fmt: skip
+def test_whom_nobody_can_follow_is_refused_in_one_line(replayed, whom, said):
+    edit("whom", whom)(replayed.folder)
+    status, _, err = replayed()
+    assert status == 1
+    assert said in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("whom", [Whom(), Whom("most-served"), Whom(click=(3.5, 7.0)), Whom(track=4)])
+def test_whom_is_written_and_read(whom):
+    assert parse_whom(json.loads(json.dumps(whom_table(whom)))) == whom
+
+
+def write_log(folder, rows, end="complete"):
+    """Put a log written by hand into a recording."""
+    head = lines(folder)[0].decode()
+    text = "".join(json.dumps(row) + "\n" for row in rows)
+    (folder / "log.jsonl").write_text(head + text + (json.dumps({"end": end}) + "\n" if end else ""))
+
+
+def fixed(at, number=0):
+    return {
+        "call": "fixed.read",
+        "at": at,
+        "args": [None, 1.0],
+        "result": [at - 0.06],
+        "image": f"fixed/{number:06}.png",
+    }
+
+
+def zoomed(at, number):
+    return {"call": "zoom.read", "at": at, "args": [None, 1.0], "result": [at - 0.06], "image": f"zoom/{number:06}.png"}
+
+
+def head_at(t, pan, moving=False):
+    return {"call": "head.state", "at": t, "result": [pan, -pan, moving, t]}
+
+
+@pytest.fixture
+def by_hand(copy):
+    """Write a log by hand whose frames are the first of the recording."""
+
+    def write(rows, end="complete"):
+        sizes = [{"bytes": (copy / row["image"]).stat().st_size} if "image" in row else {} for row in rows]
+        write_log(copy, [row | size for row, size in zip(rows, sizes, strict=True)], end)
+        return ReplayRig(open_recording(copy))
+
+    return write
+
+
+def test_what_was_not_asked_then_is_answered_by_time(by_hand):
+    rig = by_hand([
+        head_at(10.0, 0.0), fixed(10.0, 0), zoomed(10.02, 0), head_at(10.1, 0.1, True),
+        {"call": "zoom.state", "at": 10.0, "result": [100.0, False, 10.0]},
+        {"call": "zoom.state", "at": 11.0, "result": [200.0, False, 11.0]},
+        fixed(10.2, 1), zoomed(10.22, 1), fixed(10.3, 2), head_at(10.5, 0.5), fixed(11.0, 3), fixed(11.1, 4),
+    ])  # fmt: skip
+    assert rig.fixed.read().t == pytest.approx(9.94)
+    assert rig.clock.now() == 10.0
+    assert rig.head.state() == PanTiltState(0.1, -0.1, True, 10.1)  # as recorded, though not asked yet
+    rig.clock.sleep_until(10.3)
+    state = rig.head.state()  # half-way between 0.1 at 10.1 and 0.5 at 10.5
+    assert (state.pan, state.tilt, state.moving, state.t) == (pytest.approx(0.3), pytest.approx(-0.3), True, 10.3)
+    assert rig.zoom.read().t == pytest.approx(9.96)  # the one recorded between these frames
+    assert rig.zoom.read().t == pytest.approx(10.16)  # the newest by now
+    with pytest.raises(StaleFrameError, match=r"within 0\.2 s"):
+        rig.zoom.read(newer_than=10.2, timeout=0.2)
+    assert rig.clock.now() == pytest.approx(10.5)
+    assert rig.fixed.read(newer_than=9.94).t == pytest.approx(10.24)  # the newest by now, not the next
+    assert rig.fixed.read(newer_than=10.24, timeout=2.0).t == pytest.approx(10.94)
+    assert rig.zoom.state().focal_px == 200.0
+    with pytest.raises(StaleFrameError):
+        rig.fixed.read(newer_than=10.94, timeout=0.01)  # the next came 0.1 s later
+    assert rig.head.move(0.7 * STEP, 9.0) == pytest.approx((STEP, math.floor(0.5 / STEP) * STEP))
+    assert rig.zoom.zoom(5000.0) == 1200.0
+    assert rig.fixed.size == rig.zoom.still_size == SIZE
+    assert rig.board.patience == 0
+    assert (rig.differences.extra, rig.differences.missing) == (2, 0)
+    rig.fixed.read()
+    with pytest.raises(RecordingEndedError, match=r"copy: the recording ends here, at 11\.10 s") as caught:
+        rig.fixed.read()
+    assert "\n" not in str(caught.value)
+    rig.head.halt()  # closing goes on
+
+
+@pytest.mark.parametrize(("error", "kind", "message"), [
+    (["StaleFrameError", "no frame"], StaleFrameError, "^no frame$"),
+    (["OSError", "the cable is out"], DeviceError, "^OSError: the cable is out$"),
+    (["choices", "a function of that module"], DeviceError, "^choices: a function"),
+])  # fmt: skip
+def test_what_failed_then_fails_again(by_hand, error, kind, message):
+    rig = by_hand([
+        {"call": "head.state", "at": 1.0, "error": error},
+        {"call": "head.move", "at": 1.1, "args": [0.1, 0.2, None, False], "error": error},
+        {"call": "fixed.read", "at": 1.2, "args": [None, 1.0], "error": error},
+    ], end="an accident")  # fmt: skip
+    with pytest.raises(kind, match=message):
+        rig.head.state()
+    with pytest.raises(kind, match=message):
+        rig.head.move(0.1, 0.2)
+    with pytest.raises(kind, match=message):
+        rig.fixed.read()
+    assert (rig.differences.moves, rig.differences.same) == (1, True)
+    with pytest.raises(RecordingEndedError):
+        rig.head.state()  # the run broke off here
+
+
+def collect(steps, into):
+    for step in steps:
+        into.append(step)  # those before a failure stay
+
+
+@pytest.mark.parametrize("failing", [
+    dict.fromkeys([("fixed.read", n) for n in range(20, 200)], StaleFrameError("no frame within 1 s")),
+    {("head.move", 5): DeviceError("the head does not answer")},
+    {("zoom.read", 9): OSError("input/output error")},
+    {("head.move", 8): KeyboardInterrupt()},
+])  # fmt: skip
+def test_an_accident_happens_again(tmp_path, failing):
+    path = calibration_file(tmp_path)
+    error = next(iter(failing.values()))
+    steps = []
+    with pytest.raises(type(error)), Recorder(tmp_path / "run", CONFIG, path, "bird") as recorder:
+        collect(run(recorder.wrap(ToyRig(failing, real_time=True)), load_calibration(path)), steps)
+    recording = open_recording(tmp_path / "run")
+    assert not recording.truncated
+    assert recording.ending == f"{type(error).__name__}: {error}".removesuffix(": ")
+    assert recording.ending in recording.notes[0]
+    rig, again = ReplayRig(recording), []
+    expected = error if isinstance(error, CotargetError) else CotargetError()
+    with pytest.raises(type(expected), match=str(error) or "the recording ends here"):
+        collect(run(rig, load_calibration(path)), again)
+    assert_same(steps, again)
+    assert rig.differences.same
+
+
+def test_a_watchdogs_halt_is_noted_and_leaves_the_replay_alone(tmp_path):
+    path = calibration_file(tmp_path)
+    steps = []
+    with Recorder(tmp_path / "run", CONFIG, path, "bird") as recorder:
+        rig = recorder.wrap(ToyRig())
+        for step in run(rig, load_calibration(path), seconds=0.5):
+            steps.append(step)
+            watchdog = threading.Thread(target=lambda: rig.clock.now() and rig.head.halt())
+            watchdog.start()
+            watchdog.join(DEADLINE_S)
+    rows = [json.loads(line) for line in lines(tmp_path / "run")]
+    assert [row["call"] for row in rows if "aside" in row] == ["head.halt"] * len(steps)
+    again, differences = replay(tmp_path / "run")
+    assert_same(steps, again)
+    assert differences.same
+
+
+def asked_aside(rig):
+    answers = []
+    thread = threading.Thread(target=lambda: answers.extend([rig.clock.now(), rig.head.state(), rig.head.halt()]))
+    thread.start()
+    thread.join(DEADLINE_S)
+    return answers
+
+
+def test_what_another_thread_asks_takes_nothing_from_the_run(by_hand):
+    rig = by_hand([head_at(10.0, 0.0), fixed(10.0), head_at(10.1, 0.1), {"call": "head.halt", "at": 10.1}])
+    rig.fixed.read()
+    assert asked_aside(rig) == [10.0, PanTiltState(0.0, 0.0, False, 10.0), None]
+    assert rig.head.state().pan == 0.1
+
+
+def cut(folder, kept):
+    (folder / "log.jsonl").write_bytes(kept)
+    return open_recording(folder)
+
+
+def test_a_log_that_is_cut_anywhere_replays_what_is_whole(recorded, copy):
+    """Cut within each line of a step and at each of their ends: there are all steps but the last one or two."""
+    whole, (_, steps) = lines(copy), recorded
+    frames = [i for i, line in enumerate(whole) if b"fixed.read" in line]
+    for end in range(frames[20], frames[21] + 1):
+        for kept in (0, 1, len(whole[end]) - 1):
+            recording = cut(copy, b"".join(whole[:end]) + whole[end][:kept])
+            assert recording.truncated
+            assert recording.steps == (20 if end > frames[20] else 19), (end, kept)
+            assert len(recording.notes) == 1
+            assert "is cut short, and replays up to 0.8" in recording.notes[0] or "up to 0.7" in recording.notes[0]
+    again, differences = replay(copy)
+    assert_same(steps[:20], again)
+    assert differences.same
+    assert replay(copy, seconds=0.3)[1].same
+
+
+def damage_line(folder):
+    whole = lines(folder)
+    frame = [i for i, line in enumerate(whole) if b"fixed.read" in line][20]
+    whole[frame + 1] = b'{"call": "clock.now", "at": 1e' + whole[frame + 1][30:]
+    (folder / "log.jsonl").write_bytes(b"".join(whole))
+
+
+def remove_image(folder):
+    (folder / "fixed" / "000020.png").unlink()
+
+
+def shorten_image(folder):
+    path = folder / "fixed" / "000020.png"
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+@pytest.mark.parametrize(("damage", "said", "left"), [
+    (damage_line, r"line \d+ of log.jsonl is damaged", 20),
+    (remove_image, r"fixed/000020.png is missing", 19),
+    (shorten_image, r"fixed/000020.png is damaged", 19),
+])  # fmt: skip
+def test_a_recording_with_a_hole_replays_up_to_it(recorded, copy, damage, said, left):
+    damage(copy)
+    recording = open_recording(copy)
+    assert recording.truncated
+    (note,) = recording.notes
+    assert re.search(said, note)
+    assert "\n" not in note
+    assert_same(recorded[1][:left], replay(copy)[0])
+
+
+def test_an_image_of_the_right_size_that_is_none_ends_the_replay_in_one_line(copy):
+    path = copy / "fixed" / "000020.png"
+    path.write_bytes(bytes(path.stat().st_size))
+    with pytest.raises(DeviceError, match=r"000020\.png: is damaged") as caught:
+        replay(copy)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_zoom_image_that_is_missing_is_stood_in_for(recorded, copy):
+    """From it nothing is decided, so the run is the same all the same."""
+    (copy / "zoom" / "000003.png").unlink()
+    (copy / "zoom" / "000000.png").unlink()
+    recording = open_recording(copy)
+    assert not recording.truncated
+    assert re.fullmatch(r"\d+ frames of the zoom camera lack their image; the one before stands in", recording.notes[0])
+    again, differences = replay(copy)
+    assert differences.same
+    assert [step.zoom.t for step in again] == [step.zoom.t for step in recorded[1]]
+    images = dict.fromkeys(id(step.zoom.image) for step in recorded[1])
+    before = [step for step in recorded[1] if id(step.zoom.image) == list(images)[2]][-1]
+    assert np.array_equal(again[before.index + 1].zoom.image, before.zoom.image)
+    assert not again[0].zoom.image.any()  # nothing came before
+    assert again[0].zoom.image.shape == recorded[1][0].zoom.image.shape
+
+
+def edit(key, value):
+    def change(folder):
+        table = json.loads((folder / "recording.json").read_text())
+        table[key] = value
+        (folder / "recording.json").write_text(json.dumps(table))
+
+    return change
+
+
+def put(name, data):
+    return lambda folder: (folder / name).write_bytes(data)
+
+
+def test_a_simulated_world_that_would_be_refused_by_now_can_still_be_replayed(copy):
+    """As an earlier version wrote it; nothing of it is simulated again."""
+    config = json.loads((copy / "recording.json").read_text())["config"]
+    for camera in ("fixed", "zoom"):  # of which the principal point was not moved with the size, at that time
+        config["sim"][camera] |= {"size": [320, 240], "center_px": [326.0, 239.0], "exposure_s": 1.0}
+    with pytest.raises(ConfigError, match=r"center_px: \(326, 239\) is not in the 320x240 image"):
+        parse_config(config)
+    edit("config", config)(copy)
+    assert open_recording(copy).config.sim.zoom.center_px == (326.0, 239.0)
+    config["sim"]["fixed"]["rate_hz"] = 0.0  # by which a replay goes
+    edit("config", config)(copy)
+    with pytest.raises(ConfigError, match=r"sim\.fixed\.rate_hz: 0 is not greater than zero"):
+        open_recording(copy)
+
+
+def test_differences_take_no_longer_the_more_there_are():
+    """Those before are never gone through again."""
+
+    class Unwalked(set):
+        def __iter__(self):
+            pytest.fail("goes through all")
+
+    events = tuple(Event("fixed.read", 0.1 * i, (None, 1.0), (0.1 * i,), f"fixed/{i:06d}.png") for i in range(50))
+    tape = Tape(SimpleNamespace(directory=Path("run"), events=events, truncated=False, ending=COMPLETE))
+    tape._differing = Unwalked()
+    for i in range(50):
+        tape.next_frame(None, 1.0)
+        if i > 2:
+            tape.compare("head.move", None, (0.0, 0.0, None, False))
+    found = tape.differences
+    assert (found.extra, found.frames_differing, found.first_frame) == (47, 47, 3)
+    assert found.first_s == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(("spoil", "message"), [
+    (shutil.rmtree, r"copy: no such folder; give the folder of a recording"),
+    (lambda folder: (folder / "recording.json").unlink(), r"copy: is no recording: it holds no recording\.json"),
+    (edit("schema", 2), r"recording\.json: schema 2 is not 1, the one that this version reads"),
+    (edit("schema", True), r"schema True is not 1"),
+    (edit("target", "yeti"), r"unknown target 'yeti'"),
+    (edit("target", ["bird"]), r"recording\.json: target"),
+    (edit("config", {"lasers": 1}), r"recording\.json: unknown key 'lasers'"),
+    (edit("config", []), r"recording\.json: config: \[\] is not a table"),
+    (put("recording.json", b"{"), r"recording\.json: is not JSON"),
+    (put("recording.json", b"\xff"), r"recording\.json: cannot be read: not UTF-8"),
+    (put("recording.json", b"[1]"), r"holds no JSON object"),
+    (put("recording.json", b"{}"), r"missing key 'schema'"),
+    (put("recording.json", b'{"schema": 1, "cotarget": "0"}'), r"missing key 'target'; needed here: config, cotarget"),
+    (lambda folder: (folder / "calibration.json").unlink(), r"calibration\.json: no such file"),
+    (lambda folder: (folder / "log.jsonl").unlink(), r"copy: holds nothing to replay: there is no log\.jsonl"),
+    (put("log.jsonl", b""), r"copy: holds nothing to replay: the run stopped"),
+    (put("log.jsonl", b'{"rig": {}}\n'), r"line 1 of log\.jsonl is damaged: missing key 'fixed_size'"),
+    (put("log.jsonl", b'{"rig": []}\n'), r"line 1 of log\.jsonl is damaged"),
+    (put("log.jsonl", b"\x00" * 100), r"holds nothing to replay: the run stopped while a line was written"),
+    (lambda folder: write_log(folder, [fixed(1.0)], end=None), r"is cut short before its first step was complete"),
+])  # fmt: skip
+def test_what_is_no_recording_is_refused_in_one_line(copy, spoil, message):
+    spoil(copy)
+    with pytest.raises(ConfigError, match=message) as caught:
+        open_recording(copy)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_is_no_recording(copy):
+    with pytest.raises(ConfigError, match=r"log\.jsonl: is a file; give the folder"):
+        open_recording(copy / "log.jsonl")
+
+
+def test_another_version_of_the_program_is_told(copy):
+    edit("cotarget", "0.0.7")(copy)
+    assert re.fullmatch(r"was recorded by cotarget 0\.0\.7; this is .*", open_recording(copy).notes[0])
+
+
+def test_no_damage_ends_in_anything_but_one_of_our_errors(copy):
+    """Random bytes in the log and the description: refused, cut short or replayed."""
+    rng = np.random.default_rng(5)
+    whole = {name: (copy / name).read_bytes() for name in ("log.jsonl", "recording.json")}
+    short = b"".join(whole["log.jsonl"].splitlines(keepends=True)[:40])
+    outcomes = collections.Counter()
+    for _ in range(100):
+        name = "log.jsonl" if rng.random() < 0.8 else "recording.json"
+        data = bytearray(short if name == "log.jsonl" else whole[name])
+        for place in rng.integers(0, len(data), rng.integers(1, 4)):
+            data[place] = rng.choice(bytearray(b'0123456789-.eE",:{}[]\n ntfabr\x00\xff'))
+        (copy / "log.jsonl").write_bytes(short)
+        (copy / name).write_bytes(bytes(data))
+        try:
+            recording = open_recording(copy)
+        except ConfigError as error:
+            outcomes["several lines" if "\n" in str(error) else "refused"] += 1
+        else:
+            try:
+                list(until_end(run(ReplayRig(recording), calibration())))
+                outcomes["replayed"] += 1
+            except CotargetError:
+                outcomes["ended"] += 1
+        (copy / name).write_bytes(whole[name])
+    assert outcomes.keys() >= {"refused", "replayed"}, outcomes
+    assert outcomes["several lines"] == 0
+
+
+@pytest.mark.parametrize("steps", [3, 17, 40])
+def test_a_run_that_is_killed_replays_up_to_shortly_before(tmp_path, steps):
+    """SIGKILL while it records: what it said it had done is there, but for what was still on its way to the disk."""
+    command = [sys.executable, "-m", "tests.recorded_run", str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        late = threading.Timer(DEADLINE_S, process.kill)  # then its lines end
+        late.start()
+        try:
+            for _ in range(steps):
+                assert process.stdout.readline()
+        finally:
+            late.cancel()
+            late.join()
+            process.kill()
+    recording = open_recording(tmp_path / "recording")
+    assert recording.truncated
+    assert recording.steps > steps - 2  # at most the last one was not complete
+    assert "is cut short" in recording.notes[0]
+    again, differences = replay(tmp_path / "recording")
+    assert len(again) == recording.steps
+    assert differences.same
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_a_simulated_run_is_replayed_to_the_last_bit(tmp_path):
+    config = parse_config({"sim": {"scene": "indoor", "targets": ["book"], "seed": 3}})
+    target, settings = config.target("book"), FollowSettings(command_delay_s=config.command_delay_s)
+    path = tmp_path / "exact.json"
+    save_calibration(path, true_calibration(config))
+
+    def steps(rig, config, calibration, target, seconds):
+        detector = make_detector(target, config.rate_hz)
+        with SafeRig(rig, config.safety) as safe:
+            yield from follow(safe, calibration, target, detector, seconds=seconds, settings=settings)
+
+    with Recorder(tmp_path / "run", config, path, "book") as recorder:
+        rig = recorder.wrap(SimWorld(config).rig)
+        then = list(steps(rig, config, load_calibration(path), target, 1.2))
+    recording = open_recording(tmp_path / "run")
+    known, again = recording.config, ReplayRig(recording)
+    calibration = load_calibration(recording.calibration)
+    now = list(until_end(steps(again, known, calibration, known.target(recording.target), math.inf)))
+    assert State.FOLLOWING in {step.state for step in then}
+    assert_same(then, now)
+    assert again.differences.same

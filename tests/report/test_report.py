@@ -1,0 +1,445 @@
+"""The report on a calibration: what it says is so, whatever the calibration lacks, and the page needs nothing."""
+
+import base64
+import re
+from dataclasses import replace
+from html import unescape
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget import cli
+from cotarget.board import board_points
+from cotarget.calibration import Covariance, HeldOut, Options, Rejected, View, calibrate_views, save_calibration
+from cotarget.cli.calibrating import summary
+from cotarget.config import BoardConfig
+from cotarget.errors import CalibrationError
+from cotarget.report import verdict
+from cotarget.report.analysis import (
+    JITTER_GROUP,
+    Contribution,
+    Corners,
+    averaged,
+    contributions,
+    empty_places,
+    gather,
+    given,
+    lens_curves,
+    pointing,
+    what_stays,
+    with_more_placements,
+)
+from cotarget.report.page import write_report
+from cotarget.report.text import advice, correlations, digits, judge, percent, value_and_sigma
+from experiments.calibration.synthetic.aims import pointing_errors
+from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, SIZES, Lens, Stop, Truth
+from experiments.calibration.synthetic.views import Placing, noisy, placed, synthetic_views, views_at_stops, zoom_view
+from tests.full_disk import SAID, full_disk
+
+BOARD = BoardConfig()
+POINTS = board_points(BOARD)
+SECTIONS = ["figures", "pointing", "parameters", "residuals", "coverage", "lens", "heldout", "rejected", "advice"]
+NOISE_PX = 0.1
+ZOOMED = 3.0  # the second stop's focal length over the first's
+LARGEST_PAGE = 3_000_000
+UNCHECKED = Options(folds=0)  # nothing is kept out, to be quick
+ROUNDED = 0.06  # two digits are printed
+FAR_LENS = Lens(ZOOMED * 692.0, ZOOMED * 693.0, 328.0, 234.0)
+ZOOMING = Truth(stops=(Stop(ZOOMED * NOMINAL_PX, FAR_LENS, 0.01),))
+
+
+def stop_views(truth, rng, boards=8):
+    """Views at the shortest focal length and at `ZOOMED` times that, of the same boards."""
+    placing = Placing(boards=boards)
+    placements, views = [], []
+    for number in range(boards):
+        x_fixed, poses = placed(truth, POINTS, rng, placing, number)
+        placements.append(x_fixed)
+        views.append(View("fixed", noisy(truth.fixed.project(x_fixed), NOISE_PX, rng), number))
+        views += [zoom_view(truth, x_fixed, number, pose, np.zeros(2), NOISE_PX, rng) for pose in poses]
+    return views + views_at_stops(truth, placements, rng, NOISE_PX, looks=1)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(2), boards=12, moved=2)
+    return calibrate_views(views, BOARD, SIZES)
+
+
+@pytest.fixture(scope="module")
+def stops():
+    return calibrate_views(
+        stop_views(ZOOMING, np.random.default_rng(4)), BOARD, SIZES, pitch_mm=0.005, options=UNCHECKED
+    )
+
+
+def bare(calibration, **changes):
+    """Without corners, so that a page is written quickly."""
+    return replace(calibration, views=(), **changes)
+
+
+def text_of(page):
+    """What a reader sees of a page."""
+    return " ".join(unescape(re.sub(r"<style>.*?</style>|<[^>]+>", " ", page, flags=re.S)).split())
+
+
+class Reader(HTMLParser):
+    """Checks that elements are nested and closed, and keeps what could load something."""
+
+    VOID = ("meta", "img")
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.images, self.sections, self.loads = [], [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        if tag == "img":
+            self.images.append(given)
+        if tag == "section":
+            self.sections.append(given["id"])
+        self.loads += [v for k, v in attrs if k in ("src", "href", "srcset", "data", "action") and "data:" not in v]
+        self.loads += [tag] if tag in ("script", "link", "iframe", "object") else []
+        self.loads += [k for k, _ in attrs if k.startswith("on")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def read(page):
+    reader = Reader()
+    reader.feed(page)
+    assert not reader.open
+    return reader
+
+
+def test_the_page_has_everything_and_needs_nothing(stops, plain, tmp_path):
+    path = tmp_path / "r.html"
+    found = write_report(path, stops, "stops.json")
+    page = path.read_text()
+    reader = read(page)
+    assert reader.sections == SECTIONS
+    assert reader.loads == []
+    assert "http" not in re.sub(r"base64,[^\"]+", "", page)
+    assert len(page) < LARGEST_PAGE
+    assert found.text in text_of(page)
+    assert len(reader.images) == len(list((tmp_path / "r_pictures").glob("*.png"))) == 8
+    for image in reader.images:
+        assert len(image["alt"]) > 20
+        kind, _, data = image["src"].partition(";base64,")
+        begins = {"data:image/png": b"\x89PNG", "data:image/svg+xml": b"<?xml"}[kind]
+        assert base64.b64decode(data).startswith(begins)
+    for picture in (tmp_path / "r_pictures").iterdir():
+        assert cv2.imread(str(picture)).std() > 1  # not blank
+
+    write_report(path, bare(plain, covariance=None), "plain.json")  # without pictures: those of before go
+    assert list((tmp_path / "r_pictures").iterdir()) == []
+    assert read(path.read_text()).images == []
+
+
+def test_numbers_in_the_page_are_those_of_the_calibration(plain, tmp_path):
+    rejected = tuple(Rejected(f"<script>{i}</script>.png", "blurred & <b>dark</b>") for i in range(9))
+    changed = bare(
+        plain,
+        residuals=replace(plain.residuals, rejected=rejected, outliers=3),
+        provenance={**plain.provenance, "rig": "<img src=x onerror=alert(1)>"},
+        jitter=np.radians(0.02),
+        held_out=HeldOut(20, 0.123, 0.0456, 0.1, 1.95, 2.0),
+    )
+    write_report(tmp_path / "r.html", changed, "<i>x</i>.json")
+    page = (tmp_path / "r.html").read_text()
+    text = text_of(page)
+    sigma = np.sqrt(plain.covariance.matrix[0, 0])
+    assert plain.covariance.parameters[0] == "fixed.fx"
+    value, printed = re.search(r"focal length across ([\d.]+) ± ([\d.]+) px", text).groups()
+    assert float(value) == pytest.approx(plain.fixed.focal_px[0], abs=sigma)
+    assert float(printed) == pytest.approx(sigma, rel=ROUNDED)
+    shift = plain.T_zoom0_fixed.translation[0] * 1000
+    assert float(re.search(r"position x (-?[\d.]+) ±", text).group(1)) == pytest.approx(shift, abs=0.5)
+    assert "distance measured 0.123 px distance predicted 0.0456 px" in text
+    assert "every distance over what was predicted of it 1.95" in text
+    assert "They disagree: the miss is 2.0 times what it should be" in text
+    assert "0.020 degrees an axis" in text
+    assert "9 images, 3 single corners" in text
+    for name in ("<script>8</script>.png", "blurred & <b>dark</b>", "<img src=x onerror=alert(1)>", "<i>x</i>.json"):
+        assert name in text
+    assert read(page).loads == []
+    assert len(read(page).images) == 2
+
+
+@pytest.mark.slow
+def test_the_verdict_is_as_true_as_it_says(plain, stops):
+    for calibration in (plain, stops):
+        said = float(re.match(r"Points to ([\d.]+) degrees", judge(calibration, between=()).text).group(1))
+        errors = pointing_errors(calibration, Truth(), np.random.default_rng(1), 30)
+        # One calibration's error is one draw; over the view it is within a factor of three but once in hundreds.
+        assert said / 3 < np.sqrt(np.mean(errors**2)) < said * 3
+    last = pointing(stops)[-1]
+    assert last.focal_px == pytest.approx(ZOOMED * Truth().zoom.fx, rel=0.01)
+    assert f"({digits(last.rms * last.focal_px)} px at {last.focal_px:.0f} px, the longest focal length" in verdict(
+        stops
+    )
+
+
+def test_the_verdict_speaks_of_focal_lengths_between_the_stops(stops):
+    at = pointing(stops)
+    worse = replace(at[0], focal_px=1000.0, rms=2 * max(one.rms for one in at))
+    said = f"and to {digits(np.degrees(worse.rms))} degrees ({digits(worse.rms_px)} px) between its stops, at 1000 px"
+    assert said in judge(stops, at, (worse,)).text
+    assert "between its stops" not in judge(stops, at, ()).text
+
+
+def test_the_verdict_says_the_plain_truth(plain):
+    stored, plain = plain, bare(plain)
+    well, kept = judge(plain), plain.held_out
+    assert well.level == "good"
+    assert well.text.endswith("; captures kept out of the fit agree.")
+    worse = judge(replace(plain, held_out=replace(kept, widened=1.84)))
+    assert worse.level == "care"
+    assert worse.text.startswith("Captures kept out of the fit miss 1.8 times as far as was predicted, and ")
+    assert "the uncertainty is widened so; points to " in worse.text
+    # However far a wrong model has them miss, that leaves nothing undetermined; what is so is still said.
+    far, wide = replace(kept, widened=3000.0), plain.covariance.scaled(dict.fromkeys(plain.covariance.parameters, 3e3))
+    wrong = replace(plain, held_out=far, covariance=wide)
+    assert judge(wrong).text.startswith("Captures kept out of the fit miss 3000 times")
+    assert "not determine" not in judge(wrong).text
+    assert verdict(replace(wrong, held_out=kept)).startswith("Does not determine the rig")
+    words = advice(wrong, (), (), (), None)
+    assert words[0].startswith("Captures kept out miss 3000 times")
+    assert not any("Add what is missing" in item for item in words)
+    both = judge(replace(wrong, covariance=wide.scaled({"T_head_zoom.rx": 1e6})))
+    assert re.match("Captures kept out .*; does not determine the rig: .*T_head_zoom", both.text)
+    shaky = judge(replace(plain, jitter=np.radians(0.05)))
+    assert shaky.level == "care"
+    assert "most of it because the head misses what it reports by 0.050 degrees an axis" in shaky.text
+    assert "no captures were kept out" in verdict(replace(plain, held_out=None))
+    for method, words, level in [
+        ("sequential", "sequential method gives no uncertainty", "unknown"),
+        ("joint", "parameters undetermined", "bad"),
+        ("", "carries no uncertainty", "unknown"),
+    ]:
+        found = judge(replace(plain, covariance=None, held_out=None, provenance={"method": method}))
+        assert words in found.text
+        assert found.level == level
+    no_head = judge(replace(plain, T_head_zoom=None))
+    assert "without a head" in no_head.text
+    assert no_head.level == "unknown"
+    open_ = judge(replace(plain, covariance=plain.covariance.scaled({"T_head_zoom.rx": 1e6})))
+    assert open_.level == "bad"
+    assert "T_head_zoom" in open_.text
+    others = tuple(replace(view, corners_px=view.corners_px[::-1] / 2) for view in stored.views)
+    assert "not what it was made from" in verdict(replace(stored, views=others))
+    assert "% of the close-up's width" in verdict(replace(plain, jitter=np.radians(3.0)))
+
+
+def partial_calibrations():
+    nothing = {"covariance": None, "held_out": None, "residuals": None, "board": None, "provenance": {}}
+    return {
+        "photos": {"T_head_zoom": None, "covariance": None},
+        "nothing but the rig": nothing,
+        "not even a head": {**nothing, "T_head_zoom": None},
+        "one parameter": {"covariance": Covariance(("fixed.fx",), np.eye(1))},
+    }
+
+
+@pytest.mark.parametrize("changes", partial_calibrations().values(), ids=partial_calibrations())
+def test_a_calibration_that_lacks_something_has_a_page_too(plain, changes, tmp_path):
+    calibration = bare(plain, **changes)
+    found = write_report(tmp_path / "r.html", calibration)
+    page = (tmp_path / "r.html").read_text()
+    assert read(page).sections == [name for name in SECTIONS if name != "lens"]
+    assert found.text in text_of(page)
+    assert " nan" not in text_of(page)
+
+
+def test_stored_corners_give_back_their_noise(plain):
+    evidence = gather(plain)
+    for corners in evidence.corners.values():
+        assert corners.sigma == pytest.approx(NOISE_PX, rel=0.1)
+        assert averaged(corners).beyond_chance.mean() < 0.1
+    assert len(evidence.distances) == 12
+    assert 2.5 < evidence.distances.min() < evidence.distances.max() < 10
+    assert evidence.per_stop == (sum(view.camera == "zoom" for view in plain.views),)
+    assert gather(bare(plain)) is None
+
+
+def one_line(view, seen=slice(0, 5)):
+    """The view with a few corners of one row alone."""
+    corners = np.full_like(view.corners_px, np.nan)
+    corners[seen] = view.corners_px[seen]
+    return replace(view, corners_px=corners, source="line.png")
+
+
+def test_a_view_of_corners_on_one_line_is_named_and_ends_no_report(plain, caplog):
+    for bad in (
+        one_line(plain.views[0]),
+        one_line(plain.views[0], slice(0, 40, 10)),  # the diagonal
+        replace(plain.views[0], corners_px=np.full((54, 2), 100.0), source="line.png"),
+    ):
+        views = (bad, *plain.views[1:])
+        with pytest.raises(CalibrationError, match=r"line\.png: all corners seen lie on one line"):
+            calibrate_views(views, BOARD, SIZES)
+        caplog.clear()
+        assert len(gather(replace(plain, views=views)).views) == len(plain.views) - 1
+        assert caplog.messages == ["line.png: not in the report: its corners are too few, or all on one line"]
+
+
+def test_a_lens_that_zooms_further_than_was_calibrated_is_told(plain):
+    known = replace(plain, provenance={"focal_range_px": [667.0, plain.zoom.nominal_px[-1]]})
+    further = replace(plain, provenance={"focal_range_px": [667.0, 3 * plain.zoom.nominal_px[-1]]})
+    assert "goes to" not in judge(known).text
+    assert "the lens goes to 2001 px by its own account" in judge(further).text
+    assert judge(further).level == "care"
+    said = advice(further, (), (), (), gather(further))
+    assert any("but was calibrated to 667 px" in item for item in said)
+
+
+def test_a_wavy_board_is_seen_and_said(plain):
+    bent = POINTS.copy()
+    bent[:, 2] = 0.003 * np.sin(12 * POINTS[:, 0])  # waves, which no parabola takes up
+    flat = np.polyval(np.polyfit(POINTS[:, 0], bent[:, 2], 1), POINTS[:, 0])  # what a pose takes up
+    views = synthetic_views(Truth(), POINTS, np.random.default_rng(2), boards=12, moved=2, shape=bent)
+    calibration = calibrate_views(views, BOARD, SIZES, options=UNCHECKED)
+    evidence = gather(calibration)
+    assert evidence.shape.wrong
+    assert evidence.shape.out == pytest.approx(np.std(bent[:, 2] - flat), rel=0.2)  # noise adds a tenth
+    found = judge(calibration)
+    assert found.level == "care"
+    assert "not counting that the board's corners are 1." in found.text
+    assert any("mount it on something flat" in item for item in advice(calibration, (), (), (), evidence))
+    assert not gather(plain).shape.wrong
+
+
+def test_a_pattern_in_the_residuals_and_a_bare_corner_are_seen():
+    rng = np.random.default_rng(0)
+    at = rng.uniform([0, 0], [640, 480], (8000, 2))
+    at = at[~((at[:, 0] > 400) & (at[:, 1] < 200))]
+    noise = rng.normal(0, 0.1, at.shape)
+    plain = Corners(SIZE, at, noise)
+    bent = Corners(SIZE, at, noise + 0.1 * np.sin(at / 100))
+    assert averaged(plain).beyond_chance.mean() < 0.05
+    assert averaged(bent).beyond_chance.mean() > 0.3
+    assert empty_places(plain) == ["upper right corner"]
+
+
+def test_advice_follows_from_the_figures(plain):
+    at, parts = pointing(plain), contributions(plain)
+    words = advice(plain, at, (), parts, gather(plain))
+    assert f"Were {parts[0].group} known exactly" in words[0]
+    assert f"the error would be {digits(np.degrees(parts[0].left))} instead" in words[0]
+    assert any("36 more would halve it" in item for item in words)  # a quarter of the variance takes 4 * 12
+    still = replace(plain, views=tuple(replace(v, tilt=0.0) if v.camera == "zoom" else v for v in plain.views))
+    assert any("The head's tilt changed by 0 degrees" in item for item in advice(still, at, (), parts, gather(still)))
+    much = replace(at[0], rms=10 * at[0].rms)
+    shaky = replace(plain, jitter=np.radians(0.05))
+    words = advice(shaky, (much,), (), (Contribution(JITTER_GROUP, at[0].rms),), None)
+    words += advice(shaky, pointing(shaky), (), (), gather(shaky))
+    between = (replace(at[0], nominal_px=777.0, rms=4 * at[0].rms),)
+    assert any("at 777 px" in item and "Add a stop" in item for item in advice(plain, at, between, parts, None))
+    assert any("makes 99 % of the squared error" in item for item in words)
+    assert any("play in the gears" in item for item in words)
+    assert any("no number of them would halve it" in item for item in words)
+
+
+@pytest.mark.slow
+def test_more_placements_take_nothing_from_the_jitter_nor_from_a_lens_between_its_stops(plain, stops):
+    (exact,) = pointing(plain)
+    assert what_stays(plain, exact) == 0.0
+    assert with_more_placements(plain, exact, 36) == pytest.approx(exact.rms / 2)  # 12 placements and 36 more
+    jitter = np.radians(0.05)
+    shaky = replace(plain, jitter=jitter)
+    (at,) = pointing(shaky)
+    # Turns of pan count by the cosine of the tilt: a little less than both axes' together.
+    assert 0.9 * np.sqrt(2) * jitter < what_stays(shaky, at) < np.sqrt(2) * jitter
+    assert with_more_placements(shaky, at, 36) ** 2 == pytest.approx(at.rms**2 - 0.75 * exact.rms**2)
+    (between,) = pointing(stops, [1.7 * NOMINAL_PX])
+    doubt = np.linalg.norm(stops.zoom.center_doubt_px(1.7 * NOMINAL_PX)) / between.focal_px
+    assert doubt > 0
+    assert what_stays(stops, between) == pytest.approx(doubt, rel=0.01)
+    said = f"from {digits(np.degrees(at.rms))} to {digits(np.degrees(with_more_placements(shaky, at)))} degrees"
+    assert any(said in item for item in advice(shaky, (at,), (), (), gather(shaky)))
+    told = summary(shaky, Path("c.json"))
+    assert told["predicted_error_deg_with_10_more_placements"] == {
+        "667 px": pytest.approx(np.degrees(with_more_placements(shaky, at)))
+    }
+
+
+def test_what_is_left_when_a_parameter_is_known():
+    covariance = Covariance(("a", "b"), np.array([[4.0, 2.0], [2.0, 3.0]]))
+    left = given(covariance, np.array([False, True])).matrix
+    assert left == pytest.approx(np.array([[4 - 2 * 2 / 3, 0], [0, 0]]))  # Schur's complement
+
+
+def test_curves_of_the_zoom_lens_are_as_uncertain_as_the_stops(stops):
+    curves = lens_curves(stops)
+    for where, i in ((0, 0), (-1, 1)):
+        nominal = stops.zoom.nominal_px[i]
+        sigma = stops.covariance.sigma
+        assert curves.values["ratio_x"][where] == pytest.approx(stops.zoom.stops[i].focal_px[0] / nominal)
+        assert curves.sigmas["ratio_x"][where] == pytest.approx(sigma(f"zoom[{i}].fx") / nominal, rel=1e-4)
+        assert curves.sigmas["cy"][where] == pytest.approx(sigma(f"zoom[{i}].cy"), rel=1e-4)
+        grown = (nominal / stops.zoom.nominal_px[0]) ** 2
+        assert curves.sigmas["kappa1"][where] == pytest.approx(sigma(f"zoom[{i}].k1") / grown, rel=1e-4)
+    assert curves.sigmas["pupil_mm"][-1] == pytest.approx(1000 * stops.covariance.sigma("zoom[1].pupil"), rel=1e-4)
+    assert correlations(stops)
+
+
+def test_numbers_as_people_read_them():
+    assert [digits(x) for x in (0.00213, 0.0996, 12.4, 7155.0, 0.0)] == ["0.0021", "0.10", "12", "7200", "0"]
+    assert value_and_sigma(692.3149, 0.237) == "692.31 ± 0.24"
+    assert value_and_sigma(-1.5, 0.0996) == "-1.50 ± 0.10"
+    assert value_and_sigma(1234.5, 37.0) == "1234 ± 37"
+    assert value_and_sigma(0.5, None) == "0.500000"
+    assert [percent(x) for x in (0.0004, 0.03, 1.0)] == ["0.04 %", "3 %", "100 %"]
+
+
+def test_mistakes_end_in_one_line_and_leave_the_page(plain, tmp_path, capsys):
+    source, page = tmp_path / "calibration.json", tmp_path / "page.html"
+    save_calibration(source, bare(plain, covariance=None))
+    page.write_text("old")
+
+    def fails(*arguments):
+        assert cli.main(["report", *(str(a) for a in arguments)]) == 1
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert page.read_text() == "old"
+        return said
+
+    assert "no such file" in fails(tmp_path / "none.json", "--out", page)
+    (tmp_path / "broken.json").write_text("{")
+    assert "is not JSON" in fails(tmp_path / "broken.json", "--out", page)
+    assert "its folder does not exist" in fails(source, "--out", tmp_path / "none" / "page.html")
+    assert "something else" in fails(source, "--out", source)
+    (tmp_path / "page_pictures").write_text("a file")
+    assert "page_pictures" in fails(source, "--out", page)
+    (tmp_path / "page_pictures").unlink()
+    assert cli.main(["report", str(source), "--out", str(page)]) == 0
+    assert verdict(bare(plain, covariance=None)) in capsys.readouterr().out
+    assert page.read_text().startswith("<!DOCTYPE html>")
+
+    wrong = replace(plain.covariance, parameters=("<b>", *plain.covariance.parameters[1:]))
+    with pytest.raises(CalibrationError, match="is no parameter"):
+        write_report(page, bare(plain, covariance=wrong))
+    negative = replace(plain.covariance, matrix=-plain.covariance.matrix)
+    with pytest.raises(CalibrationError, match="is no variance"):
+        write_report(page, bare(plain, covariance=negative))
+
+
+@pytest.mark.slow
+def test_a_full_disk_leaves_nothing_of_a_report(plain, tmp_path):
+    """There is room for some of its pictures, and none for the page."""
+    page = tmp_path / "page.html"
+    with full_disk(60_000), pytest.raises(CalibrationError, match=f"page.html: cannot be written: {SAID}"):
+        write_report(page, plain)
+    assert not list(tmp_path.iterdir())
+    write_report(page, bare(plain, covariance=None))
+    before = page.read_bytes()
+    with full_disk(), pytest.raises(CalibrationError):
+        write_report(page, bare(plain, covariance=None))
+    assert page.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html", "page_pictures"]

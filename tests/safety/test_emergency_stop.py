@@ -1,0 +1,264 @@
+"""The emergency stop: in one process, from any thread, and across processes by a file that anybody can make."""
+
+import logging
+import math
+import os
+import threading
+import time
+
+import pytest
+
+from cotarget.config import SafetyConfig
+from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
+from cotarget.safety import SafeRig, clear_stop_file, refuse_if_stopped, stop_reason, write_stop_file
+from tests.safety_rigs import RealRig, SimulatedRig
+
+FAR = math.radians(100)
+DEADLINE_S = 10.0  # for a thread that should end at once; a machine may be busy
+
+
+@pytest.fixture
+def rig():
+    return SimulatedRig()
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "stop"
+
+
+def told(rig):
+    return [what for what, _ in rig.head.log]
+
+
+def names(folder):
+    return [path.name for path in folder.iterdir()]
+
+
+def test_a_stopped_head_does_not_move_until_it_is_cleared(rig):
+    with SafeRig(rig, SafetyConfig()) as safe:
+        safe.head.move(FAR, 0.0)
+        safe.stop("somebody is on the roof")
+        assert safe.stopped == "somebody is on the roof"
+        for _ in range(3):
+            with pytest.raises(EmergencyStopError, match="emergency stop: somebody is on the roof"):
+                safe.head.move(0.1, 0.0)
+            safe.clock.sleep_until(safe.clock.now() + 10.0)
+        assert told(rig) == ["move", "halt"]
+        assert not safe.head.state().moving  # it can be looked at, and through
+        assert safe.fixed.read().t == safe.clock.now()
+        safe.head.halt()
+        assert safe.clear() == "somebody is on the roof"
+        assert safe.stopped is None
+        safe.head.move(0.1, 0.0)
+    assert told(rig) == ["move", "halt", "halt", "move", "halt"]
+
+
+def test_a_stop_outlasts_a_halt_that_fails(rig, caplog):
+    rig.head.broken = 1
+    with SafeRig(rig, SafetyConfig()) as safe:
+        safe.head.move(FAR, 0.0)
+        safe.stop("smoke")
+        assert "could not be halted" in caplog.text
+        with pytest.raises(EmergencyStopError, match="smoke"):
+            safe.head.move(0.1, 0.0)
+        assert told(rig) == ["move", "halt"]
+
+
+def test_a_stop_while_a_command_is_on_its_way_halts_after_it():
+    """Another thread, or a signal's handler, stops between the command's begin and its end."""
+    rig = RealRig()
+    with SafeRig(rig, SafetyConfig()) as safe:
+        rig.head.hang = lambda: safe.stop("smoke")
+        with pytest.raises(EmergencyStopError, match="smoke"):
+            safe.head.move(0.5, 0.0)
+        assert rig.head.log == ["move", "halt", "moved", "halt"]
+
+
+@pytest.mark.parametrize(("raised", "seen"), [
+    (DeviceError, EmergencyStopError),  # a driver's, that the move was halted
+    (KeyboardInterrupt, KeyboardInterrupt),
+])  # fmt: skip
+def test_a_command_that_a_stop_breaks_off_tells_of_the_stop_but_hides_no_ctrl_c(raised, seen):
+    rig = RealRig()
+    with SafeRig(rig, SafetyConfig()) as safe:
+
+        def hang():
+            safe.stop("smoke")
+            raise raised("the move was halted")
+
+        rig.head.hang = hang
+        with pytest.raises(seen):
+            safe.head.move(0.5, 0.0, wait=True)
+        assert rig.head.log == ["move", "halt", "halt"]
+
+
+def test_the_file_stops_every_command_and_ends_by_its_removal(rig, file):
+    with SafeRig(rig, SafetyConfig(stop_file=file)) as safe:
+        safe.head.move(FAR, 0.0)
+        write_stop_file(file, "somebody is on the roof")
+        assert safe.stopped == "somebody is on the roof"
+        for _ in range(2):
+            with pytest.raises(EmergencyStopError, match="somebody is on the roof") as caught:
+                safe.head.move(0.1, 0.0)
+        assert str(file) in str(caught.value)
+        assert "cotarget clear" in str(caught.value)
+        assert "\n" not in str(caught.value)
+        with pytest.raises(EmergencyStopError):
+            safe.clear()
+        assert told(rig) == ["move", "halt"]
+        assert clear_stop_file(file) == "somebody is on the roof"
+        safe.head.move(0.1, 0.0)
+    assert told(rig) == ["move", "halt", "move", "halt"]
+
+
+def test_looking_at_the_rig_in_simulated_time_sees_the_file(rig, file):
+    with SafeRig(rig, SafetyConfig(stop_file=file)) as safe:
+        safe.head.move(FAR, 0.0)
+        file.touch()
+        safe.fixed.read()
+        assert told(rig) == ["move", "halt"]
+
+
+def test_a_rig_is_not_opened_while_there_is_a_stop_file(rig, file):
+    write_stop_file(file, "smoke")
+    with pytest.raises(EmergencyStopError, match="emergency stop: smoke; when it is safe to move, run") as caught:
+        SafeRig(rig, SafetyConfig(stop_file=file))
+    assert "\n" not in str(caught.value)
+    assert rig.closed
+    assert not rig.head.log
+
+
+@pytest.mark.wire
+def test_the_file_halts_a_head_in_motion_whatever_the_program_does(file):
+    rig = RealRig()
+    with SafeRig(rig, SafetyConfig(stop_file=file, watchdog_s=1000.0)) as safe:
+        safe.head.move(0.5, 0.0)
+        begun = time.monotonic()
+        write_stop_file(file, "smoke")
+        rig.head.wait_for_halt()
+        print(f"halted {1000 * (time.monotonic() - begun):.0f} ms after the file was made")
+        with pytest.raises(EmergencyStopError, match="smoke"):
+            safe.head.move(0.5, 0.0)
+        assert rig.head.log == ["move", "moved", "halt"]
+
+
+@pytest.mark.wire
+def test_stops_from_many_threads_leave_no_command_behind_them():
+    """However commands and stops interleave, the head has been told to halt last, and nothing moves it."""
+    for _ in range(50):
+        rig = RealRig()
+        with SafeRig(rig, SafetyConfig()) as safe:
+            ready = threading.Barrier(3)
+
+            def command(safe=safe, ready=ready):
+                ready.wait(DEADLINE_S)
+                for _ in range(20):
+                    try:
+                        safe.head.move(0.5, 0.0)
+                    except EmergencyStopError:
+                        return
+
+            def stop(safe=safe, ready=ready):
+                ready.wait(DEADLINE_S)
+                safe.stop("smoke")
+
+            threads = [threading.Thread(target=target) for target in (command, command, stop)]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join(DEADLINE_S)
+                assert not thread.is_alive()
+            log = list(rig.head.log)
+            with pytest.raises(EmergencyStopError):
+                safe.head.move(0.5, 0.0)
+            assert rig.head.log == log
+            assert log[-1] == "halt"
+
+
+@pytest.mark.parametrize(("content", "reason"), [
+    (b"smoke\n", "smoke"),
+    (b"", "no reason given"),
+    (b" \n\n", "no reason given"),
+    (b"smoke\nand fire\n", "smoke"),
+    (b"\x1b[31msmoke\x00", "[31msmoke"),
+    (b"\xff\xfe", "\ufffd\ufffd"),
+    ("Rauch überm Dach".encode(), "Rauch überm Dach"),
+    (b"x" * 100_000, "x" * 200),
+])  # fmt: skip
+def test_whatever_is_in_the_file_it_stops_and_gives_one_printable_line(file, content, reason):
+    file.write_bytes(content)
+    assert stop_reason(file) == reason
+    with pytest.raises(EmergencyStopError) as caught:
+        refuse_if_stopped(file)
+    assert str(caught.value).isprintable()
+
+
+def test_no_file_is_no_stop(file):
+    assert stop_reason(None) is None
+    assert stop_reason(file) is None
+    assert stop_reason(file / "below" / "it") is None
+    file.write_text("x")
+    assert stop_reason(file / "below") is None
+    assert clear_stop_file(file.parent / "other") is None
+
+
+def test_what_cannot_be_looked_at_stops(file):
+    file.mkdir()
+    assert stop_reason(file) == "the file cannot be read: Is a directory"
+    with pytest.raises(DeviceError, match="is a folder"):
+        clear_stop_file(file)
+    loop = file.parent / "loop"
+    loop.symlink_to(loop)
+    assert "cannot be read" in stop_reason(loop)
+
+
+def test_a_stop_is_written_whole_and_the_newest_holds(tmp_path):
+    (tmp_path / "run").mkdir()
+    file = tmp_path / "run" / "stop"
+    write_stop_file(file, "smoke")
+    write_stop_file(file, "fire")
+    assert stop_reason(file) == "fire"
+    assert names(file.parent) == ["stop"]
+    assert clear_stop_file(file) == "fire"
+    assert names(file.parent) == []
+    assert clear_stop_file(file) is None
+
+
+def test_a_full_disk_stops_without_a_reason(file, monkeypatch):
+    def full(number):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    write_stop_file(file, "smoke")
+    assert names(file.parent) == ["stop"]
+    assert stop_reason(file) == "no reason given"
+
+
+def test_a_stop_that_cannot_be_written_is_told(tmp_path):
+    name = "x" * 300  # longer than file systems take
+    with pytest.raises(DeviceError, match="NOT stopped: the file cannot be written") as caught:
+        write_stop_file(tmp_path / name, "smoke")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("folder", ["mistyped", "mistyped/twice", "a file"])
+def test_a_stop_file_whose_folder_is_not_there_is_told_and_no_folder_made(rig, tmp_path, folder):
+    (tmp_path / "a file").touch()
+    file = tmp_path / folder / "stop"
+    with pytest.raises(DeviceError, match="NOT stopped: there is no folder") as caught:
+        write_stop_file(file, "smoke")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ConfigError, match="nobody could stop the head by this file: there is no folder"):
+        SafeRig(rig, SafetyConfig(stop_file=file))
+    assert rig.closed
+    assert names(tmp_path) == ["a file"]
+
+
+def test_a_stop_is_logged_once(rig, file, caplog):
+    with SafeRig(rig, SafetyConfig(stop_file=file)) as safe:
+        write_stop_file(file, "smoke")
+        for _ in range(3):
+            safe.fixed.read()
+    stops = [r for r in caplog.records if r.levelno == logging.WARNING]
+    assert [r.getMessage() for r in stops] == ["emergency stop: smoke"]

@@ -1,0 +1,265 @@
+"""The simulated targets: their paths, gaits and sizes, and the models that carry them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from cotarget.config import TARGETS
+from cotarget.errors import ConfigError
+from cotarget.sim.render.opengl import mujoco
+from cotarget.sim.targets.paths import MOUNT, waypoint_path
+from cotarget.sim.targets.target import make_target, scale_spec
+
+ASSETS = Path(__file__).parents[2] / "sim_assets"
+SEEDS = range(3)
+SECONDS = np.arange(0.0, 40.0, 0.1)
+HALF_WIDTH, HALF_HEIGHT = 25.0, 19.0  # the wide view [degrees]
+MARGIN = 4.0  # kept to the view's border [degrees]
+ENTERING = 1.5  # from crossing the border until the margin is kept [s]
+PITCH = {"indoor": 0.0, "outdoor": 9.0}  # of the mount in the scenes [degrees]
+DIMENSION = {"book": (1, 0.234), "person": (2, 1.75), "bird": (1, 0.8)}  # axis, size [m]
+SIZE_TOLERANCE = 0.01  # relative; what the pipeline is told is good to this
+CASES = [(name, scene) for name in TARGETS for scene in PITCH]
+
+
+def bearings(points, scene):
+    """Horizontal and vertical angle from the mount's axis [degrees]."""
+    x, y, z = np.moveaxis(points - MOUNT, -1, 0)
+    c, s = np.cos(np.radians(PITCH[scene])), np.sin(np.radians(PITCH[scene]))
+    ahead, up = c * y + s * z, c * z - s * y
+    return np.degrees(np.arctan2(x, ahead)), np.degrees(np.arctan2(up, ahead))
+
+
+def positions(target):
+    return np.array([target.pose(t).T_world_target.translation for t in SECONDS])
+
+
+def make(name, scene="indoor", seed=0, scatter=False, waypoints=None):
+    return make_target(name, scene, np.random.default_rng(seed), scatter, waypoints)
+
+
+def extents(spec):
+    """Size of a model's bounding box along x, y, z, at zero angles, from the vertices themselves."""
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    points = []
+    for g in range(model.ngeom):
+        R, p = data.geom_xmat[g].reshape(3, 3), data.geom_xpos[g]
+        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
+            mesh = model.geom_dataid[g]
+            start = model.mesh_vertadr[mesh]
+            local = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
+        else:
+            signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+            local = signs * model.geom_aabb[g, 3:]
+        points.append(local @ R.T + p)
+    points = np.concatenate(points)
+    return points.min(axis=0), points.max(axis=0)
+
+
+@pytest.mark.parametrize(("name", "scene"), CASES)
+def test_comes_in_after_the_background_is_learnt_and_stays(name, scene):
+    for seed in SEEDS:
+        points = positions(make(name, scene, seed))
+        across, up = bearings(points, scene)
+        if name == "book":
+            entered = 0.0
+        else:
+            assert np.all(np.abs(across[SECONDS < 2.0]) > HALF_WIDTH + MARGIN)
+            entered = SECONDS[np.abs(across) < HALF_WIDTH][0]
+            assert 2.0 < entered < 3.5
+            entered += ENTERING
+        inside = entered <= SECONDS
+        assert np.all(np.abs(across[inside]) < HALF_WIDTH - MARGIN)
+        assert np.all(np.abs(up[inside]) < HALF_HEIGHT - MARGIN)
+
+
+@pytest.mark.parametrize(
+    ("name", "scene", "low", "high"),
+    [("book", "indoor", 0.2, 0.3), ("person", "indoor", 1.35, 1.65), ("bird", "outdoor", 4.5, 5.5)],
+)
+def test_moves_at_its_own_speed(name, scene, low, high):
+    for seed in SEEDS:
+        path = make(name, scene, seed).path
+        speed = np.array([np.linalg.norm(path.velocity(t)) for t in SECONDS])
+        assert low < speed.min()
+        assert speed.max() < high
+
+
+def test_bird_turns_at_20_to_25_metres_where_it_can_be_seen():
+    for seed in SEEDS:
+        path = make("bird", "outdoor", seed).path
+        v = np.array([path.velocity(t) for t in SECONDS])
+        a = np.array([path.acceleration(t) for t in SECONDS])
+        turn = np.linalg.norm(np.cross(v, a), axis=1) / np.linalg.norm(v, axis=1) ** 3
+        assert 1 / turn.max() > 2.2  # of circles of 2.5 m and more that rise and fall
+        points = positions(make("bird", "outdoor", seed))[SECONDS > 5]
+        distance = np.linalg.norm(points - MOUNT, axis=1)
+        assert distance.min() > 19.5
+        assert distance.max() < 27.0
+        assert points[:, 2].min() > 3.0
+        assert points[:, 2].max() < 10.5
+
+
+@pytest.mark.parametrize("where", ["the beginning", "where the lap begins anew"])
+@pytest.mark.parametrize(("name", "scene"), CASES)
+def test_motion_is_smooth(name, scene, where):
+    target = make(name, scene)
+    step = 0.01
+    times = np.arange(0.0, 12.0, step) + (target.path.lap[1] - 6.0 if where != "the beginning" else 0.0)
+    poses = [target.pose(t) for t in times]
+    acceleration = np.diff([p.T_world_target.translation for p in poses], 2, axis=0) / step**2
+    assert np.abs(acceleration).max() < 12.0  # 5 m/s round 2.5 m takes 10 m/s^2
+    turned = Rotation.concatenate([p.T_world_target.rotation for p in poses])
+    turn = (turned[:-1].inv() * turned[1:]).magnitude()
+    assert np.max(turn) / step < 4.0  # rad/s: no jump of heading or bank
+    for joint in poses[0].joints:
+        swing = np.diff([p.joints[joint] for p in poses], 2) / step**2
+        assert np.abs(swing).max() < 600.0  # 35 degrees at 4 Hz take 386 rad/s^2
+
+
+@pytest.mark.parametrize(("name", "scene"), CASES)
+def test_goes_round_for_as_long_as_anybody_looks(name, scene):
+    path = make(name, scene).path
+    begin, end = path.lap
+    for t in (begin + 1.0, begin + 0.7 * (end - begin)):
+        days_later = t + 5000 * (end - begin)
+        np.testing.assert_allclose(path.position(days_later), path.position(t), atol=1e-6)
+        np.testing.assert_allclose(path.velocity(days_later), path.velocity(t), atol=1e-6)
+        laps = (path.travelled(days_later) - path.travelled(t)) / (path.travelled(end) - path.travelled(begin))
+        assert laps == pytest.approx(5000)
+        assert np.linalg.norm(path.velocity(days_later)) > 0.1  # [m/s]; the book is the slowest
+
+
+@pytest.mark.parametrize(("name", "scene"), CASES)
+def test_same_seed_same_path(name, scene):
+    first, again, other = make(name, scene, 7), make(name, scene, 7), make(name, scene, 8)
+    scattered = make(name, scene, 7, scatter=True)
+    assert np.array_equal(positions(first), positions(again))
+    assert first.pose(9.3).joints == again.pose(9.3).joints
+    assert not np.allclose(positions(first), positions(other))
+    assert np.array_equal(first.path.position(8.0), scattered.path.position(8.0))
+
+
+@pytest.mark.parametrize(("name", "most"), [("book", 0.0), ("person", 0.041), ("bird", 0.151)])
+def test_sizes_scatter_within_bounds(name, most):
+    sizes = np.array([make(name, seed=seed, scatter=True).size for seed in range(30)])
+    assert np.abs(sizes - 1).max() <= most
+    assert sizes.std() >= 0.3 * most
+    assert make(name, scatter=False).size == 1.0
+
+
+def test_book_shows_its_cover_to_the_camera():
+    target = make("book")
+    for t in SECONDS[::20]:
+        T = target.pose(t).T_world_target
+        to_mount = MOUNT - T.translation
+        cosine = T.rotation.apply([1.0, 0.0, 0.0]) @ to_mount / np.linalg.norm(to_mount)
+        assert cosine > np.cos(np.radians(12.0))
+
+
+def test_walker_looks_where_it_goes_and_keeps_its_feet_on_the_ground():
+    target = make("person")
+    model = mujoco.MjModel.from_xml_path(str(ASSETS / "targets" / "person.xml"))
+    data = mujoco.MjData(model)
+    for t in np.arange(4.0, 6.0, 0.05):
+        pose = target.pose(t)
+        forward = pose.T_world_target.rotation.apply([1.0, 0.0, 0.0])
+        velocity = target.path.velocity(t)
+        assert forward @ velocity > 0.999 * np.linalg.norm(velocity)
+        for joint, angle in pose.joints.items():
+            data.qpos[model.joint(joint).qposadr[0]] = angle
+        mujoco.mj_kinematics(model, data)
+        shoes = [
+            data.geom(g).xpos[2] for g in range(model.ngeom) if model.geom_matid[g] == model.material("person_shoe").id
+        ]
+        standing = -0.875 + 0.04  # a shoe's middle is some 4 cm above its sole
+        assert abs(pose.T_world_target.translation[2] + min(shoes) - (0.875 + standing)) < 0.05
+
+
+def test_wings_beat_four_times_a_second():
+    target = make("bird", "outdoor")
+    times = np.arange(0.0, 2.0, 0.002)
+    angle = np.array([target.pose(t).joints["wing_inner_left"] for t in times])
+    ups = np.sum((angle[:-1] < angle.mean()) & (angle[1:] >= angle.mean()))
+    assert ups in (8, 9) if abs(angle[0] - angle.mean()) < 0.02 else ups == 8
+    assert np.degrees(np.ptp(angle)) == pytest.approx(70.0, abs=0.5)
+    assert target.beat_s == 0.25
+
+
+@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize("factor", [1.0, 1.12])
+def test_model_has_the_size_that_it_claims(name, factor):
+    spec = mujoco.MjSpec.from_file(str(ASSETS / "targets" / f"{name}.xml"))
+    scale_spec(spec, factor)
+    low, high = extents(spec)
+    axis, size = DIMENSION[name]
+    assert (high - low)[axis] == pytest.approx(size * factor, rel=SIZE_TOLERANCE)
+    assert (high + low)[axis] == pytest.approx(0.0, abs=SIZE_TOLERANCE * size)  # the origin is its middle
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_model_has_the_joints_that_move(name):
+    model = mujoco.MjModel.from_xml_path(str(ASSETS / "targets" / f"{name}.xml"))
+    assert {model.joint(j).name for j in range(model.njnt)} == set(make(name).pose(0.0).joints)
+    assert model.body(name).mocapid[0] == 0
+    assert not model.geom_contype.any()
+
+
+@pytest.mark.parametrize("scene", PITCH)
+def test_scene_takes_rig_and_targets_without_a_warning(scene):
+    spec = mujoco.MjSpec.from_file(str(ASSETS / "scenes" / f"{scene}.xml"))
+    for part in ("rig", *(f"targets/{name}" for name in TARGETS)):
+        child = mujoco.MjSpec.from_file(str(ASSETS / f"{part}.xml"))
+        spec.attach(child, frame=spec.worldbody.add_frame(), prefix=f"{part}/")
+    model = spec.compile()
+    assert model.nmocap == len(TARGETS)
+    assert model.vis.map.znear * model.stat.extent == pytest.approx(0.05, rel=1e-3)
+    assert model.vis.map.zfar * model.stat.extent >= 120
+    assert not model.geom_contype.any()
+    assert sum(model.light_castshadow) == 1
+
+
+def test_waypoints_replace_the_path():
+    way = ((1.0, -2.0, 8.0, 1.0), (3.0, 0.0, 9.0, 1.5), (6.0, 2.0, 8.0, 1.0))
+    for name in TARGETS:
+        target = make(name, waypoints=way)
+        assert target.path.position(3.0) == pytest.approx([0.0, 9.0, 1.5])
+        assert target.path.position(-5.0) == pytest.approx(way[0][1:])
+        assert target.path.position(50.0) == pytest.approx(way[-1][1:])
+        assert np.all(np.isfinite(target.pose(50.0).T_world_target.as_matrix()))
+    held = make("person", waypoints=((0.0, 0.0, 8.0, 0.9),)).pose(3.0)
+    assert held.T_world_target.translation[:2] == pytest.approx([0.0, 8.0])
+    assert held.T_world_target.rotation.apply([1.0, 0.0, 0.0]) == pytest.approx([0.0, -1.0, 0.0], abs=1e-6)
+
+
+def test_refuses_what_it_does_not_know():
+    with pytest.raises(ConfigError, match="book, person"):
+        make("dragon")
+    with pytest.raises(ConfigError, match="increase"):
+        waypoint_path(((1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0)))
+    with pytest.raises(ConfigError, match="at least one"):
+        waypoint_path(())
+
+
+@pytest.mark.parametrize(("name", "scene"), CASES)
+def test_a_stance_is_the_pose_in_floats(name, scene):
+    target = make(name, scene)
+    for t in SECONDS[::7]:
+        pose = target.pose(t)
+        position, axes, joints = target.stance(t, target.beat(t))
+        assert position == list(pose.position)
+        assert joints == pose.joints
+        np.testing.assert_allclose(np.transpose(axes), pose.rotation.as_matrix(), atol=1e-14)
+
+
+@pytest.mark.parametrize("waypoints", [None, [[5, 1, 9, 2], [6, 2, 9, 3], [8, 2, 7, 2]]], ids=["loop", "waypoints"])
+def test_a_paths_motion_is_position_velocity_and_acceleration_to_the_last_bit(waypoints):
+    path = make("bird", "outdoor", waypoints=waypoints).path
+    ends = (5.0, 5.001, 5.002, 5.004, 7.996, 7.998, 8.0)
+    for t in (-1.0, *ends, *SECONDS, 700.3):
+        x, v, a = path.motion(t)
+        assert (x, v, a) == (path.position(t).tolist(), path.velocity(t).tolist(), path.acceleration(t).tolist())

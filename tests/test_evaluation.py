@@ -1,0 +1,293 @@
+"""Steps and calibrations beside the truth of a rendered world, whose answers are known by construction."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.config import parse_config
+from cotarget.detection import Detection
+from cotarget.evaluation import add_row, decodes, observe, pointing_errors, true_calibration
+from cotarget.geometry import pose
+from cotarget.pipeline import State, Step
+from cotarget.rig import Frame
+from cotarget.sim.world import SimWorld
+from cotarget.targeting import Reach
+from cotarget.tracking.track import Track
+
+pytestmark = pytest.mark.render
+EXACT_DEG = 1e-6  # the inverse is exact to 1e-9; the rays of both lens models agree to 1e-12
+ASIDE = 1e-3  # the rays are also 4.5 px below the middle
+SIZE_PX = 1.0  # the book swings by some ten degrees and shows 0.03 m of its spine: 0.4 px, and it stands 0.015 m nearer
+DENSE_PX = 0.01  # 200 phases of a beat miss its maximum by 1 - cos 1.8 degrees of an amplitude of 7 px at most
+
+
+@pytest.fixture(scope="module")
+def book():
+    """A still book 10 m ahead of the fixed camera, in a world without effects but the head's own geometry."""
+    home = {"translation": [-0.4, 0, 0], "rotvec_deg": [0, 0, 0]}
+    config = parse_config(
+        {
+            "sim": {
+                "scene": "indoor",
+                "targets": ["book"],
+                "effects": {"all": False, "axes": True},
+                "T_zoom0_fixed": home,
+                "paths": {"book": [[0, 0, 10, 1.6], [9, 0, 10, 1.6]]},
+            }
+        }
+    )
+    world = SimWorld(config)
+    yield world
+    world.close()
+
+
+def reach_of(world):
+    limits = world.rig.head.limits
+    return Reach(limits.pan, limits.tilt, world.rig.zoom.focal_range)
+
+
+def test_the_true_calibration_points_exactly(book):
+    errors = pointing_errors(
+        true_calibration(book, stops=1), book.truth(), reach_of(book), np.random.default_rng(0), 50
+    )
+    assert len(errors) == 50
+    assert np.degrees(errors).max() < EXACT_DEG
+
+
+def test_a_boresight_that_is_off_by_a_tenth_of_a_degree_points_off_by_as_much(book):
+    """Gamma turned about y by 0.1 degree: the line of sight misses by 0.1 degree in the middle, at most that aside."""
+    true = true_calibration(book, stops=1)
+    off = dataclasses.replace(true, T_zoom0_fixed=pose([0, 0, 0], [0, 0.1, 0]) * true.T_zoom0_fixed)
+    errors = np.degrees(pointing_errors(off, book.truth(), reach_of(book), np.random.default_rng(0), 50))
+    assert errors.max() < 0.1 + EXACT_DEG
+    assert np.median(errors) > 0.09
+
+
+def test_a_principal_point_that_is_off_matters_less_at_a_longer_focal_length(book):
+    """The middle of the image is taken for a ray 20 px aside of the true one, at five times the shortest 692 px."""
+    true = true_calibration(book, stops=1)
+    stop = dataclasses.replace(true.zoom.stops[0], center_px=(346.0, 235.0))
+    off = dataclasses.replace(true, zoom=dataclasses.replace(true.zoom, stops=(stop,)))
+    reach = reach_of(book)
+    for nominal, focal in ((None, 692), (5 * reach.focal_px[0], 3460)):
+        errors = pointing_errors(off, book.truth(), reach, np.random.default_rng(0), 5, nominal_px=nominal)
+        between = math.atan((346 - 319.5) / focal) - math.atan((326 - 319.5) / focal)
+        assert errors == pytest.approx(between, rel=ASIDE)
+
+
+def test_the_true_calibration_at_a_focal_length_points_exactly_with_it():
+    """Of a lens whose optics move: the pupil moves both T and Gamma."""
+    world = SimWorld(parse_config({"sim": {"scene": "indoor", "effects": {"optics": True}}}))
+    nominal = 4000.0
+    lens = world.truth().zoom_lens_for(nominal)
+    assert abs(lens.pupil) > 0.05
+    to_pupil = pose([0, 0, lens.pupil], [0, 0, 0])
+    true, sim = true_calibration(world, stops=1), world.config.sim
+    at_nominal = dataclasses.replace(
+        true,
+        fixed=dataclasses.replace(true.fixed, distortion=sim.fixed.distortion),
+        zoom=ZoomLens((nominal,), (Intrinsics(lens.size, lens.focal_px, lens.center_px, lens.distortion),)),
+        T_zoom0_fixed=to_pupil.inv() * sim.T_zoom0_fixed,
+        T_head_zoom=sim.T_head_zoom * to_pupil,
+    )
+    judged = (world.truth(), reach_of(world))
+    at, elsewhere = (
+        pointing_errors(at_nominal, *judged, np.random.default_rng(0), 30, nominal_px=px) for px in (nominal, None)
+    )
+    world.close()
+    assert np.degrees(at).max() < EXACT_DEG
+    assert np.degrees(np.median(elsewhere)) > 0.1  # the same calibration is wrong at the shortest
+
+
+def step_of(world, **changes):
+    """A Step as the loop would yield it now, with nothing found."""
+    rig = world.rig
+    step = Step(
+        index=0,
+        t=rig.clock.now(),
+        state=State.SEARCHING,
+        reason="",
+        fixed=rig.fixed.read(),
+        zoom=rig.zoom.read(),
+        mask=None,
+        detections=(),
+        tracks=(),
+        target=None,
+        aim=None,
+        commanded=(0.0, 0.0, rig.zoom.focal_range[0]),
+        head=rig.head.state(),
+        lens=rig.zoom.state(),
+    )
+    return dataclasses.replace(step, **changes)
+
+
+def track(number, center_px, t=0.0, box_px=None, confirmed=True, missed=0):
+    """A track whose filtered middle need not be where its last detection is."""
+    center, size = np.array(center_px, dtype=float), np.array([16.0, 12.0])
+    box = Detection(center if box_px is None else np.array(box_px, dtype=float), size, 1.0)
+    return Track(number, t, confirmed, missed, center, np.zeros(2), size, 16.0, np.eye(4), 1.0, box)
+
+
+def row_of(world, **changes):
+    return observe(step_of(world, **changes), world.truth(), "book", world.config.target("book"))
+
+
+def test_a_row_says_what_is_so(book):
+    """The book, 0.234 m at 10 m and 0.4 m to the left of the zoom camera: u = 326 - 692 * 0.4 / 10, v = 235."""
+    row = row_of(book)
+    assert (row.u_px, row.v_px) == pytest.approx((326 - 692 * 0.04, 235), abs=1e-6)
+    assert (row.u_wide_px, row.v_wide_px) == pytest.approx((325, 239), abs=1e-6)
+    assert row.range_m == pytest.approx(math.hypot(10, 0.4))
+    assert row.size_px == pytest.approx(692 * 0.234 / 10, abs=SIZE_PX)
+    assert row.wanted_px == 160  # the longest focal length would give 194
+    assert row.visible == 1.0
+    assert row.in_wide
+    assert row.track == -1
+    assert row.focal_px == pytest.approx(692)
+    assert not row.in_frame  # it is a tenth as large as wanted
+    assert math.isnan(row.tpe_px)
+    assert (row.decoded, row.decoded_wide) == (False, False)  # its marker is 5 px large
+    assert row.off_target == ""
+
+
+def test_a_row_says_how_many_commands_were_sent(book):
+    row = row_of(book, head_commands=3, lens_commands=2)
+    assert (row.head_commands, row.lens_commands) == (3, 2)
+
+
+def test_the_detection_is_judged_and_only_where_there_is_one(book):
+    """The filter's middle and its prediction are not the detection; a coasting track has none."""
+    seen = row_of(book, target=track(4, (300, 200), box_px=(325 + 3, 239 - 4)))
+    assert seen.track == 4
+    assert seen.tpe_px == pytest.approx(5.0, abs=1e-6)
+    shared = dataclasses.replace(track(4, (325, 239), box_px=(340, 239)), shared=True)
+    for nothing in (track(4, (325, 239), missed=1), shared):  # the box of two is the detection of neither
+        row = row_of(book, target=nothing)
+        assert row.track == 4
+        assert math.isnan(row.tpe_px)
+
+
+def test_a_track_is_off_target_when_it_is_farther_than_the_larger_side(book):
+    """The larger side is the book's width, 16 to 17 px, about (325, 239)."""
+    tracks = (
+        track(2, (325 + 15, 239)),
+        track(3, (325 + 18, 239)),
+        track(5, (325, 239 - 15)),
+        track(6, (100, 100), confirmed=False),
+        track(7, (325, 239 + 18)),
+    )
+    assert row_of(book, tracks=tracks).off_target == "3 7"
+    assert row_of(book, tracks=tracks).on_target == "2:book 5:book"
+
+
+def test_a_track_is_on_a_target_only_while_it_is_seen_alone(book):
+    at = (325, 239)
+    tracks = (track(2, at, missed=1), dataclasses.replace(track(3, at), shared=True), track(4, at, confirmed=False))
+    row = row_of(book, tracks=(*tracks, track(5, at)))
+    assert (row.on_target, row.off_target) == ("5:book", "")
+
+
+def test_a_zoom_frame_has_one_row(book):
+    """A zoom camera at half the rate of the fixed one: two Steps share each of its frames."""
+    rows, (truth, target) = [], (book.truth(), book.config.target("book"))
+    step = step_of(book)
+    for t_fixed, t_zoom in ((0.00, 0.00), (0.04, 0.00), (0.08, 0.08), (0.12, 0.08), (0.16, 0.16)):
+        book.rig.clock.sleep_until(t_fixed)
+        frames = {"fixed": Frame(step.fixed.image, t_fixed), "zoom": Frame(step.zoom.image, t_zoom)}
+        add_row(rows, dataclasses.replace(step, **frames), truth, "book", target)
+    assert [(row.t_s, row.t_fixed_s) for row in rows] == [(0.00, 0.00), (0.08, 0.08), (0.16, 0.16)]
+
+
+@pytest.fixture(params=[4])
+def moving(request):
+    """A book that goes to the right at about 0.5 m/s, 4 m ahead of both cameras, which stand in one place."""
+    paths = {"book": [[0, -0.5, request.param, 1.6], [2, 0.5, request.param, 1.6]]}
+    home = {"translation": [0, 0, 0], "rotvec_deg": [0, 0, 0]}
+    effects = {"all": False, "multisampling": True}
+    sim = {"scene": "indoor", "targets": ["book"], "effects": effects, "paths": paths, "T_zoom0_fixed": home}
+    world = SimWorld(parse_config({"sim": sim}))
+    yield world
+    world.close()
+
+
+def test_each_frame_is_judged_at_its_own_time(moving):
+    """The clamped cubic is at -0.5, 0 and 0.5 m after 0, 1 and 2 s: u = 325 + f x / 4 in the wide view."""
+    focal = moving.config.sim.fixed.focal_px[0]
+    moving.rig.clock.sleep_until(2.0)
+    step = step_of(moving)
+    frames = {"fixed": Frame(step.fixed.image, 1.0), "zoom": Frame(step.zoom.image, 2.0)}
+    found = row_of(moving, **frames, target=track(1, (325, 239), t=1.0))
+    assert (found.t_fixed_s, found.t_s) == (1.0, 2.0)
+    assert found.u_wide_px == pytest.approx(325, abs=1e-6)
+    assert found.tpe_px == pytest.approx(0.0, abs=1e-6)
+    assert found.u_px == pytest.approx(326 + 692 * 0.5 / 4, abs=1e-6)
+    later = row_of(moving, target=track(1, (325, 239), t=2.0))
+    assert later.tpe_px == pytest.approx(focal * 0.5 / 4, abs=1e-6)
+
+
+@pytest.mark.parametrize("moving", [8], indirect=True)
+def test_the_marker_is_read_in_the_closeup_and_not_in_the_wide_view(moving):
+    """At 1 s the book is dead ahead: 0.234 m at 8 m are 202 px at 6920 px of focal length."""
+    rig = moving.rig
+    rig.zoom.zoom(6920.0)
+    rig.clock.sleep_until(1.0)
+    row = row_of(moving)
+    assert row.t_s == row.t_fixed_s
+    assert (row.decoded, row.decoded_wide) == (True, False)
+    truth, outline = moving.truth(), moving.truth().silhouette("book", "zoom", row.t_s)
+    assert decodes(rig.zoom.read(), outline, 1)  # as drawn by sim_assets/make_assets.py
+    assert not decodes(rig.zoom.read(), outline, 2)
+    assert not decodes(rig.zoom.read(), dataclasses.replace(outline, visible=0.0), 1)
+    assert not decodes(rig.zoom.read(), None, 1)
+    assert truth.targets.keys() == {"book"}
+
+
+WALL = """<mujoco><statistic extent="10" center="0 5 1"/>
+<worldbody><light pos="0 0 5"/><geom type="plane" size="20 20 1"/>
+<geom type="box" pos="{x} 5 1.6" size="2 .05 3"/>
+<site name="fixed_mount" pos="0 0 1.6" euler="90 0 0"/></worldbody></mujoco>"""
+# Parts of sim_assets/targets/person.xml: an ear, three of an arm, three of a leg and a panel on either side; torso,
+# neck, head, hair, nose, bag and two panels in the middle.
+SIDE_PARTS, MIDDLE_PARTS = 8, 8
+
+
+@pytest.mark.parametrize(("edge", "hidden"), [
+    (-1.0, 0),
+    (-0.02, SIDE_PARTS),  # 4 cm short of the middle, twice as far away
+    (0.02, SIDE_PARTS + MIDDLE_PARTS),
+    (1.0, 2 * SIDE_PARTS + MIDDLE_PARTS),
+])  # fmt: skip
+def test_what_a_wall_hides_is_counted_in_parts(tmp_path, edge, hidden):
+    """A person 10 m ahead faces the camera; a wall at 5 m reaches from the left to ``edge`` [m]."""
+    scene = tmp_path / "wall.xml"
+    scene.write_text(WALL.format(x=edge - 2))
+    paths = {"person": [[0, 0, 10, 0.9], [9, 0, 10, 0.9]]}
+    sim = {"scene": str(scene), "targets": ["person"], "effects": {"all": False}, "paths": paths}
+    world = SimWorld(parse_config({"sim": sim}))
+    outline = world.truth().silhouette("person", "fixed", 0.0)
+    world.close()
+    assert outline.visible == pytest.approx(1 - hidden / (2 * SIDE_PARTS + MIDDLE_PARTS))
+
+
+def test_a_birds_larger_side_is_the_maximum_over_a_beat():
+    """Against 200 silhouettes of a bird that flies on the spot, at any phase to begin with.
+
+    The span is widest twice a beat, with level wings. Of eight phases the nearest is a 16th of a beat away at most,
+    45 degrees of the span's own cosine: it misses 1 - cos 45 degrees of its amplitude.
+    """
+    paths = {"bird": [[0, 0, 10, 1.6], [9, 0, 10, 1.6]]}
+    sim = {"scene": "outdoor", "targets": ["bird"], "effects": {"all": False}, "paths": paths}
+    world = SimWorld(parse_config({"sim": sim}))
+    world.rig.clock.sleep_until(1.0)
+    truth = world.truth()
+    beat = truth.targets["bird"].beat_s
+    sides = [truth.silhouette("bird", "fixed", t).size_px.max() for t in np.linspace(0, beat, 200, endpoint=False)]
+    found = [truth.largest_side_px("bird", "fixed", t) for t in (0.0, 0.03, 0.1, 0.7)]
+    world.close()
+    swing = max(sides) - min(sides)
+    assert swing > 0.2 * max(sides)  # the beat shows: any one phase would be wrong by up to this
+    assert max(found) <= max(sides) + DENSE_PX
+    assert min(found) >= max(sides) - (1 - math.cos(math.pi / 4)) * swing / 2
