@@ -1,4 +1,4 @@
-"""The README's pictures: taken from results, all or none, and all of them shown."""
+"""The documentation's pictures: copied from results, all or none, and all of them shown."""
 
 import re
 from pathlib import Path
@@ -51,6 +51,6 @@ def test_without_one_none_is_written(results, tmp_path, capsys, harm):
 
 
 def test_the_readme_shows_them_all_and_no_other():
-    shown = re.findall(r"\]\((experiments/\S+\.jpg)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    shown = re.findall(r"\]\((docs/pictures/\S+\.jpg)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
     assert sorted(ROOT / path for path in shown) == sorted(PICTURES / f"{each.name}.jpg" for each in SHOWN)
     assert all((ROOT / path).is_file() for path in shown)
