@@ -1,8 +1,9 @@
-"""Takes the README's pictures from results, as JPEGs small enough to be kept with the code.
+"""Copy the pictures that the documentation shows from results, as JPEGs small enough to be kept with the code.
 
-Each is of as many seeds as the README says beside its table, which of hold and single_ptz are more than in a full run.
+docs/results.md says beside each table how many seeds its picture has; those of hold and single_ptz are more than a full
+run does.
 
-python -m experiments.paper.gallery [NAME ...] [--results experiments-out] [--out experiments/pictures]
+python -m experiments.paper.gallery [NAME ...] [--results experiments-out] [--out docs/pictures]
 """
 
 import sys
@@ -22,19 +23,19 @@ from experiments.paper.paper_loop import WAYS, picture_name
 
 PROGRAM = "python -m experiments.paper.gallery"
 RESULTS = Path("experiments-out")
-PICTURES = Path(__file__).parents[1] / "pictures"
+PICTURES = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 WIDEST_PX = 1280
 QUALITY = 85
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A picture of the README.
+    """A picture of the documentation.
 
     Attributes:
-        experiment: whose results it is of.
-        picture: name of its file there, without ending.
-        name: of its file in the README, without ending.
+        experiment: name of the experiment whose results it shows.
+        picture: name of its file among those results, without suffix.
+        name: name of its file in docs/pictures, without suffix.
     """
 
     experiment: str
@@ -72,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def gather(results: Path, out: Path, names: Collection[str]) -> list[Path]:
-    """Write every picture of some experiments that the README shows, or none.
+    """Write every picture of some experiments that the documentation shows, or none.
 
     Args:
         results: folder of `python -m experiments`.

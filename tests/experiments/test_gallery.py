@@ -1,4 +1,4 @@
-"""The README's pictures: taken from results, all or none, and all of them shown."""
+"""The documentation's pictures: copied from results, all or none, and all of them shown."""
 
 import re
 from pathlib import Path
@@ -50,7 +50,8 @@ def test_without_one_none_is_written(results, tmp_path, capsys, harm):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_readme_shows_them_all_and_no_other():
-    shown = re.findall(r"\]\((experiments/\S+\.jpg)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
-    assert sorted(ROOT / path for path in shown) == sorted(PICTURES / f"{each.name}.jpg" for each in SHOWN)
-    assert all((ROOT / path).is_file() for path in shown)
+def test_the_results_page_shows_them_all_and_no_other():
+    page = ROOT / "docs" / "results.md"
+    shown = re.findall(r"\]\((pictures/\S+\.jpg)\)", page.read_text(encoding="utf-8"))
+    assert sorted(page.parent / path for path in shown) == sorted(PICTURES / f"{each.name}.jpg" for each in SHOWN)
+    assert all((page.parent / path).is_file() for path in shown)
