@@ -27,7 +27,7 @@ from cotarget.control.selection import FirstCome
 from cotarget.detection import Detector, make_detector
 from cotarget.errors import ConfigError
 from cotarget.evaluation import true_calibration
-from cotarget.fusion import Pursuit
+from cotarget.fusion import TargetFusion
 from cotarget.rig import Frame, PanTiltLimits
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim
@@ -74,7 +74,7 @@ class Pipeline:
         self.detector: Detector = make_detector(self.target, film.rate_hz)
         self.calibration = calibration_of(film.size)
         self.tracker, self.policy = Tracker(settings_for(self.target), film.size), FirstCome()
-        self.pursuit = Pursuit(self.calibration, self.target, film.size)
+        self.fusion = TargetFusion(self.calibration, self.target, film.size)
         config = RigConfig()
         pan, tilt = config.head_limits
         self.reach = Reach(pan, tilt, config.focal_range_px)
@@ -86,10 +86,10 @@ class Pipeline:
         detections = self.detector.detect(frame)
         detected = time.perf_counter()
         tracks = self.tracker.update(detections, frame.t)
-        self.pursuit.see_wide(frame, tracks, self.detector.mask)
-        number = self.policy.select(self.pursuit.candidates(tracks, frame.t), np.zeros(2), self.limits)
-        self.pursuit.follow(number)
-        estimate = None if number is None else self.pursuit.estimate(number, frame.t + LEAD_S)
+        self.fusion.update_fixed(frame, tracks, self.detector.mask)
+        number = self.policy.select(self.fusion.candidates(tracks, frame.t), np.zeros(2), self.limits)
+        self.fusion.follow(number)
+        estimate = None if number is None else self.fusion.estimate(number, frame.t + LEAD_S)
         tracked = time.perf_counter()
         if estimate is not None:
             aim(self.calibration, estimate.x_fixed, self.reach, closeup=estimate.closeup)

@@ -662,7 +662,7 @@ def check_numbers(sim: SimConfig) -> None:
         raise ConfigError(f"sim.zoom.lens_steps: {sim.zoom.lens_steps} is fewer than 2")
 
 
-def told_targets(own: Iterable[str] = ()) -> str:
+def known_targets(own: Iterable[str] = ()) -> str:
     """Which targets the simulation has, with those of [sim.models], for messages."""
     return (
         f"the simulation has: {choices([*TARGETS, *own])}, and further ones with a number, as 'bird2'; others need a "
@@ -686,7 +686,7 @@ def _check_targets(sim: SimConfig) -> None:
     for where, names in (("sim.targets", sim.targets), ("sim.paths", tuple(sim.paths))):
         for at, name in enumerate(names):
             if split_name(name)[0] not in (*TARGETS, *sim.models):
-                raise ConfigError(f"{where}: unknown target '{name}'; {told_targets(sim.models)}")
+                raise ConfigError(f"{where}: unknown target '{name}'; {known_targets(sim.models)}")
             if name in names[:at]:
                 kind = split_name(name)[0]
                 free = next(f"{kind}{number}" for number in itertools.count(2) if f"{kind}{number}" not in names)

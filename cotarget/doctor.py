@@ -158,10 +158,10 @@ def _emergency_stop(config: "RigConfig") -> Finding:
 
 def _position(config: "RigConfig") -> Finding:
     """Whether anybody has noted that the head is not where it says."""
-    from cotarget.drivers.interlock import LostPosition
+    from cotarget.drivers.interlock import PositionLostMarker
 
     try:
-        LostPosition(config.hardware.head.port, config.safety.stop_file).refuse()
+        PositionLostMarker(config.hardware.head.port, config.safety.stop_file).refuse()
     except CotargetError as error:
         return Finding("head's position", False, str(error), "cotarget reset-head --rig rig.toml")
     return Finding("head's position", True, "nothing says that it is lost")

@@ -196,7 +196,7 @@ class TruthFinder:
         self._truth, self._name, self._missed = truth, name, missed
         self._numbers_at = counted(seed + FINDER_SEED)
 
-    def see_wide(self, frame: Frame, detection: Detection, mask: Image | None = None) -> None:
+    def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> None:
         """Nothing of it is remembered."""
 
     def sight_at(self, t: float) -> bool:

@@ -20,7 +20,7 @@ from cotarget.config import TargetConfig
 from cotarget.control.selection import Candidate, leaves_in
 from cotarget.control.zoom import is_seen_well, shape_of
 from cotarget.detection import Detection
-from cotarget.estimation import Appearance, Estimate, SpatialFilter, estimation_settings_for
+from cotarget.estimation import Appearance, Estimate, TargetFilter, estimation_settings_for
 from cotarget.estimation.motion_model import PAN, TILT, K, L
 from cotarget.estimation.zoom_matching import LATEST_S, CloseupFinder, Expected, Finder, Found
 from cotarget.geometry import Array
@@ -125,7 +125,7 @@ WRONG = 4.0
 UNFOUND_S = 1.5
 # Then he is looked for as far around as this leaves: standard deviations of size and depth together, and of the head's
 # bias [rad]. A size told twice too large is 0.7.
-DOUBTED_SIZE, DOUBTED_BIAS = 0.4, 5e-3
+INFLATED_SIZE, INFLATED_BIAS = 0.4, 5e-3
 # A find so near to where it was expected, in standard deviations, is no surprise.
 NEAR = 3.0
 # So long after the wide view has shown it a target may have gone elsewhere [s].
@@ -135,7 +135,7 @@ MOST_WAITING = 30
 MakeFinder = Callable[[Calibration, TargetConfig], Finder]
 
 
-class Pursuit:
+class TargetFusion:
     """The filters of all tracks, from one frame to the next.
 
     Args:
@@ -158,7 +158,7 @@ class Pursuit:
         self._calibration, self._target, self._size = calibration, target, size
         self._closed_loop, self._make_finder = closed_loop, finder
         self._assumed = estimation_settings_for(target, calibration)
-        self._filters: dict[int, SpatialFilter] = {}
+        self._filters: dict[int, TargetFilter] = {}
         self._seen_s: dict[int, float] = {}
         self._unlikely: set[int] = set()
         self._followed: int | None = None
@@ -170,7 +170,7 @@ class Pursuit:
         self._to_base = calibration.T_base_fixed
         self.states = StateHistory()
 
-    def see_wide(
+    def update_fixed(
         self, frame: Frame, tracks: Sequence[Track], mask: Image | None, favoured: Collection[int] = ()
     ) -> None:
         """Take a frame of the wide view into account.
@@ -200,27 +200,27 @@ class Pursuit:
             if track.missed:
                 continue
             if track.id not in self._filters:
-                self._filters[track.id] = SpatialFilter(self._calibration, self._target, self._assumed)
+                self._filters[track.id] = TargetFilter(self._calibration, self._target, self._assumed)
             found = self._filters[track.id]
             box, sigma_px = track.box, None
             if track.shared:  # it is inside of what covers others too, and the finder would learn those
                 inside = Detection(track.center_px, np.zeros(2), track.score, clipped=True)  # this frame shows no size
                 room = room_inside(box.size_px, track.size_px)
-                found.see_wide(inside, frame.t, sigma_px=np.hypot(room, track.size_px / 2))
+                found.update_fixed(inside, frame.t, sigma_px=np.hypot(room, track.size_px / 2))
                 continue
             lacks = missing(track.size_px, box.size_px)
             if lacks.any() and isinstance(box, Detection):  # a piece of it, which tells no size and its middle badly
                 sigma_px = np.hypot(lacks, box.size_px) / 2
-                found.see_wide(replace(box, clipped=True), frame.t, sigma_px=sigma_px)
+                found.update_fixed(replace(box, clipped=True), frame.t, sigma_px=sigma_px)
                 continue
             if track.id == self._followed and isinstance(box, Detection):
-                sight = self._finder.see_wide(frame, box, mask)
+                sight = self._finder.update_fixed(frame, box, mask)
                 if sight is not None:  # the very point that both views show
                     box, sigma_px = replace(box, center_px=sight.body_px), sight.body_sigma_px
             size_px = track.larger_side_px if self._target.dimension == "wingspan" else None
-            found.see_wide(box, frame.t, sigma_px=sigma_px, size_px=size_px)
+            found.update_fixed(box, frame.t, sigma_px=sigma_px, size_px=size_px)
 
-    def see_zoom(self, frame: Frame | None, wide_t: float) -> Found | None:
+    def update_zoom(self, frame: Frame | None, wide_t: float) -> Found | None:
         """Look for the followed target in the zoom view, and take it into account where it is found.
 
         A frame that is newer than the wide view waits until that has shown the target at about its time.
@@ -259,13 +259,13 @@ class Pursuit:
         if seen is None:
             return None
         # The wrong size, or a wrong calibration, has it looked for beside where it is, and never be found.
-        doubted = _doubted(estimate).appearance(pose.pan, pose.tilt, pose.nominal_px) if self._overdue else None
+        inflated = _inflated(estimate).appearance(pose.pan, pose.tilt, pose.nominal_px) if self._overdue else None
         pan, tilt = pose.pan + estimate.bias[0], pose.tilt + estimate.bias[1]
-        covariance = (seen if doubted is None else doubted).covariance
+        covariance = (seen if inflated is None else inflated).covariance
         found = self._finder.find(frame, Expected(estimate.x_fixed, covariance, pan, tilt, pose.nominal_px))
         self._count_unfound(frame, found, seen, estimate)
         if found is not None:
-            self._filters[self._followed].see_zoom(
+            self._filters[self._followed].update_zoom(
                 found.center_px,
                 # Both views show the same point, but wings and limbs move it: with its own error alone, each of their
                 # beats would be the target's.
@@ -297,7 +297,7 @@ class Pursuit:
         if wholly and frame.t - estimate.measured_t <= JUST_SEEN_S:
             self._unfound_s += passed
 
-    def doubts(self, number: int, t: float) -> list[str]:
+    def warnings(self, number: int, t: float) -> list[str]:
         """What speaks against what was told of a target, or against the calibration, in words.
 
         Args:
@@ -359,7 +359,7 @@ class Pursuit:
             if track.confirmed and track.id in self._filters and self._filters[track.id].knows(t)
         ]
 
-    def _direction(self, known: SpatialFilter, t: float, later: float) -> Array:
+    def _direction(self, known: TargetFilter, t: float, later: float) -> Array:
         """Pan and tilt of a target as seen from the head, (2,) [rad], the zoom camera's place on it aside."""
         estimate = known.at(t + later)
         assert estimate is not None, "what is known at a time is known later"
@@ -369,16 +369,16 @@ class Pursuit:
 def _contradicted(estimate: Estimate) -> list[str]:
     """What both views together make other than it was told or calibrated, in words."""
     wrong = []
-    if abs(estimate.size_surprise) > WRONG:
+    if abs(estimate.size_deviation) > WRONG:
         wrong.append(f"both views make it {estimate.size:.2g} m and not {estimate.target.size:.2g} m")
-    if estimate.bias_surprise > WRONG:
+    if estimate.bias_deviation > WRONG:
         wrong.append(f"the head points {math.degrees(math.hypot(*estimate.bias)):.2g} degrees beside")
     return wrong
 
 
-def _doubted(estimate: Estimate) -> Estimate:
+def _inflated(estimate: Estimate) -> Estimate:
     """The same estimate, as if size and head were hardly known: their ratio to the depth is what the wide view sees."""
     P = estimate.state_covariance.copy()
-    P[np.ix_([L, K], [L, K])] += DOUBTED_SIZE**2
-    P[[PAN, TILT], [PAN, TILT]] += DOUBTED_BIAS**2
+    P[np.ix_([L, K], [L, K])] += INFLATED_SIZE**2
+    P[[PAN, TILT], [PAN, TILT]] += INFLATED_BIAS**2
     return replace(estimate, state_covariance=P)

@@ -18,7 +18,7 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, TargetConfig
-from cotarget.control.controller import Predict, Servo, ServoSettings
+from cotarget.control.controller import Controller, ControllerSettings, Predict
 from cotarget.control.selection import FirstCome, Policy
 from cotarget.control.zoom import shape_of
 from cotarget.detection import Detection, Detector
@@ -26,7 +26,7 @@ from cotarget.detection.base import flood
 from cotarget.errors import DeviceError, StaleFrameError, UnreachableError
 from cotarget.estimation import Estimate
 from cotarget.estimation.zoom_matching import CloseupFinder, Found
-from cotarget.fusion import MakeFinder, Pursuit
+from cotarget.fusion import MakeFinder, TargetFusion
 from cotarget.rig import Camera, Clock, Frame, Image, PanTiltState, Rig, ZoomState
 from cotarget.safety.safe_rig import FUTURE_S
 from cotarget.targeting import Aim
@@ -49,7 +49,7 @@ FROZEN_S = 1.0
 ROWS = 16  # every so many rows of a picture are compared first; where one differs, it is another picture
 
 
-class Eyes:
+class FrameSource:
     """The newest frames of both cameras.
 
     Args:
@@ -59,7 +59,7 @@ class Eyes:
 
     Attributes:
         interval: from the wide frame before to the newest [s]; inf for the first.
-        close_is_new: whether the newest zoom frame shows what was not seen before: another time, and another picture,
+        zoom_is_new: whether the newest zoom frame shows what was not seen before: another time, and another picture,
             but where the wide view has not changed either since that picture came first.
     """
 
@@ -71,9 +71,9 @@ class Eyes:
         self._now = self._picture_t = self._close_t = self._shown_t = -math.inf
         self._why_blind = self._why_late = ""
         self._looked_t = -math.inf  # by the rig's clock
-        self.interval, self.close_is_new = math.inf, False
+        self.interval, self.zoom_is_new = math.inf, False
 
-    def look_wide(self) -> Frame:
+    def read_fixed(self) -> Frame:
         """Wait for the next wide frame; those that repeat or cannot be true are passed over for a while.
 
         Raises:
@@ -95,7 +95,7 @@ class Eyes:
                 timeout = until - now
 
     def _next_wide(self, timeout: float, until: float) -> Frame:
-        """The next wide frame, by a time. Raises as `look_wide` does, but at once."""
+        """The next wide frame, by a time. Raises as `read_fixed` does, but at once."""
         before = self._wide
         frame = self._fixed.read(None if before is None else before.t, timeout)
         _check_size(frame, self._fixed, "fixed")
@@ -115,7 +115,7 @@ class Eyes:
         self._wide, self._now, self._looked_t = frame, frame.t, now
         return frame
 
-    def look_close(self) -> Frame:
+    def read_zoom(self) -> Frame:
         """The newest zoom frame, which may be an old one; the first is waited for.
 
         Raises:
@@ -135,7 +135,7 @@ class Eyes:
             self._close, self._close_t = frame, self._now
             if before is None or not _same(frame.image, before.image):
                 self._shown_t = self._now
-        self.close_is_new = is_later and not self._picture_t > self._shown_t
+        self.zoom_is_new = is_later and not self._picture_t > self._shown_t
         if before is None or is_later:
             return frame
         if self._now - self._close_t > GONE_S:
@@ -196,7 +196,7 @@ class State(enum.StrEnum):
 
 
 @dataclass(frozen=True)
-class FollowSettings(ServoSettings):
+class FollowSettings(ControllerSettings):
     """How the loop follows, and how it drives head and lens.
 
     Attributes:
@@ -304,11 +304,11 @@ class _Loop:
     ) -> None:
         self._rig, self._detector, self._settings = rig, detector, settings
         self._tracker = Tracker(settings_for(target), rig.fixed.size)
-        self._pursuit = Pursuit(
+        self._fusion = TargetFusion(
             calibration, target, rig.fixed.size, closed_loop=settings.closed_loop, finder=settings.finder
         )
-        self._servo = Servo(rig, calibration, settings)
-        self._eyes = Eyes(rig.fixed, rig.zoom, rig.clock)
+        self._controller = Controller(rig, calibration, settings)
+        self._frames = FrameSource(rig.fixed, rig.zoom, rig.clock)
         self._beyond: set[int] = set()  # tracks that could not be aimed at
         self._policy = settings.policy()
         self._seen_t: dict[int, float] = {}  # when each track was seen last
@@ -316,31 +316,31 @@ class _Loop:
 
     def turn(self) -> Step:
         """One frame of the fixed camera."""
-        rig, pursuit = self._rig, self._pursuit
-        frame = self._eyes.look_wide()
-        interval = min(self._eyes.interval, LONGEST_INTERVAL_S)
+        rig, fusion = self._rig, self._fusion
+        frame = self._frames.read_fixed()
+        interval = min(self._frames.interval, LONGEST_INTERVAL_S)
         detections = self._detector.detect(frame)
         tracks = self._tracker.update(detections, frame.t)
         self._seen_t = {each.id: self._seen_t.get(each.id, frame.t) if each.missed else frame.t for each in tracks}
         favoured = {track.id for track in tracks if self._policy.favours(track)}
-        pursuit.see_wide(frame, tracks, self._detector.mask, favoured)
-        self._hear()
-        zoom = self._eyes.look_close()
-        found = pursuit.see_zoom(zoom if self._eyes.close_is_new else None, frame.t)
+        fusion.update_fixed(frame, tracks, self._detector.mask, favoured)
+        self._read_states()
+        zoom = self._frames.read_zoom()
+        found = fusion.update_zoom(zoom if self._frames.zoom_is_new else None, frame.t)
         chosen = self._choose(tracks)
         if chosen is None:
-            self._servo.zoom_out()
-            mode, reason, aim = State.SEARCHING, self._why_nobody(tracks), None
+            self._controller.zoom_out()
+            mode, reason, aim = State.SEARCHING, self._why_searching(tracks), None
         else:
-            pursuit.count_seen_well(chosen, interval, rig.zoom.focal_range[1])
+            fusion.count_seen_well(chosen, interval, rig.zoom.focal_range[1])
             mode, reason, aim = self._drive(chosen, frame.t, interval)
-        self._hear()
-        doubts = [] if chosen is None else pursuit.doubts(chosen.id, frame.t)
+        self._read_states()
+        warnings = [] if chosen is None else fusion.warnings(chosen.id, frame.t)
         step = Step(
             index=self._index,
             t=rig.clock.now(),
             state=mode,
-            reason="; ".join(filter(None, [reason, *doubts, *self._eyes.troubles()])),
+            reason="; ".join(filter(None, [reason, *warnings, *self._frames.troubles()])),
             fixed=frame,
             zoom=zoom,
             mask=self._detector.mask,
@@ -348,23 +348,23 @@ class _Loop:
             tracks=tuple(tracks),
             target=chosen,
             aim=aim,
-            commanded=self._servo.commanded,
+            commanded=self._controller.commanded,
             head=self._head,
             lens=self._lens,
-            estimate=None if chosen is None else pursuit.estimate(chosen.id, frame.t),
+            estimate=None if chosen is None else fusion.estimate(chosen.id, frame.t),
             found=found,
-            head_commands=self._servo.head_commands,
-            lens_commands=self._servo.lens_commands,
+            head_commands=self._controller.head_commands,
+            lens_commands=self._controller.lens_commands,
         )
         self._index += 1
         return step
 
-    def _hear(self) -> None:
+    def _read_states(self) -> None:
         """Ask the devices where they are."""
         self._head, self._lens = self._rig.head.state(), self._rig.zoom.state()
-        self._pursuit.states.add(self._head, self._lens)
+        self._fusion.states.add(self._head, self._lens)
 
-    def _why_nobody(self, tracks: list[Track]) -> str:
+    def _why_searching(self, tracks: list[Track]) -> str:
         """Why nobody is followed."""
         if unmet := self._policy.unmet:
             return unmet
@@ -377,14 +377,16 @@ class _Loop:
     def _choose(self, tracks: list[Track]) -> Track | None:
         """Whom to follow."""
         now = self._rig.clock.now()
-        candidates = self._pursuit.candidates(tracks, now)
+        candidates = self._fusion.candidates(tracks, now)
         if self._beyond:  # whoever could not be aimed at may have come nearer
-            estimates = {number: self._pursuit.estimate(number, now) for number in self._beyond}
-            self._beyond = {n for n, each in estimates.items() if each is not None and not self._servo.can_reach(each)}
+            estimates = {number: self._fusion.estimate(number, now) for number in self._beyond}
+            self._beyond = {
+                n for n, each in estimates.items() if each is not None and not self._controller.can_reach(each)
+            }
             candidates = [replace(each, reachable=each.id not in self._beyond) for each in candidates]
         head = np.array([self._head.pan, self._head.tilt])
         number = self._policy.select(candidates, head, self._rig.head.limits)
-        self._pursuit.follow(number)
+        self._fusion.follow(number)
         return next((track for track in tracks if track.id == number), None)
 
     def _drive(self, chosen: Track, t: float, interval: float) -> tuple[State, str, Aim | None]:
@@ -394,7 +396,7 @@ class _Loop:
             reason, aim = self._search(chosen, seen_t, interval)
             return State.LOST, f"out of sight for {t - seen_t:.1f} s; {reason}", aim
         try:
-            drive = self._servo.drive(self._predict(chosen), seen_t, interval, shape=shape_of(chosen))
+            drive = self._controller.drive(self._predict(chosen), seen_t, interval, shape=shape_of(chosen))
         except UnreachableError as error:
             self._beyond.add(chosen.id)
             return State.UNREACHABLE, str(error), None
@@ -404,7 +406,7 @@ class _Loop:
     def _search(self, chosen: Track, seen_t: float, interval: float) -> tuple[str, Aim | None]:
         """Look for a target that is out of sight; what the head does, and what it is aimed at."""
         try:
-            aim = self._servo.search(self._predict(chosen), seen_t, interval)
+            aim = self._controller.search(self._predict(chosen), seen_t, interval)
         except UnreachableError as error:
             return f"the head waits: {error}", None
         if aim is None:
@@ -413,4 +415,4 @@ class _Loop:
 
     def _predict(self, chosen: Track) -> Predict:
         """The target at any time."""
-        return lambda t: self._pursuit.estimate(chosen.id, t)
+        return lambda t: self._fusion.estimate(chosen.id, t)

@@ -193,4 +193,4 @@ class Flight:
 
 def show(spatial_filter, view):
     """Give a filter what the zoom camera saw."""
-    return spatial_filter.see_zoom(view.pixel, view.sigma_px, view.pan, view.tilt, view.nominal_px, view.t)
+    return spatial_filter.update_zoom(view.pixel, view.sigma_px, view.pan, view.tilt, view.nominal_px, view.t)

@@ -264,7 +264,7 @@ def calibrate_views(
         board=board,
         views=solution.views,
         provenance={
-            **dataclasses.asdict(options),
+            **_options_table(options),
             "when": datetime.now(UTC).isoformat(timespec="seconds"),
             "cotarget": version("cotarget"),
             "opencv": cv2.__version__,
@@ -273,6 +273,11 @@ def calibrate_views(
             **(provenance or {}),
         },
     )
+
+
+def _options_table(options: Options) -> dict[str, Any]:
+    table = dataclasses.asdict(options)
+    return {"insist" if name == "regularize" else name: value for name, value in table.items()}  # the file's key
 
 
 def _check_views(views: Sequence[View], board: BoardConfig) -> None:

@@ -57,10 +57,10 @@ E3 = np.array([0.0, 0.0, 1.0])
 # With k degrees of freedom left, a variance that was itself estimated widens the parameters' distribution to Student's,
 # whose variance is larger by k / (k - 2).
 STUDENT = 2.0
-# Without knowledge of a direction, `insist` takes it as zero give or take this.
-INSISTED_ROTATION = 1.0  # [rad]
-INSISTED_POSITION = 1.0  # [m]
-PRIOR = 1 / np.repeat([INSISTED_ROTATION, INSISTED_POSITION], 3) ** 2
+# Without knowledge of a direction, `regularize` takes it as zero give or take this.
+REGULARIZED_ROTATION = 1.0  # [rad]
+REGULARIZED_POSITION = 1.0  # [m]
+PRIOR = 1 / np.repeat([REGULARIZED_ROTATION, REGULARIZED_POSITION], 3) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,7 @@ def fit_motions(problem: Problem, start: RigidTransform) -> MotionFit:
     return _result(problem, state, taken, used)
 
 
-def insist_on(problem: Problem, found: MotionFit) -> MotionFit:
+def regularized(problem: Problem, found: MotionFit) -> MotionFit:
     """Put the free directions of X where its rotation and translation are smallest; see `PRIOR`."""
     free = int(np.sum(spectrum(found.normal, found.noise)[0] < 1))
     state, _, taken = _descend(problem, found.transforms, found.used, free=free)
@@ -420,7 +420,11 @@ def park_martin(head_motions: Sequence[RigidTransform], camera_motions: Sequence
 
 
 def solve_hand_eye(
-    A: Sequence[RigidTransform], B: Sequence[RigidTransform], *, independent: int | None = None, insist: bool = False
+    A: Sequence[RigidTransform],
+    B: Sequence[RigidTransform],
+    *,
+    independent: int | None = None,
+    regularize: bool = False,
 ) -> HandEye:
     """Find the most likely X of A_i X = X B_i, with its covariance.
 
@@ -434,9 +438,9 @@ def solve_hand_eye(
         A: motions of the hand, T_hand_hand', two or more; see `motions`.
         B: motions of the camera, T_camera_camera', likewise.
         independent: how many of the motions are independent; all, by default.
-        insist: to be given an X also where the motions leave some of it free. Its rotation and translation are then
+        regularize: to be given an X also where the motions leave some of it free. Its rotation and translation are then
             the smallest that explain the motions, and its free directions have standard deviations of
-            `INSISTED_ROTATION` and `INSISTED_POSITION`.
+            `REGULARIZED_ROTATION` and `REGULARIZED_POSITION`.
 
     Raises:
         CalibrationError: the motions contradict each other, or leave X undetermined; in words, with what to add.
@@ -446,7 +450,7 @@ def solve_hand_eye(
     a, b = _together(A), _together(B)
     problem = motion_problem(a, b, len(A) if independent is None else independent)
     X = RigidTransform.concatenate([_start(a, b)])
-    return _solved(problem, X, HandMotions(a.rotation.as_rotvec(), a.translation), insist)
+    return _solved(problem, X, HandMotions(a.rotation.as_rotvec(), a.translation), regularize)
 
 
 def solve_hand_eye_from_poses(
@@ -455,7 +459,7 @@ def solve_hand_eye_from_poses(
     *,
     placements: Sequence[int] | None = None,
     middle: Sequence[float] | Array = (0.0, 0.0, 0.0),
-    insist: bool = False,
+    regularize: bool = False,
 ) -> HandEye:
     """Find the most likely X and places of the board from poses: T_base_hand X T_camera_board = T_base_board.
 
@@ -473,7 +477,7 @@ def solve_hand_eye_from_poses(
         placements: where the board stood during each view, by number; in one place throughout, by default.
         middle: of the board's points, in its frame [m], (3,): that is the point which the camera sees best. With a
             board whose origin is a corner it makes a difference.
-        insist: see `solve_hand_eye`.
+        regularize: see `solve_hand_eye`.
 
     Raises:
         CalibrationError: the poses contradict each other, or leave X undetermined; in words, with what to add.
@@ -495,7 +499,7 @@ def solve_hand_eye_from_poses(
     start = RigidTransform.concatenate([X, *(placed[np.flatnonzero(owners == k)].mean() for k in range(len(numbers)))])
     turns_base = (hands[j].rotation * hands[i].rotation.inv()).as_rotvec()
     moved = HandMotions(A.rotation.as_rotvec(), A.translation, turns_base)
-    result = _solved(pose_problem(hands, seen, owners), start, moved, insist)
+    result = _solved(pose_problem(hands, seen, owners), start, moved, regularize)
     return replace(result, boards=tuple(board * to_middle.inv() for board in result.boards))
 
 
@@ -514,14 +518,14 @@ def _together(transforms: Sequence[RigidTransform]) -> RigidTransform:
         ) from None
 
 
-def _solved(problem: Problem, start: RigidTransform, moved: HandMotions, insist: bool) -> HandEye:
+def _solved(problem: Problem, start: RigidTransform, moved: HandMotions, regularize: bool) -> HandEye:
     """Fit, judge, and refuse or insist."""
     found = fit_motions(problem, start)
     verdict = judge_motions(found.normal, found.noise, moved)
     if not verdict.determined:
-        if not insist:
+        if not regularize:
             raise CalibrationError(f"hand-eye: {verdict.text}")
-        found = insist_on(problem, found)
+        found = regularized(problem, found)
     r = found.residuals[found.used]
     rotation_rms, translation_rms = (float(np.sqrt(np.mean(np.sum(part**2, axis=1)))) for part in (r[:, :3], r[:, 3:]))
     return HandEye(

@@ -330,20 +330,20 @@ def _most_central(candidates: Sequence[RigidTransform], scale: float) -> RigidTr
     return candidates[int(np.argmin(np.median(far + turned, axis=1)))]
 
 
-def rough_hand(model: RigModel, views: Sequence[View], points: Array, *, insist: bool = False) -> RigidTransform:
+def rough_hand(model: RigModel, views: Sequence[View], points: Array, *, regularize: bool = False) -> RigidTransform:
     """T by Park and Martin's method from all motions within each placement.
 
     Args:
         model: with the zoom camera.
         views: of any placements.
         points: the board's corners in its frame [m], (N, 3).
-        insist: whether to take the smallest turn and shift of what the motions leave free.
+        regularize: whether to take the smallest turn and shift of what the motions leave free.
 
     Raises:
         CalibrationError: the motions do not determine it, or contradict each other.
     """
     A, B = head_motions(model, views, points)
-    return solve_hand_eye(A, B, insist=True).X if insist else park_martin(A, B)
+    return solve_hand_eye(A, B, regularize=True).X if regularize else park_martin(A, B)
 
 
 def head_motions(

@@ -73,7 +73,7 @@ from cotarget.calibration.model import (
     stop_of,
 )
 from cotarget.calibration.observability import limits_of_use, name_directions, weak_directions
-from cotarget.calibration.uncertainty import covariance_of, cross_validate, with_considered
+from cotarget.calibration.uncertainty import covariance_of, cross_validate, with_consider_covariance
 from cotarget.camera import ZoomLens, distortion_growth
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
@@ -364,7 +364,7 @@ def joint(
         raise CalibrationError("the head moved only at other focal lengths than the shortest; turn it there as well")
     model = steps.model
     if steps.has_head:
-        model = replace(model, hand=rough_hand(model, steps.views, points, insist=options.insist))
+        model = replace(model, hand=rough_hand(model, steps.views, points, regularize=options.regularize))
     model = replace(model, gamma=rough_gamma(model, of_both(steps.views), points))
     used, rejected = list(steps.views), list(steps.rejected)
     blocks = tuple(block for block in ALL_BLOCKS if steps.has_head or block not in ("hand", "head"))
@@ -391,7 +391,7 @@ def joint(
         result, wrong, left_out = _cleaned(again, points, prior)
     rejected += left_out
     check_pairs(steps, rms(result.residuals))
-    if not options.insist and (text := undetermined(result)):
+    if not options.regularize and (text := undetermined(result)):
         raise CalibrationError(text)
     covariance = covariance_of(result)
     held_out = None
@@ -402,7 +402,7 @@ def joint(
             widened = max(widened, 1.0 if held_out is None else held_out.widened)
         held = [block for block in CONSIDERED if block not in result.free and (block != "scale" or steps.has_head)]
         usual = Prior(prior.reference, {**prior.sigmas, "fixed.k3": K3_WIDE, **ENCODER_SIGMAS})
-        covariance = with_considered(covariance, result, points, held, usual)
+        covariance = with_consider_covariance(covariance, result, points, held, usual)
         covariance = replace(covariance, matrix=covariance.matrix * widened**2)
     return Solution(
         model=result.model,
@@ -432,7 +432,7 @@ def _known(model: RigModel, start: RigModel, blocks: Sequence[Block], options: O
     if model.stops > 1:
         lens = lens_prior(model)
         reference, sigmas = replace(reference, zoom=lens.reference.zoom), {**sigmas, **lens.sigmas}
-    if options.insist:
+    if options.regularize:
         names = [
             name for name in parameter_names(blocks, model.stops) if not name.startswith(("fixed.", "zoom[", "board."))
         ]

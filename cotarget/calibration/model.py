@@ -95,13 +95,14 @@ class Options:
     Attributes:
         method: "joint", one fit of everything; or "sequential", the paper's, to be compared with.
         encoders: joint only: whether to find the encoders' scales and zeros too, near 1 and 0 by prior knowledge.
-        insist: joint only: whether to go on where the motions leave something open, with an uncertainty that says so.
+        regularize: joint only: whether to go on where the motions leave something open, with an uncertainty that says
+        so.
         folds: joint only: into how many parts the placements are split, each kept out once and predicted; 0 for none.
     """
 
     method: str = "joint"
     encoders: bool = False
-    insist: bool = False
+    regularize: bool = False
     folds: int = 5
 
 

@@ -25,12 +25,12 @@ from cotarget.rig import PanTiltLimits
 # Pointing is judged for targets on a grid over the wide view at these depths [m], in squares of the board: a board of
 # 0.1 m is for scenes of 4 to 30 m.
 DEPTHS_SQUARES = (40.0, 110.0, 300.0)
-OUTLOOK_GRID = (5, 4)
+ACCURACY_GRID = (5, 4)
 BORDER = 0.02  # of the image, that the grid keeps clear
 
 
 @dataclass(frozen=True, eq=False)
-class Outlook:
+class PredictedAccuracy:
     """What is known of the parameters, and how pointing depends on them.
 
     Attributes:
@@ -60,7 +60,9 @@ class Outlook:
         squared = float(np.trace(spread)) * self.variance
         return float(np.sqrt(squared)) if squared > 0 else np.inf
 
-    def with_views(self, views: Sequence[View], boards: dict[int, RigidTransform], points: Array) -> "Outlook":
+    def with_views(
+        self, views: Sequence[View], boards: dict[int, RigidTransform], points: Array
+    ) -> "PredictedAccuracy":
         """The outlook after views of more placements."""
         return replace(self, normal=self.normal + self.worth(views, boards, points))
 
@@ -69,7 +71,7 @@ class Outlook:
         return information(replace(self.model, boards=boards), views, points, self.free)
 
 
-def outlook_of(found: Fit, square: float) -> Outlook | None:
+def predict_accuracy(found: Fit, square: float) -> PredictedAccuracy | None:
     """The outlook after a fit of everything at the shortest focal length.
 
     Args:
@@ -83,7 +85,7 @@ def outlook_of(found: Fit, square: float) -> Outlook | None:
     if found.variance is None or model.fixed is None or model.zoom is None:
         return None
     size = np.array(model.fixed.size, dtype=float) - 1
-    u, v, z = np.meshgrid(*(np.linspace(BORDER, 1 - BORDER, n) for n in OUTLOOK_GRID), DEPTHS_SQUARES)
+    u, v, z = np.meshgrid(*(np.linspace(BORDER, 1 - BORDER, n) for n in ACCURACY_GRID), DEPTHS_SQUARES)
     pixels = np.stack([u.ravel(), v.ravel()], axis=-1) * size
     names = parameter_names(found.free, model.stops)
     J, _ = miss_derivatives(model, names, pixels, z.ravel() * square, model.zoom.nominal_px[0])
@@ -92,7 +94,7 @@ def outlook_of(found: Fit, square: float) -> Outlook | None:
         return None
     J = J[reached].reshape(-1, len(names))
     pointing = J.T @ J / np.count_nonzero(reached)
-    return Outlook(model, found.free, found.normal, found.variance, pointing)
+    return PredictedAccuracy(model, found.free, found.normal, found.variance, pointing)
 
 
 def planned_views(board: int, turns: Sequence[tuple[float, float]], corners: int) -> list[View]:

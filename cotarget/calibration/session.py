@@ -64,13 +64,13 @@ from cotarget.calibration.joint import (
 from cotarget.calibration.model import Capture, Progress, Rejected, RigModel, View, unseen
 from cotarget.calibration.planning import (
     Coverage,
-    Outlook,
+    PredictedAccuracy,
     distance,
     facing_board,
-    outlook_of,
     plan_placements,
     plan_poses,
     planned_views,
+    predict_accuracy,
     preferred_share,
     seen_at_home,
     where_in,
@@ -267,7 +267,7 @@ class Recorder:
         frame = self._look(self._read_fixed)
         return self._keep(Capture(frame.image, "fixed", self.number, t=frame.t), expected)
 
-    def see_zoom(self, *, expected: bool = True, find: Finder | None = None) -> View | None:
+    def update_zoom(self, *, expected: bool = True, find: Finder | None = None) -> View | None:
         """Take an image with the zoom camera where the head now stands and find the board in it.
 
         Args:
@@ -407,7 +407,7 @@ def learn_fixed(recorder: Recorder, rng: np.random.Generator) -> RigModel:
         )
     focal = smallest_spacing(view.corners_px, board.corners) * depth / board.square
     lens = replace(lens, focal_px=(focal, focal))
-    recorder.see_zoom(expected=False)
+    recorder.update_zoom(expected=False)
     coverage = {"fixed": Coverage(size)}
     for k in range(LEARNING):
         model = RigModel(boards={}, fixed=lens)
@@ -418,7 +418,7 @@ def learn_fixed(recorder: Recorder, rng: np.random.Generator) -> RigModel:
         recorder.present(wishes[0])
         if (view := recorder.see_fixed()) is not None:
             coverage["fixed"].add(view.corners_px[view.seen])
-        recorder.see_zoom(expected=False)
+        recorder.update_zoom(expected=False)
     views = [view for view in recorder.views if view.camera == "fixed"]
     return RigModel(boards={}, fixed=rough_intrinsics("fixed", views, points, size))
 
@@ -448,7 +448,7 @@ def _present_otherwise_tilted(recorder: Recorder, model: RigModel, view: View) -
     recorder.turn(view.pan, view.tilt)
     recorder.present(facing_board(recorder.board, middle, CLEARLY_TILTED.inv()))
     recorder.see_fixed()
-    recorder.see_zoom(expected=False)
+    recorder.update_zoom(expected=False)
 
 
 def _likeliest(model: RigModel, recorder: Recorder, seen: Sequence[View]) -> RigModel:
@@ -506,7 +506,7 @@ def _find_with_zoom(recorder: Recorder, model: RigModel) -> View:
         tried.append(f"{depth:.1f}")
         for pan, tilt in grid:
             recorder.turn(pan, tilt)
-            view = recorder.see_zoom(expected=False)
+            view = recorder.update_zoom(expected=False)
             if view is not None:
                 return view
     reach = " and ".join(f"{np.degrees(max(abs(q) for q in axis)):.0f} degrees" for axis in zip(*grid, strict=True))
@@ -527,7 +527,7 @@ def _turn_a_little(recorder: Recorder, view: View) -> tuple[View, View]:
             if not limits.allow(pan, tilt):
                 continue
             recorder.turn(pan, tilt)
-            turned = recorder.see_zoom(expected=False)
+            turned = recorder.update_zoom(expected=False)
             if turned is not None:
                 seen.append(turned)
                 break
@@ -558,7 +558,7 @@ def _centred(recorder: Recorder, view: View, by_pan: View, by_tilt: View) -> Vie
         float(np.clip(view.pan + d_pan, *limits.pan)),
         float(np.clip(view.tilt + d_tilt, *limits.tilt)),
     )
-    return recorder.see_zoom(expected=False) or view
+    return recorder.update_zoom(expected=False) or view
 
 
 def refitted(model: RigModel, recorder: Recorder) -> Fit:
@@ -759,7 +759,7 @@ def _see_part(
     if turn is None:
         return None
     recorder.turn(*turn)
-    view = recorder.see_zoom(
+    view = recorder.update_zoom(
         find=lambda image, view: find_expected(image, recorder.board, expected_corners(model, view, points))
     )
     if view is not None:
@@ -983,15 +983,15 @@ def _cover(
     coverage = {"fixed": Coverage(rig.fixed.size), "zoom": Coverage(rig.zoom.size)}
     for view in recorder.views:
         coverage[view.camera].add(view.corners_px[view.seen])
-    outlook: Outlook | None = None
+    predicted: PredictedAccuracy | None = None
     misses = done = 0
     while recorder.number + 1 < placements:
         # A miss means that the rough model bends the image wrongly where nothing was seen yet: keep farther inside.
         margin = min((ROUGH_MARGIN if done < REFIT_ALWAYS else FINE_MARGIN) * MARGIN_GROWTH**misses, WIDEST_MARGIN)
         recorder.turn(0.0, 0.0)
-        wish = _next_placement(recorder, model, coverage, rng, margin, outlook)
+        wish = _next_placement(recorder, model, coverage, rng, margin, predicted)
         recorder.present(wish)
-        error = "" if outlook is None else f", predicted error {np.degrees(outlook.error()):.4f} degrees"
+        error = "" if predicted is None else f", predicted error {np.degrees(predicted.error()):.4f} degrees"
         tell(f"board {recorder.number + 1} of {placements}{error}")
         missed = misses > 0
         fixed_view = recorder.see_fixed()
@@ -1007,10 +1007,10 @@ def _cover(
         if done <= REFIT_ALWAYS or done % REFIT_EVERY == 0 or missed:
             found = refitted(model, recorder)
             model = found.model
-            outlook = outlook_of(found, recorder.board.square) if "hand" in found.free else None
-        elif outlook is not None:
+            predicted = predict_accuracy(found, recorder.board.square) if "hand" in found.free else None
+        elif predicted is not None:
             seen = recorder.of_placement(recorder.number)
-            outlook = outlook.with_views(seen, {recorder.number: T}, points)
+            predicted = predicted.with_views(seen, {recorder.number: T}, points)
     return refitted(model, recorder).model
 
 
@@ -1020,7 +1020,7 @@ def _next_placement(
     coverage: dict[str, Coverage],
     rng: np.random.Generator,
     margin: float,
-    outlook: Outlook | None,
+    predicted: PredictedAccuracy | None,
 ) -> RigidTransform:
     """Where to hold the board next: of several places, near and far, the one that makes the predicted error smallest.
 
@@ -1039,9 +1039,9 @@ def _next_placement(
         if seen_at_home(model, wish, board):
             turns = [(0.0, 0.0), *turns]
         error = np.inf
-        if outlook is not None and turns:
+        if predicted is not None and turns:
             views = planned_views(recorder.number + 1, turns, len(points))
-            error = outlook.error(outlook.worth(views, {recorder.number + 1: wish}, points))
+            error = predicted.error(predicted.worth(views, {recorder.number + 1: wish}, points))
         if (error, -len(turns)) < least:
             best, least = wish, (error, -len(turns))
     if best is None:
@@ -1069,10 +1069,10 @@ def _see_from_everywhere(
         model, T, board, coverage["zoom"], rig.head.limits, MOVED_VIEWS + (not home), rng, margin * rig.zoom.size[0]
     )
     if home:
-        recorder.see_zoom()
+        recorder.update_zoom()
     for pan, tilt in turns:
         recorder.turn(pan, tilt)
-        recorder.see_zoom()
+        recorder.update_zoom()
     for view in recorder.of_placement(recorder.number):
         coverage[view.camera].add(view.corners_px[view.seen])
     return T

@@ -53,7 +53,7 @@ from cotarget.pantilt import solve
 DOUBTED_SIGMAS = 1.5
 
 
-def with_considered(
+def with_consider_covariance(
     covariance: Covariance, found: Fit, points: Array, held: Collection[Block], prior: Prior | None = None
 ) -> Covariance:
     """Add to a fit's covariance what held parameters leave in doubt.

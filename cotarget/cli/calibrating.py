@@ -41,7 +41,7 @@ def calibrate(options: argparse.Namespace) -> None:
         )
     _check_together(options)
     check_writable(options.out)
-    how = cal.Options(options.method, encoders=options.encoders, insist=options.insist)
+    how = cal.Options(options.method, encoders=options.encoders, regularize=options.insist)
     with _captures_kept(options.captures), progress_bar() as progress:
 
         def tell(done: int, total: int, text: str) -> None:

@@ -26,7 +26,7 @@ from cotarget.files import behind_link
 
 if TYPE_CHECKING:
     from cotarget.config import RigConfig
-    from cotarget.control.selection import Policy, Whom
+    from cotarget.control.selection import Policy, TargetChoice
     from cotarget.pipeline import Step
 
 
@@ -67,14 +67,14 @@ def check_shown(config: "RigConfig", name: str, rig: Path) -> None:
     Raises:
         ConfigError: it is not there, with what would be right.
     """
-    from cotarget.config import TARGETS, split_name, told_targets
+    from cotarget.config import TARGETS, known_targets, split_name
 
     if config.backend != "sim" or name in config.sim.targets:
         return
     own = config.sim.models
     if split_name(name)[0] not in (*TARGETS, *own):
         raise ConfigError(
-            f"--target: a simulated {name} cannot be, whatever [targets.{name}] says; {told_targets(own)}"
+            f"--target: a simulated {name} cannot be, whatever [targets.{name}] says; {known_targets(own)}"
         )
     raise ConfigError(
         f"{rig}: the simulated scene has no {name}; add it: [sim] targets = {json.dumps([*config.sim.targets, name])}"
@@ -85,11 +85,13 @@ class Choice:
     """Whom the options ask for, and whether it was ever there.
 
     Attributes:
-        whom: in words that a recording keeps.
+        target_choice: in words that a recording keeps.
         policy: makes what decides.
     """
 
-    def __init__(self, options: argparse.Namespace, size: tuple[int, int], recorded: "Whom | None" = None) -> None:
+    def __init__(
+        self, options: argparse.Namespace, size: tuple[int, int], recorded: "TargetChoice | None" = None
+    ) -> None:
         """Read the options.
 
         Args:
@@ -107,23 +109,24 @@ class Choice:
         self._seen: set[int] = set()
         self._followed = False
         self.policy: Callable[[], Policy]
-        self.whom = _whom(options, recorded)
-        if self.whom.click is not None:
-            u, v = self.whom.click
+        self.target_choice = _choice_of(options, recorded)
+        if self.target_choice.click is not None:
+            u, v = self.target_choice.click
             said = "the recorded click" if options.click is None else "--click"
             if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
                 raise ConfigError(f"{said}: ({u:g}, {v:g}) is not in the wide view's {size[0]}x{size[1]} image")
             self.policy = partial(Chosen, pixel=(u, v), width_px=size[0])
             self._wish = f"{said}: no track came near ({u:g}, {v:g})"
-        elif self.whom.track is not None:
-            self.policy = partial(Chosen, number=self.whom.track)
+        elif self.target_choice.track is not None:
+            self.policy = partial(Chosen, number=self.target_choice.track)
             said = "the recorded track" if options.track is None else "--track"
-            self._wish = f"{said}: there was no track {self.whom.track}"
-        elif self.whom.policy is not None and self.whom.policy in MAKERS:
-            self.policy = MAKERS[self.whom.policy]
+            self._wish = f"{said}: there was no track {self.target_choice.track}"
+        elif self.target_choice.policy is not None and self.target_choice.policy in MAKERS:
+            self.policy = MAKERS[self.target_choice.policy]
         else:
             raise ConfigError(
-                f"the recorded policy '{self.whom.policy}' is unknown; give --policy, one of: {choices(MAKERS)}"
+                f"the recorded policy '{self.target_choice.policy}' is unknown; "
+                f"give --policy, one of: {choices(MAKERS)}"
             )
 
     def see(self, step: "Step") -> None:
@@ -139,15 +142,15 @@ class Choice:
         return f"{self._wish}; the tracks were: {choices(map(str, self._seen))}"
 
 
-def _whom(options: argparse.Namespace, recorded: "Whom | None") -> "Whom":
+def _choice_of(options: argparse.Namespace, recorded: "TargetChoice | None") -> "TargetChoice":
     """What the options say; else what was recorded; else the first policy, by its name, in case that changes."""
-    from cotarget.control.selection import ANYBODY, Whom
+    from cotarget.control.selection import ANY_TARGET, TargetChoice
 
     if options.click is not None:
-        return Whom(click=(options.click[0], options.click[1]))
+        return TargetChoice(click=(options.click[0], options.click[1]))
     if options.track is not None or options.policy is not None:
-        return Whom(options.policy, None, options.track)
-    return Whom(POLICIES[0]) if recorded in (None, ANYBODY) else recorded
+        return TargetChoice(options.policy, None, options.track)
+    return TargetChoice(POLICIES[0]) if recorded in (None, ANY_TARGET) else recorded
 
 
 # --- reasons ---

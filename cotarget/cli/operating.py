@@ -334,7 +334,7 @@ def reset_head(options: argparse.Namespace) -> None:
     """Cotarget reset-head."""
     from cotarget.config import load_config
     from cotarget.drivers.clock import MonotonicClock
-    from cotarget.drivers.interlock import LostPosition
+    from cotarget.drivers.interlock import PositionLostMarker
     from cotarget.drivers.ptu_d46 import reset
     from cotarget.safety import StopLook, end_politely, refuse_if_stopped
 
@@ -349,7 +349,7 @@ def reset_head(options: argparse.Namespace) -> None:
             raise ConfigError("not reset; it needs the answer yes, or --yes")
     look, undo = StopLook(config.safety.stop_file), end_politely()
     try:
-        lost = LostPosition(head.port, config.safety.stop_file)
+        lost = PositionLostMarker(head.port, config.safety.stop_file)
         unit = reset(head, MonotonicClock(), lost, stopped=look.reason)
     finally:
         undo()

@@ -191,7 +191,7 @@ def follow(options: argparse.Namespace) -> None:
     check_outputs([options.csv, options.video], inputs, options.record)
     choice = Choice(options, config.stream_sizes[0])
     with (
-        Recorder(options.record, config, options.calibration, options.target, choice.whom)
+        Recorder(options.record, config, options.calibration, options.target, choice.target_choice)
         if options.record
         else nothing() as recorder
     ):
@@ -226,7 +226,7 @@ def replay(options: argparse.Namespace) -> int:
         tracks.extend(Tracked(number, step.fixed.t, each.id, each.center_px) for each in step.tracks if each.confirmed)
 
     played = ReplayRig(recording)
-    choice = Choice(options, played.fixed.size, recording.whom)
+    choice = Choice(options, played.fixed.size, recording.target_choice)
     config, name, steps = recording.config, recording.target, recording.steps
     states = _follow(
         lambda: SafeRig(played, config.safety), calibration, config, options, name, choice, math.inf, steps, see

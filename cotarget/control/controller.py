@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.control.head import Steering, SteeringSettings
-from cotarget.control.zoom import ZoomPolicy, ZoomSettings, expect
+from cotarget.control.head import HeadController, HeadSettings
+from cotarget.control.zoom import ZoomController, ZoomSettings, expect
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
 from cotarget.rig import Angles, PanTiltState, Rig
@@ -23,21 +23,21 @@ Predict = Callable[[float], Estimate | None]
 
 
 @dataclass(frozen=True)
-class ServoSettings:
+class ControllerSettings:
     """How head and lens are driven.
 
     Attributes:
         command_delay_s: from a command to the start of the head's motion [s].
         lens_delay_s: likewise of the lens's [s]; as the head's by default.
         predict: whether the target's motion is allowed for; without it the head is sent where the target was seen.
-        steering: how the head keeps up, and when it is left alone.
+        head_controller: how the head keeps up, and when it is left alone.
         zoom: when the lens zooms in and out.
     """
 
     command_delay_s: float = 0.0
     lens_delay_s: float | None = None
     predict: bool = True
-    steering: SteeringSettings = field(default_factory=SteeringSettings)
+    head_controller: HeadSettings = field(default_factory=HeadSettings)
     zoom: ZoomSettings = field(default_factory=ZoomSettings)
 
 
@@ -65,17 +65,17 @@ class _Course:
         target: the target then.
         first: the aim at it.
         then: the aim at where it is a frame later, at the same focal length.
-        doubts: of a target that is carried elsewhere, how surely the head's next goal is known [rad].
+        goal_sigmas: of a target that is carried elsewhere, how surely the head's next goal is known [rad].
     """
 
     effect_t: float
     target: Estimate
     first: Aim
     then: Aim
-    doubts: Angles
+    goal_sigmas: Angles
 
 
-class Servo:
+class Controller:
     """Drives head and lens after one target at a time; remembers what was commanded, and how often.
 
     Args:
@@ -84,11 +84,11 @@ class Servo:
         settings: how.
     """
 
-    def __init__(self, rig: Rig, calibration: Calibration, settings: ServoSettings = ServoSettings()) -> None:
+    def __init__(self, rig: Rig, calibration: Calibration, settings: ControllerSettings = ControllerSettings()) -> None:
         self._rig, self._calibration, self._settings = rig, calibration, settings
         shortest, longest = (self._true(nominal) for nominal in rig.zoom.focal_range)
-        self._zoom = ZoomPolicy((shortest, longest), rig.zoom.size, settings.zoom)
-        self._steering = Steering(rig.head.limits, settings.steering)
+        self._zoom = ZoomController((shortest, longest), rig.zoom.size, settings.zoom)
+        self._head_controller = HeadController(rig.head.limits, settings.head_controller)
         state = rig.head.state()
         self.commanded = (state.pan, state.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
         self.head_commands, self.lens_commands = 0, 1  # sent so far
@@ -106,11 +106,11 @@ class Servo:
             UnreachableError: no pan and tilt within the limits do it, or nothing is known of it.
         """
         course = self._course(predict, seen_t, interval)
-        self._steer(course, interval)
+        self._command_head(course, interval)
         pan, tilt, focal = self.commanded
         now, lens_delay_s = self._rig.clock.now(), self._settings.lens_delay_s
         exposed = interval + (course.effect_t if lens_delay_s is None else now + lens_delay_s)
-        (pan_then, _), (tilt_then, _) = self._steering.head.at(exposed)
+        (pan_then, _), (tilt_then, _) = self._head_controller.head.at(exposed)
         then = predict(exposed if self._settings.predict else seen_t)
         choice = self._zoom.choose(
             None if then is None else expect(then, pan_then, tilt_then, focal, shape=shape),
@@ -146,7 +146,7 @@ class Servo:
         seen = course.target.appearance(course.first.pan, course.first.tilt, self._rig.zoom.focal_range[0])
         if seen is None or (seen.sigma_px > np.array(self._rig.zoom.size) / 2).any():
             return None
-        self._steer(course, interval)
+        self._command_head(course, interval)
         return course.first
 
     def _course(self, predict: Predict, seen_t: float, interval: float) -> _Course:
@@ -158,26 +158,26 @@ class Servo:
         if at_effect is None or then is None:
             raise UnreachableError("where the target is was not seen yet")
         state = self._rig.head.state()
-        self._steering.head.saw(state)  # a head that was halted, or is slow, is not where it was sent
+        self._head_controller.head.saw(state)  # a head that was halted, or is slow, is not where it was sent
         reach = reach_of(self._rig, state)
         first = self._aim(at_effect, reach)
-        later = predict(effect + self._settings.steering.ahead_s) if at_effect.carried else None
-        doubts = (0.0, 0.0) if later is None else doubts_of(later, first)
-        return _Course(effect, at_effect, first, self._aim(then, reach, first), doubts)
+        later = predict(effect + self._settings.head_controller.ahead_s) if at_effect.carried else None
+        goal_sigmas = (0.0, 0.0) if later is None else goal_sigmas_of(later, first)
+        return _Course(effect, at_effect, first, self._aim(then, reach, first), goal_sigmas)
 
-    def _steer(self, course: _Course, interval: float) -> None:
+    def _command_head(self, course: _Course, interval: float) -> None:
         """Send the head, if that is worth it."""
         effect, first, then = course.effect_t, course.first, course.then
         rates = (then.pan - first.pan) / interval, (then.tilt - first.tilt) / interval
         pan, tilt, focal = self.commanded
-        command = self._steering.decide(
+        command = self._head_controller.decide(
             effect,
             interval,
             (first.pan, first.tilt),
             rates,
             self._rig.zoom.size[0] / self._true(focal),
             effect - course.target.measured_t,
-            course.doubts,
+            course.goal_sigmas,
         )
         if command is not None:
             pan, tilt = self._rig.head.move(command.pan, command.tilt, command.speed)
@@ -216,7 +216,7 @@ class Servo:
         return dataclasses.replace(found, pan=pan, tilt=tilt)
 
 
-def doubts_of(target: Estimate, aimed: Aim) -> Angles:
+def goal_sigmas_of(target: Estimate, aimed: Aim) -> Angles:
     """How surely the pan and tilt at a target are known, near to an aim: standard deviations [rad]; 0 out of sight."""
     seen = target.appearance(aimed.pan, aimed.tilt, aimed.nominal_px)
     if seen is None:

@@ -200,19 +200,19 @@ FINE, FINE_STEPS = 0.1, 0.6
 NEARER = 0.2
 # Of what an axis that is slow, while the other turns, is told to lead by, so much is left out: with all of it the head
 # nods with the noise of the speed, without any it lags behind whoever goes slightly aslant.
-DOUBTED_LEAD = 0.5
+LEAD_SIGMAS = 0.5
 # While a target is carried elsewhere no axis turns back for less than so many standard deviations of where it will be.
-DOUBTED_TURN = 0.5
+TURN_SIGMAS = 0.5
 
 
 @dataclass(frozen=True)
-class SteeringSettings:
+class HeadSettings:
     """How the head is spared.
 
     Attributes:
         zone: the head is left alone while the target stays so near to the middle, as a part of the image's width; or
             within a step of the head, where that is more.
-        spared: whether it is left alone at all; without that it is told anew with every frame.
+        deadband: whether it is left alone at all; without that it is told anew with every frame.
         ahead_s: how far ahead a goal lies [s], and no less than a frame and a half. So long a head goes on that nobody
             commands any more: 0.3 s follow no better, and then it stands too late after a fault.
         catch_s: what the head is off is made good in about this time [s]; shorter is nearer, longer is steadier.
@@ -225,7 +225,7 @@ class SteeringSettings:
     """
 
     zone: float = 0.007
-    spared: bool = True
+    deadband: bool = True
     ahead_s: float = 0.2
     catch_s: float = 0.15
     far: float = 13.0
@@ -257,10 +257,10 @@ class _Way:
         return self.wanted[0] + seconds * self.rates[0], self.wanted[1] + seconds * self.rates[1]
 
 
-class Steering:
+class HeadController:
     """Decides from frame to frame whether the head gets a new command."""
 
-    def __init__(self, limits: PanTiltLimits, settings: SteeringSettings = SteeringSettings()) -> None:
+    def __init__(self, limits: PanTiltLimits, settings: HeadSettings = HeadSettings()) -> None:
         """Begin without a command.
 
         Args:
@@ -280,7 +280,7 @@ class Steering:
         rates: Angles,
         field: float,
         lead_s: float = 0.0,
-        doubts: Angles = (0.0, 0.0),
+        goal_sigmas: Angles = (0.0, 0.0),
     ) -> HeadCommand | None:
         """Decide on the head.
 
@@ -291,15 +291,16 @@ class Steering:
             rates: how fast that changes [rad/s].
             field: the angle of the image's width [rad].
             lead_s: from when the target was measured last to ``effect_t`` [s]; one that stands is still there.
-            doubts: of a target that is carried elsewhere, standard deviations of pan and tilt ``ahead_s`` later [rad].
+            goal_sigmas: of a target that is carried elsewhere, standard deviations of pan and tilt ``ahead_s`` later
+            [rad].
 
         Returns:
             None where it is best left alone.
         """
         zone = max(self._settings.zone * field, self._limits.step)
-        way = self._calmed(wanted, rates, zone, lead_s)
-        rests = self._rests(effect_t, interval_s, way, zone) if self._settings.spared else [False, False]
-        if self._settings.spared and self._may_rest(effect_t, interval_s, way, zone, rests):
+        way = self._damped(wanted, rates, zone, lead_s)
+        resting = self._axes_at_rest(effect_t, interval_s, way, zone) if self._settings.deadband else [False, False]
+        if self._settings.deadband and self._may_hold(effect_t, interval_s, way, zone, resting):
             return None
         off = _apart(way.wanted, self._at(effect_t), wanted[1])
         if math.isinf(self._limits.acceleration):  # it jumps: to the middle of the target's way until the next chance
@@ -309,25 +310,25 @@ class Steering:
         else:
             catch_s = self._settings.hurry_s if off > self._settings.far * zone else self._settings.catch_s
             command = self._along(effect_t, interval_s, way, catch_s)
-            if self._settings.spared and not way.still:
-                command = self._spared(command, way, rests, doubts)
+            if self._settings.deadband and not way.still:
+                command = self._held(command, way, resting, goal_sigmas)
         command = self._within(command)
         self._note_turns(command)
         self.head.obeys(effect_t, command)
         return command
 
-    def _calmed(self, wanted: Angles, rates: Angles, zone: float, lead_s: float) -> _Way:
+    def _damped(self, wanted: Angles, rates: Angles, zone: float, lead_s: float) -> _Way:
         """The target's way, without the speed of what stands: that is mostly noise, and a guess ahead of it too."""
         limit = self._settings.slow * zone
         slow = tuple(abs(rate) * scale <= limit for rate, scale in zip(rates, _scales(wanted[1]), strict=True))
         still = _apart(rates, (0.0, 0.0), wanted[1]) <= self._settings.still * zone
-        back_s = lead_s if still else DOUBTED_LEAD * lead_s
+        back_s = lead_s if still else LEAD_SIGMAS * lead_s
         pan, tilt = (q - back_s * rate if at_rest else q for q, rate, at_rest in zip(wanted, rates, slow, strict=True))
         pan_rate, tilt_rate = (0.0 if at_rest else rate for rate, at_rest in zip(rates, slow, strict=True))
         return _Way((pan, tilt), (pan_rate, tilt_rate), (slow[0], slow[1]), still)
 
-    def _may_rest(self, effect_t: float, interval_s: float, way: _Way, zone: float, rests: Sequence[bool]) -> bool:
-        """Whether the last command will do until the next chance; `rests` tells of which axis it does."""
+    def _may_hold(self, effect_t: float, interval_s: float, way: _Way, zone: float, resting: Sequence[bool]) -> bool:
+        """Whether the last command will do until the next chance; `resting` tells of which axis it does."""
         command = self.head.command
         if command is None:
             return False
@@ -339,9 +340,9 @@ class Steering:
             there = zip(way.after(interval_s), self._at(effect_t + interval_s), strict=True)
             centred = all(abs(q - to_step(x, self._limits.step)) <= fine for q, x in there)
             return centred or effect_t - self.head.commanded_t < self._settings.rest_s
-        return all(rests)
+        return all(resting)
 
-    def _rests(self, effect_t: float, interval_s: float, way: _Way, zone: float) -> list[bool]:
+    def _axes_at_rest(self, effect_t: float, interval_s: float, way: _Way, zone: float) -> list[bool]:
         """Of each axis, whether its last goal and speed will do until the next chance.
 
         That is so where the target stays in the zone, and where the axis is on its way there already: told anew in
@@ -352,12 +353,12 @@ class Steering:
         now, then, back = (
             [abs(q - x) for q, x in zip(way.after(s), self._at(effect_t + s), strict=True)] for s in times
         )
-        rests = []
+        resting = []
         for i, scale in enumerate(_scales(way.wanted[1])):
             most = zone / scale
             returns = then[i] < now[i] and back[i] <= max(most, NEARER * now[i])
-            rests.append(then[i] <= most or returns)
-        return rests
+            resting.append(then[i] <= most or returns)
+        return resting
 
     def _at(self, t: float) -> Angles:
         """Where the head is at a time [s] if it is left alone [rad]."""
@@ -378,7 +379,7 @@ class Steering:
             speeds.append(max(abs(v), LEAST_SPEED))
         return HeadCommand(goals[0], goals[1], (speeds[0], speeds[1]))
 
-    def _spared(self, command: HeadCommand, way: _Way, rests: Sequence[bool], doubts: Angles) -> HeadCommand:
+    def _held(self, command: HeadCommand, way: _Way, resting: Sequence[bool], goal_sigmas: Angles) -> HeadCommand:
         """The same, but an axis that is slow and near enough keeps its goal and its speed.
 
         Whoever walks by stays at one height. Where the tilt is told anew as often as the pan has to be, it goes up and
@@ -391,8 +392,8 @@ class Steering:
         kept = []
         for i in range(2):
             turn = news[i][0] - olds[i][0]
-            back = turn * self._turning[i] < 0 and abs(turn) <= DOUBTED_TURN * doubts[i]
-            kept.append(olds[i] if back or (way.slow[i] and rests[i]) else news[i])
+            back = turn * self._turning[i] < 0 and abs(turn) <= TURN_SIGMAS * goal_sigmas[i]
+            kept.append(olds[i] if back or (way.slow[i] and resting[i]) else news[i])
         (pan, pan_speed), (tilt, tilt_speed) = kept
         return HeadCommand(pan, tilt, (pan_speed, tilt_speed))
 

@@ -81,7 +81,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Outlook:
+class SelectionState:
     """What an order is made from.
 
     Attributes:
@@ -107,14 +107,14 @@ class Plan(NamedTuple):
     first: int
 
 
-def plan(outlook: Outlook) -> Plan:
+def plan(state: SelectionState) -> Plan:
     """The order that serves most before they leave, and is over first; if nobody can be had, who would be done first.
 
     Of orders of the same targets with the same one last only the one over first is gone on with: whoever sets out
     earlier from the same target is nowhere later (dynamic programming after Held and Karp 1962).
     """
-    planned = outlook.waiting[:MOST_PLANNED]
-    alone = [(done_in(c, outlook, outlook.head, 0.0), c) for c in planned]
+    planned = state.waiting[:MOST_PLANNED]
+    alone = [(done_in(c, state, state.head, 0.0), c) for c in planned]
     orders = {(1 << i, i): Plan(1, end, c.id) for i, (end, c) in enumerate(alone) if end <= c.leaves_in}
     best = max(orders.values(), key=_worth, default=None)
     while orders:
@@ -124,7 +124,7 @@ def plan(outlook: Outlook) -> Plan:
             for i, candidate in enumerate(planned):
                 if done >> i & 1:
                     continue
-                end = done_in(candidate, outlook, there, order.end)
+                end = done_in(candidate, state, there, order.end)
                 if end > candidate.leaves_in:  # nobody waits for what cannot be had
                     continue
                 key, found = (done | 1 << i, i), Plan(order.served + 1, end, order.first)
@@ -153,29 +153,29 @@ def travel_s(way: Angles, limits: PanTiltLimits) -> float:
     return longest / limits.speed + limits.speed / limits.acceleration
 
 
-def done_in(candidate: Candidate, outlook: Outlook, head: Angles, now: float) -> float:
+def done_in(candidate: Candidate, state: SelectionState, head: Angles, now: float) -> float:
     """When a target will have been seen for long enough if it comes next; it moves on meanwhile [s from now].
 
     Args:
         candidate: the target.
-        outlook: gives the head's limits, and who is looked at already.
+        state: gives the head's limits, and who is looked at already.
         head: pan and tilt then [rad].
         now: when it sets out [s from now].
     """
     arrival = now
-    if now > 0 or candidate.id != outlook.current:  # the head is not there already
+    if now > 0 or candidate.id != state.current:  # the head is not there already
         for _ in range(2):  # the way depends on when the head arrives; the second time is right to a few hundredths
             pan, tilt = candidate.after(arrival)
-            arrival = now + travel_s((pan - head[0], tilt - head[1]), outlook.limits)
+            arrival = now + travel_s((pan - head[0], tilt - head[1]), state.limits)
         arrival += SETTLE_S
-    return arrival + max(outlook.look_s - candidate.seen_s, 0.0)
+    return arrival + max(state.look_s - candidate.seen_s, 0.0)
 
 
 # --- whom ---
 
 
 @dataclass(frozen=True)
-class Whom:
+class TargetChoice:
     """Which of several targets a run follows: one of these, or the first that comes where nothing is said.
 
     Attributes:
@@ -190,16 +190,20 @@ class Whom:
 
 
 # Nothing is said.
-ANYBODY = Whom()
+ANY_TARGET = TargetChoice()
 
 
-def whom_table(whom: Whom) -> dict[str, Any]:
+def choice_table(target_choice: TargetChoice) -> dict[str, Any]:
     """Write whom a run follows."""
-    parts = {"policy": whom.policy, "click": whom.click and list(whom.click), "track": whom.track}
+    parts = {
+        "policy": target_choice.policy,
+        "click": target_choice.click and list(target_choice.click),
+        "track": target_choice.track,
+    }
     return {name: value for name, value in parts.items() if value is not None}
 
 
-def parse_whom(table: Any) -> Whom:
+def parse_choice(table: Any) -> TargetChoice:
     """Read whom a run followed.
 
     Raises:
@@ -211,10 +215,10 @@ def parse_whom(table: Any) -> Whom:
     if not isinstance(policy, str | None) or not (track is None or (type(track) is int and track > 0)):
         raise ValueError(f"{table!r} is no policy's name or track's number")
     if click is None:
-        return Whom(policy, None, track)
+        return TargetChoice(policy, None, track)
     if not (isinstance(click, list) and len(click) == 2 and all(type(x) in (int, float) for x in click)):
         raise ValueError(f"click {click!r} is no pixel")
-    return Whom(click=(float(click[0]), float(click[1])))
+    return TargetChoice(click=(float(click[0]), float(click[1])))
 
 
 # A click means the target in whose box it is, or one whose middle is within this part of the image's width.
@@ -291,7 +295,7 @@ class Rounds:
         look_s: how long each is looked at [s].
     """
 
-    next_of: Callable[[Outlook], int]
+    next_of: Callable[[SelectionState], int]
     look_s: float = LOOK_S
     _id: int | None = None
     _since: float = -math.inf
@@ -309,7 +313,7 @@ class Rounds:
         if waiting:
             if self._id not in {c.id for c in waiting} or not 0 <= t - self._since < SETTLE_S:
                 pan, tilt = head.tolist()
-                self._turn(self.next_of(Outlook(waiting, self._id, (pan, tilt), limits, self.look_s)), t)
+                self._turn(self.next_of(SelectionState(waiting, self._id, (pan, tilt), limits, self.look_s)), t)
         else:
             self._turn(self._least_seen(candidates, t), t)
         return self._id
@@ -332,23 +336,23 @@ class Rounds:
         return current.id if behind or kept_s < SETTLE_S + self.look_s else least.id
 
 
-def nearest_deadline(outlook: Outlook) -> int:
+def nearest_deadline(state: SelectionState) -> int:
     """The one followed before to its end; then whoever leaves first of those that can still be seen."""
-    if outlook.current in {c.id for c in outlook.waiting}:
-        return outlook.current
-    in_time = [c for c in outlook.waiting if done_in(c, outlook, outlook.head, 0.0) <= c.leaves_in]
-    return (in_time or outlook.waiting)[0].id
+    if state.current in {c.id for c in state.waiting}:
+        return state.current
+    in_time = [c for c in state.waiting if done_in(c, state, state.head, 0.0) <= c.leaves_in]
+    return (in_time or state.waiting)[0].id
 
 
-def most_served(outlook: Outlook) -> int:
+def most_served(state: SelectionState) -> int:
     """The first of the order that serves most before they leave; the one followed before while it can still be had.
 
     When a target leaves is known badly: whoever made another plan at every frame would look at nobody for long enough.
     """
-    current = next((c for c in outlook.waiting if c.id == outlook.current), None)
-    if current is not None and done_in(current, outlook, outlook.head, 0.0) <= current.leaves_in:
+    current = next((c for c in state.waiting if c.id == state.current), None)
+    if current is not None and done_in(current, state, state.head, 0.0) <= current.leaves_in:
         return current.id
-    return plan(outlook).first
+    return plan(state).first
 
 
 @dataclass

@@ -181,7 +181,7 @@ def longest_focal(
     return low
 
 
-class ZoomPolicy:
+class ZoomController:
     """Decides on the lens from one frame to the next, with hysteresis, so that it does not hunt."""
 
     def __init__(

@@ -10,23 +10,23 @@ import cv2
 import numpy as np
 
 from cotarget.config import TargetConfig
-from cotarget.detection.background import BIRD, PERSON, MotionDetector, MotionSettings, plain
+from cotarget.detection.background import BIRD, PERSON, BackgroundDetector, MotionSettings, plain
 from cotarget.detection.base import Detection, Detector, ExternalDetector
-from cotarget.detection.color_template import ColourDetector
-from cotarget.detection.small_target import SpeckDetector
+from cotarget.detection.color_template import ColorTemplateDetector
+from cotarget.detection.small_target import SmallTargetDetector
 from cotarget.errors import ConfigError
 from cotarget.rig import Image
 
 __all__ = [
     "BIRD",
     "PERSON",
-    "ColourDetector",
+    "BackgroundDetector",
+    "ColorTemplateDetector",
     "Detection",
     "Detector",
     "ExternalDetector",
-    "MotionDetector",
     "MotionSettings",
-    "SpeckDetector",
+    "SmallTargetDetector",
     "make_detector",
     "plain",
 ]
@@ -46,10 +46,10 @@ def make_detector(target: TargetConfig, rate_hz: float, template: Image | None =
     """
     kind: str = target.detector
     if kind == "speck":
-        return SpeckDetector()
+        return SmallTargetDetector()
     if kind in ("motion", "mog2"):
         settings = BIRD if target.dimension == "wingspan" else PERSON
-        return MotionDetector(plain(settings) if kind == "mog2" else settings, rate_hz)
+        return BackgroundDetector(plain(settings) if kind == "mog2" else settings, rate_hz)
     if template is None:
         if target.template is None:
             raise ConfigError('a target with detector = "colour" needs a template, a picture of the target')
@@ -59,4 +59,4 @@ def make_detector(target: TargetConfig, rate_hz: float, template: Image | None =
         if read is None:
             raise ConfigError(f"{target.template}: is not a picture; a target's template is a PNG or JPEG of it")
         template = np.asarray(read, dtype=np.uint8)
-    return ColourDetector(template)
+    return ColorTemplateDetector(template)

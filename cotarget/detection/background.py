@@ -122,7 +122,7 @@ def plain(settings: MotionSettings) -> MotionSettings:
     )
 
 
-class MotionDetector:
+class BackgroundDetector:
     """What differs from an adaptive Gaussian mixture of the background (Zivkovic 2004), as connected pieces."""
 
     def __init__(self, settings: MotionSettings, rate_hz: float) -> None:

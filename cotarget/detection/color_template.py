@@ -138,7 +138,7 @@ LOOK, AROUND = (16, 16), 0.25
 LARGEST_FITTED_PX = 48.0
 
 
-class ColourDetector:
+class ColorTemplateDetector:
     """What has a template's colour, located to a fraction of a pixel by fitting the template to it.
 
     Everything happens in one plane: a pixel's chroma along the template's mean chroma. It is linear in the colour,

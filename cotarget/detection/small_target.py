@@ -262,7 +262,7 @@ OUTLINE = 0.33
 
 
 @dataclass(frozen=True)
-class Speck:
+class SmallTarget:
     """What stands out.
 
     Attributes:
@@ -280,7 +280,7 @@ class Speck:
     around: float
 
 
-def find_specks(grey: Image, threshold: float, most: int) -> list[Speck]:
+def find_small_targets(grey: Image, threshold: float, most: int) -> list[SmallTarget]:
     """Find what stands out at any scale, what does so most first; each thing once.
 
     Args:
@@ -288,22 +288,22 @@ def find_specks(grey: Image, threshold: float, most: int) -> list[Speck]:
         threshold: least contrast, in standard deviations of the surroundings.
         most: how many to look at, the best first; bounds the time that a hundred specks take.
     """
-    found: list[Speck] = []
+    found: list[SmallTarget] = []
     level = grey
     for scale in range(SCALES):
         if min(level.shape) < 2 * OUTER_HALF_PX:
             break
         half = cv2.resize(level, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         for u, v, signal, around in _peaks(level, half, scale >= SLOPING_SCALE, threshold, most):
-            speck = _outline(grey, (u, v), scale, signal, around)
-            if speck is not None:
-                found.append(speck)
+            target = _outline(grey, (u, v), scale, signal, around)
+            if target is not None:
+                found.append(target)
         level = half
-    found.sort(key=lambda speck: -speck.signal)
-    kept: list[Speck] = []
-    for speck in found:
-        if not any(share(speck, other) for other in kept):
-            kept.append(speck)
+    found.sort(key=lambda target: -target.signal)
+    kept: list[SmallTarget] = []
+    for target in found:
+        if not any(share(target, other) for other in kept):
+            kept.append(target)
     return kept[:most]
 
 
@@ -376,7 +376,7 @@ def _first_moment(half: Image, side: int, axis: int) -> Array:
     return np.asarray(cv2.sepFilter2D(half, cv2.CV_32F, kernels[0], kernels[1]))
 
 
-def _outline(grey: Image, peak: tuple[int, int], scale: int, signal: float, around: float) -> Speck | None:
+def _outline(grey: Image, peak: tuple[int, int], scale: int, signal: float, around: float) -> SmallTarget | None:
     """Box a speck in the whole picture; None where it has no outline within its ring.
 
     Args:
@@ -401,10 +401,10 @@ def _outline(grey: Image, peak: tuple[int, int], scale: int, signal: float, arou
     cut = (x == 0 and left > 0, y == 0 and top > 0, x + w == window.shape[1] and left + x + w < grey.shape[1])
     if label == 0 or any(cut) or (y + h == window.shape[0] and top + y + h < grey.shape[0]):
         return None  # it goes on beyond its ring: a pole, or a matter for the next scale
-    return Speck((left + x, top + y), (w, h), contrast, signal, around)
+    return SmallTarget((left + x, top + y), (w, h), contrast, signal, around)
 
 
-def share(one: Speck, other: Speck) -> bool:
+def share(one: SmallTarget, other: SmallTarget) -> bool:
     """Whether the boxes of two specks share a pixel."""
     return all(a < b + n and b < a + m for a, m, b, n in zip(one.low, one.size, other.low, other.size, strict=True))
 
@@ -412,7 +412,7 @@ def share(one: Speck, other: Speck) -> bool:
 # Least contrast, in standard deviations of the surroundings.
 LEAST_SIGNAL = 4.5
 # So many specks are looked at in a frame, those that stand out most first; it bounds the time of a frame.
-MOST_SPECKS = 40
+MOST_TARGETS = 40
 # What is found to have changed of things that stand, nine times in ten less, after each of AGES_S; measured on films of
 # the collection that tests/detection/test_real_clips.py names, each seen through air and a codec.
 STANDING_CHANGE = (0.05, 0.08, 0.15, 0.20)
@@ -450,7 +450,7 @@ MOST_CLIPPED_SCORE = 0.45
 WARM_UP_S = AGES_S[1]
 
 
-class SpeckDetector:
+class SmallTargetDetector:
     """Finds small targets by contrast and change, and says how sure it is of each."""
 
     def __init__(self) -> None:
@@ -480,32 +480,32 @@ class SpeckDetector:
         self.mask = np.zeros(grey.shape, np.uint8)
         if not fresh or self._history.span < WARM_UP_S:
             return []
-        found: list[tuple[Speck, Detection]] = []
-        arrived: list[tuple[Speck, Detection]] = []
-        for speck in find_specks(grey, LEAST_SIGNAL, MOST_SPECKS):
+        found: list[tuple[SmallTarget, Detection]] = []
+        arrived: list[tuple[SmallTarget, Detection]] = []
+        for target in find_small_targets(grey, LEAST_SIGNAL, MOST_TARGETS):
             changes = [
-                change(grey, speck.low, speck.size, speck.around, shift, self._history.noise, before)
+                change(grey, target.low, target.size, target.around, shift, self._history.noise, before)
                 if before is not None
                 else np.nan
                 for before in references
             ]
-            detection = box_detection(*speck.low, *speck.size, speck_score(speck.signal, changes), grey.shape)
+            detection = box_detection(*target.low, *target.size, small_target_score(target.signal, changes), grey.shape)
             if detection.clipped:
                 detection = replace(detection, score=min(detection.score, MOST_CLIPPED_SCORE))
             if detection.score >= LEAST_SCORE:
-                found.append((speck, detection))
+                found.append((target, detection))
             if detection.score >= BELIEVED_SCORE and np.nanmax(changes) >= ARRIVED:
-                arrived.append((speck, detection))
+                arrived.append((target, detection))
         differing = self._differing(grey, shift, references)
         found = _best_of(found + [_as_a_whole(pair, arrived) for pair in differing])
-        for speck, detection in reversed(found):
-            (x, y), (w, h) = speck.low, speck.size
+        for target, detection in reversed(found):
+            (x, y), (w, h) = target.low, target.size
             self.mask[y : y + h, x : x + w] = round(255 * detection.score)
         return [detection for _, detection in found]
 
     def _differing(
         self, grey: Image, shift: Array, references: list[tuple[Image, Array] | None]
-    ) -> list[tuple[Speck, Detection]]:
+    ) -> list[tuple[SmallTarget, Detection]]:
         """Specks in what differs from all earlier pictures, where there are enough of them and the camera stood."""
         earlier = [kept for kept in references if kept is not None]
         if len(earlier) < FEWEST_EARLIER or any(np.abs(then - shift).max() > STANDING_PX for _, then in earlier):
@@ -518,40 +518,42 @@ class SpeckDetector:
         cv2.accumulateWeighted(difference, self._usual, USUAL_GAIN)
         unusual = cv2.subtract(difference, nearby * np.float32(USUAL_TIMES), dtype=cv2.CV_8U)
         found = []
-        for speck in find_specks(unusual, LEAST_DIFFERENCE, MOST_SPECKS):
-            score = float(1 / (1 + (speck.signal / EVEN_DIFFERENCE) ** -SLOPE)) if speck.contrast > 0 else 0.0
-            detection = box_detection(*speck.low, *speck.size, score, grey.shape)
+        for target in find_small_targets(unusual, LEAST_DIFFERENCE, MOST_TARGETS):
+            score = float(1 / (1 + (target.signal / EVEN_DIFFERENCE) ** -SLOPE)) if target.contrast > 0 else 0.0
+            detection = box_detection(*target.low, *target.size, score, grey.shape)
             if detection.clipped:
                 detection = replace(detection, score=min(score, MOST_CLIPPED_SCORE))
             if detection.score >= LEAST_SCORE:
-                found.append((speck, detection))
+                found.append((target, detection))
         return found
 
 
-def _as_a_whole(differing: tuple[Speck, Detection], arrived: list[tuple[Speck, Detection]]) -> tuple[Speck, Detection]:
+def _as_a_whole(
+    differing: tuple[SmallTarget, Detection], arrived: list[tuple[SmallTarget, Detection]]
+) -> tuple[SmallTarget, Detection]:
     """What differs from earlier pictures, with the box of the speck that has arrived there and that it is a part of.
 
     Of a plain target that moves by less than its own length within AGES_S[0] only the front differs. Its contrast shows
     all of it. A thing that stands behind a target differs, but has not arrived.
     """
-    speck, detection = differing
-    around = [pair for pair in arrived if share(pair[0], speck)]
-    if len(around) != 1 or math.prod(around[0][0].size) <= math.prod(speck.size):
+    target, detection = differing
+    around = [pair for pair in arrived if share(pair[0], target)]
+    if len(around) != 1 or math.prod(around[0][0].size) <= math.prod(target.size):
         return differing
     whole, box = around[0]
     return whole, replace(box, score=max(box.score, detection.score))
 
 
-def _best_of(found: list[tuple[Speck, Detection]]) -> list[tuple[Speck, Detection]]:
+def _best_of(found: list[tuple[SmallTarget, Detection]]) -> list[tuple[SmallTarget, Detection]]:
     """Of those that share a pixel the surest; the surest first."""
-    kept: list[tuple[Speck, Detection]] = []
-    for speck, detection in sorted(found, key=lambda pair: -pair[1].score):
-        if not any(share(speck, other) for other, _ in kept):
-            kept.append((speck, detection))
+    kept: list[tuple[SmallTarget, Detection]] = []
+    for target, detection in sorted(found, key=lambda pair: -pair[1].score):
+        if not any(share(target, other) for other, _ in kept):
+            kept.append((target, detection))
     return kept
 
 
-def speck_score(signal: float, changes: list[float]) -> float:
+def small_target_score(signal: float, changes: list[float]) -> float:
     """How sure it is that a speck is a target and not a thing that stands, 0 to 1.
 
     Args:

@@ -116,9 +116,9 @@ class SocketBoard:
         self._socket.close()
 
     def _ask(self, what: str, T_fixed_board: RigidTransform | None) -> None:
-        wish = None if T_fixed_board is None else pose_dict(T_fixed_board)
+        request = None if T_fixed_board is None else pose_dict(T_fixed_board)
         try:
-            self._socket.sendall(json.dumps({what: wish}).encode() + b"\n")
+            self._socket.sendall(json.dumps({what: request}).encode() + b"\n")
             line = self._lines.readline(LONGEST_ANSWER)
         except OSError as error:
             raise DeviceError(f"{self._name}: the board's holder does not answer: {error}") from None

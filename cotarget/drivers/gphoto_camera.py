@@ -42,7 +42,7 @@ from cotarget.rig import Clock, Frame, Image, ZoomState
 
 
 @dataclass
-class Desk:
+class SharedState:
     """What the camera's thread shares with others, who hold ``changed`` to look at it or to change it.
 
     Attributes:
@@ -267,11 +267,11 @@ class Patience:
         return now + BUSY_PAUSE_S if now < self._since + BUSY_PATIENCE_S else None
 
 
-class LensDuty:
+class LensJob:
     """Sends the lens where the latest command wants it, and reads back whether it went."""
 
-    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, desk: Desk) -> None:
-        self._config, self._clock, self._link, self._desk = config, clock, link, desk
+    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, shared: SharedState) -> None:
+        self._config, self._clock, self._link, self._shared = config, clock, link, shared
         self._zoom: ZoomSetting | None = None
         self._order = -1  # being carried out
         self._sent, self._tries, self._due, self._deadline = False, 0, 0.0, 0.0
@@ -279,28 +279,28 @@ class LensDuty:
 
     def begin(self, zoom: ZoomSetting, first: bool) -> None:
         """Look where a camera just opened has its lens; it is sent back to where it was before the camera was lost."""
-        self._zoom, self._order, desk = zoom, -1, self._desk
+        self._zoom, self._order, shared = zoom, -1, self._shared
         reading = position_in(patiently(self._clock, lambda: self._link.get(zoom.name)))
         position = zoom.lens.positions[0] if reading is None else reading
         now = self._clock.now()
-        with desk.changed:
+        with shared.changed:
             if first:
-                desk.wanted = min(zoom.lens.positions, key=lambda each: abs(each - position))
-            desk.motion = LensMotion(position, position, now, self._config.lens_speed)
-            desk.standing = reading == desk.wanted
-            self._order = desk.order if desk.standing else -1
+                shared.wanted = min(zoom.lens.positions, key=lambda each: abs(each - position))
+            shared.motion = LensMotion(position, position, now, self._config.lens_speed)
+            shared.standing = reading == shared.wanted
+            self._order = shared.order if shared.standing else -1
 
     def due(self) -> float:
         """When there is something to do [s]."""
-        with self._desk.changed:
-            if self._desk.lens_trouble or (self._desk.standing and self._order == self._desk.order):
+        with self._shared.changed:
+            if self._shared.lens_trouble or (self._shared.standing and self._order == self._shared.order):
                 return math.inf
-            return self._due if self._order == self._desk.order else -math.inf
+            return self._due if self._order == self._shared.order else -math.inf
 
     def run(self) -> None:
         """Send or verify."""
-        with self._desk.changed:
-            order, wanted = self._desk.order, self._desk.wanted
+        with self._shared.changed:
+            order, wanted = self._shared.order, self._shared.wanted
         if order != self._order:
             self._order, self._sent, self._tries = order, False, 0
             self._patience.reset()
@@ -318,9 +318,9 @@ class LensDuty:
     def _send(self, zoom: ZoomSetting, wanted: int) -> None:
         start = self._clock.now() + self._config.command_delay_s
         self._link.put(zoom.name, zoom.values[wanted])
-        with self._desk.changed:
-            assert self._desk.motion is not None, "the camera is not open"
-            self._desk.motion = motion = self._desk.motion.toward(wanted, start)
+        with self._shared.changed:
+            assert self._shared.motion is not None, "the camera is not open"
+            self._shared.motion = motion = self._shared.motion.toward(wanted, start)
         self._sent, self._tries = True, self._tries + 1
         self._due = now = self._clock.now()
         self._deadline = max(motion.arrives, now) + VERIFY_S
@@ -328,8 +328,8 @@ class LensDuty:
     def _verify(self, zoom: ZoomSetting, wanted: int) -> None:
         reading = position_in(self._link.get(zoom.name))
         if reading == wanted:
-            with self._desk.changed:
-                self._desk.standing = self._desk.order == self._order
+            with self._shared.changed:
+                self._shared.standing = self._shared.order == self._order
         elif self._clock.now() < self._deadline:
             self._due = self._clock.now() + VERIFY_PAUSE_S
         elif self._tries < LENS_TRIES:
@@ -339,17 +339,17 @@ class LensDuty:
             self._give_up(wanted, f"its setting '{zoom.name}' reads {shown}")
 
     def _give_up(self, wanted: int, why: str) -> None:
-        with self._desk.changed:
-            if self._desk.order == self._order:  # a newer command deserves its own chance
-                self._desk.lens_trouble = f"the zoom camera's lens did not go to position {wanted}: {why}"
-                self._desk.changed.notify_all()
+        with self._shared.changed:
+            if self._shared.order == self._order:  # a newer command deserves its own chance
+                self._shared.lens_trouble = f"the zoom camera's lens did not go to position {wanted}: {why}"
+                self._shared.changed.notify_all()
 
 
-class StillDuty:
+class StillJob:
     """Takes a still for whoever waits for one."""
 
-    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, desk: Desk) -> None:
-        self._config, self._clock, self._link, self._desk = config, clock, link, desk
+    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, shared: SharedState) -> None:
+        self._config, self._clock, self._link, self._shared = config, clock, link, shared
         self._future: Future[Frame] | None = None
         self._due = -math.inf
         self._patience = Patience(clock)
@@ -357,15 +357,15 @@ class StillDuty:
 
     def due(self) -> float:
         """When there is something to do [s]."""
-        with self._desk.changed:
-            if self._desk.still is None:
+        with self._shared.changed:
+            if self._shared.still is None:
                 return math.inf
-            return self._due if self._desk.still is self._future else -math.inf
+            return self._due if self._shared.still is self._future else -math.inf
 
     def run(self) -> None:
         """Take it."""
-        with self._desk.changed:
-            future = self._desk.still
+        with self._shared.changed:
+            future = self._shared.still
         if future is None:  # nobody waits any more
             return
         if future is not self._future:
@@ -404,20 +404,20 @@ class StillDuty:
         return Frame(image, (begin + end) / 2)
 
     def _finish(self, future: "Future[Frame]", result: Frame | Exception) -> None:
-        with self._desk.changed:
-            if self._desk.still is future:
-                self._desk.still = None
+        with self._shared.changed:
+            if self._shared.still is future:
+                self._shared.still = None
         if isinstance(result, Frame):
             future.set_result(result)
         else:
             future.set_exception(result)
 
 
-class ViewDuty:
+class ViewJob:
     """Fetches frames of the viewfinder and publishes the newest."""
 
-    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, desk: Desk) -> None:
-        self._config, self._clock, self._link, self._desk = config, clock, link, desk
+    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, shared: SharedState) -> None:
+        self._config, self._clock, self._link, self._shared = config, clock, link, shared
         self._due = -math.inf
         self._data, self._renewed = b"", -math.inf
         self._patience = Patience(clock)
@@ -462,8 +462,8 @@ class ViewDuty:
             due = self._patience.next_try(error)
             if due is None:
                 raise
-            with self._desk.changed:
-                self._desk.trouble = str(error)
+            with self._shared.changed:
+                self._shared.trouble = str(error)
             self._due = due
             return
         arrived = self._clock.now()
@@ -485,16 +485,16 @@ class ViewDuty:
         else:
             trouble = f"its frames take {took:.2g} s to come"
             self._data = data  # or it would be taken for a new one if it came once more, in time
-        with self._desk.changed:
-            self._desk.dropped += 1
-            self._desk.trouble = trouble
+        with self._shared.changed:
+            self._shared.dropped += 1
+            self._shared.trouble = trouble
 
     def _publish(self, data: bytes, image: Image, arrived: float) -> None:
         self._data, self._renewed = data, arrived
-        with self._desk.changed:
-            self._desk.frame, self._desk.arrived = Frame(image, arrived - self._config.latency_s), arrived
-            self._desk.trouble = ""
-            self._desk.changed.notify_all()
+        with self._shared.changed:
+            self._shared.frame, self._shared.arrived = Frame(image, arrived - self._config.latency_s), arrived
+            self._shared.trouble = ""
+            self._shared.changed.notify_all()
 
 
 def freshness(config: HardwareZoom) -> float:
@@ -522,14 +522,14 @@ class Shooting:
         config: the camera's.
         clock: the rig's.
         link: to the camera, not open yet.
-        desk: where commands come from and results go.
+        shared: where commands come from and results go.
     """
 
-    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, desk: Desk) -> None:
-        self._config, self._clock, self._link, self._desk = config, clock, link, desk
-        self._lens = LensDuty(config, clock, link, desk)
-        self._still = StillDuty(config, clock, link, desk)
-        self._view = ViewDuty(config, clock, link, desk)
+    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, shared: SharedState) -> None:
+        self._config, self._clock, self._link, self._shared = config, clock, link, shared
+        self._lens = LensJob(config, clock, link, shared)
+        self._still = StillJob(config, clock, link, shared)
+        self._view = ViewJob(config, clock, link, shared)
         self._connected = False
         self._lost_at = self._attempt = 0.0
         self._pause = FIRST_PAUSE_S
@@ -569,15 +569,15 @@ class Shooting:
     def work(self) -> float:
         """Do the most urgent thing that is due; return when something is due again [s]."""
         now = self._clock.now()
-        if self._desk.gone:
+        if self._shared.gone:
             return math.inf
         if not self._connected:
             if now >= self._attempt:
                 self._look_again()
             return now if self._connected else self._attempt
-        duties = (self._lens, self._still, self._view)
+        jobs = (self._lens, self._still, self._view)
         try:
-            due = next((duty for duty in duties if duty.due() <= now), None)
+            due = next((job for job in jobs if job.due() <= now), None)
             if due is not None:
                 due.run()
         except LinkError as error:
@@ -586,7 +586,7 @@ class Shooting:
             self._wait(error)
             self._disconnect()  # takes 5 s where the camera is silent
             return self._attempt
-        return min(duty.due() for duty in duties)
+        return min(job.due() for job in jobs)
 
     def _connect(self, first: bool) -> ZoomSetting:
         """Open the link and everything behind it; what fails leaves it closed."""
@@ -624,13 +624,13 @@ class Shooting:
 
     def _wait(self, error: Exception) -> None:
         self._attempt, self._pause = self._clock.now() + self._pause, 2 * self._pause
-        with self._desk.changed:
-            self._desk.trouble = f"looking for the camera again, {error}"
+        with self._shared.changed:
+            self._shared.trouble = f"looking for the camera again, {error}"
 
     def _give_up(self, error: CotargetError | LinkError) -> None:
         why = f"the zoom camera at '{self._config.port}' is gone: {error}"
         log.error("%s", why)
-        self._desk.dismiss(why)
+        self._shared.dismiss(why)
 
 
 # Opening takes 1 to 2 s; a camera that brings its lens out, or is busy, some more.
@@ -667,11 +667,11 @@ class GphotoCamera:
 
     def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink | None = None) -> None:
         self._config, self._clock = config, clock
-        self._desk = Desk()
+        self._shared = SharedState()
         self._still_turn = threading.Lock()
         link = GphotoLink(config.port, config.model) if link is None else link
         opened: Future[ZoomSetting] = Future()
-        work = Shooting(config, clock, link, self._desk)
+        work = Shooting(config, clock, link, self._shared)
         self._thread = threading.Thread(target=self._run, args=(work, opened), name="zoom camera", daemon=True)
         self._thread.start()
         try:
@@ -701,8 +701,8 @@ class GphotoCamera:
     @property
     def dropped(self) -> int:
         """How many frames were broken, late or of another size, and therefore not handed out."""
-        with self._desk.changed:
-            return self._desk.dropped
+        with self._shared.changed:
+            return self._shared.dropped
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
         """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
@@ -711,23 +711,23 @@ class GphotoCamera:
             StaleFrameError: no such frame arrived within ``timeout`` [s].
             DeviceError: the camera is gone.
         """
-        desk = self._desk
+        shared = self._shared
         fresh = freshness(self._config)
 
         def there() -> bool:
-            if desk.gone:
+            if shared.gone:
                 return True
-            new = desk.frame is not None and (newer_than is None or desk.frame.t > newer_than)
-            return new and self._clock.now() - desk.arrived <= fresh
+            new = shared.frame is not None and (newer_than is None or shared.frame.t > newer_than)
+            return new and self._clock.now() - shared.arrived <= fresh
 
-        with desk.changed:
-            came = desk.changed.wait_for(there, timeout)
+        with shared.changed:
+            came = shared.changed.wait_for(there, timeout)
             self._check()
-            if came and desk.frame is not None:
-                return desk.frame
+            if came and shared.frame is not None:
+                return shared.frame
             which = "frame" if newer_than is None else f"frame newer than {newer_than:.3f} s"
             raise StaleFrameError(
-                f"no {which} from the zoom camera within {timeout:g} s{desk.trouble and f': {desk.trouble}'}"
+                f"no {which} from the zoom camera within {timeout:g} s{shared.trouble and f': {shared.trouble}'}"
             )
 
     def zoom(self, focal_px: float) -> float:
@@ -738,13 +738,13 @@ class GphotoCamera:
         """
         if not focal_px > 0 or math.isinf(focal_px):
             raise DeviceError(f"the lens cannot go to a focal length of {focal_px} px")
-        position, desk = self._lens.position_for(focal_px), self._desk
-        with desk.changed:
+        position, shared = self._lens.position_for(focal_px), self._shared
+        with shared.changed:
             self._check()
-            if position != desk.wanted or desk.lens_trouble:
-                desk.wanted, desk.order = position, desk.order + 1
-                desk.standing, desk.lens_trouble, desk.called = False, "", True
-                desk.changed.notify_all()
+            if position != shared.wanted or shared.lens_trouble:
+                shared.wanted, shared.order = position, shared.order + 1
+                shared.standing, shared.lens_trouble, shared.called = False, "", True
+                shared.changed.notify_all()
         return self._lens.focal_at(position)
 
     def state(self) -> ZoomState:
@@ -753,15 +753,15 @@ class GphotoCamera:
         Raises:
             DeviceError: the lens did not go where it was sent, or the camera is gone.
         """
-        desk = self._desk
-        with desk.changed:
+        shared = self._shared
+        with shared.changed:
             self._check()
-            if desk.lens_trouble:
-                raise DeviceError(desk.lens_trouble)
-            assert desk.motion is not None, "an open camera knows its lens"
+            if shared.lens_trouble:
+                raise DeviceError(shared.lens_trouble)
+            assert shared.motion is not None, "an open camera knows its lens"
             now = self._clock.now()
-            moving = not desk.standing or now < desk.motion.arrives
-            return ZoomState(self._lens.focal_at(desk.motion.position(now)), moving, now)
+            moving = not shared.standing or now < shared.motion.arrives
+            return ZoomState(self._lens.focal_at(shared.motion.position(now)), moving, now)
 
     def capture(self) -> Frame:
         """Take a full still.
@@ -770,32 +770,32 @@ class GphotoCamera:
             ConfigError: stills are of another size than configured.
             DeviceError: the camera took none.
         """
-        desk = self._desk
+        shared = self._shared
         with self._still_turn:
             future: Future[Frame] = Future()
-            with desk.changed:
+            with shared.changed:
                 self._check()
-                desk.still, desk.called = future, True
-                desk.changed.notify_all()
+                shared.still, shared.called = future, True
+                shared.changed.notify_all()
             try:
                 return future.result(STILL_LIMIT_S)
             except TimeoutError:
                 raise DeviceError(f"the zoom camera took no still within {STILL_LIMIT_S:g} s") from None
             finally:
-                with desk.changed:
-                    if desk.still is future:
-                        desk.still = None
+                with shared.changed:
+                    if shared.still is future:
+                        shared.still = None
 
     def close(self) -> None:
         """Let the camera go; harmless when that was done before."""
-        self._desk.dismiss("the zoom camera is closed")
+        self._shared.dismiss("the zoom camera is closed")
         self._thread.join(CLOSE_LIMIT_S)
         if self._thread.is_alive():
             log.warning("the zoom camera at '%s' does not answer; it is left as it is", self._config.port)
 
     def _check(self) -> None:
-        if self._desk.gone:
-            raise DeviceError(self._desk.gone)
+        if self._shared.gone:
+            raise DeviceError(self._shared.gone)
 
     def _run(self, work: Shooting, opened: "Future[ZoomSetting]") -> None:
         """The camera's thread."""
@@ -805,18 +805,20 @@ class GphotoCamera:
             opened.set_exception(error)
             return
         try:
-            while not self._desk.gone:
+            while not self._shared.gone:
                 self._rest_until(work.work())
         except Exception as error:  # a thread must not die in silence
             log.debug("the driver of the zoom camera failed", exc_info=True)
-            self._desk.dismiss(f"the driver of the zoom camera failed: {error!r}")
+            self._shared.dismiss(f"the driver of the zoom camera failed: {error!r}")
         finally:
             with contextlib.suppress(Exception):
                 work.close()
 
     def _rest_until(self, due: float) -> None:
         """Wait until something is due, or somebody wants something."""
-        desk = self._desk
-        with desk.changed:
-            desk.changed.wait_for(lambda: desk.called, min(max(due - self._clock.now(), 0.0), threading.TIMEOUT_MAX))
-            desk.called = False
+        shared = self._shared
+        with shared.changed:
+            shared.changed.wait_for(
+                lambda: shared.called, min(max(due - self._clock.now(), 0.0), threading.TIMEOUT_MAX)
+            )
+            shared.called = False

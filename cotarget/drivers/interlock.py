@@ -37,7 +37,7 @@ class PositionLostError(DeviceError):
         super().__init__(f"the pan-tilt unit at {name} {what}; see that it is free, then run cotarget reset-head")
 
 
-class LostPosition:
+class PositionLostMarker:
     """What is remembered of the unit at a port.
 
     Args:
@@ -105,7 +105,7 @@ def _reason(file: Path) -> str:
 
 
 @contextlib.contextmanager
-def claimed(port: str) -> Iterator[None]:
+def rig_lock(port: str) -> Iterator[None]:
     """Have the rig whose pan-tilt unit is at a port to oneself; the claim ends with the process, however that ends.
 
     It is a name that Linux lets one socket of a machine have at a time. Elsewhere, and among containers, the ports and

@@ -23,7 +23,7 @@ from typing import TypeVar
 
 from cotarget.config import HardwareHead, SafetyConfig
 from cotarget.drivers import ptu_protocol
-from cotarget.drivers.interlock import LostPosition, PositionLostError
+from cotarget.drivers.interlock import PositionLostError, PositionLostMarker
 from cotarget.drivers.ptu_d46 import (
     HALT_NOW,
     HALT_TRIES,
@@ -104,7 +104,7 @@ class Track:
 
 # --- d46wishes ---
 
-Wish = TypeVar("Wish")
+Request = TypeVar("Request")
 
 
 class DroppedError(HaltedError):
@@ -160,7 +160,7 @@ class Halt:
     done: threading.Event = field(default_factory=threading.Event)
 
 
-def drained(queue: deque[Wish]) -> list[Wish]:
+def drained(queue: deque[Request]) -> list[Request]:
     """Take all wishes out of a queue that others go on filling."""
     return [queue.popleft() for _ in range(len(queue))]
 
@@ -253,17 +253,17 @@ class Loop:
             log.warning("%s: the pan-tilt unit did not acknowledge the last halt: %s", self._line.name, error)
 
     def _halt(self) -> None:
-        wishes = drained(self.halts)
+        requests = drained(self.halts)
         # Threads that halt at once may get here in another order than they were numbered in.
-        self.halted = max([self.halted, *(wish.number for wish in wishes)])
+        self.halted = max([self.halted, *(request.number for request in requests)])
         try:
             self._abandon(DroppedError("the move was halted"))
             self._stop()
-            for wish in wishes:
-                wish.answered = True
+            for request in requests:
+                request.answered = True
         finally:
-            for wish in wishes:
-                wish.done.set()
+            for request in requests:
+                request.done.set()
 
     def _stop(self) -> None:
         """Order the halt and wait for the answer."""
@@ -281,11 +281,11 @@ class Loop:
     def _move(self) -> None:
         # A snapshot that says moving must be there before the wish leaves the queue: see D46Head.state.
         self.snapshot = Snapshot(self.snapshot.pan, self.snapshot.tilt, True, self.snapshot.t)
-        wishes = drained(self.moves)
-        fresh = [wish for wish in wishes if wish.number > self.halted]
-        for wish in wishes:
-            if wish not in fresh:
-                wish.finish(DroppedError("the move was halted"))
+        requests = drained(self.moves)
+        fresh = [request for request in requests if request.number > self.halted]
+        for request in requests:
+            if request not in fresh:
+                request.finish(DroppedError("the move was halted"))
         if not fresh:
             return
         *older, move = fresh
@@ -315,11 +315,11 @@ class Loop:
         move.deadline = self._clock.now() + longest + self._delay + PATIENCE_S
 
     def _order(self, name: str, value: int) -> None:
-        if reason := self._other_wish():
+        if reason := self._other_request():
             raise DroppedError(reason)
-        self._exchange(command(name, value), ptu_protocol.done, self._other_wish)
+        self._exchange(command(name, value), ptu_protocol.done, self._other_request)
 
-    def _other_wish(self) -> str:
+    def _other_request(self) -> str:
         """Why the move under way is not to be sent any further; empty if there is no reason."""
         if self.halts or self.closing or self._line.events:
             return "the move was halted"
@@ -456,7 +456,7 @@ class D46Head:
     """
 
     def __init__(self, config: HardwareHead, clock: Clock, safety: SafetyConfig = NOTHING_SAID) -> None:
-        self._lost = LostPosition(config.port, safety.stop_file)
+        self._lost = PositionLostMarker(config.port, safety.stop_file)
         self._lost.refuse()
         self._line = open_line(config.port, config.baud, clock)
         self._signs = (config.pan_sign, config.tilt_sign)
@@ -542,10 +542,10 @@ class D46Head:
         """
         if self._closed:
             return
-        wish = Halt(next(self._numbers))
-        self._loop.halts.append(wish)
-        wish.done.wait(HALT_S + self._loop.braking_s if self._thread.is_alive() else 0.0)
-        if wish.answered or self._loop.rests:
+        request = Halt(next(self._numbers))
+        self._loop.halts.append(request)
+        request.done.wait(HALT_S + self._loop.braking_s if self._thread.is_alive() else 0.0)
+        if request.answered or self._loop.rests:
             return
         if not self._thread.is_alive() and not isinstance(self._dead, LostError):
             with contextlib.suppress(DeviceError):

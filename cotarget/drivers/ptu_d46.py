@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from cotarget.config import HardwareHead
 from cotarget.drivers import ptu_protocol
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.interlock import LostPosition, PositionLostError, claimed
+from cotarget.drivers.interlock import PositionLostError, PositionLostMarker, rig_lock
 from cotarget.drivers.ptu_protocol import (
     DELIMITER,
     HALT,
@@ -218,7 +218,7 @@ def probe(port: str, baud: int) -> str:
     Raises:
         DeviceError: no pan-tilt unit, or another program has it.
     """
-    with claimed(port), contextlib.closing(open_line(port, baud, MonotonicClock())) as line:
+    with rig_lock(port), contextlib.closing(open_line(port, baud, MonotonicClock())) as line:
         try:
             line.write(DELIMITER)
             line.drain(GREETING_QUIET_S, GREETING_MOST_S)
@@ -308,7 +308,7 @@ NOT_HALTED = (
 )
 
 
-def reset(config: HardwareHead, clock: Clock, lost: LostPosition, stopped: Callable[[], str | None]) -> Unit:
+def reset(config: HardwareHead, clock: Clock, lost: PositionLostMarker, stopped: Callable[[], str | None]) -> Unit:
     """Let the unit find its limits anew; until that has succeeded, its position counts as lost.
 
     Whatever ends it before, Ctrl-C and other exceptions included, sends a halt and waits a little for the answer;
@@ -327,7 +327,7 @@ def reset(config: HardwareHead, clock: Clock, lost: LostPosition, stopped: Calla
         EmergencyStopError: it was stopped.
         DeviceError: it failed.
     """
-    with claimed(config.port), contextlib.closing(open_line(config.port, config.baud, clock)) as line:
+    with rig_lock(config.port), contextlib.closing(open_line(config.port, config.baud, clock)) as line:
         greet(line)
         _refuse_if_stopped(stopped)
         lost.note(str(PositionLostError(line.name, "has begun a reset that did not come to its end")))

@@ -9,7 +9,7 @@ from cotarget.drivers.axis import AxisCamera
 from cotarget.drivers.board import make_board
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.gphoto_camera import GphotoCamera
-from cotarget.drivers.interlock import claimed
+from cotarget.drivers.interlock import rig_lock
 from cotarget.drivers.polled_head import D46Head
 from cotarget.errors import ConfigError
 from cotarget.rig import Board
@@ -70,7 +70,7 @@ def open_hardware(config: RigConfig) -> HardwareRig:
     sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL))
     clock = MonotonicClock()
     with contextlib.ExitStack() as opened:
-        opened.enter_context(claimed(hardware.head.port))
+        opened.enter_context(rig_lock(hardware.head.port))
         board = opened.enter_context(contextlib.closing(make_board(hardware.board)))
         fixed = opened.enter_context(contextlib.closing(AxisCamera(hardware.fixed, clock)))
         zoom = opened.enter_context(contextlib.closing(GphotoCamera(hardware.zoom, clock)))

@@ -21,13 +21,13 @@ has it; the depth by itself is as good as the calibration.
 
 from cotarget.estimation.measurement_model import Appearance, Estimate
 from cotarget.estimation.motion_model import EstimationSettings, MotionSettings, estimation_settings_for
-from cotarget.estimation.target_filter import SpatialFilter
+from cotarget.estimation.target_filter import TargetFilter
 
 __all__ = [
     "Appearance",
     "Estimate",
     "EstimationSettings",
     "MotionSettings",
-    "SpatialFilter",
+    "TargetFilter",
     "estimation_settings_for",
 ]

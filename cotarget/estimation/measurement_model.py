@@ -171,12 +171,12 @@ class Estimate:
         return self.target.size * math.exp(self.state[K])
 
     @property
-    def size_surprise(self) -> float:
+    def size_deviation(self) -> float:
         """How far the true size is from the told one, in the standard deviations that were assumed; 0 is as told."""
         return float(self.state[K]) / self.size_prior
 
     @property
-    def bias_surprise(self) -> float:
+    def bias_deviation(self) -> float:
         """How far the head's bias is, in the standard deviations that were assumed; above 4, calibrate again."""
         return math.hypot(*self.bias) / self.bias_prior
 

@@ -111,15 +111,16 @@ class EstimationSettings:
         size_gate: likewise of a size; 99.7 % with one.
         misses: so many measurements beyond jump_gate on end are believed.
         zoom_misses: likewise in the zoom view, while the wide view has no surprise: then size or head is doubted.
-        calm: a mean surprise below which the wide view counts as having none.
-        lean_gain: weight of the newest innovation in the zoom view in their mean, in standard deviations.
-        most_lean: largest such mean; beyond it size and head are doubted too. Of white noise it is 0.23 for each axis.
+        consistent_nis: a mean surprise below which the wide view counts as having none.
+        mean_innovation_gain: weight of the newest innovation in the zoom view in their mean, in standard deviations.
+        most_mean_innovation: largest such mean; beyond it size and head are doubted too. Of white noise it is 0.23 for
+        each axis.
         depth_sigma: of the depth's logarithm, before a size is seen.
-        depth_doubt: what is added to it where the target has jumped, or looks of quite another size.
-        size_doubt: what is added to the sigma of size and depth together, where the zoom view contradicts them.
-        bias_doubt: what is then added to the sigma of the head's bias [rad].
-        surprise_gain: weight of the newest measurement in the mean surprise.
-        most_boost: most by which surprise multiplies the acceleration's variance.
+        depth_inflation: what is added to it where the target has jumped, or looks of quite another size.
+        size_inflation: what is added to the sigma of size and depth together, where the zoom view contradicts them.
+        bias_inflation: what is then added to the sigma of the head's bias [rad].
+        nis_gain: weight of the newest measurement in the mean surprise.
+        most_noise_scale: most by which surprise multiplies the acceleration's variance.
         history_s: how late a measurement may come after the newest one [s].
     """
 
@@ -137,19 +138,19 @@ class EstimationSettings:
     size_gate: float = 9.0
     misses: int = 3
     zoom_misses: int = 8
-    calm: float = 2.0
-    lean_gain: float = 0.1
-    most_lean: float = 1.0
+    consistent_nis: float = 2.0
+    mean_innovation_gain: float = 0.1
+    most_mean_innovation: float = 1.0
     depth_sigma: float = 1.0
-    depth_doubt: float = 0.3
-    size_doubt: float = 0.3
-    bias_doubt: float = 5e-3
-    surprise_gain: float = 0.2
-    most_boost: float = 30.0
+    depth_inflation: float = 0.3
+    size_inflation: float = 0.3
+    bias_inflation: float = 5e-3
+    nis_gain: float = 0.2
+    most_noise_scale: float = 30.0
     history_s: float = 1.5
 
     @property
-    def jump_boost(self) -> float:
+    def jump_noise_scale(self) -> float:
         """By what the acceleration's variance is larger than usual where it was found elsewhere."""
         return max(1.0, (self.motion.jump.acceleration / self.motion.acceleration) ** 2)
 
@@ -229,7 +230,7 @@ NEAREST = 0.2
 # its closed form loses its digits.
 SHORT = 0.03
 _UNIT = np.eye(MOVING)
-MOST_DOUBT = 0.5  # of the logarithm's variance
+MOST_UNCERTAINTY = 0.5  # of the logarithm's variance
 # However long nothing is measured, no more is doubted than this, in standard deviations: that it is anywhere in view, a
 # factor of some five in the depth, three in size and attitude, and six degrees of the head.
 MOST_SIGMA = np.array([3.0, 3.0, 1.5, *[1e2] * 3, *[1e3] * 3, 1.0, 1.0, 0.1, 0.1])
@@ -294,7 +295,7 @@ def _singer(dt: float, tau: float) -> Array:
     return np.array([[pp, pv, pa], [pv, vv, va], [pa, va, aa]])
 
 
-def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, boost: float = 1.0) -> tuple[Array, Array]:
+def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, noise_scale: float = 1.0) -> tuple[Array, Array]:
     """Predict state and covariance ``dt`` >= 0 [s] ahead.
 
     Args:
@@ -302,7 +303,7 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, boost: floa
         P: its covariance, (13, 13).
         dt: how far ahead [s].
         motion: how the target moves.
-        boost: by what the acceleration's variance is larger than usual.
+        noise_scale: by what the acceleration's variance is larger than usual.
     """
     if dt <= 0:
         return x, P
@@ -331,8 +332,8 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, boost: floa
     N[:, L] -= y[:MOVING]
     N[L, L] = 1.0
     # The mean of 1 / depth^2 over all depths that it may have: an uncertain depth makes the noise larger.
-    sigma = motion.acceleration * math.exp(min(P[L, L], MOST_DOUBT) - log_depth)
-    P[:MOVING, :MOVING] += N @ span.noise @ N.T * (boost * sigma * sigma)
+    sigma = motion.acceleration * math.exp(min(P[L, L], MOST_UNCERTAINTY) - log_depth)
+    P[:MOVING, :MOVING] += N @ span.noise @ N.T * (noise_scale * sigma * sigma)
     return y, _bounded(P)
 
 

@@ -46,13 +46,14 @@ class Node:
         t: [s].
         x: state, see `cotarget.estimation.motion_model`, (13,).
         P: its covariance, (13, 13).
-        surprise: squared innovation over what was expected, averaged over the last measurements of the middle.
-        boost: by what the acceleration's variance is larger than usual.
+        nis: squared innovation over what was expected, averaged over the last measurements of the middle.
+        noise_scale: by what the acceleration's variance is larger than usual.
         missed_wide: how many measurements in the wide view were turned away on end.
         missed_zoom: likewise in the zoom view.
         missed_size: likewise of the size.
         size_t: when the size was last measured [s].
-        lean: innovation in the zoom view over its standard deviation, averaged over the last second or so, (2,).
+        mean_innovation: innovation in the zoom view over its standard deviation, averaged over the last second or so,
+        (2,).
         wide_t: when the wide view last corrected the middle [s]; a start, at first or elsewhere, is no correction.
         moved_t: when it was last found elsewhere than it could be [s].
     """
@@ -60,15 +61,15 @@ class Node:
     t: float
     x: Array
     P: Array
-    surprise: float = 1.0
-    boost: float = 1.0
+    nis: float = 1.0
+    noise_scale: float = 1.0
     missed_wide: int = 0
     missed_zoom: int = 0
     missed_size: int = 0
     size_t: float = -math.inf
     wide_t: float = -math.inf
     moved_t: float = -math.inf
-    lean: tuple[float, float] = (0.0, 0.0)
+    mean_innovation: tuple[float, float] = (0.0, 0.0)
 
     def jumped(self, jump: Jump) -> bool:
         """Whether it was found elsewhere so lately that it may be on its way still."""
@@ -168,28 +169,30 @@ def correct_wide(node: Node, seen: WideSeen, settings: EstimationSettings) -> No
     innovation = seen.tangent - node.x[:2]
     R = seen.R * _repeated(node.t - node.wide_t, settings.noise_s)
     S_inv = _inverse(PHt[:2] + R)
-    surprise = float(innovation @ S_inv @ innovation)
-    if surprise > settings.jump_gate:
+    nis = float(innovation @ S_inv @ innovation)
+    if nis > settings.jump_gate:
         if node.missed_wide + 1 < settings.misses:
-            return replace(node, missed_wide=node.missed_wide + 1, missed_zoom=0, lean=(0.0, 0.0))
+            return replace(node, missed_wide=node.missed_wide + 1, missed_zoom=0, mean_innovation=(0.0, 0.0))
         return _size(_elsewhere(node, seen, settings), seen.size, settings)
-    if surprise > settings.gate:  # measured worse than thought: it counts as much as one that just passes
-        S_inv = _inverse(PHt[:2] + R * (surprise / settings.gate))
-        surprise = float(innovation @ S_inv @ innovation)
+    if nis > settings.gate:  # measured worse than thought: it counts as much as one that just passes
+        S_inv = _inverse(PHt[:2] + R * (nis / settings.gate))
+        nis = float(innovation @ S_inv @ innovation)
     gain = PHt @ S_inv
     P = node.P - gain @ PHt.T
-    node = _told(replace(node, x=node.x + gain @ innovation, P=P, missed_wide=0, wide_t=node.t), surprise, settings)
+    node = _with_noise_scale(
+        replace(node, x=node.x + gain @ innovation, P=P, missed_wide=0, wide_t=node.t), nis, settings
+    )
     return _size(node, seen.size, settings)
 
 
 def correct_zoom(node: Node, seen: ZoomSeen, settings: EstimationSettings) -> Node:
     """Take a middle in the zoom view into account, iterated because the depth enters in no linear way."""
-    if node.missed_zoom >= settings.zoom_misses or math.hypot(*node.lean) > settings.most_lean:
-        node = replace(node, P=_doubted(node.P, settings), missed_zoom=0, lean=(0.0, 0.0))
+    if node.missed_zoom >= settings.zoom_misses or math.hypot(*node.mean_innovation) > settings.most_mean_innovation:
+        node = replace(node, P=_inflated(node.P, settings), missed_zoom=0, mean_innovation=(0.0, 0.0))
     # While the wide view surprises too, it is the target that moved, and neither its size nor the head is to blame.
-    missed = node.missed_zoom + (node.missed_wide == 0 and node.surprise < settings.calm)
+    missed = node.missed_zoom + (node.missed_wide == 0 and node.nis < settings.consistent_nis)
     x = node.x
-    surprise = 0.0
+    nis = 0.0
     for i in range(ROUNDS):
         tangent, J, d = seen.sight.seen(x)
         if d[2] <= 0:
@@ -198,16 +201,16 @@ def correct_zoom(node: Node, seen: ZoomSeen, settings: EstimationSettings) -> No
         PHt = node.P[:, SEEN] @ J.T
         S_inv = _inverse(J @ PHt[SEEN] + seen.R)
         if i == 0:
-            surprise = float(innovation @ S_inv @ innovation)
-            if surprise > settings.gate:
+            nis = float(innovation @ S_inv @ innovation)
+            if nis > settings.gate:
                 return replace(node, missed_zoom=missed)
-            lean = _leaning(node, J @ PHt[SEEN] + seen.R, innovation, settings)
+            mean_innovation = _mean_innovation(node, J @ PHt[SEEN] + seen.R, innovation, settings)
         gain = PHt @ S_inv
         before, x = x[L], node.x + gain @ innovation
         if abs(x[L] - before) < SETTLED:
             break
     P = node.P - gain @ PHt.T
-    return _told(replace(node, x=x, P=P, missed_zoom=0, lean=lean), surprise, settings)
+    return _with_noise_scale(replace(node, x=x, P=P, missed_zoom=0, mean_innovation=mean_innovation), nis, settings)
 
 
 def _size(node: Node, size: SizeSeen | None, settings: EstimationSettings) -> Node:
@@ -229,8 +232,8 @@ def _size(node: Node, size: SizeSeen | None, settings: EstimationSettings) -> No
             return replace(node, missed_size=node.missed_size + 1)
         # Turned or come nearer, against all expectation: let both give way.
         P = P.copy()
-        P[L, L] += settings.depth_doubt**2
-        P[G, G] += settings.depth_doubt**2
+        P[L, L] += settings.depth_inflation**2
+        P[G, G] += settings.depth_inflation**2
         Ph = P @ h
         S = float(h @ Ph) + variance
     x = node.x + Ph * (innovation / S)
@@ -253,21 +256,21 @@ def _slowed(node: Node, settings: EstimationSettings) -> Node:
     return replace(node, x=x, P=P)
 
 
-def _told(node: Node, surprise: float, settings: EstimationSettings) -> Node:
+def _with_noise_scale(node: Node, nis: float, settings: EstimationSettings) -> Node:
     """Keep count of how surprising measurements are; a target that surprises manoeuvres harder than usual."""
-    mean = node.surprise + settings.surprise_gain * (surprise / 2 - node.surprise)
-    boost = min(max(mean, 1.0), settings.most_boost)
+    mean = node.nis + settings.nis_gain * (nis / 2 - node.nis)
+    noise_scale = min(max(mean, 1.0), settings.most_noise_scale)
     if node.jumped(settings.motion.jump):
-        boost = max(boost, settings.jump_boost)
-    return replace(node, surprise=mean, boost=boost)
+        noise_scale = max(noise_scale, settings.jump_noise_scale)
+    return replace(node, nis=mean, noise_scale=noise_scale)
 
 
-def _leaning(node: Node, S: Array, innovation: Array, settings: EstimationSettings) -> tuple[float, float]:
+def _mean_innovation(node: Node, S: Array, innovation: Array, settings: EstimationSettings) -> tuple[float, float]:
     """Average the zoom view's innovations: what always lies to one side is no noise, however small it is."""
-    if node.surprise >= settings.calm:  # the target moves otherwise than thought, which says nothing of the head
+    if node.nis >= settings.consistent_nis:  # the target moves otherwise than thought, which says nothing of the head
         return 0.0, 0.0
-    g = settings.lean_gain
-    u, v = node.lean
+    g = settings.mean_innovation_gain
+    u, v = node.mean_innovation
     return (
         u + g * (float(innovation[0]) / math.sqrt(S[0, 0]) - u),
         v + g * (float(innovation[1]) / math.sqrt(S[1, 1]) - v),
@@ -289,27 +292,27 @@ def _elsewhere(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node
     speeds = motion.jump.speed, motion.jump.speed, motion.speed
     accelerations = motion.jump.acceleration, motion.jump.acceleration, motion.acceleration
     P[range(3, 9), range(3, 9)] = (np.array([*speeds, *accelerations]) * nearness) ** 2
-    P[L, L] += settings.depth_doubt**2
+    P[L, L] += settings.depth_inflation**2
     return replace(
         node,
         x=x,
         P=P,
         missed_wide=0,
         missed_zoom=0,
-        lean=(0.0, 0.0),
-        surprise=1.0,
-        boost=settings.jump_boost,
+        mean_innovation=(0.0, 0.0),
+        nis=1.0,
+        noise_scale=settings.jump_noise_scale,
         moved_t=node.t,
     )
 
 
-def _doubted(P: Array, settings: EstimationSettings) -> Array:
+def _inflated(P: Array, settings: EstimationSettings) -> Array:
     """What the zoom view does not find where it should be: either the told size is wrong, or the head is."""
     P = P.copy()
     # Size and depth may be wrong together: by what the wide view sees, their ratio stays known.
-    P[np.ix_([L, K], [L, K])] += settings.size_doubt**2
-    P[PAN, PAN] += settings.bias_doubt**2
-    P[TILT, TILT] += settings.bias_doubt**2
+    P[np.ix_([L, K], [L, K])] += settings.size_inflation**2
+    P[PAN, PAN] += settings.bias_inflation**2
+    P[TILT, TILT] += settings.bias_inflation**2
     return P
 
 
@@ -325,7 +328,7 @@ def _inverse(S: Array) -> Array:
     return np.array([[d / det, -b / det], [-c / det, a / det]])
 
 
-class SpatialFilter:
+class TargetFilter:
     """Where one target is in 3D and how fast it moves, how large it is, and by how much the head points wrongly.
 
     Measurements may come in any order, because each says when its light fell. Those of the last second or so are kept,
@@ -354,7 +357,7 @@ class SpatialFilter:
         self._seen: list[WideSeen | ZoomSeen] = []
         self._nodes: list[Node | None] = []  # the state after each of them, as far as gone over
 
-    def see_wide(
+    def update_fixed(
         self, detection: Measurement, t: float, *, sigma_px: Array | None = None, size_px: float | None = None
     ) -> bool:
         """Take a detection in the wide view into account.
@@ -389,7 +392,7 @@ class SpatialFilter:
         size = self._size(side, J[int(vertical), int(vertical)], bound=detection.clipped)
         return self._insert(WideSeen(t, z, (J * np.array([sigma_u**2, sigma_v**2])) @ J.T, size))
 
-    def see_zoom(
+    def update_zoom(
         self,
         pixel: Array,
         sigma_px: float | Array,
@@ -413,7 +416,7 @@ class SpatialFilter:
                 known badly. By default from the settings.
 
         Returns:
-            Whether it could be taken, see `see_wide`.
+            Whether it could be taken, see `update_fixed`.
         """
         lens = self._calibration.zoom.at(nominal_px)
         found = lens.tangents(pixel)
@@ -456,7 +459,7 @@ class SpatialFilter:
         """Predict state and covariance at a time that is no earlier [s]."""
         settings = self._settings
         motion = settings.jump_motion if node.jumped(settings.motion.jump) else settings.motion
-        return propagate(node.x, node.P, t - node.t, motion, node.boost)
+        return propagate(node.x, node.P, t - node.t, motion, node.noise_scale)
 
     def _before(self, t: float) -> Node | None:
         """The newest state that is no later than a time [s]."""

@@ -399,7 +399,7 @@ class Found:
 class Finder(Protocol):
     """Finds the target that is followed in the zoom view; the docstrings of `CloseupFinder` say what is what."""
 
-    def see_wide(self, frame: Frame, detection: Detection, mask: Image | None = None) -> Sight | None:
+    def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> Sight | None:
         """Remember the target as a wide frame shows it."""
 
     def sight_at(self, t: float) -> object | None:
@@ -431,7 +431,7 @@ class CloseupFinder:
         self._last_t = -math.inf
         self._last_offset: Array = np.zeros(2)  # beside the expected place, in wide pixels
 
-    def see_wide(self, frame: Frame, detection: Detection, mask: Image | None = None) -> Sight | None:
+    def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> Sight | None:
         """Remember the target as a wide frame shows it.
 
         Args:

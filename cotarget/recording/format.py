@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from cotarget.config import RigConfig, expect_table, parse_config
-from cotarget.control.selection import Whom, parse_whom
+from cotarget.control.selection import TargetChoice, parse_choice
 from cotarget.errors import ConfigError, choices
 from cotarget.rig import PanTiltLimits, Speed
 
@@ -253,7 +253,7 @@ class Recording:
         config: of the rig that was recorded; its backend is that rig's.
         calibration: the run's calibration.json.
         target: name of the target that was followed.
-        whom: which one, where there were several; nothing is said where an older version recorded it.
+        target_choice: which one, where there were several; nothing is said where an older version recorded it.
         facts: what the rig said of itself.
         events: every call on the rig, in order.
         ending: "complete"; or the error that ended the run; or, where it just stops, what it stops with.
@@ -265,7 +265,7 @@ class Recording:
     config: RigConfig
     calibration: Path
     target: str
-    whom: Whom
+    target_choice: TargetChoice
     facts: RigFacts
     events: tuple[Event, ...]
     ending: str
@@ -298,7 +298,7 @@ def open_recording(directory: Path) -> Recording:
     if not directory.exists():
         raise ConfigError(f"{directory}: no such folder; give the folder of a recording")
     meta = read_json(directory / META)
-    target, whom, config = _parse_meta(directory, meta)
+    target, target_choice, config = _parse_meta(directory, meta)
     if not (directory / CALIBRATION).is_file():
         raise ConfigError(f"{directory / CALIBRATION}: no such file; the recording is not whole")
     facts, rows, ending = None, [], ""
@@ -332,7 +332,7 @@ def open_recording(directory: Path) -> Recording:
         config,
         directory / CALIBRATION,
         target,
-        whom,
+        target_choice,
         facts,
         tuple(rows),
         ending or stop,
@@ -345,7 +345,7 @@ class _DamageError(Exception):
     """Where a log stops being whole."""
 
 
-def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, Whom, RigConfig]:
+def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, TargetChoice, RigConfig]:
     """The target's name, which one, and the configuration, whose picture of the target lies in the recording."""
     path = directory / META
     name, table = meta["target"], meta["config"]
@@ -355,7 +355,7 @@ def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, Whom, Ri
         expect_table(table, "config")
         config = parse_config(table, recorded=True)
         target = config.target(name)
-        whom = parse_whom(meta.get("whom", {}))
+        target_choice = parse_choice(meta.get("whom", {}))
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     except (ValueError, OverflowError) as error:
@@ -365,7 +365,7 @@ def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, Whom, Ri
     if template is not None and not template.is_file():
         raise ConfigError(f"{template}: no such file; the recording is not whole")
     target = replace(target, template=template)
-    return name, whom, dataclasses.replace(config, targets={**config.targets, name: target})
+    return name, target_choice, dataclasses.replace(config, targets={**config.targets, name: target})
 
 
 def _rows(path: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:

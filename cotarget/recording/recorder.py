@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 
 from cotarget.config import RigConfig, config_table
-from cotarget.control.selection import ANYBODY, Whom, whom_table
+from cotarget.control.selection import ANY_TARGET, TargetChoice, choice_table
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile
 from cotarget.geometry import RigidTransform
@@ -451,7 +451,12 @@ class Recorder:
     """
 
     def __init__(
-        self, directory: Path, config: RigConfig, calibration: Path, target: str, whom: Whom = ANYBODY
+        self,
+        directory: Path,
+        config: RigConfig,
+        calibration: Path,
+        target: str,
+        target_choice: TargetChoice = ANY_TARGET,
     ) -> None:
         """Make the folder and write down what the run begins with.
 
@@ -460,7 +465,7 @@ class Recorder:
             config: of the rig; passwords in it are not recorded.
             calibration: calibration.json, of which the recording gets a copy.
             target: name of the target that will be followed.
-            whom: which one, where there are several.
+            target_choice: which one, where there are several.
 
         Raises:
             ConfigError: the folder is not empty, something cannot be read or written, or there is no such target.
@@ -475,7 +480,7 @@ class Recorder:
         except OSError as error:
             raise ConfigError(f"{directory}: cannot hold a recording: {error.strerror}") from None
         try:
-            self._write_beginning(config, calibration, target, whom)
+            self._write_beginning(config, calibration, target, target_choice)
             self._writer = RecordWriter(directory)
         except BaseException as error:
             self._remove()
@@ -519,7 +524,7 @@ class Recorder:
         elif self._writer.failure and kind is None:
             raise CotargetError(f"{self._directory}: the recording is cut short: {self._writer.failure}")
 
-    def _write_beginning(self, config: RigConfig, calibration: Path, target: str, whom: Whom) -> None:
+    def _write_beginning(self, config: RigConfig, calibration: Path, target: str, target_choice: TargetChoice) -> None:
         chosen = config.target(target)
         if chosen.template is not None:
             copy = TEMPLATE + chosen.template.suffix
@@ -536,7 +541,7 @@ class Recorder:
             "numpy": np.__version__,
             "when": datetime.now(UTC).isoformat(timespec="seconds"),
             "target": target,
-            "whom": whom_table(whom),
+            "whom": choice_table(target_choice),
             "config": config_table(dataclasses.replace(config, targets={**config.targets, target: chosen})),
         }
         part = self._directory / f"{META}.part"

@@ -351,7 +351,7 @@ class Track:
     shared: bool = False
 
 
-class TargetFilter:
+class ImageFilter:
     """The Kalman filters and the size history of one track."""
 
     def __init__(

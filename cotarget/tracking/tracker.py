@@ -15,8 +15,8 @@ from scipy.optimize import linear_sum_assignment
 from cotarget.geometry import Array
 from cotarget.tracking.track import (
     CUT,
+    ImageFilter,
     Measurement,
-    TargetFilter,
     Track,
     TrackerSettings,
     center_variance,
@@ -66,7 +66,7 @@ class Tracker:
         """
         self._settings = settings or TrackerSettings()
         self._image_size = image_size
-        self._tracks: list[TargetFilter] = []
+        self._tracks: list[ImageFilter] = []
         self._next_id = 1
         self._t: float | None = None
         self._intervals = deque([FIRST_INTERVAL_S], INTERVALS)
@@ -151,7 +151,7 @@ class Tracker:
         for j, detection in enumerate(detections):
             if free[j]:  # whoever covers what is born here is no other
                 free &= ~covers[j]
-                self._tracks.append(TargetFilter(self._next_id, detection, t, self._settings, self._image_size))
+                self._tracks.append(ImageFilter(self._next_id, detection, t, self._settings, self._image_size))
                 self._next_id += 1
 
 
@@ -169,7 +169,7 @@ class _Pairs:
 
     def __init__(
         self,
-        states: Sequence[TargetFilter],
+        states: Sequence[ImageFilter],
         detections: Sequence[Measurement],
         image_size: tuple[int, int] | None,
     ) -> None:
@@ -199,7 +199,7 @@ class _Pairs:
         self.possible = near | (self.overlap > OVERLAP_ENOUGH)
 
 
-def _least_likely(states: Sequence[TargetFilter], image_size: tuple[int, int] | None) -> Array:
+def _least_likely(states: Sequence[ImageFilter], image_size: tuple[int, int] | None) -> Array:
     """The distance and logarithm of volume beyond which a detection is more likely a newcomer, (tracks, 1).
 
     One that was hidden for so long comes back at a rate of about one in as long again, with the density of a normal
@@ -214,7 +214,7 @@ def _least_likely(states: Sequence[TargetFilter], image_size: tuple[int, int] | 
     return limits
 
 
-def _boxes_of(states: Sequence[TargetFilter]) -> tuple[Array, Array]:
+def _boxes_of(states: Sequence[ImageFilter]) -> tuple[Array, Array]:
     """Middles and sizes of tracks [px], (n, 2) each."""
     at, size = [state.center for state in states], [state.size for state in states]
     return np.array(at).reshape(-1, 2), np.array(size).reshape(-1, 2)
@@ -233,7 +233,7 @@ def _shared(at: Array, size: Array, center: Array, extent: Array) -> Array:
     return _area(np.maximum(0.0, high - low))
 
 
-def _belongs(state: TargetFilter, detection: Measurement, image_size: tuple[int, int] | None) -> bool:
+def _belongs(state: ImageFilter, detection: Measurement, image_size: tuple[int, int] | None) -> bool:
     """Whether a lone detection may be of a lone track, as `_Pairs` says it: mostly in a fifth of the time.
 
     Where the boxes overlap enough, nothing that speaks against it counts.
@@ -243,7 +243,7 @@ def _belongs(state: TargetFilter, detection: Measurement, image_size: tuple[int,
     return bool(_Pairs([state], [detection], image_size).possible[0, 0])
 
 
-def _overlap(state: TargetFilter, detection: Measurement) -> float:
+def _overlap(state: ImageFilter, detection: Measurement) -> float:
     """Intersection over union of a track's predicted box and a detection's, 0 to 1."""
     shared = own = other = 1.0
     boxes = state.center, state.size.tolist(), detection.center_px.tolist(), detection.size_px.tolist()

@@ -18,7 +18,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
-from cotarget.control.head import SteeringSettings
+from cotarget.control.head import HeadSettings
 from cotarget.metrics import score
 from cotarget.pipeline import FollowSettings
 from experiments.engine.harness import Experiment, Row, seeds_of
@@ -28,7 +28,7 @@ from experiments.following.field import FieldSettings, calibrated, held, target_
 from experiments.following.field_scenes import hold_config
 from experiments.following.wide_view import record
 
-WAYS = {"with": SteeringSettings(), "without": SteeringSettings(spared=False)}
+WAYS = {"with": HeadSettings(), "without": HeadSettings(deadband=False)}
 FIGURES = ("commands_per_min", "reversals_per_min", "tpo_width_median")
 # With the dead zone over without: at most.
 WANTED = {"commands_per_min": 0.5, "reversals_per_min": 0.5, "tpo_width_median": 1.1}
@@ -54,8 +54,8 @@ def one(calibration: Calibration, settings: DeadZoneSettings, seed: int) -> list
     for name in settings.targets:
         config = hold_config(name, seed)
         view = record(config, target_of(config, name), settings.seconds)
-        for way, steering in WAYS.items():
-            how = FollowSettings.of(config, steering=steering, closed_loop=settings.closed_loop)
+        for way, head_controller in WAYS.items():
+            how = FollowSettings.of(config, head_controller=head_controller, closed_loop=settings.closed_loop)
             found = score(held(calibration, config, name, settings.seconds, how, view))
             rows.append({"seed": seed, "target": name, "way": way} | {key: getattr(found, key) for key in FIGURES})
     return rows

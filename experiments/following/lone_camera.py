@@ -17,8 +17,8 @@ import numpy as np
 from cotarget.calibration import Calibration
 from cotarget.config import TargetConfig
 from cotarget.control.controller import NO_CHANGE
-from cotarget.control.head import Steering
-from cotarget.control.zoom import Expected, ZoomPolicy
+from cotarget.control.head import HeadController
+from cotarget.control.zoom import Expected, ZoomController
 from cotarget.detection import Detection, Detector
 from cotarget.errors import UnreachableError
 from cotarget.geometry import Array
@@ -72,8 +72,8 @@ class LoneCamera:
         self._detector, self._delay_s, self._field = detector, delay_s, list(field)
         self._zoom = calibration.zoom
         self._shortest, longest = (self._zoom.at(f).focal_px[0] for f in rig.zoom.focal_range)
-        self._policy = ZoomPolicy((self._shortest, longest), rig.zoom.size)
-        self._steering = Steering(rig.head.limits)
+        self._policy = ZoomController((self._shortest, longest), rig.zoom.size)
+        self._head_controller = HeadController(rig.head.limits)
         self._course, self._tracker = Course(target, noise_px, lasts_s), Tracker(settings_for(target))
         self._focal = rig.zoom.zoom(rig.zoom.focal_range[0])
         self._next, self._round, self._set_out = 0, self._field, -math.inf
@@ -148,16 +148,16 @@ class LoneCamera:
         course, rig = self._course, self._rig
         now = rig.clock.now()
         effect = now + self._delay_s
-        self._steering.head.saw(rig.head.state())
+        self._head_controller.head.saw(rig.head.state())
         wanted, _ = course.at(effect)
         true_px = self._zoom.at(self._focal).focal_px[0]
         field = rig.zoom.size[0] / true_px
-        command = self._steering.decide(effect, interval, wanted, course.rates, field, effect - course.seen_t)
+        command = self._head_controller.decide(effect, interval, wanted, course.rates, field, effect - course.seen_t)
         if command is not None:
             rig.head.move(command.pan, command.tilt, command.speed)
         exposed = effect + interval
         (pan, tilt), (pan_variance, tilt_variance) = course.at(exposed)
-        (head_pan, _), (head_tilt, _) = self._steering.head.at(exposed)
+        (head_pan, _), (head_tilt, _) = self._head_controller.head.at(exposed)
         scale = math.cos(tilt)
         expected = Expected(
             np.array([(pan - head_pan) * scale, head_tilt - tilt]),

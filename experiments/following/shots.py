@@ -21,7 +21,7 @@ from cotarget.detection import make_detector
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Estimate
 from cotarget.evaluation import observe, true_calibration
-from cotarget.fusion import Pursuit
+from cotarget.fusion import TargetFusion
 from cotarget.geometry import Array
 from cotarget.metrics import Row as Judged
 from cotarget.pipeline import State, Step
@@ -134,7 +134,7 @@ def fire(
             t = shot.exposed_t
             miss = truth.line_of_sight_miss(*truth.head_at(t), truth.nominal_at(t), truth.center(name, t))
             parts = budget(truth, exact, calibration, reach_of(rig), name, shot)
-            found = lookout.see_zoom()
+            found = lookout.update_zoom()
             second = lookout.shoot()
             corrected = None if second is None else observe(lookout.judged(second), truth, name, target)
             lookout.forget()
@@ -161,8 +161,8 @@ class _Lookout:
         self._rig, self._config, self._calibration = rig, config, calibration
         self._detector = make_detector(target, config.rate_hz)
         self._tracker = Tracker(settings_for(target), rig.fixed.size)
-        self._wide = Pursuit(calibration, target, rig.fixed.size)  # which never sees the zoom view
-        self._both: Pursuit | None = None
+        self._wide = TargetFusion(calibration, target, rig.fixed.size)  # which never sees the zoom view
+        self._both: TargetFusion | None = None
         self._policy = FirstCome()
         self._tracks: list[Track] = []
         self._t: float | None = None
@@ -174,29 +174,29 @@ class _Lookout:
         self._t = self.frame.t
         self._tracks = self._tracker.update(self._detector.detect(self.frame), self.frame.t)
         state = self._rig.head.state()
-        for pursuit in self._pursuits():
-            pursuit.see_wide(self.frame, self._tracks, self._detector.mask)
-            pursuit.states.add(state, self._rig.zoom.state())
+        for fusion in self._fusions():
+            fusion.update_fixed(self.frame, self._tracks, self._detector.mask)
+            fusion.states.add(state, self._rig.zoom.state())
         candidates = self._wide.candidates(self._tracks, self._rig.clock.now())
         number = self._policy.select(candidates, np.array([state.pan, state.tilt]), self._rig.head.limits)
         self.track = next((track for track in self._tracks if track.id == number), None)
-        for pursuit in self._pursuits():
-            pursuit.follow(number)
+        for fusion in self._fusions():
+            fusion.follow(number)
 
-    def _pursuits(self) -> Iterator[Pursuit]:
+    def _fusions(self) -> Iterator[TargetFusion]:
         yield self._wide
         if self._both is not None:
             yield self._both
 
     def shoot(self) -> Shot | None:
         """Aim at the track for the first zoom frame that can be exposed then, and wait for it; None if it cannot be."""
-        pursuit = self._wide if self._both is None else self._both
+        fusion = self._wide if self._both is None else self._both
         rate, now = self._config.rate_hz, self._rig.clock.now()
         still = now + self._config.command_delay_s + self._config.sim.zoom.exposure_s / 2
         t = (math.floor(still * rate + ROUNDING) + 1) / rate
         if self.track is None:
             return None
-        at, then = (pursuit.estimate(self.track.id, each) for each in (self.frame.t, t))
+        at, then = (fusion.estimate(self.track.id, each) for each in (self.frame.t, t))
         if at is None or then is None:
             return None
         try:
@@ -220,10 +220,10 @@ class _Lookout:
         moved = then.x_fixed - at.x_fixed
         return Shot(self.frame.t, t, pixel, at.depth, moved, found.nominal_px, pan, tilt, nominal)
 
-    def see_zoom(self) -> bool:
+    def update_zoom(self) -> bool:
         """Look for the target in the shot's zoom frame, for the next shot; whether it was found."""
         assert self._both is not None, "a shot was taken"
-        return self._both.see_zoom(self._zoom, self.frame.t) is not None
+        return self._both.update_zoom(self._zoom, self.frame.t) is not None
 
     def forget(self) -> None:
         """Forget what the zoom view has shown."""

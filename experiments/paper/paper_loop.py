@@ -13,7 +13,7 @@ from cotarget.config import TargetConfig
 from cotarget.control.controller import reach_of
 from cotarget.detection import Detector
 from cotarget.errors import UnreachableError
-from cotarget.pipeline import Eyes, FollowSettings, State, Step, follow
+from cotarget.pipeline import FollowSettings, FrameSource, State, Step, follow
 from cotarget.rig import Rig
 from cotarget.targeting import Aim, Closeup, Method, aim, depth_of, point_at
 from cotarget.tracking.track import Track, settings_for
@@ -37,17 +37,17 @@ def follow_as_the_paper(
     Of the settings only the delay of commands counts, by which the head's standing is told from its not having begun.
     """
     calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
-    eyes, tracker = Eyes(rig.fixed, rig.zoom, rig.clock), Tracker(settings_for(target), rig.fixed.size)
+    eyes, tracker = FrameSource(rig.fixed, rig.zoom, rig.clock), Tracker(settings_for(target), rig.fixed.size)
     head = rig.head.state()
     commanded = (head.pan, head.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
     mine: Track | None = None
     index, sent, begun = 0, 0, rig.clock.now()  # when what was commanded last has begun [s]
     end = begun + seconds
     while rig.clock.now() < end:
-        frame = eyes.look_wide()
+        frame = eyes.read_fixed()
         detections = detector.detect(frame)
         tracks = tracker.update(detections, frame.t)
-        zoom = eyes.look_close()
+        zoom = eyes.read_zoom()
         mine = _first(tracks, mine)
         head, lens, now, found = rig.head.state(), rig.zoom.state(), rig.clock.now(), None
         if mine is not None and not mine.missed and now >= begun and not head.moving and not lens.moving:

@@ -9,7 +9,7 @@ from cotarget.board import board_points
 from cotarget.calibration import Options, calibrate_views, predicted_pointing
 from cotarget.calibration.bundle import ALL_BLOCKS, difference, fit, parameter_names
 from cotarget.calibration.initialization import place_boards
-from cotarget.calibration.uncertainty import covariance_of, model_of, with_considered
+from cotarget.calibration.uncertainty import covariance_of, model_of, with_consider_covariance
 from cotarget.config import BoardConfig
 from experiments.calibration.synthetic.aims import draw_targets, misses
 from experiments.calibration.synthetic.rig import SIZES, Truth
@@ -45,7 +45,7 @@ def found(calibration):
 
 @pytest.mark.parametrize("name", ["pan_scale", "tilt_scale"])
 def test_what_a_held_scale_does_is_what_fits_say_that_hold_it_elsewhere(found, name):
-    covariance = with_considered(covariance_of(found), found, POINTS, ["scale"])
+    covariance = with_consider_covariance(covariance_of(found), found, POINTS, ["scale"])
     i = covariance.parameters.index(f"head.{name}")
     own = len(parameter_names(ALL_BLOCKS))
     by_held = covariance.matrix[:own, i] / covariance.matrix[i, i]
@@ -58,12 +58,12 @@ def test_what_a_held_scale_does_is_what_fits_say_that_hold_it_elsewhere(found, n
 
 def test_nothing_grows_smaller_and_what_is_free_is_not_considered(found):
     covariance = covariance_of(found)
-    grown = with_considered(covariance, found, POINTS, ["scale"])
+    grown = with_consider_covariance(covariance, found, POINTS, ["scale"])
     own = len(covariance.parameters)
     added = grown.matrix[:own, :own] - covariance.matrix
     assert grown.parameters[:own] == covariance.parameters
     assert np.linalg.eigvalsh(added)[0] > -1e-9 * np.linalg.eigvalsh(added)[-1]
-    assert with_considered(covariance, found, POINTS, []) is covariance
+    assert with_consider_covariance(covariance, found, POINTS, []) is covariance
 
 
 def test_scales_that_are_off_are_doubted_by_as_much(calibration):

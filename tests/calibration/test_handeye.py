@@ -315,7 +315,7 @@ def test_what_is_free_is_said_and_stays_uncertain(case, from_poses):
     with pytest.raises(CalibrationError) as refused:
         solve(*given)
     assert str(refused.value) == f"hand-eye: {text}"
-    found = solve(*given, insist=True)
+    found = solve(*given, regularize=True)
     assert not found.verdict.determined
     assert found.verdict.text == text
     assert found.verdict.directions.shape == (len(free), 6)
@@ -335,7 +335,7 @@ def test_what_is_free_is_said_and_stays_uncertain(case, from_poses):
 
 def test_what_is_free_is_as_small_as_can_be():
     hands = head([(-15, 0), (-5, 0), (0, 0), (10, 0)])
-    found = solve_hand_eye_from_poses(hands, boards_seen(hands), insist=True).X
+    found = solve_hand_eye_from_poses(hands, boards_seen(hands), regularize=True).X
     assert abs(found.translation[1]) < EXACT  # along the pan axis
     # Of all rotations about the pan axis in front of the true one, the smallest.
     angles = np.linspace(-np.pi, np.pi, 3601)
@@ -371,7 +371,7 @@ def test_contradictions_are_refused_here_too():
     with pytest.raises(CalibrationError, match="determinant -1"):
         solve_hand_eye(A, [b.inv() for b in B])
     with pytest.raises(CalibrationError, match="units"):
-        solve_hand_eye(A, [RigidTransform.identity()] * len(A), insist=True)
+        solve_hand_eye(A, [RigidTransform.identity()] * len(A), regularize=True)
     with pytest.raises(CalibrationError, match="1 and 1 motions"):
         solve_hand_eye(A[:1], B[:1])
     with pytest.raises(CalibrationError, match="three views"):

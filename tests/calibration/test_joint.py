@@ -200,7 +200,7 @@ def test_pan_alone_is_refused_or_owned_up_to(views, calibration):
     only_pan = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=10, tilt_range=0.0)
     with pytest.raises(CalibrationError, match=r"only pan moved: .* along the pan axis and .* about it .* tilt"):
         calibrated(only_pan)
-    found = calibrated(only_pan, insist=True)
+    found = calibrated(only_pan, regularize=True)
     assert largest_pull(found, Truth()) < PULL
     sigma = found.covariance.sigma
     assert sigma("T_head_zoom.ty") > USELESS_POSITION  # along the pan axis
@@ -209,7 +209,7 @@ def test_pan_alone_is_refused_or_owned_up_to(views, calibration):
     measured, predicted = pointing(found, Truth())
     assert measured < POINTING_FACTOR * predicted
     # Where the motions leave nothing open, insisting changes nothing.
-    assert apart(calibration, calibrated(views, insist=True)) < LOOSE_SIGMAS
+    assert apart(calibration, calibrated(views, regularize=True)) < LOOSE_SIGMAS
 
 
 CUT_SHARE = 0.6  # of the views

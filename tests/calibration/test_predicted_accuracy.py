@@ -9,7 +9,7 @@ from cotarget.board import board_points
 from cotarget.calibration import Calibration, Options, calibrate_views, predicted_pointing
 from cotarget.calibration.bundle import ALL_BLOCKS, fit
 from cotarget.calibration.initialization import place_boards
-from cotarget.calibration.planning import BORDER, DEPTHS_SQUARES, OUTLOOK_GRID, outlook_of, planned_views
+from cotarget.calibration.planning import ACCURACY_GRID, BORDER, DEPTHS_SQUARES, planned_views, predict_accuracy
 from cotarget.calibration.uncertainty import covariance_of, model_of
 from cotarget.config import BoardConfig
 from experiments.calibration.synthetic.rig import SIZE, SIZES, Truth
@@ -42,73 +42,73 @@ def found(views, start):
 
 
 @pytest.fixture(scope="module")
-def outlook(found):
-    return outlook_of(found, BOARD.square)
+def predicted(found):
+    return predict_accuracy(found, BOARD.square)
 
 
 def fitted(start, views):
     return fit(place_boards(start, views, POINTS), views, POINTS, ALL_BLOCKS)
 
 
-def test_its_error_is_that_of_the_calibration(found, outlook):
+def test_its_error_is_that_of_the_calibration(found, predicted):
     model = found.model
     calibration = Calibration(
         model.fixed, model.zoom, model.gamma, model.hand, model.head, covariance=covariance_of(found)
     )
-    across, down = (np.linspace(BORDER, 1 - BORDER, count) for count in OUTLOOK_GRID)
+    across, down = (np.linspace(BORDER, 1 - BORDER, count) for count in ACCURACY_GRID)
     pixels = np.array([(u, v) for u in across for v in down]) * (np.array(SIZE) - 1)
     errors = [predicted_pointing(calibration, pixels, depth * BOARD.square) for depth in DEPTHS_SQUARES]
-    assert outlook.error() == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=ROUNDING)
+    assert predicted.error() == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=ROUNDING)
 
 
-def test_as_much_again_reduces_it_by_the_root_of_two(found, outlook, views):
-    again = outlook.worth(views, dict(found.model.boards), POINTS)
+def test_as_much_again_reduces_it_by_the_root_of_two(found, predicted, views):
+    again = predicted.worth(views, dict(found.model.boards), POINTS)
     for times in (1, 3, 8):
-        assert outlook.error(times * again) == pytest.approx(outlook.error() / np.sqrt(1 + times), rel=ROUNDING)
-    assert outlook.with_views(views, dict(found.model.boards), POINTS).error() == outlook.error(again)
+        assert predicted.error(times * again) == pytest.approx(predicted.error() / np.sqrt(1 + times), rel=ROUNDING)
+    assert predicted.with_views(views, dict(found.model.boards), POINTS).error() == predicted.error(again)
 
 
 # Corners of 16 placements tell their noise to 1 %, and where the fit ends up moves the prediction by a few more.
 REAL_TOLERANCE = 0.1
 
 
-def test_what_was_promised_is_kept(start, found, outlook):
+def test_what_was_promised_is_kept(start, found, predicted):
     """Really taken twice, with other noise; and one placement more, really taken."""
     exact, rng = drawn(0, noise_px=0.0), np.random.default_rng(1)
     more = [
         replace(v, corners_px=v.corners_px + rng.normal(0, NOISE_PX, v.corners_px.shape), board=v.board + BOARDS)
         for v in exact
     ]
-    twice = outlook_of(fitted(start, [*found.views, *more]), BOARD.square)
-    assert twice.error() == pytest.approx(outlook.error() / np.sqrt(2), rel=REAL_TOLERANCE)
+    twice = predict_accuracy(fitted(start, [*found.views, *more]), BOARD.square)
+    assert twice.error() == pytest.approx(predicted.error() / np.sqrt(2), rel=REAL_TOLERANCE)
     number = BOARDS - 1
-    fewer = outlook_of(fitted(start, [v for v in found.views if v.board != number]), BOARD.square)
+    fewer = predict_accuracy(fitted(start, [v for v in found.views if v.board != number]), BOARD.square)
     turns = [(v.pan, v.tilt) for v in found.views if v.board == number and v.camera == "zoom"]
     planned = planned_views(number, turns, len(POINTS))
     promised = fewer.error(fewer.worth(planned, {number: found.model.boards[number]}, POINTS))
-    assert promised == pytest.approx(outlook.error(), rel=REAL_TOLERANCE)
+    assert promised == pytest.approx(predicted.error(), rel=REAL_TOLERANCE)
 
 
-def test_every_placement_helps_and_more_where_the_head_looks(found, outlook, views):
+def test_every_placement_helps_and_more_where_the_head_looks(found, predicted, views):
     for number, T in found.model.boards.items():
         mine = [v for v in views if v.board == number]
         turns = [(v.pan, v.tilt) for v in mine if v.camera == "zoom"]
         errors = [
-            outlook.error(outlook.worth(planned_views(number, turns[:count], len(POINTS)), {number: T}, POINTS))
+            predicted.error(predicted.worth(planned_views(number, turns[:count], len(POINTS)), {number: T}, POINTS))
             for count in range(len(turns) + 1)
         ]
-        assert all(b < a for a, b in zip([outlook.error(), *errors], errors, strict=False))
+        assert all(b < a for a, b in zip([predicted.error(), *errors], errors, strict=False))
         # What is planned is worth what is then taken, wherever the corners are.
-        taken = outlook.worth(mine, {number: T}, POINTS)
-        assert np.allclose(outlook.worth(planned_views(number, turns, len(POINTS)), {number: T}, POINTS), taken)
+        taken = predicted.worth(mine, {number: T}, POINTS)
+        assert np.allclose(predicted.worth(planned_views(number, turns, len(POINTS)), {number: T}, POINTS), taken)
 
 
 HOPELESS = np.radians(10.0)
 
 
-def test_what_is_open_has_no_good_outlook(start, outlook):
-    assert replace(outlook, normal=np.zeros_like(outlook.normal)).error() == np.inf
+def test_what_is_open_has_no_good_outlook(start, predicted):
+    assert replace(predicted, normal=np.zeros_like(predicted.normal)).error() == np.inf
     only_pan = synthetic_views(Truth(), POINTS, np.random.default_rng(0), boards=BOARDS, tilt_range=0.0)
-    assert outlook_of(fitted(start, only_pan), BOARD.square).error() > HOPELESS
+    assert predict_accuracy(fitted(start, only_pan), BOARD.square).error() > HOPELESS
     nothing_left = fitted(start, drawn(0, boards=3))
-    assert outlook_of(replace(nothing_left, variance=None), BOARD.square) is None
+    assert predict_accuracy(replace(nothing_left, variance=None), BOARD.square) is None

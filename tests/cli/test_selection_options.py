@@ -12,7 +12,7 @@ from cotarget.calibration import save_calibration
 from cotarget.cli.common import POLICIES, Choice, add_choice
 from cotarget.config import RigConfig
 from cotarget.control import selection
-from cotarget.control.selection import Candidate, Whom
+from cotarget.control.selection import Candidate, TargetChoice
 from cotarget.errors import ConfigError
 from cotarget.evaluation import true_calibration
 from cotarget.rig import PanTiltLimits
@@ -76,12 +76,12 @@ def test_what_a_recording_says_is_not_called_an_option():
     add_choice(parser)
     plain = parser.parse_args([])
     with pytest.raises(ConfigError, match=r"^the recorded click: \(640, 3\) is not in the wide view's 640x480 image"):
-        Choice(plain, SIZE, Whom(click=(640.0, 3.0)))
-    for whom, said in (
-        (Whom(click=(3.0, 4.0)), "the recorded click: no track came near (3, 4)"),
-        (Whom(track=9), "the recorded track: there was no track 9"),
+        Choice(plain, SIZE, TargetChoice(click=(640.0, 3.0)))
+    for target_choice, said in (
+        (TargetChoice(click=(3.0, 4.0)), "the recorded click: no track came near (3, 4)"),
+        (TargetChoice(track=9), "the recorded track: there was no track 9"),
     ):
-        choice = Choice(plain, SIZE, whom)
+        choice = Choice(plain, SIZE, target_choice)
         choice.see(SimpleNamespace(target=None, tracks=[track(2, (1, 1))]))
         assert choice.unmet == f"{said}; the tracks were: 2"
 

@@ -10,8 +10,8 @@ import pytest
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.control.controller import Servo, ServoSettings, reach_of
-from cotarget.control.head import SteeringSettings
+from cotarget.control.controller import Controller, ControllerSettings, reach_of
+from cotarget.control.head import HeadSettings
 from cotarget.control.zoom import ZoomSettings
 from cotarget.errors import UnreachableError
 from cotarget.estimation import Appearance
@@ -113,13 +113,13 @@ def still(x, **known):
     return lambda t: Known(np.array([x, -1.0, 10.0]), t, **known)
 
 
-def servo(rig, **settings):
-    return Servo(rig, CALIBRATION, ServoSettings(command_delay_s=DELAY, **settings))
+def controller(rig, **settings):
+    return Controller(rig, CALIBRATION, ControllerSettings(command_delay_s=DELAY, **settings))
 
 
 def test_the_lens_starts_at_its_shortest_and_the_head_where_it_is():
     rig = Rig()
-    assert servo(rig).commanded == (0.0, 0.0, SHORTEST)
+    assert controller(rig).commanded == (0.0, 0.0, SHORTEST)
     assert (rig.moves, rig.zooms) == ([], [SHORTEST])
 
 
@@ -128,7 +128,7 @@ def test_whatever_is_sent_is_counted():
     rig = Rig(t=2.0)
     move, goal = rig.head.move, (0.05, 0.1)
     rig.head.move = lambda *command: move(*command) and goal
-    driver = servo(rig, steering=SteeringSettings(spared=False))
+    driver = controller(rig, head_controller=HeadSettings(deadband=False))
     for i in range(20):
         driver.drive(still(0.5 + 1e-4 * (i % 2)), rig.t, FRAME)
         assert driver.commanded[:2] == goal
@@ -141,7 +141,7 @@ def test_whatever_is_sent_is_counted():
 
 def test_the_aim_is_at_where_the_target_will_be_when_the_command_takes_effect():
     rig = Rig(t=2.0)
-    found = servo(rig).drive(moving(2.0), 1.9, FRAME).aim
+    found = controller(rig).drive(moving(2.0), 1.9, FRAME).aim
     assert found.pan == pytest.approx(math.atan(4.2 / 10))
     assert found.tilt == pytest.approx(math.atan(1 / math.hypot(4.2, 10)))  # up
     # The head was at rest in the middle: it is sent farther than there, as the target goes on.
@@ -150,17 +150,17 @@ def test_the_aim_is_at_where_the_target_will_be_when_the_command_takes_effect():
 
 def test_without_prediction_the_aim_is_at_where_it_was_seen():
     rig = Rig(t=2.0)
-    found = servo(rig, predict=False).drive(moving(1.0), 1.9, FRAME).aim
+    found = controller(rig, predict=False).drive(moving(1.0), 1.9, FRAME).aim
     assert found.pan == pytest.approx(math.atan(1.9 / 10))
     assert rig.moves == [(found.pan, found.tilt, None)]  # at full speed, for it is taken to stand there
 
 
 def test_the_bias_of_the_head_is_taken_off_within_its_limits():
-    found = servo(Rig()).drive(still(2.0, bias=(0.01, -0.02)), 0.0, FRAME).aim
+    found = controller(Rig()).drive(still(2.0, bias=(0.01, -0.02)), 0.0, FRAME).aim
     assert found.pan == pytest.approx(math.atan(0.2) - 0.01)
     assert found.tilt == pytest.approx(math.atan(1 / math.hypot(2, 10)) + 0.02)
     edge = 10 * math.tan(0.999)
-    assert servo(Rig()).drive(still(edge, bias=(-0.01, 0.0)), 0.0, FRAME).aim.pan == LIMITS.pan[1]
+    assert controller(Rig()).drive(still(edge, bias=(-0.01, 0.0)), 0.0, FRAME).aim.pan == LIMITS.pan[1]
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_the_bias_of_the_head_is_taken_off_within_its_limits():
 )
 def test_what_cannot_be_aimed_at_moves_nothing(predict, why):
     rig = Rig()
-    driver = servo(rig)
+    driver = controller(rig)
     with pytest.raises(UnreachableError, match=why):
         driver.drive(predict, 0.0, FRAME)
     assert (rig.moves, rig.zooms) == ([], [SHORTEST])
@@ -178,7 +178,7 @@ def test_what_cannot_be_aimed_at_moves_nothing(predict, why):
 def test_a_target_that_stands_gets_one_command_of_head_and_lens():
     """Once the head is there, and the lens is told its own number for the true focal length of Eq. 17."""
     rig = Rig()
-    driver = servo(rig)
+    driver = controller(rig)
     for i in range(50):
         rig.t = i * FRAME
         drive = driver.drive(still(0.5), rig.t, FRAME)
@@ -194,7 +194,7 @@ def test_a_target_that_stands_gets_one_command_of_head_and_lens():
 def test_the_less_is_known_the_wider_the_lens_stays():
     """A direction known to 0.05 rad: by the table of the normal distribution, 95 % of both axes is 2.24 sigma each."""
     rig = Rig(moves=[(0.0, math.atan(0.1), None)])  # it looks there already
-    drive = servo(rig).drive(still(0.0, sigma=0.05), 0.0, FRAME)
+    drive = controller(rig).drive(still(0.0, sigma=0.05), 0.0, FRAME)
     assert drive.zoom_reason == "unsure"
     assert drive.chance == pytest.approx(ZoomSettings().sure, abs=0.01)
     # Of the height alone, the narrower axis, 95 % are within 1.96 sigma; half the book comes on top.
@@ -204,7 +204,7 @@ def test_the_less_is_known_the_wider_the_lens_stays():
 
 def test_zooming_out_leaves_the_head_alone_and_is_told_once():
     rig = Rig()
-    driver = servo(rig)
+    driver = controller(rig)
     driver.drive(still(0.5), 0.0, FRAME)
     moves, zooms = len(rig.moves), len(rig.zooms)
     for _ in range(3):
@@ -222,7 +222,7 @@ def test_zooming_out_leaves_the_head_alone_and_is_told_once():
 def test_a_head_that_was_halted_on_its_way_is_sent_again():
     """As a watchdog does after a gap in the frames; whoever took it to have arrived would leave it where it stands."""
     rig = Rig()
-    driver = servo(rig)
+    driver = controller(rig)
     driver.drive(still(5.0), rig.t, FRAME)
     rig.t = 0.3
     halted = [axis.halt(rig.t) for axis in rig.axes]
@@ -236,7 +236,7 @@ def test_a_head_that_was_halted_on_its_way_is_sent_again():
 
 def test_a_lost_target_is_looked_for_with_the_shortest_focal_length():
     rig = Rig()
-    driver = servo(rig)
+    driver = controller(rig)
     driver.drive(still(0.5), 0.0, FRAME)
     assert rig.zooms[-1] > SHORTEST
     rig.t = 1.0
@@ -250,11 +250,11 @@ def test_a_lost_target_of_which_too_little_is_known_is_waited_for():
     """Half the height of the widest close-up is 240 px of 770: 0.31 rad."""
     for sigma, goes in ((0.30, True), (0.32, False)):
         rig = Rig()
-        assert (servo(rig).search(still(2.0, sigma=sigma), 0.0, FRAME) is not None) == goes
+        assert (controller(rig).search(still(2.0, sigma=sigma), 0.0, FRAME) is not None) == goes
         assert len(rig.moves) == goes
     rig = Rig()
     with pytest.raises(UnreachableError):
-        servo(rig).search(still(30.0), 0.0, FRAME)
+        controller(rig).search(still(30.0), 0.0, FRAME)
     assert not rig.moves
 
 
@@ -266,7 +266,7 @@ def test_the_lens_has_a_delay_of_its_own():
             asked.append(t)
             return Known(np.array([0.5, -1.0, 10.0]), t)
 
-        servo(rig, lens_delay_s=delay).drive(predict, 1.9, FRAME)
+        controller(rig, lens_delay_s=delay).drive(predict, 1.9, FRAME)
         assert asked == pytest.approx([2.0 + DELAY, 2.0 + DELAY + FRAME, 2.0 + exposed + FRAME])
 
 
@@ -275,20 +275,20 @@ def test_a_narrow_target_may_be_larger():
     focals = []
     for shape in (1.0, 2.5):
         rig = Rig(moves=[(0.0, math.atan(0.1), None)])
-        servo(rig).drive(still(0.0, sigma=0.02), 0.0, FRAME, shape=shape)  # of a book its width is told
+        controller(rig).drive(still(0.0, sigma=0.02), 0.0, FRAME, shape=shape)  # of a book its width is told
         focals.append(rig.zooms[-1])
     assert focals[1] > CLEARLY * focals[0]
 
 
 def test_what_can_be_reached():
-    driver = servo(Rig())
+    driver = controller(Rig())
     assert driver.can_reach(still(10 * math.tan(0.99))(0.0))
     assert not driver.can_reach(still(10 * math.tan(1.01))(0.0))
 
 
 def test_every_frame_has_its_command_without_a_dead_zone():
     rig = Rig()
-    driver = servo(rig, steering=SteeringSettings(spared=False))
+    driver = controller(rig, head_controller=HeadSettings(deadband=False))
     for i in range(10):
         rig.t = i * FRAME
         driver.drive(moving(1.0), rig.t, FRAME)

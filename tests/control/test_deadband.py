@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from cotarget.control.controller import doubts_of
-from cotarget.control.head import Steering, SteeringSettings
-from cotarget.estimation import SpatialFilter
+from cotarget.control.controller import goal_sigmas_of
+from cotarget.control.head import HeadController, HeadSettings
+from cotarget.estimation import TargetFilter
 from cotarget.rig import PanTiltLimits, PanTiltState
 from cotarget.sim.motion import Axis
 from cotarget.targeting import Reach, aim
@@ -20,7 +20,7 @@ LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.radians(149), math.radians
 LATENCY, DELAY = 0.12, 0.08  # from light to frame, and from command to motion [s]
 SECONDS = 8.0
 EXPOSURE = 0.01  # [s]
-AHEAD = SteeringSettings().ahead_s
+AHEAD = HeadSettings().ahead_s
 FRAME = 1 / RATE
 NOMINAL = {"book": 160 * 10 / 0.234, "person": 300 * 10 / 1.75}  # for the size wanted at 10 m
 
@@ -62,9 +62,9 @@ def follow(name, seed, settings):
 
     Without settings the head goes at full speed to where the target will be, with every frame.
     """
-    steering = None if settings is None else Steering(LIMITS, settings)
+    head_controller = None if settings is None else HeadController(LIMITS, settings)
     flight, head = Flight(name, seed, SECONDS), Head()
-    estimator = SpatialFilter(flight.calibration, flight.target)
+    estimator = TargetFilter(flight.calibration, flight.target)
     for axis, q in zip(head.axes, flight.aimed(0.0), strict=True):
         axis.command(-10.0, q)
     waiting, misses, smears = [], [], []
@@ -74,7 +74,7 @@ def follow(name, seed, settings):
         while waiting and waiting[0][0] <= t:
             _, seen_t, seen, view = waiting.pop(0)
             if seen is not None:
-                estimator.see_wide(seen, seen_t)
+                estimator.update_fixed(seen, seen_t)
             if view is not None:
                 show(estimator, view)
         effect = t + DELAY
@@ -85,15 +85,15 @@ def follow(name, seed, settings):
         aims = [aim(flight.calibration, e.x_fixed, reach, nominal_px=NOMINAL[name]) for e in estimates]
         (wanted, after) = ((a.pan - e.bias[0], a.tilt - e.bias[1]) for a, e in zip(aims, estimates, strict=True))
         rates = tuple((b - a) * RATE for a, b in zip(wanted, after, strict=True))
-        if steering is None:
+        if head_controller is None:
             # The unit brakes to rest at its goal, which therefore lies its stopping distance ahead.
             goals = [q + r * abs(r) / (2 * LIMITS.acceleration) for q, r in zip(after, rates, strict=True)]
             head.move(t, *goals, None)
         else:
-            steering.head.saw(PanTiltState(*head.at(t), True, t))
+            head_controller.head.saw(PanTiltState(*head.at(t), True, t))
             late, ahead = effect - estimates[0].measured_t, estimator.at(effect + AHEAD)
-            doubts = doubts_of(ahead, aims[0]) if ahead.carried else (0.0, 0.0)
-            command = steering.decide(effect, 1 / RATE, wanted, rates, field_angle, late, doubts)
+            doubts = goal_sigmas_of(ahead, aims[0]) if ahead.carried else (0.0, 0.0)
+            command = head_controller.decide(effect, 1 / RATE, wanted, rates, field_angle, late, doubts)
             if command is not None:
                 head.move(t, command.pan, command.tilt, command.speed)
         if t > 1.5:
@@ -125,7 +125,7 @@ def over_seeds(name, settings):
 SAME_OFFSET = 1.1
 HALF = 0.5
 COMMANDS = {"book": 0.6, "person": HALF}
-EVERY_FRAME = SteeringSettings(spared=False)
+EVERY_FRAME = HeadSettings(deadband=False)
 # At the target's own speed the picture smears by less than this part of what it does at full speed; measured 0.5.
 LESS_SMEAR = 0.7
 
@@ -133,7 +133,7 @@ LESS_SMEAR = 0.7
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["book", "person"])
 def test_half_the_commands_and_reversals_at_the_same_offset(name):
-    commands, reversals, offset, _ = over_seeds(name, SteeringSettings())
+    commands, reversals, offset, _ = over_seeds(name, HeadSettings())
     before = over_seeds(name, EVERY_FRAME)
     assert commands <= COMMANDS[name] * before[0]
     assert reversals <= HALF * before[1]
@@ -150,53 +150,53 @@ def test_at_the_speed_of_the_target_the_picture_smears_less():
 
 
 WIDTH = 0.1  # of the image [rad]; the zone is a step of the head, 0.9 mrad
-ZONE = max(SteeringSettings().zone * WIDTH, STEP)
+ZONE = max(HeadSettings().zone * WIDTH, STEP)
 
 
 def standing(limits=LIMITS, pan=0.0):
     """A head that stands, and nobody has commanded."""
-    steering = Steering(limits)
-    steering.head.saw(PanTiltState(pan, 0.0, False, -FRAME))
-    return steering
+    head_controller = HeadController(limits)
+    head_controller.head.saw(PanTiltState(pan, 0.0, False, -FRAME))
+    return head_controller
 
 
-def decide(steering, t, wanted, rate=0.0):
-    return steering.decide(t, FRAME, (wanted, 0.0), (rate, 0.0), WIDTH)
+def decide(head_controller, t, wanted, rate=0.0):
+    return head_controller.decide(t, FRAME, (wanted, 0.0), (rate, 0.0), WIDTH)
 
 
 def test_a_target_that_stands_is_centred_once_and_left_alone():
-    steering = standing()
-    first = decide(steering, 0.0, 0.05)
+    head_controller = standing()
+    first = decide(head_controller, 0.0, 0.05)
     assert (first.pan, first.tilt, first.speed) == (0.05, 0.0, None)
     # On its way, and there: the same place, give or take what is less than the zone, needs no further command ...
-    assert all(decide(steering, i * FRAME, 0.05 + 0.9 * ZONE * (-1) ** i) is None for i in range(1, 25))
+    assert all(decide(head_controller, i * FRAME, 0.05 + 0.9 * ZONE * (-1) ** i) is None for i in range(1, 25))
     # ... until it has rested for a second: then it is centred, slowly, if it is off by more than rounding leaves, seen
     # from the step at which it really stands, a third of one beside its goal.
     at = round(0.05 / STEP) * STEP
     assert 0.05 + 0.25 * STEP < at < 0.05 + 0.35 * STEP
-    assert decide(steering, 1.04, at + 0.55 * STEP) is None
-    assert decide(steering, 1.04, at - 0.55 * STEP) is None
-    centred = decide(steering, 1.08, at - 0.65 * STEP)
+    assert decide(head_controller, 1.04, at + 0.55 * STEP) is None
+    assert decide(head_controller, 1.04, at - 0.55 * STEP) is None
+    centred = decide(head_controller, 1.08, at - 0.65 * STEP)
     assert centred.pan == at - 0.65 * STEP
-    assert centred.speed[0] == pytest.approx((0.05 - centred.pan) / SteeringSettings().catch_s)
-    assert decide(steering, 1.12, 0.05) is None
+    assert centred.speed[0] == pytest.approx((0.05 - centred.pan) / HeadSettings().catch_s)
+    assert decide(head_controller, 1.12, 0.05) is None
     # Out of the zone it is gone after at once.
-    assert decide(steering, 1.2, 0.05 + 2 * ZONE).pan == 0.05 + 2 * ZONE
+    assert decide(head_controller, 1.2, 0.05 + 2 * ZONE).pan == 0.05 + 2 * ZONE
 
 
 def test_a_moving_target_is_followed_at_its_own_speed():
     """Once it keeps up, the unit told so is left alone for as long as its goal is ahead."""
-    steering = standing()
+    head_controller = standing()
     rate, commands = 0.3, []
     for i in range(100):
         t = i * FRAME
-        command = decide(steering, t, 0.5 + rate * t, rate)
+        command = decide(head_controller, t, 0.5 + rate * t, rate)
         commands += [] if command is None else [(t, command)]
         if t > 1.0:
-            at = steering.head.at(t)[0][0]
+            at = head_controller.head.at(t)[0][0]
             assert abs(at - 0.5 - rate * t) < 2 * ZONE
     late = [(t, command) for t, command in commands if t > 1.0]
-    ahead_s = SteeringSettings().ahead_s
+    ahead_s = HeadSettings().ahead_s
     assert len(late) < 0.25 * 75  # of 75 frames: a new goal each 0.2 s at most, and what the first ones left over
     for t, command in late:
         assert command.speed[0] == pytest.approx(rate, rel=0.1)
@@ -207,37 +207,39 @@ def test_a_moving_target_is_followed_at_its_own_speed():
 
 def test_each_axis_has_its_targets_speed():
     """A target that goes aslant is followed aslant, and not along one axis and then the other."""
-    steering, rates = standing(), (0.3, -0.1)
+    head_controller, rates = standing(), (0.3, -0.1)
     for i in range(60):
         t = i * FRAME
         wanted = 0.5 + rates[0] * t, 0.1 + rates[1] * t
-        steering.decide(t, FRAME, wanted, rates, WIDTH)
+        head_controller.decide(t, FRAME, wanted, rates, WIDTH)
     for later in (0.25, 0.5, 0.75):
-        assert [speed for _, speed in steering.head.at(t + later * FRAME)] == pytest.approx(rates, abs=0.03)
+        assert [speed for _, speed in head_controller.head.at(t + later * FRAME)] == pytest.approx(rates, abs=0.03)
 
 
 def test_an_axis_that_stands_is_left_alone_while_the_other_turns():
     """Whoever walks by at one height does not have the head nod with the noise of the estimate."""
-    steering, rng = standing(), np.random.default_rng(0)
+    head_controller, rng = standing(), np.random.default_rng(0)
     tilts = []
     for i in range(100):
         t = i * FRAME
         off, rate = 0.3 * ZONE * rng.uniform(-1, 1, 2)
-        command = steering.decide(t, FRAME, (0.5 + 0.3 * t, 0.1 + off), (0.3, rate / FRAME / 2), WIDTH)
+        command = head_controller.decide(t, FRAME, (0.5 + 0.3 * t, 0.1 + off), (0.3, rate / FRAME / 2), WIDTH)
         if command is not None and t > 1.0:
             tilts.append(command.tilt)
     assert len(tilts) > 5
     assert len(set(tilts)) == 1
     # It is sent on when it is not near any more.
-    assert steering.decide(4.0, FRAME, (0.5 + 0.3 * 4.0, 0.1 + 2 * ZONE), (0.3, 0.0), WIDTH).tilt > tilts[-1]
+    assert head_controller.decide(4.0, FRAME, (0.5 + 0.3 * 4.0, 0.1 + 2 * ZONE), (0.3, 0.0), WIDTH).tilt > tilts[-1]
 
 
 @pytest.mark.parametrize(("doubt", "turns_back"), [(0.0, True), (0.1, False), (0.01, True)])
 def test_what_is_carried_does_not_have_the_head_turn_back_for_less_than_is_doubted(doubt, turns_back):
     """Half a standard deviation is less than what is doubted: of 0.1 rad it is more than the goal goes back by."""
-    steering = standing()
+    head_controller = standing()
     tilts = [
-        steering.decide(i * FRAME, FRAME, (0.5 + 0.3 * i * FRAME, tilt), (0.3, 0.1), WIDTH, 0.0, (doubt, doubt)).tilt
+        head_controller.decide(
+            i * FRAME, FRAME, (0.5 + 0.3 * i * FRAME, tilt), (0.3, 0.1), WIDTH, 0.0, (doubt, doubt)
+        ).tilt
         for i, tilt in enumerate((0.1, 0.12, 0.09))
     ]
     assert tilts[1] > tilts[0]
@@ -253,7 +255,7 @@ def test_a_goal_is_within_the_limits():
 def test_a_head_that_jumps_is_sent_to_the_middle_of_the_way():
     """The textbook's unit, without limits of speed and acceleration."""
     limits = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), math.inf, math.inf, 0.0)
-    steering = standing(limits)
-    command = decide(steering, 0.0, 0.5, 0.4)
+    head_controller = standing(limits)
+    command = decide(head_controller, 0.0, 0.5, 0.4)
     assert (command.pan, command.speed) == (0.5 + 0.4 * FRAME / 2, None)
-    assert steering.head.at(0.0)[0] == (command.pan, 0.0)
+    assert head_controller.head.at(0.0)[0] == (command.pan, 0.0)

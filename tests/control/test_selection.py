@@ -16,7 +16,7 @@ from cotarget.control.selection import (
     Candidate,
     Chosen,
     FirstCome,
-    Outlook,
+    SelectionState,
     leaves_in,
     plan,
     travel_s,
@@ -199,7 +199,7 @@ def test_the_plan_is_the_best_of_all_orders():
             candidate(i, rng.uniform(-1.5, 1.5), rate=rng.uniform(-0.1, 0.1), leaves=rng.uniform(2, 9))
             for i in range(5)
         ]
-        found = plan(Outlook(five, None, (0.0, 0.0), LIMITS, LOOK_S))
+        found = plan(SelectionState(five, None, (0.0, 0.0), LIMITS, LOOK_S))
         best = served_by_best_order(five, STILL)
         assert abs(found.served - best) <= 1  # the way to a moving target is only nearly right
         sharp += found.served == best
@@ -220,7 +220,7 @@ def test_a_plan_of_many_takes_a_part_of_a_frame(monkeypatch):
 
 def test_a_plan_with_nobody_to_be_had_takes_who_is_done_first():
     lost = [candidate(1, 0.5, leaves=0.1), candidate(2, -0.2, leaves=0.2)]
-    found = plan(Outlook(lost, None, (0.0, 0.0), LIMITS, LOOK_S))
+    found = plan(SelectionState(lost, None, (0.0, 0.0), LIMITS, LOOK_S))
     assert (found.served, found.first) == (0, 2)
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from cotarget import metrics
 from cotarget.control import zoom
-from cotarget.control.zoom import Expected, ZoomPolicy, ZoomSettings, chance_inside, expect, longest_focal
-from cotarget.estimation import SpatialFilter
+from cotarget.control.zoom import Expected, ZoomController, ZoomSettings, chance_inside, expect, longest_focal
+from cotarget.estimation import TargetFilter
 from tests.moving_targets import APART, Flight, show
 
 SIZE = (640, 480)
@@ -51,7 +51,7 @@ def test_the_longest_focal_length_has_the_chance_asked_for():
 
 
 def test_wide_while_unsure_close_when_sure_and_out_before_it_is_lost():
-    policy = ZoomPolicy(RANGE, SIZE)
+    policy = ZoomController(RANGE, SIZE)
     commanded, t, way = RANGE[0], 0.0, []
     for sigma in [0.3] * 10 + list(np.geomspace(0.3, 0.001, 40)) + [0.001] * 20 + list(np.geomspace(0.001, 0.2, 20)):
         choice = policy.choose(expected(sigma), 4000.0, commanded, t)
@@ -72,7 +72,7 @@ def test_the_lens_does_not_hunt():
     rng = np.random.default_rng(0)
 
     def moves(settings):
-        policy, commanded, count = ZoomPolicy(RANGE, SIZE, settings), RANGE[0], 0
+        policy, commanded, count = ZoomController(RANGE, SIZE, settings), RANGE[0], 0
         for i in range(500):
             seen = expected(0.02 * math.exp(rng.normal(0, 0.2)))
             choice = policy.choose(seen, 4000.0 * math.exp(rng.normal(0, 0.02)), commanded, i * FRAME)
@@ -85,14 +85,14 @@ def test_the_lens_does_not_hunt():
 
 
 def test_a_target_that_comes_near_is_followed_by_zooming_out():
-    policy, commanded = ZoomPolicy(RANGE, SIZE), 4000.0
+    policy, commanded = ZoomController(RANGE, SIZE), 4000.0
     for i, wanted in enumerate(np.geomspace(4000.0, 1500.0, 50)):
         commanded = policy.choose(expected(0.002), float(wanted), commanded, i * FRAME).focal_px
         assert abs(math.log(commanded / wanted)) < 0.1
 
 
 def test_the_lens_zooms_in_anew_only_when_things_have_settled():
-    policy = ZoomPolicy(RANGE, SIZE, ZoomSettings(settle_s=0.3))
+    policy = ZoomController(RANGE, SIZE, ZoomSettings(settle_s=0.3))
     out = policy.choose(expected(0.05), 4000.0, 4000.0, 0.0)
     assert out.reason == "about to be lost"
     assert policy.choose(expected(0.001), 4000.0, out.focal_px, 0.1).reason == "settling"
@@ -100,7 +100,7 @@ def test_the_lens_zooms_in_anew_only_when_things_have_settled():
 
 
 def test_a_lens_on_its_way_out_stops_where_it_is_once_that_is_sure_enough():
-    policy = ZoomPolicy(RANGE, SIZE, ZoomSettings(settle_s=0.3))
+    policy = ZoomController(RANGE, SIZE, ZoomSettings(settle_s=0.3))
     out = policy.choose(expected(0.3), 4000.0, 4000.0, 0.0)
     assert out.focal_px < 1.1 * RANGE[0]
     stopped = policy.choose(expected(0.001), 4000.0, out.focal_px, 0.1, now_px=3500.0)
@@ -111,9 +111,9 @@ def test_a_lens_on_its_way_out_stops_where_it_is_once_that_is_sure_enough():
 
 def test_an_estimate_says_what_to_expect():
     flight = Flight("person", 0, 2.0)
-    estimator = SpatialFilter(flight.calibration, flight.target)
+    estimator = TargetFilter(flight.calibration, flight.target)
     for t in flight.times:
-        estimator.see_wide(flight.wide(t), t)
+        estimator.update_fixed(flight.wide(t), t)
         show(estimator, flight.zoom(t + APART))
     t = flight.times[-1] + 0.2
     pan, tilt = flight.aimed(t)

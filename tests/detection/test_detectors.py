@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS, TargetConfig
-from cotarget.detection import ColourDetector, MotionDetector, SpeckDetector, color_template, make_detector
+from cotarget.detection import (
+    BackgroundDetector,
+    ColorTemplateDetector,
+    SmallTargetDetector,
+    color_template,
+    make_detector,
+)
 from cotarget.detection.background import FLOODED_S, pieces
 from cotarget.detection.base import MOST_FOREGROUND, flood
 from cotarget.detection.color_template import LARGEST_FITTED_PX, MARGIN_PX, MOST_FITTED, fit_template
@@ -58,7 +64,7 @@ def book_picture(center, size, turn, rng):
 @pytest.mark.parametrize("turn_deg", [pytest.param(0.0, marks=pytest.mark.slow), 6.0])
 def test_colour_is_located_to_a_fraction_of_a_pixel(turn_deg):
     rng = np.random.default_rng(0)
-    detector = ColourDetector(cover())
+    detector = ColorTemplateDetector(cover())
     errors = []
     for _ in range(60):
         center, size = rng.uniform((30, 25), (65, 45)), np.array(BOOK_PX) * rng.uniform(0.9, 1.2)
@@ -92,7 +98,7 @@ def test_a_large_book_is_located_as_well_and_by_no_more_pixels(width, monkeypatc
         return fit_template(template, patch, center, size)
 
     monkeypatch.setattr(color_template, "fit_template", fit)
-    (found,) = ColourDetector(cover()).detect(Frame(on_a_wall((book_of(width), 107, 63)), 0.0))
+    (found,) = ColorTemplateDetector(cover()).detect(Frame(on_a_wall((book_of(width), 107, 63)), 0.0))
     height = width * 3 // 4
     np.testing.assert_allclose(found.center_px, (107 + (width - 1) / 2, 63 + (height - 1) / 2), atol=ACCURACY_PX)
     np.testing.assert_allclose(found.size_px, (width, height), atol=ACCURACY_PX)
@@ -101,7 +107,7 @@ def test_a_large_book_is_located_as_well_and_by_no_more_pixels(width, monkeypatc
 
 
 def test_a_large_book_at_the_border_is_located():
-    (found,) = ColourDetector(cover()).detect(Frame(on_a_wall((book_of(200), 440, 330)), 0.0))
+    (found,) = ColorTemplateDetector(cover()).detect(Frame(on_a_wall((book_of(200), 440, 330)), 0.0))
     assert found.clipped
     np.testing.assert_allclose(found.center_px, (440 + 199 / 2, 330 + 149 / 2), atol=1.0)
 
@@ -114,7 +120,7 @@ def test_among_a_hundred_red_things_the_book_is_found_by_a_few_fits(size, monkey
     red[:, : size // 4] = (60, 40, 150)
     things = [(red, 20 + 60 * (k % 10), 10 + 47 * (k // 10)) for k in range(100)]
     things[37] = (book_of(16), *things[37][1:])
-    best = ColourDetector(cover()).detect(Frame(on_a_wall(*things), 0.0))[0]
+    best = ColorTemplateDetector(cover()).detect(Frame(on_a_wall(*things), 0.0))[0]
     np.testing.assert_allclose(best.center_px, np.add(things[37][1:], (15 / 2, 11 / 2)), atol=ACCURACY_PX)
     assert len(fits) == MOST_FITTED
 
@@ -124,16 +130,16 @@ def test_another_colour_is_not_taken_for_the_target():
     image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     for k, other in enumerate([(190, 25, 35), (25, 190, 35), (20, 120, 160), (250, 250, 250), (0, 0, 0)]):
         image[30:42, 5 + 18 * k : 18 + 18 * k] = other
-    assert ColourDetector(cover()).detect(Frame(photograph(image, rng), 0.0)) == []
+    assert ColorTemplateDetector(cover()).detect(Frame(photograph(image, rng), 0.0)) == []
 
 
 def test_a_grey_or_missing_template_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="grey"):
-        ColourDetector(np.full((10, 10, 3), 128, np.uint8))
+        ColorTemplateDetector(np.full((10, 10, 3), 128, np.uint8))
     badge = np.full((10, 10, 3), 128, np.uint8)
     badge[3:7, 3:7] = (25, 35, 230)  # 16 % of it strongly red
     with pytest.raises(ConfigError, match="cut it to the coloured part"):
-        ColourDetector(badge)
+        ColorTemplateDetector(badge)
     book = dataclasses.replace(DEFAULT_TARGETS["book"], template=None)
     with pytest.raises(ConfigError, match="template"):
         make_detector(book, RATE)
@@ -335,7 +341,7 @@ def test_who_walks_is_seen_again_soon_after_the_whole_picture_has_changed(what):
 
 
 def test_the_kind_of_detector_follows_the_target():
-    assert isinstance(motion("bird"), MotionDetector)
-    assert isinstance(make_detector(DEFAULT_TARGETS["bird"], RATE), SpeckDetector)
+    assert isinstance(motion("bird"), BackgroundDetector)
+    assert isinstance(make_detector(DEFAULT_TARGETS["bird"], RATE), SmallTargetDetector)
     red = TargetConfig(0.2, "width", 160.0, "colour")
-    assert isinstance(make_detector(red, RATE, cover()), ColourDetector)
+    assert isinstance(make_detector(red, RATE, cover()), ColorTemplateDetector)

@@ -7,8 +7,16 @@ import numpy as np
 import pytest
 
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.detection import MotionDetector, SpeckDetector, make_detector
-from cotarget.detection.small_target import CLEAR_SIGNAL, EVEN, CameraMotion, History, change, find_specks, speck_score
+from cotarget.detection import BackgroundDetector, SmallTargetDetector, make_detector
+from cotarget.detection.small_target import (
+    CLEAR_SIGNAL,
+    EVEN,
+    CameraMotion,
+    History,
+    change,
+    find_small_targets,
+    small_target_score,
+)
 from cotarget.errors import CotargetError
 from cotarget.rig import Frame
 from cotarget.tracking.track import settings_for
@@ -47,7 +55,7 @@ def photograph(picture, rng):
 
 
 def watch(pictures, detector=None):
-    detector = detector or SpeckDetector()
+    detector = detector or SmallTargetDetector()
     return [detector.detect(Frame(picture, i / RATE)) for i, picture in enumerate(pictures)]
 
 
@@ -170,7 +178,7 @@ def test_poles_wires_and_edges_are_no_specks():
     picture[50:52] = 60  # a wire
     picture[:60, 200:] += 25  # a cloud's edge
     grey = cv2.cvtColor(photograph(picture, rng), cv2.COLOR_BGR2GRAY)
-    assert [speck for speck in find_specks(grey, 5.0, 40) if speck.low[1] < 150] == []
+    assert [target for target in find_small_targets(grey, 5.0, 40) if target.low[1] < 150] == []
 
 
 def test_a_camera_that_shakes_makes_nothing_move():
@@ -269,13 +277,13 @@ def test_the_pictures_noise_is_measured():
 def test_score_rises_with_contrast_and_change_and_neither_alone_will_do():
     """Half at the stated balance; a clear contrast does not make up for a lack of change."""
     usual = [0.05, 0.08, 0.15, 0.20]
-    assert speck_score(EVEN, usual) == pytest.approx(0.5)
-    assert speck_score(6.0, [0.9] * 4) > 0.8
-    assert speck_score(100.0, [0.0] * 4) < 0.05
-    assert speck_score(100.0, usual) == speck_score(CLEAR_SIGNAL, usual)
+    assert small_target_score(EVEN, usual) == pytest.approx(0.5)
+    assert small_target_score(6.0, [0.9] * 4) > 0.8
+    assert small_target_score(100.0, [0.0] * 4) < 0.05
+    assert small_target_score(100.0, usual) == small_target_score(CLEAR_SIGNAL, usual)
     appeared = [0.0, 0.0, 1.0, 1.0]  # what has come and stands
-    assert speck_score(CLEAR_SIGNAL, appeared) < 0.5 < speck_score(CLEAR_SIGNAL, [0.1, 0.3, 1.0, 1.0])
-    assert speck_score(CLEAR_SIGNAL, [float("nan")] * 4) == 0.0
+    assert small_target_score(CLEAR_SIGNAL, appeared) < 0.5 < small_target_score(CLEAR_SIGNAL, [0.1, 0.3, 1.0, 1.0])
+    assert small_target_score(CLEAR_SIGNAL, [float("nan")] * 4) == 0.0
 
 
 def test_frames_that_repeat_and_times_that_jump():
@@ -285,7 +293,7 @@ def test_frames_that_repeat_and_times_that_jump():
         draw(picture, 60 + 3 * i, 80, 8, 5)
 
     pictures = film(24, paint)
-    detector = SpeckDetector()
+    detector = SmallTargetDetector()
     for i, picture in enumerate(pictures):
         found = detector.detect(Frame(picture, i / RATE))
     assert found
@@ -326,6 +334,6 @@ def test_a_hundred_moving_things_keep_their_numbers():
 
 
 def test_names_of_detectors():
-    assert isinstance(make_detector(SPECK, RATE), SpeckDetector)
+    assert isinstance(make_detector(SPECK, RATE), SmallTargetDetector)
     for name in ("motion", "mog2"):
-        assert isinstance(make_detector(dataclasses.replace(SPECK, detector=name), RATE), MotionDetector)
+        assert isinstance(make_detector(dataclasses.replace(SPECK, detector=name), RATE), BackgroundDetector)

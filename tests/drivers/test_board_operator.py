@@ -21,7 +21,7 @@ DEADLINE_S = 30.0  # for what should come at once
 
 
 @pytest.mark.parametrize(
-    ("wish", "words"),
+    ("wanted", "words"),
     [
         (
             pose([0.8, -0.3, 3.2], [0, 0, 0]),
@@ -35,20 +35,20 @@ DEADLINE_S = 30.0  # for what should come at once
         (pose([0, 0, 2.0], [0, 0, 90]), "turned 90 degrees clockwise in its plane"),
     ],
 )
-def test_a_person_is_told_where(wish, words):
-    assert words in in_words(wish)
+def test_a_person_is_told_where(wanted, words):
+    assert words in in_words(wanted)
 
 
 def test_the_nearer_edge_is_told_right():
     """A turn about y (down) by +30 degrees takes x, to the right, towards -z: to the camera."""
-    wish = pose([0, 0, 2.0], [0, 30, 0])
-    left, right = wish.apply([[0.0, 0, 0], [0.8, 0, 0]])[:, 2]
+    wanted = pose([0, 0, 2.0], [0, 30, 0])
+    left, right = wanted.apply([[0.0, 0, 0], [0.8, 0, 0]])[:, 2]
     assert right < left
-    assert "with its right edge nearer" in in_words(wish)
-    wish = pose([0, 0, 2.0], [30, 0, 0])
-    upper, lower = wish.apply([[0.0, 0, 0], [0, 0.5, 0]])[:, 2]
+    assert "with its right edge nearer" in in_words(wanted)
+    wanted = pose([0, 0, 2.0], [30, 0, 0])
+    upper, lower = wanted.apply([[0.0, 0, 0], [0, 0.5, 0]])[:, 2]
     assert upper < lower
-    assert "with its upper edge nearer" in in_words(wish)
+    assert "with its upper edge nearer" in in_words(wanted)
 
 
 def test_a_person_has_patience_and_reads_all_wishes():

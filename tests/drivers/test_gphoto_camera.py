@@ -24,7 +24,7 @@ import pytest
 from cotarget.config import HardwareZoom
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.gphoto import GphotoLink, LinkError, Setting, cameras, full_port, probe
-from cotarget.drivers.gphoto_camera import Desk, GphotoCamera, Shooting
+from cotarget.drivers.gphoto_camera import GphotoCamera, SharedState, Shooting
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
 from tests.simulated_clock import SimClock
 
@@ -140,10 +140,10 @@ class Bench:
     """The driver's work in simulated time, and what its users would do."""
 
     def __init__(self, config=CONFIG, prepare=lambda camera: None):
-        self.clock, self.desk = SimClock(), Desk()
+        self.clock, self.shared = SimClock(), SharedState()
         self.camera = Camera(self.clock)
         prepare(self.camera)
-        self.work = Shooting(config, self.clock, self.camera, self.desk)
+        self.work = Shooting(config, self.clock, self.camera, self.shared)
         self.zoom = self.work.open()
         self.frames = []
 
@@ -151,13 +151,13 @@ class Bench:
         until = self.clock.t + seconds
         while self.clock.t < until:
             due = self.work.work()
-            if self.desk.frame is not None and (not self.frames or self.desk.frame is not self.frames[-1]):
-                self.frames.append(self.desk.frame)
+            if self.shared.frame is not None and (not self.frames or self.shared.frame is not self.frames[-1]):
+                self.frames.append(self.shared.frame)
             self.clock.t = max(self.clock.t, min(due, until))
 
     def send(self, position):
-        self.desk.wanted, self.desk.order = position, self.desk.order + 1
-        self.desk.standing, self.desk.lens_trouble = False, ""
+        self.shared.wanted, self.shared.order = position, self.shared.order + 1
+        self.shared.standing, self.shared.lens_trouble = False, ""
 
 
 def opening_fails(config=CONFIG, **changes):
@@ -178,7 +178,7 @@ def test_opening_enters_shooting_before_it_looks_for_the_lens():
     assert bench.camera.values["capturetarget"] == "Internal RAM"
     assert bench.zoom.lens.focal_range == pytest.approx((6.0 / 0.01794, 72.0 / 0.01794))
     assert bench.camera.commands("zoom") == []
-    assert bench.desk.frame.image.shape == (24, 32, 3)
+    assert bench.shared.frame.image.shape == (24, 32, 3)
 
 
 def test_a_camera_that_always_shoots_and_has_no_targets_is_taken_as_it_is():
@@ -287,7 +287,7 @@ def test_a_lens_by_choices_is_sent_by_their_own_text():
     bench.send(bench.zoom.lens.position_for(21.3 / 0.01794))
     bench.run(0.1)
     assert bench.camera.commands("zoom") == ["064"]
-    assert bench.desk.standing
+    assert bench.shared.standing
 
 
 def test_frames_of_another_size_say_what_to_write():
@@ -312,7 +312,7 @@ def test_a_lens_outside_the_table_is_brought_back():
 
 def test_opening_tries_once_more_and_then_says_why():
     bench = Bench(prepare=lambda camera: camera.fail.update(open=[IO]))
-    assert bench.desk.frame is not None
+    assert bench.shared.frame is not None
     error = opening_fails(fail={"open": [CLAIM, ...]})
     assert error.type is DeviceError
     assert "gvfs-gphoto2-volume-monitor" in str(error.value)
@@ -323,7 +323,7 @@ def test_opening_tries_once_more_and_then_says_why():
 @pytest.mark.parametrize("call", ["put", "get", "preview"])
 @pytest.mark.parametrize("code", [BUSY, BAD])
 def test_a_camera_that_is_busy_at_first_is_waited_for(call, code):
-    assert Bench(prepare=lambda camera: camera.fail.update({call: [code] * 5})).desk.frame is not None
+    assert Bench(prepare=lambda camera: camera.fail.update({call: [code] * 5})).shared.frame is not None
 
 
 @pytest.mark.parametrize("call", ["put", "get", "preview"])
@@ -384,36 +384,36 @@ def test_a_frozen_viewfinder_gives_no_new_frames_and_is_not_hammered():
 def test_broken_frames_are_dropped_and_counted(data, trouble):
     bench = Bench()
     bench.run(0.5)
-    newest = bench.desk.frame
+    newest = bench.shared.frame
     bench.camera.frozen = data
     bench.run(0.1)
-    assert bench.desk.frame is newest
-    assert bench.desk.dropped >= 1
-    assert bench.desk.trouble == trouble
+    assert bench.shared.frame is newest
+    assert bench.shared.dropped >= 1
+    assert bench.shared.trouble == trouble
     bench.camera.frozen = None
     bench.run(0.3)
-    assert bench.desk.frame is not newest
-    assert bench.desk.trouble == ""
+    assert bench.shared.frame is not newest
+    assert bench.shared.trouble == ""
 
 
 def test_frames_that_come_late_cannot_be_dated_and_are_dropped():
     bench = Bench()
     bench.run(0.5)
-    newest, dropped = bench.desk.frame, bench.desk.dropped
+    newest, dropped = bench.shared.frame, bench.shared.dropped
     bench.camera.take["preview"] = 1.0
     bench.run(1.5)
-    assert bench.desk.frame is newest
-    assert bench.desk.dropped > dropped
-    assert bench.desk.trouble == "its frames take 1 s to come"
+    assert bench.shared.frame is newest
+    assert bench.shared.dropped > dropped
+    assert bench.shared.trouble == "its frames take 1 s to come"
     bench.camera.frozen = jpeg(SIZE, 33)
     bench.run(1.5)
     bench.camera.take.pop("preview")
     bench.run(0.5)
-    assert bench.desk.frame is newest  # the late one, shown again in time, is no newer for that
+    assert bench.shared.frame is newest  # the late one, shown again in time, is no newer for that
     bench.camera.frozen = None
     bench.run(0.3)
-    assert bench.desk.frame is not newest
-    assert bench.desk.trouble == ""
+    assert bench.shared.frame is not newest
+    assert bench.shared.trouble == ""
 
 
 def test_a_slow_camera_may_be_slow():
@@ -428,8 +428,8 @@ def test_zeros_after_a_jpeg_are_padding():
     bench = Bench()
     bench.camera.frozen = jpeg(SIZE, 50) + bytes(30)
     bench.run(0.2)
-    assert bench.desk.dropped == 0
-    assert np.abs(bench.desk.frame.image - 50.0).max() <= GREY
+    assert bench.shared.dropped == 0
+    assert np.abs(bench.shared.frame.image - 50.0).max() <= GREY
 
 
 def test_images_are_not_turned_as_the_camera_felt_itself_held():
@@ -442,8 +442,8 @@ def test_images_are_not_turned_as_the_camera_felt_itself_held():
     bench = Bench()
     bench.camera.frozen = turned
     bench.run(0.2)
-    assert bench.desk.frame.image.shape == (24, 32, 3)
-    assert np.abs(bench.desk.frame.image - 50.0).max() <= GREY
+    assert bench.shared.frame.image.shape == (24, 32, 3)
+    assert np.abs(bench.shared.frame.image - 50.0).max() <= GREY
 
 
 # --- the lens
@@ -455,9 +455,9 @@ def test_the_lens_is_sent_at_once_read_back_and_moves_as_estimated():
     start = bench.clock.t
     bench.run(0.01)
     assert bench.camera.commands("zoom") == [60.0]
-    assert bench.desk.standing
-    assert bench.desk.motion.arrives == pytest.approx(start + 0.05 + 1.0)
-    assert bench.desk.motion.position(start + 0.55) == pytest.approx(30.0)
+    assert bench.shared.standing
+    assert bench.shared.motion.arrives == pytest.approx(start + 0.05 + 1.0)
+    assert bench.shared.motion.position(start + 0.55) == pytest.approx(30.0)
 
 
 def test_the_latest_command_wins():
@@ -474,10 +474,10 @@ def test_a_busy_camera_gets_its_command_again_while_frames_go_on(code):
     bench.camera.fail["put"] = [code] * 10
     bench.send(30)
     bench.run(0.5)
-    assert not bench.desk.standing
+    assert not bench.shared.standing
     assert len(bench.frames) >= 3
     bench.run(1.5)
-    assert bench.desk.standing
+    assert bench.shared.standing
     assert bench.camera.values["zoom"] == 30.0
 
 
@@ -486,14 +486,14 @@ def test_a_command_that_is_refused_for_long_is_given_up_until_the_next():
     bench.camera.fail["put"] = [BAD, ...]
     bench.send(30)
     bench.run(5.0)
-    assert bench.desk.lens_trouble == (
+    assert bench.shared.lens_trouble == (
         "the zoom camera's lens did not go to position 30: gphoto2 says [-2] what gphoto2 calls it"
     )
     frames = len(bench.frames)
     bench.camera.fail.clear()
     bench.send(31)
     bench.run(0.5)
-    assert (bench.desk.standing, bench.camera.values["zoom"]) == (True, 31.0)
+    assert (bench.shared.standing, bench.camera.values["zoom"]) == (True, 31.0)
     assert len(bench.frames) > frames
 
 
@@ -504,7 +504,7 @@ def test_a_camera_may_be_busy_now_and_then():
         bench.camera.fail["put"] = [BUSY] * 20
         bench.send(position)
         bench.run(3.0)
-        assert (bench.desk.standing, bench.camera.values["zoom"]) == (True, float(position))
+        assert (bench.shared.standing, bench.camera.values["zoom"]) == (True, float(position))
     bench.camera.fail["preview"] = [*[BUSY] * 20, None] * 3
     bench.run(10.0)
     assert bench.camera.log.count(("open",)) == 1
@@ -525,10 +525,10 @@ def test_a_command_that_replaces_a_refused_one_has_its_own_chance():
 
     bench.camera.put = replaced
     bench.run(1.5)
-    assert bench.desk.lens_trouble == ""
+    assert bench.shared.lens_trouble == ""
     bench.camera.fail.clear()
     bench.run(0.5)
-    assert (bench.desk.standing, bench.camera.values["zoom"]) == (True, 40.0)
+    assert (bench.shared.standing, bench.camera.values["zoom"]) == (True, 40.0)
 
 
 def test_a_lens_that_ignores_a_command_is_sent_again():
@@ -536,9 +536,9 @@ def test_a_lens_that_ignores_a_command_is_sent_again():
     bench.camera.ignore = 1
     bench.send(12)
     bench.run(1.0)
-    assert not bench.desk.standing
+    assert not bench.shared.standing
     bench.run(1.0)
-    assert bench.desk.standing
+    assert bench.shared.standing
     assert bench.camera.commands("zoom") == [12.0, 12.0]
 
 
@@ -547,7 +547,7 @@ def test_a_lens_that_never_goes_is_told():
     bench.camera.ignore = 99
     bench.send(12)
     bench.run(5.0)
-    assert bench.desk.lens_trouble == "the zoom camera's lens did not go to position 12: its setting 'zoom' reads 0"
+    assert bench.shared.lens_trouble == "the zoom camera's lens did not go to position 12: its setting 'zoom' reads 0"
     assert len(bench.camera.commands("zoom")) == 2
 
 
@@ -558,14 +558,14 @@ def test_a_setting_that_follows_the_lens_is_waited_for():
 
     def following(name):
         setting = get(name)
-        return replace(setting, value=float(round(bench.desk.motion.position(bench.clock.t))))
+        return replace(setting, value=float(round(bench.shared.motion.position(bench.clock.t))))
 
     bench.camera.get = following
     bench.send(60)
     bench.run(0.9)
-    assert not bench.desk.standing
+    assert not bench.shared.standing
     bench.run(0.5)
-    assert bench.desk.standing
+    assert bench.shared.standing
     assert bench.camera.commands("zoom") == [60.0]
 
 
@@ -583,9 +583,9 @@ def test_a_camera_that_is_lost_is_found_again_and_its_lens_sent_back(call, code)
     bench.run(2.0)
     assert bench.camera.values["capture"] == 1
     assert bench.camera.values["zoom"] == 50.0
-    assert bench.desk.standing
-    assert bench.desk.trouble == ""
-    assert bench.clock.t - bench.desk.arrived < 2 * PERIOD
+    assert bench.shared.standing
+    assert bench.shared.trouble == ""
+    assert bench.clock.t - bench.shared.arrived < 2 * PERIOD
     assert bench.camera.threads == {threading.get_ident()}
 
 
@@ -596,7 +596,7 @@ def test_a_lens_that_is_where_it_was_is_not_sent_again():
     bench.camera.fail["preview"] = [IO]
     bench.run(2.0)
     assert bench.camera.commands("zoom") == [40.0]
-    assert bench.desk.standing
+    assert bench.shared.standing
 
 
 def test_a_camera_that_stays_away_is_gone_within_seconds():
@@ -604,10 +604,10 @@ def test_a_camera_that_stays_away_is_gone_within_seconds():
     bench.camera.fail = {"preview": [IO], "open": [IO, ...]}
     bench.camera.take = {"open": 2.5}
     bench.run(0.5)
-    assert "looking for the camera again" in bench.desk.trouble
+    assert "looking for the camera again" in bench.shared.trouble
     bench.run(10.0)
-    assert bench.desk.gone.startswith("the zoom camera at 'usb:' is gone: gphoto2 says [-7] what gphoto2 calls it")
-    assert "\n" not in bench.desk.gone
+    assert bench.shared.gone.startswith("the zoom camera at 'usb:' is gone: gphoto2 says [-7] what gphoto2 calls it")
+    assert "\n" not in bench.shared.gone
     assert bench.work.work() == math.inf
 
 
@@ -616,7 +616,7 @@ def test_a_camera_that_comes_back_as_another_is_gone():
     bench.camera.fail["preview"] = [IO]
     bench.camera.preview_size = (40, 30)
     bench.run(2.0)
-    assert "hardware.zoom.size" in bench.desk.gone
+    assert "hardware.zoom.size" in bench.shared.gone
 
 
 def test_a_viewfinder_that_is_busy_for_long_is_opened_again():
@@ -624,7 +624,7 @@ def test_a_viewfinder_that_is_busy_for_long_is_opened_again():
     bench.camera.fail["preview"] = [BUSY] * 40
     bench.run(10.0)
     assert bench.camera.log.count(("open",)) == 2
-    assert bench.desk.trouble == ""
+    assert bench.shared.trouble == ""
 
 
 def test_closing_ends_shooting_unless_the_camera_is_lost():
@@ -694,7 +694,7 @@ def test_a_camera_in_use():
 def test_a_lens_moves_until_it_should_have_arrived():
     with opened(replace(CONFIG, lens_speed=0.001)) as rig:
         goal = rig.camera.zoom(1000.0)
-        wait_for(lambda: rig.camera._desk.standing)
+        wait_for(lambda: rig.camera._shared.standing)
         state = rig.camera.state()
         assert state.moving
         assert state.focal_px == pytest.approx(6.0 / 0.01794, rel=1e-3)
@@ -705,7 +705,7 @@ def test_commands_do_not_wait_for_the_next_frame():
     """It would come in 100 s."""
     with opened(replace(CONFIG, rate_hz=0.01)) as rig:
         rig.camera.zoom(1000.0)
-        wait_for(lambda: rig.camera._desk.standing)
+        wait_for(lambda: rig.camera._shared.standing)
         assert rig.camera.capture().image.shape == (48, 64, 3)
 
 
@@ -715,7 +715,7 @@ def test_reading_says_why_no_frame_comes():
         with pytest.raises(StaleFrameError, match=r"no frame newer than \d+\.\d{3} s from the zoom camera within 0 s"):
             rig.camera.read(newest.t + 1000.0, 0.0)
         rig.link.fail["preview"] = [BUSY, ...]
-        wait_for(lambda: rig.camera._desk.trouble)
+        wait_for(lambda: rig.camera._shared.trouble)
         with pytest.raises(StaleFrameError, match=r"within 0\.01 s: .*gphoto2 says \[-110\]"):
             rig.camera.read(newest.t + 1000.0, 0.01)
 
@@ -726,7 +726,7 @@ def test_an_old_frame_is_not_the_newest():
         rig.camera.read(timeout=DEADLINE_S)
         rig.link.fail["preview"] = [BUSY, ...]
         clock = rig.link.clock
-        wait_for(lambda: clock.now() > rig.camera._desk.arrived + 0.5)
+        wait_for(lambda: clock.now() > rig.camera._shared.arrived + 0.5)
         with pytest.raises(StaleFrameError, match="no frame from the zoom camera within 0 s"):
             rig.camera.read(timeout=0.0)
         rig.link.fail.clear()
@@ -835,7 +835,7 @@ def test_a_gone_camera_says_so_at_every_call(monkeypatch):
     monkeypatch.setattr("cotarget.drivers.gphoto_camera.RECONNECT_S", 0.0)
     with opened() as rig:
         rig.link.fail = {"open": [IO, ...], "preview": [IO, ...]}
-        wait_for(lambda: rig.camera._desk.gone)
+        wait_for(lambda: rig.camera._shared.gone)
         calls = (rig.camera.read, rig.camera.state, rig.camera.capture, lambda: rig.camera.zoom(1000.0))
         for call in calls:
             with pytest.raises(DeviceError, match="the zoom camera at 'usb:' is gone: gphoto2 says"):
@@ -882,7 +882,7 @@ def test_a_mistake_in_the_driver_is_no_silence_and_no_traceback(caplog):
 
     with opened() as rig:
         rig.link.preview = wrong
-        wait_for(lambda: rig.camera._desk.gone)
+        wait_for(lambda: rig.camera._shared.gone)
         with pytest.raises(DeviceError, match=r"the driver of the zoom camera failed: RuntimeError\('a mistake'\)"):
             rig.camera.read()
     assert "Traceback" not in caplog.text
@@ -1197,7 +1197,7 @@ def test_an_emulated_camera_that_was_switched_off_gets_its_lens_back(emulated):
     camera.zoom(21.3 / 0.01794)  # position 64
     wait_for(lambda: not camera.state().moving)
     assert emulated.fault("power-off") == 64
-    wait_for(lambda: camera._desk.trouble)
+    wait_for(lambda: camera._shared.trouble)
     emulated.fault("power-off", "off")
     frame_after(camera, MonotonicClock().now())
     wait_for(lambda: not camera.state().moving)
@@ -1231,7 +1231,7 @@ def test_a_hung_camera_stops_no_other_thread_and_is_found_again(emulated):
     ticker.start()
     emulated.fault("hung")
     try:
-        wait_for(lambda: camera._desk.trouble)
+        wait_for(lambda: camera._shared.trouble)
         leaving = clock.now()  # the camera, which asks it twice
         wait_for(lambda: clock.now() > leaving + HELD_S)
         with pytest.raises(StaleFrameError, match=r"looking for the camera again, gphoto2 says \[-"):

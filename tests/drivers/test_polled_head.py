@@ -160,9 +160,9 @@ def test_a_halt_comes_first_and_older_moves_are_not_sent(bench):
     bench.start()
     bench.orders()
     move = bench.move(1000, 0)
-    wish = bench.halt()
+    request = bench.halt()
     bench.run(0.5)
-    assert wish.answered
+    assert request.answered
     assert bench.orders() == ["H"]
     assert str(move.error) == "the move was halted"
     later = bench.move(100, 0)
@@ -174,8 +174,8 @@ def test_a_halted_head_moves_until_it_stands(bench):
     bench.start()
     move = bench.move(3000, 0)
     bench.until(lambda: bench.unit.position("P") > 500)
-    wish = bench.halt()
-    took = bench.until(lambda: wish.answered)
+    request = bench.halt()
+    took = bench.until(lambda: request.answered)
     assert took < 0.02
     assert bench.loop.snapshot.moving
     bench.until(lambda: not bench.loop.snapshot.moving)
@@ -207,8 +207,8 @@ def test_a_byte_of_noise_at_the_unit_does_not_keep_it_from_a_halt(bench):
     bench.until(lambda: bench.unit.position("P") > 500)
     bench.unit.scripted = {noise: list(said) for noise, said in NOISE.items()}
     bench.unit.noise = b"x"
-    wish = bench.halt()
-    bench.until(lambda: wish.answered)
+    request = bench.halt()
+    bench.until(lambda: request.answered)
     assert not bench.unit.turning()
     move = bench.move(0, 0)
     bench.until(move.done.is_set)
@@ -365,9 +365,9 @@ def test_a_move_is_not_taken_up_again_for_ever_nor_after_a_halt(bench):
     bench.run(0.3)
     back = bench.clock.now() + 0.7
     bench.unit.receive = lambda data: receive(data) if bench.clock.now() > back else receive(data) and b""
-    wish = bench.halt()
+    request = bench.halt()
     bench.run(3.0)
-    assert wish.answered
+    assert request.answered
     assert str(move.error) == "the move was halted"
     assert not bench.unit.turning()
 

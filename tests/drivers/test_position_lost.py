@@ -2,7 +2,7 @@
 
 import pytest
 
-from cotarget.drivers.interlock import LostPosition, PositionLostError
+from cotarget.drivers.interlock import PositionLostError, PositionLostMarker
 from cotarget.errors import DeviceError
 
 USB = "/dev/serial/by-id/usb-FTDI_FT232R-if00"
@@ -14,7 +14,7 @@ def stop_file(tmp_path):
 
 
 def test_each_rig_remembers_its_own_heads(stop_file):
-    lost, other = LostPosition(USB, stop_file), LostPosition(USB, stop_file.with_name("other"))
+    lost, other = PositionLostMarker(USB, stop_file), PositionLostMarker(USB, stop_file.with_name("other"))
     lost.refuse()
     lost.note(str(PositionLostError(USB, "fell off the roof")))
     assert lost.file.name == "stop.dev-serial-by-id-usb-FTDI-FT232R-if00.position-lost"
@@ -28,7 +28,7 @@ def test_each_rig_remembers_its_own_heads(stop_file):
 
 def test_the_reset_of_one_head_says_nothing_of_another(stop_file):
     """Two heads may share a stop file; a unit may come back at another port, which nobody can tell from that."""
-    first, second = LostPosition("/dev/ttyUSB0", stop_file), LostPosition("/dev/ttyUSB1", stop_file)
+    first, second = PositionLostMarker("/dev/ttyUSB0", stop_file), PositionLostMarker("/dev/ttyUSB1", stop_file)
     first.note("lost")
     second.forget()
     with pytest.raises(DeviceError, match=rf"^lost \(or, where no unit is at that port any more, remove {first.file}"):
@@ -37,7 +37,7 @@ def test_the_reset_of_one_head_says_nothing_of_another(stop_file):
 
 @pytest.mark.parametrize("content", [b"", b"\n", b"\xff\x00\n\x1b[31m\nmany\nlines", b"x" * 100_000])
 def test_whatever_is_in_the_file_it_refuses_in_one_line(stop_file, content):
-    lost = LostPosition(USB, stop_file)
+    lost = PositionLostMarker(USB, stop_file)
     stop_file.parent.mkdir()
     lost.file.write_bytes(content)
     with pytest.raises(DeviceError) as caught:
@@ -51,12 +51,12 @@ def test_the_stop_file_itself_is_no_lost_position(stop_file):
     stop_file.parent.mkdir()
     stop_file.touch()
     stop_file.with_name("stop.old").touch()
-    LostPosition(USB, stop_file).refuse()
+    PositionLostMarker(USB, stop_file).refuse()
 
 
 def test_what_cannot_be_written_or_read_is_told(tmp_path, caplog):
     (tmp_path / "file").touch()
-    lost = LostPosition(USB, tmp_path / "file" / "stop")
+    lost = PositionLostMarker(USB, tmp_path / "file" / "stop")
     lost.refuse()
     lost.note("it fell off the roof")
     assert "nobody will remember: it fell off the roof" in caplog.text
@@ -64,12 +64,14 @@ def test_what_cannot_be_written_or_read_is_told(tmp_path, caplog):
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
     with pytest.raises(DeviceError, match="cannot be read, where it would say that the head's position is lost"):
-        LostPosition(USB, loop / "stop").refuse()
+        PositionLostMarker(USB, loop / "stop").refuse()
     with pytest.raises(DeviceError, match="cannot be removed, though the unit was reset"):
-        LostPosition(USB, loop / "stop").forget()
+        PositionLostMarker(USB, loop / "stop").forget()
 
 
 def test_without_a_stop_file_it_is_in_the_users_state_folder(tmp_path, monkeypatch):
     monkeypatch.delenv("XDG_STATE_HOME", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert LostPosition("/dev/ttyS0", None).file == tmp_path / ".local/state/cotarget/head.dev-ttyS0.position-lost"
+    assert (
+        PositionLostMarker("/dev/ttyS0", None).file == tmp_path / ".local/state/cotarget/head.dev-ttyS0.position-lost"
+    )

@@ -9,7 +9,7 @@ import pytest
 import serial
 
 from cotarget.config import HardwareHead, SafetyConfig
-from cotarget.drivers.interlock import LostPosition
+from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.polled_head import D46Head, Move
 from cotarget.errors import ConfigError, DeviceError, HaltedError
 from tests.d46_bench import CONFIG, Bench
@@ -291,7 +291,7 @@ def test_a_lost_position_is_remembered_until_the_unit_was_reset(opened, bench, t
             opened(HardwareHead(**{**vars(CONFIG), "port": port}), safety)
         assert str(again.value) == f"{caught.value} (or, where no unit is at that port any more, remove {file})"
     assert bench.unit.heard == []
-    LostPosition("PORT", safety.stop_file).forget()
+    PositionLostMarker("PORT", safety.stop_file).forget()
     opened(CONFIG, safety).state()
 
 

@@ -3,7 +3,7 @@
 import pytest
 import serial
 
-from cotarget.drivers.interlock import LostPosition
+from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.ptu_d46 import reset
 from cotarget.errors import DeviceError, EmergencyStopError
 from tests.d46_bench import CONFIG, Bench
@@ -22,7 +22,7 @@ def bench(monkeypatch):
 
 @pytest.fixture
 def lost(tmp_path):
-    return LostPosition("PORT", tmp_path / "stop")
+    return PositionLostMarker("PORT", tmp_path / "stop")
 
 
 def turns(bench, told=BOTH, ends=25.0):

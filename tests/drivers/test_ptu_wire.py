@@ -14,7 +14,7 @@ import pytest
 
 from cotarget.config import HardwareHead
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.interlock import LostPosition
+from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.polled_head import D46Head
 from cotarget.drivers.ptu_d46 import probe, reset
 from cotarget.emulators.faults import Faults
@@ -276,7 +276,7 @@ def test_a_power_cycle_ends_it_and_a_reset_mends_it(hasty):
     said = fails(head.state)
     assert "was switched off and on" in said or "does not answer any more" in said
     head.close()
-    lost = LostPosition(hasty.config.port, None)
+    lost = PositionLostMarker(hasty.config.port, None)
     if "was switched off and on" in said:
         assert fails(hasty.open).startswith(said)
     lost.forget()
@@ -327,7 +327,7 @@ def test_a_reset_is_broken_off_by_whatever_ends_it(stock, state_home, how, statu
     assert "Traceback" not in said
     assert len(said.splitlines()) == 1 + (how == signal.SIGINT)
     assert ("emergency stop: no reason given" in said) == (how == "stop")
-    lost = LostPosition(stock.config.port, state_home / "stop")
+    lost = PositionLostMarker(stock.config.port, state_home / "stop")
     with pytest.raises(DeviceError, match="has begun a reset that did not come to its end"):
         lost.refuse()
 

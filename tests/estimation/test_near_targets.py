@@ -8,7 +8,7 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
-from cotarget.estimation import SpatialFilter
+from cotarget.estimation import TargetFilter
 from cotarget.pipeline import FollowSettings, State, follow
 from experiments.calibration.synthetic.rig import SIZE, Truth
 from tests.moving_targets import calibration_of
@@ -57,12 +57,12 @@ class Approach:
 @pytest.mark.parametrize("name", WAYS)
 def test_what_stays_close_and_cut_for_a_minute_is_about_where_it_was_seen_last(name, speed):
     lens, way = Truth().fixed, Approach(name, speed)
-    estimator = SpatialFilter(calibration_of(Truth()), way.target)
+    estimator = TargetFilter(calibration_of(Truth()), way.target)
     arrived = way.waits_s + (way.start - way.stop) / speed
     depths, sigmas = [], []
     for t in np.arange(0.0, arrived + 60.0, 1 / RATE):
         box = way.box(lens, t)
-        estimator.see_wide(box, t)
+        estimator.update_fixed(box, t)
         found = estimator.at(t + 0.1)
         assert np.isfinite(found.state).all()
         sigma = np.sqrt(np.diag(found.state_covariance))
@@ -87,10 +87,10 @@ def test_a_box_that_is_cut_brings_a_target_nearer_and_never_moves_it_away():
     whole = Detection(middle, np.array([31.0, 120.0]), 1.0)
     found = {}
     for part in (0.3, 0.9, 1.0, 1.4):
-        estimator = SpatialFilter(calibration, person)
+        estimator = TargetFilter(calibration, person)
         for i in range(40):
             cut = replace(whole, size_px=whole.size_px * part, clipped=True)
-            estimator.see_wide(whole if i < 10 else cut, i / RATE)
+            estimator.update_fixed(whole if i < 10 else cut, i / RATE)
         found[part] = estimator.at(39 / RATE).depth
     depth = Truth().fixed.fy * person.size / 120.0
     assert found[0.3] == pytest.approx(depth, rel=0.01)

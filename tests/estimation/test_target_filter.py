@@ -11,11 +11,11 @@ from cotarget.calibration import Covariance
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.errors import CalibrationError
-from cotarget.estimation import SpatialFilter, estimation_settings_for
+from cotarget.estimation import TargetFilter, estimation_settings_for
 from cotarget.estimation.measurement_model import Sights
 from cotarget.estimation.motion_model import BIRD, PERSON, STATES, USUAL_BIAS, MotionSettings, propagate
 from cotarget.targeting import Reach, aim, depth_of, point_at
-from cotarget.tracking.track import TargetFilter, settings_for
+from cotarget.tracking.track import ImageFilter, settings_for
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth
 from tests.moving_targets import APART, RATE, Flight, calibration_of, magnified, show
 
@@ -55,11 +55,11 @@ def depth_sigma(estimate):
 
 def run(flight, zoom=True, delays=DELAYS, settings=None):
     """Follow a target; yields (time of the newest frame, {delay: estimate})."""
-    estimator = SpatialFilter(flight.calibration, flight.target, settings)
+    estimator = TargetFilter(flight.calibration, flight.target, settings)
     for t in flight.times:
         seen = flight.wide(t)
         if seen is not None:
-            assert estimator.see_wide(seen, t)
+            assert estimator.update_fixed(seen, t)
             yield t, {delay: estimator.at(t + delay) for delay in delays}
         view = flight.zoom(t + APART) if zoom else None
         if view is not None:
@@ -87,7 +87,7 @@ def baselines(flight):
         if seen is None:
             continue
         if state is None:
-            state = TargetFilter(1, seen, t, settings_for(flight.target))
+            state = ImageFilter(1, seen, t, settings_for(flight.target))
         else:
             state.predict(t)
             state.correct(seen)
@@ -240,7 +240,7 @@ def measurements(flight):
     for t in flight.times:
         seen, view = flight.wide(t), flight.zoom(t + APART)
         if seen is not None:
-            every.append((t, lambda f, seen=seen, t=t: f.see_wide(seen, t)))
+            every.append((t, lambda f, seen=seen, t=t: f.update_fixed(seen, t)))
         if view is not None:
             every.append((view.t, lambda f, view=view: show(f, view)))
     return every
@@ -251,7 +251,7 @@ def test_out_of_order_is_as_in_order():
     every = measurements(flight)
     rng = np.random.default_rng(0)
     arrival = [t + rng.uniform(0, 0.6) for t, _ in every]
-    ordered, shuffled = (SpatialFilter(flight.calibration, flight.target) for _ in range(2))
+    ordered, shuffled = (TargetFilter(flight.calibration, flight.target) for _ in range(2))
     for _, give in every:
         assert give(ordered)
     for i in np.argsort(arrival):
@@ -264,12 +264,12 @@ def test_out_of_order_is_as_in_order():
 
 def test_what_is_older_than_memory_is_refused():
     flight = Flight("person", 0, 4.0)
-    estimator = SpatialFilter(flight.calibration, flight.target)
+    estimator = TargetFilter(flight.calibration, flight.target)
     for t in flight.times:
-        estimator.see_wide(flight.wide(t), t)
+        estimator.update_fixed(flight.wide(t), t)
         estimator.at(t)
     before = estimator.at(4.0).state
-    assert not estimator.see_wide(flight.wide(1.0), 1.0)
+    assert not estimator.update_fixed(flight.wide(1.0), 1.0)
     np.testing.assert_array_equal(estimator.at(4.0).state, before)
     assert estimator.at(1.0) is None
     assert estimator.at(3.0).measured_t <= 3.0
@@ -279,13 +279,13 @@ def test_what_is_older_than_memory_is_refused():
 def test_a_wild_measurement_does_no_harm(camera):
     flight = Flight("bird", 2, 3.0)
     every = measurements(flight)
-    clean, hit = (SpatialFilter(flight.calibration, flight.target) for _ in range(2))
+    clean, hit = (TargetFilter(flight.calibration, flight.target) for _ in range(2))
     for _, give in every:
         give(clean)
         give(hit)
     t = flight.times[-1] + 0.02
     if camera == "wide":
-        hit.see_wide(Detection(np.array([40.0, 400.0]), np.array([90.0, 90.0]), 1.0), t)
+        hit.update_fixed(Detection(np.array([40.0, 400.0]), np.array([90.0, 90.0]), 1.0), t)
     else:
         view = flight.zoom(t)
         show(hit, replace(view, pixel=view.pixel + np.array([250.0, -180.0])))
@@ -298,25 +298,25 @@ def test_a_detector_that_errs_more_than_it_is_thought_to_makes_nothing_leap():
     """A book that stands, seen with two and a half times the noise that a book is taken to have."""
     flight = Flight("book", 4, 3.0)
     rng = np.random.default_rng(4)
-    estimator = SpatialFilter(flight.calibration, flight.target)
+    estimator = TargetFilter(flight.calibration, flight.target)
     still = flight.wide(0.0)
     fastest = 0.0
     for t in np.arange(0.0, 20.0, 1 / RATE):
-        estimator.see_wide(replace(still, center_px=still.center_px + rng.normal(0.0, 0.5, 2)), t)
+        estimator.update_fixed(replace(still, center_px=still.center_px + rng.normal(0.0, 0.5, 2)), t)
         fastest = max(fastest, float(np.linalg.norm(velocity(estimator.at(t))[:2])) if t > 1 else 0.0)
     assert fastest < 1.0  # taken for elsewhere each time, it would be several metres a second
 
 
 def test_a_target_that_jumps_is_believed_after_three_frames():
     flight = Flight("book", 3, 2.0)
-    estimator = SpatialFilter(flight.calibration, flight.target)
+    estimator = TargetFilter(flight.calibration, flight.target)
     for t in flight.times:
-        estimator.see_wide(flight.wide(t), t)
+        estimator.update_fixed(flight.wide(t), t)
     seen = flight.wide(2.0)
     moved = Detection(seen.center_px + np.array([60.0, 20.0]), seen.size_px * 1.3, 1.0)
     depth = depth_of(flight.calibration, flight.target, moved.size_px[0], moved.center_px)
     for i in range(6):
-        estimator.see_wide(moved, 2.0 + i / RATE)
+        estimator.update_fixed(moved, 2.0 + i / RATE)
     found = estimator.at(2.0 + 5 / RATE)
     there = point_at(flight.calibration, moved.center_px, depth)
     assert np.linalg.norm(found.x_fixed[:2] - there[:2]) < 0.02
@@ -330,18 +330,18 @@ def test_a_wrong_known_size_is_corrected_and_reported(wrong, least):
     *_, (t, estimates) = run(flight, delays=(0.0,))
     found = estimates[0.0]
     assert abs(found.state[2] - state_of(flight, t)[2]) < 0.12  # without the zoom view it is 0.3
-    assert abs(found.size_surprise) >= least
+    assert abs(found.size_deviation) >= least
     assert found.size / flight.size == pytest.approx(1.0, abs=0.12)
     if wrong == 1.0:
-        assert abs(found.size_surprise) < 2.5
-        assert found.bias_surprise < 2.5
+        assert abs(found.size_deviation) < 2.5
+        assert found.bias_deviation < 2.5
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.2, 0.4, 0.6])
 def test_a_head_that_points_wrongly_is_corrected_without_oscillation(delay):
     """Half a degree of bias; the head goes at once where it is sent, and every measurement is late by the delay."""
     flight = Flight("person", 4, 4.0, bias=(8e-3, -6e-3))
-    estimator = SpatialFilter(flight.calibration, flight.target)
+    estimator = TargetFilter(flight.calibration, flight.target)
     lens, waiting, offsets = magnified(flight.truth, NOMINAL), [], []
     for t in flight.times:
         waiting.append((t, flight.wide(t), None))
@@ -355,7 +355,7 @@ def test_a_head_that_points_wrongly_is_corrected_without_oscillation(delay):
         while waiting and waiting[0][0] <= t - delay + EXACT:
             seen_t, seen, view = waiting.pop(0)
             if seen is not None:
-                estimator.see_wide(seen, seen_t)
+                estimator.update_fixed(seen, seen_t)
             if view is not None:
                 show(estimator, view)
     off = np.array(offsets)
@@ -392,45 +392,45 @@ def test_the_appearance_is_the_truths_and_its_covariance_that_of_samples():
 
 def test_nothing_is_told_before_anything_is_seen():
     flight = Flight("person", 0, 1.0)
-    estimator = SpatialFilter(flight.calibration, flight.target)
+    estimator = TargetFilter(flight.calibration, flight.target)
     assert estimator.at(0.0) is None
     show(estimator, flight.zoom(0.0))
     assert estimator.at(1.0) is None  # a direction of the zoom camera alone begins nothing
-    assert not estimator.see_wide(flight.wide(0.0), math.nan)
-    assert not estimator.see_wide(Detection(np.array([np.nan, 1.0]), np.array([5.0, 5.0]), 1.0), 0.0)
-    assert estimator.see_wide(flight.wide(0.0), 0.0)
+    assert not estimator.update_fixed(flight.wide(0.0), math.nan)
+    assert not estimator.update_fixed(Detection(np.array([np.nan, 1.0]), np.array([5.0, 5.0]), 1.0), 0.0)
+    assert estimator.update_fixed(flight.wide(0.0), 0.0)
     assert np.isfinite(estimator.at(0.5).state).all()
-    assert not estimator.see_wide(flight.wide(0.0), 0.0)  # the same frame again
+    assert not estimator.update_fixed(flight.wide(0.0), 0.0)  # the same frame again
 
 
 def test_a_long_gap_and_a_target_that_flies_at_the_camera_leave_a_covariance():
     flight = Flight("bird", 7, 3.0)
-    estimator = SpatialFilter(flight.calibration, flight.target)
+    estimator = TargetFilter(flight.calibration, flight.target)
     for _, give in measurements(flight):
         give(estimator)
     for ahead in (0.0, 1.0, 10.0, 60.0):
         found = estimator.at(3.0 + ahead)
         assert np.isfinite(found.state).all()
         assert np.linalg.eigvalsh(found.state_covariance).min() > 0
-    assert estimator.see_wide(flight.wide(0.2), 20.0)
+    assert estimator.update_fixed(flight.wide(0.2), 20.0)
     again = estimator.at(20.0)
     there = flight.path(0.2)
     assert np.abs(again.state[:2] - there[:2] / there[2]).max() < 0.02
     near = flight.calibration.fixed.image_center_px
-    charging = SpatialFilter(flight.calibration, flight.target)
+    charging = TargetFilter(flight.calibration, flight.target)
     for i in range(30):  # from 30 m to 1 m in 1.2 s
-        charging.see_wide(Detection(near, np.array([550.0, 100.0]) / (30.0 - i), 1.0), i / RATE)
+        charging.update_fixed(Detection(near, np.array([550.0, 100.0]) / (30.0 - i), 1.0), i / RATE)
     assert 0.1 < charging.at(1.2).depth < 5.0
     assert charging.at(3.0).depth > 0
 
 
 def test_a_box_that_the_border_cuts_tells_no_size():
     flight = Flight("person", 0, 1.0)
-    estimator = SpatialFilter(flight.calibration, flight.target)
+    estimator = TargetFilter(flight.calibration, flight.target)
     seen = flight.wide(0.0)
-    estimator.see_wide(replace(seen, size_px=seen.size_px / 3, clipped=True), 0.0)
+    estimator.update_fixed(replace(seen, size_px=seen.size_px / 3, clipped=True), 0.0)
     assert depth_sigma(estimator.at(0.0)) > 0.9
-    estimator.see_wide(seen, 0.04)
+    estimator.update_fixed(seen, 0.04)
     found = estimator.at(0.04)
     assert abs(math.log(found.depth / flight.path(0.04)[2])) < 4 * depth_sigma(found) < 0.5
 
@@ -443,8 +443,8 @@ def test_a_middle_of_known_error_is_believed_as_told_though_its_box_is_clipped()
     flight = Flight("person", 0, 1.0)
     seen, variances = flight.wide(0.0), []
     for clipped in (False, True):
-        estimator = SpatialFilter(flight.calibration, flight.target)
-        estimator.see_wide(replace(seen, clipped=clipped), 0.0, sigma_px=np.array([2.0, 3.0]))
+        estimator = TargetFilter(flight.calibration, flight.target)
+        estimator.update_fixed(replace(seen, clipped=clipped), 0.0, sigma_px=np.array([2.0, 3.0]))
         variances.append(middle_variance(estimator, 0.0))
     np.testing.assert_allclose(variances[1], variances[0], rtol=EXACT)
 
@@ -452,21 +452,21 @@ def test_a_middle_of_known_error_is_believed_as_told_though_its_box_is_clipped()
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_two_sights_tell_a_velocity_and_a_third_that_errs_alike_hardly_more(elsewhere):
     flight = Flight("bird", 0, 1.0)
-    estimator = SpatialFilter(flight.calibration, flight.target)
+    estimator = TargetFilter(flight.calibration, flight.target)
     seen, t, dt = flight.wide(0.0), 0.0, 1.0 / RATE
-    estimator.see_wide(seen, t)
+    estimator.update_fixed(seen, t)
     if elsewhere:
         seen = replace(seen, center_px=seen.center_px + JUMP_PX)
         for _ in range(BIRD.misses):
             t += dt
-            estimator.see_wide(seen, t)
+            estimator.update_fixed(seen, t)
     first = np.sqrt(middle_variance(estimator, t))
     t += dt
-    estimator.see_wide(seen, t)
+    estimator.update_fixed(seen, t)
     found = estimator.at(t).state_covariance
     assert (np.sqrt(np.diag(found))[3:5] < AS_TWO * math.sqrt(2.0) * first / dt).all()
     t += SOON * BIRD.noise_s
-    estimator.see_wide(seen, t)
+    estimator.update_fixed(seen, t)
     assert (middle_variance(estimator, t) > HARDLY * np.diag(found)[:2]).all()
 
 
@@ -482,13 +482,13 @@ def test_a_covariance_stays_one_through_a_flight(seed):
 
 def test_a_measurement_that_is_none_is_as_good_as_not_made():
     flight = Flight("person", 0, 1.0)
-    clean, hit = (SpatialFilter(flight.calibration, flight.target) for _ in range(2))
+    clean, hit = (TargetFilter(flight.calibration, flight.target) for _ in range(2))
     for t in flight.times:
         seen = flight.wide(t)
         for estimator in (clean, hit):
-            estimator.see_wide(seen, t)
-        hit.see_wide(seen, t + 0.01, sigma_px=np.full(2, np.nan))
-        hit.see_zoom(np.zeros(2), np.nan, 0.0, 0.0, NOMINAL_PX, t + 0.02)
+            estimator.update_fixed(seen, t)
+        hit.update_fixed(seen, t + 0.01, sigma_px=np.full(2, np.nan))
+        hit.update_zoom(np.zeros(2), np.nan, 0.0, 0.0, NOMINAL_PX, t + 0.02)
     a, b = clean.at(1.5), hit.at(1.5)
     assert np.isfinite(b.state).all()
     # Two predictions in place of one; see above how much that is.
@@ -516,4 +516,4 @@ def test_a_calibrations_own_doubt_is_the_prior_of_the_heads_bias():
     sigma = estimation_settings_for(person, doubtful).motion.bias_sigma
     assert sigma == pytest.approx(math.hypot(5e-4, 2 / 692 / math.sqrt(2)), rel=0.02)
     with pytest.raises(CalibrationError):
-        SpatialFilter(replace(calibration, T_head_zoom=None), person)
+        TargetFilter(replace(calibration, T_head_zoom=None), person)

@@ -110,7 +110,7 @@ class Scene:
 
     def finder(self):
         finder = CloseupFinder(self.calibration, BIRD)
-        finder.see_wide(*self.wide())
+        finder.update_fixed(*self.wide())
         return finder
 
     def error(self, found, finder=None):
@@ -182,7 +182,7 @@ def test_a_preview_of_half_the_size():
     zoom = scene.zoom()
     half = Frame(cv2.resize(zoom.image, (320, 240), interpolation=cv2.INTER_AREA), 0.0)
     finder = CloseupFinder(scene.calibration.for_streams(SIZE, (320, 240)), BIRD)
-    finder.see_wide(*scene.wide())
+    finder.update_fixed(*scene.wide())
     full = scene.expected()
     found = finder.find(half, dataclasses.replace(full, nominal_px=full.nominal_px / 2))
     assert found is not None
@@ -206,7 +206,7 @@ def test_the_sight_nearest_in_time_counts_and_an_old_one_does_not():
     zoom = scene.zoom(t=1.0)
     assert finder.find(zoom, scene.expected()) is None
     for t in (0.8, 0.94, 0.98, 1.03):
-        finder.see_wide(Frame(frame.image, t), detection, mask)
+        finder.update_fixed(Frame(frame.image, t), detection, mask)
     assert finder.sight_at(1.0).t == 0.98
     assert finder.find(zoom, scene.expected()).t == 1.0
     assert finder.sight_at(1.2) is None
@@ -218,7 +218,7 @@ def test_without_a_foreground_the_box_does():
     frame, detection, mask = scene.wide()
     for nothing in (None, np.zeros_like(mask)):
         finder = CloseupFinder(scene.calibration, BIRD)
-        finder.see_wide(frame, detection, nothing)
+        finder.update_fixed(frame, detection, nothing)
         found = finder.find(scene.zoom(), scene.expected())
         assert found is not None
         assert scene.error(found, finder) < REGISTERED_PX
@@ -243,7 +243,7 @@ def test_a_box_that_the_wide_view_s_border_cuts_says_little_of_the_body():
     sigmas = []
     for clipped in (False, True):
         finder = CloseupFinder(scene.calibration, BIRD)
-        finder.see_wide(frame, dataclasses.replace(detection, clipped=clipped), mask)
+        finder.update_fixed(frame, dataclasses.replace(detection, clipped=clipped), mask)
         sigmas.append(finder.find(scene.zoom(), scene.expected()).body_sigma_px)
     assert (sigmas[1] > 0.45 * detection.size_px * scene.nominal / FOCAL).all()
     assert (sigmas[1] > 2 * sigmas[0]).all()
@@ -256,7 +256,7 @@ def test_a_doubtful_find_is_believed_where_it_goes_on_from_a_sure_one():
     for gap, believed in ((0.04, True), (0.3, False)):
         finder = scene.finder()
         assert finder.find(scene.zoom(), scene.expected()) is not None
-        finder.see_wide(Frame(frame.image, gap), detection, mask)
+        finder.update_fixed(Frame(frame.image, gap), detection, mask)
         assert (finder.find(Frame(leaf.image, gap), scene.expected()) is not None) == believed
 
 
@@ -272,7 +272,7 @@ def test_boxes_at_and_beyond_the_border_do_no_harm(center):
     scene = Scene([(1.5, -1.0, 20.0)])
     frame, detection, mask = scene.wide()
     finder = CloseupFinder(scene.calibration, BIRD)
-    finder.see_wide(frame, dataclasses.replace(detection, center_px=np.array(center)), mask)
+    finder.update_fixed(frame, dataclasses.replace(detection, center_px=np.array(center)), mask)
     assert finder.find(scene.zoom(), scene.expected()) is None
 
 
@@ -309,7 +309,7 @@ def test_rendered_targets_are_found_from_the_shortest_focal_length_to_the_longes
         mask = (np.abs(wide.image.astype(int) - nothing.image).max(axis=2) > 25).astype(np.uint8)
         outline = truth.silhouette(name, "fixed", t)
         box = Detection((outline.low_px + outline.high_px) / 2, outline.size_px, 0.9)
-        sight = finder.see_wide(wide, box, mask)
+        sight = finder.update_fixed(wide, box, mask)
         # As if the depth were known to a twentieth, by which it is wrong.
         head, lens = truth.head_at(t), truth.nominal_at(t)
         found = finder.find(zoom, Expected(x_fixed * 1.05, 30.0**2 * np.eye(2), *head, lens))
@@ -337,7 +337,7 @@ def test_cost_beside_the_background_model():
     for _ in range(100):
         moments = [time.perf_counter()]
         for job in (
-            lambda: finder.see_wide(*sight),
+            lambda: finder.update_fixed(*sight),
             lambda: finder.find(zoom, expected),
             lambda: model.apply(zoom.image),
         ):

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from benchmarks import sim_speed
 from cotarget.config import parse_config
-from cotarget.control.head import SteeringSettings
+from cotarget.control.head import HeadSettings
 from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, true_calibration
 from cotarget.geometry import pose
 from cotarget.metrics import score
@@ -120,7 +120,7 @@ def test_how_many_times_is_of_medians_at_one_delay():
 WALKED = 3.0, 5.0  # of a person who walks from 1 s on; nothing is left of how it was acquired [s]
 SETTLED = 7.4, 9.0  # who stops at 5 s and is known of 0.6 s later, with a head that was on its way [s]
 NO_WORSE = 1.2  # times the wide view's own offset: medians of 50 frames
-ZONE = SteeringSettings().zone  # the head of who stands is left alone in it
+ZONE = HeadSettings().zone  # the head of who stands is left alone in it
 SWING = ZONE / 2  # an offset that goes to and fro beyond it on both sides swings
 
 

@@ -218,8 +218,8 @@ def test_workers_end_with_their_parent_however_it_ends(tmp_path):
 
 
 def test_a_pipeline_that_is_too_slow_is_missed():
-    def rows(motion, speck):
-        took = {pipeline_speed.ALONE: 4.0, "mog2": 40.0, "motion": motion, "speck": speck}
+    def rows(motion, target):
+        took = {pipeline_speed.ALONE: 4.0, "mog2": 40.0, "motion": motion, "speck": target}
         return [{"way": way, "ms": ms, "aimed": True} for way, ms in took.items()]
 
     assert pipeline_speed.missed(pipeline_speed.summarise(rows(6.0, 10.0))) == []  # the mixture's own is told, no more

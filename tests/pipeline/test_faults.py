@@ -320,7 +320,7 @@ class Asked:
     def __init__(self):
         self.times = []
 
-    def see_wide(self, frame, detection, mask=None):
+    def update_fixed(self, frame, detection, mask=None):
         del frame, detection, mask
 
     def sight_at(self, t):
@@ -474,14 +474,14 @@ def test_a_chosen_target_that_was_hidden_for_long_is_followed_on():
     """Its track lives for 0.8 s; then it has another number, and is the same target."""
     rig = Rig()
     hidden = run(rig, Seer(still, lambda t: not 1.0 <= t < 2.5), 5.0, policy=partial(Chosen, number=1))
-    assert [(state, number) for (state, number), _ in itertools.groupby(hidden, key=whom)][-2:] == [
+    assert [(state, number) for (state, number), _ in itertools.groupby(hidden, key=target_choice)][-2:] == [
         (State.SEARCHING, None),
         (State.FOLLOWING, 2),
     ]
     assert off(rig, still, rig.t) < STEP
 
 
-def whom(step):
+def target_choice(step):
     return step.state, None if step.target is None else step.target.id
 
 

@@ -15,7 +15,7 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.control.selection import RATE_S
 from cotarget.detection import Detection
 from cotarget.estimation.zoom_matching import LONGEST_APART_S, CloseupFinder, Found
-from cotarget.fusion import MOST_FILTERS, MOST_WAITING, UNFOUND_S, Pursuit
+from cotarget.fusion import MOST_FILTERS, MOST_WAITING, UNFOUND_S, TargetFusion
 from cotarget.geometry import pose
 from cotarget.rig import Frame, PanTiltState, ZoomState
 from cotarget.tracking.track import Track, settings_for
@@ -48,42 +48,42 @@ def track(number, box, t=0.0, *, missed=0, confirmed=True, larger=None):
     return Track(number, t, confirmed, missed, box.center_px, still, box.size_px, side, np.eye(4), 1.0, box)
 
 
-def seen(pursuit, tracks_at, frames):
+def seen(fusion, tracks_at, frames):
     """Show a pursuit so many frames; the time of the last one."""
     for i in range(frames):
         t = i * FRAME_S
-        pursuit.see_wide(Frame(PICTURE, t), tracks_at(t), None)
+        fusion.update_fixed(Frame(PICTURE, t), tracks_at(t), None)
     return t
 
 
 def test_a_track_has_an_estimate_as_long_as_it_lives():
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
     box = box_at(1.0, 0.5, 10.0)
-    assert pursuit.estimate(1, 0.0) is None
-    t = seen(pursuit, lambda t: [track(1, box, t), track(2, box_at(-1.0, 0.0, 8.0), t)], 10)
-    np.testing.assert_allclose(pursuit.estimate(1, t).x_fixed, (1.0, 0.5, 10.0), rtol=0.02)
-    np.testing.assert_allclose(pursuit.estimate(2, t).x_fixed, (-1.0, 0.0, 8.0), rtol=0.02, atol=1e-6)
-    pursuit.see_wide(Frame(PICTURE, t + FRAME_S), [track(2, box_at(-1.0, 0.0, 8.0), t + FRAME_S)], None)
-    assert pursuit.estimate(1, t) is None
-    assert pursuit.estimate(2, t) is not None
+    assert fusion.estimate(1, 0.0) is None
+    t = seen(fusion, lambda t: [track(1, box, t), track(2, box_at(-1.0, 0.0, 8.0), t)], 10)
+    np.testing.assert_allclose(fusion.estimate(1, t).x_fixed, (1.0, 0.5, 10.0), rtol=0.02)
+    np.testing.assert_allclose(fusion.estimate(2, t).x_fixed, (-1.0, 0.0, 8.0), rtol=0.02, atol=1e-6)
+    fusion.update_fixed(Frame(PICTURE, t + FRAME_S), [track(2, box_at(-1.0, 0.0, 8.0), t + FRAME_S)], None)
+    assert fusion.estimate(1, t) is None
+    assert fusion.estimate(2, t) is not None
 
 
 def test_a_track_that_was_missed_measures_nothing():
     """Its box is an old one, and it was elsewhere."""
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
-    t = seen(pursuit, lambda t: [track(1, box_at(1.0, 0.0, 10.0), t)], 5)
-    before = pursuit.estimate(1, t + 1)
-    pursuit.see_wide(Frame(PICTURE, t + 1), [track(1, box_at(3.0, 0.0, 10.0), t + 1, missed=1)], None)
-    after = pursuit.estimate(1, t + 1)
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    t = seen(fusion, lambda t: [track(1, box_at(1.0, 0.0, 10.0), t)], 5)
+    before = fusion.estimate(1, t + 1)
+    fusion.update_fixed(Frame(PICTURE, t + 1), [track(1, box_at(3.0, 0.0, 10.0), t + 1, missed=1)], None)
+    after = fusion.estimate(1, t + 1)
     assert (after.state == before.state).all()
     assert after.measured_t == t
 
 
 def test_of_a_hundred_tracks_only_the_first_have_filters():
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
     tracks = [track(n, box_at(0.05 * n, 0.0, 10.0)) for n in range(1, 101)]
-    pursuit.see_wide(Frame(PICTURE, 0.0), tracks, None)
-    known = [n for n in range(1, 101) if pursuit.estimate(n, 0.0) is not None]
+    fusion.update_fixed(Frame(PICTURE, 0.0), tracks, None)
+    known = [n for n in range(1, 101) if fusion.estimate(n, 0.0) is not None]
     assert known == list(range(1, MOST_FILTERS + 1))
 
 
@@ -91,18 +91,18 @@ def test_a_birds_wingspan_is_the_largest_side_over_a_beat():
     """The same boxes with twice the largest side are of a bird at half the distance."""
     depths = []
     for larger in (20.0, 40.0):
-        pursuit = Pursuit(CALIBRATION, BIRD, SIZE)
+        fusion = TargetFusion(CALIBRATION, BIRD, SIZE)
         box = Detection(np.array([320.0, 240.0]), np.array([12.0, 8.0]), 1.0)
-        t = seen(pursuit, lambda t, box=box, larger=larger: [track(1, box, t, larger=larger)], 20)
-        depths.append(pursuit.estimate(1, t).depth)
+        t = seen(fusion, lambda t, box=box, larger=larger: [track(1, box, t, larger=larger)], 20)
+        depths.append(fusion.estimate(1, t).depth)
     assert depths[0] == pytest.approx(2 * depths[1], rel=0.01)
 
 
 def test_a_policy_is_told_directions_and_speeds_as_the_head_sees_them():
     """At 2 m/s to the right, 10 m away: seen from 0.4 m to the right, the middle of the view is to the left."""
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
-    t = seen(pursuit, lambda t: [track(1, box_at(2.0 * t - 2.0, -1.0, 10.0), t)], 26)
-    (found,) = pursuit.candidates([track(1, box_at(0.0, -1.0, 10.0), t)], t)
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    t = seen(fusion, lambda t: [track(1, box_at(2.0 * t - 2.0, -1.0, 10.0), t)], 26)
+    (found,) = fusion.candidates([track(1, box_at(0.0, -1.0, 10.0), t)], t)
     assert t == pytest.approx(1.0)
     # The depth is known by the size alone, to some per cent.
     assert found.at[0] == pytest.approx(math.atan2(-BASELINE, 10.0), abs=2e-3)
@@ -123,15 +123,15 @@ class Learner:
     def __init__(self):
         self.shown = {}
 
-    def see_wide(self, frame, detection, mask):
+    def update_fixed(self, frame, detection, mask):
         self.shown[frame.t] = detection.size_px
 
 
 def test_who_crosses_another_is_predicted_as_before():
     """While both are one box neither is where its own last box was, 6 px a frame ago and more."""
-    tracker, pursuit = Tracker(settings_for(PERSON), SIZE), Pursuit(CALIBRATION, PERSON, SIZE)
-    pursuit.follow(1)
-    pursuit._finder, merged, worst = Learner(), [], 0.0
+    tracker, fusion = Tracker(settings_for(PERSON), SIZE), TargetFusion(CALIBRATION, PERSON, SIZE)
+    fusion.follow(1)
+    fusion._finder, merged, worst = Learner(), [], 0.0
     for i in range(100):
         t = i * FRAME_S
         middles, size = crossing_persons(t)
@@ -139,47 +139,47 @@ def test_who_crosses_another_is_predicted_as_before():
         if abs(middles[0, 0] - middles[1, 0]) <= size[0]:
             merged.append(t)
             boxes = [Detection(np.array(CENTER), size + np.abs(middles[0] - middles[1]), 1.0)]
-        pursuit.see_wide(Frame(PICTURE, t), tracker.update(boxes, t), None)
+        fusion.update_fixed(Frame(PICTURE, t), tracker.update(boxes, t), None)
         for number in (1, 2) if t > 1.0 else ():
-            found = pursuit.estimate(number, t + 0.2)
+            found = fusion.estimate(number, t + 0.2)
             at = CENTER + FOCAL * found.x_fixed[:2] / found.x_fixed[2]
             worst = max(worst, np.linalg.norm(at - crossing_persons(t + 0.2)[0][number - 1]))
             assert found.measured_t == pytest.approx(t + 0.2, abs=0.2 + 1e-9)
             assert found.depth == pytest.approx(10.0, rel=0.01)
     assert len(merged) >= 5
     assert worst < 1.0  # stale boxes make it 50 px and more
-    assert not set(merged) & set(pursuit._finder.shown)
-    np.testing.assert_allclose(list(pursuit._finder.shown.values()), [size] * len(pursuit._finder.shown))
+    assert not set(merged) & set(fusion._finder.shown)
+    np.testing.assert_allclose(list(fusion._finder.shown.values()), [size] * len(fusion._finder.shown))
 
 
 def test_a_share_of_a_box_is_the_less_believed_the_more_room_there_is():
     """Two stand as one box, and the tracker has drifted 10 px aside: what it says may not carry the estimate away."""
 
     def pulled(around):
-        pursuit = Pursuit(CALIBRATION, PERSON, SIZE)
+        fusion = TargetFusion(CALIBRATION, PERSON, SIZE)
         own = Detection(np.array(CENTER), np.array([28.0, 122.5]), 1.0)
-        t = seen(pursuit, lambda t: [track(1, own, t)], 25) + FRAME_S
+        t = seen(fusion, lambda t: [track(1, own, t)], 25) + FRAME_S
         aside = track(1, replace(own, center_px=np.add(CENTER, (10.0, 0.0))), t)
         tracks = [replace(aside, box=replace(own, size_px=np.array([around, 122.5])), shared=True)]
-        pursuit.see_wide(Frame(PICTURE, t), tracks, None)
-        return FOCAL * pursuit.estimate(1, t).x_fixed[0] / 10.0
+        fusion.update_fixed(Frame(PICTURE, t), tracks, None)
+        return FOCAL * fusion.estimate(1, t).x_fixed[0] / 10.0
 
     assert 0 < pulled(100.0) < pulled(40.0) < 1.0
 
 
 def test_a_policy_is_told_of_confirmed_tracks_only_and_of_how_long_each_was_seen_well():
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
     tracks = [track(n, box_at(float(n), 0.0, 10.0), confirmed=n < 3) for n in (1, 2, 3)]
-    pursuit.see_wide(Frame(PICTURE, 0.0), tracks, None)
-    pursuit.states.add(PanTiltState(math.atan2(2.0 - BASELINE, 10.0), 0.0, False, 0.0), ZoomState(ZOOMED, False, 0.0))
+    fusion.update_fixed(Frame(PICTURE, 0.0), tracks, None)
+    fusion.states.add(PanTiltState(math.atan2(2.0 - BASELINE, 10.0), 0.0, False, 0.0), ZoomState(ZOOMED, False, 0.0))
     for _ in range(3):
-        pursuit.count_seen_well(tracks[1], 0.5, ZOOMED)
+        fusion.count_seen_well(tracks[1], 0.5, ZOOMED)
     unknown = track(4, box_at(0.0, 0.0, 10.0))
-    found = {each.track.id: each.seen_s for each in pursuit.candidates([*tracks, unknown], 0.0)}
+    found = {each.track.id: each.seen_s for each in fusion.candidates([*tracks, unknown], 0.0)}
     assert found == {1: 0.0, 2: 1.5}
-    pursuit.see_wide(Frame(PICTURE, FRAME_S), tracks[:1], None)  # it is gone ...
-    pursuit.see_wide(Frame(PICTURE, 2 * FRAME_S), tracks, None)  # ... and whoever has its number is another
-    assert {each.seen_s for each in pursuit.candidates(tracks, 2 * FRAME_S)} == {0.0}
+    fusion.update_fixed(Frame(PICTURE, FRAME_S), tracks[:1], None)  # it is gone ...
+    fusion.update_fixed(Frame(PICTURE, 2 * FRAME_S), tracks, None)  # ... and whoever has its number is another
+    assert {each.seen_s for each in fusion.candidates(tracks, 2 * FRAME_S)} == {0.0}
 
 
 @pytest.mark.parametrize(("pan", "nominal", "well"), [
@@ -190,19 +190,19 @@ def test_a_policy_is_told_of_confirmed_tracks_only_and_of_how_long_each_was_seen
     (0.11, ZOOMED, False),  # of 0.107 to the border half the book is 0.012
 ])  # fmt: skip
 def test_seen_well_is_whoever_is_as_large_as_wanted_and_in_the_image(pan, nominal, well):
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
     box = box_at(BASELINE, 0.0, 10.0)
-    t = seen(pursuit, lambda t: [track(1, box, t)], 20)
+    t = seen(fusion, lambda t: [track(1, box, t)], 20)
 
     def told(number_of_frames_missed=0, t=t):
         there = track(1, box, t, missed=number_of_frames_missed)
-        before = pursuit.candidates([there], t)[0].seen_s
-        pursuit.count_seen_well(there, 0.5, ZOOMED)
-        return pursuit.candidates([there], t)[0].seen_s - before
+        before = fusion.candidates([there], t)[0].seen_s
+        fusion.count_seen_well(there, 0.5, ZOOMED)
+        return fusion.candidates([there], t)[0].seen_s - before
 
     assert told() == 0.0  # nothing was heard of head and lens
     for when in (t, t + 1.0):
-        pursuit.states.add(PanTiltState(pan, 0.0, False, when), ZoomState(nominal, False, when))
+        fusion.states.add(PanTiltState(pan, 0.0, False, when), ZoomState(nominal, False, when))
     assert told() == 0.5 * well
     assert told(25, t + 1.0) == 0.0  # whoever is out of sight is not seen
 
@@ -213,7 +213,7 @@ class Finder:
     def __init__(self, x_fixed, body_sigma_px=1.0):
         self.x, self.body_sigma_px, self.asked = np.array(x_fixed), body_sigma_px, []
 
-    def see_wide(self, frame, detection, mask):
+    def update_fixed(self, frame, detection, mask):
         return None
 
     def sight_at(self, t):
@@ -226,18 +226,18 @@ class Finder:
         return Found(np.array(CENTER) + ZOOMED * tangent, 1.0, body, 1.0, 1.0, np.ones(2), frame.t)
 
 
-def followed(x_fixed, wrong, frames, finder, **pursuit):
+def followed(x_fixed, wrong, frames, finder, **fusion):
     """A pursuit of a book at a place whose size looks wrong, whose zoom view the finder answers for."""
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE, **pursuit)
-    pursuit.follow(1)
-    pursuit._finder = finder
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE, **fusion)
+    fusion.follow(1)
+    fusion._finder = finder
     found = []
     for i in range(frames):
         t = i * FRAME_S
-        pursuit.see_wide(Frame(PICTURE, t), [track(1, box_at(*x_fixed, wrong=wrong), t)], None)
-        pursuit.states.add(PanTiltState(0.0, 0.0, False, t), ZoomState(ZOOMED, False, t))
-        found.append(pursuit.see_zoom(Frame(PICTURE, t), t))
-    return pursuit, found
+        fusion.update_fixed(Frame(PICTURE, t), [track(1, box_at(*x_fixed, wrong=wrong), t)], None)
+        fusion.states.add(PanTiltState(0.0, 0.0, False, t), ZoomState(ZOOMED, False, t))
+        found.append(fusion.update_zoom(Frame(PICTURE, t), t))
+    return fusion, found
 
 
 def test_the_zoom_view_triangulates_the_depth():
@@ -260,48 +260,48 @@ def test_a_point_that_may_not_be_the_body_moves_the_estimate_less():
     x, off = (0.45, 0.1, 10.0), (0.47, 0.1, 10.0)
 
     def pulled(sigma_px):
-        pursuit, _ = followed(x, 1.0, 10, Finder(off, sigma_px))
-        return pursuit.estimate(1, 9 * FRAME_S).x_fixed[0] - x[0]
+        fusion, _ = followed(x, 1.0, 10, Finder(off, sigma_px))
+        return fusion.estimate(1, 9 * FRAME_S).x_fixed[0] - x[0]
 
     assert pulled(30.0) < 0.7 * pulled(1.0)
 
 
 def test_the_zoom_view_is_not_asked_before_it_is_known_where_it_looks_and_for_whom():
     x = (0.45, 0.1, 10.0)
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
-    pursuit._finder = Finder(x)
-    pursuit.see_wide(Frame(PICTURE, 0.0), [track(1, box_at(*x))], None)
-    assert pursuit.see_zoom(Frame(PICTURE, 0.0), 0.0) is None  # nobody is followed, and nothing was heard of the head
-    pursuit.states.add(PanTiltState(0.0, 0.0, False, 0.0), ZoomState(ZOOMED, False, 0.0))
-    assert pursuit.see_zoom(Frame(PICTURE, 0.0), 0.0) is None
-    pursuit.follow(1)
-    pursuit._finder = Finder(x)
-    assert pursuit.see_zoom(Frame(PICTURE, 0.0), 0.0) is not None
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion._finder = Finder(x)
+    fusion.update_fixed(Frame(PICTURE, 0.0), [track(1, box_at(*x))], None)
+    assert fusion.update_zoom(Frame(PICTURE, 0.0), 0.0) is None  # nobody is followed, and nothing was heard of the head
+    fusion.states.add(PanTiltState(0.0, 0.0, False, 0.0), ZoomState(ZOOMED, False, 0.0))
+    assert fusion.update_zoom(Frame(PICTURE, 0.0), 0.0) is None
+    fusion.follow(1)
+    fusion._finder = Finder(x)
+    assert fusion.update_zoom(Frame(PICTURE, 0.0), 0.0) is not None
 
 
 def test_another_target_is_looked_for_by_another_finder():
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
-    pursuit.follow(1)
-    finder = pursuit._finder
-    pursuit.follow(1)
-    assert pursuit._finder is finder
-    pursuit.follow(2)
-    assert pursuit._finder is not finder
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion.follow(1)
+    finder = fusion._finder
+    fusion.follow(1)
+    assert fusion._finder is finder
+    fusion.follow(2)
+    assert fusion._finder is not finder
 
 
 def test_the_middle_of_the_followed_body_is_what_both_views_show():
     """A track's box may lie beside the body; where a finder has taken it, its middle counts."""
 
     class Sees(Finder):
-        def see_wide(self, frame, detection, mask):
+        def update_fixed(self, frame, detection, mask):
             return type("Sight", (), {"body_px": detection.center_px + 5.0, "body_sigma_px": np.full(2, 0.1)})
 
     box = box_at(0.0, 0.0, 10.0)
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
-    pursuit.follow(1)
-    pursuit._finder = Sees((0, 0, 10))
-    t = seen(pursuit, lambda t: [track(1, box, t), track(2, replace(box), t)], 10)
-    ours, other = (pursuit.estimate(n, t).x_fixed for n in (1, 2))
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion.follow(1)
+    fusion._finder = Sees((0, 0, 10))
+    t = seen(fusion, lambda t: [track(1, box, t), track(2, replace(box), t)], 10)
+    ours, other = (fusion.estimate(n, t).x_fixed for n in (1, 2))
     assert ours[0] * FOCAL / ours[2] == pytest.approx(5.0, abs=0.05)
     assert other[0] == pytest.approx(0.0, abs=1e-6)
 
@@ -310,35 +310,35 @@ def crowd(numbers, t=0.0, *, confirmed=True):
     return [track(n, box_at(0.05 * n, 0.0, 10.0), t, confirmed=confirmed) for n in numbers]
 
 
-def known(pursuit, t=0.0):
-    return {n for n in range(1, 101) if pursuit.estimate(n, t) is not None}
+def known(fusion, t=0.0):
+    return {n for n in range(1, 101) if fusion.estimate(n, t) is not None}
 
 
 def test_whoever_is_known_stays_known_when_elder_ones_are_believed():
     """Tracks come with the eldest confirmed ones first, and one that was there all the time may be confirmed late."""
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
-    pursuit.see_wide(Frame(PICTURE, 0.0), crowd(range(51, 101)), None)
-    before = known(pursuit)
-    pursuit.see_wide(Frame(PICTURE, FRAME_S), crowd(range(1, 101), FRAME_S), None)
-    assert known(pursuit, FRAME_S) == before
-    assert all(pursuit.estimate(n, FRAME_S).measured_t == FRAME_S for n in before)
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion.update_fixed(Frame(PICTURE, 0.0), crowd(range(51, 101)), None)
+    before = known(fusion)
+    fusion.update_fixed(Frame(PICTURE, FRAME_S), crowd(range(1, 101), FRAME_S), None)
+    assert known(fusion, FRAME_S) == before
+    assert all(fusion.estimate(n, FRAME_S).measured_t == FRAME_S for n in before)
 
 
 def test_the_followed_and_the_favoured_are_known_before_others():
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
-    pursuit.see_wide(Frame(PICTURE, 0.0), crowd(range(1, 101)), None, favoured={90})
-    assert known(pursuit) == {*range(1, MOST_FILTERS), 90}
-    pursuit.follow(5)
-    pursuit.see_wide(Frame(PICTURE, FRAME_S), crowd(range(1, 101), FRAME_S), None, favoured=set(range(20, 60)))
-    assert known(pursuit, FRAME_S) == {5, *range(20, 20 + MOST_FILTERS - 1)}
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion.update_fixed(Frame(PICTURE, 0.0), crowd(range(1, 101)), None, favoured={90})
+    assert known(fusion) == {*range(1, MOST_FILTERS), 90}
+    fusion.follow(5)
+    fusion.update_fixed(Frame(PICTURE, FRAME_S), crowd(range(1, 101), FRAME_S), None, favoured=set(range(20, 60)))
+    assert known(fusion, FRAME_S) == {5, *range(20, 20 + MOST_FILTERS - 1)}
 
 
 def test_whoever_is_believed_is_known_before_whoever_is_not():
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
-    pursuit.see_wide(Frame(PICTURE, 0.0), crowd(range(1, 51), confirmed=False), None)
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion.update_fixed(Frame(PICTURE, 0.0), crowd(range(1, 51), confirmed=False), None)
     tracks = crowd(range(51, 101), FRAME_S) + crowd(range(1, 51), FRAME_S, confirmed=False)
-    pursuit.see_wide(Frame(PICTURE, FRAME_S), tracks, None)
-    assert known(pursuit, FRAME_S) == set(range(51, 51 + MOST_FILTERS))
+    fusion.update_fixed(Frame(PICTURE, FRAME_S), tracks, None)
+    assert known(fusion, FRAME_S) == set(range(51, 51 + MOST_FILTERS))
 
 
 class Gated(Finder):
@@ -354,46 +354,46 @@ def test_what_is_not_found_where_it_should_be_is_said_and_then_looked_for_farthe
     """Its size is told 15 % too small: at 10 m, 0.4 m beside, that is 21 px of 3000."""
     x = (BASELINE + 0.05, 0.0, 10.0)
     frames = int(UNFOUND_S / FRAME_S) + 2
-    pursuit, found = followed(x, 1.15, frames, Gated(x))
+    fusion, found = followed(x, 1.15, frames, Gated(x))
     t = (frames - 1) * FRAME_S
     assert found[:-2] == [None] * (frames - 2)
-    (told,) = pursuit.doubts(1, t)
+    (told,) = fusion.warnings(1, t)
     assert told.startswith("for 1.5 s not found where the zoom view should show it")
-    assert pursuit.doubts(2, t) == []
-    pursuit, found = followed(x, 1.15, frames + 30, Gated(x))
+    assert fusion.warnings(2, t) == []
+    fusion, found = followed(x, 1.15, frames + 30, Gated(x))
     assert all(each is not None for each in found[-20:])
-    (told,) = pursuit.doubts(1, t + 30 * FRAME_S)
+    (told,) = fusion.warnings(1, t + 30 * FRAME_S)
     assert told.startswith("the told size or the calibration seems wrong: both views make it 0.2")
-    pursuit.follow(2)
-    pursuit.follow(1)
-    assert len(pursuit.doubts(1, t)) <= 1
+    fusion.follow(2)
+    fusion.follow(1)
+    assert len(fusion.warnings(1, t)) <= 1
 
 
 def test_who_is_not_what_was_told_is_an_unlikely_candidate():
     x = (BASELINE + 0.05, 0.0, 10.0)
     for wrong, likely in ((1.0, True), (1.15, False)):
         frames = int(UNFOUND_S / FRAME_S) + 32
-        pursuit, _ = followed(x, wrong, frames, Gated(x))
-        (seen_so,) = pursuit.candidates([track(1, box_at(*x, wrong=wrong))], (frames - 1) * FRAME_S)
+        fusion, _ = followed(x, wrong, frames, Gated(x))
+        (seen_so,) = fusion.candidates([track(1, box_at(*x, wrong=wrong))], (frames - 1) * FRAME_S)
         assert seen_so.likely is likely
-        pursuit.follow(2)  # what it was found to be is not forgotten meanwhile
-        (seen_so,) = pursuit.candidates([track(1, box_at(*x, wrong=wrong))], frames * FRAME_S)
+        fusion.follow(2)  # what it was found to be is not forgotten meanwhile
+        (seen_so,) = fusion.candidates([track(1, box_at(*x, wrong=wrong))], frames * FRAME_S)
         assert seen_so.likely is likely
 
 
 def test_what_cannot_be_seen_is_not_missed():
     """Out of the zoom view, or hidden in the wide one too."""
     x = (BASELINE + 2.0, 0.0, 10.0)  # 600 px beside the middle
-    pursuit, _ = followed(x, 1.0, 100, Nowhere(x))
-    assert pursuit.doubts(1, 99 * FRAME_S) == []
+    fusion, _ = followed(x, 1.0, 100, Nowhere(x))
+    assert fusion.warnings(1, 99 * FRAME_S) == []
     seen_last = (BASELINE + 0.05, 0.0, 10.0)
-    pursuit, _ = followed(seen_last, 1.0, 5, Nowhere(seen_last))
+    fusion, _ = followed(seen_last, 1.0, 5, Nowhere(seen_last))
     for i in range(5, 60):
         t = i * FRAME_S
-        pursuit.see_wide(Frame(PICTURE, t), [track(1, box_at(*seen_last), t, missed=i)], None)
-        pursuit.states.add(PanTiltState(0.0, 0.0, False, t), ZoomState(ZOOMED, False, t))
-        pursuit.see_zoom(Frame(PICTURE, t), t)
-    assert pursuit.doubts(1, t) == []
+        fusion.update_fixed(Frame(PICTURE, t), [track(1, box_at(*seen_last), t, missed=i)], None)
+        fusion.states.add(PanTiltState(0.0, 0.0, False, t), ZoomState(ZOOMED, False, t))
+        fusion.update_zoom(Frame(PICTURE, t), t)
+    assert fusion.warnings(1, t) == []
 
 
 class Nowhere(Finder):
@@ -412,50 +412,50 @@ class Compared(CloseupFinder):
 def apart(by, frames=60):
     """Views of which the zoom camera's newest frame is newer by so much [s] than the wide one's; the finds."""
     x = (BASELINE, 0.0, 10.0)
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
-    pursuit.follow(1)
-    pursuit._finder = Compared(CALIBRATION, BOOK)
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion.follow(1)
+    fusion._finder = Compared(CALIBRATION, BOOK)
     found = []
     for i in range(frames):
         t = 1.0 + i * FRAME_S
-        pursuit.see_wide(Frame(PICTURE, t), [track(1, box_at(*x), t)], None)
+        fusion.update_fixed(Frame(PICTURE, t), [track(1, box_at(*x), t)], None)
         for when in (t, t + by):
-            pursuit.states.add(PanTiltState(0.0, 0.0, False, when), ZoomState(ZOOMED, False, when))
-        found.append(pursuit.see_zoom(Frame(PICTURE, t + by), t))
+            fusion.states.add(PanTiltState(0.0, 0.0, False, when), ZoomState(ZOOMED, False, when))
+        found.append(fusion.update_zoom(Frame(PICTURE, t + by), t))
         if found[-1] is not None:
             assert abs(found[-1].t - t) <= max(LONGEST_APART_S, -by) + 1e-9
-            assert pursuit.estimate(1, t).measured_t == pytest.approx(max(t, found[-1].t) if found[-1].t <= t else t)
-    return found, pursuit.doubts(1, t)
+            assert fusion.estimate(1, t).measured_t == pytest.approx(max(t, found[-1].t) if found[-1].t <= t else t)
+    return found, fusion.warnings(1, t)
 
 
 @pytest.mark.parametrize("by", [0.08, 0.13, 0.29, 0.49, -0.13, -0.29, -0.49])
 def test_views_of_other_latencies_are_compared(by):
-    found, doubts = apart(by)
+    found, warnings = apart(by)
     assert all(each is not None for each in found[15:])
     assert np.diff([each.t for each in found[15:]]) == pytest.approx(FRAME_S)
-    assert doubts == []
+    assert warnings == []
 
 
 @pytest.mark.parametrize(("by", "later"), [(0.7, "wide"), (-0.7, "zoom")])
 def test_views_that_are_too_far_apart_in_time_are_told(by, later):
-    doubts = apart(by)[1]
-    assert doubts == [f"the views are too far apart in time: the {later} one comes 0.70 s later"]
+    warnings = apart(by)[1]
+    assert warnings == [f"the views are too far apart in time: the {later} one comes 0.70 s later"]
 
 
 def test_a_zoom_frame_without_a_wide_view_of_its_time_is_not_one_without_the_target():
     """The wide view shows the target now and then only; the calibration is not to blame."""
     x = (BASELINE, 0.0, 10.0)
-    pursuit = Pursuit(CALIBRATION, BOOK, SIZE)
-    pursuit.follow(1)
-    pursuit._finder = Sparse(CALIBRATION, BOOK)
+    fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
+    fusion.follow(1)
+    fusion._finder = Sparse(CALIBRATION, BOOK)
     for i in range(100):
         t = i * FRAME_S
-        pursuit.see_wide(Frame(PICTURE, t), [track(1, box_at(*x), t, missed=i % 25)], None)
-        pursuit.states.add(PanTiltState(0.0, 0.0, False, t), ZoomState(ZOOMED, False, t))
-        pursuit.see_zoom(Frame(PICTURE, t), t)
-    assert len(pursuit._finder.asked) <= 4 * 2 * LONGEST_APART_S / FRAME_S + 1
-    assert len(pursuit._waiting) <= MOST_WAITING
-    assert pursuit.doubts(1, t) == []
+        fusion.update_fixed(Frame(PICTURE, t), [track(1, box_at(*x), t, missed=i % 25)], None)
+        fusion.states.add(PanTiltState(0.0, 0.0, False, t), ZoomState(ZOOMED, False, t))
+        fusion.update_zoom(Frame(PICTURE, t), t)
+    assert len(fusion._finder.asked) <= 4 * 2 * LONGEST_APART_S / FRAME_S + 1
+    assert len(fusion._waiting) <= MOST_WAITING
+    assert fusion.warnings(1, t) == []
 
 
 class Sparse(Compared):

@@ -23,7 +23,7 @@ SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))]
 WRONG = "the told size or the calibration seems wrong"
 
 
-def doubts(step):
+def warnings(step):
     """A Step's reason but for the lens's, and that the pictures are always the same, black as they are."""
     usual = ("zoom: ", "the fixed camera has shown the same picture for ")
     return "; ".join(part for part in step.reason.split("; ") if not part.startswith(usual))
@@ -57,7 +57,7 @@ def test_a_wrong_size_is_told_and_made_good(name, seed, wrong):
     assert WRONG in last.reason
     assert f"both views make it {last.estimate.size:.2g} m and not {last.estimate.target.size:.2g} m" in last.reason
     assert "\n" not in last.reason
-    assert doubts(followed[0]) == ""  # at first nothing speaks against it
+    assert warnings(followed[0]) == ""  # at first nothing speaks against it
     assert abs(np.log(last.estimate.size * wrong / last.estimate.target.size)) < LEFT
     # What nothing was known of is at an edge of the close-up or beyond; then it comes to the middle.
     middle = np.mean(truth.box(name, "zoom", last.zoom.t), axis=0)
@@ -81,4 +81,4 @@ def test_a_wrong_size_of_a_bird_costs_no_aim(seed, wrong):
 def test_a_right_size_is_not_doubted(name, seed):
     steps, _ = told(name, seed, 1.0)
     assert steps[-1].state is State.FOLLOWING
-    assert {doubts(step) for step in steps if step.state is State.FOLLOWING} == {""}
+    assert {warnings(step) for step in steps if step.state is State.FOLLOWING} == {""}

@@ -21,7 +21,7 @@ from cotarget.calibration import load_calibration
 from cotarget.calibration.file import save_calibration
 from cotarget.cli.main import main
 from cotarget.config import parse_config
-from cotarget.control.selection import Chosen, Whom, parse_whom, whom_table
+from cotarget.control.selection import Chosen, TargetChoice, choice_table, parse_choice
 from cotarget.detection import make_detector
 from cotarget.errors import ConfigError, CotargetError, DeviceError, StaleFrameError
 from cotarget.estimation import Estimate
@@ -212,7 +212,7 @@ def of_track_2(tmp_path_factory):
     settings = FollowSettings(
         command_delay_s=CONFIG.command_delay_s, lens_delay_s=CONFIG.lens_delay_s, policy=partial(Chosen, number=2)
     )
-    with Recorder(folder / "run", CONFIG, path, "bird", Whom(track=2)) as recorder:
+    with Recorder(folder / "run", CONFIG, path, "bird", TargetChoice(track=2)) as recorder:
         steps = list(run(recorder.wrap(ToyRig()), load_calibration(path), SECONDS, settings))
     assert {step.target.id for step in steps if step.target} == {2}
     return folder / "run"
@@ -260,7 +260,7 @@ def test_a_recording_that_does_not_say_whom_replays_as_the_first_policy_does(rep
     assert replayed() == then
 
 
-@pytest.mark.parametrize(("whom", "said"), [
+@pytest.mark.parametrize(("target_choice", "said"), [
     ({"policy": "by-name"}, "the recorded policy 'by-name' is unknown; give --policy, one of: first-come"),
     ({"click": [500.0, 3.0]}, "the recorded click: (500, 3) is not in the wide view's 96x72 image"),
     ({"click": [float("nan"), 3.0]}, "is not in the wide view"),
@@ -271,17 +271,20 @@ def test_a_recording_that_does_not_say_whom_replays_as_the_first_policy_does(rep
     ({"track": 1, "policy": "first-come"}, "is not one of policy, click and track"),
     (None, "recording.json: whom: None is not one of"),
 ])  # fmt: skip
-def test_whom_nobody_can_follow_is_refused_in_one_line(replayed, whom, said):
-    edit("whom", whom)(replayed.folder)
+def test_whom_nobody_can_follow_is_refused_in_one_line(replayed, target_choice, said):
+    edit("whom", target_choice)(replayed.folder)
     status, _, err = replayed()
     assert status == 1
     assert said in err
     assert err.count("\n") == 1
 
 
-@pytest.mark.parametrize("whom", [Whom(), Whom("most-served"), Whom(click=(3.5, 7.0)), Whom(track=4)])
-def test_whom_is_written_and_read(whom):
-    assert parse_whom(json.loads(json.dumps(whom_table(whom)))) == whom
+@pytest.mark.parametrize(
+    "target_choice",
+    [TargetChoice(), TargetChoice("most-served"), TargetChoice(click=(3.5, 7.0)), TargetChoice(track=4)],
+)
+def test_whom_is_written_and_read(target_choice):
+    assert parse_choice(json.loads(json.dumps(choice_table(target_choice)))) == target_choice
 
 
 def write_log(folder, rows, end="complete"):

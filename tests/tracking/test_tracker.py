@@ -8,7 +8,7 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.tracking import tracker as tracker_module
-from cotarget.tracking.track import CUT, TargetFilter, TrackerSettings, center_variance, missing, settings_for
+from cotarget.tracking.track import CUT, ImageFilter, TrackerSettings, center_variance, missing, settings_for
 from cotarget.tracking.tracker import MOST_DETECTIONS, Tracker
 
 RATE = 25.0
@@ -405,7 +405,7 @@ def test_a_lone_pair_is_matched_as_any_other(monkeypatch, name):
 def test_a_boxs_variance_is_the_same_in_floats_and_for_many():
     rng = np.random.default_rng(3)
     for settings in (PLAIN, *map(settings_for, DEFAULT_TARGETS.values())):
-        state = TargetFilter(1, Seen(np.zeros(2), np.array([20.0, 12.0])), 0.0, settings)
+        state = ImageFilter(1, Seen(np.zeros(2), np.array([20.0, 12.0])), 0.0, settings)
         boxes = [Seen(np.zeros(2), rng.uniform(3, 40, 2), clipped=bool(rng.random() < 0.3)) for _ in range(50)]
         sides = np.array([box.size_px for box in boxes])
         part = np.where([[box.clipped] for box in boxes], CUT, settings.noise_of_size)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cotarget.config import TARGETS, Waypoint, split_name, told_targets
+from cotarget.config import TARGETS, Waypoint, known_targets, split_name
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.sim.targets.gait import (
@@ -216,7 +216,7 @@ def _place_of(name: str) -> tuple[int, int]:
     """Index of a target's kind in TARGETS, and its number among its kind, from 1 on."""
     kind, number = split_name(name)
     if kind not in TARGETS:
-        raise ConfigError(f"unknown target '{name}'; {told_targets()}")
+        raise ConfigError(f"unknown target '{name}'; {known_targets()}")
     return TARGETS.index(kind), number
 
 
