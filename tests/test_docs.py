@@ -1,4 +1,4 @@
-"""The documentation names what there is."""
+"""The documentation names what there is; `mkdocs build --strict` checks the links within it."""
 
 import pkgutil
 import re
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-DOCS = Path(__file__).parents[1] / "docs"
-PAGES = sorted(path for path in DOCS.rglob("*.md") if path.name != "upgrading.md")  # which lists what there was
+ROOT = Path(__file__).parents[1]
+PAGES = sorted(path for path in (ROOT / "docs").rglob("*.md") if path.name != "upgrading.md")  # it lists what there was
 
 
 def exists(name):
@@ -23,3 +23,9 @@ def exists(name):
 def test_every_name_exists(page):
     names = set(re.findall(r"`(cotarget(?:\.\w+)+)", page.read_text(encoding="utf-8")))
     assert [name for name in sorted(names) if not exists(name)] == []
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
+def test_every_linked_file_exists(page):
+    links = re.findall(r"\]\(([^)#\s]+)", (ROOT / page).read_text(encoding="utf-8"))
+    assert [link for link in links if "://" not in link and not (ROOT / link).exists()] == []
