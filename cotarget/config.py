@@ -123,16 +123,16 @@ class SimCamera:
     """The simulated fixed camera: true intrinsics, sensor and link.
 
     Attributes:
-        size: (width, height) [px].
-        focal_px: true (fx, fy) [px]; where a file gives another size and not this, the field of view stays as wide.
-        center_px: true principal point [px]; likewise it stays where it is beside the image's middle.
-        distortion: true (k1, k2, p1, p2, k3).
+        size: image size; the field of view stays the same where ``focal_px`` is not given [px].
+        focal_px: true focal length; by default it grows with the image's width [px].
+        center_px: true principal point; by default it keeps its place relative to the image's centre [px].
+        distortion: true Brown-Conrady coefficients in OpenCV's order.
         noise: standard deviation of the sensor's noise [grey levels].
-        rate_hz: frames a second.
-        latency_s: from light to frame [s].
-        exposure_s: how long light is gathered [s]; what moves meanwhile is blurred, and rendering takes twice as
-            long while the camera turns. 0 for an instant.
-        jpeg_quality: 1 to 100.
+        rate_hz: frames per second.
+        latency_s: time from light to frame [s].
+        exposure_s: exposure time, during which motion blurs the image; rendering takes twice as long while the camera
+            turns; 0 for an instant [s].
+        jpeg_quality: JPEG quality.
     """
 
     size: Size = (640, 480)
@@ -175,18 +175,19 @@ class ZoomOptics:
 class SimZoomCamera(SimCamera):
     """The simulated zoom camera; ``focal_px``, ``center_px`` and ``distortion`` hold at the shortest focal length.
 
-    The curves are what the effect "optics" adds, over s = ln(nominal / shortest) / ln(longest / shortest) in 0..1.
-    Their defaults are of the size of a 12x consumer zoom's, and bent as no cubic is.
+    The effect "optics" adds the four curves. A curve [c1, c2, ...] is the polynomial c1 s + c2 s^2 + ... in
+    s = ln(nominal / shortest) / ln(longest / shortest), which runs from 0 to 1. The defaults are as large as those of a
+    12x consumer zoom, and no cubic fits them.
 
     Attributes:
-        focal_mm: shortest and longest focal length as the maker states them [mm].
-        pitch_mm: size of a pixel as the maker states it [mm]; focal_mm / pitch_mm is what the device tells.
-        lens_steps: number of positions from shortest to longest, evenly spaced in the logarithm.
-        lens_speed: positions a second.
-        focal_curve: true over nominal focal length is 1 + this times what it is at the shortest.
-        center_drift_px: what the principal point's u and v have moved by [px].
-        distortion_drift: what is added to k1 as it is measured in the image, in tangents at the shortest focal length.
-        pupil: how far the entrance pupil has moved along the axis [m]; forward is positive.
+        focal_mm: shortest and longest nominal focal length [mm].
+        pitch_mm: nominal size of a pixel; focal_mm / pitch_mm is what the device reports [mm].
+        lens_steps: number of lens positions, evenly spaced in the logarithm of the focal length.
+        lens_speed: lens positions per second.
+        focal_curve: relative change of the ratio of true to nominal focal length.
+        center_drift_px: curves by which the principal point's u and v move [px].
+        distortion_drift: change of k1 in the image, in tangents at the shortest focal length.
+        pupil: forward movement of the entrance pupil along the optical axis [m].
     """
 
     focal_px: Focal = (692.0, 693.0)
@@ -238,17 +239,17 @@ def _along(curve: Curve, s: float) -> float:
 
 @dataclass(frozen=True)
 class SimHead:
-    """The simulated pan-tilt unit; defaults are a stock PTU-D46-17.5 with the geometry of a real, imperfect one.
+    """The simulated pan-tilt head; the defaults are a stock PTU-D46-17.5 with the geometry of a real, imperfect unit.
 
     Attributes:
-        step_deg: resolution [degrees].
-        pan_deg: lowest and highest pan [degrees].
-        tilt_deg: lowest and highest tilt [degrees].
+        step_deg: step size; 0 for a continuous head [degrees].
+        pan_deg: range of pan [degrees].
+        tilt_deg: range of tilt [degrees].
         speed_deg_s: highest speed [degrees/s].
         accel_deg_s2: acceleration [degrees/s^2].
-        command_delay_s: from command to motion [s].
-        axis_offset_mm: distance between the axes along the pan frame's z, dz [mm].
-        squareness_deg: departure of the axes from a right angle, eps [degrees].
+        command_delay_s: time from a command to the start of motion [s].
+        axis_offset_mm: dz, distance between the axes along the pan frame's z [mm].
+        squareness_deg: eps, deviation of the angle between the axes from 90 degrees [degrees].
         backlash_deg: play of each axis [degrees].
     """
 
@@ -265,28 +266,28 @@ class SimHead:
 
 @dataclass(frozen=True)
 class SimEffects:
-    """One switch for each way in which the simulation departs from the textbook; ``all = false`` clears them.
+    """Switches of the effects by which the simulation departs from an ideal rig.
+
+    ``all = true`` or ``all = false`` sets every switch that is not named, except ``shadows`` and ``multisampling``.
 
     Attributes:
         noise: sensor noise.
-        jpeg: compression.
+        jpeg: JPEG compression.
         distortion: lens distortion of both cameras.
-        latency: light to frame.
-        blur: motion during the exposure.
-        command_delay: command to motion.
+        latency: time from light to frame.
+        blur: motion blur during the exposure.
+        command_delay: time from a command to the start of motion.
         profile: finite speed and acceleration of the head.
-        steps: the head's resolution.
-        axes: axis offset and non-squareness.
-        backlash: play.
+        steps: step size of the head.
+        axes: axis offset and non-squareness of the head.
+        backlash: play of the head's axes.
         lens: positions and travel time of the zoom lens.
-        optics: what the zoom lens's optics do besides magnifying: focal curve, centre, distortion and pupil that move
-            with focal length. Without it the coefficients of the distortion stay what they are, so that the image's
-            distortion vanishes as the field narrows.
-        scatter: true sizes differ from what the pipeline is told.
-        shadows: cast shadows (costs two to four times the rendering).
+        optics: curves of focal length, principal point, distortion and entrance pupil over the zoom range. Without them
+            the distortion coefficients are constant, so that the image's distortion vanishes as the field narrows.
+        scatter: true sizes that differ from the nominal sizes.
+        shadows: cast shadows; rendering takes two to four times as long.
         multisampling: antialiasing with 4 samples.
-        clutter: outdoors foliage sways, clouds drift, shadows cross the ground and the light changes. Off by default:
-            the figures of calibration and of the demo are for a world at rest.
+        clutter: swaying foliage, drifting clouds, moving shadows and changing light in the outdoor scene.
     """
 
     noise: bool = True
@@ -318,19 +319,20 @@ class SimConfig:
     """The simulated world.
 
     Attributes:
-        scene: a scene of sim_assets, or a path to an MJCF file.
-        seed: of everything random.
-        targets: which targets are in the scene.
-        T_zoom0_fixed: the true Gamma.
-        T_head_zoom: the true T, at the zoom lens's shortest focal length like Gamma.
-        fixed: the wide camera.
+        scene: "outdoor", "indoor", or the path of an MJCF file with a site ``fixed_mount``; relative to rig.toml.
+        seed: seed of everything random.
+        targets: targets in the scene: "book", "person", "bird", names of ``[sim.models]``, and further ones of a kind
+            with a number from 2 on, such as "bird2".
+        T_zoom0_fixed: the true Gamma of the paper, at the shortest focal length.
+        T_head_zoom: the true T of the paper, at the shortest focal length.
+        fixed: the fixed camera.
         zoom: the zoom camera.
-        head: the pan-tilt unit.
-        effects: switches.
-        models: for targets of one's own, by name: a mesh in metres (.obj, .stl), x forward and z up, or an MJCF file
-            with one body; a relative path is relative to rig.toml.
-        paths: for a target of that name, waypoints [t, x, y, z] (seconds, metres in the world) of a smooth path
-            that replaces the built-in one.
+        head: the pan-tilt head.
+        effects: switches of effects.
+        models: models of own targets: a mesh in metres (.obj, .stl; x forward, z up) or an MJCF file (.xml) with one
+            body; relative to rig.toml.
+        paths: path of a target in place of the built-in one: waypoints of the body's centre, in seconds and metres of
+            the world, joined by a smooth curve.
     """
 
     scene: str = "outdoor"
@@ -407,14 +409,14 @@ class HardwareHead:
 
     Attributes:
         port: serial port such as "/dev/ttyUSB0", or "socket://host:port".
-        baud: of the serial line.
-        step_deg: resolution that the unit is expected to report [degrees].
-        pan_deg: lowest and highest pan that it is expected to report, in this file's sense of pan [degrees].
-        tilt_deg: the same of tilt [degrees].
-        pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left, as the D46's manual has it.
+        baud: baud rate of the serial line.
+        step_deg: step size that the unit is expected to report [degrees].
+        pan_deg: range of pan that the unit is expected to report, with positive pan to the right [degrees].
+        tilt_deg: range of tilt that the unit is expected to report, with positive tilt up [degrees].
+        pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left, as in the D46's manual.
         tilt_sign: 1 where the unit's positive tilt goes up, -1 where it goes down.
-        speed_deg_s: speed of moves, as far as the unit allows [degrees/s].
-        command_delay_s: from a command to the start of motion, as measured [s].
+        speed_deg_s: speed of moves, at most the unit's own [degrees/s].
+        command_delay_s: time from a command to the start of motion, as measured [s].
     """
 
     port: str = ""
@@ -430,18 +432,18 @@ class HardwareHead:
 
 @dataclass(frozen=True)
 class HardwareFixed:
-    """The wide camera, on an Axis video server or network camera.
+    """The fixed camera, on an Axis video server or network camera.
 
     Attributes:
-        url: of the server, such as "http://192.168.0.90".
-        camera: its number on the server, from 1.
-        user: empty where none is asked for.
-        password: empty where the environment variable COTARGET_PASSWORD holds it.
-        size: (width, height) that is expected [px].
-        resolution: as the server calls it, such as "4CIF"; empty for its default.
-        rate_hz: frames a second asked for.
-        compression: 0 to 100; less is finer.
-        latency_s: from light to a frame's first byte, as measured [s].
+        url: address of the server, such as "http://192.168.0.90".
+        camera: number of the camera on the server, from 1.
+        user: user name; empty where the server asks for none.
+        password: password; empty where the environment variable COTARGET_PASSWORD holds it.
+        size: image size that is expected [px].
+        resolution: the server's name of the resolution, such as "4CIF"; empty for its default.
+        rate_hz: frames per second to request.
+        compression: JPEG compression; less is finer.
+        latency_s: time from light to a frame's first byte, as measured [s].
     """
 
     url: str = ""
@@ -461,18 +463,18 @@ class HardwareZoom:
 
     Attributes:
         port: "usb:", "usb:BUS,DEVICE" or "ptpip:host:port:port", as gphoto2 writes them.
-        model: as gphoto2 calls it; empty for the one that it finds there.
-        settings: what else to set when it is opened, by gphoto2's names.
+        model: gphoto2's name of the model; empty for the camera that is found at the port.
+        settings: further settings to make when the camera is opened, by gphoto2's names.
         zoom_key: gphoto2's name of the setting that moves the lens.
-        lens: (position, focal length [mm]) of some positions, from the shortest to the longest; between them the
-            logarithm of the focal length is interpolated.
-        lens_speed: positions a second, to tell when the lens stands; the camera does not.
-        size: (width, height) of the frames of the viewfinder [px].
-        still_size: the same of full stills [px].
-        pitch_mm: size of a pixel of the viewfinder's frames [mm].
-        rate_hz: frames of the viewfinder a second, at most.
-        latency_s: from light to a frame, as measured [s].
-        command_delay_s: from a command to the start of the lens's motion [s].
+        lens: some lens positions and their nominal focal lengths, both increasing; between them the logarithm of the
+            focal length is interpolated.
+        lens_speed: lens positions per second; the end of a movement is computed from it, as the camera reports none.
+        size: size of the viewfinder's frames [px].
+        still_size: size of full stills [px].
+        pitch_mm: nominal size of a pixel of the viewfinder's frames [mm].
+        rate_hz: highest number of viewfinder frames per second.
+        latency_s: time from light to a frame, as measured [s].
+        command_delay_s: time from a command to the start of the lens's motion [s].
     """
 
     port: str = ""
@@ -491,7 +493,11 @@ class HardwareZoom:
 
 @dataclass(frozen=True)
 class HardwareBoard:
-    """Who holds the calibration board: "person", or a program at "socket://host:port"."""
+    """How the calibration board is presented.
+
+    Attributes:
+        presenter: "person", who is asked on the terminal to hold it, or a program at "socket://host:port".
+    """
 
     presenter: str = "person"
 
@@ -891,7 +897,14 @@ ENCODING = "utf-8-sig"  # with the byte-order mark that some editors write, or w
 
 @dataclass(frozen=True)
 class BoardConfig:
-    """The calibration board: inner corners (columns, rows) and the side of a square [m]."""
+    """The calibration board.
+
+    Attributes:
+        kind: a plain chessboard, or a ChArUco board, which is also found where only a part of it is visible.
+        corners: number of inner corners; of a chessboard one number is odd and the other even, so that its orientation
+            is unique.
+        square: side of a square, as measured on the print [m].
+    """
 
     kind: Literal["chessboard", "charuco"] = "chessboard"
     corners: Annotated[tuple[int, int], "[columns, rows]"] = (9, 6)
@@ -900,17 +913,17 @@ class BoardConfig:
 
 @dataclass(frozen=True)
 class TargetConfig:
-    """What the pipeline is told of a target.
+    """A target profile: what is known of a target before it is seen.
 
     Attributes:
-        size: its true size [m].
-        dimension: which of its dimensions that is.
-        wanted_px: how large that dimension shall be in the close-up [px].
-        detector: how it is found in the wide view.
-        template: picture of the target, cut to its outline, for one that is found by its colour; a relative path is
-            relative to rig.toml.
-        motion: how it moves: a thing that stands and is put elsewhere at times, who walks, or who flies; by default
-            what is found by its colour stands, what has a wingspan flies, and all else walks.
+        size: true size of the dimension below [m].
+        dimension: the dimension that ``size`` gives.
+        wanted_px: size of that dimension in the close-up [px].
+        detector: how the fixed camera's images are searched: "colour" matches a template, "motion" subtracts the
+            background, "speck" finds targets of a few pixels, "mog2" is the paper's plain background subtraction.
+        template: picture of the target, cut to its outline, for the detector "colour"; relative to rig.toml.
+        motion: motion model; by default "standing" for the detector "colour", "flying" for a wingspan, "walking" for
+            all others.
     """
 
     size: float
@@ -932,16 +945,16 @@ DEFAULT_TARGETS: Mapping[str, TargetConfig] = types.MappingProxyType(
 
 @dataclass(frozen=True)
 class SafetyConfig:
-    """Soft limits inside the device's own, and when the head is halted or does not move at all.
+    """Soft limits of the head, within the device's own, and when the head is halted.
 
     Attributes:
-        pan_deg: lowest and highest pan [degrees]; None for the device's.
-        tilt_deg: lowest and highest tilt [degrees]; None for the device's.
-        speed_deg_s: speed cap [degrees/s]; None for the device's.
+        pan_deg: range of pan; the device's own by default [degrees].
+        tilt_deg: range of tilt; the device's own by default [degrees].
+        speed_deg_s: highest speed; the device's own by default [degrees/s].
         max_frame_age_s: a frame older than this is not acted on [s].
-        watchdog_s: a head that may be moving is halted when for so long neither a fresh frame was read nor a command
-            given [s]; its braking comes after that.
-        stop_file: while this file exists, the head does not move; None for no such file.
+        watchdog_s: a head that may be moving is halted after this time without a new frame or command; braking comes on
+            top [s].
+        stop_file: while this file exists, the head does not move; relative to rig.toml; no such file by default.
     """
 
     pan_deg: Limits | None = None
@@ -954,16 +967,16 @@ class SafetyConfig:
 
 @dataclass(frozen=True)
 class RigConfig:
-    """The whole of rig.toml.
+    """All tables of rig.toml.
 
     Attributes:
-        backend: which rig it is.
-        sim: the simulated one.
-        hardware: the real one.
-        recording: folder of the one that was recorded; a relative path is relative to rig.toml.
-        board: for calibration.
-        safety: soft limits.
-        targets: what can be followed.
+        backend: the rig to open: the simulation, the real devices, or a recording.
+        sim: the simulated rig.
+        hardware: the real devices.
+        recording: folder of the recording, for the backend "replay"; relative to rig.toml.
+        board: the calibration board.
+        safety: limits of motion.
+        targets: target profiles by name.
     """
 
     backend: Literal["sim", "hardware", "replay"] = "sim"

@@ -40,19 +40,18 @@ def add_choice(parser: argparse.ArgumentParser, default: str = POLICIES[0]) -> N
     which.add_argument(
         "--policy",
         choices=POLICIES,
-        help="of several targets: the first until it disappears, each in turn and who leaves first before others, "
-        f"or in the order in which most get a good close-up ({default})",
+        help="choice among several targets: the first until it disappears, the one that leaves first, or the order "
+        f"that gives most of them a good close-up ({default})",
     )
     which.add_argument(
         "--click",
         type=number,
         nargs=2,
         metavar=("U", "V"),
-        help="only the target at this pixel of the wide view, from (0, 0) at the top left [px]: the first confirmed "
-        "track there or near",
+        help="follow only the target at this pixel of the fixed image: the first confirmed track at or near it",
     )
     which.add_argument(
-        "--track", type=count, metavar="N", help="only the track of this number, as film and table have it"
+        "--track", type=count, metavar="N", help="follow only the track with this id, as in video and table"
     )
 
 

@@ -115,13 +115,13 @@ def _parser() -> argparse.ArgumentParser:
 
     def command(name: str, run: Callable[[argparse.Namespace], int | None], summary: str) -> Parser:
         made = commands.add_parser(name, help=summary, description=summary)
-        made.add_argument("-v", "--verbose", action="store_true", help="say more about what is done")
+        made.add_argument("-v", "--verbose", action="store_true", help="report more of what is done")
         made.set_defaults(run=run)
         return made
 
     demo = command("demo", running.demo, "calibrate a simulated rig and follow a book, a person and a bird")
     demo.add_argument("--out", type=Path, default=Path("demo-out"), metavar="DIR", help="where to write (demo-out)")
-    demo.add_argument("--seed", type=not_negative, default=0, help="of everything random (0)")
+    demo.add_argument("--seed", type=not_negative, default=0, help="seed of everything random (0)")
 
     calibrate = command(
         "calibrate", calibrating.calibrate, "calibrate from a rig, from saved captures, or from plain photos"
@@ -134,45 +134,45 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         default=Path("calibration.json"),
         metavar="FILE",
-        help="what to write (calibration.json); one of before is kept",
+        help="file to write (calibration.json); an earlier one is kept under another name",
     )
-    calibrate.add_argument("--captures", type=Path, metavar="DIR", help="with --rig: keep the images there")
+    calibrate.add_argument("--captures", type=Path, metavar="DIR", help="with --rig: keep the images in this folder")
     calibrate.add_argument("--fixed", metavar="GLOB", help="photos of the fixed camera, such as 'left*.jpg'")
     calibrate.add_argument(
-        "--zoom", metavar="GLOB", help="photos of the zoom camera, paired by the numbers in the names"
+        "--zoom", metavar="GLOB", help="photos of the zoom camera, paired by the numbers in their names"
     )
     calibrate.add_argument("--board", type=corners, metavar="CxR", help="inner corners of the board, such as 9x6")
     calibrate.add_argument("--square", type=positive, metavar="M", help="side of a square [m]")
-    calibrate.add_argument("--kind", choices=KINDS, help=f"of the board on photos ({KINDS[0]})")
+    calibrate.add_argument("--kind", choices=KINDS, help=f"kind of the board on photos ({KINDS[0]})")
     calibrate.add_argument(
         "--placements",
         type=count,
         metavar="N",
-        help="with --rig: how many placements of the board, the first handful in any case (30)",
+        help="with --rig: number of board placements; the first handful is taken in any case (30)",
     )
     calibrate.add_argument(
         "--stops",
         type=count,
         metavar="N",
-        help="with --rig: how many stops of the zoom lens, more where they are too far apart; 1: shortest alone (8)",
+        help="with --rig: number of zoom samples, more where they are too far apart; 1: shortest alone (8)",
     )
     calibrate.add_argument(
         "--method",
         choices=("joint", "sequential"),
         default="joint",
-        help="one fit of everything, or the paper's (joint)",
+        help="one fit of everything, or the paper's step-by-step method (joint)",
     )
-    calibrate.add_argument("--encoders", action="store_true", help="find the encoders' scales and zeros too")
+    calibrate.add_argument("--encoders", action="store_true", help="calibrate the encoders' scales and zeros too")
     calibrate.add_argument(
         "--insist",
         action="store_true",
-        help="go on where the motions leave something open, with an uncertainty to match",
+        help="go on where the motions leave something undetermined, with an uncertainty to match",
     )
 
-    report = command("report", calibrating.report, "tell whether to trust a calibration, on one page with pictures")
+    report = command("report", calibrating.report, "write a page on how far a calibration can be trusted")
     report.add_argument("calibration", type=Path, metavar="FILE", help="calibration.json")
     report.add_argument(
-        "--out", type=Path, default=Path("report.html"), metavar="PAGE", help="what to write (report.html)"
+        "--out", type=Path, default=Path("report.html"), metavar="PAGE", help="file to write (report.html)"
     )
 
     aim = command(
@@ -181,120 +181,140 @@ def _parser() -> argparse.ArgumentParser:
         "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout",
     )
     aim.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
-    aim.add_argument("--pixel", type=float, nargs=2, required=True, metavar=("U", "V"), help="in the fixed view [px]")
+    aim.add_argument("--pixel", type=float, nargs=2, required=True, metavar=("U", "V"), help="pixel of the fixed image")
     how_far = aim.add_mutually_exclusive_group(required=True)
-    how_far.add_argument("--depth", type=positive, metavar="M", help="along the fixed camera's axis [m]")
-    how_far.add_argument("--size-px", type=positive, metavar="S", help="how large the target of --target appears [px]")
+    how_far.add_argument("--depth", type=positive, metavar="M", help="depth along the fixed camera's axis [m]")
+    how_far.add_argument(
+        "--size-px", type=positive, metavar="S", help="size of the target of --target in the fixed image [px]"
+    )
     aim.add_argument("--target", metavar="NAME", help="a target of rig.toml, for its size")
     how_close = aim.add_mutually_exclusive_group()
-    how_close.add_argument("--wanted-px", type=positive, metavar="N", help="how large it shall appear [px]")
-    how_close.add_argument("--focal-mm", type=positive, metavar="F", help="the focal length to use [mm]")
+    how_close.add_argument("--wanted-px", type=positive, metavar="N", help="wanted size in the close-up [px]")
+    how_close.add_argument("--focal-mm", type=positive, metavar="F", help="focal length to use [mm]")
     aim.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml, for limits and targets (the default rig)")
-    aim.add_argument("--ik", choices=("exact", "paper-table", "paper-example"), default="exact", help="(exact)")
+    aim.add_argument(
+        "--ik",
+        choices=("exact", "paper-table", "paper-example"),
+        default="exact",
+        help="inverse kinematics: exact, or a reading of the paper's shortcut (exact)",
+    )
 
     follow = command("follow", running.follow, "follow a target with a calibrated rig")
     follow.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
     follow.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
     follow.add_argument("--target", required=True, metavar="NAME", help="a target of rig.toml")
     add_choice(follow)
-    follow.add_argument("--seconds", type=positive, default=20.0, metavar="S", help="for how long (20)")
+    follow.add_argument("--seconds", type=positive, default=20.0, metavar="S", help="duration [s] (20)")
     follow.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
     follow.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
     follow.add_argument("--record", type=Path, metavar="DIR", help="record everything, for cotarget replay")
 
     replay = command("replay", running.replay, "run the pipeline again on a recording of follow --record")
-    replay.add_argument("recording", type=Path, metavar="DIR", help="its folder")
-    add_choice(replay, "whom the recorded run followed")
+    replay.add_argument("recording", type=Path, metavar="DIR", help="folder of the recording")
+    add_choice(replay, "as in the recorded run")
     replay.add_argument(
         "--check",
         action="store_true",
-        help="end with status 1 where the commands differ from the recorded ones, which are told in any case",
+        help="end with status 1 if the commands differ from the recorded ones",
     )
     replay.add_argument(
         "--labels",
         type=Path,
         metavar="FILE",
-        help="score the tracks by these: a csv as for detect, whose frame is the picture's number in DIR/fixed",
+        help="score the tracks by these labels: a csv as for detect, whose frame is the image number in DIR/fixed",
     )
     replay.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
     replay.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
 
-    point = command("point", operating.point, "send head and lens somewhere, and take a picture with each camera")
+    point = command("point", operating.point, "move head and lens to given values, and take a picture with each camera")
     point.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
-    point.add_argument("--pan-deg", type=number, metavar="A", help="positive turns right (where it is)")
-    point.add_argument("--tilt-deg", type=number, metavar="A", help="positive goes up (where it is)")
-    point.add_argument("--focal-mm", type=positive, metavar="F", help="of the zoom lens (where it is)")
+    point.add_argument("--pan-deg", type=number, metavar="A", help="pan, positive to the right (unchanged)")
+    point.add_argument("--tilt-deg", type=number, metavar="A", help="tilt, positive up (unchanged)")
+    point.add_argument("--focal-mm", type=positive, metavar="F", help="focal length [mm] (unchanged)")
     point.add_argument(
-        "--pictures", type=Path, metavar="DIR", help="write fixed.png and zoom.png there; those of before are kept"
+        "--pictures",
+        type=Path,
+        metavar="DIR",
+        help="write fixed.png and zoom.png to this folder; earlier ones are kept under other names",
     )
 
-    latency = command("latency", operating.latency, "measure how late cameras and head are, by what moves")
+    latency = command(
+        "latency", operating.latency, "measure the latencies and command delays of cameras, head and lens"
+    )
     latency.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
     latency.add_argument(
-        "--calibration", type=Path, metavar="FILE", help="calibration.json, for the fixed camera: a board is swung"
+        "--calibration",
+        type=Path,
+        metavar="FILE",
+        help="calibration.json; measures the fixed camera too, by a board that is swung",
     )
 
     stop = command("stop", operating.stop, "emergency stop of every rig that watches this rig.toml's stop file")
     stop.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
-    stop.add_argument("--reason", default="stopped by the operator", metavar="TEXT", help="what everybody is told")
+    stop.add_argument(
+        "--reason",
+        default="stopped by the operator",
+        metavar="TEXT",
+        help="reason, which every stopped program reports",
+    )
 
     clear = command("clear", operating.clear, "end an emergency stop, when it is safe to move")
     clear.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
 
     reset_head = command(
-        "reset-head", operating.reset_head, "let the pan-tilt unit find its limits: it turns all the way"
+        "reset-head", operating.reset_head, "let the pan-tilt head find its limits; it turns through its whole range"
     )
     reset_head.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
-    reset_head.add_argument("--yes", action="store_true", help="camera and cables are clear of it")
+    reset_head.add_argument("--yes", action="store_true", help="confirm that camera and cables are clear of it")
 
     emulate = command(
         "emulate", operating_module.emulate, "put a simulated rig behind the real devices' protocols, in real time"
     )
     emulate.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml of the simulated rig (the default rig)")
     emulate.add_argument(
-        "--write", type=Path, required=True, metavar="FILE", help="where to write the rig.toml that connects to it"
+        "--write", type=Path, required=True, metavar="FILE", help="rig.toml to write, which connects to it"
     )
-    emulate.add_argument("--host", default="127.0.0.1", help="to listen at (127.0.0.1: this machine alone)")
+    emulate.add_argument("--host", default="127.0.0.1", help="address to listen at (127.0.0.1: this machine alone)")
     for name in ("head", "fixed", "zoom", "board", "control"):
-        emulate.add_argument(f"--{name}", type=port, default=0, metavar="PORT", help="to listen at (any that is free)")
-    emulate.add_argument(
-        "--tcp", action="store_true", help="let the rig.toml reach the head by TCP, not by a serial port"
-    )
-    emulate.add_argument("--user", default="", metavar="NAME", help="who alone may look through the fixed camera")
+        emulate.add_argument(f"--{name}", type=port, default=0, metavar="PORT", help="port to listen at (any free one)")
+    emulate.add_argument("--tcp", action="store_true", help="connect the head by TCP instead of a serial port")
+    emulate.add_argument("--user", default="", metavar="NAME", help="user name that the fixed camera asks for (none)")
     emulate.add_argument(
         "--fault",
         action="append",
         default=[],
         metavar="DEVICE.FAULT",
-        help="to be on from the start, of those below; while it runs, the control socket switches them",
+        help="fault to be on from the start, one of those below; the control socket switches faults later",
     )
     emulate.more = operating_module.fault_names
-    emulate.add_argument("--seconds", type=positive, metavar="S", help="for how long (until Ctrl-C)")
+    emulate.add_argument("--seconds", type=positive, metavar="S", help="duration [s] (until Ctrl-C)")
 
-    view = command("view", running_module.view, "show the simulated scene, both cameras' frusta and what they see")
+    view = command("view", running_module.view, "show the simulated scene, both cameras' frusta and their images")
     view.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml of the simulated rig (the default rig)")
-    view.add_argument("--target", metavar="NAME", help="follow this target of rig.toml meanwhile")
-    view.add_argument("--calibration", type=Path, metavar="FILE", help="to follow by (the simulation's true one)")
-    view.add_argument("--browser", action="store_true", help="in a web browser, on this machine alone")
+    view.add_argument("--target", metavar="NAME", help="follow this target of rig.toml")
     view.add_argument(
-        "--port", type=port, metavar="P", help=f"of the page; 0: any that is free ({running_module.PORT})"
+        "--calibration", type=Path, metavar="FILE", help="calibration.json (the simulation's true calibration)"
     )
-    view.add_argument("--seconds", type=positive, metavar="S", help="for how long (until it is closed, or Ctrl-C)")
+    view.add_argument("--browser", action="store_true", help="serve a page for a web browser on this machine")
+    view.add_argument(
+        "--port", type=port, metavar="P", help=f"port of the page; 0: any free one ({running_module.PORT})"
+    )
+    view.add_argument("--seconds", type=positive, metavar="S", help="duration [s] (until it is closed, or Ctrl-C)")
 
-    detect = command("detect", running.detect, "run the fixed camera's detector and tracker on any film")
-    detect.add_argument("film", type=Path, metavar="VIDEO")
+    detect = command("detect", running.detect, "run the fixed camera's detector and tracker on any video")
+    detect.add_argument("film", type=Path, metavar="VIDEO", help="video to search")
     detect.add_argument(
-        "--target", required=True, metavar="NAME", help="a target of rig.toml (without: book, person, bird)"
+        "--target", required=True, metavar="NAME", help="a target of rig.toml, or one of book, person, bird"
     )
     detect.add_argument(
         "--csv",
         type=Path,
         required=True,
         metavar="FILE",
-        help="write the confirmed tracks, one line each a frame: u_px and v_px are the box's centre, the score is 0 "
-        "where it is only predicted",
+        help="write one line per confirmed track and frame: u_px and v_px are the box's centre, the score is 0 "
+        "where the box is only predicted",
     )
-    detect.add_argument("--video", type=Path, metavar="OUT", help="write the film with the tracks drawn (.mp4)")
+    detect.add_argument("--video", type=Path, metavar="OUT", help="write the video with the tracks drawn (.mp4)")
     detect.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml, for targets of your own")
     detect.add_argument(
         "--labels",
@@ -305,15 +325,17 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     board = command("board", calibrating.board, "write a calibration board to print, to scale")
-    board.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .pdf, .svg or .png")
-    board.add_argument("--kind", choices=KINDS, default=KINDS[0], help="charuco has markers in it (chessboard)")
+    board.add_argument("--out", type=Path, required=True, metavar="FILE", help="file to write: .pdf, .svg or .png")
+    board.add_argument(
+        "--kind", choices=KINDS, default=KINDS[0], help="kind of board; charuco has markers (chessboard)"
+    )
     board.add_argument("--board", type=corners, default=(9, 6), metavar="CxR", help="inner corners (9x6)")
     board.add_argument("--square", type=positive, default=0.025, metavar="M", help="side of a square [m] (0.025)")
 
     doctor = command(
-        "doctor", running.doctor, "versions, rendering, and for each thing that is missing the command that fixes it"
+        "doctor",
+        running.doctor,
+        "check versions, rendering and devices, and print the command that fixes what is missing",
     )
-    doctor.add_argument(
-        "--rig", type=Path, metavar="FILE", help="rig.toml: look at its devices too, by harmless questions"
-    )
+    doctor.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml: check its devices too, without moving them")
     return parser

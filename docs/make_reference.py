@@ -1,0 +1,150 @@
+"""Fill configuration.md and cli.md from the code when the documentation is built, so that neither gets out of date.
+
+MkDocs runs this as a hook (see mkdocs.yml): both pages hold an introduction and a mark, which is replaced by what is
+made here. `python docs/make_reference.py` prints it.
+"""
+
+import argparse
+import dataclasses
+import inspect
+import json
+import logging
+import re
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial, reduce
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import griffe
+
+from cotarget.cli.main import _parser
+from cotarget.config import DEFAULT_TARGETS, RigConfig, parse_config
+from cotarget.errors import ConfigError
+from cotarget.geometry import RigidTransform, pose_dict
+
+MARK = "<!-- made from the code -->"
+KINDS = {bool: "boolean", int: "integer", float: "number", str: "string", Path: "path", RigidTransform: "pose"}
+UNITS = {"deg_s2": "degrees/s^2", "deg_s": "degrees/s", "deg": "degrees", "px": "px", "mm": "mm", "hz": "Hz", "s": "s"}
+UNIT_IN_TEXT = re.compile(r" \[(m|s|px|mm|degrees|degrees/s|degrees/s\^2|grey levels)\]")
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Insert what is made from the code; MkDocs calls this for every page."""
+    make = {"configuration.md": configuration, "cli.md": command_line}.get(page.file.src_uri)
+    return markdown.replace(MARK, make()) if make else markdown
+
+
+def configuration() -> str:
+    """Describe every table of rig.toml and every key in it."""
+    keys = ("size", "dimension", "wanted_px", "detector")
+    known = [(f"`{name}`", *(_toml(getattr(each, key)) for key in keys)) for name, each in DEFAULT_TARGETS.items()]
+    return "\n".join((*_tables("", RigConfig), "These targets need no table:\n", _grid(("target", *keys), known)))
+
+
+def _tables(where: str, cls: type[Any]) -> Iterator[str]:
+    """Describe one table, then the tables in it."""
+    docstrings = [griffe.Docstring(inspect.cleandoc(each.__doc__ or "")) for each in cls.__mro__[-2::-1]]
+    sections = [section for each in docstrings for section in each.parse("google", warnings=False)]
+    attributes = [each for section in sections if section.kind.value == "attributes" for each in section.value]
+    meanings = {each.name: " ".join(each.description.split()).rstrip(".") for each in attributes}
+    hints, rows, inner = typing.get_type_hints(cls, include_extras=True), list[tuple[str, ...]](), list[Any]()
+    for field in dataclasses.fields(cls):
+        key, hint = f"{where}.{field.name}".lstrip("."), hints[field.name]
+        held = (typing.get_args(hint) or (hint,))[-1]  # of a Mapping, what it holds
+        if dataclasses.is_dataclass(held):
+            inner.append((key if held is hint else f"{key}.NAME", held))
+            continue
+        default = field.default_factory() if callable(field.default_factory) else field.default
+        meaning = meanings.get(field.name, "")
+        if not meaning:  # a warning, and `mkdocs build --strict` fails
+            logging.getLogger("mkdocs.hooks").warning("%s: 'Attributes:' has no %s", cls.__name__, field.name)
+        by_name = [unit for end, unit in UNITS.items() if field.name.endswith(f"_{end}")]
+        unit, meaning = (UNIT_IN_TEXT.findall(meaning) or by_name or [""])[0], UNIT_IN_TEXT.sub("", meaning)
+        rows.append((f"`{field.name}`", _kind(hint), unit, _toml(default), _range(key, hint, default), meaning))
+    yield f"## {f'`[{where}]`' if where else 'Outside of the tables'} {{ #{where or 'backend'} }}\n"
+    yield (cls.__doc__ or "").partition("Attributes:")[0].replace("\n    ", "\n").strip() + "\n"
+    yield _grid(("key", "type", "unit", "default", "range", "meaning"), rows) if rows else ""
+    for key, held in inner:
+        yield from _tables(key, held)
+
+
+def _kind(hint: Any) -> str:
+    """Name a type."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        return f"`{args[1]}`"
+    if origin is Literal:
+        return ", ".join(f"`{json.dumps(each)}`" for each in args)
+    if origin is tuple:
+        return f"list of {_kind(args[0])}" if args[-1] is ... else f"[{', '.join(map(_kind, args))}]"
+    if origin is Mapping:
+        return f"table: NAME = {_kind(args[1])}"
+    return KINDS[hint] if hint in KINDS else _kind(args[0])  # X or None
+
+
+def _toml(value: Any) -> str:
+    """Write a default as rig.toml has it."""
+    if value in (None, dataclasses.MISSING):
+        return "none" if value is None else "required"
+    if isinstance(value, RigidTransform):
+        rows = (f"{key} = {[round(number, 9) for number in row]}" for key, row in pose_dict(value).items())
+        return f"`{{ {', '.join(rows)} }}`"
+    return f"`{json.dumps(value)}`"
+
+
+def _range(key: str, hint: Any, default: Any) -> str:
+    """Find by trying which numbers are accepted while all other keys have their defaults."""
+    if hint not in (int, float, float | None):
+        return ""
+    number: Any = int if hint is int else float
+    usual = default if isinstance(default, int | float) else 1.0
+    if choices := _refusal(key, usual + 1).partition("is not one of: ")[2]:
+        return choices
+    words = []
+    for inclusive, exclusive, bad in (("≥", ">", -(10**9)), ("≤", "<", 10**9)):
+        if _refusal(key, number(bad)):
+            good = usual
+            while abs(good - bad) > (1 if number is int else 1e-9):
+                middle = number((good + bad) / 2)
+                good, bad = (good, middle) if _refusal(key, middle) else (middle, bad)
+            edge = number(round(good, 6))
+            words.append(f"{exclusive if _refusal(key, edge) else inclusive} {edge:g}")
+    return " and ".join(words)
+
+
+def _refusal(key: str, value: float) -> str:
+    """Say why a value is refused; empty where it is accepted."""
+    table: dict[str, Any] = {"sim": {"effects": {"optics": False}}}  # with it, a check takes ten times as long
+    *path, name = (key := key.replace("NAME", "book")).split(".")
+    reduce(lambda inner, part: inner.setdefault(part, {}), path, table)[name] = value
+    try:
+        parse_config(table)
+    except ConfigError as error:
+        return str(error) if str(error).startswith(key) else ""
+    return ""
+
+
+def command_line() -> str:
+    """Describe every command and its arguments."""
+    commands = next(a for a in _parser()._actions if isinstance(a, argparse._SubParsersAction)).choices
+    parts = []
+    for name, parser in commands.items():
+        parser.formatter_class = partial(argparse.HelpFormatter, width=96)
+        parts += [f"## cotarget {name} {{ #{name} }}\n", f"{parser.description[:1].upper()}{parser.description[1:]}.\n"]
+        parts.append(f"```text\n{parser.format_usage()}```\n".replace("usage: ", "").replace("\n       ", "\n"))
+        write = parser._get_formatter()._format_action_invocation
+        rows = [(f"`{write(a)}`", a.help or "") for a in parser._actions if a.dest not in ("help", "verbose")]
+        parts.append(_grid(("argument", "meaning"), rows) if rows else "")
+        parts.append(f"```text\n{parser.more()}\n```\n" if parser.more else "")
+    return "\n".join(parts)
+
+
+def _grid(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    """Write a table in Markdown."""
+    lines = [heads, ("---",) * len(heads), *([cell.replace("|", "\\|") for cell in row] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+
+if __name__ == "__main__":
+    print(configuration(), command_line(), sep="\n")  # noqa: T201
