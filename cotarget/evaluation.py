@@ -19,7 +19,7 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import TARGETS, TargetConfig, split_name
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError, UnreachableError
-from cotarget.estimation.zoom_matching import GATE_SIGMAS, CloseupFinder, Expected, Found
+from cotarget.estimation.zoom_matching import GATE_SIGMAS, CloseupFinder, Expected, ZoomMeasurement
 from cotarget.geometry import Array
 from cotarget.metrics import WHOLLY_VISIBLE, Closeup, Row
 from cotarget.pantilt import HeadGeometry
@@ -203,7 +203,7 @@ class TruthFinder:
         """The truth is there at any time."""
         return True
 
-    def find(self, frame: Frame, expected: Expected) -> Found | None:
+    def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
         """Find the target; None where its middle is not in the frame, or not where it is expected."""
         view, box = self._view(expected), self._truth.box(self._name, "zoom", frame.t)
         if view is None or box is None or self._missed(frame.t):
@@ -215,7 +215,7 @@ class TruthFinder:
         inside = (at >= 0).all() and (at <= np.array(frame.image.shape[1::-1]) - 1).all()
         if not inside or off @ np.linalg.solve(view.covariance, off) > GATE_SIGMAS**2:
             return None
-        return Found(at, self.SIGMA_PX, np.full(2, self.SIGMA_PX), 1.0, 1.0, np.ptp(box, axis=0), frame.t)
+        return ZoomMeasurement(at, self.SIGMA_PX, np.full(2, self.SIGMA_PX), 1.0, 1.0, np.ptp(box, axis=0), frame.t)
 
 
 # Pointing error is stated for targets at these depths, all over the wide view [m].

@@ -22,7 +22,7 @@ from cotarget.control.zoom import is_seen_well, shape_of
 from cotarget.detection import Detection
 from cotarget.estimation import Appearance, Estimate, TargetFilter, estimation_settings_for
 from cotarget.estimation.motion_model import PAN, TILT, K, L
-from cotarget.estimation.zoom_matching import LATEST_S, CloseupFinder, Expected, Finder, Found
+from cotarget.estimation.zoom_matching import LATEST_S, CloseupFinder, Expected, Finder, ZoomMeasurement
 from cotarget.geometry import Array
 from cotarget.pantilt import towards
 from cotarget.rig import Frame, Image, PanTiltState, ZoomState
@@ -220,7 +220,7 @@ class TargetFusion:
             size_px = track.larger_side_px if self._target.dimension == "wingspan" else None
             found.update_fixed(box, frame.t, sigma_px=sigma_px, size_px=size_px)
 
-    def update_zoom(self, frame: Frame | None, wide_t: float) -> Found | None:
+    def update_zoom(self, frame: Frame | None, wide_t: float) -> ZoomMeasurement | None:
         """Look for the followed target in the zoom view, and take it into account where it is found.
 
         A frame that is newer than the wide view waits until that has shown the target at about its time.
@@ -245,7 +245,7 @@ class TargetFusion:
             self._waiting.popleft()
         return None if due is None else self._look_close(due)
 
-    def _look_close(self, frame: Frame) -> Found | None:
+    def _look_close(self, frame: Frame) -> ZoomMeasurement | None:
         """Look for the followed target in a frame of whose time the wide view has shown it."""
         assert self._followed is not None, "who asks has looked"
         pose, estimate = self.states.at(frame.t), self.estimate(self._followed, frame.t)
@@ -283,7 +283,7 @@ class TargetFusion:
         """Whether the zoom view should have shown the target long since."""
         return self._unfound_s > UNFOUND_S
 
-    def _count_unfound(self, frame: Frame, found: Found | None, seen: Appearance, estimate: Estimate) -> None:
+    def _count_unfound(self, frame: Frame, found: ZoomMeasurement | None, seen: Appearance, estimate: Estimate) -> None:
         """Note for how long the target was not where the zoom view should show it."""
         passed, self._zoom_t = min(max(frame.t - self._zoom_t, 0.0), JUST_SEEN_S), frame.t
         size = np.array(frame.image.shape[1::-1])

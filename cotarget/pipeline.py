@@ -25,7 +25,7 @@ from cotarget.detection import Detection, Detector
 from cotarget.detection.base import flood
 from cotarget.errors import DeviceError, StaleFrameError, UnreachableError
 from cotarget.estimation import Estimate
-from cotarget.estimation.zoom_matching import CloseupFinder, Found
+from cotarget.estimation.zoom_matching import CloseupFinder, ZoomMeasurement
 from cotarget.fusion import MakeFinder, TargetFusion
 from cotarget.rig import Camera, Clock, Frame, Image, PanTiltState, Rig, ZoomState
 from cotarget.safety.safe_rig import FUTURE_S
@@ -258,7 +258,7 @@ class Step:
     head: PanTiltState
     lens: ZoomState
     estimate: Estimate | None = None
-    found: Found | None = None
+    found: ZoomMeasurement | None = None
     head_commands: int = 0
     lens_commands: int = 0
 

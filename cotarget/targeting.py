@@ -45,7 +45,7 @@ class Reach:
 
 
 @dataclass(frozen=True)
-class Closeup:
+class WantedSize:
     """How large the target shall be: its size [m], the size wanted in the image [px], and whether that is a height."""
 
     size: float
@@ -119,7 +119,7 @@ def aim(
     x_fixed: Array,
     reach: Reach,
     *,
-    closeup: Closeup | None = None,
+    closeup: WantedSize | None = None,
     nominal_px: float | None = None,
     method: Method = "exact",
     pixel: Array | None = None,

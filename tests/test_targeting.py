@@ -12,7 +12,7 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.errors import CalibrationError, CotargetError, UnreachableError
 from cotarget.geometry import RigidTransform, Rotation
 from cotarget.pantilt import HeadGeometry
-from cotarget.targeting import METHODS, Closeup, Reach, aim, depth_of, error_budget, point_at
+from cotarget.targeting import METHODS, Reach, WantedSize, aim, depth_of, error_budget, point_at
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
 
 # The solver accepts a miss of 1e-11 rad, which is 1e-7 px at the longest focal length of 8000 px.
@@ -83,7 +83,7 @@ def test_the_exact_aim_brings_the_target_to_the_wanted_pixel(real_head, pixel):
         truth = random_truth(rng, real_head)
         assert np.hypot(truth.zoom.cx - 319.5, truth.zoom.cy - 239.5) > 0  # else a mixed-up centre could hide
         x_fixed = np.array([*rng.uniform(-0.4, 0.4, 2), 1.0]) * rng.uniform(4, 40)
-        closeup = Closeup(0.3, rng.uniform(20, 300))
+        closeup = WantedSize(0.3, rng.uniform(20, 300))
         for how in ({}, {"nominal_px": rng.uniform(667, 8000)}, {"closeup": closeup}):
             found = aim(calibration_of(truth), x_fixed, ANYWHERE, pixel=pixel, **how)
             tolerance = IN_TURN_PX if "closeup" in how else PIXEL
@@ -99,7 +99,7 @@ def test_the_closeup_is_as_large_as_wanted():
     for _ in range(10):
         truth = replace(random_truth(rng, True), zoom=Lens(692.0, 693.0, 326.0, 235.0))
         x_fixed = np.array([*rng.uniform(-0.4, 0.4, 2), 1.0]) * rng.uniform(4, 10)
-        found = aim(calibration_of(truth), x_fixed, ANYWHERE, closeup=Closeup(0.234, 160.0))
+        found = aim(calibration_of(truth), x_fixed, ANYWHERE, closeup=WantedSize(0.234, 160.0))
         assert not found.limited
         M = truth.zoom_fixed(found.pan, found.tilt)
         half = M[:3, :3].T @ [0.117, 0, 0]
@@ -123,7 +123,7 @@ def test_the_papers_worked_point():
     """x_zoom0 = (811, 563, 10464) mm: range 10510 and 7186 px; the paper takes the depth for the range: 7155 px."""
     x_fixed = np.array([2.9738, 0.5263, 10.0])
     calibration = shifted(*(np.array([0.811, 0.563, 10.464]) - x_fixed))
-    book = Closeup(0.234, 160.0)
+    book = WantedSize(0.234, 160.0)
     exact = aim(calibration, x_fixed, ANYWHERE, closeup=book)
     assert round(1000 * exact.range) == 10510
     assert exact.focal_px == pytest.approx(7186, abs=WHOLE_MM_PX)
@@ -165,7 +165,7 @@ def test_the_shortcut_says_where_it_has_no_solution():
     (1000.0, 8000.0, True),
 ])  # fmt: skip
 def test_the_focal_length_is_limited_to_the_lens(wanted_px, nominal, limited):
-    found = aim(HOME, np.array([0.0, 0.0, 10.0]), ANYWHERE, closeup=Closeup(0.234, wanted_px))
+    found = aim(HOME, np.array([0.0, 0.0, 10.0]), ANYWHERE, closeup=WantedSize(0.234, wanted_px))
     assert found.nominal_px == pytest.approx(nominal, rel=RELATIVE)
     assert found.limited is limited
 

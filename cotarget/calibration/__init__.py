@@ -4,7 +4,7 @@ from cotarget.board import draw_board
 from cotarget.calibration.calibrate import calibrate_captures, calibrate_photos, calibrate_rig, calibrate_views
 from cotarget.calibration.corners import find_corners
 from cotarget.calibration.file import load_calibration, save_calibration
-from cotarget.calibration.handeye import HandEye, solve_hand_eye, solve_hand_eye_from_poses
+from cotarget.calibration.handeye import HandEye, solve_hand_eye, solve_hand_eye_from_motions
 from cotarget.calibration.model import Calibration, Capture, Covariance, HeldOut, Options, Rejected, Residuals, View
 from cotarget.calibration.observability import Observability, name_directions, weak_directions
 from cotarget.calibration.uncertainty import line_of_sight_covariance, predicted_pointing
@@ -32,6 +32,6 @@ __all__ = [
     "predicted_pointing",
     "save_calibration",
     "solve_hand_eye",
-    "solve_hand_eye_from_poses",
+    "solve_hand_eye_from_motions",
     "weak_directions",
 ]

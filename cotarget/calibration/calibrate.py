@@ -45,7 +45,7 @@ from cotarget.calibration.model import (
     unseen,
 )
 from cotarget.calibration.sequential import sequential
-from cotarget.calibration.session import SETTLE, Recorder, capture_session, view_of
+from cotarget.calibration.session import SETTLE, CaptureRecorder, capture_session, view_of
 from cotarget.config import BoardConfig, RigConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.geometry import Array
@@ -59,7 +59,7 @@ TEACHING_VIEWS = 4  # of a stop, after each of which it is fitted again
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class FoundViews:
     """What images gave: views, what was left out, and the images' sizes (width, height) [px]."""
 
     views: tuple[View, ...]
@@ -80,7 +80,7 @@ def beyond_shortest(name: str, focal_px: float, shortest_px: float) -> Rejected:
 
 def find_views(
     directory: Path, index: CaptureIndex, progress: Progress | None = None, *, options: Options = DEFAULT_OPTIONS
-) -> Found:
+) -> FoundViews:
     """Find the boards in all images of an index; the sequential method's only at the shortest focal length.
 
     Args:
@@ -126,7 +126,7 @@ def find_views(
         more, lost = _find_parts(views, later, index.board, sizes, replace(options, folds=0))
         views += more
         rejected += lost
-    return Found(tuple(views), tuple(rejected), sizes)
+    return FoundViews(tuple(views), tuple(rejected), sizes)
 
 
 def _why_none(directory: Path, index: CaptureIndex, rejected: Sequence[Rejected]) -> str:
@@ -443,7 +443,7 @@ def calibrate_rig(
         CalibrationError: a camera never sees the board, there is no common view, or the head fails.
         ConfigError: the board looks the same upside down.
     """
-    recorder = Recorder(rig, board, captures_dir, pitch_mm, settle, config)
+    recorder = CaptureRecorder(rig, board, captures_dir, pitch_mm, settle, config)
     rng = np.random.default_rng(seed)
     capture_session(recorder, placements, rng, progress, stops=stops, far_placements=far_placements)
     provenance = {

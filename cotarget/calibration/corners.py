@@ -78,7 +78,7 @@ SMALL = Look(window=WINDOW_SHARE, inside=0.3, near=0.3, sharpness=0.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class FoundCorners:
     """What a search came to.
 
     Attributes:
@@ -98,7 +98,7 @@ class Found:
         return np.where(self.seen[:, None], np.round(self.corners_px, CORNER_DECIMALS), np.nan)
 
 
-def search(grey: Image, grid: Array, predicted: Array, look: Look) -> Found | None:
+def search(grey: Image, grid: Array, predicted: Array, look: Look) -> FoundCorners | None:
     """Look for corners near their predictions, learn how far these are off, and look again until nothing changes.
 
     Args:
@@ -129,7 +129,7 @@ def search(grey: Image, grid: Array, predicted: Array, look: Look) -> Found | No
             break
         # Affine is enough to find the next ones by, and reaches safely beyond what is seen.
         start, half = mapped(predicted, found, seen, curved=False), min(half, LARGEST_WINDOW_PX)
-    return Found(found, seen, expected, spacing)
+    return FoundCorners(found, seen, expected, spacing)
 
 
 def grid_of(board: BoardConfig) -> Array:
@@ -382,7 +382,7 @@ def find_near(image: Image, board: BoardConfig, predicted_px: Array) -> Array | 
     return found.rounded()
 
 
-def _as_predicted(grey: Image, grid: Array, predicted: Array, found: Found) -> bool:
+def _as_predicted(grey: Image, grid: Array, predicted: Array, found: FoundCorners) -> bool:
     """Whether the corners seen are surely numbered as predicted.
 
     Two squares or one diagonal off, the colours are the same. But where one of the board's edges is in view, either a

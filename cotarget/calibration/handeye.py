@@ -1,6 +1,6 @@
 """Hand-eye: X = T_hand_camera from motions of the hand and of the camera, A_i X = X B_i (Eqs. 3, 4).
 
-`park_martin` gives it in closed form. `solve_hand_eye` and `solve_hand_eye_from_poses` go on from there to the most
+`park_martin` gives it in closed form. `solve_hand_eye_from_motions` and `solve_hand_eye` go on from there to the most
 likely X, with its covariance and with a verdict on what the motions determine; they serve a robot's arm as well as a
 pan-tilt head, whose hand turns without shifting.
 
@@ -64,7 +64,7 @@ PRIOR = 1 / np.repeat([REGULARIZED_ROTATION, REGULARIZED_POSITION], 3) ** 2
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class HandEyeProblem:
     """Residuals of n motions or poses as functions of stacked transforms, X being the first.
 
     Attributes:
@@ -105,7 +105,7 @@ class MotionFit:
     covariance: Array
 
 
-def motion_problem(A: RigidTransform, B: RigidTransform, independent: int) -> Problem:
+def motion_problem(A: RigidTransform, B: RigidTransform, independent: int) -> HandEyeProblem:
     """A X = X B: rotation and translation are a group each.
 
     Args:
@@ -138,10 +138,12 @@ def motion_problem(A: RigidTransform, B: RigidTransform, independent: int) -> Pr
         # variances, so that each gives 2.
         return count * np.repeat([4.0, 2.0 * (sigma[0] / sigma[3]) ** 2], 3)
 
-    return Problem(residuals, ROTATION_AND_TRANSLATION, noise, independent, share)
+    return HandEyeProblem(residuals, ROTATION_AND_TRANSLATION, noise, independent, share)
 
 
-def pose_problem(T_base_hand: RigidTransform, T_camera_board: RigidTransform, owners: npt.NDArray[np.intp]) -> Problem:
+def pose_problem(
+    T_base_hand: RigidTransform, T_camera_board: RigidTransform, owners: npt.NDArray[np.intp]
+) -> HandEyeProblem:
     """T_camera_board = X^-1 T_base_hand^-1 Z, in the camera's frame turned so that z is the line of sight.
 
     Args:
@@ -185,7 +187,7 @@ def pose_problem(T_base_hand: RigidTransform, T_camera_board: RigidTransform, ow
         by_w = (e / rotation) ** 2 + (e * lever / translation) ** 2
         return 2.0 * count * np.repeat([by_w, (e / translation) ** 2], 3)
 
-    return Problem(residuals, (0, 0, 1, 2, 2, 3), noise, n - boards)
+    return HandEyeProblem(residuals, (0, 0, 1, 2, 2, 3), noise, n - boards)
 
 
 def _turn_to_z(directions: Array) -> Rotation:
@@ -205,7 +207,7 @@ def _cross(v: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in ([o, -z, y], [z, o, -x], [-y, x, o])], axis=-2)
 
 
-def fit_motions(problem: Problem, start: RigidTransform) -> MotionFit:
+def fit_motions(problem: HandEyeProblem, start: RigidTransform) -> MotionFit:
     """Find the most likely transforms, gross errors left out; free directions stay where the search left them."""
     used = np.ones(len(problem.residuals(start)[0]), dtype=bool)
     state = start
@@ -216,7 +218,7 @@ def fit_motions(problem: Problem, start: RigidTransform) -> MotionFit:
     return _result(problem, state, taken, used)
 
 
-def regularized(problem: Problem, found: MotionFit) -> MotionFit:
+def regularized(problem: HandEyeProblem, found: MotionFit) -> MotionFit:
     """Put the free directions of X where its rotation and translation are smallest; see `PRIOR`."""
     free = int(np.sum(spectrum(found.normal, found.noise)[0] < 1))
     state, _, taken = _descend(problem, found.transforms, found.used, free=free)
@@ -232,7 +234,7 @@ def stepped(transforms: RigidTransform, step: Array) -> RigidTransform:
 
 
 def _descend(
-    problem: Problem, state: RigidTransform, used: npt.NDArray[np.bool_], *, robust: bool = False, free: int = 0
+    problem: HandEyeProblem, state: RigidTransform, used: npt.NDArray[np.bool_], *, robust: bool = False, free: int = 0
 ) -> tuple[RigidTransform, Array, Array]:
     """Iterate Gauss and Newton's step; also gives the six residuals' standard deviations and their lost freedom."""
     freedom = np.full(6, float(len(state)))  # taken from each of the six residuals
@@ -266,7 +268,7 @@ def _eliminated(N: Array, g: Array) -> tuple[Array, Array, Array]:
 
 
 def _inverse(
-    problem: Problem, state: RigidTransform, Nx: Array, sigma: Array, count: int, free: int
+    problem: HandEyeProblem, state: RigidTransform, Nx: Array, sigma: Array, count: int, free: int
 ) -> tuple[Array, Array]:
     """The covariance of X, and the step towards the smallest X that the prior asks for."""
     values, V = spectrum(Nx, problem.share * problem.noise(state, sigma, count))
@@ -288,7 +290,7 @@ def _taken(WJ: Array, J: Array, inverse: Array, through: Array, N: Array) -> Arr
     return taken
 
 
-def _sigmas(problem: Problem, r: Array, taken: Array, *, robust: bool, lost: float = 0.0) -> Array:
+def _sigmas(problem: HandEyeProblem, r: Array, taken: Array, *, robust: bool, lost: float = 0.0) -> Array:
     """Standard deviation of each of the six residuals, one for each group; see the module's text."""
     in_nominal = r / NOMINAL
     left = 6 * len(r) - taken.sum() - lost
@@ -313,7 +315,7 @@ def _sigmas(problem: Problem, r: Array, taken: Array, *, robust: bool, lost: flo
 
 
 def _result(
-    problem: Problem, state: RigidTransform, taken: Array, used: npt.NDArray[np.bool_], free: int = 0
+    problem: HandEyeProblem, state: RigidTransform, taken: Array, used: npt.NDArray[np.bool_], free: int = 0
 ) -> MotionFit:
     r, J = problem.residuals(state)
     sigma = _sigmas(problem, r[used], taken, robust=False, lost=STUDENT)
@@ -419,7 +421,7 @@ def park_martin(head_motions: Sequence[RigidTransform], camera_motions: Sequence
     return RigidTransform.from_components(_translation(R, A, B), Rotation.from_matrix(R))
 
 
-def solve_hand_eye(
+def solve_hand_eye_from_motions(
     A: Sequence[RigidTransform],
     B: Sequence[RigidTransform],
     *,
@@ -432,7 +434,7 @@ def solve_hand_eye(
     in translation, both weighted by their own standard deviations; seven motions and more have these estimated, and
     gross errors left out. The covariance takes the motions as independent. Motions that share poses are not: all pairs
     of n poses tell no more than n - 1 of them, and `independent` says so. With poses at hand,
-    `solve_hand_eye_from_poses` is more exact.
+    `solve_hand_eye` is more exact.
 
     Args:
         A: motions of the hand, T_hand_hand', two or more; see `motions`.
@@ -453,7 +455,7 @@ def solve_hand_eye(
     return _solved(problem, X, HandMotions(a.rotation.as_rotvec(), a.translation), regularize)
 
 
-def solve_hand_eye_from_poses(
+def solve_hand_eye(
     T_base_hand: Sequence[RigidTransform],
     T_camera_board: Sequence[RigidTransform],
     *,
@@ -477,7 +479,7 @@ def solve_hand_eye_from_poses(
         placements: where the board stood during each view, by number; in one place throughout, by default.
         middle: of the board's points, in its frame [m], (3,): that is the point which the camera sees best. With a
             board whose origin is a corner it makes a difference.
-        regularize: see `solve_hand_eye`.
+        regularize: see `solve_hand_eye_from_motions`.
 
     Raises:
         CalibrationError: the poses contradict each other, or leave X undetermined; in words, with what to add.
@@ -518,7 +520,7 @@ def _together(transforms: Sequence[RigidTransform]) -> RigidTransform:
         ) from None
 
 
-def _solved(problem: Problem, start: RigidTransform, moved: HandMotions, regularize: bool) -> HandEye:
+def _solved(problem: HandEyeProblem, start: RigidTransform, moved: HandMotions, regularize: bool) -> HandEye:
     """Fit, judge, and refuse or insist."""
     found = fit_motions(problem, start)
     verdict = judge_motions(found.normal, found.noise, moved)

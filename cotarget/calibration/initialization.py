@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from cotarget.calibration.bundle import Fit, fit, predict_pixels, robust_sigma
-from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye
+from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye_from_motions
 from cotarget.calibration.model import CameraName, Rejected, RigModel, View, stop_of
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
@@ -343,7 +343,7 @@ def rough_hand(model: RigModel, views: Sequence[View], points: Array, *, regular
         CalibrationError: the motions do not determine it, or contradict each other.
     """
     A, B = head_motions(model, views, points)
-    return solve_hand_eye(A, B, regularize=True).X if regularize else park_martin(A, B)
+    return solve_hand_eye_from_motions(A, B, regularize=True).X if regularize else park_martin(A, B)
 
 
 def head_motions(

@@ -129,7 +129,7 @@ def view_of(capture: Capture, corners_px: Array) -> View:
 
 
 @dataclass(eq=False)
-class Recorder:
+class CaptureRecorder:
     """A capture session's hands: it moves the head, presents the board, takes images and keeps what was seen.
 
     Attributes:
@@ -382,7 +382,7 @@ ROUGH_RMS_PX = 3.0  # a rough fit worse than this is not believed
 CENTRAL = 0.12  # of the image's width: nearer to the middle a board is central
 
 
-def learn_fixed(recorder: Recorder, rng: np.random.Generator) -> RigModel:
+def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> RigModel:
     """Rough intrinsics of the fixed camera, from one board straight ahead and a few tilted ones.
 
     Raises:
@@ -423,7 +423,7 @@ def learn_fixed(recorder: Recorder, rng: np.random.Generator) -> RigModel:
     return RigModel(boards={}, fixed=rough_intrinsics("fixed", views, points, size))
 
 
-def learn_zoom(recorder: Recorder, model: RigModel) -> RigModel:
+def learn_zoom(recorder: CaptureRecorder, model: RigModel) -> RigModel:
     """Rough Gamma and T: find the board with the zoom camera, turn the head a little, and see how it moves."""
     assert model.fixed is not None
     focal = recorder.rig.zoom.state().focal_px
@@ -439,7 +439,7 @@ def learn_zoom(recorder: Recorder, model: RigModel) -> RigModel:
     return refitted(model, recorder).model
 
 
-def _present_otherwise_tilted(recorder: Recorder, model: RigModel, view: View) -> None:
+def _present_otherwise_tilted(recorder: CaptureRecorder, model: RigModel, view: View) -> None:
     """Show both cameras another board in the same place: of Gamma's mirror images only the true one fits both."""
     assert model.fixed is not None
     points = board_points(recorder.board)
@@ -451,7 +451,7 @@ def _present_otherwise_tilted(recorder: Recorder, model: RigModel, view: View) -
     recorder.update_zoom(expected=False)
 
 
-def _likeliest(model: RigModel, recorder: Recorder, seen: Sequence[View]) -> RigModel:
+def _likeliest(model: RigModel, recorder: CaptureRecorder, seen: Sequence[View]) -> RigModel:
     """Rough Gamma and T from one placement seen from three head poses.
 
     Each view has two possible poses of the board; every combination of them makes a model, and all views so far
@@ -486,7 +486,7 @@ def _likeliest(model: RigModel, recorder: Recorder, seen: Sequence[View]) -> Rig
     return min(results, key=lambda one: one[0])[1]
 
 
-def _find_with_zoom(recorder: Recorder, model: RigModel) -> View:
+def _find_with_zoom(recorder: CaptureRecorder, model: RigModel) -> View:
     """A zoom view of a placement that the fixed camera sees too, near the middle of the zoom image."""
     assert model.fixed is not None
     limits = recorder.rig.head.limits
@@ -517,7 +517,7 @@ def _find_with_zoom(recorder: Recorder, model: RigModel) -> View:
     )
 
 
-def _turn_a_little(recorder: Recorder, view: View) -> tuple[View, View]:
+def _turn_a_little(recorder: CaptureRecorder, view: View) -> tuple[View, View]:
     """See the same board from another pan and from another tilt."""
     limits = recorder.rig.head.limits
     seen: list[View] = []
@@ -539,7 +539,7 @@ def _turn_a_little(recorder: Recorder, view: View) -> tuple[View, View]:
     return seen[0], seen[1]
 
 
-def _centred(recorder: Recorder, view: View, by_pan: View, by_tilt: View) -> View:
+def _centred(recorder: CaptureRecorder, view: View, by_pan: View, by_tilt: View) -> View:
     """Bring the board to the middle of the zoom image, where the unknown distortion bends no pose.
 
     The two turns tell how pan and tilt move the board in the image, whatever the camera's roll.
@@ -561,7 +561,7 @@ def _centred(recorder: Recorder, view: View, by_pan: View, by_tilt: View) -> Vie
     return recorder.update_zoom(expected=False) or view
 
 
-def refitted(model: RigModel, recorder: Recorder) -> Fit:
+def refitted(model: RigModel, recorder: CaptureRecorder) -> Fit:
     """Fit the rough model to all views so far: at first Gamma alone, with more views everything."""
     points: Array = board_points(recorder.board)
     views = recorder.views
@@ -642,7 +642,7 @@ BORDER_PX = 12.0  # a point of the board is brought anywhere but this near to th
 
 
 def see_stops(
-    recorder: Recorder,
+    recorder: CaptureRecorder,
     model: RigModel,
     stops: Sequence[float],
     placements: int,
@@ -721,7 +721,7 @@ def _stop_at(model: RigModel, nominal: float) -> tuple[int, RigModel]:
 
 
 def _see_stop(
-    recorder: Recorder,
+    recorder: CaptureRecorder,
     model: RigModel,
     number: int,
     fixed_view: View,
@@ -747,7 +747,7 @@ def _see_stop(
 
 
 def _see_part(
-    recorder: Recorder,
+    recorder: CaptureRecorder,
     model: RigModel,
     nominal: float,
     coverage: Coverage,
@@ -898,7 +898,7 @@ MOST_MISSES = 4  # placements in a row without a view before giving up
 
 
 def capture_session(
-    recorder: Recorder,
+    recorder: CaptureRecorder,
     placements: int,
     rng: np.random.Generator,
     progress: Progress | None = None,
@@ -949,7 +949,7 @@ def capture_session(
         progress(total, total, "fitting")
 
 
-def _break_off(recorder: Recorder) -> None:
+def _break_off(recorder: CaptureRecorder) -> None:
     """End a session that failed or was interrupted: the head first of all; what fails now hides no earlier error."""
     with contextlib.suppress(CotargetError):  # whoever closes the rig halts it again, and tells where that fails
         recorder.rig.head.halt()
@@ -960,7 +960,7 @@ def _break_off(recorder: Recorder) -> None:
             log.warning("while the session was broken off: %s", error)
 
 
-def _stops_without_views(recorder: Recorder, stops: Sequence[float]) -> list[Rejected]:
+def _stops_without_views(recorder: CaptureRecorder, stops: Sequence[float]) -> list[Rejected]:
     """The stops that were asked for and not seen, each by the nearest views [px]."""
     half = np.log(stops[1] / stops[0]) / 2
     seen = np.log([view.focal_px for view in recorder.views if view.camera == "zoom" and view.focal_px is not None])
@@ -972,7 +972,7 @@ def _stops_without_views(recorder: Recorder, stops: Sequence[float]) -> list[Rej
 
 
 def _cover(
-    recorder: Recorder,
+    recorder: CaptureRecorder,
     model: RigModel,
     placements: int,
     rng: np.random.Generator,
@@ -1015,7 +1015,7 @@ def _cover(
 
 
 def _next_placement(
-    recorder: Recorder,
+    recorder: CaptureRecorder,
     model: RigModel,
     coverage: dict[str, Coverage],
     rng: np.random.Generator,
@@ -1050,7 +1050,7 @@ def _next_placement(
 
 
 def _see_from_everywhere(
-    recorder: Recorder,
+    recorder: CaptureRecorder,
     model: RigModel,
     wish: RigidTransform,
     fixed_view: View,

@@ -34,7 +34,7 @@ def aim(options: argparse.Namespace) -> None:
     from cotarget.calibration import load_calibration
     from cotarget.calibration.joint import SAME_FOCAL
     from cotarget.config import RigConfig, load_config
-    from cotarget.targeting import Closeup, Reach, depth_of, error_budget, point_at
+    from cotarget.targeting import Reach, WantedSize, depth_of, error_budget, point_at
     from cotarget.targeting import aim as aim_at
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
@@ -62,7 +62,7 @@ def aim(options: argparse.Namespace) -> None:
         shortest = calibration.zoom.nominal_px[0]
     reach = Reach(*config.head_limits, (shortest, max(shortest, longest)), step=config.head_step)
     closeup = (
-        Closeup(target.size, options.wanted_px, target.dimension == "height")
+        WantedSize(target.size, options.wanted_px, target.dimension == "height")
         if target and options.wanted_px is not None
         else None
     )

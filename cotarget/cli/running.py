@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from cotarget.rig import Rig
     from cotarget.safety import SafeRig
     from cotarget.sim.truth import Truth
-    from cotarget.sim.viewer.scene import Sight
+    from cotarget.sim.viewer.scene import Snapshot
     from cotarget.sim.world import SimWorld
 
 
@@ -63,7 +63,7 @@ def view(options: argparse.Namespace) -> None:
             print("", file=sys.stderr)
 
 
-def watch(sights: "Iterator[Sight]", window: Any, now: Callable[[], float], sleep: Callable[[float], None]) -> None:
+def watch(sights: "Iterator[Snapshot]", window: Any, now: Callable[[], float], sleep: Callable[[float], None]) -> None:
     """Show what happens, no quicker than it happens, until it is over or the window is closed.
 
     Args:
@@ -119,7 +119,7 @@ def _opener(options: argparse.Namespace) -> "Callable[[Truth], Any]":
 
 def _sights(
     options: argparse.Namespace, config: "RigConfig", world: "SimWorld", calibration: "Calibration | None"
-) -> "Iterator[Sight]":
+) -> "Iterator[Snapshot]":
     """What there is to see: the pipeline at work where there is a target, else the rig at rest."""
     from cotarget.evaluation import true_calibration
     from cotarget.safety import SafeRig
@@ -132,14 +132,14 @@ def _sights(
             yield from _followed(options.target, config, calibration or true_calibration(world), world, rig, seconds)
 
 
-def _at_rest(rig: "Rig", truth: "Truth", seconds: float) -> "Iterator[Sight]":
-    from cotarget.sim.viewer.scene import Sight, frusta_of
+def _at_rest(rig: "Rig", truth: "Truth", seconds: float) -> "Iterator[Snapshot]":
+    from cotarget.sim.viewer.scene import Snapshot, frusta_of
 
     fixed = rig.fixed.read()
     for _ in itertools.count():
         t = rig.clock.now()
         pictures = {"fixed": fixed.image, "zoom": rig.zoom.read().image}
-        yield Sight(t, f"t = {t:.1f} s", pictures, frusta_of(truth, t))  # type: ignore[arg-type]
+        yield Snapshot(t, f"t = {t:.1f} s", pictures, frusta_of(truth, t))  # type: ignore[arg-type]
         if t >= seconds:
             return
         fixed = rig.fixed.read(newer_than=fixed.t)
@@ -147,11 +147,11 @@ def _at_rest(rig: "Rig", truth: "Truth", seconds: float) -> "Iterator[Sight]":
 
 def _followed(
     name: str, config: "RigConfig", calibration: "Calibration", world: "SimWorld", rig: "Rig", seconds: float
-) -> "Iterator[Sight]":
+) -> "Iterator[Snapshot]":
     from cotarget.detection import make_detector
     from cotarget.drawing import draw_wide, draw_zoom
     from cotarget.pipeline import FollowSettings, follow
-    from cotarget.sim.viewer.scene import Sight, frusta_of
+    from cotarget.sim.viewer.scene import Snapshot, frusta_of
 
     truth = world.truth()
     target = config.target(name)
@@ -161,7 +161,7 @@ def _followed(
         depths = {} if step.aim is None else {"zoom": step.aim.range}
         caption = f"t = {step.t:.1f} s   {name}: {step.state}"
         pictures = {"fixed": draw_wide(step), "zoom": draw_zoom(step)}
-        yield Sight(step.t, caption, pictures, frusta_of(truth, step.t, depths))  # type: ignore[arg-type]
+        yield Snapshot(step.t, caption, pictures, frusta_of(truth, step.t, depths))  # type: ignore[arg-type]
 
 
 def demo(options: argparse.Namespace) -> None:

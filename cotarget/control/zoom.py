@@ -44,7 +44,7 @@ class ZoomSettings:
 
 
 @dataclass(frozen=True)
-class Expected:
+class ExpectedTarget:
     """The target as it will stand to the line of sight when the next frame is exposed.
 
     Attributes:
@@ -82,7 +82,9 @@ def shape_of(track: Track) -> float:
     return float(width / height)
 
 
-def expect(estimate: Estimate, pan: float, tilt: float, nominal_px: float, *, shape: float = 1.0) -> Expected | None:
+def expect(
+    estimate: Estimate, pan: float, tilt: float, nominal_px: float, *, shape: float = 1.0
+) -> ExpectedTarget | None:
     """Work out how a target will stand to the line of sight.
 
     Args:
@@ -99,14 +101,14 @@ def expect(estimate: Estimate, pan: float, tilt: float, nominal_px: float, *, sh
     return None if seen is None else _expected(estimate, seen, shape)
 
 
-def _expected(estimate: Estimate, seen: Appearance, shape: float) -> Expected:
+def _expected(estimate: Estimate, seen: Appearance, shape: float) -> ExpectedTarget:
     focal = seen.focal_px
     sides = {
         "height": (shape, 1.0),
         "width": (1.0, 1 / shape),
         "wingspan": (min(shape, 1.0), min(1 / shape, 1.0)),
     }[estimate.target.dimension]
-    return Expected(
+    return ExpectedTarget(
         seen.offset_px / focal,
         seen.covariance / (focal[:, None] * focal),
         0.5 * seen.size_px / focal * np.array(sides),
@@ -137,7 +139,7 @@ def is_seen_well(
     return chance_inside(_expected(estimate, seen, shape), focal, zoom.size) >= SEEN_WELL
 
 
-def chance_inside(expected: Expected, focal_px: float, size: tuple[int, int], rim_px: float = 0.0) -> float:
+def chance_inside(expected: ExpectedTarget, focal_px: float, size: tuple[int, int], rim_px: float = 0.0) -> float:
     """The chance that the whole target is in the image.
 
     Args:
@@ -158,7 +160,11 @@ def chance_inside(expected: Expected, focal_px: float, size: tuple[int, int], ri
 
 
 def longest_focal(
-    expected: Expected, chance: float, size: tuple[int, int], focal_range: tuple[float, float], rim_px: float = 0.0
+    expected: ExpectedTarget,
+    chance: float,
+    size: tuple[int, int],
+    focal_range: tuple[float, float],
+    rim_px: float = 0.0,
 ) -> float:
     """The longest focal length at which the whole target is in the image with some chance.
 
@@ -200,7 +206,12 @@ class ZoomController:
         self._out_t = -math.inf
 
     def choose(
-        self, expected: Expected | None, wanted_px: float, commanded_px: float, t: float, now_px: float | None = None
+        self,
+        expected: ExpectedTarget | None,
+        wanted_px: float,
+        commanded_px: float,
+        t: float,
+        now_px: float | None = None,
     ) -> ZoomChoice:
         """Decide where the lens shall be.
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from cotarget.config import TargetConfig
-from cotarget.detection.background import BIRD, PERSON, BackgroundDetector, MotionSettings, plain
+from cotarget.detection.background import BIRD, PERSON, BackgroundDetector, BackgroundSettings, plain
 from cotarget.detection.base import Detection, Detector, ExternalDetector
 from cotarget.detection.color_template import ColorTemplateDetector
 from cotarget.detection.small_target import SmallTargetDetector
@@ -21,11 +21,11 @@ __all__ = [
     "BIRD",
     "PERSON",
     "BackgroundDetector",
+    "BackgroundSettings",
     "ColorTemplateDetector",
     "Detection",
     "Detector",
     "ExternalDetector",
-    "MotionSettings",
     "SmallTargetDetector",
     "make_detector",
     "plain",

@@ -17,7 +17,7 @@ FLOODED_S = 0.2
 
 
 @dataclass(frozen=True)
-class MotionSettings:
+class BackgroundSettings:
     """What moves like the target.
 
     Attributes:
@@ -70,7 +70,7 @@ WIDE, UPRIGHT = 0.7, 1.0
 # The plain mixture remembers 120 frames at 30 a second [s].
 PLAIN_HISTORY_S = 4.0
 # A bird may be as small as four pixels, so that nothing is opened away; it casts no shadow on the sky.
-BIRD = MotionSettings(
+BIRD = BackgroundSettings(
     history_s=8.0,
     background_part=0.9,
     warm_up_s=0.5,
@@ -88,7 +88,7 @@ BIRD = MotionSettings(
 )
 # A person stops at times, casts a shadow, falls apart into limbs and trunk one above the other, and stands upright
 # (1.3 still lets two or three side by side pass, but not a patch of light on the ground).
-PERSON = MotionSettings(
+PERSON = BackgroundSettings(
     history_s=20.0,
     background_part=0.7,
     warm_up_s=0.5,
@@ -106,7 +106,7 @@ PERSON = MotionSettings(
 )
 
 
-def plain(settings: MotionSettings) -> MotionSettings:
+def plain(settings: BackgroundSettings) -> BackgroundSettings:
     """The paper's detector: the mixture with OpenCV's part of the background; nothing against sway or light.
 
     What of the foreground is taken together, and how large a target may be, the paper does not say: that is as here.
@@ -125,7 +125,7 @@ def plain(settings: MotionSettings) -> MotionSettings:
 class BackgroundDetector:
     """What differs from an adaptive Gaussian mixture of the background (Zivkovic 2004), as connected pieces."""
 
-    def __init__(self, settings: MotionSettings, rate_hz: float) -> None:
+    def __init__(self, settings: BackgroundSettings, rate_hz: float) -> None:
         """Begin without a background.
 
         Args:

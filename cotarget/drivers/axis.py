@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
 from cotarget.config import HardwareFixed
-from cotarget.drivers.mjpeg import JpegDecoder, MultipartReader, Picture, boundary_of
+from cotarget.drivers.mjpeg import JpegDecoder, JpegPicture, MultipartReader, boundary_of
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
 from cotarget.rig import Clock, Frame, Image
 
@@ -487,11 +487,11 @@ class AxisCamera:
         self._api = ""
         self._closing = threading.Event()
         self._decoder, self._decoding = JpegDecoder(), threading.Lock()
-        self._decoded: tuple[Picture, Image] | None = None
+        self._decoded: tuple[JpegPicture, Image] | None = None
         # All that follows is shared with the thread, and guarded by this.
         self._new = threading.Condition()
         self._counters = Counters()
-        self._picture: Picture | None = None  # the newest
+        self._picture: JpegPicture | None = None  # the newest
         self._last = b""  # its bytes, kept where it could not be decoded too
         self._fresh = self._heard = clock.now()  # when the newest came, and the last byte
         self._spoilt = self._frozen = False  # what came since the newest: broken ones, or the same
@@ -572,7 +572,7 @@ class AxisCamera:
                 f"[{width}, {height}], or ask for another hardware.fixed.resolution than '{self._config.resolution}'"
             )
 
-    def _time(self, picture: Picture) -> float:
+    def _time(self, picture: JpegPicture) -> float:
         return picture.t - self._config.latency_s
 
     def _ready(self, after: float) -> bool:
@@ -581,7 +581,7 @@ class AxisCamera:
         told = picture is not None and (self._time(picture) > after or picture.size != self.size)
         return told or bool(self._failed) or self._closing.is_set()
 
-    def _decode(self, picture: Picture) -> Image | None:
+    def _decode(self, picture: JpegPicture) -> Image | None:
         """The picture's image, read-only; None, and counted, if it has none."""
         with self._decoding:
             if self._decoded is not None and self._decoded[0] is picture:
@@ -679,7 +679,7 @@ class AxisCamera:
         finally:
             self._take([], reader.broken - broken + reader.unfinished, None)
 
-    def _take(self, pictures: list[Picture], broken: int, now: float | None) -> bool:
+    def _take(self, pictures: list[JpegPicture], broken: int, now: float | None) -> bool:
         """Note what came; whether the pictures have been the same for too long."""
         with self._new:
             self._heard = self._heard if now is None else now

@@ -249,7 +249,7 @@ BOUNDARY = re.compile(r"""boundary\s*=\s*(?:"([^"]*)"|([^\s;]+))""", re.IGNORECA
 
 
 @dataclass(frozen=True)
-class Picture:
+class JpegPicture:
     """A whole JPEG.
 
     Attributes:
@@ -294,7 +294,7 @@ class MultipartReader:
         """Whether a picture has begun that has not ended."""
         return self._picture is not None
 
-    def feed(self, data: bytes, t: float) -> list[Picture]:
+    def feed(self, data: bytes, t: float) -> list[JpegPicture]:
         """Take the next bytes, which arrived at ``t`` [s]; return the pictures that they complete."""
         if data:
             self._data += data
@@ -303,7 +303,7 @@ class MultipartReader:
             else:
                 count, earlier = self._arrivals.pop()
                 self._arrivals.append((count + len(data), earlier))
-        pictures: list[Picture] = []
+        pictures: list[JpegPicture] = []
         while self._skip() and self._begin() and self._continue(pictures):
             pass
         return pictures
@@ -331,7 +331,7 @@ class MultipartReader:
             self._picture = Walk()
         return True
 
-    def _continue(self, pictures: list[Picture]) -> bool:
+    def _continue(self, pictures: list[JpegPicture]) -> bool:
         """Walk on through a picture; whether it came to an end, good or bad."""
         walk = self._picture
         assert walk is not None
@@ -349,7 +349,7 @@ class MultipartReader:
             self.broken += 1
             self._skipped = 0
         else:
-            pictures.append(Picture(bytes(self._data[:end]), walk.size, self._arrivals[0][1]))
+            pictures.append(JpegPicture(bytes(self._data[:end]), walk.size, self._arrivals[0][1]))
             self._drop(end)
         return True
 

@@ -28,7 +28,7 @@ from cotarget.drivers.ptu_d46 import (
     HALT_NOW,
     HALT_TRIES,
     AxisFacts,
-    Unit,
+    UnitInfo,
     connect,
     halt_outright,
     refuse_events,
@@ -63,7 +63,7 @@ class Snapshot:
     t: float
 
 
-class Track:
+class AxisTrack:
     """What is known of one axis from polls and orders."""
 
     def __init__(self, name: AxisName, facts: AxisFacts) -> None:
@@ -194,9 +194,9 @@ class Loop:
         snapshot: the newest.
     """
 
-    def __init__(self, line: Line, unit: Unit, clock: Clock, delay: float) -> None:
+    def __init__(self, line: Line, unit: UnitInfo, clock: Clock, delay: float) -> None:
         self._line, self._clock, self._delay = line, clock, delay
-        self._tracks = (Track("P", unit.pan), Track("T", unit.tilt))
+        self._tracks = (AxisTrack("P", unit.pan), AxisTrack("T", unit.tilt))
         self._next = 0  # the axis to poll
         self._polled = True  # since the last move, so that moves in quick succession leave the line to polls too
         self._active: Move | None = None
@@ -464,7 +464,7 @@ class D46Head:
         self._dead: DeviceError | None = None
         self._closed = False
         try:
-            self.unit: Unit = connect(self._line, config)
+            self.unit: UnitInfo = connect(self._line, config)
             for key, cap in (
                 ("hardware.head.speed_deg_s", config.speed_deg_s),
                 ("safety.speed_deg_s", safety.speed_deg_s),
@@ -612,7 +612,7 @@ class D46Head:
             self._loop.turn()
 
 
-def _limits(unit: Unit, config: HardwareHead) -> PanTiltLimits:
+def _limits(unit: UnitInfo, config: HardwareHead) -> PanTiltLimits:
     """What the unit can do, in the sense of rig.toml."""
     (pan, tilt), step = (unit.pan, unit.tilt), unit.pan.step
     return PanTiltLimits(
@@ -633,7 +633,7 @@ def _steps(speed: float, axis: AxisFacts) -> int:
     return min(max(math.floor(speed / axis.step * (1 + ROUNDING)), axis.slowest, 1), axis.fastest)
 
 
-def _refuse_too_slow(key: str, cap_deg_s: float | None, unit: Unit, port: str) -> None:
+def _refuse_too_slow(key: str, cap_deg_s: float | None, unit: UnitInfo, port: str) -> None:
     """Refuse a cap that the unit cannot keep.
 
     Raises:

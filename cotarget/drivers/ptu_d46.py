@@ -73,7 +73,7 @@ class AxisFacts:
 
 
 @dataclass(frozen=True)
-class Unit:
+class UnitInfo:
     """What a unit says about itself: its version, its step mode as far as it knows it, its axes."""
 
     version: str
@@ -87,7 +87,7 @@ class Unit:
         return max(axis.fastest / axis.acceleration for axis in (self.pan, self.tilt))
 
 
-def connect(line: Line, config: HardwareHead) -> Unit:
+def connect(line: Line, config: HardwareHead) -> UnitInfo:
     """Come to terms with the unit, check that it is the one that rig.toml describes, and make it ready; it halts.
 
     Raises:
@@ -163,16 +163,16 @@ def greet(line: Line) -> None:
     raise _stranger(line)
 
 
-def identify(line: Line) -> Unit:
+def identify(line: Line) -> UnitInfo:
     """Ask the unit what it is.
 
     Raises:
         DeviceError: it does not say.
     """
-    return Unit(_told(line, "V"), _told(line, "WP"), _axis(line, "P"), _axis(line, "T"))
+    return UnitInfo(_told(line, "V"), _told(line, "WP"), _axis(line, "P"), _axis(line, "T"))
 
 
-def refuse_uncalibrated(name: str, unit: Unit) -> None:
+def refuse_uncalibrated(name: str, unit: UnitInfo) -> None:
     """Refuse a unit that does not know where it is.
 
     Raises:
@@ -186,7 +186,7 @@ def refuse_uncalibrated(name: str, unit: Unit) -> None:
             )
 
 
-def compare(name: str, unit: Unit, config: HardwareHead) -> None:
+def compare(name: str, unit: UnitInfo, config: HardwareHead) -> None:
     """Compare what the unit says with what rig.toml expects.
 
     Raises:
@@ -308,7 +308,7 @@ NOT_HALTED = (
 )
 
 
-def reset(config: HardwareHead, clock: Clock, lost: PositionLostMarker, stopped: Callable[[], str | None]) -> Unit:
+def reset(config: HardwareHead, clock: Clock, lost: PositionLostMarker, stopped: Callable[[], str | None]) -> UnitInfo:
     """Let the unit find its limits anew; until that has succeeded, its position counts as lost.
 
     Whatever ends it before, Ctrl-C and other exceptions included, sends a halt and waits a little for the answer;

@@ -69,7 +69,7 @@ class HttpError(Exception):
 
 
 @dataclass(frozen=True)
-class Request:
+class HttpRequest:
     """One request.
 
     Attributes:
@@ -87,7 +87,7 @@ class Request:
     headers: Message
 
 
-def read_request(stream: BinaryIO) -> Request | None:
+def read_request(stream: BinaryIO) -> HttpRequest | None:
     """Read one request; None where the client closed without one.
 
     Raises:
@@ -107,7 +107,7 @@ def read_request(stream: BinaryIO) -> Request | None:
         pairs += _form(headers, stream)
     except (http.client.HTTPException, ValueError):
         raise HttpError(HTTPStatus.BAD_REQUEST) from None
-    return Request(words[0], words[1], url.path, dict(pairs), headers)
+    return HttpRequest(words[0], words[1], url.path, dict(pairs), headers)
 
 
 def _form(headers: Message, stream: BinaryIO) -> list[tuple[str, str]]:
@@ -157,7 +157,7 @@ def _same(a: str, b: str) -> bool:
     return hmac.compare_digest(a.encode(), b.encode())
 
 
-class Guard:
+class Authenticator:
     """Checks the authorization of requests; safe to use from any thread.
 
     Args:
@@ -176,7 +176,7 @@ class Guard:
         self._used: dict[str, set[str]] = {}
         self._lock = threading.Lock()
 
-    def refuse(self, request: Request) -> str | None:
+    def refuse(self, request: HttpRequest) -> str | None:
         """The challenge that a request must be answered with; None where it is allowed."""
         if not self._user:
             return None
@@ -213,7 +213,7 @@ class Guard:
             return False
         return _same(told, f"{self._user}:{self._password}")
 
-    def _digest(self, request: Request, fields: dict[str, str]) -> bool:
+    def _digest(self, request: HttpRequest, fields: dict[str, str]) -> bool:
         def field(name: str) -> str:
             return fields.get(name, "")
 
@@ -806,7 +806,7 @@ class AxisServer:
         self._unit = AxisUnit() if unit is None else unit
         self._sizes = named_sizes(self._unit.standard)
         self._pictures = Pictures(feeds, quality, self.faults, self._sizes["4CIF"])
-        self._guard = Guard(user, password, auth, f"AXIS_{self._unit.serial}")
+        self._guard = Authenticator(user, password, auth, f"AXIS_{self._unit.serial}")
         self._sent = sent
         self._viewers = 0
         self._connections: set[socket.socket] = set()
@@ -913,7 +913,7 @@ class AxisServer:
                 return
         raise HttpError(HTTPStatus.NOT_FOUND)
 
-    def _answer(self, connection: socket.socket, kind: str, request: Request, camera: str | None) -> None:
+    def _answer(self, connection: socket.socket, kind: str, request: HttpRequest, camera: str | None) -> None:
         arguments = request.arguments
         match kind:
             case "parameters":

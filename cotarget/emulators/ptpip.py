@@ -265,7 +265,7 @@ class InitEvent:
 
 
 @dataclass(frozen=True)
-class Request:
+class OperationRequest:
     """An operation to do; ``sends_data`` where its data follows."""
 
     code: int
@@ -305,7 +305,7 @@ class Probe:
     answer: bool = False
 
 
-Packet = InitCommand | InitEvent | Request | StartData | Data | Cancel | Probe
+Packet = InitCommand | InitEvent | OperationRequest | StartData | Data | Cancel | Probe
 
 
 class PacketReader:
@@ -346,7 +346,7 @@ def parse_packet(kind: int, body: bytes) -> Packet:
             return InitEvent(*struct.unpack("<I", body))
         case Kind.REQUEST, length if 10 <= length <= 10 + 4 * PARAMETERS and length % 4 == 2:
             phase, code, transaction, *parameters = struct.unpack(f"<IHI{(length - 10) // 4}I", body)
-            return Request(code, transaction, tuple(parameters), sends_data=phase == 2)
+            return OperationRequest(code, transaction, tuple(parameters), sends_data=phase == 2)
         case Kind.START_DATA, 12:
             return StartData(*struct.unpack("<IQ", body))
         case ((Kind.DATA | Kind.END_DATA), length) if length >= 4:
@@ -421,7 +421,7 @@ class CommandSession:
 
     def __init__(self, device: PtpDevice, deaf: Callable[[], bool] = lambda: False) -> None:
         self._device, self._deaf = device, deaf
-        self._request: Request | None = None  # whose data is not all there
+        self._request: OperationRequest | None = None  # whose data is not all there
         self._total = -1  # bytes of that data, as announced; -1 before it is
         self._data = bytearray()
 
@@ -433,7 +433,7 @@ class CommandSession:
         """
         waiting = self._request
         match received:
-            case Request() if waiting is None:
+            case OperationRequest() if waiting is None:
                 if not received.sends_data:
                     return self._operate(received, b"")
                 self._request, self._total, self._data = received, -1, bytearray()
@@ -449,17 +449,17 @@ class CommandSession:
                     return self._complete(waiting)
             case Probe(answer=False):
                 return [packet(Kind.PROBE_RESPONSE)]
-            case Request() | StartData() | Data() | InitCommand() | InitEvent():
+            case OperationRequest() | StartData() | Data() | InitCommand() | InitEvent():
                 raise PtpError(f"PTP/IP: a packet out of turn: {type(received).__name__}")
         return []
 
-    def _complete(self, request: Request) -> list[bytes]:
+    def _complete(self, request: OperationRequest) -> list[bytes]:
         self._request = None
         if len(self._data) < self._total:
             return [response(Code.INCOMPLETE_TRANSFER, request.transaction)]
         return self._operate(request, bytes(self._data))
 
-    def _operate(self, request: Request, data: bytes) -> list[bytes]:
+    def _operate(self, request: OperationRequest, data: bytes) -> list[bytes]:
         if self._deaf():
             return []
         missing = PARAMETERS - len(request.parameters)

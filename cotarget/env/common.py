@@ -35,7 +35,7 @@ from cotarget.geometry import Array
 from cotarget.pipeline import PATIENCE_S
 from cotarget.rig import PanTiltState, ZoomState
 from cotarget.sim.model import has_clutter
-from cotarget.sim.render.pictures import Pictures
+from cotarget.sim.render.pictures import SizedPictures
 from cotarget.sim.targets.random_paths import SECONDS, in_view
 from cotarget.sim.truth import CameraName, Outlines, part_seen
 from cotarget.sim.world import SimWorld
@@ -377,7 +377,7 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         self._observation, self._size = observation, size_of(image_size)
         self._last = max(round(seconds_of(seconds) * self.config.rate_hz), 1)
         self._episode: Episode | None = None
-        self._opened: dict[Size, Pictures] = {}  # of the episode
+        self._opened: dict[Size, SizedPictures] = {}  # of the episode
 
     @property
     def episode(self) -> Episode:

@@ -16,11 +16,11 @@ from cotarget.config import TargetConfig
 from cotarget.estimation.motion_model import PAN, SEEN, STATES, TILT, A, B, G, K, L
 from cotarget.geometry import Array
 from cotarget.pantilt import HeadGeometry
-from cotarget.targeting import Closeup
+from cotarget.targeting import WantedSize
 
 
 @dataclass(frozen=True)
-class Sight:
+class SightLine:
     """The moved zoom camera, as it sees a target at (a, b, 1) e^l: along d = view (a, b, 1, e^-l) (Eq. 2).
 
     Attributes:
@@ -71,7 +71,7 @@ class Sights:
         self._across = self._unhand @ across
         self._across_twice = self._across @ across
 
-    def at(self, pan: float, tilt: float, nominal_px: float) -> Sight:
+    def at(self, pan: float, tilt: float, nominal_px: float) -> SightLine:
         """The Sight where the head reports pan and tilt [rad] and the lens its nominal focal length [px]."""
         head = self._head
         true_pan = head.pan_scale * pan + head.pan_zero
@@ -88,7 +88,7 @@ class Sights:
         panned[:, 3] -= self._dz
         view = after_pan @ panned
         view[:, 3] += self._unhand @ (self._dz - hand_t)
-        return Sight(view, after_pan @ unpan_slope @ self._fixed, turn @ panned)
+        return SightLine(view, after_pan @ unpan_slope @ self._fixed, turn @ panned)
 
 
 _SEEN_TWICE = np.ix_(SEEN, SEEN)
@@ -181,10 +181,10 @@ class Estimate:
         return math.hypot(*self.bias) / self.bias_prior
 
     @property
-    def closeup(self) -> Closeup:
+    def closeup(self) -> WantedSize:
         """How large the target shall be, for `aim`: its size as it shows itself now, foreshortened or not."""
         apparent = self.target.size * math.exp(self.state[K] + self.state[G])
-        return Closeup(apparent, self.target.wanted_px, self.target.dimension == "height")
+        return WantedSize(apparent, self.target.wanted_px, self.target.dimension == "height")
 
     def appearance(self, pan: float, tilt: float, nominal_px: float) -> Appearance | None:
         """Where the target appears in the zoom image, the head's bias included.

@@ -13,7 +13,7 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import TargetConfig
-from cotarget.estimation.measurement_model import Estimate, Sight, Sights
+from cotarget.estimation.measurement_model import Estimate, SightLine, Sights
 from cotarget.estimation.motion_model import (
     PAN,
     SEEN,
@@ -131,7 +131,7 @@ class ZoomSeen:
     t: float
     tangent: Array
     R: Array
-    sight: Sight
+    sight: SightLine
 
     @property
     def key(self) -> tuple[float, int]:

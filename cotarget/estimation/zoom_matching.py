@@ -50,7 +50,7 @@ Pixels = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class FixedView:
     """The target as one wide frame shows it. What only a search for it needs is worked out when it is asked for.
 
     Attributes:
@@ -112,7 +112,7 @@ class Sight:
         return template, weight if inside is None else weight * inside, -first
 
 
-def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetConfig) -> Sight | None:
+def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetConfig) -> FixedView | None:
     """Cut the target out of a wide frame.
 
     Args:
@@ -159,7 +159,7 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetC
         foreground = du**2 + dv**2 <= 1
     if detection.clipped:  # the hidden part may be as large again
         sigma = np.hypot(sigma, size / 2)
-    return Sight(frame.t, body, sigma, size, patch, low.astype(float), foreground, outside)
+    return FixedView(frame.t, body, sigma, size, patch, low.astype(float), foreground, outside)
 
 
 def _margin(size: Array) -> float:
@@ -217,7 +217,7 @@ USUAL_LACK, LEAST_LACK = 0.1, 0.04  # 1 - score
 
 
 @dataclass(frozen=True)
-class View:
+class ZoomView:
     """How the wide view's surroundings of the target appear in a zoom frame.
 
     Attributes:
@@ -255,7 +255,7 @@ class Place:
     sigma_px: float = math.nan
 
 
-def register(image: Image, sight: Sight, view: View) -> Place | None:
+def register(image: Image, sight: FixedView, view: ZoomView) -> Place | None:
     """Find the place in a zoom image that is most alike to a sight of the target: first coarsely, then finely.
 
     Returns:
@@ -273,7 +273,9 @@ def register(image: Image, sight: Sight, view: View) -> Place | None:
     return replace(place, sigma_px=(SIGMA_PX + SIGMA_SAMPLES * fine) * math.sqrt(lack) * view.scale)
 
 
-def _search(image: Image, sight: Sight, view: View, pitch: float, around_px: Array, reach: int | None) -> Place | None:
+def _search(
+    image: Image, sight: FixedView, view: ZoomView, pitch: float, around_px: Array, reach: int | None
+) -> Place | None:
     """Find the place in a zoom image that is most alike to a sight, sampled every ``pitch`` wide pixels.
 
     Args:
@@ -374,7 +376,7 @@ class Expected:
 
 
 @dataclass(frozen=True)
-class Found:
+class ZoomMeasurement:
     """The target in a zoom frame: one point of it, taken for the middle of its body, as both views show it.
 
     Attributes:
@@ -399,13 +401,13 @@ class Found:
 class Finder(Protocol):
     """Finds the target that is followed in the zoom view; the docstrings of `CloseupFinder` say what is what."""
 
-    def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> Sight | None:
+    def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> FixedView | None:
         """Remember the target as a wide frame shows it."""
 
     def sight_at(self, t: float) -> object | None:
         """What the wide view showed of the target at about a time [s]; None where it did not, or has not yet."""
 
-    def find(self, frame: Frame, expected: Expected) -> Found | None:
+    def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
         """Find the target in a zoom frame."""
 
 
@@ -426,12 +428,12 @@ class CloseupFinder:
         self._T_base_fixed = calibration.T_base_fixed
         self._T_zoom_head = calibration.hand_eye().inv()
         self._target = target
-        self._sights: deque[Sight] = deque()
+        self._sights: deque[FixedView] = deque()
         self._usual_score, self._sure_t = 0.0, -math.inf
         self._last_t = -math.inf
         self._last_offset: Array = np.zeros(2)  # beside the expected place, in wide pixels
 
-    def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> Sight | None:
+    def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> FixedView | None:
         """Remember the target as a wide frame shows it.
 
         Args:
@@ -449,12 +451,12 @@ class CloseupFinder:
                 self._sights.popleft()
         return sight
 
-    def sight_at(self, t: float) -> Sight | None:
+    def sight_at(self, t: float) -> FixedView | None:
         """What the wide view showed of the target at about a time [s]; None where it did not, or has not yet."""
         near = min(self._sights, key=lambda sight: abs(sight.t - t), default=None)
         return None if near is None or abs(near.t - t) > LONGEST_APART_S else near
 
-    def find(self, frame: Frame, expected: Expected) -> Found | None:
+    def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
         """Find the target in a zoom frame.
 
         Args:
@@ -470,7 +472,7 @@ class CloseupFinder:
         place = register(frame.image, sight, view)
         if place is None or not self._believes(place, sight, view, frame.t):
             return None
-        return Found(
+        return ZoomMeasurement(
             center_px=place.center_px,
             sigma_px=place.sigma_px,
             body_sigma_px=np.abs(view.J) @ sight.body_sigma_px,
@@ -480,7 +482,7 @@ class CloseupFinder:
             t=frame.t,
         )
 
-    def _believes(self, place: Place, sight: Sight, view: View, t: float) -> bool:
+    def _believes(self, place: Place, sight: FixedView, view: ZoomView, t: float) -> bool:
         """Whether a place is sure, or goes on from what was; remembers it if so."""
         offset = np.asarray(np.linalg.solve(view.J, place.center_px - view.center_px), dtype=float)
         usual = self._usual_score - FADING * abs(t - self._sure_t)
@@ -494,7 +496,7 @@ class CloseupFinder:
         self._last_t, self._last_offset = t, offset
         return True
 
-    def view(self, expected: Expected) -> View | None:
+    def view(self, expected: Expected) -> ZoomView | None:
         """Where in the zoom frame the target is expected; None behind a camera or beyond its lens."""
         x, covariance = np.asarray(expected.x_fixed, dtype=float), np.asarray(expected.covariance, dtype=float)
         if not (np.isfinite(x).all() and np.isfinite(covariance).all() and x[2] > 0):
@@ -510,4 +512,4 @@ class CloseupFinder:
         if not (np.isfinite(zoom).all() and np.isfinite(wide).all()):
             return None
         J = (zoom[1:3] - zoom[3:5]).T @ np.linalg.inv((wide[1:3] - wide[3:5]).T)
-        return View(zoom[0], covariance + LEAST_SIGMA_PX**2 * np.eye(2), J)
+        return ZoomView(zoom[0], covariance + LEAST_SIGMA_PX**2 * np.eye(2), J)

@@ -135,7 +135,7 @@ def focal_figure(stops: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Fi
 
 
 @dataclass(frozen=True)
-class Picture:
+class Plot:
     """A picture for the page and for the folder beside it.
 
     Attributes:
@@ -402,14 +402,14 @@ DENSE = {"pointing_map": PNG_DPI, "residuals": 140, "coverage": PNG_DPI}
 
 def draw(
     calibration: Calibration, at: tuple[AtFocal, ...], between: tuple[AtFocal, ...], evidence: Evidence | None
-) -> dict[str, Picture]:
+) -> dict[str, Plot]:
     """Draw what the calibration has the data for, by the names of `NAMES`."""
-    made: dict[str, Picture] = {}
+    made: dict[str, Plot] = {}
 
     def add(name: str, figure: Figure, alt: str, caption: str) -> None:
         dense = name in DENSE
         png = as_bytes(figure, "png", DENSE.get(name, PNG_DPI))
-        made[name] = Picture(name, png, None if dense else as_bytes(figure, "svg"), alt, caption)
+        made[name] = Plot(name, png, None if dense else as_bytes(figure, "svg"), alt, caption)
 
     if at and np.isfinite(at[-1].rms):
         _pointing(calibration, at, between, evidence, add)

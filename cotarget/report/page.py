@@ -30,7 +30,7 @@ from cotarget.report.analysis import (
     pointing,
     share_beyond,
 )
-from cotarget.report.figures import Picture
+from cotarget.report.figures import Plot
 from cotarget.report.text import (
     LABELS,
     STRONG,
@@ -128,7 +128,7 @@ def folded(summary: str, body: str) -> str:
     return f"<details><summary>{escape(summary)}</summary>{body}</details>"
 
 
-def figure(picture: Picture) -> str:
+def figure(picture: Plot) -> str:
     """Write a picture, embedded."""
     kind, data = ("svg+xml", picture.svg) if picture.svg is not None else ("png", picture.png)
     text = base64.b64encode(data).decode("ascii")
@@ -184,7 +184,7 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
     return found
 
 
-def _write(path: Path, page: str, made: dict[str, Picture]) -> None:
+def _write(path: Path, page: str, made: dict[str, Plot]) -> None:
     """Write page and pictures, all or nothing; pictures of an earlier report that this one does not have go."""
     folder = path.with_name(f"{path.stem}_pictures")
     files = {folder / f"{name}.png": picture.png for name, picture in made.items()} | {path: page.encode()}
@@ -210,7 +210,7 @@ def _body(
     at: tuple[AtFocal, ...],
     parts: tuple[Contribution, ...],
     evidence: Evidence | None,
-    made: dict[str, Picture],
+    made: dict[str, Plot],
     items: list[str],
 ) -> str:
     several = len(calibration.zoom.stops) > 1
@@ -242,7 +242,7 @@ def _header(calibration: Calibration, source: str, found: Verdict) -> str:
 
 
 def _pointing(
-    calibration: Calibration, at: tuple[AtFocal, ...], parts: tuple[Contribution, ...], made: dict[str, Picture]
+    calibration: Calibration, at: tuple[AtFocal, ...], parts: tuple[Contribution, ...], made: dict[str, Plot]
 ) -> Iterator[str]:
     if not at or not np.isfinite(at[-1].rms):
         yield paragraph("Nothing can be predicted: that takes a head, and a fit that tells its uncertainty.")
@@ -287,7 +287,7 @@ def _parameters(calibration: Calibration) -> Iterator[str]:
         )
 
 
-def _residuals(calibration: Calibration, evidence: Evidence | None, made: dict[str, Picture]) -> Iterator[str]:
+def _residuals(calibration: Calibration, evidence: Evidence | None, made: dict[str, Plot]) -> Iterator[str]:
     if evidence is None:
         yield paragraph("The calibration stores no corners, so that nothing can be checked again.")
         return
@@ -314,7 +314,7 @@ def _residuals(calibration: Calibration, evidence: Evidence | None, made: dict[s
     yield figure(made["histogram"])
 
 
-def _coverage(evidence: Evidence | None, made: dict[str, Picture]) -> Iterator[str]:
+def _coverage(evidence: Evidence | None, made: dict[str, Plot]) -> Iterator[str]:
     if evidence is None:
         yield paragraph("The calibration stores no corners.")
         return

@@ -392,7 +392,7 @@ DIRECTIONS = 160  # in which a target's outermost points are looked for, some 16
 Outline = tuple[Array, Array, Array]  # pixels of the middle, of the top-left and of the bottom-right corner, (2,) each
 
 
-class View(NamedTuple):
+class TrueView(NamedTuple):
     """A camera at one time.
 
     Attributes:
@@ -495,7 +495,7 @@ class Outlines:
         low, high = _ends(pixels.reshape(2, PHASES // EVERY, -1))
         return max((high - low).ravel().tolist())
 
-    def view(self, camera: CameraName, t: float) -> View:
+    def view(self, camera: CameraName, t: float) -> TrueView:
         """A camera at time t."""
         if camera == "fixed":
             return self._fixed
@@ -508,13 +508,13 @@ class Outlines:
             self._zoom_t, self._stood = t, stands
         return self._zoom
 
-    def _placed(self, camera: CameraName, lens: TrueLens) -> View:
+    def _placed(self, camera: CameraName, lens: TrueLens) -> TrueView:
         """A camera as it stands now."""
         body = self._bodies[camera]
         axes = self._turns[body].copy()
         (fx, fy), (cx, cy), bent = lens.focal_px, lens.center_px, any(lens.distortion)
         to_image = axes.T if bent else np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) @ axes.T
-        return View(self._places[body] + axes[:, 2] * lens.pupil, lens, bent, to_image)
+        return TrueView(self._places[body] + axes[:, 2] * lens.pupil, lens, bent, to_image)
 
     def _at(self, t: float) -> None:
         """Forget what was worked out for another time."""

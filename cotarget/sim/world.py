@@ -21,7 +21,7 @@ from cotarget.sim.devices import (
 )
 from cotarget.sim.model import base_pose, build_model, has_clutter, mount_pose
 from cotarget.sim.render.optics import TrueLens, covering_size
-from cotarget.sim.render.pictures import Pictures
+from cotarget.sim.render.pictures import SizedPictures
 from cotarget.sim.render.portrait import Portrait, portrait
 from cotarget.sim.render.sensor import Sensor
 from cotarget.sim.render.views import Ahead, Views, is_allowed
@@ -132,14 +132,14 @@ class SimWorld:
         """The perfect image that a lens sees at time t, without sensor effects, BGR."""
         return self._views().sharp(camera, lens, t)
 
-    def pictures(self, size: tuple[int, int], before: Pictures | None = None) -> Pictures:
+    def pictures(self, size: tuple[int, int], before: SizedPictures | None = None) -> SizedPictures:
         """What both cameras see, at another size (width, height) [px]; whoever asks for them closes them.
 
         Args:
             size: of each picture.
             before: those of a world before, as large; they are over, which saves to open OpenGL anew.
         """
-        return Pictures(self.config.sim, self._model, self._state, self._lens_at, self._lenses(), size, before)
+        return SizedPictures(self.config.sim, self._model, self._state, self._lens_at, self._lenses(), size, before)
 
     def portrait(self, azimuth_deg: float, axes: bool) -> Portrait:
         """A picture of the rig as it is now, seen in a direction [degrees], with or without its frames' axes."""

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from cotarget.calibration.bundle import fit
-from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye_from_poses
+from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye
 from cotarget.calibration.initialization import board_pose
 from cotarget.calibration.model import RigModel, View
 from cotarget.camera import Intrinsics, ZoomLens
@@ -78,7 +78,7 @@ def one(_: None, settings: HandEyeSettings, seed: int) -> list[Row]:
     heads = [base_head(view.pan, view.tilt) for view in views]
     seen = [board_pose(lens, view.corners_px, points) for view in views]
     closed = park_martin(*motions(heads, seen))
-    weighted = solve_hand_eye_from_poses(heads, seen, middle=middle)
+    weighted = solve_hand_eye(heads, seen, middle=middle)
     board = (truth.gamma.inv() * closed.inv() * heads[0] * closed) * seen[0]
     start = RigModel({0: board}, zoom=ZoomLens((NOMINAL_PX,), (lens,)), gamma=truth.gamma, hand=closed)
     joint = fit(start, views, points, {"hand"})

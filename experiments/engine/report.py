@@ -11,7 +11,7 @@ import numpy as np
 
 from cotarget.files import write_whole
 from cotarget.report import page as page_module
-from cotarget.report.figures import Picture
+from cotarget.report.figures import Plot
 from cotarget.report.page import STYLE
 from cotarget.report.text import Table, count, digits, listed
 from experiments.engine.bounds import WORSE, leaves
@@ -145,10 +145,10 @@ def _case(outcome: Outcome) -> Iterator[str]:
         yield page_module.preformatted(outcome.text)
     for name, png in outcome.pictures.items():
         caption = f"{name}.png, of seed {outcome.pictured}"
-        yield page_module.figure(Picture(name, png, None, f"{case.experiment.name}: {caption}", caption))
+        yield page_module.figure(Plot(name, png, None, f"{case.experiment.name}: {caption}", caption))
     if outcome.picture is not None:
         name = case.experiment.name
-        yield page_module.figure(Picture(name, outcome.picture, None, f"{name}: {outcome.caption}", outcome.caption))
+        yield page_module.figure(Plot(name, outcome.picture, None, f"{name}: {outcome.caption}", outcome.caption))
     if outcome.missed is not None:
         lost = outcome.missed
         yield page_module.subheading("Wanted figures")

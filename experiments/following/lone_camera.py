@@ -18,7 +18,7 @@ from cotarget.calibration import Calibration
 from cotarget.config import TargetConfig
 from cotarget.control.controller import NO_CHANGE
 from cotarget.control.head import HeadController
-from cotarget.control.zoom import Expected, ZoomController
+from cotarget.control.zoom import ExpectedTarget, ZoomController
 from cotarget.detection import Detection, Detector
 from cotarget.errors import UnreachableError
 from cotarget.geometry import Array
@@ -159,7 +159,7 @@ class LoneCamera:
         (pan, tilt), (pan_variance, tilt_variance) = course.at(exposed)
         (head_pan, _), (head_tilt, _) = self._head_controller.head.at(exposed)
         scale = math.cos(tilt)
-        expected = Expected(
+        expected = ExpectedTarget(
             np.array([(pan - head_pan) * scale, head_tilt - tilt]),
             np.diag([pan_variance * scale**2, tilt_variance]),
             np.array(course.sides) / 2,

@@ -15,7 +15,7 @@ from cotarget.detection import Detector
 from cotarget.errors import UnreachableError
 from cotarget.pipeline import FollowSettings, FrameSource, State, Step, follow
 from cotarget.rig import Rig
-from cotarget.targeting import Aim, Closeup, Method, aim, depth_of, point_at
+from cotarget.targeting import Aim, Method, WantedSize, aim, depth_of, point_at
 from cotarget.tracking.track import Track, settings_for
 from cotarget.tracking.tracker import Tracker
 
@@ -90,7 +90,7 @@ def _aim(calibration: Calibration, target: TargetConfig, track: Track, rig: Rig)
     size_px, center_px = float(track.box.size_px[int(vertical)]), track.box.center_px
     try:
         x_fixed = point_at(calibration, center_px, depth_of(calibration, target, size_px, center_px))
-        closeup = Closeup(target.size, target.wanted_px, vertical)
+        closeup = WantedSize(target.size, target.wanted_px, vertical)
         return aim(calibration, x_fixed, reach_of(rig), closeup=closeup, method=METHOD)
     except UnreachableError:
         return None

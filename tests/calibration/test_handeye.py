@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye, solve_hand_eye_from_poses
+from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye, solve_hand_eye_from_motions
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform, Rotation, pose
 from experiments.calibration.synthetic.rig import Truth
@@ -37,7 +37,7 @@ def test_exact_motions_give_t_exactly(angles):
 
 def test_matrices_are_refused_in_words():
     with pytest.raises(CalibrationError, match=r"RigidTransform\.from_matrix makes them"):
-        solve_hand_eye_from_poses([np.eye(4)] * 3, [np.eye(4)] * 3)
+        solve_hand_eye([np.eye(4)] * 3, [np.eye(4)] * 3)
 
 
 @pytest.mark.parametrize(("angles", "message"), [
@@ -139,13 +139,13 @@ def check_honest(*solvers):
 
 def from_poses(hands):
     seen = boards_seen(hands)
-    return lambda rng: solve_hand_eye_from_poses(hands, [noisy(T, rng) for T in seen])
+    return lambda rng: solve_hand_eye(hands, [noisy(T, rng) for T in seen])
 
 
 def from_motions(starts, ends):
     A = [a.inv() * b for a, b in zip(starts, ends, strict=True)]
     B = [X.inv() * motion * X for motion in A]
-    return lambda rng: solve_hand_eye(A, [noisy(b, rng) for b in B])
+    return lambda rng: solve_hand_eye_from_motions(A, [noisy(b, rng) for b in B])
 
 
 @pytest.mark.slow
@@ -170,8 +170,8 @@ def test_it_is_no_worse_than_park_and_martin():
         poses = [noisy(T, rng) for T in seen]
         A, B = motions(hands, poses)
         errors["closed"].append(error_of(park_martin(A, B)))
-        errors["pairs"].append(error_of(solve_hand_eye(A, B, independent=19).X))
-        errors["poses"].append(error_of(solve_hand_eye_from_poses(hands, poses).X))
+        errors["pairs"].append(error_of(solve_hand_eye_from_motions(A, B, independent=19).X))
+        errors["poses"].append(error_of(solve_hand_eye(hands, poses).X))
     turn, shift = (
         {k: np.sqrt(np.mean(np.square(e)[:, s])) for k, e in errors.items()} for s in (slice(3), slice(3, 6))
     )
@@ -195,7 +195,7 @@ def test_it_is_no_worse_than_opencv():
             method=cv2.CALIB_HAND_EYE_PARK,
         )  # fmt: skip
         theirs.append(error_of(RigidTransform.from_components(t.ravel(), Rotation.from_matrix(R))))
-        ours.append(error_of(solve_hand_eye_from_poses(hands, poses).X))
+        ours.append(error_of(solve_hand_eye(hands, poses).X))
     for part in (slice(3), slice(3, 6)):
         assert np.mean(np.square(ours)[:, part]) <= np.mean(np.square(theirs)[:, part])
 
@@ -206,19 +206,19 @@ def test_it_is_no_worse_than_opencv():
     arm(np.random.default_rng(2), 30),
 ])  # fmt: skip
 def test_exact_poses_give_x_and_the_board(hands):
-    found = solve_hand_eye_from_poses(hands, boards_seen(hands))
+    found = solve_hand_eye(hands, boards_seen(hands))
     assert np.abs(error_of(found.X)).max() < EXACT
     assert np.abs((found.boards[0].inv() * BOARD).as_matrix() - np.eye(4)).max() < EXACT
     assert found.verdict.determined
     assert found.verdict.text.startswith("determined: ")
     A, B = motions(hands, boards_seen(hands))
-    assert np.abs(error_of(solve_hand_eye(A[:2], B[:2]).X)).max() < EXACT  # two motions do
+    assert np.abs(error_of(solve_hand_eye_from_motions(A[:2], B[:2]).X)).max() < EXACT  # two motions do
 
 
 def test_the_residuals_are_those_of_the_noise():
     rng = np.random.default_rng(4)
     hands = arm(rng, 100)
-    found = solve_hand_eye_from_poses(hands, [noisy(T, rng) for T in boards_seen(hands)])
+    found = solve_hand_eye(hands, [noisy(T, rng) for T in boards_seen(hands)])
     assert found.rotation_rms == pytest.approx(SIGMA_R * np.sqrt(3), rel=0.15)  # 300 numbers know it to 4 %
     assert found.translation_rms == pytest.approx(SIGMA_T * np.sqrt(3), rel=0.15)
     assert found.rejected == ()
@@ -230,7 +230,7 @@ def test_several_placements_are_one_answer():
     boards = {7: BOARD, 3: pose([-1.0, 0.5, 3.0], [0.0, 40.0, 0.0])}
     where = [7, 3] * 6
     seen = [T for hand, k in zip(hands, where, strict=True) for T in boards_seen([hand], boards[k])]
-    found = solve_hand_eye_from_poses(hands, seen, placements=where, middle=[0.4, 0.3, 0.0])
+    found = solve_hand_eye(hands, seen, placements=where, middle=[0.4, 0.3, 0.0])
     assert np.abs(error_of(found.X)).max() < EXACT
     for board, number in zip(found.boards, (3, 7), strict=True):
         assert np.abs((board.inv() * boards[number]).as_matrix() - np.eye(4)).max() < EXACT
@@ -247,7 +247,7 @@ def test_a_board_seen_best_in_its_middle():
         seen = [noisy(T * to_middle, rng, 4e-3, 2e-4) * to_middle.inv() for T in boards_seen(hands)]
         for known, kept in errors.items():
             middle = to_middle.translation * known
-            kept.append(error_of(solve_hand_eye_from_poses(hands, seen, middle=middle).X))
+            kept.append(error_of(solve_hand_eye(hands, seen, middle=middle).X))
     assert np.mean(np.square(errors[True])) < np.mean(np.square(errors[False])) / 2
 
 
@@ -256,9 +256,9 @@ def test_gross_errors_are_found_and_left_out(hands):
     rng = np.random.default_rng(7)
     hands = hands(rng, 20)
     seen = [noisy(T, rng) for T in boards_seen(hands)]
-    clean = solve_hand_eye_from_poses(hands, seen)
+    clean = solve_hand_eye(hands, seen)
     seen[3], seen[11] = noisy(seen[3], rng, 1.0, 0.5), noisy(seen[11], rng, 0.1, 0.05)
-    found = solve_hand_eye_from_poses(hands, seen)
+    found = solve_hand_eye(hands, seen)
     assert found.rejected == (3, 11)
     e = error_of(found.X) - error_of(clean.X)
     assert e @ np.linalg.solve(clean.covariance, e) < chi2.ppf(0.9, 6)  # two poses of twenty fewer
@@ -268,10 +268,10 @@ def test_the_same_poses_give_the_same_answer():
     rng = np.random.default_rng(8)
     hands = arm(rng, 15)
     seen = [noisy(T, rng) for T in boards_seen(hands)]
-    first, again = (solve_hand_eye_from_poses(hands, seen) for _ in range(2))
+    first, again = (solve_hand_eye(hands, seen) for _ in range(2))
     assert (first.X.as_matrix() == again.X.as_matrix()).all()
     assert (first.covariance == again.covariance).all()
-    backwards = solve_hand_eye_from_poses(hands[::-1], seen[::-1])
+    backwards = solve_hand_eye(hands[::-1], seen[::-1])
     step = error_of(first.X) - error_of(backwards.X)
     assert step @ np.linalg.solve(first.covariance, step) < 1e-8  # the search stops at 1e-5 standard deviations
 
@@ -311,7 +311,9 @@ def test_what_is_free_is_said_and_stays_uncertain(case, from_poses):
     hands, text, free = UNDETERMINED[case]
     rng = np.random.default_rng(10)
     seen = [noisy(T, rng, 1e-3, 1e-3) for T in boards_seen(hands)]
-    solve, given = (solve_hand_eye_from_poses, (hands, seen)) if from_poses else (solve_hand_eye, motions(hands, seen))
+    solve, given = (
+        (solve_hand_eye, (hands, seen)) if from_poses else (solve_hand_eye_from_motions, motions(hands, seen))
+    )
     with pytest.raises(CalibrationError) as refused:
         solve(*given)
     assert str(refused.value) == f"hand-eye: {text}"
@@ -335,7 +337,7 @@ def test_what_is_free_is_said_and_stays_uncertain(case, from_poses):
 
 def test_what_is_free_is_as_small_as_can_be():
     hands = head([(-15, 0), (-5, 0), (0, 0), (10, 0)])
-    found = solve_hand_eye_from_poses(hands, boards_seen(hands), regularize=True).X
+    found = solve_hand_eye(hands, boards_seen(hands), regularize=True).X
     assert abs(found.translation[1]) < EXACT  # along the pan axis
     # Of all rotations about the pan axis in front of the true one, the smallest.
     angles = np.linspace(-np.pi, np.pi, 3601)
@@ -348,7 +350,7 @@ def test_motions_too_small_for_their_noise():
     hands = head(rng.uniform(-0.6, 0.6, (10, 2)))
     seen = [noisy(T, rng) for T in boards_seen(hands)]
     with pytest.raises(CalibrationError, match=r"motions of 1\.\d degrees at most, .* are too small for their noise"):
-        solve_hand_eye_from_poses(hands, seen)
+        solve_hand_eye(hands, seen)
 
 
 def test_noise_of_the_hand_is_no_second_axis():
@@ -357,24 +359,24 @@ def test_noise_of_the_hand_is_no_second_axis():
     for _ in range(20):
         hands = [noisy(T, rng) for T in PLANAR]
         with pytest.raises(CalibrationError, match=r"position along that axis|too small"):
-            solve_hand_eye_from_poses(hands, [noisy(T, rng, 1e-3, 1e-3) for T in boards_seen(PLANAR)])
+            solve_hand_eye(hands, [noisy(T, rng, 1e-3, 1e-3) for T in boards_seen(PLANAR)])
 
 
 def test_pan_at_another_tilt_is_pan():
     hands = head([(-15, 20), (-5, 20), (0, 20), (10, 20)])
     with pytest.raises(CalibrationError, match="only pan moved"):
-        solve_hand_eye_from_poses(hands, boards_seen(hands))
+        solve_hand_eye(hands, boards_seen(hands))
 
 
 def test_contradictions_are_refused_here_too():
     A, B = motions(arm(np.random.default_rng(13), 6), boards_seen(arm(np.random.default_rng(13), 6)))
     with pytest.raises(CalibrationError, match="determinant -1"):
-        solve_hand_eye(A, [b.inv() for b in B])
+        solve_hand_eye_from_motions(A, [b.inv() for b in B])
     with pytest.raises(CalibrationError, match="units"):
-        solve_hand_eye(A, [RigidTransform.identity()] * len(A), regularize=True)
+        solve_hand_eye_from_motions(A, [RigidTransform.identity()] * len(A), regularize=True)
     with pytest.raises(CalibrationError, match="1 and 1 motions"):
-        solve_hand_eye(A[:1], B[:1])
+        solve_hand_eye_from_motions(A[:1], B[:1])
     with pytest.raises(CalibrationError, match="three views"):
-        solve_hand_eye_from_poses([X, X], [X, X])
+        solve_hand_eye([X, X], [X, X])
     with pytest.raises(CalibrationError, match="as many poses"):
-        solve_hand_eye_from_poses([X, X], [X])
+        solve_hand_eye([X, X], [X])

@@ -11,7 +11,7 @@ from cotarget import __version__
 from cotarget.calibration import calibrate_captures, calibrate_photos, calibrate_rig
 from cotarget.calibration.captures import INDEX, read_index
 from cotarget.calibration.planning import GRID, Coverage
-from cotarget.calibration.session import Recorder
+from cotarget.calibration.session import CaptureRecorder
 from cotarget.config import BoardConfig, parse_config
 from cotarget.errors import CalibrationError, DeviceError, EmergencyStopError, HaltedError, StaleFrameError
 from cotarget.geometry import pose
@@ -79,7 +79,7 @@ def test_captures_give_the_same_calibration(session):
 
 def test_a_session_that_is_killed_leaves_every_image_in_the_index(tmp_path):
     """Also those of the placement that is under way: in the zoom stage one of them holds many."""
-    recorder = Recorder(SyntheticRig(), BOARD, tmp_path)
+    recorder = CaptureRecorder(SyntheticRig(), BOARD, tmp_path)
     recorder.start()
     recorder.present(pose([-0.4, -0.25, 3.0], [0, 0, 0]))
     for count in range(1, 4):
@@ -92,7 +92,7 @@ def test_a_session_that_is_killed_leaves_every_image_in_the_index(tmp_path):
 
 def test_a_session_leaves_what_rig_it_was_and_what_it_was_told_to_do(tmp_path):
     config = parse_config({"hardware": {"fixed": {"password": "secret", "url": "http://me:secret@server"}}})
-    recorder = Recorder(SyntheticRig(), BOARD, tmp_path, config=config)
+    recorder = CaptureRecorder(SyntheticRig(), BOARD, tmp_path, config=config)
     recorder.start()
     recorder.present(pose([-0.4, -0.25, 3.0], [0, 20, 0]))
     recorder.turn(0.25, -0.1)
@@ -131,7 +131,7 @@ def test_a_broken_rig_is_refused_in_one_line(broken, message):
 def test_a_head_that_was_halted_on_its_way_is_sent_again(halts, arrives):
     """One that tells nobody, and is seen to stand elsewhere."""
     rig = SyntheticRig(halts=halts)
-    recorder = Recorder(rig, BOARD)
+    recorder = CaptureRecorder(rig, BOARD)
     if arrives:
         recorder.turn(0.5, 0.1)
         assert rig.pose == pytest.approx((0.5, 0.1), abs=rig.limits.step)
@@ -168,7 +168,7 @@ HALTED, LATE = HaltedError("the move was halted"), StaleFrameError("the newest f
 @pytest.mark.parametrize("times", [1, 2, 3])
 def test_a_move_that_the_watchdog_halted_is_commanded_again(tmp_path, times, caplog):
     made = Failing(moves=[HALTED] * times)
-    recorder = Recorder(made.rig, BOARD, tmp_path)
+    recorder = CaptureRecorder(made.rig, BOARD, tmp_path)
     if times < 3:
         recorder.turn(0.5, 0.1)
         assert made.rig.pose == pytest.approx((0.5, 0.1), abs=made.rig.limits.step)
@@ -186,10 +186,10 @@ def test_a_head_that_was_stopped_is_not_sent_again(error):
     """Nor where the operator stops it while a frame is late."""
     made = Failing(moves=[error])
     with pytest.raises(type(error), match=str(error)):
-        Recorder(made.rig, BOARD).turn(0.5, 0.1)
+        CaptureRecorder(made.rig, BOARD).turn(0.5, 0.1)
     assert made.sent == [(0.5, 0.1)]
     made = Failing(frames=[LATE, LATE])
-    recorder = Recorder(made.rig, BOARD)
+    recorder = CaptureRecorder(made.rig, BOARD)
     recorder.turn(0.5, 0.1)
     made.sent.clear()
 
@@ -207,7 +207,7 @@ def test_a_head_that_was_stopped_is_not_sent_again(error):
 @pytest.mark.parametrize("times", [1, 2, 3])
 def test_a_late_frame_is_waited_for_again_with_the_head_where_it_should_be(camera, times):
     made = Failing(frames=[LATE] * times)
-    recorder = Recorder(made.rig, BOARD)
+    recorder = CaptureRecorder(made.rig, BOARD)
     recorder.turn(0.5, 0.1)
     pushed = made.rig.pose
     look = {"fixed": recorder.see_fixed, "zoom": recorder.update_zoom}[camera]

@@ -17,7 +17,7 @@ from cotarget.config import RigConfig, SimConfig
 from cotarget.errors import DeviceError
 from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.viewer import browser, desktop
-from cotarget.sim.viewer.scene import FAR, SIDE_POINTS, Onlooker, Sight, frusta_of, frustum_rim, line_geoms
+from cotarget.sim.viewer.scene import FAR, SIDE_POINTS, Onlooker, Snapshot, frusta_of, frustum_rim, line_geoms
 from cotarget.sim.world import SimWorld
 from tests.cli.test_commands import call
 
@@ -74,7 +74,7 @@ def test_the_zoom_cameras_frustum_follows_head_and_lens_and_the_wide_ones_does_n
 def test_lines_are_drawn_from_end_to_end(world):
     lines = frusta_of(world.truth(), 5.0)
     geoms = [mujoco.MjvGeom() for _ in range(100)]
-    assert line_geoms(Sight(5.0, "", {}, lines), iter(geoms)) == 2 * (4 * SIDE_POINTS + 4)
+    assert line_geoms(Snapshot(5.0, "", {}, lines), iter(geoms)) == 2 * (4 * SIDE_POINTS + 4)
     for (begin, end), geom in zip(itertools.chain(*lines.values()), geoms, strict=False):
         along = geom.mat.reshape(3, 3)[:, 2] * geom.size[2]
         np.testing.assert_allclose(geom.pos, begin, atol=NEAR_M)
@@ -120,7 +120,7 @@ class Window:
 def moments(clock, took):
     for index, s in enumerate(took):
         clock.sleep(s)  # the machine's work
-        yield Sight(index * 0.1, "", {}, {})
+        yield Snapshot(index * 0.1, "", {}, {})
 
 
 def test_nothing_happens_quicker_than_it_does_and_a_slow_moment_is_not_made_up_for():
@@ -263,7 +263,7 @@ def test_the_page_is_served_to_this_machine_alone_with_the_model_and_ends_with_t
     assert listener.getsockname()[0] == browser.HOST
     window = browser.BrowserWindow(world.truth(), listener)
     try:
-        window.show(Sight(5.0, "", {}, frusta_of(world.truth(), 5.0)))
+        window.show(Snapshot(5.0, "", {}, frusta_of(world.truth(), 5.0)))
         assert window.is_open()
         with urllib.request.urlopen(window.where, timeout=ANSWER_S) as page:
             assert page.headers["Content-Type"].startswith("text/html")
@@ -296,11 +296,11 @@ def test_the_overlay_hands_over_lines_and_pictures_that_are_new(world):
     red = np.zeros((480, 640, 3), np.uint8)
     red[..., 2] = 255
     lines = frusta_of(world.truth(), 5.0)
-    overlay.sight = Sight(5.0, "", {"fixed": red, "zoom": red}, lines)
+    overlay.sight = Snapshot(5.0, "", {"fixed": red, "zoom": red}, lines)
     for _ in range(2):
         overlay.on_update(None)
         assert len(overlay.viewer.extra_geoms) == sum(map(len, lines.values()))
     assert sent == [(0, b"\xff\0\0\xff", browser.PICTURE_PX, 300)] * 2
-    overlay.sight = Sight(5.1, "", {"fixed": red}, lines)
+    overlay.sight = Snapshot(5.1, "", {"fixed": red}, lines)
     overlay.on_update(None)
     assert [texture for texture, *_ in sent] == [0, 0, 1]

@@ -18,7 +18,7 @@ from cotarget.estimation import Appearance
 from cotarget.geometry import pose
 from cotarget.rig import PanTiltLimits, PanTiltState, ZoomState
 from cotarget.sim.motion import Axis
-from cotarget.targeting import Closeup
+from cotarget.targeting import WantedSize
 
 SIZE, CENTER = (640, 480), (319.5, 239.5)
 SHORTEST, LONGEST = 700.0, 7000.0
@@ -94,7 +94,7 @@ class Known:
 
     @property
     def closeup(self):
-        return Closeup(BOOK.size, BOOK.wanted_px)
+        return WantedSize(BOOK.size, BOOK.wanted_px)
 
     def appearance(self, pan, tilt, nominal_px):
         x, y, z = self.x_fixed

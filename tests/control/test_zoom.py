@@ -7,7 +7,7 @@ import pytest
 
 from cotarget import metrics
 from cotarget.control import zoom
-from cotarget.control.zoom import Expected, ZoomController, ZoomSettings, chance_inside, expect, longest_focal
+from cotarget.control.zoom import ExpectedTarget, ZoomController, ZoomSettings, chance_inside, expect, longest_focal
 from cotarget.estimation import TargetFilter
 from tests.moving_targets import APART, Flight, show
 
@@ -20,7 +20,7 @@ FOUND = 3e-3  # the focal length is found to a part of two thousand; chances are
 
 
 def expected(sigma, offset=(0.0, 0.0), half=(0.01, 0.015), size_sigma=0.0):
-    return Expected(np.array(offset), np.eye(2) * sigma**2, np.array(half), size_sigma)
+    return ExpectedTarget(np.array(offset), np.eye(2) * sigma**2, np.array(half), size_sigma)
 
 
 @pytest.mark.parametrize(("sigma", "offset"), [(0.002, (0.0, 0.0)), (0.01, (0.02, -0.01)), (0.03, (0.0, 0.03))])

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cotarget.calibration.session import Recorder
+from cotarget.calibration.session import CaptureRecorder
 from cotarget.config import HardwareBoard
 from cotarget.drivers.board import PersonBoard, SocketBoard, in_words, make_board
 from cotarget.emulators.serve import JsonLines
@@ -143,7 +143,7 @@ def test_a_board_in_hands_is_waited_for():
     rig = SyntheticRig()
     rig.board = SlowHands(rig, patience=20.0)
     rig.placed.append((0.0, pose([-0.4, -0.25, 3.0], [0, 0, 0])))
-    recorder = Recorder(rig, rig.board_config)
+    recorder = CaptureRecorder(rig, rig.board_config)
     recorder.start()
     begun = rig.t
     recorder.present(pose([-0.1, -0.1, 3.0], [0, 20, 0]))
@@ -154,7 +154,7 @@ def test_a_board_in_hands_is_waited_for():
 def test_a_board_that_nobody_brings_is_not_waited_for_without_end():
     rig = SyntheticRig()
     rig.board = replace(rig.board, patience=5.0)
-    recorder = Recorder(rig, rig.board_config)
+    recorder = CaptureRecorder(rig, rig.board_config)
     recorder.start()
     begun = rig.t
     recorder.present(pose([0, 0, -3.0], [0, 0, 0]))

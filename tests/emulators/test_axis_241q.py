@@ -19,12 +19,12 @@ import pytest
 from cotarget.emulators import axis_241q
 from cotarget.emulators.axis_241q import (
     AXIS_FAULTS,
+    Authenticator,
     AxisServer,
     AxisUnit,
-    Guard,
     HttpError,
+    HttpRequest,
     Pace,
-    Request,
     damaged,
     fixed_ptz,
     list_parameters,
@@ -195,7 +195,10 @@ def test_mutated_requests_are_answered_or_refused():
         + b"\r\n\r\n"
         b"action=list&group=root.Brand",
     ]
-    guards = [Guard("A", "b", "basic", "R"), Guard("Mufasa", "Circle Of Life", "digest", "testrealm@host.com")]
+    guards = [
+        Authenticator("A", "b", "basic", "R"),
+        Authenticator("Mufasa", "Circle Of Life", "digest", "testrealm@host.com"),
+    ]
     outcomes = set()
     for _ in range(FUZZ):
         data = bytearray(rng.choice(seeds))
@@ -223,14 +226,14 @@ def headers_of(authorization):
 
 
 def authorized(authorization, target="/dir/index.html", method="GET"):
-    return Request(method, target, target, {}, headers_of(authorization))
+    return HttpRequest(method, target, target, {}, headers_of(authorization))
 
 
 @pytest.fixture
 def rfc_guard(monkeypatch):
     nonces = itertools.chain([RFC_NONCE], (f"{i:032x}" for i in itertools.count()))
     monkeypatch.setattr(axis_241q.secrets, "token_hex", lambda _: next(nonces))
-    guard = Guard("Mufasa", "Circle Of Life", "digest", "testrealm@host.com", now=lambda: guard.time)
+    guard = Authenticator("Mufasa", "Circle Of Life", "digest", "testrealm@host.com", now=lambda: guard.time)
     guard.time = 0.0
     assert guard.refuse(authorized("")) == (
         f'WWW-Authenticate: Digest realm="testrealm@host.com", nonce="{RFC_NONCE}", algorithm=MD5, qop="auth"'
@@ -277,7 +280,7 @@ def test_another_method_or_target_needs_another_digest(rfc_guard):
 
 
 def test_a_nonce_that_nobody_issued_is_stale():
-    guard = Guard("u", "p", "digest", "R")
+    guard = Authenticator("u", "p", "digest", "R")
 
     def md5(text):
         return hashlib.md5(text.encode()).hexdigest()
@@ -288,14 +291,14 @@ def test_a_nonce_that_nobody_issued_is_stale():
 
 
 def test_nonces_do_not_pile_up():
-    guard = Guard("u", "p", "digest", "R")
+    guard = Authenticator("u", "p", "digest", "R")
     for _ in range(3 * axis_241q.MAX_NONCES):
         guard.challenge()
     assert len(guard._issued) == len(guard._used) == axis_241q.MAX_NONCES
 
 
 def test_basic_is_the_rfc_s():
-    guard = Guard("Aladdin", "open sesame", "basic", "AXIS_00408C000241")
+    guard = Authenticator("Aladdin", "open sesame", "basic", "AXIS_00408C000241")
     refusal = 'WWW-Authenticate: Basic realm="AXIS_00408C000241"'
     assert guard.refuse(authorized("Basic QWxhZGRpbjpvcGVuIHNlc2FtZQ==")) is None
     wrong = base64.b64encode(b"Aladdin:open").decode()
@@ -304,7 +307,7 @@ def test_basic_is_the_rfc_s():
 
 
 def test_without_a_user_everybody_may_look():
-    assert Guard("", "", "digest", "R").refuse(authorized("")) is None
+    assert Authenticator("", "", "digest", "R").refuse(authorized("")) is None
 
 
 @pytest.mark.parametrize(("source", "wanted"), [(25, 25), (25, 10), (25, 20), (30, 7), (10, 25)])

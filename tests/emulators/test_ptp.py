@@ -21,12 +21,12 @@ from cotarget.emulators.ptpip import (
     InitCommand,
     InitEvent,
     ObjectInfo,
+    OperationRequest,
     PacketReader,
     Probe,
     Property,
     PtpError,
     Range,
-    Request,
     StartData,
 )
 
@@ -35,9 +35,9 @@ GUID = bytes(range(16))
 CONVERSATION = (
     (bytes.fromhex("22000000 01000000") + GUID + bytes.fromhex("6100 6200 0000 0000 0100"), InitCommand(GUID, "ab")),
     (bytes.fromhex("0c000000 03000000 07000000"), InitEvent(7)),
-    (bytes.fromhex("12000000 06000000 01000000 0110 00000000"), Request(0x1001, 0, ())),
-    (bytes.fromhex("16000000 06000000 01000000 0210 01000000 01000000"), Request(0x1002, 1, (1,))),
-    (bytes.fromhex("16000000 06000000 02000000 1610 02000000 2ad00000"), Request(0x1016, 2, (0xD02A,), True)),
+    (bytes.fromhex("12000000 06000000 01000000 0110 00000000"), OperationRequest(0x1001, 0, ())),
+    (bytes.fromhex("16000000 06000000 01000000 0210 01000000 01000000"), OperationRequest(0x1002, 1, (1,))),
+    (bytes.fromhex("16000000 06000000 02000000 1610 02000000 2ad00000"), OperationRequest(0x1016, 2, (0xD02A,), True)),
     (bytes.fromhex("14000000 09000000 02000000 0200000000000000"), StartData(2, 2)),
     (bytes.fromhex("0e000000 0c000000 02000000 6900"), Data(2, b"\x69\x00", True)),
     (bytes.fromhex("0d000000 0a000000 02000000 69"), Data(2, b"\x69", False)),
@@ -195,8 +195,8 @@ class Echo:
 def test_transactions():
     device = Echo()
     session = CommandSession(device)
-    assert session.receive(Request(0x1003, 1, (7,))) == [ptpip.response(Code.OK, 1)]
-    assert session.receive(Request(0x9999, 2, (), True)) == []
+    assert session.receive(OperationRequest(0x1003, 1, (7,))) == [ptpip.response(Code.OK, 1)]
+    assert session.receive(OperationRequest(0x9999, 2, (), True)) == []
     assert session.receive(StartData(2, 3)) == []
     assert session.receive(Data(2, b"ab", False)) == []
     assert b"".join(session.receive(Data(2, b"c", True))) == b"".join(ptpip.data_phase(2, b"abc")) + ptpip.response(
@@ -208,11 +208,11 @@ def test_transactions():
 def test_data_that_is_too_little():
     device = Echo()
     session = CommandSession(device)
-    for packet in (Request(0x1016, 2, (), True), StartData(2, 3)):
+    for packet in (OperationRequest(0x1016, 2, (), True), StartData(2, 3)):
         session.receive(packet)
     assert session.receive(Data(2, b"ab", True)) == [ptpip.response(Code.INCOMPLETE_TRANSFER, 2)]
     assert device.asked == []
-    assert session.receive(Request(0x1001, 3, ())) == [ptpip.response(Code.OK, 3)]
+    assert session.receive(OperationRequest(0x1001, 3, ())) == [ptpip.response(Code.OK, 3)]
 
 
 @pytest.mark.parametrize(
@@ -222,13 +222,13 @@ def test_data_that_is_too_little():
         [Data(1, b"", True)],
         [InitCommand(GUID, "")],
         [InitEvent(1)],
-        [Request(1, 1, (), True), Request(1, 2, ())],
-        [Request(1, 1, (), True), Data(1, b"", True)],
-        [Request(1, 1, (), True), StartData(2, 0)],
-        [Request(1, 1, (), True), StartData(1, 1), StartData(1, 1)],
-        [Request(1, 1, (), True), StartData(1, 1), Data(1, b"ab", True)],
-        [Request(1, 1, (), True), StartData(1, 1), Data(2, b"a", True)],
-        [Request(1, 1, (), True), StartData(1, 1 << 40)],
+        [OperationRequest(1, 1, (), True), OperationRequest(1, 2, ())],
+        [OperationRequest(1, 1, (), True), Data(1, b"", True)],
+        [OperationRequest(1, 1, (), True), StartData(2, 0)],
+        [OperationRequest(1, 1, (), True), StartData(1, 1), StartData(1, 1)],
+        [OperationRequest(1, 1, (), True), StartData(1, 1), Data(1, b"ab", True)],
+        [OperationRequest(1, 1, (), True), StartData(1, 1), Data(2, b"a", True)],
+        [OperationRequest(1, 1, (), True), StartData(1, 1 << 40)],
     ],
 )
 def test_packets_out_of_turn(packets):
@@ -241,14 +241,14 @@ def test_packets_out_of_turn(packets):
 
 def test_a_probe_is_answered_at_any_time_and_a_cancel_ignored():
     session = CommandSession(Echo())
-    session.receive(Request(1, 1, (), True))
+    session.receive(OperationRequest(1, 1, (), True))
     assert session.receive(Probe()) == [bytes.fromhex("08000000 0e000000")]
     assert session.receive(Cancel(1)) == []
 
 
 def test_the_deaf_do_and_answer_nothing():
     device = Echo()
-    assert CommandSession(device, lambda: True).receive(Request(0x1001, 1, ())) == []
+    assert CommandSession(device, lambda: True).receive(OperationRequest(0x1001, 1, ())) == []
     assert device.asked == []
 
 

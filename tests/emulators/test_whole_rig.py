@@ -18,7 +18,7 @@ import serial
 from cotarget.calibration import load_calibration
 from cotarget.config import RigConfig, load_config
 from cotarget.emulators.emulation import FAULTS
-from cotarget.targeting import Closeup, Reach, aim, point_at
+from cotarget.targeting import Reach, WantedSize, aim, point_at
 from tests.cli.test_commands import call
 from tests.emulated_rig import DEADLINE_S, PASSWORD, Watch, emulated, meanwhile, program, way
 
@@ -150,7 +150,7 @@ def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
         calibration,
         np.array([x, MOUNT_M - z, y]),
         Reach(*config.head_limits, config.focal_range_px),
-        closeup=Closeup(book.size, book.wanted_px),
+        closeup=WantedSize(book.size, book.wanted_px),
     )
     truth = rig.truth()
     assert truth["pan_deg"] == pytest.approx(math.degrees(there.pan), abs=LOOKED_AT_DEG)

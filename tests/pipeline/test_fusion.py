@@ -14,7 +14,7 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.control.selection import RATE_S
 from cotarget.detection import Detection
-from cotarget.estimation.zoom_matching import LONGEST_APART_S, CloseupFinder, Found
+from cotarget.estimation.zoom_matching import LONGEST_APART_S, CloseupFinder, ZoomMeasurement
 from cotarget.fusion import MOST_FILTERS, MOST_WAITING, UNFOUND_S, TargetFusion
 from cotarget.geometry import pose
 from cotarget.rig import Frame, PanTiltState, ZoomState
@@ -223,7 +223,7 @@ class Finder:
         self.asked.append(expected)
         tangent = (self.x[:2] - (BASELINE, 0.0)) / self.x[2]  # the head looks straight ahead
         body = np.full(2, self.body_sigma_px)
-        return Found(np.array(CENTER) + ZOOMED * tangent, 1.0, body, 1.0, 1.0, np.ones(2), frame.t)
+        return ZoomMeasurement(np.array(CENTER) + ZOOMED * tangent, 1.0, body, 1.0, 1.0, np.ones(2), frame.t)
 
 
 def followed(x_fixed, wrong, frames, finder, **fusion):
@@ -406,7 +406,7 @@ class Compared(CloseupFinder):
 
     def find(self, frame, expected):
         self.asked = [*getattr(self, "asked", []), frame.t]
-        return Found(np.array(CENTER), 1.0, np.ones(2), 1.0, 1.0, np.ones(2), frame.t)
+        return ZoomMeasurement(np.array(CENTER), 1.0, np.ones(2), 1.0, 1.0, np.ones(2), frame.t)
 
 
 def apart(by, frames=60):

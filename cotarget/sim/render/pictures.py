@@ -19,7 +19,7 @@ from cotarget.sim.truth import CameraName
 NOISE = {"fixed": 6, "zoom": 7}  # streams of random numbers, apart from the world's others
 
 
-class Pictures:
+class SizedPictures:
     """Renders both cameras of a world, for the thread that makes it."""
 
     def __init__(
@@ -30,7 +30,7 @@ class Pictures:
         lens_at: Callable[[CameraName, float], TrueLens],
         lenses: Sequence[TrueLens],
         size: tuple[int, int],
-        before: "Pictures | None" = None,
+        before: "SizedPictures | None" = None,
     ) -> None:
         """Open OpenGL.
 

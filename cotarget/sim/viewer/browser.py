@@ -18,7 +18,7 @@ import numpy as np
 from cotarget.errors import DeviceError
 from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.truth import Truth
-from cotarget.sim.viewer.scene import Onlooker, Sight, line_geoms
+from cotarget.sim.viewer.scene import Onlooker, Snapshot, line_geoms
 
 try:
     from mujoco.studio import launch_thread, messages, viewer_protocol, web_viewer
@@ -99,7 +99,7 @@ class BrowserWindow:
         """Whether the page is served."""
         return bool(self._handle.is_running())
 
-    def show(self, sight: Sight) -> None:
+    def show(self, sight: Snapshot) -> None:
         """Show a moment."""
         self._onlooker.come_to(sight.t)
         self._overlay.sight = sight
@@ -125,11 +125,11 @@ class Overlay:
         Args:
             aim: puts a camera where the scene is looked at first, and chooses what is seen.
         """
-        self.sight: Sight | None = None
+        self.sight: Snapshot | None = None
         self.viewer: Any = None
         self.ready: queue.Queue[None] = queue.Queue()
         self._aim = aim
-        self._uploaded: Sight | None = None
+        self._uploaded: Snapshot | None = None
         self._textures: dict[str, tuple[int, int, int]] = {}
 
     @messages.handler(priority=AFTER_ALL)  # type: ignore[untyped-decorator]

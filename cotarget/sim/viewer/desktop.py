@@ -11,7 +11,7 @@ from cotarget.errors import DeviceError
 from cotarget.rig import Image
 from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.truth import Truth
-from cotarget.sim.viewer.scene import Onlooker, Sight, line_geoms
+from cotarget.sim.viewer.scene import Onlooker, Snapshot, line_geoms
 
 OTHERWISE = "--browser shows the scene in a web browser instead"
 PICTURE_SHARE = 0.3  # of the window's width, for each camera's picture
@@ -48,7 +48,7 @@ class DesktopWindow:
         """Whether nobody has closed it."""
         return bool(self._handle.is_running())
 
-    def show(self, sight: Sight) -> None:
+    def show(self, sight: Snapshot) -> None:
         """Show a moment."""
         handle = self._handle
         with handle.lock():

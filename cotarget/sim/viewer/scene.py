@@ -22,7 +22,7 @@ SIDE_POINTS = 8  # segments of each side of a frustum's end, which distortion be
 
 
 @dataclass(frozen=True)
-class Sight:
+class Snapshot:
     """One moment of a world, for a window that shows it.
 
     Attributes:
@@ -119,7 +119,7 @@ class Onlooker:
         option.sitegroup[:] = 0
 
 
-def line_geoms(sight: Sight, geoms: "Iterator[mujoco.MjvGeom]") -> int:
+def line_geoms(sight: Snapshot, geoms: "Iterator[mujoco.MjvGeom]") -> int:
     """Make geoms the lines of a sight's frusta.
 
     Args:
