@@ -1,32 +1,29 @@
-"""Two cameras that cooperate: a wide one finds a small target, a zoom camera on a pan-tilt unit shows it large.
+"""Two cooperating cameras: find a small target in a fixed camera, show it large in a zoom camera on a pan-tilt head.
 
-The pipeline: a rig is calibrated from pictures of a board (`cotarget.calibration`). Then, for each frame of the wide
-camera, a detector finds the target (`cotarget.detection`), a tracker keeps its identity (`cotarget.tracking.tracker`),
-a
-filter estimates where it is in 3D from its known size and from both views (`cotarget.estimation`,
-`cotarget.estimation.zoom_matching`), the exact inverse gives pan, tilt and focal length (`cotarget.targeting`,
-`cotarget.pantilt`),
-and a servo sends head and lens there, ahead of all delays (`cotarget.control.controller`). `cotarget.pipeline.follow`
-does all that
-and yields one `cotarget.pipeline.Step` a frame; whatever draws, scores or records reads Steps.
+    import cotarget as ct
 
-The pipeline sees only a `cotarget.rig.Rig`: two cameras, a pan-tilt unit, a clock, and a board for calibration. Whether
-that is simulated, real or a recording is up to the rig.toml (`cotarget.config`) that `cotarget.backends.open_rig`
-opens.
+    with ct.open_rig("rig.toml") as rig:
+        calibration = ct.calibrate(rig)
+        for step in ct.follow(rig, calibration, "bird", seconds=20):
+            print(step.t, step.state, step.aim)
 
-Where to read:
+The names below are imported on first use; `__init__.pyi` says where each is defined.
 
-- To use it: `cotarget.rig`, `cotarget.config`, `cotarget.calibration.calibrate_rig`, `cotarget.pipeline`, and
-  `cotarget.safety.SafeRig`, which belongs in front of every rig that moves.
-- For the method: `cotarget.geometry` for frames and conventions, then `cotarget.camera`, `cotarget.pantilt`,
-  `cotarget.targeting`; equation numbers are those of the paper *Cooperative Targeting* (Shakeri and Zhang).
-- For one's own target: `cotarget.detection` for the detector, `cotarget.config.SimConfig` for its model.
-- For experiments: `cotarget.sim.world.SimWorld` gives a rig and the truth about it, `cotarget.metrics` the scores,
-  `cotarget.env` gymnasium environments.
-- For devices: `cotarget.drivers` and, to rehearse without them, `cotarget.emulators`.
-
-Coordinates: `T_a_b` maps from frame b to frame a; metres, radians and seconds unless a name says otherwise; pixels are
-(u, v) with (0, 0) in the middle of the top left one.
+Conventions: ``T_a_b`` maps from frame b to frame a. Units are metres, radians and seconds, unless a suffix says
+otherwise. Pixels are (u, v), and (0, 0) is the centre of the top-left pixel. Equation numbers are those of *Cooperative
+Targeting* (Shakeri and Zhang).
 """
 
-__version__ = "0.1.0"
+from typing import Any
+
+import lazy_loader
+
+_lazy, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version(__name__)
+    return _lazy(name)

@@ -1,5 +1,6 @@
 """Open the rig that a configuration describes; the only module that imports backends."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cotarget.errors import ConfigError
@@ -7,10 +8,30 @@ from cotarget.rig import Rig
 
 if TYPE_CHECKING:
     from cotarget.config import RigConfig
+    from cotarget.safety import SafeRig
 
 
-def open_rig(config: "RigConfig") -> Rig:
-    """Open the rig that a configuration describes; the only place that imports a backend.
+def open_rig(config: "RigConfig | Path | str") -> "SafeRig":
+    """Open a rig with the safety layer in front of it: limits, watchdog and stop file.
+
+    Args:
+        config: a configuration, or the path of a rig.toml.
+
+    Raises:
+        ConfigError: the configuration is malformed, or does not say enough of that rig.
+        DeviceError: a device could not be opened.
+        EmergencyStopError: the stop file exists.
+    """
+    from cotarget.config import load_config
+    from cotarget.safety import SafeRig
+
+    if isinstance(config, str | Path):
+        config = load_config(Path(config))
+    return SafeRig(open_devices(config), config.safety)
+
+
+def open_devices(config: "RigConfig") -> Rig:
+    """Open the same rig without the safety layer, for callers that put a recorder or a test between the two.
 
     Raises:
         ConfigError: the configuration does not say enough of that rig.

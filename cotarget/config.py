@@ -1057,12 +1057,13 @@ class RigConfig:
         return found
 
 
-def load_config(path: Path) -> RigConfig:
+def load_config(path: Path | str) -> RigConfig:
     """Read rig.toml.
 
     Raises:
         ConfigError: the file is missing, malformed, or says something unknown or impossible.
     """
+    path = Path(path)
     return config_of(read_text(path), path)
 
 

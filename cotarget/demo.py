@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from cotarget.calibration import Calibration, calibrate_rig, save_calibration
+from cotarget.calibration import Calibration, save_calibration
+from cotarget.calibration.calibrate import calibrate
 from cotarget.config import RigConfig
 from cotarget.control.controller import reach_of
 from cotarget.detection import make_detector
@@ -117,7 +118,7 @@ def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> 
     """Calibrate from rendered boards; judge it by the truth, which it cannot see; picture the rig."""
     world = SimWorld(config)
     with SafeRig(world.rig, config.safety) as rig:
-        calibration = calibrate_rig(
+        calibration = calibrate(
             rig,
             config.board,
             pitch_mm=config.pitch_mm,

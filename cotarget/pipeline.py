@@ -21,13 +21,13 @@ from cotarget.config import RigConfig, TargetConfig
 from cotarget.control.controller import Controller, ControllerSettings, Predict
 from cotarget.control.selection import FirstCome, Policy
 from cotarget.control.zoom import shape_of
-from cotarget.detection import Detection, Detector
+from cotarget.detection import Detection, Detector, make_detector
 from cotarget.detection.base import flood
 from cotarget.errors import DeviceError, StaleFrameError, UnreachableError
 from cotarget.estimation import Estimate
 from cotarget.estimation.zoom_matching import CloseupFinder, ZoomMeasurement
 from cotarget.fusion import MakeFinder, TargetFusion
-from cotarget.rig import Camera, Clock, Frame, Image, PanTiltState, Rig, ZoomState
+from cotarget.rig import Camera, Clock, Frame, Image, PanTiltState, Rig, ZoomState, opened_from
 from cotarget.safety.safe_rig import FUTURE_S
 from cotarget.targeting import Aim
 from cotarget.tracking.track import Track, settings_for
@@ -266,31 +266,51 @@ class Step:
 def follow(
     rig: Rig,
     calibration: Calibration,
-    target: TargetConfig,
-    detector: Detector,
+    target: TargetConfig | str,
+    detector: Detector | None = None,
     *,
-    seconds: float,
-    settings: FollowSettings = FollowSettings(),
+    seconds: float = math.inf,
+    settings: FollowSettings | None = None,
 ) -> Iterator[Step]:
     """Follow a target and yield one Step for each frame of the fixed camera.
+
+    What is left out comes from the configuration that the rig was opened from.
 
     Args:
         rig: any rig; the caller closes it.
         calibration: of that rig.
-        target: what to follow.
-        detector: finds it in the fixed view.
+        target: what to follow, or its name in the rig's configuration.
+        detector: finds it in the fixed camera's image; by default the one that the target's configuration names.
         seconds: for how long on the rig's clock [s].
-        settings: delays and habits.
+        settings: delays and habits; by default the delays of the rig's configuration.
 
     Raises:
         CalibrationError: the calibration has no T.
-        ConfigError: the calibration is of another aspect ratio than the rig's streams.
+        ConfigError: the target is unknown, the rig has no configuration to take it from, or the calibration is of
+            another aspect ratio than the rig's streams.
         StaleFrameError: frames of the fixed camera stopped coming, or came too late to act on, or again; or the zoom
             camera shows nothing new for 10 s. Until then the wide view alone is followed, and every Step says so.
         DeviceError: a device failed; frames have another size than before among others.
     """
     calibration.hand_eye()  # refused now, and not when the first target is seen
-    loop = _Loop(rig, calibration.for_streams(rig.fixed.size, rig.zoom.size), target, detector, settings)
+    wanted = opened_from(rig).target(target) if isinstance(target, str) else target
+    if detector is None:
+        detector = make_detector(wanted, opened_from(rig).rate_hz)
+    if settings is None:
+        settings = FollowSettings.of(opened_from(rig))
+    fitting = calibration.for_streams(rig.fixed.size, rig.zoom.size)
+    return _turns(rig, fitting, wanted, detector, seconds, settings)
+
+
+def _turns(
+    rig: Rig,
+    calibration: Calibration,
+    target: TargetConfig,
+    detector: Detector,
+    seconds: float,
+    settings: FollowSettings,
+) -> Iterator[Step]:
+    loop = _Loop(rig, calibration, target, detector, settings)
     end = rig.clock.now() + seconds
     while rig.clock.now() < end:
         yield loop.turn()

@@ -1,4 +1,4 @@
-"""What the pipeline sees of a rig: frames, four small device Protocols, a clock, and `open_rig`.
+"""What the pipeline sees of a rig: frames, four small device Protocols and a clock.
 
 A rig is the MuJoCo simulation, real devices, or a recording; the pipeline cannot tell which. Every blocking call
 advances the rig's own clock, which is simulated time in the simulation.
@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.errors import DeviceError
+from cotarget.errors import ConfigError, DeviceError
 from cotarget.geometry import RigidTransform
 
 if TYPE_CHECKING:
-    pass
+    from cotarget.config import RigConfig
 
 
 Image = npt.NDArray[np.uint8]
@@ -205,3 +205,15 @@ class Rig(Protocol):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Halt, then close."""
+
+
+def opened_from(rig: Rig) -> "RigConfig":
+    """The configuration that a rig was opened from, its attribute ``config``.
+
+    Raises:
+        ConfigError: the rig was made in another way and has none.
+    """
+    config: RigConfig | None = getattr(rig, "config", None)
+    if config is None:
+        raise ConfigError(f"a {type(rig).__name__} has no configuration; pass target, detector and settings yourself")
+    return config

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from cotarget.calibration import Calibration, predicted_pointing
 from cotarget.camera import depth_from_size, focal_for_size
@@ -116,31 +117,44 @@ def point_at(calibration: Calibration, pixel: Array, depth: float) -> Array:
 
 def aim(
     calibration: Calibration,
-    x_fixed: Array,
-    reach: Reach,
+    x_fixed: Array | None = None,
+    reach: Reach | None = None,
     *,
+    pixel: npt.ArrayLike | None = None,
+    depth: float | None = None,
     closeup: WantedSize | None = None,
     nominal_px: float | None = None,
     method: Method = "exact",
-    pixel: Array | None = None,
+    zoom_pixel: Array | None = None,
 ) -> Aim:
     """Solve pan, tilt and focal length for a target (Eqs. 6, 13, 16 and 17, with the exact range).
+
+    The target is either a point, or a pixel of the fixed camera with its depth.
 
     Args:
         calibration: the rig.
         x_fixed: the target in the fixed camera's frame [m], (3,).
-        reach: limits, and where the head is now.
+        reach: limits, and where the head is now; by default any angles, and the focal lengths that were calibrated.
+        pixel: the target in the fixed camera's image, (2,) [px].
+        depth: along the fixed camera's axis [m].
         closeup: how large the target is wanted; decides the focal length.
         nominal_px: the focal length where no close-up is asked for; the shortest by default.
         method: the exact inverse, or the paper's shortcut in one of its two readings.
-        pixel: where in the zoom image the target is wanted; its centre by default.
+        zoom_pixel: where in the zoom image the target is wanted, (2,) [px]; its centre by default.
 
     Raises:
         CalibrationError: the calibration has no T.
         UnreachableError: no pan and tilt within the limits do it.
     """
+    if x_fixed is None:
+        if pixel is None or depth is None:
+            raise TypeError("aim() needs x_fixed, or pixel and depth")
+        x_fixed = point_at(calibration, np.asarray(pixel, dtype=float), depth)
+    if reach is None:
+        focal_px = calibration.zoom.nominal_px
+        reach = Reach((-math.pi, math.pi), (-math.pi, math.pi), (focal_px[0], focal_px[-1]))
     x_base = calibration.in_base(x_fixed)  # (6)
-    wanted = calibration.zoom.stops[0].image_center_px if pixel is None else np.asarray(pixel, dtype=float)
+    wanted = calibration.zoom.stops[0].image_center_px if zoom_pixel is None else np.asarray(zoom_pixel, dtype=float)
     if closeup:  # begin near: with the range from the base
         nominal_px = calibration.zoom.nominal_for(focal_for_size(closeup.size, closeup.wanted_px, math.hypot(*x_base)))
     nominal, limited = _limit(reach.focal_px[0] if nominal_px is None else nominal_px, reach)

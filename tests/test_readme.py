@@ -145,7 +145,7 @@ def test_the_library_on_any_rig_runs(capsys, tmp_path, monkeypatch):
     (tmp_path / "rig.toml").write_text('[sim]\nscene = "indoor"\ntargets = ["book"]\n')
     world = SimWorld(load_config(tmp_path / "rig.toml"), rendered=())
     # To calibrate takes half a minute, and has tests of its own.
-    monkeypatch.setattr("cotarget.calibration.calibrate_rig", lambda rig, board: true_calibration(world))
+    monkeypatch.setattr("cotarget.calibration.calibrate.calibrate", lambda rig, board: true_calibration(world))
     exec(python_with("SafeRig").replace("seconds=8.0", "seconds=0.1"), {})
     assert "searching" in capsys.readouterr().out
     assert load_calibration(tmp_path / "calibration.json").T_head_zoom is not None

@@ -85,7 +85,7 @@ def test_the_exact_aim_brings_the_target_to_the_wanted_pixel(real_head, pixel):
         x_fixed = np.array([*rng.uniform(-0.4, 0.4, 2), 1.0]) * rng.uniform(4, 40)
         closeup = WantedSize(0.3, rng.uniform(20, 300))
         for how in ({}, {"nominal_px": rng.uniform(667, 8000)}, {"closeup": closeup}):
-            found = aim(calibration_of(truth), x_fixed, ANYWHERE, pixel=pixel, **how)
+            found = aim(calibration_of(truth), x_fixed, ANYWHERE, zoom_pixel=pixel, **how)
             tolerance = IN_TURN_PX if "closeup" in how else PIXEL
             np.testing.assert_allclose(seen_by_zoom(truth, found, x_fixed)[0], wanted, rtol=0, atol=tolerance)
             x_zoom = truth.in_zoom(x_fixed[None], found.pan, found.tilt)[0]

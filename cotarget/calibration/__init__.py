@@ -1,11 +1,11 @@
 """Calibration: boards and corners, intrinsics, stereo (Gamma), hand-eye (T), capture sessions and the file."""
 
 from cotarget.board import draw_board
-from cotarget.calibration.calibrate import calibrate_captures, calibrate_photos, calibrate_rig, calibrate_views
+from cotarget.calibration.calibrate import calibrate_captures, calibrate_photos, calibrate_views
 from cotarget.calibration.corners import find_corners
-from cotarget.calibration.file import load_calibration, save_calibration
+from cotarget.calibration.file import Calibration, load_calibration, save_calibration
 from cotarget.calibration.handeye import HandEye, solve_hand_eye, solve_hand_eye_from_motions
-from cotarget.calibration.model import Calibration, Capture, Covariance, HeldOut, Options, Rejected, Residuals, View
+from cotarget.calibration.model import Capture, Covariance, HeldOut, Options, Rejected, Residuals, View
 from cotarget.calibration.observability import Observability, name_directions, weak_directions
 from cotarget.calibration.uncertainty import line_of_sight_covariance, predicted_pointing
 
@@ -22,7 +22,6 @@ __all__ = [
     "View",
     "calibrate_captures",
     "calibrate_photos",
-    "calibrate_rig",
     "calibrate_views",
     "draw_board",
     "find_corners",

@@ -20,6 +20,7 @@ import numpy as np
 from cotarget.board import board_points, check_board
 from cotarget.calibration.captures import CaptureIndex, pair_photos, read_images, read_index
 from cotarget.calibration.corners import another_board, find_corners, guess_corners
+from cotarget.calibration.file import Calibration
 from cotarget.calibration.initialization import FEWEST_CORNERS
 from cotarget.calibration.joint import (
     NO_PLACE,
@@ -34,7 +35,6 @@ from cotarget.calibration.joint import (
 )
 from cotarget.calibration.model import (
     DEFAULT_OPTIONS,
-    Calibration,
     CameraName,
     Capture,
     Options,
@@ -49,7 +49,7 @@ from cotarget.calibration.session import SETTLE, CaptureRecorder, capture_sessio
 from cotarget.config import BoardConfig, RigConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.geometry import Array
-from cotarget.rig import Rig
+from cotarget.rig import Rig, opened_from
 
 NO_BOARD = "no whole board of {}x{} corners is seen"
 TWO_BOARDS = "two boards are in this picture; show one"
@@ -337,7 +337,7 @@ def _at_shortest(views: Sequence[View], nominal: Sequence[float]) -> tuple[list[
 def calibrate_captures(
     directory: Path, *, options: Options = DEFAULT_OPTIONS, progress: Progress | None = None
 ) -> Calibration:
-    """Calibrate from captures that `calibrate_rig` or somebody else saved; no rig is needed.
+    """Calibrate from captures that `calibrate` or somebody else saved; no rig is needed.
 
     Args:
         directory: folder with index.json and its images.
@@ -408,9 +408,9 @@ def _calibrate_images(
     )
 
 
-def calibrate_rig(
+def calibrate(
     rig: Rig,
-    board: BoardConfig,
+    board: BoardConfig | None = None,
     *,
     captures_dir: Path | None = None,
     progress: Progress | None = None,
@@ -427,7 +427,7 @@ def calibrate_rig(
 
     Args:
         rig: of which nothing needs to be known.
-        board: the board that its holder holds.
+        board: the board that its holder holds; that of the rig's configuration by default, and its `pitch_mm` too.
         captures_dir: where to keep the images; None to keep none.
         progress: called with what is done, of how much, and in words.
         placements: how many placements of the board, at the shortest focal length.
@@ -443,6 +443,9 @@ def calibrate_rig(
         CalibrationError: a camera never sees the board, there is no common view, or the head fails.
         ConfigError: the board looks the same upside down.
     """
+    if board is None:
+        opened = opened_from(rig)
+        board, pitch_mm = opened.board, opened.pitch_mm if pitch_mm is None else pitch_mm
     recorder = CaptureRecorder(rig, board, captures_dir, pitch_mm, settle, config)
     rng = np.random.default_rng(seed)
     capture_session(recorder, placements, rng, progress, stops=stops, far_placements=far_placements)

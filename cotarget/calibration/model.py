@@ -1,15 +1,13 @@
 """What a calibration takes and gives: captures, views (the corners of one image), and the calibration itself."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
 from cotarget.pantilt import IDEAL_HEAD, HeadGeometry
@@ -197,106 +195,6 @@ class HeldOut:
     corners_rms_px: float
     ratio: float
     widened: float = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """All that targeting needs to know of a rig, and what it was found from.
-
-    Attributes:
-        fixed: the fixed camera.
-        zoom: the zoom camera over its focal lengths.
-        T_zoom0_fixed: the paper's Gamma, at the shortest focal length.
-        T_head_zoom: the paper's T, at the shortest focal length; None where there was no head to calibrate.
-        head: the pan-tilt unit's own geometry.
-        pitch_mm: size of a pixel of the zoom camera [mm], where it is known; only for focal lengths in millimetres.
-        residuals: how well the corners are explained, and what was rejected.
-        covariance: None where the method gives none.
-        jitter: standard deviation by which each axis of the head misses what it reports, at every pose anew [rad];
-            beyond the head itself it stands for whatever of the rig the model leaves out.
-        held_out: what captures kept out of the fit say; None where there were too few, or the method tells none.
-        board_warp: by how much the board's middle stands out towards its z, along its x and along its y [m].
-        board: the board, None for a calibration that comes from no board.
-        views: the corners themselves, so that the calibration can be checked and refitted.
-        provenance: versions, method, when, from which captures; JSON values only.
-    """
-
-    fixed: Intrinsics
-    zoom: ZoomLens
-    T_zoom0_fixed: RigidTransform
-    T_head_zoom: RigidTransform | None
-    head: HeadGeometry = IDEAL_HEAD
-    pitch_mm: float | None = None
-    residuals: Residuals | None = None
-    covariance: Covariance | None = None
-    jitter: float = 0.0
-    held_out: HeldOut | None = None
-    board_warp: tuple[float, float] = (0.0, 0.0)
-    board: BoardConfig | None = None
-    views: tuple[View, ...] = ()
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-
-    def hand_eye(self, nominal_px: float | None = None) -> RigidTransform:
-        """T_head_zoom, for those who cannot do without.
-
-        Args:
-            nominal_px: focal length by the device's own account [px], whose entrance pupil is meant; the shortest
-                calibrated one by default.
-
-        Raises:
-            CalibrationError: there was no head to calibrate.
-        """
-        if self.T_head_zoom is None:
-            raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
-        if nominal_px is None:
-            return self.T_head_zoom
-        return self.T_head_zoom * self.zoom.to_pupil(nominal_px)
-
-    @cached_property
-    def T_base_fixed(self) -> RigidTransform:
-        """Where the fixed camera is seen from the base (6).
-
-        Raises:
-            CalibrationError: there was no head to calibrate.
-        """
-        return self.hand_eye() * self.T_zoom0_fixed
-
-    @cached_property
-    def _base_fixed(self) -> Array:
-        """Rotation and translation of that side by side, (3, 4)."""
-        return self.T_base_fixed.as_matrix()[:3]
-
-    def in_base(self, x_fixed: Array) -> Array:
-        """Where a point of the fixed camera's frame is in the base's (6), (3,) [m]; in a third of scipy's time.
-
-        Raises:
-            CalibrationError: there was no head to calibrate.
-        """
-        x, y, z = x_fixed
-        return np.asarray(self._base_fixed @ np.array((x, y, z, 1.0)))
-
-    def for_streams(self, fixed_size: tuple[int, int], zoom_size: tuple[int, int]) -> "Calibration":
-        """The same calibration for streams (width, height) [px] that are scaled.
-
-        Raises:
-            ConfigError: a stream has another aspect ratio than was calibrated.
-        """
-        covariance = self.covariance
-        if covariance is not None:
-            s_fixed, s_zoom = fixed_size[0] / self.fixed.size[0], zoom_size[0] / self.zoom.size[0]
-            in_pixels = ("fx", "fy", "cx", "cy")
-            covariance = covariance.scaled(
-                {f"fixed.{k}": s_fixed for k in in_pixels}
-                | {f"zoom[{i}].{k}": s_zoom for i in range(len(self.zoom.stops)) for k in in_pixels}
-            )
-        pitch_mm = self.pitch_mm and self.pitch_mm * self.zoom.size[0] / zoom_size[0]  # a larger pixel, where binned
-        return replace(
-            self,
-            fixed=self.fixed.resized(fixed_size),
-            zoom=self.zoom.resized(zoom_size),
-            covariance=covariance,
-            pitch_mm=pitch_mm,
-        )
 
 
 @dataclass(frozen=True, eq=False)

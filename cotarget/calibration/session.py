@@ -868,6 +868,7 @@ class _StillsRig:
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
+        self.config: RigConfig | None = getattr(rig, "config", None)
         self.fixed: Camera = rig.fixed
         self.zoom: ZoomCamera = StillCamera(rig.zoom, rig.clock)
         self.head: PanTilt = rig.head

@@ -43,7 +43,8 @@ from cotarget.calibration.bundle import (
     robust_scale,
     stepped,
 )
-from cotarget.calibration.model import Calibration, Covariance, HeldOut, RigModel, View, stop_of
+from cotarget.calibration.file import Calibration
+from cotarget.calibration.model import Covariance, HeldOut, RigModel, View, stop_of
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
 from cotarget.pantilt import solve

@@ -27,9 +27,10 @@ def calibrate(options: argparse.Namespace) -> None:
     """Cotarget calibrate."""
     from cotarget import calibration as cal
     from cotarget.backends import open_rig
+    from cotarget.calibration.calibrate import calibrate as calibrate_rig
     from cotarget.calibration.session import SETTLE, SETTLE_LONG, with_stills
     from cotarget.config import BoardConfig, load_config
-    from cotarget.safety import SafeRig, refuse_if_stopped
+    from cotarget.safety import refuse_if_stopped
 
     config = None if options.rig is None else load_config(options.rig)
     inputs = _photos(options) if config is None else rig_files(options.rig, config)
@@ -50,12 +51,12 @@ def calibrate(options: argparse.Namespace) -> None:
         if config is not None:
             refuse_if_stopped(config.safety.stop_file)
             check_board_is_told(options.rig, config)
-            with SafeRig(open_rig(config), config.safety) as rig:
+            with open_rig(config) as rig:
                 session = {name: getattr(options, name) for name in _given(options, SESSION)}
                 if options.stops is not None:
                     session["stops"] = _enough_stops(options.stops, rig.zoom.focal_range)
                 finer = rig.zoom.still_size[0] / rig.zoom.size[0]
-                found = cal.calibrate_rig(
+                found = calibrate_rig(
                     with_stills(rig),
                     config.board,
                     captures_dir=options.captures,

@@ -216,7 +216,7 @@ def latency(options: argparse.Namespace) -> None:
     from cotarget.calibration import load_calibration
     from cotarget.config import load_config
     from cotarget.latency import measure_fixed, measure_head, measure_lens
-    from cotarget.safety import SafeRig, refuse_if_stopped
+    from cotarget.safety import refuse_if_stopped
 
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
@@ -229,7 +229,7 @@ def latency(options: argparse.Namespace) -> None:
         check_board_is_told(options.rig, config)
     tables = config.sim if config.backend == "sim" else config.hardware
     where = "sim" if config.backend == "sim" else "hardware"
-    with SafeRig(open_rig(config), config.safety) as rig:
+    with open_rig(config) as rig:
         head = measure_head(rig)
         found = {
             f"{where}.zoom.latency_s": tables.zoom.latency_s + head.zoom.seconds,
@@ -269,7 +269,7 @@ def point(options: argparse.Namespace) -> None:
     from cotarget.calibration.captures import write_image
     from cotarget.calibration.session import wait_for_lens
     from cotarget.config import load_config
-    from cotarget.safety import SafeRig, refuse_if_stopped
+    from cotarget.safety import refuse_if_stopped
 
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
@@ -277,7 +277,7 @@ def point(options: argparse.Namespace) -> None:
     check_outputs(shots.values(), rig_files(options.rig, config))
     if config.backend == "replay":
         raise ConfigError(f"{options.rig}: backend is 'replay'; a recording's head and lens cannot be sent anywhere")
-    with SafeRig(open_rig(config), config.safety) as rig:
+    with open_rig(config) as rig:
         limits = rig.head.limits
         for option, angle, bounds in (
             ("--pan-deg", options.pan_deg, limits.pan),

@@ -176,7 +176,7 @@ def demo(options: argparse.Namespace) -> None:
 
 def follow(options: argparse.Namespace) -> None:
     """Cotarget follow."""
-    from cotarget.backends import open_rig
+    from cotarget.backends import open_devices
     from cotarget.calibration import load_calibration
     from cotarget.config import load_config
     from cotarget.recording.recorder import Recorder
@@ -197,7 +197,7 @@ def follow(options: argparse.Namespace) -> None:
     ):
 
         def opened() -> SafeRig:
-            return SafeRig(recorder.wrap(open_rig(config)) if recorder else open_rig(config), config.safety)
+            return SafeRig(recorder.wrap(open_devices(config)) if recorder else open_devices(config), config.safety)
 
         states = _follow(opened, calibration, config, options, options.target, choice, options.seconds)
     _tell_if_nothing_was_seen("follow", options.target, states["states"], choice)

@@ -33,7 +33,9 @@ class HardwareRig:
         clock: MonotonicClock,
         board: Board,
         opened: contextlib.ExitStack,
+        config: RigConfig,
     ) -> None:
+        self.config = config
         self.fixed, self.zoom, self.head, self.clock, self.board = fixed, zoom, head, clock, board
         self._opened = opened
 
@@ -75,4 +77,4 @@ def open_hardware(config: RigConfig) -> HardwareRig:
         fixed = opened.enter_context(contextlib.closing(AxisCamera(hardware.fixed, clock)))
         zoom = opened.enter_context(contextlib.closing(GphotoCamera(hardware.zoom, clock)))
         head = opened.enter_context(contextlib.closing(D46Head(hardware.head, clock, config.safety)))
-        return HardwareRig(fixed, zoom, head, clock, board, opened.pop_all())
+        return HardwareRig(fixed, zoom, head, clock, board, opened.pop_all(), config)

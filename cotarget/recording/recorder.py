@@ -355,6 +355,7 @@ class RecordingRig:
         try:
             zoom = rig.zoom
             self.real_time = bool(getattr(rig, "real_time", False))
+            self.config: RigConfig | None = getattr(rig, "config", None)
             facts = RigFacts(
                 rig.fixed.size, zoom.size, zoom.still_size, zoom.focal_range, rig.head.limits, self.real_time
             )
@@ -446,7 +447,7 @@ class Recorder:
     Wrap the rig below the safety layer and close it before the recorder:
 
         with Recorder(folder, config, calibration, target) as recorder:
-            with SafeRig(recorder.wrap(open_rig(config)), config.safety) as rig:
+            with SafeRig(recorder.wrap(open_devices(config)), config.safety) as rig:
                 ...
     """
 

@@ -507,6 +507,7 @@ class ReplayRig:
     def __init__(self, recording: Recording) -> None:
         self._tape = Tape(recording)
         self.real_time = recording.facts.real_time
+        self.config = recording.config
         self.fixed: Camera = _FixedCamera(self._tape, recording.directory, recording.facts.fixed_size)
         self.zoom: ZoomCamera = _ZoomCamera(self._tape, recording)
         self.head: PanTilt = _Head(self._tape, recording)

@@ -25,8 +25,9 @@ from cotarget.calibration.bundle import (
     stepped,
 )
 from cotarget.calibration.calibrate import tells_pose
+from cotarget.calibration.file import Calibration
 from cotarget.calibration.initialization import place_boards
-from cotarget.calibration.model import Calibration, CameraName, Covariance, View, stop_of
+from cotarget.calibration.model import CameraName, Covariance, View, stop_of
 from cotarget.calibration.observability import name_directions, weak_directions
 from cotarget.calibration.uncertainty import STEP, miss_derivatives, model_of, predicted_pointing
 from cotarget.camera import ZoomLens

@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from cotarget.calibration.model import Calibration
+from cotarget.calibration.file import Calibration
 from cotarget.calibration.uncertainty import predicted_pointing
 from cotarget.geometry import Array
 from cotarget.report.analysis import (

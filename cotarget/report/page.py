@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cotarget.calibration.file import check_covariance
-from cotarget.calibration.model import Calibration
+from cotarget.calibration.file import Calibration, check_covariance
 from cotarget.errors import CalibrationError
 from cotarget.report import figures
 from cotarget.report.analysis import (

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from cotarget.calibration.bundle import LENS_NAMES
-from cotarget.calibration.model import Calibration
+from cotarget.calibration.file import Calibration
 from cotarget.calibration.observability import BOTH, NEARER, OUTWARD, TILT_BOARDS
 from cotarget.calibration.planning import distance
 from cotarget.camera import Intrinsics

@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable
 from types import TracebackType
 
-from cotarget.config import SafetyConfig
+from cotarget.config import RigConfig, SafetyConfig
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError
 from cotarget.files import HeldSignals
 from cotarget.rig import (
@@ -317,6 +317,7 @@ class SafeRig:
             EmergencyStopError: there is a stop file.
         """
         self._rig = rig
+        self.config: RigConfig | None = getattr(rig, "config", None)  # what it was opened from
         self._closed = False
         self._watcher: Watcher | None = None
         self._undo_signals: Callable[[], None] = lambda: None

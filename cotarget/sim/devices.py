@@ -5,7 +5,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import NoReturn
 
-from cotarget.config import SimCamera, SimEffects, SimHead, SimZoomCamera
+from cotarget.config import RigConfig, SimCamera, SimEffects, SimHead, SimZoomCamera
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Camera, Clock, Frame, Image, PanTiltLimits, PanTiltState, Speed, ZoomState, to_step
@@ -253,7 +253,9 @@ class SimRig:
         clock: Clock,
         board: SimBoard,
         release: Callable[[], None],
+        config: RigConfig,
     ) -> None:
+        self.config = config
         self.fixed: Camera = fixed
         self.zoom, self.head, self.clock, self.board = zoom, head, clock, board
         self._of_world = (fixed, zoom, board)  # whatever is put in their places

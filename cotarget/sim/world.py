@@ -96,6 +96,7 @@ class SimWorld:
             self._clock,
             SimBoard(self._place_board),
             self.close,
+            config,
         )
 
     def truth(self) -> Truth:

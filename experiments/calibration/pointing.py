@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from cotarget.calibration import Calibration, calibrate_rig
+from cotarget.calibration import Calibration
+from cotarget.calibration.calibrate import calibrate
 from cotarget.config import RigConfig, SimConfig
 from cotarget.control.controller import reach_of
 from cotarget.evaluation import pointing_errors
@@ -74,7 +75,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
         )
         world = SimWorld(config)
         with SafeRig(world.rig, config.safety) as opened:
-            calibration = calibrate_rig(opened, config.board, seed=seed)
+            calibration = calibrate(opened, config.board, seed=seed)
             reach = reach_of(opened)
             for model, (method, ignoring) in MODELS.items():
                 judged = without_offsets(calibration) if ignoring else calibration

@@ -21,7 +21,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from cotarget.calibration import Calibration, calibrate_rig, predicted_pointing
+from cotarget.calibration import Calibration, predicted_pointing
+from cotarget.calibration.calibrate import calibrate
 from cotarget.config import RigConfig, SimConfig, SimEffects
 from cotarget.control.controller import reach_of
 from cotarget.evaluation import pointing_errors, true_calibration
@@ -67,7 +68,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
         config = RigConfig(sim=sim)
         world = SimWorld(config)
         with SafeRig(world.rig, config.safety) as rig:
-            calibration = calibrate_rig(rig, config.board, seed=seed)
+            calibration = calibrate(rig, config.board, seed=seed)
             reach, truth, exact = reach_of(rig), world.truth(), true_calibration(world, stops=FOCAL_LENGTHS)
             for i, nominal in enumerate(np.geomspace(*reach.focal_px, FOCAL_LENGTHS)):
                 judged = functools.partial(

@@ -8,7 +8,8 @@ import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from cotarget.calibration import Calibration, calibrate_rig
+from cotarget.calibration import Calibration
+from cotarget.calibration.calibrate import calibrate
 from cotarget.config import RigConfig, TargetConfig
 from cotarget.detection import Detector, make_detector
 from cotarget.evaluation import add_row, true_calibration
@@ -70,7 +71,7 @@ def _calibrated(from_boards: bool, seed: int, rig: RigText) -> Calibration:
         return true_calibration(SimWorld(config, rendered=()))
     world = SimWorld(config)
     with SafeRig(world.rig, config.safety) as safe:
-        return calibrate_rig(safe, config.board, pitch_mm=config.pitch_mm, seed=config.sim.seed)
+        return calibrate(safe, config.board, pitch_mm=config.pitch_mm, seed=config.sim.seed)
 
 
 # A rig's calibration, from rendered boards or exact; the same for all experiments in the field with that rig.

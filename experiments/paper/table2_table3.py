@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from cotarget.calibration import Calibration, calibrate_rig
+from cotarget.calibration import Calibration
+from cotarget.calibration.calibrate import calibrate
 from cotarget.geometry import Array, RigidTransform, pose
 from cotarget.report.text import value_and_sigma
 from cotarget.safety import SafeRig
@@ -65,7 +66,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
     config = settings.config("indoor", (), seed)
     world = SimWorld(config)
     with SafeRig(world.rig, config.safety) as rig:
-        calibration = calibrate_rig(rig, config.board, placements=settings.placements, stops=1, seed=seed)
+        calibration = calibrate(rig, config.board, placements=settings.placements, stops=1, seed=seed)
     truth = world.truth()
     lenses = {"fixed": truth.fixed_lens, "zoom": truth.zoom_lens_for(truth.focal_range[0])}
     found = {"fixed": calibration.fixed, "zoom": calibration.zoom.stops[0]}

@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from cotarget.backends import open_rig
+from cotarget.backends import open_devices
 from cotarget.config import RigConfig
 from cotarget.detection import Detection, Detector, make_detector
 from cotarget.drivers.clock import MonotonicClock
@@ -142,7 +142,7 @@ def _follow(emulated: EmulatedRig, name: str, seconds: float) -> list[Row]:
 def open_tapped(config: RigConfig, taps: list[Tap]) -> Rig:
     """Open a rig with the line to its head tapped."""
     with tapped(MonotonicClock()) as found:
-        rig = open_rig(config)
+        rig = open_devices(config)
     taps += found
     return rig
 

@@ -44,7 +44,7 @@ def _one(folder: Path, number: int, at: tuple[float, float, float], seconds: flo
     with EmulatedRig(folder, tables) as emulated:
         calibration = exact_calibration(emulated.sim)
         config = emulated.config()
-        with SafeRig(open_rig(config), config.safety) as rig:
+        with open_rig(config) as rig:
             before = emulated.truth()
             begins = before["world"] + rig.clock.now() - before["t"]
             wire = _aims(rig, config, calibration, seconds)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from cotarget import __version__
-from cotarget.calibration import calibrate_captures, calibrate_photos, calibrate_rig
+from cotarget.calibration import calibrate_captures, calibrate_photos
+from cotarget.calibration.calibrate import calibrate
 from cotarget.calibration.captures import INDEX, read_index
 from cotarget.calibration.planning import GRID, Coverage
 from cotarget.calibration.session import CaptureRecorder
@@ -29,7 +30,7 @@ def session(tmp_path_factory):
     truth = Truth(gamma=pose([-1.2, 0.1, -0.1], [1.0, 10.0, 40.0]), hand=pose([0.1, -0.15, 0.08], [2.0, 1.5, -38.0]))
     directory = tmp_path_factory.mktemp("captures")
     told = []
-    calibration = calibrate_rig(
+    calibration = calibrate(
         SyntheticRig(truth), BOARD, captures_dir=directory, progress=lambda *args: told.append(args), placements=18
     )
     return truth, calibration, directory, told
@@ -74,7 +75,7 @@ def test_captures_give_the_same_calibration(session):
     assert np.linalg.norm(error.translation) < 1e-3
     assert abs(again.residuals.zoom_views - calibration.residuals.zoom_views) <= 3
     with pytest.raises(CalibrationError, match="already holds captures"):
-        calibrate_rig(SyntheticRig(), BOARD, captures_dir=directory)
+        calibrate(SyntheticRig(), BOARD, captures_dir=directory)
 
 
 def test_a_session_that_is_killed_leaves_every_image_in_the_index(tmp_path):
@@ -123,7 +124,7 @@ NARROW = PanTiltLimits((-0.4, 0.4), (-0.4, 0.4), 2.6, 3.6, 0.0009)
 ])  # fmt: skip
 def test_a_broken_rig_is_refused_in_one_line(broken, message):
     with pytest.raises(CalibrationError, match=message) as caught:
-        calibrate_rig(SyntheticRig(**broken), BOARD)
+        calibrate(SyntheticRig(**broken), BOARD)
     assert "\n" not in str(caught.value)
 
 
@@ -248,7 +249,7 @@ class Interrupted:
 def test_an_interrupted_session_halts_the_head_before_anything_else_and_keeps_what_it_has(tmp_path, caplog):
     made = Interrupted(frames=6)
     with pytest.raises(KeyboardInterrupt):
-        calibrate_rig(made.rig, BOARD, captures_dir=tmp_path)
+        calibrate(made.rig, BOARD, captures_dir=tmp_path)
     assert made.log == ["halt", "board"]
     assert (tmp_path / INDEX).exists()
     assert "while the session was broken off: whoever holds the board is gone" in caplog.text
@@ -262,7 +263,7 @@ def test_a_head_that_cannot_be_halted_hides_no_error(tmp_path):
 
     made.rig.head.halt = halt
     with pytest.raises(KeyboardInterrupt):
-        calibrate_rig(made.rig, BOARD, captures_dir=tmp_path)
+        calibrate(made.rig, BOARD, captures_dir=tmp_path)
     assert made.log == ["board"]
 
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cotarget.calibration import Options, calibrate_captures, calibrate_rig, predicted_pointing
+from cotarget.calibration import Options, calibrate_captures, predicted_pointing
+from cotarget.calibration.calibrate import calibrate
 from cotarget.calibration.captures import INDEX
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
@@ -42,7 +43,7 @@ def session(tmp_path_factory):
     """A calibration from a dozen placements and three far ones, and the folder of its captures."""
     directory = tmp_path_factory.mktemp("captures")
     rig, asked = SyntheticRig(optics=fourfold), {"placements": 12, "stops": STOPS, "far_placements": 3}
-    return calibrate_rig(rig, BOARD, captures_dir=directory, options=QUICK, **asked), directory
+    return calibrate(rig, BOARD, captures_dir=directory, options=QUICK, **asked), directory
 
 
 def at(calibration, nominal_px):

@@ -64,7 +64,7 @@ def test_follow_keeps_what_was_seen_until_it_ended_and_halts_the_head_first(
 ):
     error.__dict__.pop("__notes__", None)
     rig = WatchedRig(folder, {("fixed.read", FRAMES + 1): error})
-    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: rig)
+    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: rig)
     assert call(capsys, *FOLLOW) == (status, "", f"cotarget follow: {said}{EARLY}")
     assert rig.written == [OLD]
     assert rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") == FRAMES
@@ -78,7 +78,7 @@ def test_an_emergency_stop_keeps_what_was_seen(folder, capsys, monkeypatch):
             if self.calls["fixed.read"] == FRAMES:
                 (folder / "stop").write_text("the cat\n")
 
-    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: Stopped())
+    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: Stopped())
     status, out, err = call(capsys, *FOLLOW)
     assert (status, out) == (1, "")
     assert "emergency stop: the cat" in err
@@ -87,7 +87,9 @@ def test_an_emergency_stop_keeps_what_was_seen(folder, capsys, monkeypatch):
 
 
 def test_a_run_that_ends_before_its_first_step_leaves_the_old_table(folder, capsys, monkeypatch):
-    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: ToyRig({("fixed.read", 1): DeviceError("gone")}))
+    monkeypatch.setattr(
+        "cotarget.backends.open_devices", lambda config: ToyRig({("fixed.read", 1): DeviceError("gone")})
+    )
     assert call(capsys, *FOLLOW) == (1, "", "cotarget follow: gone\n")
     assert (folder / "out.csv").read_text() == OLD
     assert not (folder / "out.mp4").exists()
@@ -131,7 +133,7 @@ def test_what_went_wrong_is_told_at_the_end_and_in_json(folder, capsys, monkeypa
     """A head that may hardly turn: the bird, 10 to 15 degrees off the axis, is beyond its limits."""
     with (folder / "rig.toml").open("a") as file:
         file.write("pan_deg = [-1, 1]\n")
-    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: ToyRig())
+    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: ToyRig())
     status, out, err = call(capsys, *FOLLOW, "--seconds", "1")
     assert status == 0
     told = json.loads(out)

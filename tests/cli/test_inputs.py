@@ -53,7 +53,7 @@ def made(tmp_path_factory):
 def folder(made, monkeypatch):
     """It is the working folder, and nothing in it has changed afterwards."""
     monkeypatch.chdir(made)
-    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: ToyRig())
+    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: ToyRig())
     before = contents(made)
     yield made
     assert contents(made) == before
@@ -192,7 +192,7 @@ def test_a_calibration_takes_the_place_of_no_photo_and_of_nothing_in_an_index(fo
 
 
 def test_a_calibration_that_could_not_be_written_is_told_before_the_session(folder, capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: pytest.fail("opened"))
+    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: pytest.fail("opened"))
     out = tmp_path / "c.json"
     writing = PartFile(out)
     try:

@@ -202,7 +202,7 @@ def test_a_latency_that_cannot_be_is_refused(folder, capsys, monkeypatch, delay,
     """Frames of the default simulation are dated by 60 ms; less than zero by what is measured inaccurately is zero."""
     found = HeadLatency(Delay(delay, 0.99), command=0.04, frames=100)
     monkeypatch.setattr("cotarget.latency.measure_head", lambda rig: found)
-    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: SimulatedRig())
+    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: SimulatedRig())
     status, out, err = call(capsys, "latency", "--rig", "sim.toml")
     if configured is None:
         assert (status, out) == (1, "")

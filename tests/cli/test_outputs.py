@@ -89,8 +89,8 @@ def sessions(monkeypatch):
     """Lets `calibrate --rig` open a rig without a world; its session is what a test says."""
     rig = SimulatedRig()
     rig.zoom.still_size, rig.zoom.focal_range = rig.zoom.size, RigConfig().focal_range_px  # 12 x zoom
-    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: rig)
-    return lambda error=None: monkeypatch.setattr("cotarget.calibration.calibrate_rig", Session(error))
+    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: rig)
+    return lambda error=None: monkeypatch.setattr("cotarget.calibration.calibrate.calibrate", Session(error))
 
 
 CALIBRATE = ("calibrate", "--rig", "rig.toml", "--captures", "kept")
@@ -136,7 +136,7 @@ def test_stops_that_are_too_far_apart_have_others_between_them(
     """Each at most 2.5 times the one before: from 1 to 12 by 2.29 takes three steps."""
     sessions()
     session = Session(CalibrationError("enough"))
-    monkeypatch.setattr("cotarget.calibration.calibrate_rig", session)
+    monkeypatch.setattr("cotarget.calibration.calibrate.calibrate", session)
     status, _, err = call(capsys, "calibrate", "--rig", "rig.toml", *([] if stops is None else ["--stops", stops]))
     assert status == 1
     assert session.told.get("stops") == taken
@@ -151,7 +151,7 @@ def test_an_earlier_calibration_is_kept(folder, capsys, sessions, monkeypatch):
     monkeypatch.setattr("cotarget.cli.calibrating.summary", lambda found, path: {"zero": -0.0})
     found = true_calibration(RigConfig())
     sessions()
-    monkeypatch.setattr("cotarget.calibration.calibrate_rig", lambda *_, **__: _with_residuals(found))
+    monkeypatch.setattr("cotarget.calibration.calibrate.calibrate", lambda *_, **__: _with_residuals(found))
     (folder / "calibration.json").write_text(OLD)
     status, out, err = call(capsys, "calibrate", "--rig", "rig.toml")
     assert (status, out) == (0, '{\n  "zero": 0.0\n}\n')
@@ -198,7 +198,7 @@ def pointed(folder, monkeypatch):
         capture=lambda: Frame(image, rig.clock.now()),
         zoom=lambda focal: rig.head.log.append(("zoom", focal)),
     )
-    monkeypatch.setattr("cotarget.backends.open_rig", lambda config: rig)
+    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: rig)
     return rig
 
 

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from cotarget.backends import open_rig
+from cotarget.backends import open_devices
 from cotarget.config import HardwareConfig, HardwareHead, RigConfig, parse_config
 from cotarget.drivers import rig as rig_module
 from cotarget.drivers.ptu_d46 import probe
@@ -72,12 +72,12 @@ def test_a_device_that_is_not_named_is_asked_for_before_any_is_opened(devices, t
 
 def test_a_rig_toml_with_a_sim_section_only_is_no_real_rig():
     with pytest.raises(ConfigError, match=r"hardware\.head\.port: is missing"):
-        open_rig(RigConfig(backend="hardware", hardware=HardwareConfig()))
+        open_devices(RigConfig(backend="hardware", hardware=HardwareConfig()))
 
 
 def test_the_head_comes_last_and_is_let_go_first(devices):
     log, *_ = devices
-    with open_rig(CONFIG) as rig:
+    with open_devices(CONFIG) as rig:
         assert log == [f"open {name}" for name in ORDER]
         assert rig.real_time
         assert rig.head.arguments == (CONFIG.hardware.head, rig.clock, CONFIG.safety)

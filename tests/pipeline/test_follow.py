@@ -303,10 +303,11 @@ def test_runs_with_the_same_settings_do_not_steer_each_other():
                 return self.near.detect(frame) + self.far.detect(frame)
 
         return Two()
+    same = FollowSettings()
 
     pairs = zip(
-        follow(Rig(), CALIBRATION, BOOK, seen(1.0), seconds=3.0),
-        follow(Rig(), CALIBRATION, BOOK, seen(9.0), seconds=3.0),
+        follow(Rig(), CALIBRATION, BOOK, seen(1.0), seconds=3.0, settings=same),
+        follow(Rig(), CALIBRATION, BOOK, seen(9.0), seconds=3.0, settings=same),
         strict=False,
     )
     followed = [[step.target and step.target.id for step in pair] for pair in pairs]
