@@ -303,6 +303,7 @@ def test_runs_with_the_same_settings_do_not_steer_each_other():
                 return self.near.detect(frame) + self.far.detect(frame)
 
         return Two()
+
     same = FollowSettings()
 
     pairs = zip(
