@@ -299,18 +299,7 @@ def follow(
     if settings is None:
         settings = FollowSettings.of(opened_from(rig))
     fitting = calibration.for_streams(rig.fixed.size, rig.zoom.size)
-    return _turns(rig, fitting, wanted, detector, seconds, settings)
-
-
-def _turns(
-    rig: Rig,
-    calibration: Calibration,
-    target: TargetConfig,
-    detector: Detector,
-    seconds: float,
-    settings: FollowSettings,
-) -> Iterator[Step]:
-    loop = _Loop(rig, calibration, target, detector, settings)
+    loop = _Loop(rig, fitting, wanted, detector, settings)
     end = rig.clock.now() + seconds
     while rig.clock.now() < end:
         yield loop.turn()
