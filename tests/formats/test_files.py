@@ -1,0 +1,627 @@
+"""Files of v0.1.0 load, and are written today with the same keys: calibrations, captures, recordings, tables, stops."""
+
+import dataclasses
+import json
+import math
+import re
+import shutil
+import threading
+import tomllib
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from cotarget import errors
+from cotarget.calibration import load_calibration, save_calibration
+from cotarget.cli.main import main
+from cotarget.config import parse_config
+from cotarget.demo import summary
+from cotarget.drivers.interlock import PositionLostMarker
+from cotarget.errors import CalibrationError, CotargetError, DeviceError, EmergencyStopError
+from cotarget.geometry import pose
+from cotarget.metrics import read_labels, read_rows, read_tracks, score, write_rows
+from cotarget.recording.format import open_recording
+from cotarget.recording.recorder import Recorder
+from cotarget.recording.replay import ReplayRig
+from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
+from cotarget.safety import refuse_if_stopped
+from tests.formats.lists import (
+    CAPTURES_DEG,
+    CAPTURES_FOCAL,
+    CAPTURES_M,
+    CORNERS_PX,
+    DETECTED_PX,
+    KEYS,
+    OLD,
+    PRINTED,
+    SAME,
+    UNKNOWN,
+    VIEWS,
+    assert_close,
+    assert_keys,
+    assert_listed,
+    columns,
+    copy_old,
+    header,
+    keys_in,
+    last_list,
+    leaves,
+    listed,
+    listed_keys,
+    read,
+    read_lines,
+    run,
+    table_rows,
+)
+
+
+@pytest.fixture
+def old(tmp_path, monkeypatch):
+    return copy_old(tmp_path, monkeypatch)
+
+
+# --- calibration.json ---
+
+
+def test_v010_calibration_loads():
+    then, found = read(OLD / "calibration.json"), load_calibration(OLD / "calibration.json")
+    assert found.fixed.size == (640, 480)
+    assert found.fixed.focal_px == (then["fixed"]["fx"], then["fixed"]["fy"])
+    assert found.fixed.center_px == (then["fixed"]["cx"], then["fixed"]["cy"])
+    assert found.fixed.distortion == tuple(then["fixed"]["distortion"])
+    assert found.zoom.size == (320, 240)
+    assert found.zoom.nominal_px == pytest.approx((1000 / 3, 2500 / 3))
+    assert found.zoom.stops[1].focal_px[0] == then["zoom"]["stops"][1]["fx"]
+    assert found.zoom.pupil == (0.0, then["zoom"]["stops"][1]["pupil"])
+    for name in ("T_zoom0_fixed", "T_head_zoom"):
+        T = getattr(found, name)
+        assert T.translation == pytest.approx(then[name]["translation"])
+        assert np.degrees(T.rotation.as_rotvec()) == pytest.approx(then[name]["rotvec_deg"])
+    assert found.head.axis_offset == then["head"]["axis_offset"]
+    assert math.degrees(found.head.squareness) == pytest.approx(then["head"]["squareness_deg"])
+    assert (found.head.pan_scale, found.head.tilt_scale) == (1.0, 1.0)
+    assert (found.head.pan_zero, found.head.tilt_zero, found.pitch_mm) == (0.0, 0.0, 0.018)
+    assert math.degrees(found.jitter) == pytest.approx(then["head"]["jitter_deg"])
+    assert found.residuals.stereo_rms_px == then["residuals"]["stereo_rms_px"]
+    assert (found.residuals.fixed_views, found.residuals.zoom_views, found.residuals.pairs) == (13, 18, 6)
+    assert len(found.residuals.rejected) == 6
+    assert found.residuals.rejected[0].name == "0022_fixed_board09.png"
+    assert found.covariance.parameters[:2] == ("fixed.fx", "fixed.fy")
+    assert np.array_equal(found.covariance.matrix, then["covariance"]["matrix"])
+    assert (found.held_out.views, found.held_out.widened) == (18, 1.0)
+    assert (found.board.kind, found.board.corners, found.board.square) == ("chessboard", (9, 6), 0.1)
+    assert found.board_warp == tuple(then["board_warp"])
+    assert (found.provenance["method"], found.provenance["images"]) == ("joint", 37)
+    for view, table in zip(found.views, then["views"], strict=True):
+        assert (view.camera, view.board, view.source) == (table["camera"], table["board"], table["source"])
+        assert (view.pan, view.tilt, view.t, view.focal_px) == tuple(table[k] for k in ("pan", "tilt", "t", "focal_px"))
+        corners = [(math.nan, math.nan) if corner is None else corner for corner in table["corners_px"]]
+        assert np.array_equal(view.corners_px, corners, equal_nan=True)
+    assert any(not view.seen.all() for view in found.views)  # a corner that is not seen is null
+
+
+def test_v010_calibrations_by_other_methods_load():
+    photos, sequential = (load_calibration(OLD / f"calibration_{name}.json") for name in ("photos", "sequential"))
+    assert (photos.T_head_zoom, photos.pitch_mm, photos.residuals.handeye_rms_px) == (None, None, None)
+    assert (sequential.covariance, sequential.held_out) == (None, None)
+    plain = load_calibration(OLD / "calibration_plain.json")
+    assert (plain.residuals, plain.covariance, plain.board, plain.views) == (None, None, None, ())
+
+
+@pytest.mark.parametrize("name", ["calibration", "calibration_photos", "calibration_sequential", "calibration_plain"])
+def test_calibration_json_is_written_as_it_was(name, tmp_path):
+    then = read(OLD / f"{name}.json")
+    save_calibration(tmp_path / "now.json", load_calibration(OLD / f"{name}.json"))
+    now = read(tmp_path / "now.json")
+    assert_keys("calibration_json.txt", now, may_lack=["provenance."])
+    before, after = (dict(enumerate(leaves(each))) for each in (then, now))
+    assert [key for key, _ in before.values()] == [key for key, _ in after.values()]
+    for place, (key, value) in before.items():
+        if isinstance(value, float):  # angles are kept in radians
+            assert after[place][1] == pytest.approx(value, rel=1e-12, abs=1e-15), key
+        elif key not in ("T_zoom0_fixed.rotvec_deg", "T_head_zoom.rotvec_deg"):
+            assert after[place][1] == value, key
+
+
+def test_a_covariance_has_the_listed_parameters(tmp_path):
+    table = read(OLD / "calibration.json")
+    table["covariance"]["parameters"][0] = UNKNOWN
+    (tmp_path / "c.json").write_text(json.dumps(table))
+    with pytest.raises(CalibrationError) as caught:
+        load_calibration(tmp_path / "c.json")
+    assert_listed(
+        "covariance_parameters.txt", {re.sub(r"\[\d+]", "[N]", name) for name in last_list(str(caught.value))}
+    )
+
+
+def test_v010_calibration_aims_as_it_did(old, capsys):
+    arguments = ["--pixel", 400, 200, "--depth", 9, "--target", "book", "--wanted-px", 60, "--rig", "rig_captures.toml"]
+    now, then = run(capsys, "aim", "--calibration", "calibration.json", *arguments), read(old / "printed" / "aim.json")
+    assert_close(now, then, SAME)
+    assert_listed("printed.txt", {f"aim: {key}" for key in keys_in(now)}, begins="aim:")
+
+
+# --- captures ---
+
+
+# Which a calibration from saved captures does not have.
+OF_SESSIONS = [
+    f"provenance.{key}" for key in ("rig", "seed", "placements", "stops", "far_placements", "focal_range_px")
+]
+
+
+def test_v010_captures_are_calibrated(old, capsys):
+    now = run(capsys, "calibrate", "--from", "captures", "--out", "now.json")
+    then = read(old / "printed" / "calibrate.json")
+    assert now["fixed_views"] == pytest.approx(then["fixed_views"], abs=VIEWS)
+    assert now["zoom_views"] == pytest.approx(then["zoom_views"], abs=VIEWS)
+    for key in ("fixed_rms_px", "zoom_rms_px", "stereo_rms_px", "handeye_rms_px"):
+        assert now[key] == pytest.approx(then[key], abs=CORNERS_PX)
+    keys = {re.sub(r"\d+", "N", key) for key in keys_in(now)}
+    assert_listed("printed.txt", {f"calibrate: {key}" for key in keys}, begins="calibrate:")
+    assert_keys("calibration_json.txt", read(old / "now.json"), may_lack=[*OF_SESSIONS, "provenance.photos"])
+    found, before = load_calibration(old / "now.json"), load_calibration(OLD / "calibration.json")
+    for name in ("T_zoom0_fixed", "T_head_zoom"):
+        apart = getattr(found, name).inv() * getattr(before, name)
+        assert np.linalg.norm(apart.translation) < CAPTURES_M
+        assert np.degrees(apart.rotation.magnitude()) < CAPTURES_DEG
+    assert found.fixed.focal_px == pytest.approx(before.fixed.focal_px, rel=CAPTURES_FOCAL)
+
+
+def assert_is_captures(folder, may_lack=()):
+    names = {re.sub(r"\d", "N", path.name) for path in folder.iterdir()}
+    assert_listed(
+        "captures.txt", {f"file {name}" for name in names} | {f"file {name}" for name in may_lack}, begins="file "
+    )
+    assert_keys("captures.txt", read(folder / "index.json"), begins="index.json ")
+    session = read(folder / "session.json")
+    assert_keys("captures.txt", {**session, "config": None}, begins="session.json ")
+    assert_config(session["config"])
+    commands = read_lines(folder / "commands.jsonl")
+    assert {key for command in commands for key in keys_in(command)} == set(
+        listed_keys("captures.txt", "commands.jsonl ")
+    )
+    assert_listed("captures.txt", {f"do {command['do']}" for command in commands}, begins="do ")
+
+
+def assert_config(table):
+    """A configuration that the program wrote down has keys of rig.toml only, and can be read."""
+    free = ("sim.models.", "sim.paths.", "hardware.zoom.settings.", "targets.")
+    names = {key.split(".")[-1] for key in KEYS if key.startswith("targets.")}
+    for key in keys_in(table):
+        known = key in KEYS or key.startswith(free)
+        assert known, f"the key {key} is written, which rig.toml does not have"
+        if key.startswith("targets."):
+            assert key.split(".")[-1] in names
+    parse_config(table)
+
+
+def test_captures_have_the_listed_keys():
+    assert_is_captures(OLD / "captures")
+
+
+@pytest.mark.render
+def test_captures_are_written_with_the_listed_keys(old, capsys):
+    """A session that does not find the board with the zoom camera has written some of everything."""
+    text = (old / "rig_captures.toml").read_text()
+    (old / "rig.toml").write_text(f"{text}\n[sim.head]\npan_deg = [-1, 1]\ntilt_deg = [-1, 1]\n")
+    change = "T_head_zoom = { translation = [0, 0, 0], rotvec_deg = [0, 180, 0] }  # it looks back\n"
+    (old / "rig.toml").write_text(
+        (old / "rig.toml").read_text().replace('scene = "plain.xml"\n', f'scene = "plain.xml"\n{change}')
+    )
+    assert main(["calibrate", "--rig", "rig.toml", "--captures", "taken"]) == 1
+    assert "--from taken" in capsys.readouterr().err  # fits what there is
+    assert_is_captures(old / "taken", may_lack=["NNNN_zoom_boardNN.png"])
+
+
+# --- recordings ---
+
+
+def assert_is_recording(folder, may_lack=()):
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    names = {f"file {re.sub('[0-9]', 'N', str(path.relative_to(folder)))}" for path in files}
+    assert_listed("recordings.txt", names | {f"file {name}" for name in may_lack}, begins="file ")
+    meta = read(folder / "recording.json")
+    assert_config(meta["config"])
+    for key in ("recording", "safety.stop_file"):
+        assert key not in keys_in(meta["config"])
+    target_choice = meta.pop("whom")
+    assert len(target_choice) <= 1
+    assert {f"whom.{key}" for key in target_choice} <= listed_keys("recordings.txt", "recording.json ").keys()
+    assert_keys("recordings.txt", {**meta, "config": 0}, begins="recording.json ", may_lack=["whom"])
+    first, *events, last = read_lines(folder / "log.jsonl")
+    assert_keys("recordings.txt", first["rig"], begins="rig ")
+    assert_keys("recordings.txt", last, begins="end ")
+    known = set(listed_keys("recordings.txt", "event "))
+    assert {key for event in events for key in event} <= known
+    counts = {call: (arguments, int(results)) for call, arguments, results in calls()}
+    for event in events:
+        arguments, results = counts[event["call"]]
+        assert len(event.get("args", [])) in arguments
+        assert len(event.get("result", [])) == (0 if "error" in event else results)
+
+
+def calls():
+    """The listed calls: name, how many arguments, how many results."""
+    for line in listed("recordings.txt"):
+        if line.startswith("call "):
+            name, _, rest = line.removeprefix("call ").partition(" ")
+            arguments, _, results = rest.partition(" -> ")
+            yield name, {int(number) for number in arguments.split(" or ")}, results
+
+
+def test_recordings_have_the_listed_keys():
+    assert_is_recording(OLD / "recording")
+
+
+def test_v010_recording_is_replayed(old, capsys):
+    status = main(["replay", "recording", "--check", "--csv", "now.csv", "--video", "now.mp4"])
+    printed = capsys.readouterr()
+    now, then = json.loads(printed.out), read(old / "printed" / "replay.json")
+    assert now["steps"] == 7
+    assert now["states"] == {"searching": 3, "following": 4, "coasting": 0, "lost": 0, "unreachable": 0}
+    differences = now["differences"]
+    assert status == (0 if differences["frames_differing"] == 0 else 1)
+    assert (differences["missing"], differences["extra"], differences["moves"]) == (0, 0, 4)
+    # Another processor rounds otherwise. A commit that changes the commands on purpose widens this.
+    assert differences["largest_deg"] < SAME
+    assert differences["largest_px"] < 1e3 * SAME
+    keys = keys_in(now) - {key for key in keys_in(now) if key.startswith("reasons.")}
+    assert keys == keys_in(then) - {key for key in keys_in(then) if key.startswith("reasons.")}
+    assert_listed("printed.txt", {f"replay: {key}" for key in keys} | {"replay: reasons"}, begins="replay:")
+    assert set(now["states"]) == set(columns("state"))
+    with av.open(str(old / "now.mp4")) as film:
+        assert (film.streams.video[0].codec_context.name, film.streams.video[0].pix_fmt) == ("h264", "yuv420p")
+    assert header(old / "now.csv") == columns("follow.csv")
+    for a, b in zip(table_rows(old / "now.csv"), table_rows(old / "follow.csv"), strict=True):
+        numbers = {key for key in b if key not in ("state", "reason", "track")}
+        assert (a["state"], a["track"]) == (b["state"], b["track"])
+        assert [float(a[key] or "nan") for key in numbers] == pytest.approx(
+            [float(b[key] or "nan") for key in numbers], rel=SAME, nan_ok=True
+        )
+
+
+@pytest.mark.parametrize("target_choice", [{}, {"click": [72.0, 78.0]}, {"track": 1}, {"policy": "nearest-deadline"}])
+def test_the_choice_of_a_target_is_read_from_a_recording(target_choice, old, capsys):
+    path = old / "recording" / "recording.json"
+    path.write_text(json.dumps(read(path) | {"whom": target_choice}))
+    assert set(target_choice) <= {key.removeprefix("whom.") for key in listed_keys("recordings.txt", "recording.json ")}
+    assert run(capsys, "replay", "recording")["states"]["following"] == 4
+
+
+def test_a_recording_is_a_rig(old, capsys):
+    now = run(capsys, "follow", "--rig", "rig_replay.toml", "--calibration", "calibration.json", "--target", "book")
+    assert (now["steps"], now["states"]["following"]) == (7, 4)
+    keys = {key for key in keys_in(now) if not key.startswith("reasons.")} | {"reasons"}
+    assert_listed("printed.txt", {f"follow: {key}" for key in keys}, begins="follow:")
+
+
+@pytest.mark.render
+def test_a_recording_is_written_with_the_listed_keys(old, capsys):
+    arguments = ["--calibration", "calibration.json", "--target", "book", "--policy", "most-served", "--seconds", 0.75]
+    now = run(capsys, "follow", "--rig", "rig_recording.toml", *arguments, "--csv", "now.csv", "--record", "now")
+    assert now["states"]["following"] == 4
+    assert_is_recording(old / "now")
+    assert header(old / "now.csv") == columns("follow.csv")
+    assert read(old / "now" / "recording.json")["whom"] == {"policy": "most-served"}
+
+
+class Fake:
+    """A rig whose devices answer the same in every run; its lens first fails with the given errors."""
+
+    real_time = True
+
+    def __init__(self, failing=()):
+        self.t, self.failing = 100.0, list(failing)
+        self.fixed, self.zoom, self.head, self.clock = FakeFixed(self), FakeZoom(self), FakeHead(self), FakeClock(self)
+        self.board = FakeBoard()
+
+    def close(self):
+        self.head.halt()
+
+
+class FakeFixed:
+    size = (4, 3)
+
+    def __init__(self, rig):
+        self.rig = rig
+
+    def read(self, newer_than=None, timeout=1.0):
+        self.rig.t += 0.25
+        width, height = self.size
+        return Frame(np.full((height, width, 3), int(self.rig.t), np.uint8), self.rig.t - 0.125)
+
+
+class FakeZoom(FakeFixed):
+    still_size, focal_range = (8, 6), (100.0, 1200.0)
+
+    def capture(self):
+        return Frame(np.full((6, 8, 3), 7, np.uint8), self.rig.t - 0.0625)
+
+    def zoom(self, focal_px):
+        return min(focal_px, self.focal_range[1])
+
+    def state(self):
+        if self.rig.failing:
+            raise self.rig.failing.pop(0)
+        return ZoomState(300.0, False, self.rig.t)
+
+
+class FakeHead:
+    limits = PanTiltLimits((-2.5, 2.5), (-0.75, 0.5), math.inf, 4.0, 0.0)
+
+    def __init__(self, rig):
+        self.rig = rig
+
+    def move(self, pan, tilt, speed=None, wait=False):
+        return pan, min(tilt, self.limits.tilt[1])
+
+    def state(self):
+        return PanTiltState(0.125, -0.25, True, self.rig.t)
+
+    def halt(self):
+        pass
+
+
+class FakeClock:
+    def __init__(self, rig):
+        self.rig = rig
+
+    def now(self):
+        return self.rig.t
+
+    def sleep_until(self, t):
+        self.rig.t = max(self.rig.t, t)
+
+
+class FakeBoard:
+    patience = 0.0
+
+    def present(self, T_fixed_board):
+        pass
+
+    swing = present
+
+
+class SilentError(DeviceError):
+    """An error of a driver, which cotarget.errors does not have."""
+
+
+ERRORS = ("StaleFrameError", "HaltedError", "EmergencyStopError", "DeviceError", "CalibrationError", "ConfigError")
+
+
+def every_call(rig):
+    """Make each call on a rig; what it answers."""
+    T = pose([0.5, -0.25, 2.0], [0.0, 0.0, 90.0])
+    for _ in (*ERRORS, "SilentError", "ValueError"):
+        try:
+            rig.zoom.state()
+        except Exception as error:
+            names = [name for name in ERRORS if type(error) is getattr(errors, name)]
+            yield *(names or [type(error).__name__]), str(error)
+    yield rig.fixed.read().t
+    yield rig.fixed.read(newer_than=100.0, timeout=0.5).t
+    yield rig.zoom.read(timeout=0.25).t
+    yield rig.zoom.capture().image.shape
+    yield rig.zoom.zoom(2000.0)
+    yield tuple(vars_of(rig.zoom.state()))
+    yield rig.head.move(0.1, 0.75)
+    yield rig.head.move(0.1, 0.25, 0.5)
+    yield rig.head.move(0.1, 0.25, (0.5, 0.25), wait=True)
+    yield tuple(vars_of(rig.head.state()))
+    yield rig.head.halt()
+    yield rig.clock.sleep_until(102.0)
+    yield rig.clock.now()
+    yield rig.board.present(T)
+    yield rig.board.present(None)
+    yield rig.board.swing(T)
+
+
+def vars_of(state):
+    return dataclasses.astuple(state)
+
+
+def record_every_call(folder):
+    """Record one of each call, and one from another thread."""
+    config = parse_config({"targets": {"book": {"template": "small_book.png"}}})
+    failures = [
+        *(getattr(errors, name)(f"said by {name}") for name in ERRORS),
+        SilentError("no answer"),
+        ValueError("3"),
+    ]
+    with (
+        Recorder(folder, config, OLD / "calibration_plain.json", "bird") as recorder,
+        recorder.wrap(Fake(failures)) as rig,
+    ):
+        answers = list(every_call(rig))
+        aside = threading.Thread(target=rig.head.halt)
+        aside.start()
+        aside.join()
+    return answers
+
+
+ANSWERS = [
+    *((name, f"said by {name}") for name in ERRORS),
+    *(("SilentError", "no answer"), ("ValueError", "3")),
+    *(100.125, 100.375, 100.625, (6, 8, 3), 1200.0, (300.0, False, 100.75)),
+    *((0.1, 0.5), (0.1, 0.25), (0.1, 0.25), (0.125, -0.25, True, 100.75)),
+    *(None, None, 102.0, None, None, None),
+]
+# An error that is not one of cotarget.errors is raised again as a device's.
+REPLAYED = [
+    *ANSWERS[:6],
+    *(("DeviceError", "SilentError: no answer"), ("DeviceError", "ValueError: 3")),
+    *ANSWERS[8:],
+]
+
+
+def plain_log(folder):
+    """The log without what depends on the version of the library that writes PNGs."""
+    return [{key: value for key, value in line.items() if key != "bytes"} for line in read_lines(folder / "log.jsonl")]
+
+
+def test_every_call_is_recorded_as_it_was(tmp_path):
+    assert record_every_call(tmp_path / "now") == ANSWERS
+    assert plain_log(tmp_path / "now") == plain_log(OLD / "every_call")
+    assert_is_recording(tmp_path / "now", may_lack=["template.png"])
+
+
+def test_v010_recording_of_every_call_has_all_listed_keys():
+    assert_is_recording(OLD / "every_call", may_lack=["template.png"])
+    _, *events, _ = read_lines(OLD / "every_call" / "log.jsonl")
+    assert {event["call"] for event in events} == {name for name, _, _ in calls()}
+    assert {key for event in events for key in event} == set(listed_keys("recordings.txt", "event "))
+
+
+def test_v010_recording_of_every_call_is_replayed():
+    recording = open_recording(OLD / "every_call")
+    facts = recording.facts
+    assert (facts.fixed_size, facts.zoom_size, facts.still_size) == ((4, 3), (4, 3), (8, 6))
+    assert (facts.focal_range, facts.real_time) == ((100.0, 1200.0), True)
+    assert dataclasses.astuple(facts.limits) == ((-2.5, 2.5), (-0.75, 0.5), math.inf, 4.0, 0.0)
+    assert (recording.target, recording.ending, recording.truncated) == ("bird", "complete", False)
+    assert list(every_call(ReplayRig(recording))) == REPLAYED
+
+
+def test_errors_have_the_listed_names():
+    """A class may have another name besides, as long as recordings have the listed one."""
+    lines = {line for line in listed("recordings.txt") if line.startswith("error ")}
+    pairs = {name: base for name, _, base in (line.removeprefix("error ").partition(": ") for line in lines)}
+    for name, base in pairs.items():
+        assert getattr(errors, name).__base__ is (Exception if base == "Exception" else getattr(errors, base))
+    found = {kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, CotargetError)}
+    new = found - {getattr(errors, name) for name in pairs}
+    assert not new, f"{new} are new errors: if they are added on purpose, write them into tests/formats/recordings.txt"
+
+
+@pytest.mark.parametrize("line", [line for line in listed("recordings.txt") if line.startswith("error ")])
+def test_a_recorded_error_is_raised_again(line, tmp_path):
+    name, _, base = line.removeprefix("error ").partition(": ")
+    folder = tmp_path / "run"
+    shutil.copytree(OLD / "every_call", folder)
+    log = (folder / "log.jsonl").read_text()
+    (folder / "log.jsonl").write_text(log.replace('"StaleFrameError"', f'"{name}"', 1))
+    with pytest.raises(getattr(errors, name)) as caught:
+        ReplayRig(open_recording(folder)).zoom.state()
+    assert str(caught.value) == "said by StaleFrameError"
+    assert isinstance(caught.value, getattr(errors, base, Exception))
+
+
+def test_recordings_cut_short_are_replayed(old, capsys):
+    log = old / "recording" / "log.jsonl"
+    *lines, end = log.read_text().splitlines(keepends=True)
+    log.write_text("".join(lines))
+    assert run(capsys, "replay", "recording")["steps"] == 6  # the last step may be half a one
+    log.write_text("".join(lines) + end.replace("complete", "HaltedError: the head was halted"))
+    assert run(capsys, "replay", "recording")["steps"] == 7
+
+
+# --- tables, scores and films ---
+
+
+def test_v010_film_gives_the_same_tracks(old, capsys):
+    now = run(capsys, "detect", "film.mp4", "--target", "person", "--csv", "now.csv", "--labels", "labels.csv")
+    then = read(old / "printed" / "detect.json")
+    assert now.keys() == then.keys()
+    assert (now["frames"], now["rate_hz"], now["tracks"], now["labelled_frames"]) == (75, 25.0, 1, 45)
+    labels = {line.removeprefix("labels: ") for line in listed("printed.txt") if line.startswith("labels: ")}
+    assert labels <= set(now)
+    assert_listed("printed.txt", {f"detect: {key}" for key in set(now) - labels}, begins="detect:")
+    assert header(old / "now.csv") == columns("tracks.csv")
+    now, then = (
+        {(row["frame"], row["t"], row["track"]): [float(row[key]) for key in ("u_px", "v_px")] for row in rows}
+        for rows in (table_rows(old / "now.csv"), table_rows(old / "tracks.csv"))
+    )
+    both = now.keys() & then.keys()
+    assert len(both) > 0.9 * max(len(now), len(then))
+    assert all(math.dist(now[key], then[key]) < DETECTED_PX for key in both)
+
+
+def test_replay_scores_by_labels_with_the_listed_keys(old, capsys):
+    labels = {line.removeprefix("labels: ") for line in listed("printed.txt") if line.startswith("labels: ")}
+    assert labels <= set(run(capsys, "replay", "recording", "--labels", "labels.csv"))
+
+
+def test_v010_tables_are_read():
+    tracks, labels = read_tracks(OLD / "tracks.csv"), read_labels(OLD / "labels.csv")
+    assert (tracks[0].frame, tracks[0].t, tracks[0].track) == (36, 1.44, 1)
+    assert tracks[0].center_px == pytest.approx([37.27, 53.30])
+    assert len(tracks) == 39
+    (label,) = labels[30]  # at (20, 45) of 10x20 pixels
+    assert label.center_px == pytest.approx([24.5, 54.5])
+    assert header(OLD / "labels.csv") == columns("labels.csv")
+    assert header(OLD / "tracks.csv") == columns("tracks.csv")
+    assert header(OLD / "follow.csv") == columns("follow.csv")
+
+
+def test_v010_steps_give_the_same_scores(tmp_path):
+    rows = read_rows(OLD / "demo" / "steps.csv")
+    first = table_rows(OLD / "demo" / "steps.csv")[0]
+    assert (rows[0].t_s, rows[0].target, rows[0].in_wide) == (float(first["t_s"]), "bird", first["in_wide"] == "True")
+    assert dataclasses.asdict(score(rows)) == pytest.approx(read(OLD / "demo" / "score.json"), rel=1e-12)
+    write_rows(tmp_path / "steps.csv", rows)
+    assert (tmp_path / "steps.csv").read_bytes() == (OLD / "demo" / "steps.csv").read_bytes()
+    assert header(tmp_path / "steps.csv") == columns("steps.csv")
+
+
+def test_v010_metrics_are_read():
+    metrics = read(OLD / "demo" / "metrics.json")
+    targets = metrics.pop("targets")
+    assert set(targets) == {"book", "person", "bird"}
+    for scores in targets.values():
+        assert_listed("metrics_json.txt", {f"targets.NAME.{key}" for key in scores}, begins="targets.NAME.")
+    assert set(read(OLD / "demo" / "score.json")) == set(targets["bird"])
+    others = {line for line in listed("metrics_json.txt") if not line.startswith("targets.")}
+    assert keys_in(metrics) == others
+    assert "22.9 m" in summary({**metrics, "targets": targets}).splitlines()[-1]  # how far the bird was
+
+
+# --- boards ---
+
+
+@pytest.mark.parametrize("kind", ["chessboard", "charuco"])
+def test_a_board_is_printed_as_it_was(kind, tmp_path, capsys):
+    """Boards that were printed are still to be found, so that squares and markers stay where they are."""
+    out = tmp_path / "board.png"
+    assert main(["board", "--out", str(out), "--kind", kind, "--board", "4x3", "--square", "0.01"]) == 0
+    printed = capsys.readouterr().out
+    table = tomllib.loads(printed[printed.index("[board]") :])
+    assert table == {"board": {"kind": kind, "corners": [4, 3], "square": 0.01}}
+    now, then = (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in (out, OLD / f"board_{kind}.png"))
+    assert now.shape == then.shape
+    pattern = slice(0, round(5 / 6 * len(then)))  # below it are words, in what font there is
+    assert np.mean(now[pattern] != then[pattern]) < PRINTED
+
+
+# --- stops ---
+
+
+def test_v010_stop_file_stops(tmp_path, capsys, monkeypatch):
+    shutil.copytree(OLD / "stopped", tmp_path / "rig")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(EmergencyStopError, match="smoke"):
+        refuse_if_stopped(Path("rig/stop"))
+    assert main(["point", "--rig", "rig/rig.toml"]) == 1
+    assert "smoke" in capsys.readouterr().err
+    assert main(["clear", "--rig", "rig/rig.toml"]) == 0
+    assert "smoke" in capsys.readouterr().out
+    assert not Path("rig/stop").exists()
+    assert main(["stop", "--rig", "rig/rig.toml", "--reason", "smoke"]) == 0
+    assert Path("rig/stop").read_bytes() == (OLD / "stopped" / "stop").read_bytes()
+
+
+def test_v010_position_lost_file_is_heeded(tmp_path, monkeypatch):
+    name = "stop.dev-ttyUSB0.position-lost"
+    for port in ("/dev/ttyUSB0", "/dev/ttyUSB1"):  # the same unit, at another port maybe
+        with pytest.raises(DeviceError, match="hit a limit"):
+            PositionLostMarker(port, OLD / "stopped" / "stop").refuse()
+    lost = PositionLostMarker("/dev/ttyUSB0", tmp_path / "stop")
+    lost.refuse()
+    lost.note((OLD / "stopped" / name).read_text().strip())
+    assert (tmp_path / name).read_bytes() == (OLD / "stopped" / name).read_bytes()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    PositionLostMarker("socket://127.0.0.1:4001", None).note("lost")
+    assert (tmp_path / "state" / "cotarget" / "head.socket-127.0.0.1-4001.position-lost").read_text() == "lost\n"

@@ -1,0 +1,420 @@
+"""Names that users' files and scripts hold keep their spelling: keys, options, exit statuses, ids: tests/formats."""
+
+import contextlib
+import dataclasses
+import inspect
+import itertools
+import json
+import re
+import signal
+import socket
+import sys
+import threading
+import tomllib
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import cotarget
+import experiments
+from cotarget.cli.main import main
+from cotarget.config import config_table, load_config, parse_config
+from cotarget.drivers.board import make_board
+from cotarget.env import SchedulingPolicy
+from cotarget.env.common import RIG_FEATURES
+from cotarget.env.follow import TRACK_FEATURES
+from cotarget.env.schedule import CANDIDATE_FEATURES
+from cotarget.errors import ConfigError
+from cotarget.geometry import pose
+from cotarget.sim.world import SimWorld
+from tests.formats.lists import (
+    DEADLINE_S,
+    KEYS,
+    OLD,
+    RIG_TOML,
+    TABLES,
+    UNKNOWN,
+    assert_listed,
+    command_lines,
+    copy_old,
+    keys_in,
+    last_list,
+    listed,
+    parser_of,
+    program,
+    read,
+    run,
+    statuses,
+    subcommands,
+)
+
+
+@pytest.fixture
+def old(tmp_path, monkeypatch):
+    return copy_old(tmp_path, monkeypatch)
+
+
+# --- rig.toml ---
+def refusal(tmp_path, text):
+    """The error of a rig.toml."""
+    path = tmp_path / "refused.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_table_of_rig_toml_has_the_listed_keys(table, tmp_path):
+    head = f"[{table}]\n" if table else ""
+    message = refusal(tmp_path, f"{head}{UNKNOWN} = 1\n")
+    depth = table.count(".") + 1 if table else 0
+    here = {".".join(key.split(".")[: depth + 1]) for key in KEYS if not table or key.startswith(f"{table}.")}
+    if not table:  # `targets` is a table of tables
+        assert "targets" in here
+    begins = f"{table}." if table else ""
+    found = {f"{begins}{name}" for name in last_list(message)}
+    gone, new = sorted(here - found), sorted(found - here)
+    assert not gone, f"rig.toml does not know {gone} any more: users' files hold them; keep them as aliases"
+    assert not new, f"rig.toml knows {new}: if they are added on purpose, write them into tests/formats/rig_toml.txt"
+
+
+def same_default(text, value):
+    """Whether a default is the listed one; angles are kept in radians, and rounded by that."""
+    if text == "none" or value is None:
+        return (text == "none") == (value is None)
+    wanted = json.loads(text)
+    is_vector = isinstance(value, list) and value and isinstance(value[0], float)
+    return wanted == pytest.approx(value, rel=1e-12) if is_vector else wanted == value
+
+
+def test_rig_toml_defaults_to_what_is_listed():
+    table = config_table(parse_config({}))
+    for key, default, _ in RIG_TOML:
+        value = table
+        for part in key.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        if key.endswith(".template") and value is not None:
+            value = Path(value).name
+        if key == "sim.effects.all":
+            continue  # stands for all others
+        assert same_default(default, value), f"{key} is by default {json.dumps(value)}, not {default} as listed"
+
+
+@pytest.mark.parametrize(("key", "names"), [(key, names) for key, _, names in RIG_TOML if names])
+def test_a_key_of_rig_toml_has_the_listed_choices(key, names, tmp_path):
+    table, _, name = key.rpartition(".")
+    wrong = "1" if name == "baud" else '"?"'
+    message = refusal(tmp_path, f"[{table}]\n{name} = {wrong}\n" if table else f"{name} = {wrong}\n")
+    assert sorted(last_list(message)) == sorted(names), f"{key} has other choices than tests/formats/rig_toml.txt"
+
+
+def test_v010_rig_files_name_every_key():
+    found = set()
+    for path in OLD.glob("rig_*.toml"):
+        found |= keys_in(tomllib.loads(path.read_text(encoding="utf-8")))
+    free = ("sim.models.", "sim.paths.", "hardware.zoom.settings.")  # whose keys are names
+    found = {next((start[:-1] for start in free if key.startswith(start)), key) for key in found}
+    found = {re.sub(r"^targets\.\w+\.", "targets.book.", key) for key in found}
+    assert {re.sub(r"^targets\.\w+\.", "targets.book.", key) for key in KEYS} == found
+
+
+# --- rig.toml of v0.1.0 ---
+def test_v010_simulated_rig_loads():
+    config = load_config(OLD / "rig_sim.toml")
+    sim = config.sim
+    assert (config.backend, Path(sim.scene), sim.seed) == ("sim", OLD / "plain.xml", 7)
+    assert sim.targets == ("book", "person", "person2", "bird", "dog")
+    assert sim.T_zoom0_fixed.translation == pytest.approx([-1.2, 0.05, 0.2])
+    assert np.degrees(sim.T_zoom0_fixed.rotation.as_rotvec()) == pytest.approx([1, 8, 4])
+    assert sim.T_head_zoom.translation == pytest.approx([0.05, -0.12, 0.1])
+    assert np.degrees(sim.T_head_zoom.rotation.as_rotvec()) == pytest.approx([2, -1, 3])
+    assert dataclasses.astuple(sim.fixed) == (
+        *((320, 240), (340.0, 341.0), (161.0, 119.0), (-0.19, 0.01, 0.001, -0.002, 0.003)),
+        *(1.5, 20.0, 0.05, 0.01, 85),
+    )
+    assert dataclasses.astuple(sim.zoom) == (
+        *((320, 240), (345.0, 346.0), (162.0, 118.0), (-0.09, 0.02, 0.002, -0.001, 0.004)),
+        *(2.5, 12.5, 0.07, 0.005, 80),
+        *((6.0, 60.0), 0.018, 65, 100.0, (0.1, -0.05), ((5.0, -3.0), (-2.0,)), (0.1,), (0.02, -0.01)),
+    )
+    assert dataclasses.astuple(sim.head) == (0.05, (-150.0, 151.0), (-40.0, 30.0), 100.0, 200.0, 0.03, 4.0, 0.2, 0.01)
+    off = {name for name, on in dataclasses.asdict(sim.effects).items() if not on}
+    assert off == {"backlash", "multisampling"}
+    assert sim.models == {"dog": OLD / "dog.obj"}
+    assert sim.paths == {"dog": ((0.0, -9.0, 12.0, 0.4), (5.0, -9.0, 12.0, 0.4), (9.0, -3.0, 11.0, 0.4))}
+    assert dataclasses.astuple(config.board) == ("charuco", (8, 6), 0.05)
+    assert dataclasses.astuple(config.safety) == ((-90.0, 80.0), (-30.0, 25.0), 60.0, 0.8, 0.4, OLD / "stop")
+    book = config.target("book")
+    assert dataclasses.astuple(book) == (0.3, "width", 150.0, "colour", OLD / "small_book.png", "standing")
+    assert dataclasses.astuple(config.target("person2")) == (1.75, "height", 300.0, "mog2", None, None)
+    assert dataclasses.astuple(config.target("bird")) == (0.8, "wingspan", 160.0, "speck", None, "flying")
+    assert dataclasses.astuple(config.target("dog")) == (0.75, "height", 200.0, "motion", None, "walking")
+
+
+def test_v010_scene_and_model_make_a_world():
+    config = load_config(OLD / "rig_sim.toml")
+    only_dog = dataclasses.replace(config, sim=dataclasses.replace(config.sim, targets=("dog",)))
+    world = SimWorld(only_dog, rendered=())
+    with world.rig as rig:
+        assert rig.fixed.size == (320, 240)
+        # The fixed camera stands at (0, 0, 1.6) m and looks along the world's y.
+        assert world.truth().T_world_fixed.translation == pytest.approx([0, 0, 1.6])
+        assert world.truth().T_world_fixed.rotation.apply([0, 0, 1]) == pytest.approx([0, 1, 0], abs=1e-9)
+
+
+def test_v010_hardware_rigs_load():
+    hardware = load_config(OLD / "rig_hardware.toml").hardware
+    head = ("/dev/ttyUSB0", 19200, 0.0514286, (-158.0, 158.0), (-46.0, 31.0), 1, -1, 90.0, 0.05)
+    assert dataclasses.astuple(hardware.head) == head
+    fixed = ("http://192.168.0.90", 2, "viewer", "secret", (352, 288), "CIF", 15.0, 20, 0.12)
+    assert dataclasses.astuple(hardware.fixed) == fixed
+    assert dataclasses.astuple(hardware.zoom) == (
+        *("usb:", "Canon PowerShot S5 IS", {"imagequality": "Fine", "iso": "Auto"}, "zoom"),
+        *(((0, 6.0), (64, 21.3), (128, 72.0)), 50.0, (320, 240), (3264, 2448), 0.01794, 10.0, 0.09, 0.06),
+    )
+    assert dataclasses.astuple(hardware.board) == ("person",)
+    config = load_config(OLD / "rig_hardware_network.toml")
+    assert (config.backend, config.board.square) == ("hardware", 0.1)
+    assert config.hardware.head.port == "socket://127.0.0.1:4001"
+    assert config.hardware.fixed.url == "http://127.0.0.1:8090"
+    assert config.hardware.zoom.port == "ptpip:127.0.0.1:15740:15740"
+    assert config.hardware.board.presenter == "socket://127.0.0.1:4002"
+
+
+# --- commands ---
+def test_the_commands_have_the_listed_options(monkeypatch):
+    parser = parser_of(main, monkeypatch)
+    lines = list(command_lines("cotarget", parser))
+    for name, command in subcommands(parser).items():
+        lines += command_lines(f"cotarget {name}", command)
+    assert_listed("commands.txt", lines, begins="cotarget")
+
+
+def test_every_command_answers_help():
+    for line in listed("commands.txt"):
+        if line.count(" ") == 1 and line.startswith("cotarget ") and not line.startswith("cotarget -"):
+            with pytest.raises(SystemExit) as ended:
+                main([line.split()[1], "--help"])
+            assert ended.value.code == 0, line
+
+
+# --- exit statuses ---
+def test_a_command_ends_with_the_listed_status(old, capsys):
+    assert main(["stop", "--rig", "rig_recording.toml"]) == statuses()["a command has done what was asked"]
+    assert main(["point", "--rig", "rig_recording.toml"]) == statuses()["a device, or the rig, fails"]
+    assert main(["point", "--rig", "no.toml"]) == statuses()["a file is wrong or missing"]
+    with pytest.raises(SystemExit) as ended:
+        main(["point"])
+    assert ended.value.code == statuses()["an argument is wrong"]
+    log = old / "recording" / "log.jsonl"
+    other = re.sub(r'("head.move", "at": [0-9.]+, "args": \[)[-0-9.]+', r"\g<1>0.1", log.read_text(), count=1)
+    log.write_text(other)
+    assert main(["replay", "recording"]) == 0
+    differs = statuses()["replay --check finds other commands than were recorded"]
+    assert main(["replay", "recording", "--check"]) == differs
+
+
+@pytest.mark.parametrize("what", ["SIGHUP", "Ctrl-C", "SIGTERM"])
+def test_a_signal_ends_a_command_with_the_listed_status(what, old):
+    with program([sys.executable, "-m", "cotarget.cli", "reset-head", "--rig", "rig_hardware.toml"], old) as process:
+        assert "yes" in process.stdout.readline()  # it asks, and waits for an answer
+        process.send_signal(signal.SIGINT if what == "Ctrl-C" else signal.Signals[what])
+        process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == statuses()[what]
+
+
+# --- what commands print and write ---
+@pytest.mark.render
+def test_point_prints_and_writes_what_is_listed(old, capsys):
+    Path("taken").mkdir()
+    for _ in range(2):
+        arguments = ["--pan-deg", 5, "--focal-mm", 8, "--pictures", "taken"]
+        now = run(capsys, "point", "--rig", "rig_recording.toml", *arguments)
+    assert_listed("printed.txt", {f"point: {key}" for key in keys_in(now)}, begins="point:")
+    assert now["pan_deg"] == pytest.approx(5, abs=0.0514286)  # a step of the head
+    assert_listed("files.txt", {f"point --pictures: {path.name}" for path in Path("taken").iterdir()}, begins="point")
+
+
+def test_the_keys_that_latency_printed_are_those_of_rig_toml():
+    found = keys_in(read(OLD / "printed" / "latency.json"))
+    wanted = {line.removeprefix("latency: ") for line in listed("printed.txt") if line.startswith("latency: ")}
+    assert found <= wanted
+    assert {key.removeprefix("measured.") for key in wanted if key.startswith("measured.")} <= set(KEYS)
+
+
+def test_the_report_of_a_calibration_writes_what_is_listed(old, capsys):
+    """Of a calibration without a head, which cannot point, and has fewer pictures."""
+    assert main(["report", "calibration_photos.json", "--out", "page.html"]) == 0
+    assert Path("page.html").is_file()
+    found = {f"report: {path.name}" for path in Path("page_pictures").iterdir()}
+    assert found == {f"report: {name}.png" for name in ("coverage", "histogram", "residuals", "situation")}
+    assert found < set(listed("files.txt"))
+
+
+# --- emulated devices, and programs that hold the board ---
+def ask(address, *questions):
+    """Send JSON objects to a socket, one a line; the answers."""
+    host, _, port = address.removeprefix("socket://").rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=DEADLINE_S) as line, line.makefile("rw") as file:
+        for question in questions:
+            file.write(json.dumps(question) + "\n")
+            file.flush()
+            yield json.loads(file.readline())
+
+
+T_JSON = {"translation": [0.0, 0.0, 3.0], "rotvec_deg": [0.0, 0.0, 0.0]}
+
+
+@pytest.mark.render
+@pytest.mark.wire
+def test_the_emulator_writes_and_answers_what_is_listed(old):
+    command = [sys.executable, "-m", "cotarget.cli", "emulate", "--rig", "rig_captures.toml", "--write", "rig.toml"]
+    with program(command, old) as process:
+        lines = [process.stdout.readline().split(maxsplit=1) for _ in range(7)]
+        address = {name: rest.strip() for name, rest in lines[:6]}
+        truth, *others = ask(
+            address["control"],
+            {"truth": True},
+            {"fault": "head.silence", "on": True},
+            {"fault": "head.silence", "on": False},
+        )
+        board = list(ask(address["board"], {"present": T_JSON}, {"swing": T_JSON}, {"present": None}, {"wave": None}))
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == statuses()["emulate ends by Ctrl-C"]
+    assert_listed("emulation.txt", {f"printed {name}" for name in address}, begins="printed ")
+    assert_listed("emulation.txt", {f"truth {key}" for key in keys_in(truth)}, begins="truth ")
+    assert others == [{"ok": True}] * 2
+    assert board[:3] == [{"ok": True}] * 3
+    assert set(board[3]) == {"error"}
+    config = load_config(old / "rig.toml")  # and unknown keys are refused
+    assert config.hardware.board.presenter == address["board"]
+    assert config.hardware.zoom.port == address["zoom"]
+    assert config.hardware.fixed.url == address["fixed"].removesuffix("/mjpg/video.mjpg")
+    assert address["head"] == f"{config.hardware.head.port} and {address['head'].split()[-1]}"
+
+
+@pytest.mark.parametrize("device", ["head", "fixed", "zoom"])
+def test_the_emulated_devices_have_the_listed_faults(device, tmp_path, capsys):
+    assert main(["emulate", "--write", str(tmp_path / "rig.toml"), "--fault", f"{device}.{UNKNOWN}"]) == 1
+    names = last_list(capsys.readouterr().err.strip())
+    begins = f"fault {device}."
+    assert_listed("emulation.txt", {f"{begins}{name}" for name in names}, begins=begins)
+
+
+def test_a_program_that_holds_the_board_is_asked_in_the_listed_words():
+    said = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def hold():
+            connection, _ = server.accept()
+            with connection, connection.makefile("rw") as file:
+                for line in file:
+                    said.append(json.loads(line))
+                    file.write('{"ok": true}\n')
+                    file.flush()
+
+        holder = threading.Thread(target=hold)
+        holder.start()
+        network = load_config(OLD / "rig_hardware_network.toml").hardware.board
+        presenter = f"socket://127.0.0.1:{server.getsockname()[1]}"
+        board = make_board(dataclasses.replace(network, presenter=presenter))
+        board.present(pose([0.5, -0.25, 2.0], [0.0, 0.0, 90.0]))
+        board.swing(pose([0.0, 0.0, 3.0], [0.0, 0.0, 0.0]))
+        board.present(None)
+        board.close()
+        holder.join(timeout=DEADLINE_S)
+    assert said[0].keys() == {"present"}
+    assert said[0]["present"].keys() == T_JSON.keys()
+    assert said[0]["present"]["translation"] == pytest.approx([0.5, -0.25, 2.0])
+    assert said[0]["present"]["rotvec_deg"] == pytest.approx([0.0, 0.0, 90.0])
+    assert said[1:] == [{"swing": T_JSON}, {"present": None}]
+
+
+# --- environments ---
+FOLLOW, SCHEDULE = "cotarget/Follow-v0", "cotarget/Schedule-v0"
+
+
+def span(space, where, names=None):
+    """Lines for a space: the range of each number, with its name where it has one."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        for key, part in space.items():
+            yield from span(part, f"{where}.{key}", names)
+    elif isinstance(space, gymnasium.spaces.Discrete):
+        yield f"{where} Discrete {space.n}, from {space.start}"
+    elif len(space.shape) == 1:
+        named = (names or {}).get(where.rpartition(".")[2]) or itertools.repeat("")
+        for number, (low, high, name) in enumerate(zip(space.low, space.high, named, strict=False)):
+            yield f"{where}[{number}] {low:g} to {high:g} {name}".rstrip()
+    elif len(space.shape) == 2:
+        assert (space.low == space.low[0]).all()
+        assert (space.high == space.high[0]).all()
+        row = gymnasium.spaces.Box(space.low[0], space.high[0], dtype=space.dtype)
+        yield f"{where} {space.shape[0]} rows of {space.shape[1]}"
+        yield from span(row, f"{where}[]", names)
+    else:
+        yield f"{where} {space.shape} {space.low.min()} to {space.high.max()}"
+    if isinstance(space, gymnasium.spaces.Box) and len(space.shape) != 2:
+        yield f"{where} {space.dtype}"
+
+
+def kind_of(value):
+    array = np.asarray(value)
+    return f"{array.dtype}{list(array.shape) if array.shape else ''}"
+
+
+def default_of(parameter):
+    value = parameter.default
+    return dataclasses.astuple(value) if dataclasses.is_dataclass(value) else value
+
+
+FEATURES = {
+    FOLLOW: {f"{FOLLOW} observation": [*TRACK_FEATURES, *RIG_FEATURES], "rig": [*RIG_FEATURES]},
+    SCHEDULE: {"tracks[]": [*CANDIDATE_FEATURES], "rig": [*RIG_FEATURES]},
+}
+
+
+@pytest.mark.parametrize("name", [FOLLOW, SCHEDULE])
+def test_an_environment_is_as_listed(name):
+    with contextlib.closing(gymnasium.make(f"cotarget.env:{name}")) as env:
+        lines = [
+            f"{name} argument {key} = {default_of(parameter)}"
+            for key, parameter in inspect.signature(type(env.unwrapped)).parameters.items()
+        ]
+        observation, info = env.reset(seed=3)
+        assert env.observation_space.contains(observation)
+        action = np.zeros(3, np.float32) if name == FOLLOW else 0
+        _, reward, terminated, truncated, after = env.step(action)
+        assert (type(reward), terminated, truncated) == (float, False, False)
+        assert info.keys() == after.keys()
+        lines += span(env.action_space, f"{name} action")
+        lines += span(env.observation_space, f"{name} observation", FEATURES[name])
+        lines += [f"{name} info.{key} {kind_of(value)}" for key, value in info.items()]
+        lines += [f"{name} metadata.{key} = {value}" for key, value in env.metadata.items()]
+        if name == SCHEDULE:
+            with pytest.raises(ConfigError) as caught:
+                SchedulingPolicy(env, UNKNOWN)
+            assert_listed("policies.txt", last_list(str(caught.value)))
+    with contextlib.closing(gymnasium.make(name, observation="images")) as env:
+        lines += span(env.observation_space, f"{name} images", FEATURES[name])
+    assert_listed("environments.txt", lines, begins=name)
+
+
+def test_policies_of_commands_are_listed():
+    (line,) = [line for line in listed("commands.txt") if line.startswith("cotarget follow --policy")]
+    assert_listed("policies.txt", line[line.index("{") + 1 : line.index("}")].split(", "))
+
+
+# --- environment variables ---
+def test_environment_variables_are_listed():
+    """Of this project's own all are listed; of others those that it heeds."""
+    found = set()
+    for folder in (Path(cotarget.__file__).parent, Path(experiments.__file__).parent):
+        for path in folder.rglob("*.py"):
+            found |= set(re.findall('"([A-Z]+_[A-Z_]+)"', path.read_text(encoding="utf-8")))
+    own = {name for name in found if name.startswith("COTARGET_")}
+    assert_listed("environment_variables.txt", own, begins="COTARGET_")
+    assert set(listed("environment_variables.txt")) <= found
