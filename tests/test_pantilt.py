@@ -6,7 +6,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from cotarget.errors import UnreachableError
 from cotarget.geometry import angle_between, pose
-from cotarget.pantilt import HeadGeometry, base_head, miss, nearest, shortcut, solve, zoom_fixed
+from cotarget.pantilt import HeadGeometry, base_head, miss, nearest, shortcut, solve, towards, zoom_fixed
 
 RIGS, TARGETS = 500, 200  # 100,000 targets
 MISS_DEG = 1e-9  # the figure to reach
@@ -127,12 +127,25 @@ def test_hand_worked_target():
     assert solution.range == pytest.approx(np.sqrt(3))
 
 
+def test_the_direction_of_a_point_is_what_an_ideal_head_turns_by():
+    """45 degrees right; up by atan(1 / sqrt 2), because the way on the ground is sqrt 2 long."""
+    assert np.degrees(towards(np.array([1.0, -1.0, 1.0]))) == pytest.approx((45.0, 35.264389682754654))
+
+
 def test_nearest_prefers_the_branch_where_the_head_is():
     solutions = solve(np.array([0.0, 0.0, 5.0]), RigidTransform.identity())
     wide = (-np.pi, np.pi)
     over = nearest(solutions, wide, wide, now=(3.1, 3.1))
     assert (abs(over.pan), abs(over.tilt)) == pytest.approx((np.pi, np.pi))
     assert nearest(solutions, wide, wide).tilt == pytest.approx(0)
+
+
+def test_nearest_is_what_the_slower_axis_has_to_travel():
+    """To (0, 0) pan turns by 2.0 and tilt not at all; over the top pan turns by 1.1, and tilt by half a turn."""
+    solutions = solve(np.array([0.0, 0.0, 5.0]), RigidTransform.identity())
+    wide = (-np.pi, np.pi)
+    found = nearest(solutions, wide, wide, now=(2.0, 0.0))
+    assert (found.pan, found.tilt) == pytest.approx((0.0, 0.0), abs=ROUNDING)
 
 
 def test_nearest_counts_whole_turns():

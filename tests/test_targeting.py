@@ -107,6 +107,14 @@ def test_the_closeup_is_as_large_as_wanted():
         assert np.linalg.norm(ends[1] - ends[0]) == pytest.approx(160.0, abs=SIZE_PX)
 
 
+def test_a_height_is_magnified_by_the_vertical_focal_length():
+    """300 px for 1.75 m at 12 m take fy = 300 x 12 / 1.75; fx is 686 / 684 of that, the lens calls it 667 / 684."""
+    found = aim(HOME, np.array([0.0, 0.0, 12.0]), ANYWHERE, closeup=WantedSize(1.75, 300.0, vertical=True))
+    fy = 300 * 12 / 1.75
+    assert found.focal_px == pytest.approx(fy * 686 / 684, rel=RELATIVE)
+    assert found.nominal_px == pytest.approx(fy * 667 / 684, rel=RELATIVE)
+
+
 def test_an_aim_uses_the_lens_as_it_was_calibrated_at_that_focal_length():
     """Between two stops the principal point drifts: half way in the logarithm it is half way between."""
     stops = (Intrinsics(SIZE, (700.0, 700.0), (326.0, 235.0)), Intrinsics(SIZE, (2828.0, 2828.0), (336.0, 245.0)))
@@ -250,6 +258,14 @@ def test_error_budget_straight_ahead():
     assert budget["pixel"] == pytest.approx(math.hypot(SIGMA / 686, SIGMA / 684), rel=CURVATURE)
     assert budget["size"] == pytest.approx(0.0, abs=1e-12)
     assert budget["total"] == pytest.approx(math.hypot(budget["steps"], budget["pixel"]), rel=RELATIVE)
+
+
+def test_error_budget_high_up():
+    """At 45 degrees the ray (0, -1, 1) is sqrt(2) long: along u a pixel turns it by 1 / sqrt(2), along v by 1 / 2."""
+    pixel = np.array([319.5, 239.5 - 684])
+    found = aim(HOME, point_at(HOME, pixel, 10.0), ANYWHERE)
+    budget = error_budget(HOME, pixel, found, ANYWHERE)
+    assert budget["pixel"] == pytest.approx(math.hypot(SIGMA / 686 / math.sqrt(2), SIGMA / 684 / 2), rel=CURVATURE)
 
 
 def test_error_budget_off_to_the_side():

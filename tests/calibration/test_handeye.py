@@ -35,6 +35,15 @@ def test_exact_motions_give_t_exactly(angles):
         assert np.linalg.norm(error.translation) < EXACT
 
 
+def test_motions_with_a_shift_give_t_exactly_too():
+    """A head with an axis offset of 0.2 m shifts as it turns; so does a robot's arm."""
+    hand = pose([0.1, -0.2, 0.05], [10.0, -20.0, 30.0])
+    A, B = exact_motions(hand, [(0.1, -0.3), (0.4, 0.2), (-0.5, 0.1)], Truth(hand=hand, dz=0.2))
+    error = park_martin(A, B).inv() * hand
+    assert error.rotation.magnitude() < EXACT
+    assert np.linalg.norm(error.translation) < EXACT
+
+
 def test_matrices_are_refused_in_words():
     with pytest.raises(CalibrationError, match=r"RigidTransform\.from_matrix makes them"):
         solve_hand_eye([np.eye(4)] * 3, [np.eye(4)] * 3)

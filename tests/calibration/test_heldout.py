@@ -10,10 +10,12 @@ from cotarget.board import board_points
 from cotarget.calibration import Calibration, Options, calibrate_views, uncertainty
 from cotarget.calibration.bundle import ALL_BLOCKS, Prior, fit, parameter_names
 from cotarget.calibration.initialization import place_boards
+from cotarget.calibration.model import View
 from cotarget.calibration.uncertainty import cross_validate, model_of
 from cotarget.config import BoardConfig
-from experiments.calibration.synthetic.rig import SIZES, Lens, Truth, other_rig, truth_of
-from experiments.calibration.synthetic.views import Placing, spread_views
+from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZES, Lens, Truth, other_rig, truth_of
+from experiments.calibration.synthetic.views import Placing, noisy, placed, spread_views, views_at_stops, zoom_view
+from tests.synthetic_rig import fourfold
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)
@@ -79,9 +81,26 @@ SAME_MISS = 0.03
 SAME_FIT = 1e-3  # a fit stops within a thousandth of a standard deviation of its optimum
 
 
-def test_what_is_measured_is_the_miss_of_the_prediction():
-    """Every fold predicted by hand: OpenCV's pose of the board, and the head's matrices written out."""
-    views, folds = drawn(Truth(), 0), 2
+def drawn_at_stops(truth, seed, boards=8):
+    """Views at the shortest focal length and at the further stops of a zoom lens."""
+    rng, placing = np.random.default_rng((seed, 3)), Placing(boards=boards, looks=3)
+    views, corners, home = [], [], np.zeros(2)
+    for number in range(boards):
+        x_fixed, poses = placed(truth, POINTS, rng, placing, number)
+        corners.append(x_fixed)
+        views.append(View("fixed", noisy(truth.fixed.project(x_fixed), NOISE_PX, rng), number))
+        views += [zoom_view(truth, x_fixed, number, pose, home, NOISE_PX, rng) for pose in poses]
+    return views + views_at_stops(truth, corners, rng, NOISE_PX)
+
+
+@pytest.mark.parametrize("stops", [(), (fourfold(2 * NOMINAL_PX),)], ids=["one focal length", "two"])
+def test_what_is_measured_is_the_miss_of_the_prediction(stops):
+    """Every fold predicted by hand: OpenCV's pose of the board, and the head's matrices written out.
+
+    A miss counts in pixels of the shortest focal length.
+    """
+    truth, folds = replace(Truth(), stops=stops), 2
+    views = drawn_at_stops(truth, 0)
     start = model_of(calibrate_views(views, BOARD, SIZES, options=QUICK))
     everything = fitted(start, views)
     squares = []
@@ -95,8 +114,12 @@ def test_what_is_measured_is_the_miss_of_the_prediction():
             w, t = cv2.solvePnPRefineLM(POINTS, fixed_view.corners_px, rig.fixed.K, D, w, t)
             x_fixed = POINTS @ cv2.Rodrigues(w)[0].T + t.ravel()
             for view in (v for v in kept if v.camera == "zoom" and v.board == fixed_view.board):
-                pixels = rig.zoom.project(rig.in_zoom(x_fixed, view.pan, view.tilt))
-                squares.append(np.sum(np.mean(pixels - view.corners_px, axis=0) ** 2))
+                stop = int(view.focal_px > NOMINAL_PX)
+                lens, pupil = model.zoom.stops[stop], [0.0, 0.0, model.zoom.pupil[stop]]
+                lens = Lens(*lens.focal_px, *lens.center_px, lens.distortion)
+                off = lens.project(rig.in_zoom(x_fixed, view.pan, view.tilt) - pupil) - view.corners_px
+                squares.append(np.sum((np.nanmean(off, axis=0) / (1 + stop)) ** 2))
+    assert len(squares) == sum(view.camera == "zoom" for view in views)
     found = cross_validate(everything, POINTS, None, folds)
     assert found.views == len(squares)
     assert found.measured_px == pytest.approx(np.sqrt(np.mean(squares)), rel=SAME_MISS)

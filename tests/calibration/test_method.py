@@ -9,6 +9,7 @@ import pytest
 from cotarget.board import board_points
 from cotarget.calibration import Options, calibrate_photos, calibrate_views
 from cotarget.calibration.bundle import EVERY_BLOCK, batches_of, difference, fit, parameter_names, predict, stepped
+from cotarget.calibration.initialization import rough_gamma
 from cotarget.calibration.model import RigModel, View
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_GAMMA, DEFAULT_T, BoardConfig
@@ -124,6 +125,18 @@ def test_gamma_comes_from_moved_head_poses_where_there_is_no_common_view_at_home
     apart = [v for v in moved if (v.camera == "fixed") == (v.board % 2 == 0)]
     with pytest.raises(CalibrationError, match=r"no placement of the board is seen by both cameras"):
         calibrate_views(apart, BOARD, SIZES)
+
+
+def test_the_first_guess_of_gamma_is_exact_for_exact_corners():
+    """From every pose of a head whose camera is rolled by 20 degrees and 0.1 m off the axes."""
+    truth = Truth(hand=pose([0.1, -0.08, 0.05], [3.0, -4.0, 20.0]))
+    views = synthetic_views(truth, POINTS, np.random.default_rng(0), boards=6, noise_px=0.0)
+    fixed, zoom = (Intrinsics(SIZE, (n.fx, n.fy), (n.cx, n.cy), n.distortion) for n in (truth.fixed, truth.zoom))
+    model = RigModel({}, fixed, ZoomLens((667.0,), (zoom,)), hand=truth.hand, head=HeadGeometry(truth.dz, truth.eps))
+    moved = [view for view in views if view.camera == "fixed" or view.pan != 0]
+    off = rough_gamma(model, moved, POINTS) * truth.gamma.inv()
+    assert off.rotation.magnitude() < 1e-5  # OpenCV refines a pose until it changes by 1e-6 or so
+    assert np.linalg.norm(off.translation) < 1e-4
 
 
 def test_a_bent_board_is_fitted_with_its_bend():

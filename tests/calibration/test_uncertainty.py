@@ -119,6 +119,21 @@ def test_worked_by_hand(parameters, matrix, nominal, expected):
     assert np.allclose(found, expected, rtol=1e-6, atol=1e-12)  # by differences of 1e-5
 
 
+def test_worked_by_hand_where_the_head_has_turned():
+    """A target 45 degrees to the right, 10 m deep: sqrt(2) 10 m away. An error of Gamma along x is seen aslant."""
+    found = line_of_sight_covariance(ideal(("T_zoom0_fixed.tx",), [[0.01]]), np.array([820.0, 240.0]), 10.0)
+    across = 1 / np.sqrt(2)  # of a shift along x
+    assert np.allclose(found, [[0.01 * (across / (10 * np.sqrt(2))) ** 2, 0], [0, 0]], rtol=1e-6, atol=1e-12)
+
+
+def test_jitter_worked_by_hand():
+    """Both axes scatter by 0.02 rad: at a tilt of 45 degrees a turn of pan moves the line of sight by cos(45 deg)."""
+    jittery = replace(ideal(("fixed.fx",), [[0.0]]), jitter=0.02)
+    for v, share in ((240.0, 1.0), (240.0 - 500.0, 0.5)):
+        found = line_of_sight_covariance(jittery, np.array([320.0, v]), 10.0)
+        assert np.allclose(found, 0.02**2 * np.diag([share, 1.0]), rtol=1e-6, atol=1e-12)
+
+
 def test_many_targets_at_once_and_out_of_reach():
     pixels, depths = np.array([[[320.0, 240.0], [100.0, 50.0], [600.0, 400.0]]]), np.array([[10.0, 4.0, 30.0]])
     calibration = ideal(("T_zoom0_fixed.tx", "fixed.cx", "T_head_zoom.tx"), np.diag([1e-4, 1.0, 1e-4]))
@@ -217,3 +232,14 @@ def test_the_variance_of_a_coordinate():
     assert coordinate_variance(residuals, residuals.size // 2) == pytest.approx(2 * clean)
     residuals[::54] += 5.0  # one corner in 54, fifty times off, where the mean of squares would grow fiftyfold
     assert coordinate_variance(residuals, 0) < 2 * clean
+
+
+def test_the_variance_of_a_coordinate_worked_by_hand():
+    """60 corners are 1 px off, 40 are off by twice Huber's scale, which is 3 / 1.1774 times the median length.
+
+    There psi has the length of the scale, and its slope is 1/2 across the residual and 0 along it.
+    """
+    scale = 3 / 1.1774
+    residuals = np.repeat([[1.0, 0.0], [2 * scale, 0.0]], [60, 40], axis=0)
+    by_hand = (0.6 + 0.4 * scale**2) / 2 / (0.6 + 0.4 / 4) ** 2
+    assert coordinate_variance(residuals, 0) == pytest.approx(by_hand, rel=1e-9)

@@ -9,6 +9,7 @@ import pytest
 from cotarget.calibration import Options, calibrate_captures, predicted_pointing
 from cotarget.calibration.calibrate import calibrate
 from cotarget.calibration.captures import INDEX
+from cotarget.calibration.joint import with_stop
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
 from cotarget.geometry import RigidTransform
@@ -152,6 +153,20 @@ def test_the_doubt_about_the_center_between_stops():
         assert np.allclose(bridge.center_doubt_px(2 * NOMINAL_PX), 0.0, atol=ROUNDING)
     straight = lens_of([(320.0, 240.0), (324.0, 240.0), (328.0, 240.0), (332.0, 240.0)])
     assert np.allclose(straight.center_doubt_px(1.3 * NOMINAL_PX), 0.0, atol=ROUNDING)  # a line is a line
+
+
+def test_the_next_stop_is_guessed_to_go_on_as_the_last_two_went():
+    """From one octave to the next the axis moves by (8, -4) px, and the true focal length grows by 1 % more."""
+    first = Intrinsics(SIZE, (NOMINAL_PX, NOMINAL_PX), (320.0, 240.0), (-0.1, 0.0, 0.0, 0.0, 0.0))
+    second = replace(first.scaled(2 * 1.01), center_px=(328.0, 236.0), distortion=(-0.4, 0.0, 0.0, 0.0, 0.0))
+    lens = ZoomLens((NOMINAL_PX, 2 * NOMINAL_PX), (first, second), (0.0, -0.02))
+    guessed = with_stop(lens, 4 * NOMINAL_PX)
+    assert guessed.nominal_px == (NOMINAL_PX, 2 * NOMINAL_PX, 4 * NOMINAL_PX)
+    assert guessed.stops[:2] == lens.stops
+    assert guessed.stops[2].focal_px == pytest.approx((4 * 1.01**2 * NOMINAL_PX,) * 2)
+    assert guessed.stops[2].center_px == pytest.approx((336.0, 232.0))
+    assert guessed.stops[2].distortion == pytest.approx((-1.6, 0.0, 0.0, 0.0, 0.0))  # the image is bent as before
+    assert guessed.pupil == (0.0, -0.02, -0.02)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])

@@ -8,7 +8,7 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
-from cotarget.estimation import TargetFilter
+from cotarget.estimation import TargetFilter, estimation_settings_for
 from cotarget.pipeline import FollowSettings, State, follow
 from experiments.calibration.synthetic.rig import SIZE, Truth
 from tests.moving_targets import calibration_of
@@ -79,6 +79,22 @@ def test_what_stays_close_and_cut_for_a_minute_is_about_where_it_was_seen_last(n
         assert max(late) < 1.1 * farthest
     assert max(late) < 1.5 * min(late)  # it stands, and so does the estimate
     assert max(sigmas) < 1.5 + ROUNDING  # a factor of five, and no more
+
+
+USUAL_SPEED = 0.1  # of it; what a frame adds and takes away leaves 4 %
+
+
+@pytest.mark.parametrize("name", WAYS)
+def test_a_velocity_along_the_axis_that_no_size_measures_is_as_uncertain_as_at_first(name):
+    """Its standard deviation returns to the usual speed: the target has been seen in part for five seconds."""
+    calibration, target = calibration_of(Truth()), DEFAULT_TARGETS[name]
+    estimator = TargetFilter(calibration, target)
+    box = Detection(np.array(calibration.fixed.image_center_px), np.array([60.0, 80.0]), 1.0)
+    for i in range(100):
+        estimator.update_fixed(box if i < 25 else replace(box, clipped=True), i / RATE)
+    found = estimator.at(99 / RATE)
+    speed = estimation_settings_for(target).motion.speed
+    assert found.depth * math.sqrt(found.state_covariance[5, 5]) == pytest.approx(speed, rel=USUAL_SPEED)
 
 
 def test_a_box_that_is_cut_brings_a_target_nearer_and_never_moves_it_away():

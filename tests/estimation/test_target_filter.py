@@ -6,14 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from scipy.linalg import expm
 
-from cotarget.calibration import Covariance
+from cotarget.calibration import Calibration, Covariance
+from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.errors import CalibrationError
 from cotarget.estimation import TargetFilter, estimation_settings_for
 from cotarget.estimation.measurement_model import Sights
 from cotarget.estimation.motion_model import BIRD, PERSON, STATES, USUAL_BIAS, MotionSettings, propagate
+from cotarget.geometry import RigidTransform
 from cotarget.targeting import Reach, aim, depth_of, point_at
 from cotarget.tracking.track import ImageFilter, settings_for
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth
@@ -125,6 +128,20 @@ def test_the_zoom_cameras_sight_is_that_of_written_out_matrices():
         np.testing.assert_allclose(J[:, i], (seen(*at + step) - seen(*at - step)) / (2 * DIFFERENCE), atol=DERIVATIVE)
 
 
+def test_the_sight_is_from_where_the_entrance_pupil_has_moved():
+    """A lens whose pupil moves forward by 0.2 m sees the same direction less 0.2 m along its own z."""
+    truth, forward = Truth(), 0.2
+    still = calibration_of(truth)
+    lens = still.zoom.stops[0]
+    zoom = ZoomLens((NOMINAL_PX, 2 * NOMINAL_PX), (lens, lens.scaled(2.0)), (0.0, forward))
+    sight = Sights(replace(still, zoom=zoom)).at(0.4, 0.2, 2 * NOMINAL_PX)
+    x_fixed = np.array([2.7, -0.9, 9.0])
+    x = np.zeros(STATES)
+    x[:3] = *(x_fixed[:2] / 9.0), math.log(9.0)
+    _, _, d = sight.seen(x)
+    np.testing.assert_allclose(d * 9.0, truth.in_zoom(x_fixed, 0.4, 0.2) - [0.0, 0.0, forward], atol=EXACT)
+
+
 # ---------------------------------------------------------------- motion
 def test_a_straight_way_is_straight_and_an_acceleration_bends_it():
     endless = MotionSettings(1.0, 1e6, 1e6, 0.04)  # an acceleration that stays
@@ -165,6 +182,46 @@ def test_two_short_predictions_are_one_long_one():
     # Noise is scaled by the depth, and by how uncertain that is, at the end of each.
     np.testing.assert_allclose(np.diag(twice[1]), np.diag(once[1]), rtol=SPLIT)
     assert np.linalg.eigvalsh(once[1]).min() > 0
+
+
+# White jerk in place of Singer's decay, for short spans, is right to a share of dt / tau, which is 0.03 at most.
+WHITE_JERK = 0.03
+
+
+@pytest.mark.parametrize(("dt", "tolerance"), [(0.02, WHITE_JERK), (0.5, 1e-6)])
+def test_the_noise_is_that_of_singers_acceleration(dt, tolerance):
+    """By Van Loan's integral of x' = F x + white noise, for a target straight ahead at 1 m."""
+    tau, acceleration = 1.0, 3.0
+    motion = MotionSettings(acceleration, tau, 1e6, 0.04)
+    _, P = propagate(np.zeros(STATES), np.zeros((STATES, STATES)), dt, motion)
+    F = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1 / tau]])
+    Q = np.diag([0.0, 0.0, 2 * acceleration**2 / tau])
+    M = expm(np.block([[-F, Q], [np.zeros((3, 3)), F.T]]) * dt)
+    expected = M[3:, 3:].T @ M[:3, 3:]
+    for axis in range(3):
+        own = [axis, 3 + axis, 6 + axis]
+        np.testing.assert_allclose(P[np.ix_(own, own)], expected, rtol=tolerance)
+
+
+def test_noise_along_the_axis_moves_a_target_off_the_axis_in_the_image():
+    """a = X / Z, b = Y / Z and l = log Z change by (dX - a dZ) / Z, (dY - b dZ) / Z and dZ / Z."""
+    a, b, Z = 0.5, -0.25, 8.0
+    motion = MotionSettings(3.0, 1.0, 1e6, 0.04)
+    zero = np.zeros((STATES, STATES))
+    variance = propagate(np.zeros(STATES), zero, 0.5, motion)[1][0, 0]  # of X, Y and Z each
+    x = np.zeros(STATES)
+    x[:3] = a, b, math.log(Z)
+    J = np.array([[1.0, 0.0, -a], [0.0, 1.0, -b], [0.0, 0.0, 1.0]]) / Z
+    np.testing.assert_allclose(propagate(x, zero, 0.5, motion)[1][:3, :3], variance * J @ J.T, rtol=EXACT)
+
+
+def test_attitude_and_bias_return_to_what_is_assumed_of_them():
+    """A Gauss-Markov process that starts known has 1 - exp(-2 dt / tau) of its variance after dt."""
+    motion = MotionSettings(1.0, 1.0, 1.0, 0.04, attitude_sigma=0.3, attitude_s=2.0, bias_sigma=0.01, bias_s=50.0)
+    _, P = propagate(np.zeros(STATES), np.zeros((STATES, STATES)), 1.5, motion)
+    bias = 0.01**2 * (1 - math.exp(-2 * 1.5 / 50.0))
+    expected = [0.0, 0.3**2 * (1 - math.exp(-2 * 1.5 / 2.0)), bias, bias]
+    np.testing.assert_allclose(np.diag(P)[9:], expected, rtol=EXACT)
 
 
 # ---------------------------------------------------------------- honesty and prediction
@@ -388,6 +445,18 @@ def test_the_appearance_is_the_truths_and_its_covariance_that_of_samples():
     assert abs(math.log(seen.size_px / true_px)) < 3 * seen.size_sigma + 0.02
     assert found.closeup.vertical
     assert found.closeup.size == pytest.approx(flight.size, rel=0.1)
+
+
+@pytest.mark.parametrize(("name", "focal"), [("book", 500.0), ("person", 1000.0), ("bird", 500.0)])
+def test_a_height_appears_by_the_vertical_focal_length(name, focal):
+    """Both cameras in one place, fy twice fx: a height appears fy / depth large, anything else fx / depth."""
+    lens, still = Intrinsics((641, 481), (500.0, 1000.0), (320.0, 240.0)), RigidTransform.identity()
+    target = DEFAULT_TARGETS[name]
+    estimator = TargetFilter(Calibration(lens, ZoomLens((500.0,), (lens,)), still, still), target)
+    assert estimator.update_fixed(Detection(np.array([320.0, 240.0]), np.array([50.0, 40.0]), 1.0), 0.0)
+    found = estimator.at(0.0)
+    seen = found.appearance(0.0, 0.0, 500.0)
+    assert seen.size_px == pytest.approx(focal * found.closeup.size / found.depth, rel=EXACT)
 
 
 def test_nothing_is_told_before_anything_is_seen():

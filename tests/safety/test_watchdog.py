@@ -11,7 +11,7 @@ import pytest
 
 from cotarget.config import SafetyConfig, SimHead
 from cotarget.errors import DeviceError, EmergencyStopError, StaleFrameError
-from cotarget.rig import Frame
+from cotarget.rig import Frame, PanTiltState
 from cotarget.safety import SafeRig, stop_file, watchdog
 from tests.safety_rigs import DEADLINE_S, IMAGE, RealRig, SimulatedRig
 
@@ -141,6 +141,26 @@ def test_a_head_that_is_seen_to_rest_at_its_goal_is_left_in_peace(rig, safe, cap
     assert not warnings(caplog)
 
 
+@pytest.mark.parametrize("goal", [(FAR, 0.0), (0.0, math.radians(20))], ids=["pan", "tilt"])
+def test_a_head_that_rests_elsewhere_is_watched_on(rig, safe, goal):
+    """It has not started yet: one axis is at its goal, the other is not."""
+    rig.head.state = lambda: PanTiltState(0.0, 0.0, moving=False, t=rig.clock.now())
+    safe.head.move(*goal)
+    safe.head.state()
+    safe.clock.sleep_until(10.0)
+    assert rig.head.halts == [pytest.approx(WATCHDOG_S, abs=EXACT)]
+
+
+def test_a_head_that_passes_its_goal_is_watched_on(rig, safe):
+    """A moving head is sent to where it is: it is at its goal, and overshoots."""
+    safe.head.move(FAR, 0.0)
+    safe.clock.sleep_until(0.3)
+    safe.head.move(safe.head.state().pan, 0.0)
+    assert safe.head.state().moving
+    safe.clock.sleep_until(10.0)
+    assert rig.head.halts == [pytest.approx(0.3 + WATCHDOG_S, abs=EXACT)]
+
+
 def test_time_that_passes_behind_its_back_counts(rig, safe):
     safe.head.move(FAR, 0.0)
     rig.clock.sleep_until(0.7)
@@ -247,6 +267,35 @@ def test_a_wait_is_watched_for_no_longer_than_the_way_takes():
         took = time.monotonic() - begun
     print(f"a wait that hung was ended after {took:.2f} s")
     assert 0.35 * 1.5 + SHORT_S < took < 0.35 * 1.5 + SHORT_S + TIMELY_S
+
+
+TICK_S = 0.001  # between looks at a head that never arrives
+
+
+@pytest.mark.parametrize(("goal", "speed", "moving", "way_s"), [
+    # The head reaches 4 rad/s after 0.1 s.
+    ((1.0, 0.0), None, False, 1.0 / 4 + 0.1),
+    ((0.2, -1.0), None, False, 1.0 / 4 + 0.1),  # the longer way counts
+    ((0.1, 0.0), None, False, 2 * 0.05),  # 0.05 s to half way, and as long to brake: 40 rad/s^2 0.05^2 = 0.1 rad
+    ((1.0, 0.5), (4.0, 1.0), False, 1.0 / 1 + 1.0 / 40),  # the slower axis counts
+    ((1.0, 0.0), None, True, 1.0 / 4 + 0.1 + 2 * 0.1),  # it may move the other way: it brakes and speeds up first
+])  # fmt: skip
+def test_a_device_may_wait_half_as_long_again_as_the_way_takes(goal, speed, moving, way_s):
+    """On a clock that the waiting device itself turns."""
+    now = [0.0]
+    rig = RealRig(SimpleNamespace(now=lambda: now[0], sleep_until=lambda t: None))
+    rig.real_time = False  # so that calls watch, and no thread
+    rig.head.state = lambda: PanTiltState(0.0, 0.0, moving, now[0])
+    with SafeRig(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
+
+        def wait():
+            while not rig.head.halted.is_set():
+                now[0] += TICK_S
+                safe.head.state()
+
+        rig.head.hang = wait
+        safe.head.move(*goal, speed=speed, wait=True)
+    assert now[0] == pytest.approx(1.5 * way_s + SHORT_S, abs=TICK_S)
 
 
 @pytest.mark.wire
