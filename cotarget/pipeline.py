@@ -289,7 +289,7 @@ def follow(
             camera showed nothing new for 10 s. Until then the run goes on without it, and every Step says so.
         DeviceError: a device failed, or its frames changed their size.
     """
-    calibration.hand_eye()  # raises now and not when the first target is seen
+    calibration.hand_eye()  # raises with the first step, not when the first target is seen
     wanted = opened_from(rig).target(target) if isinstance(target, str) else target
     if detector is None:
         detector = make_detector(wanted, opened_from(rig).rate_hz)
