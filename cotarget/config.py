@@ -1,23 +1,11 @@
-"""rig.toml, read into frozen dataclasses; unknown keys are refused with the valid ones named.
+"""Read rig.toml into frozen dataclasses; unknown keys are refused with the valid ones named.
 
-Values keep the units of the file, because people edit it: metres and degrees, millimetres where a name says so.
-Defaults are the rig that the project's figures are stated for.
+Values keep the units of the file, because people edit it: metres and degrees, and millimetres if a name says so. The
+defaults of [sim] are the rig for which the project's figures are stated; those of [hardware] are a PTU-D46-17.5 as it
+leaves the factory, an Axis 241Q, and a Canon PowerShot S5 IS.
 
-The [hardware] tables of rig.toml as frozen dataclasses: where the devices are and what is expected of them.
-
-Values keep the units of the file: metres and degrees, millimetres where a name says so. Defaults are a PTU-D46-17.5 as
-it leaves the factory, an Axis 241Q, and a Canon PowerShot S5 IS.
-
-What rig.toml must not say beyond its [sim] and [hardware] tables: values of the right type that make no sense.
-
-What the [sim] tables of rig.toml must not say: values of the right type that make no sense.
-
-The [sim] tables of rig.toml as frozen dataclasses: the simulated world, its cameras, head and effects.
-
-Values keep the units of the file: metres and degrees, millimetres where a name says so. Defaults are the rig that the
-project's figures are stated for.
-
-Turns tables, as TOML gives them, into frozen dataclasses by the types of their fields.
+`build` turns a table into a dataclass by the types of its fields. `check_config` then refuses values of the right type
+that make no sense.
 """
 
 import dataclasses
@@ -40,18 +28,18 @@ from cotarget.errors import ConfigError, choices
 from cotarget.files import assets_dir
 from cotarget.geometry import RigidTransform, pose, pose_dict
 
-FEWEST_CORNERS, MOST_CORNERS = 3, 100  # of a board, a side
+FEWEST_CORNERS, MOST_CORNERS = 3, 100  # corners along a side of a board
 
 
 def check_config(config: "RigConfig", recorded: bool = False) -> None:
     """Refuse values of the right type that make no sense.
 
     Args:
-        config: of a rig.
-        recorded: as `cotarget.config.parse_config` has it.
+        config: configuration of a rig.
+        recorded: whether it belongs to a recording, see `parse_config`.
 
     Raises:
-        ConfigError: with the key.
+        ConfigError: a value is refused; the message names the key.
     """
     check_numbers(config.sim) if recorded else check_sim(config.sim)
     check_hardware(config.hardware)
@@ -70,10 +58,10 @@ def check_config(config: "RigConfig", recorded: bool = False) -> None:
 
 
 def check_corners(board: "BoardConfig") -> None:
-    """Refuse a board whose corners are too few or too many, and a chessboard that looks the same upside down.
+    """Refuse a board with too few or too many corners, and a chessboard that looks the same upside down.
 
     Raises:
-        ConfigError: with the key.
+        ConfigError: the board is refused; the message names the key.
     """
     columns, rows = board.corners
     if min(columns, rows) < FEWEST_CORNERS:
@@ -88,7 +76,7 @@ def check_corners(board: "BoardConfig") -> None:
 
 
 def _check_safety(safety: "SafetyConfig", rate_hz: float) -> None:
-    """Refuse limits that are none, a watchdog that halts between two frames, and a stop file without a name."""
+    """Refuse empty ranges, a watchdog that halts between two frames, and a stop file without a name."""
     for where, limits in (("safety.pan_deg", safety.pan_deg), ("safety.tilt_deg", safety.tilt_deg)):
         if limits is not None and limits[0] >= limits[1]:
             raise ConfigError(f"{where}: {list(limits)} is not [lowest, highest]")
@@ -103,9 +91,9 @@ def _check_safety(safety: "SafetyConfig", rate_hz: float) -> None:
         raise ConfigError(f"safety.stop_file: '{safety.stop_file}' is a folder; name a file in it, as 'stop'")
 
 
-# --- simconfig ---
+# The [sim] tables
 
-# What the numbers of a list are, for who gives something else.
+# The text of an annotation describes the numbers of a list in error messages.
 Pair = tuple[float, float]
 Limits = Annotated[Pair, "[lowest, highest]"]
 Size = Annotated[tuple[int, int], "[width, height]"]
@@ -115,7 +103,7 @@ Distortion = Annotated[tuple[float, float, float, float, float], "[k1, k2, p1, p
 Waypoint = Annotated[tuple[float, float, float, float], "[t, x, y, z]"]
 # Coefficients of s, s^2, s^3 ...: a curve that is 0 at the shortest focal length.
 Curve = Annotated[tuple[float, ...], "[of s, of s^2, ...]"]
-TARGETS = ("book", "person", "bird")  # that the simulation has models of
+TARGETS = ("book", "person", "bird")  # targets with a model in the simulation
 
 
 @dataclass(frozen=True)
@@ -146,7 +134,7 @@ class SimCamera:
     jpeg_quality: int = 90
 
     def fitted(self, size: Size, focal_px: Focal | None) -> dict[str, Any]:
-        """What else is other in pixels in an image of another size [px], with a focal length, or of the same view."""
+        """Scale focal length and principal point to an image size [px]; without a focal length, keep the view."""
         by = self._gain(size, focal_px)
         return {
             "focal_px": tuple(by * focal for focal in self.focal_px),
@@ -157,13 +145,13 @@ class SimCamera:
         }
 
     def _gain(self, size: Size, focal_px: Focal | None) -> float:
-        """How many times as many pixels there are to an angle; more or fewer at its sides change nothing of that."""
+        """Ratio of pixels per angle to those of the default; more or fewer pixels at the sides do not change it."""
         return size[0] / self.size[0] if focal_px is None else focal_px[0] / self.focal_px[0]
 
 
 @dataclass(frozen=True)
 class ZoomOptics:
-    """What a zoom lens does at one focal length; ``pupil`` is how far forward its entrance pupil has moved [m]."""
+    """Optics of a zoom lens at one focal length; ``pupil`` is the forward movement of its entrance pupil [m]."""
 
     focal_px: Focal
     center_px: Center
@@ -203,7 +191,7 @@ class SimZoomCamera(SimCamera):
     pupil: Curve = (0.03, 0.06, -0.9, 1.17, -0.44)
 
     def fitted(self, size: Size, focal_px: Focal | None) -> dict[str, Any]:
-        """The same of a zoom camera: more pixels to an angle are smaller ones, as what it tells and does agree."""
+        """Scale to an image size, with pixel pitch and drift of the principal point: more pixels are smaller ones."""
         by = self._gain(size, focal_px)
         return {
             **super().fitted(size, focal_px),
@@ -212,13 +200,13 @@ class SimZoomCamera(SimCamera):
         }
 
     def optics_at(self, magnification: float) -> ZoomOptics:
-        """What the lens does at a nominal focal length, given as a multiple of the shortest."""
+        """Compute the optics at a nominal focal length, given as a multiple of the shortest."""
         s = math.log(magnification) / math.log(self.focal_mm[1] / self.focal_mm[0])
         gain = magnification * (1 + _along(self.focal_curve, s))
         (fx, fy), (cx, cy), (k1, k2, p1, p2, k3) = self.focal_px, self.center_px, self.distortion
         du, dv = (_along(curve, s) for curve in self.center_drift_px)
-        # A pixel's tangent shrinks as the focal length grows; coefficients that grow with its powers keep the image's
-        # distortion.
+        # Tangents within the image shrink as the focal length grows. Coefficients that grow with its powers keep the
+        # image's distortion.
         squared = gain * gain
         k1 = (k1 + _along(self.distortion_drift, s)) * squared
         return ZoomOptics(
@@ -230,7 +218,7 @@ class SimZoomCamera(SimCamera):
 
 
 def _along(curve: Curve, s: float) -> float:
-    """A curve's value, by Horner's rule."""
+    """Evaluate a curve by Horner's rule."""
     value = 0.0
     for coefficient in reversed(curve):
         value = (value + coefficient) * s
@@ -308,8 +296,8 @@ class SimEffects:
     clutter: bool = False
 
 
-# Offsets of the kind the paper's rig had: 0.4 m beside each other, a few degrees apart, the camera bolted to the
-# unit with a lever of some ten centimetres.
+# Offsets like those of the paper's rig: cameras 0.4 m apart, a few degrees between them, and the zoom camera mounted on
+# the unit with a lever of some ten centimetres.
 DEFAULT_GAMMA = pose([-0.40, 0.03, 0.06], [0.8, -1.9, 0.6])
 DEFAULT_T = pose([0.02, -0.08, 0.05], [0.7, -1.4, 0.5])
 
@@ -348,16 +336,16 @@ class SimConfig:
     paths: Mapping[str, tuple[Waypoint, ...]] = field(default_factory=dict)
 
 
-# No effect of a real rig but the quality of the rendering, which `all` leaves alone.
+# Switches of the rendering's quality, which are no effects of a real rig and which `all` does not set.
 QUALITY = ("multisampling", "shadows")
 ALL = "all"
 
 
 def expand_all(effects: Mapping[str, Any]) -> dict[str, Any]:
-    """Let ``all`` set every switch of [sim.effects] that is not named.
+    """Expand ``all`` to every switch of [sim.effects] that is not named.
 
     Raises:
-        ConfigError: it is neither true nor false, or a key is neither a switch nor ``all``.
+        ConfigError: ``all`` is neither true nor false, or a key is neither a switch nor ``all``.
     """
     switches = {f.name for f in fields(SimEffects)}
     if unknown := sorted(set(effects) - switches - {ALL}):
@@ -372,30 +360,30 @@ def expand_all(effects: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def fit_sizes(sim: SimConfig, given: Mapping[str, Any]) -> SimConfig:
-    """Let a view stay what it is where another image size was given, and go with the focal length where that was.
+    """Scale the cameras' defaults to a given image size, or to a given focal length.
 
     Args:
-        sim: as it was read.
-        given: the [sim] table that it was read from; what a camera's table says stays as it is said.
+        sim: configuration as read.
+        given: the [sim] table that it was read from; keys given there stay as they are.
     """
     cameras: dict[str, SimCamera] = {}
     for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
         if min(*camera.size, *camera.focal_px) <= 0:
-            continue  # refused elsewhere
+            continue  # check_numbers refuses it
         said = given.get(name, {})
-        # Nothing changes where size and focal length are the default's.
+        # Nothing changes if size and focal length are the defaults.
         follows = type(camera)().fitted(camera.size, camera.focal_px if "focal_px" in said else None)
         cameras[name] = replace(camera, **{key: value for key, value in follows.items() if key not in said})
     return replace(sim, **cameras)  # type: ignore[arg-type]
 
 
 def split_name(name: str) -> tuple[str, int]:
-    """A target's kind and its number among its kind: ("bird", 1) of ``bird``, ("bird", 2) of ``bird2``."""
+    """Split a target's name into kind and number: ("bird", 1) for ``bird``, ("bird", 2) for ``bird2``."""
     number = re.search(r"(?<=\D)([2-9]|[1-9]\d+)\Z", name)
     return (name, 1) if number is None else (name[: number.start()], int(number[0]))
 
 
-# --- hwconfig ---
+# The [hardware] tables
 
 BAUDS = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 SOCKET = re.compile(r"socket://(\[[0-9A-Fa-f:.]+\]|[^:/\s]+):(\d+)/?")
@@ -513,16 +501,16 @@ class HardwareConfig:
 
 
 def socket_address(url: str) -> tuple[str, int] | None:
-    """Host and port of "socket://host:port"; None for anything else."""
+    """Parse host and port of "socket://host:port"; None for anything else."""
     match = SOCKET.fullmatch(url)
     return None if match is None else (match[1].strip("[]"), int(match[2]))
 
 
 def check_hardware(hardware: HardwareConfig) -> None:
-    """Refuse values of the right type that make no sense; devices that are not named are no mistake yet.
+    """Refuse values of [hardware] that make no sense; a device without an address is no error yet.
 
     Raises:
-        ConfigError: with the key.
+        ConfigError: a value is refused; the message names the key.
     """
     head, fixed, zoom = hardware.head, hardware.fixed, hardware.zoom
     if head.baud not in BAUDS:
@@ -570,26 +558,26 @@ def _is_web_address(url: str) -> bool:
     try:
         parts = urlsplit(url)
         return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
-    except ValueError:  # an address in brackets that is none, a port that is no number
+    except ValueError:  # an invalid address in brackets, or an invalid port
         return False
 
 
-# --- simchecks ---
+# Checks of the [sim] tables
 
-# The curves of the zoom lens are checked at this many focal lengths.
+# Number of focal lengths at which the zoom lens's curves are checked.
 CHECKED_FOCALS = 33
-# Farther than any lens is long: an entrance pupil that moves so far was given in millimetres [m].
+# Largest movement of an entrance pupil, longer than any lens; beyond it millimetres were given [m].
 FARTHEST_PUPIL = 1.0
-# Beyond these it is another unit that was meant: of millimetres, degrees, frames a second and grey levels.
+# Largest values [mm, degrees, Hz, grey levels]; beyond them another unit was meant.
 MOST_AXIS_OFFSET_MM, MOST_SQUARENESS_DEG, MOST_RATE_HZ, MOST_NOISE = 1000.0, 45.0, 1000.0, 255.0
-MODEL_SUFFIXES = (".obj", ".stl", ".xml")  # of what a target of one's own is made of
+MODEL_SUFFIXES = (".obj", ".stl", ".xml")  # files of a user's own target models
 
 
 def check_sim(sim: SimConfig) -> None:
-    """Refuse a simulated world that cannot be.
+    """Refuse an impossible simulated world.
 
     Raises:
-        ConfigError: with the key.
+        ConfigError: a value is refused; the message names the key.
     """
     check_numbers(sim)
     for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
@@ -611,10 +599,10 @@ def check_sim(sim: SimConfig) -> None:
 
 
 def check_numbers(sim: SimConfig) -> None:
-    """Refuse what no rig can be, simulated or of a recording: sizes, rates and limits.
+    """Refuse sizes, rates and limits that are impossible for a simulated or a recorded rig.
 
     Raises:
-        ConfigError: with the key.
+        ConfigError: a value is refused; the message names the key.
     """
     positive: dict[str, tuple[float, ...]] = {
         "sim.zoom.pitch_mm": (sim.zoom.pitch_mm,),
@@ -669,7 +657,7 @@ def check_numbers(sim: SimConfig) -> None:
 
 
 def known_targets(own: Iterable[str] = ()) -> str:
-    """Which targets the simulation has, with those of [sim.models], for messages."""
+    """Format the names of the simulation's targets and of [sim.models], for messages."""
     return (
         f"the simulation has: {choices([*TARGETS, *own])}, and further ones with a number, as 'bird2'; others need a "
         "model: [sim.models]"
@@ -677,7 +665,7 @@ def known_targets(own: Iterable[str] = ()) -> str:
 
 
 def _check_models(sim: SimConfig) -> None:
-    """Refuse models of targets that the simulation has, and files that can be none."""
+    """Refuse models with the name of a built-in target, with a number, or with an unknown suffix."""
     for name, path in sim.models.items():
         if name in TARGETS:
             raise ConfigError(f"sim.models.{name}: the simulation has a {name} of its own; give yours another name")
@@ -688,7 +676,7 @@ def _check_models(sim: SimConfig) -> None:
 
 
 def _check_targets(sim: SimConfig) -> None:
-    """Refuse targets of which there is no model, and two of a name."""
+    """Refuse targets without a model, and two targets of one name."""
     for where, names in (("sim.targets", sim.targets), ("sim.paths", tuple(sim.paths))):
         for at, name in enumerate(names):
             if split_name(name)[0] not in (*TARGETS, *sim.models):
@@ -700,7 +688,7 @@ def _check_targets(sim: SimConfig) -> None:
 
 
 def _check_frame_time(where: str, camera: SimCamera) -> None:
-    """Refuse an exposure that does not end before the next begins."""
+    """Refuse an exposure that is longer than a frame's interval."""
     if camera.rate_hz > 0 and camera.exposure_s * camera.rate_hz > 1:
         raise ConfigError(
             f"{where}.exposure_s: {camera.exposure_s:g} s is longer than the {1 / camera.rate_hz:g} s from one frame "
@@ -709,7 +697,7 @@ def _check_frame_time(where: str, camera: SimCamera) -> None:
 
 
 def _check_center(where: str, camera: SimCamera) -> None:
-    """Refuse a principal point outside of the picture, as one that was meant for a larger picture."""
+    """Refuse a principal point outside the image, such as one meant for a larger image."""
     (u, v), (width, height) = camera.center_px, camera.size
     if min(camera.size) > 0 and not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
         raise ConfigError(
@@ -718,16 +706,16 @@ def _check_center(where: str, camera: SimCamera) -> None:
 
 
 def _sees_nothing(lens: Intrinsics) -> bool:
-    """Whether part of the image has no ray."""
+    """Whether a part of the image has no ray."""
     w, h = lens.size
     rim = np.array([(u, v) for u in np.linspace(-1, w, 9) for v in np.linspace(-1, h, 9)])
     return not np.isfinite(lens.ray(rim)).all()
 
 
 def _check_lens(where: str, camera: SimCamera) -> None:
-    """Refuse a lens through which part of the image sees nothing."""
+    """Refuse a distortion that leaves a part of the image without rays."""
     if min(*camera.size, *camera.focal_px) <= 0:
-        return  # said elsewhere
+        return  # check_numbers refuses it
     if _sees_nothing(Intrinsics(camera.size, camera.focal_px, camera.center_px, camera.distortion)):
         raise ConfigError(
             f"{where}.distortion: {list(camera.distortion)} folds back inside the image, so that parts of it see "
@@ -736,7 +724,7 @@ def _check_lens(where: str, camera: SimCamera) -> None:
 
 
 def _check_optics(zoom: SimZoomCamera) -> None:
-    """Refuse a zoom lens whose curves no real lens follows."""
+    """Refuse zoom curves that no real lens follows."""
     shortest_mm, longest_mm = zoom.focal_mm
     before = 0.0
     for magnification in np.geomspace(1.0, longest_mm / shortest_mm, CHECKED_FOCALS).tolist():
@@ -758,13 +746,13 @@ def _check_optics(zoom: SimZoomCamera) -> None:
             )
 
 
-# --- tables ---
+# Tables of TOML to dataclasses
 
-KINDS = {int: "whole numbers", float: "numbers", str: "texts"}  # what lists are of, beside lists
+KINDS = {int: "whole numbers", float: "numbers", str: "texts"}  # elements of lists, for messages
 
 
 def expect_table(value: Any, where: str) -> None:
-    """Refuse what is not a table."""
+    """Refuse a value that is no table."""
     if not isinstance(value, Mapping):
         raise ConfigError(f"{where}: {value!r} is not a table")
 
@@ -773,8 +761,8 @@ def build(cls: type[Any], table: Any, where: str, base: Any = None) -> Any:
     """Make a dataclass from a table.
 
     Args:
-        cls: the dataclass; its fields' types say what each value must be.
-        table: of values; what is not said keeps its default.
+        cls: the dataclass; the types of its fields say what each value must be.
+        table: table of values; missing keys keep their defaults.
         where: dotted name of the table, for messages.
         base: an instance whose values are the defaults instead.
 
@@ -805,10 +793,10 @@ def _join(where: str, name: str) -> str:
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
-    """Check one value against its field's type and convert it."""
+    """Check a value against its field's type and convert it."""
     hint, form = _parts(hint)
     origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (types.UnionType, typing.Union):  # the only unions are "or None", which TOML cannot say
+    if origin in (types.UnionType, typing.Union):  # the only unions are "or None", and TOML has no None
         return _convert(args[0], value, where)
     if origin is Literal:
         if value not in args or isinstance(value, bool):
@@ -838,7 +826,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
 
 
 def _parts(hint: Any) -> tuple[Any, str]:
-    """A type, and the words beside it for what its values are: `Annotated[type, words]`; empty where there are none."""
+    """Split `Annotated[type, words]` into the type and the words; the words of other types are empty."""
     if typing.get_origin(hint) is Annotated:
         hint, form = typing.get_args(hint)
         return hint, form
@@ -879,7 +867,7 @@ def _convert_pose(value: Any, where: str) -> RigidTransform:
 
 
 def _as_tables(value: Any) -> Any:
-    """Dataclasses as tables, without what is None, for TOML cannot say that."""
+    """Convert dataclasses to tables, without values of None, which TOML does not have."""
     if isinstance(value, RigidTransform):
         return pose_dict(value)
     if dataclasses.is_dataclass(value):
@@ -892,7 +880,7 @@ def _as_tables(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-ENCODING = "utf-8-sig"  # with the byte-order mark that some editors write, or without
+ENCODING = "utf-8-sig"  # UTF-8 with or without the byte order mark that some editors write
 
 
 @dataclass(frozen=True)
@@ -995,21 +983,21 @@ class RigConfig:
 
     @property
     def head_limits_deg(self) -> tuple[Pair, Pair]:
-        """The same [degrees]."""
+        """Pan and tilt limits [degrees]: the device's, and the soft ones where they are tighter."""
         head, soft = self.sim.head if self.backend == "sim" else self.hardware.head, self.safety
         pan = _overlap(head.pan_deg, soft.pan_deg, "safety.pan_deg")
         return pan, _overlap(head.tilt_deg, soft.tilt_deg, "safety.tilt_deg")
 
     @property
     def head_step(self) -> float:
-        """The head's resolution [rad]; 0 for a continuous one."""
+        """Step size of the head [rad]; 0 for a continuous head."""
         if self.backend != "sim":
             return math.radians(self.hardware.head.step_deg)
         return math.radians(self.sim.head.step_deg) if self.sim.effects.steps else 0.0
 
     @property
     def focal_range_px(self) -> Pair:
-        """The zoom camera's shortest and longest nominal focal length [px]."""
+        """Shortest and longest nominal focal length of the zoom camera [px]."""
         if self.backend == "sim":
             shortest, longest = self.sim.zoom.focal_mm
         else:
@@ -1023,33 +1011,33 @@ class RigConfig:
 
     @property
     def stream_sizes(self) -> tuple[Size, Size]:
-        """(width, height) of the fixed and the zoom camera's stream [px]."""
+        """(width, height) of the streams of the fixed and the zoom camera [px]."""
         if self.backend == "sim":
             return self.sim.fixed.size, self.sim.zoom.size
         return self.hardware.fixed.size, self.hardware.zoom.size
 
     @property
     def rate_hz(self) -> float:
-        """Frames of the fixed camera a second."""
+        """Frame rate of the fixed camera [Hz]."""
         return self.sim.fixed.rate_hz if self.backend == "sim" else self.hardware.fixed.rate_hz
 
     @property
     def command_delay_s(self) -> float:
-        """From a command to the start of motion, as far as it is known [s]."""
+        """Time from a command to the start of the head's motion, as configured [s]."""
         if self.backend != "sim":
             return self.hardware.head.command_delay_s
         return self.sim.head.command_delay_s if self.sim.effects.command_delay else 0.0
 
     @property
     def lens_delay_s(self) -> float:
-        """From a command to the start of the lens's motion, as far as it is known [s]."""
+        """Time from a command to the start of the lens's motion, as configured [s]."""
         return self.command_delay_s if self.backend == "sim" else self.hardware.zoom.command_delay_s
 
     def target(self, name: str) -> TargetConfig:
-        """Look a target up by name; a further one of a kind, as ``bird2``, is like the first unless it has its own.
+        """Look up a target profile by name; a further one of a kind, such as ``bird2``, defaults to that kind's.
 
         Raises:
-            ConfigError: no such target.
+            ConfigError: there is no such target.
         """
         found = _of_kind(self.targets, name)
         if found is None:
@@ -1061,28 +1049,28 @@ def load_config(path: Path | str) -> RigConfig:
     """Read rig.toml.
 
     Raises:
-        ConfigError: the file is missing, malformed, or says something unknown or impossible.
+        ConfigError: the file is missing or malformed, or has an unknown key or an impossible value.
     """
     path = Path(path)
     return config_of(read_text(path), path)
 
 
 def config_of(text: str, path: Path) -> RigConfig:
-    """What a rig.toml says, from its text alone.
+    """Parse the text of a rig.toml.
 
     Args:
-        text: of the file, as `read_text` gives it.
-        path: where it is: relative paths in it are relative to its folder, and messages name it. It is not read.
+        text: text of the file, see `read_text`.
+        path: path of the file; relative paths are relative to its folder, and messages name it. It is not read.
 
     Raises:
-        ConfigError: the text is malformed, or says something unknown or impossible.
+        ConfigError: the text is malformed, or has an unknown key or an impossible value.
     """
     table = _tables(text, path)
     try:
         config = parse_config(table)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
-    beside = {  # an absolute template stays what it is
+    beside = {  # an absolute template path stays unchanged
         name: dataclasses.replace(target, template=target.template and path.parent / target.template)
         for name, target in config.targets.items()
     }
@@ -1097,7 +1085,7 @@ def config_of(text: str, path: Path) -> RigConfig:
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """The tables of a rig.toml as it stands, unchecked.
+    """Read the tables of a rig.toml without checking them.
 
     Raises:
         ConfigError: the file is missing or is not TOML.
@@ -1106,7 +1094,7 @@ def read_tables(path: Path) -> dict[str, Any]:
 
 
 def read_text(path: Path) -> str:
-    """What stands in a rig.toml.
+    """Read the text of a rig.toml.
 
     Raises:
         ConfigError: the file is missing or is no text.
@@ -1131,12 +1119,12 @@ def _tables(text: str, path: Path) -> dict[str, Any]:
 
 
 def parse_config(table: Mapping[str, Any], *, recorded: bool = False) -> RigConfig:
-    """Build the configuration from TOML's tables; what is not said keeps its default.
+    """Build the configuration from TOML's tables; missing keys keep their defaults.
 
     Args:
-        table: as TOML has it.
-        recorded: whether it is a recording's, which opens no simulated world: one that an earlier version had is not
-            refused then.
+        table: tables as TOML gives them.
+        recorded: whether they belong to a recording. It opens no simulated world, so a world that only an earlier
+            version had is not refused.
 
     Raises:
         ConfigError: an unknown key or an impossible value.
@@ -1157,7 +1145,7 @@ def parse_config(table: Mapping[str, Any], *, recorded: bool = False) -> RigConf
 
 
 def _of_kind(targets: Mapping[str, TargetConfig], name: str) -> TargetConfig | None:
-    """The target of that name, or of the name without the number from 2 on at its end."""
+    """Return the target of that name, or of its kind without the number."""
     return targets.get(name) or targets.get(split_name(name)[0])
 
 
@@ -1169,9 +1157,9 @@ def _overlap(own: Pair, soft: Pair | None, where: str) -> Pair:
 
 
 def config_table(config: RigConfig) -> dict[str, Any]:
-    """Write a configuration as `parse_config` reads it.
+    """Convert a configuration to tables that `parse_config` reads.
 
-    Passwords stay behind; and so does what would keep a replay, which moves nothing, from running.
+    Passwords are left out, and so is what would keep a replay from running, such as the stop file.
     """
     table: dict[str, Any] = _as_tables(dataclasses.replace(config, recording=None))
     table["safety"].pop("stop_file", None)

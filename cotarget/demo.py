@@ -1,7 +1,7 @@
-"""The whole method on a simulated rig that nobody has told the software about: calibrate, then follow three targets.
+"""Demonstrate the method in simulation: calibrate a rig from rendered boards, then follow three targets.
 
-The three runs share nothing but the calibration, so they run side by side. A script that calls `run_demo` needs the
-usual ``if __name__ == "__main__"``, because each run is a new process.
+The software knows nothing of the simulated rig but what it measures. The three runs share only the calibration, so they
+run side by side. A script that calls `run_demo` needs ``if __name__ == "__main__"``, because each run is a new process.
 """
 
 import dataclasses
@@ -33,29 +33,29 @@ from cotarget.video import FilmWriter, join_films
 
 SCENES = {"book": "indoor", "person": "indoor", "bird": "outdoor"}
 CALIBRATION_SCENE = "indoor"
-# Two seconds to learn the background, then long enough to acquire and to follow [s].
+# Length of the runs: two seconds to learn the background, then enough to acquire and follow the target [s].
 RUN_S = {"book": 8.0, "person": 11.0, "bird": 11.0}
-# Targets over which the pointing error of the calibration is stated.
+# Number of targets over which the pointing error of the calibration is stated.
 POINTING_TARGETS = 400
-POINTING_STREAM = 4  # of random numbers, apart from the world's own
+POINTING_STREAM = 4  # stream of random numbers for these, independent of the world's
 FRONT_DEG, BACK_DEG = -62.0, 118.0  # directions of the two pictures of the rig
 
-UNFINISHED = ".unfinished-"  # begins the name of the folder that a run works in
-ABANDONED_S = 3600.0  # such a folder that has not changed for so long is of a run that was killed
+UNFINISHED = ".unfinished-"  # prefix of the folder in which a run works
+ABANDONED_S = 3600.0  # age from which such a folder is taken to be left by a killed run
 
 Progress = Callable[[str, int, int], None]
 
 
 def run_demo(out: Path, seed: int, progress: Progress) -> dict[str, Any]:
-    """Calibrate a simulated rig from rendered boards, follow a book, a person and a bird, and write what was seen.
+    """Calibrate a simulated rig from rendered boards, follow a book, a person and a bird, and write the results.
 
     Args:
         out: folder for pictures, video, tables and metrics.json; its files are replaced only when all is done.
-        seed: of everything random.
-        progress: told (what, done, of how much).
+        seed: seed of everything random.
+        progress: called with (what, done, total).
 
     Returns:
-        What metrics.json holds.
+        The content of metrics.json.
     """
     began = time.perf_counter()
     with finished_together(out) as work:
@@ -88,14 +88,14 @@ def run_demo(out: Path, seed: int, progress: Progress) -> dict[str, Any]:
 
 
 def sim_config(scene: str, targets: tuple[str, ...], seed: int) -> RigConfig:
-    """The default rig in a scene with targets."""
+    """Make the default rig in a scene with targets."""
     config = RigConfig()
     return dataclasses.replace(config, sim=dataclasses.replace(config.sim, scene=scene, targets=targets, seed=seed))
 
 
 @contextmanager
 def finished_together(out: Path) -> Iterator[Path]:
-    """Give a folder to work in; its files move to ``out`` only when all went well.
+    """Yield a folder to work in; its files move to ``out`` only when the block ends without an error.
 
     Raises:
         ConfigError: ``out`` cannot be a folder.
@@ -115,7 +115,7 @@ def finished_together(out: Path) -> Iterator[Path]:
 
 
 def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> tuple[Calibration, dict[str, float]]:
-    """Calibrate from rendered boards; judge it by the truth, which it cannot see; picture the rig."""
+    """Calibrate from rendered boards, evaluate the calibration by the ground truth, and draw the rig."""
     world = SimWorld(config)
     with SafeRig(world.rig, config.safety) as rig:
         calibration = calibrate(
@@ -135,7 +135,7 @@ def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> 
                 POINTING_TARGETS,
             )
         )
-        rig.head.move(0.0, 0.0, wait=True)  # where the zoom camera's frame is zoom0
+        rig.head.move(0.0, 0.0, wait=True)  # here the zoom camera's frame is zoom0
         front, back = world.portrait(FRONT_DEG, axes=False), world.portrait(BACK_DEG, axes=True)
         picture = np.hstack(
             [
@@ -151,7 +151,7 @@ def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> 
 
 
 def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, report: Report) -> list[Row]:
-    """Follow one target; write its picture, its rows and its part of the video."""
+    """Follow one target; write its picture and its part of the video, and return its rows."""
     config = sim_config(SCENES[name], (name,), seed)
     target, rate_hz = config.target(name), config.rate_hz
     world = SimWorld(config)
@@ -172,7 +172,7 @@ def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, repo
 
 
 def summary(metrics: dict[str, Any]) -> str:
-    """The figures as a short table for people."""
+    """Format the figures as a short table."""
     pointing = metrics["calibration"]["pointing_error_deg"]
     lines = [
         f"pointing error of the calibration: median {pointing['median']:.4f}, p95 {pointing['p95']:.4f} degrees",

@@ -1,4 +1,4 @@
-"""The fixed camera's detector and tracker on any film: a table of tracks, and the film with the tracks drawn."""
+"""Run the fixed camera's detector and tracker on a film; write a table of tracks, and the film with tracks drawn."""
 
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -19,27 +19,27 @@ from cotarget.tracking.tracker import Tracker
 from cotarget.video import Film, FilmWriter
 
 COLUMNS = ("frame", "t", "track", "u_px", "v_px", "width_px", "height_px", "score")
-# How long a trail is drawn behind a target [s].
+# Length of the trail that is drawn behind a target [s].
 TRAIL_S = 1.0
-# Colours (BGR) that stay apart on sky, grass and asphalt; a track keeps its own.
+# Colours (BGR) that are distinct on sky, grass and asphalt; a track keeps its own.
 COLOURS = ((60, 60, 255), (0, 200, 255), (80, 220, 60), (255, 160, 40), (255, 80, 220), (40, 140, 255), (230, 230, 60))
-# A drawn box keeps this distance from the target [px], so that a bird of five pixels is not painted over.
+# Distance of a drawn box from the target [px], so that it does not cover a bird of five pixels.
 BOX_MARGIN_PX = 4
 Progress = Callable[[int, int | None], None]
 
 
 @dataclass(frozen=True)
 class FilmSummary:
-    """What was found in a film.
+    """Summary of the tracks in a film.
 
     Attributes:
-        frames: how many it has that can be decoded.
-        frames_with_target: in how many of them there was a confirmed track.
-        tracks: how many tracks were confirmed.
-        duration_s: from the first frame to the last [s].
-        rate_hz: frames a second, as the film says.
-        last_frame: number of the last one, from 0; there are fewer frames where some cannot be decoded.
-        shortfall: why there are fewer frames than the film has; None where it is whole, or that cannot be known.
+        frames: number of frames that can be decoded.
+        frames_with_target: number of these with a confirmed track.
+        tracks: number of confirmed tracks.
+        duration_s: time from the first frame to the last [s].
+        rate_hz: frame rate that the film states [Hz].
+        last_frame: number of the last frame, from 0; there are fewer frames if some cannot be decoded.
+        shortfall: why frames are missing; None if the film is whole, or if that cannot be known.
     """
 
     frames: int
@@ -60,21 +60,21 @@ def run_on_film(
     template: Image | None = None,
     keep: bool = False,
 ) -> FilmSummary:
-    """Find and track a target in a film.
+    """Detect and track a target in a film.
 
-    The table has a row for each confirmed track in each frame; in a frame in which the target was not detected
-    and its place is the motion filter's prediction, the score is 0, and in one in which several were seen as one, each
-    has the score of that. Files appear only when complete. A film that is damaged or cut short is gone through where it
-    can be decoded, its frames under the numbers that they have in the whole film, and the summary says so.
+    The table has a row for each confirmed track in each frame. The score is 0 in a frame in which the target was not
+    detected and its place is predicted; a detection that several tracks share gives its score to each. Files appear
+    only when complete. A damaged film is processed as far as it can be decoded, its frames keep the numbers that they
+    have in the whole film, and the summary says so.
 
     Args:
         video: the film.
-        target: what to look for.
-        csv_path: the table to write: frame,t,track,u_px,v_px,width_px,height_px,score.
-        drawn: the film to write with the tracks drawn, if any.
-        progress: told (frames done, frames in all or None) after every frame.
-        template: BGR picture of the target, for a target that is found by its colour.
-        keep: whether what there is so far is kept where the run ends in an error or is interrupted.
+        target: target profile.
+        csv_path: table to write: frame,t,track,u_px,v_px,width_px,height_px,score.
+        drawn: film to write with the tracks drawn, if any.
+        progress: called with (frames done, frames in all or None) after every frame.
+        template: image of the target for the detector "colour", BGR.
+        keep: whether to keep the results so far if the run ends in an error or is interrupted.
 
     Raises:
         CotargetError: the film cannot be read, or a file cannot be written.
@@ -99,7 +99,7 @@ def _run(
     progress: Progress | None,
     template: Image | None,
 ) -> FilmSummary:
-    """Go through the film once."""
+    """Process the film once."""
     detector = make_detector(target, film.rate_hz, template)
     tracker = Tracker(settings_for(target), film.size)
     trails = Trails()
@@ -124,20 +124,20 @@ def _run(
 
 
 def _row(index: int, t: float, track: Track) -> list[str]:
-    """A track's line of the table."""
+    """Format a track's line of the table."""
     numbers = (*track.center_px, *track.size_px)
     score = track.score if track.missed == 0 else 0.0
     return [str(index), f"{t:.4f}", str(track.id), *(f"{x:z.2f}" for x in numbers), f"{score:.3f}"]
 
 
 class Trails:
-    """Draws tracks as boxes with their number and the way they came."""
+    """Draw tracks as boxes with their id and their trail."""
 
     def __init__(self) -> None:
         self._trails: dict[int, deque[tuple[float, Array]]] = {}
 
     def draw(self, image: Image, tracks: Iterable[Track], t: float) -> Image:
-        """Draw confirmed tracks onto a copy of an image; a box is thin while its target is only predicted."""
+        """Draw confirmed tracks on a copy of an image; a box is thin while its target is only predicted."""
         image = image.copy()
         tracks = [track for track in tracks if track.confirmed]
         for track in tracks:

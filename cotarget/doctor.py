@@ -1,4 +1,4 @@
-"""Looks at this machine: versions, rendering, film codec, and the command that fixes what is missing."""
+"""Examine this machine: versions, rendering, film codec and devices, with the command that fixes what is missing."""
 
 import importlib.metadata
 import os
@@ -28,7 +28,7 @@ PACKAGES = (
     "tqdm",
 )
 OLDEST_PYTHON = (3, 11)
-# Rendering is tried in a process of its own, because a broken OpenGL may take its process with it.
+# Rendering is tried in its own process, because a broken OpenGL may crash it.
 RENDER = (
     "from cotarget.sim.render.opengl import BACKEND, make_renderer, mujoco;"
     "m = mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size=\"1\"/></worldbody></mujoco>');"
@@ -39,7 +39,7 @@ RENDER_TIMEOUT_S = 60.0
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at: whether it is well, what was found, and the command that fixes it."""
+    """Result of one check: whether it is well, what was found, and the command that fixes it."""
 
     name: str
     ok: bool
@@ -48,7 +48,7 @@ class Finding:
 
 
 def examine(config: "RigConfig | None" = None) -> list[Finding]:
-    """Look at everything that cotarget needs; with a rig's config also at its devices, by questions that do no harm."""
+    """Examine everything that cotarget needs; with a rig's configuration also its devices, without moving anything."""
     found = [
         _python(),
         *map(_package, PACKAGES),
@@ -141,7 +141,7 @@ def _gphoto_cameras(needed: bool) -> Finding:
 
 
 def _emergency_stop(config: "RigConfig") -> Finding:
-    """Whether an operator has stopped the head."""
+    """Check whether an operator has stopped the head."""
     from cotarget.safety import refuse_if_stopped
 
     name, path = "emergency stop", config.safety.stop_file
@@ -157,7 +157,7 @@ def _emergency_stop(config: "RigConfig") -> Finding:
 
 
 def _position(config: "RigConfig") -> Finding:
-    """Whether anybody has noted that the head is not where it says."""
+    """Check whether the head's position is marked as lost."""
     from cotarget.drivers.interlock import PositionLostMarker
 
     try:
@@ -168,7 +168,7 @@ def _position(config: "RigConfig") -> Finding:
 
 
 def _devices(hardware: "HardwareConfig") -> list[Finding]:
-    """Ask the devices who they are."""
+    """Ask each device for its identity."""
     from cotarget.drivers import axis, board, gphoto, ptu_d46
 
     head, zoom = hardware.head, hardware.zoom
@@ -191,7 +191,7 @@ def _devices(hardware: "HardwareConfig") -> list[Finding]:
 
 
 def _fix(error: CotargetError, name: str, there: str) -> str:
-    """What helps with a device that does not answer as it should."""
+    """Return the command or advice that helps with a device that does not answer as it should."""
     from cotarget.drivers.axis import LoginError
     from cotarget.drivers.serial_line import InUseError, NoPermissionError
 

@@ -1,7 +1,4 @@
-"""Pictures from Steps: side by side frames, one picture a target, and the aim error over time.
-
-Plots of a run, by matplotlib.
-"""
+"""Draw Steps and runs: frames side by side, one picture for each target, and plots of the aim error over time."""
 
 import math
 import textwrap
@@ -23,17 +20,17 @@ from cotarget.pipeline import State, Step
 from cotarget.rig import Image
 
 OFFSET, FOCAL = "#1f6f8b", "#777777"  # colours of the curves
-ROOM = 1.25  # above and below the focal lengths, as a factor
+ROOM = 1.25  # margin above and below the focal lengths, as a factor
 
 
 def plot_aim_error(path: Path, rows: Mapping[str, Sequence[Row]]) -> None:
-    """Draw the target's offset from the centre of the zoom image over time, one panel a target, into a PNG."""
+    """Plot the target's offset from the zoom image's centre over time, one panel for each target, into a PNG."""
     with matplotlib.rc_context({"font.size": 9}):
         aim_error_figure(rows).savefig(path, dpi=110)
 
 
 def aim_error_figure(rows: Mapping[str, Sequence[Row]]) -> Figure:
-    """The same as a figure, with the legend beside the panels and not on them."""
+    """Make the figure of `plot_aim_error`, with the legend outside the panels."""
     focals = [end(row.focal_px for run in rows.values() for row in run) for end in (min, max)]
     figure = Figure(figsize=(8, 2.4 * len(rows)), layout="constrained")
     FigureCanvasAgg(figure)
@@ -68,17 +65,17 @@ FOUND, FOLLOWED, CROSS, INK, PAPER, ARROW = (
     (0, 120, 235),
 )
 STRIP_PX = 36  # height of a caption
-SIZE_KNOWN_S = 1.5  # a target that has just come in is still cut by the border, or not yet seen with wings spread
-RECENT_STEPS = 16  # states kept to tell what the lens was when a frame was exposed; more than any latency needs
-# For the close-up, focal length (relative) and target (over the image's width) are this near to what is wanted.
+SIZE_KNOWN_S = 1.5  # time after which a target's size is known: it may have been clipped, or not seen with wings spread
+RECENT_STEPS = 16  # states kept to interpolate the lens at a frame's exposure; more than any latency needs
+# Largest deviations for a picture of the close-up: of the focal length (relative), and of the target (over the width).
 SETTLED = 0.08
-CENTRED = 0.04  # so near to the middle, over the image's width, is what is shown as centred before it is close up
+CENTRED = 0.04  # largest distance of a target from the centre that is shown as centred, over the image's width
 REASON_SCALE, REASON_LETTER_PX, REASON_LINE_PX, REASON_MARGIN_PX = 0.45, 8, 16, 8  # few letters are wider
-BOX_MARGIN_PX = 4  # a box stands this far outside of what it marks
+BOX_MARGIN_PX = 4  # distance of a drawn box from the target
 
 
 def write_text(image: Image, text: str, at: Sequence[float] | Array, scale: float = 0.55, *, halo: bool = True) -> None:
-    """Write text into an image, in dark ink; with a light halo where the background is a picture."""
+    """Write text into an image in dark ink, with a light halo for pictures as a background."""
     u, v = round(at[0]), round(at[1])
     font = cv2.FONT_HERSHEY_SIMPLEX
     for du, dv in ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, 1), (-1, 1), (1, -1)) if halo else ():
@@ -90,20 +87,20 @@ def write_picture(path: Path, image: Image) -> None:
     """Write an image as PNG, in one step.
 
     Raises:
-        ConfigError: it cannot be written.
+        ConfigError: the file cannot be written.
     """
     write_whole(path, cv2.imencode(".png", image)[1].tobytes())
 
 
 def captioned(image: Image, text: str) -> Image:
-    """An image with a caption below."""
+    """Append a caption below an image."""
     strip = np.full((STRIP_PX, image.shape[1], 3), PAPER, np.uint8)
     write_text(strip, text, (10, STRIP_PX - 12), halo=False)
     return np.vstack([image, strip])
 
 
 def draw_wide(step: Step) -> Image:
-    """The wide view with every confirmed track's box, the one followed in another colour, (H, W, 3)."""
+    """Draw the fixed camera's frame with every confirmed track's box, the followed one in another colour, (H, W, 3)."""
     image = step.fixed.image.copy()
     for track in step.tracks:
         if not track.confirmed:
@@ -118,7 +115,7 @@ def draw_wide(step: Step) -> Image:
 
 
 def draw_zoom(step: Step) -> Image:
-    """The zoom view with a small cross at its centre."""
+    """Draw the zoom camera's frame with a small cross at its centre."""
     image = step.zoom.image.copy()
     u, v = image.shape[1] // 2, image.shape[0] // 2
     for a, b in (
@@ -132,14 +129,14 @@ def draw_zoom(step: Step) -> Image:
 
 
 def side_by_side(step: Step, title: str) -> Image:
-    """One frame of the video: the wide view with its detection, the zoom view, and what the loop does."""
+    """Draw one frame of the video: both cameras' frames, with the detection and the state of the pipeline."""
     pan, tilt = np.degrees(step.head.pan), np.degrees(step.head.tilt)
     depth = f"depth {step.aim.depth:5.1f} m" if step.aim is not None else ""
     wide = captioned(
         _explained(draw_wide(step), step.reason), f"{title}   t = {step.fixed.t:5.2f} s   {step.state}   {depth}"
     )
     zoomed = draw_zoom(step)
-    if zoomed.shape[0] < step.fixed.image.shape[0]:  # a preview: as high as the wide view, for the eye
+    if zoomed.shape[0] < step.fixed.image.shape[0]:  # enlarge a small viewfinder frame to the fixed frame's height
         factor = step.fixed.image.shape[0] / zoomed.shape[0]
         zoomed = np.asarray(cv2.resize(zoomed, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC), np.uint8)
     close = captioned(
@@ -154,7 +151,7 @@ def side_by_side(step: Step, title: str) -> Image:
 
 
 def _explained(image: Image, reason: str) -> Image:
-    """Write why the loop does what it does onto the foot of an image, in as many lines as it takes."""
+    """Write the reason of a state at the bottom of an image, wrapped to its width."""
     lines = textwrap.wrap(reason, max(1, (image.shape[1] - 2 * REASON_MARGIN_PX) // REASON_LETTER_PX))
     for number, line in enumerate(reversed(lines)):
         at = (REASON_MARGIN_PX, image.shape[0] - REASON_MARGIN_PX - number * REASON_LINE_PX)
@@ -163,14 +160,14 @@ def _explained(image: Image, reason: str) -> Image:
 
 
 class TargetStages:
-    """Picks from a run of Steps what one picture of a target shows: before, centred, and close up.
+    """Choose the Steps for the picture of a target: before, centred, and close-up.
 
-    It judges by what the loop itself knows: where it found the target in a zoom view, and where the lens said that it
-    was when that was exposed.
+    It uses what the pipeline itself knows: the target's place in a zoom frame, and the reported focal length at the
+    frame's exposure.
     """
 
     def __init__(self, shortest_px: float) -> None:
-        """Begin; ``shortest_px`` is the shortest nominal focal length."""
+        """Create an empty choice; ``shortest_px`` is the shortest nominal focal length."""
         self._shortest = shortest_px
         self._largest, self._widest, self._since = 0.0, math.inf, math.inf
         self._recent: deque[Step] = deque(maxlen=RECENT_STEPS)
@@ -179,7 +176,7 @@ class TargetStages:
         self.close: Step | None = None
 
     def see(self, step: Step) -> None:
-        """Take a Step into account."""
+        """Consider a Step."""
         self._recent.append(step)
         if self.before is None or (step.target is None and self.centred is None):
             self.before = step
@@ -193,17 +190,17 @@ class TargetStages:
             return
         size = float(np.max(step.target.box.size_px))
         settled = abs(math.log(focal_px / step.aim.nominal_px)) < SETTLED
-        alone = not step.target.shared  # or else the box is as large as all that it covers
+        alone = not step.target.shared  # a shared box is as large as all that it covers
         if alone and settled and away < SETTLED and size > self._largest:
             self._largest, self.close = size, step
 
     def _focal_of_view(self) -> float:
-        """Focal length of the latest zoom frame, which is older than the lens's latest state [px]."""
+        """Focal length of the newest zoom frame, which is older than the newest state of the lens [px]."""
         t, focal = [s.lens.t for s in self._recent], [s.lens.focal_px for s in self._recent]
         return float(np.interp(self._recent[-1].zoom.t, t, focal))
 
     def picture(self, title: str) -> Image:
-        """Both views of a target in six panels, as in Fig. 4 to 6: found, before, centred, close up."""
+        """Draw both cameras' frames of a target in six panels, as in Figs. 4 to 6."""
         missing = next(s for s in (self.close, self.centred, self.before) if s is not None)
         before, centred, close = self.before or missing, self.centred or missing, self.close or missing
         mask = np.zeros(close.fixed.image.shape[:2], np.uint8) if close.mask is None else close.mask
@@ -219,7 +216,7 @@ class TargetStages:
         return np.vstack([np.hstack(panels[i : i + 2]) for i in range(0, len(panels), 2)])
 
     def _enlarged(self, step: Step) -> Image:
-        """What the wide view alone has of the target, at the close-up's scale (both lenses being alike when short)."""
+        """Enlarge the fixed frame around the target to the close-up's scale (if both lenses are alike when short)."""
         image = step.fixed.image
         if step.target is None:
             return image
@@ -234,7 +231,7 @@ class TargetStages:
 
 
 def _off_center(step: Step) -> float:
-    """How far from the middle of a Step's zoom view the target was found, over its width; infinite where it was not."""
+    """Distance of the target from the centre of a Step's zoom frame, over its width; infinite if it was not found."""
     height, width = step.zoom.image.shape[:2]
     if step.found is None or step.found.t != step.zoom.t:
         return math.inf
@@ -242,10 +239,10 @@ def _off_center(step: Step) -> float:
 
 
 def draw_frames(image: Image, origins_px: Mapping[str, Array]) -> Image:
-    """The picture of a rig at pan = tilt = 0 with the names of its frames, Gamma and T, as in Fig. 2.
+    """Label a picture of a rig at pan = tilt = 0 with its frames, Gamma and T, as in Fig. 2.
 
     Args:
-        image: the rig.
+        image: picture of the rig.
         origins_px: pixels of the origins of the frames fixed, zoom and base, (2,) each.
     """
     image = image.copy()

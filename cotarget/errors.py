@@ -1,4 +1,4 @@
-"""The exceptions that a user of cotarget may meet; each message is one line that names what is wrong."""
+"""Define cotarget's exceptions; each message is one line that names what is wrong."""
 
 from collections.abc import Iterable
 
@@ -8,11 +8,11 @@ class CotargetError(Exception):
 
 
 class ConfigError(CotargetError):
-    """A configuration or a file does not say what it should."""
+    """A configuration, an argument or a file is invalid."""
 
 
 class MissingPackageError(CotargetError):
-    """A package that only some uses need is not installed."""
+    """An optional package is needed and not installed."""
 
 
 class CalibrationError(CotargetError):
@@ -20,7 +20,7 @@ class CalibrationError(CotargetError):
 
 
 class DeviceError(CotargetError):
-    """A camera, the pan-tilt unit or the renderer did not do what was asked."""
+    """A camera, the pan-tilt unit or the renderer failed."""
 
 
 class StaleFrameError(DeviceError):
@@ -28,7 +28,7 @@ class StaleFrameError(DeviceError):
 
 
 class HaltedError(DeviceError):
-    """A move did not come to its end because the head was halted, or sent elsewhere; it may be commanded again."""
+    """A move ended before its goal, because the head was halted or sent elsewhere; it may be commanded again."""
 
 
 class EmergencyStopError(DeviceError):
@@ -36,9 +36,9 @@ class EmergencyStopError(DeviceError):
 
 
 class UnreachableError(CotargetError):
-    """No pan and tilt within the limits brings the target to the wanted pixel."""
+    """No pan and tilt within the limits bring the target to the wanted pixel."""
 
 
 def choices(names: Iterable[str]) -> str:
-    """Format valid choices for the end of an error message."""
+    """Format the valid choices for the end of an error message."""
     return ", ".join(sorted(names)) or "none"

@@ -1,8 +1,8 @@
-"""Puts Steps and calibrations beside a simulated world's truth, which the pipeline cannot see.
+"""Compare Steps and calibrations with the simulation's ground truth, and stand in for detectors by the truth.
 
-What a pipeline may be told by the simulation's truth, where it shall not find out by itself.
-
-Detections and finds without pictures, and a calibration without error: for runs that need neither rendering nor boards.
+The pipeline cannot see the ground truth. `observe` and `pointing_errors` evaluate with it. `TruthDetector`,
+`TruthFinder` and `true_calibration` replace detector, registration and calibration by the truth with noise, for runs
+that need neither rendering nor boards.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ from cotarget.tracking.track import Track
 
 
 def true_calibration(world: SimWorld, stops: int = 8) -> Calibration:
-    """What a calibration of a world's rig without any error would be, at focal lengths even in the logarithm."""
+    """Make the calibration of a world's rig without any error, with zoom samples even in the logarithm."""
     sim, truth = world.config.sim, world.truth()
     nominal = tuple(float(f) for f in np.geomspace(*truth.focal_range, stops))
     lenses = [truth.zoom_lens_for(f) for f in nominal]
@@ -51,24 +51,24 @@ def true_calibration(world: SimWorld, stops: int = 8) -> Calibration:
     )
 
 
-# Seeds so far apart are another's random numbers: what a detector and what a finder err by is independent.
+# Distance of seeds, so that the errors of detector and finder are independent.
 FINDER_SEED = 1 << 33
-# Gives the random numbers of a time [s]; they are to be drawn before those of another time are asked for.
+# Gives the random numbers of a time [s]; draw them before those of another time are requested.
 NumbersAt = Callable[[float], np.random.Generator]
 
 
 def seeded(seed: int) -> NumbersAt:
-    """Random numbers of each time, by a generator of its own."""
+    """Make random numbers for each time, by a new generator each."""
     return lambda t: np.random.default_rng((seed, microseconds(t)))
 
 
 def counted(seed: int) -> NumbersAt:
-    """Others, ten times as quick: one generator that counts, and is told for each time where to begin."""
+    """Make random numbers for each time by one counter-based generator, ten times as fast as `seeded`."""
     bits = np.random.Philox(key=seed)
     rng, begin = np.random.Generator(bits), bits.state
 
     def at(t: float) -> np.random.Generator:
-        begin["state"]["counter"][1] = microseconds(t)  # it counts in [0], and never so far
+        begin["state"]["counter"][1] = microseconds(t)  # the generator counts in [0], which never overflows here
         bits.state = begin
         return rng
 
@@ -76,22 +76,22 @@ def counted(seed: int) -> NumbersAt:
 
 
 def microseconds(t: float) -> int:
-    """A time [s] as a whole number, by which what is of that time is found again."""
+    """Round a time [s] to whole microseconds, as a key."""
     return round(t * 1e6)
 
 
 @dataclass(frozen=True)
 class TruthNoise:
-    """How a detector errs.
+    """Errors of a simulated detector.
 
     Attributes:
-        center_px: standard deviation of the box's middle along each axis [px].
-        size: standard deviation of its sides, relative.
-        miss: part of the frames in which a target is not found.
-        smallest_px: a target whose larger side is smaller is not found [px].
+        center_px: standard deviation of the box's centre along each axis [px].
+        size: relative standard deviation of the box's sides.
+        miss: part of the frames in which a target is not detected.
+        smallest_px: least larger side of a detected target [px].
 
     Raises:
-        ConfigError: a number is below 0, or misses are more than all.
+        ConfigError: a number is below 0, or `miss` is above 1.
     """
 
     center_px: float = 0.5
@@ -100,7 +100,7 @@ class TruthNoise:
     smallest_px: float = 4.0
 
     def __post_init__(self) -> None:
-        """Refuse what is no noise."""
+        """Refuse values that are no noise."""
         for name, value in asdict(self).items():
             if not (isinstance(value, Real) and 0 <= float(value) < math.inf):
                 raise ConfigError(f"noise.{name}: {value!r} is not a number from 0 on")
@@ -109,9 +109,9 @@ class TruthNoise:
 
 
 class TruthDetector:
-    """Finds the targets where they truly are in a camera, with noise; needs no picture and sees no clutter.
+    """Detect the targets by ground truth with noise, without an image and without clutter.
 
-    What it finds in a frame depends on the seed and on the frame's time alone. What hides a target is not considered.
+    The detections of a frame depend on the seed and the frame's time alone. Occlusion is not considered.
     """
 
     mask: Image | None = None
@@ -125,27 +125,27 @@ class TruthDetector:
         numbers: Callable[[int], NumbersAt] = seeded,
         camera: CameraName = "fixed",
     ) -> None:
-        """Begin.
+        """Create a detector.
 
         Args:
-            truth: of the world whose frames are asked about.
-            seed: of the noise.
-            noise: how it errs.
-            names: the targets to find; all by default.
+            truth: ground truth of the world.
+            seed: seed of the noise.
+            noise: errors of the detections.
+            names: names of the targets to detect; all by default.
             numbers: makes the random numbers of the seed.
-            camera: whose frames are searched; the fixed one's by default.
+            camera: camera whose frames are searched; the fixed one by default.
         """
         self._camera = camera
         self._truth, self._noise, self._numbers_at = truth, noise, numbers(seed)
         self._names = tuple(truth.targets if names is None else names)
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """Find the targets, largest first."""
+        """Detect the targets, largest first."""
         noise, size = self._noise, self._truth.lens(self._camera, frame.t).size
         rng = self._numbers_at(frame.t)
         found = []
         for name in self._names:
-            # Drawn whether the target is seen or not, so that none changes another's.
+            # Draw whether the target is seen or not, so that no target changes another's noise.
             draws, luck = rng.normal(size=4).tolist(), rng.random()
             box = self._truth.box(name, self._camera, frame.t)
             if box is None or luck < noise.miss:
@@ -165,13 +165,13 @@ class TruthDetector:
 
 
 class TruthFinder:
-    """Finds a target in the zoom view where it truly is, with noise, if it is looked for there; needs no picture.
+    """Find a target in the zoom image by ground truth with noise, if it is where it is expected; without an image.
 
-    To be given to the loop as `FollowSettings.finder`. What it finds is the middle of the body, as the real one means
-    to. What hides a target is not considered.
+    It is meant for `FollowSettings.finder`. Like the real finder it gives the body's centre. Occlusion is not
+    considered.
     """
 
-    SIGMA_PX = 1.0  # of the noise; the real finder assumes that lens, head and the times of frames leave as much
+    SIGMA_PX = 1.0  # of the noise; the real finder assumes as much for lens, head and frame times
 
     def __init__(
         self,
@@ -182,29 +182,29 @@ class TruthFinder:
         seed: int,
         missed: Callable[[float], bool] = lambda t: False,
     ) -> None:
-        """Begin.
+        """Create a finder.
 
         Args:
-            calibration: of the rig.
-            target: what is told of the target.
-            truth: of the world whose frames are asked about.
-            name: of the target.
-            seed: of the noise.
-            missed: whether it is not found in a frame, by the time when that was exposed [s].
+            calibration: calibration of the rig.
+            target: target profile.
+            truth: ground truth of the world.
+            name: name of the target.
+            seed: seed of the noise.
+            missed: whether the target is not found in a frame, by its exposure time [s].
         """
         self._view = CloseupFinder(calibration, target).view
         self._truth, self._name, self._missed = truth, name, missed
         self._numbers_at = counted(seed + FINDER_SEED)
 
     def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> None:
-        """Nothing of it is remembered."""
+        """Do nothing: the ground truth is always known."""
 
     def sight_at(self, t: float) -> bool:
-        """The truth is there at any time."""
+        """Return True: the ground truth is known at any time."""
         return True
 
     def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
-        """Find the target; None where its middle is not in the frame, or not where it is expected."""
+        """Find the target; None if its centre is outside the frame or outside the gate."""
         view, box = self._view(expected), self._truth.box(self._name, "zoom", frame.t)
         if view is None or box is None or self._missed(frame.t):
             return None
@@ -218,40 +218,40 @@ class TruthFinder:
         return ZoomMeasurement(at, self.SIGMA_PX, np.full(2, self.SIGMA_PX), 1.0, 1.0, np.ptp(box, axis=0), frame.t)
 
 
-# Pointing error is stated for targets at these depths, all over the wide view [m].
+# Depths of the targets for which pointing errors are stated, over the whole fixed image [m].
 POINTING_DEPTHS = (4.0, 30.0)
-# Whence the markers are that the simulated targets carry; sim_assets/make_assets.py draws them.
+# Dictionary of the simulated targets' markers; sim_assets/make_assets.py draws them.
 MARKERS = cv2.aruco.DICT_4X4_50
-# A marker is sought in its target's true box, widened on each side by this part of the larger side ...
+# A marker is searched in its target's true box, widened on each side by this part of the larger side ...
 SEARCH_MARGIN = 0.25
-SEARCH_PX = 8.0  # ... and by this, for what a moving target smears and the finder's windows need [px]
-ENLARGED = 2  # times for the finder, which wants some eight pixels a cell of what can be read at four
+SEARCH_PX = 8.0  # ... plus this, for motion blur and the windows of the marker detector [px]
+ENLARGED = 2  # magnification for the marker detector, which needs some eight pixels per cell where four are readable
 
 
 def add_row(rows: list[Row], step: Step, truth: Truth, name: str, target: TargetConfig) -> None:
-    """Append a Step's row, unless its zoom frame is the one that the last row is of.
+    """Append a Step's row, unless its zoom frame has a row already.
 
     A zoom camera slower than the fixed one has no new frame in some Steps; those frames would count twice.
 
     Args:
-        rows: of the Steps before, oldest first; grows by one where the zoom frame is new.
-        step: of the loop.
-        truth: of the simulated world.
-        name: of the target that is followed.
-        target: gives its dimension and the size wanted.
+        rows: rows of earlier Steps, oldest first; extended in place.
+        step: step of the pipeline.
+        truth: ground truth of the simulated world.
+        name: name of the followed target.
+        target: target profile, for the dimension and the wanted size.
     """
     if not rows or step.zoom.t > rows[-1].t_s:
         rows.append(observe(step, truth, name, target))
 
 
 def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
-    """Put a Step beside the truth: its zoom frame, and its fixed frame, each at its own time.
+    """Compare a Step with the ground truth: its zoom frame and its fixed frame, each at its own time.
 
     Args:
-        step: of the loop.
-        truth: of the simulated world.
-        name: of the target that is followed.
-        target: gives its dimension and the size wanted.
+        step: step of the pipeline.
+        truth: ground truth of the simulated world.
+        name: name of the followed target.
+        target: target profile, for the dimension and the wanted size.
     """
     t, t_fixed = step.zoom.t, step.fixed.t
     outline = truth.silhouette(name, "zoom", t)
@@ -259,7 +259,7 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
     wide_px = truth.pixel("fixed", truth.center(name, t_fixed), t_fixed)
     wide_outlines = {each: truth.silhouette(each, "fixed", t_fixed) for each in truth.targets}
     wide_outline = wide_outlines[name]
-    marker = marker_of(name) if split_name(name)[0] in TARGETS else None  # a user's own carries none
+    marker = marker_of(name) if split_name(name)[0] in TARGETS else None  # a user's own target has no marker
     pan, tilt = truth.head_at(t)
     followed = step.target
     alone = followed is not None and not followed.missed and not followed.shared
@@ -294,19 +294,19 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
 
 
 def closeup_of(truth: Appearances, name: str, target: TargetConfig, t: float) -> Closeup:
-    """What the zoom camera shows of a target at a time.
+    """Ground truth of a target in the zoom camera at a time.
 
     Args:
-        truth: of the simulated world.
-        name: of the target.
-        target: gives its dimension and the size wanted.
-        t: the zoom frame's [s].
+        truth: ground truth of the simulated world.
+        name: name of the target.
+        target: target profile, for the dimension and the wanted size.
+        t: time of the zoom frame [s].
     """
     return _closeup(truth, name, target, t, truth.silhouette(name, "zoom", t))
 
 
 def _closeup(truth: Appearances, name: str, target: TargetConfig, t: float, outline: Silhouette | None) -> Closeup:
-    """The same by the target's outline."""
+    """Compute the close-up from the target's outline in the zoom image; None for a target behind the camera."""
     lens = truth.lens("zoom", t)
     u, v = truth.center_px(name, "zoom", t).tolist()
     size = math.nan
@@ -329,12 +329,12 @@ def _closeup(truth: Appearances, name: str, target: TargetConfig, t: float, outl
 def decodes(frame: Frame, outline: Silhouette | None, marker: int) -> bool:
     """Whether a target's marker can be read in a frame.
 
-    It is sought about the target's true box only: that is quick, and a marker elsewhere is not this target's.
+    Only the surroundings of the target's true box are searched: that is fast, and a marker elsewhere is another's.
 
     Args:
-        frame: of either camera.
-        outline: the target's true one in it.
-        marker: its number in MARKERS.
+        frame: frame of either camera.
+        outline: true outline of the target in it.
+        marker: id of the marker in MARKERS.
     """
     if outline is None or outline.visible <= 0:
         return False
@@ -350,25 +350,25 @@ def decodes(frame: Frame, outline: Silhouette | None, marker: int) -> bool:
 
 
 def off_target(tracks: Iterable[Track], outlines: Iterable[Silhouette | None]) -> list[int]:
-    """Numbers of the confirmed tracks that are on no target.
+    """List the ids of confirmed tracks that are on no target.
 
     Args:
-        tracks: at a fixed frame's time.
-        outlines: the targets' true ones in it; a track is off a target when it is farther from the middle of its box
-            than the box's larger side.
+        tracks: tracks at a fixed frame's time.
+        outlines: true outlines of the targets in it; a track is on a target if its distance from the centre of the box
+            is at most the box's larger side.
     """
     found = [outline for outline in outlines if outline is not None]
     return [track.id for track in tracks if track.confirmed and not any(_is_on(track, each) for each in found)]
 
 
 def on_target(tracks: Iterable[Track], outlines: Mapping[str, Silhouette | None]) -> list[tuple[int, str]]:
-    """Confirmed tracks that a frame shows alone, each with every target that it is on, the nearest first.
+    """List confirmed tracks with a detection of their own, each with every target that it is on, the nearest first.
 
-    One that coasts is where nobody looks, and one in a box with others is on them all.
+    A coasting track is no evidence, and one that shares a box with others would be on all of them.
 
     Args:
-        tracks: at a fixed frame's time.
-        outlines: the targets' true ones in it, by name.
+        tracks: tracks at a fixed frame's time.
+        outlines: true outlines of the targets in it, by name.
     """
     seen = [track for track in tracks if track.confirmed and not track.missed and not track.shared]
     return [
@@ -383,12 +383,12 @@ def on_target(tracks: Iterable[Track], outlines: Mapping[str, Silhouette | None]
 
 
 def _is_on(track: Track, outline: Silhouette) -> bool:
-    """Whether a track is no farther from the middle of an outline's box than the box's larger side."""
+    """Whether a track's distance from the centre of an outline's box is at most the box's larger side."""
     return _off_px(track, outline) <= float(outline.size_px.max())
 
 
 def _off_px(track: Track, outline: Silhouette) -> float:
-    """From the middle of an outline's box to a track [px]."""
+    """Distance of a track from the centre of an outline's box [px]."""
     return float(np.linalg.norm(track.center_px - (outline.low_px + outline.high_px) / 2))
 
 
@@ -402,20 +402,20 @@ def pointing_errors(
     nominal_px: float | None = None,
     step: float = 0.0,
 ) -> Array:
-    """Pointing error of a calibration: pixel and depth given exactly.
+    """Compute pointing errors of a calibration, for exact pixels and depths.
 
     Args:
-        calibration: to be judged.
-        truth: of the simulated world that it is of.
+        calibration: calibration to evaluate.
+        truth: ground truth of the simulated world.
         reach: limits of head and lens.
-        rng: draws the targets, evenly over the wide image and over depth.
-        count: how many targets.
+        rng: draws the targets, uniform over the fixed image and over depth.
+        count: number of targets.
         method: the exact inverse, or the paper's shortcut.
-        nominal_px: what the zoom camera's device calls the focal length [px]; the shortest by default.
-        step: to which the head's angles are rounded [rad]; 0 for not at all, which is how the error is stated.
+        nominal_px: nominal focal length of the zoom camera [px]; the shortest by default.
+        step: step to which the head's angles are rounded [rad]; 0 for none, as pointing errors are defined.
 
     Returns:
-        Angle between the line of sight and the true target for each that can be reached [rad], (n,), n <= count.
+        Angle between the line of sight and the true target, for each reachable target [rad], (n,), n <= count.
     """
     lens = truth.fixed_lens
     errors = []

@@ -1,10 +1,7 @@
-"""Files that appear under their name only when complete, and that one run at a time writes.
+"""Write files atomically: a file gets its name only when it is complete, and one run at a time writes it.
 
-Where the files that come with cotarget lie.
-
-Files that are either the old one or the new one, never half of one.
-
-Signals that would end the program, held back while what must not stay half done is done: a halt, a file's end.
+`PartFile` locks and replaces a file, `HeldSignals` defers signals meanwhile, and `CsvFile` writes tables. `assets_dir`
+finds the files that are installed with cotarget.
 """
 
 import contextlib
@@ -23,17 +20,14 @@ from cotarget.errors import CalibrationError, ConfigError, CotargetError
 
 
 def assets_dir() -> Path:
-    """The folder sim_assets: inside the installed package, or beside it in a checkout."""
+    """Return the folder sim_assets: inside the installed package, or beside it in a checkout."""
     package = Path(__file__).parent
     inside = package / "sim_assets"
     return inside if inside.is_dir() else package.parent / "sim_assets"
 
 
-# --- atomic ---
-
-
 def write_atomically(path: Path, data: bytes) -> None:
-    """Replace a file's content in one step, also when the program or the power fails half-way.
+    """Replace a file's content in one step, even if the program or the power fails halfway.
 
     Raises:
         CalibrationError: the file cannot be written, or another run is writing it.
@@ -44,19 +38,19 @@ def write_atomically(path: Path, data: bytes) -> None:
         raise CalibrationError(str(error)) from None
 
 
-# --- heldsignals ---
+# Deferred signals
 
-# Signals that would end the process on the spot: a polite request, a terminal or connection that has gone, Ctrl-\.
+# Signals that end the process at once: a request, a closed terminal or connection, and Ctrl-\.
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name))
 HELD = (signal.SIGINT, *ENDING)
-# So many signals end even that, once they are let: a wait for devices or disks that do not answer.
+# Number of signals that end even a critical section, once that is allowed: a wait for devices or disks without answer.
 IMPATIENCE = 3
 
 
 class HeldSignals:
-    """Keeps Ctrl-C and SIGTERM back; they are delivered afterwards.
+    """Defer SIGINT, SIGTERM and other ending signals during a critical section, and deliver them after it.
 
-    Only the main thread gets signals, so elsewhere there is nothing to hold.
+    Only the main thread receives signals, so in other threads there is nothing to defer.
     """
 
     def __init__(self) -> None:
@@ -65,7 +59,7 @@ class HeldSignals:
         self._may_hurry = False
 
     def hold(self) -> None:
-        """From now on note signals; may be called again where a signal cut it short."""
+        """Start to defer signals; may be called again if a signal interrupted it."""
         if threading.current_thread() is not threading.main_thread():
             return
         for number in HELD:
@@ -75,18 +69,18 @@ class HeldSignals:
                 signal.signal(number, self._note)
 
     def let_hurry(self) -> None:
-        """From now on enough signals end the wait, as after the head's halt."""
+        """From now on let `IMPATIENCE` signals end the critical section, for example after the head was halted."""
         self._may_hurry = True
 
     def restore(self) -> None:
-        """Put the former handlers back."""
+        """Restore the previous handlers."""
         while self._previous:
             number, previous = self._previous.popitem()
             if signal.getsignal(number) == self._note:
                 signal.signal(number, previous)
 
     def deliver(self) -> None:
-        """Let the signal act that was held back, if there was one."""
+        """Raise the first deferred signal, if there was one."""
         if self.pending:
             signal.raise_signal(self.pending[0])
 
@@ -96,35 +90,35 @@ class HeldSignals:
             raise KeyboardInterrupt
 
 
-# A small file is written in less, so that who finds it being written waits for it, for so long at most [s].
+# Longest wait for another run that is writing a small file [s]; writing takes less.
 PATIENCE_S = 5.0
-LOOK_S = 0.01  # between looks whether it is [s]
+LOOK_S = 0.01  # interval of the attempts meanwhile [s]
 
 
 def behind_link(path: Path) -> Path:
-    """The file that a name stands for: a link's goal, which may not exist yet, or else the name itself."""
+    """Resolve a symbolic link to its target, which may not exist yet; return other paths unchanged."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 class PartFile:
-    """The file beside a result in which it is written, and which gets the result's name in one step.
+    """Temporary file beside a result, which gets the result's name in one step.
 
-    It has the same name in every run and is locked as long as its run lives: a second run on the same result is
-    refused, where it does not wait, and what a killed one has left is taken over.
+    It has the same name in every run and is locked while its run lives: a second run on the same result waits or is
+    refused, and the file of a killed run is reused.
 
     Attributes:
-        path: what to write to.
+        path: the temporary file to write to.
     """
 
     def __init__(self, path: Path, patience_s: float = 0.0) -> None:
-        """Take the file; what is in it may be of a killed run.
+        """Lock the file; it may hold what a killed run has left.
 
         Args:
-            path: the result; where it is a link, its goal is what is replaced in the end.
+            path: the result; if it is a link, the link's target is replaced in the end.
             patience_s: how long to wait for another run that is writing it [s].
 
         Raises:
-            ConfigError: another run is writing it, and still is by then, or it cannot be written.
+            ConfigError: another run is still writing it, or it cannot be written.
         """
         self._name, self._final = path, behind_link(path)
         self.path = self._final.with_name(f".{self._final.stem}.part{self._final.suffix}")
@@ -136,7 +130,7 @@ class PartFile:
             raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
 
     def _take(self, until: float) -> int:
-        """A locked descriptor of the file; never of one that has just got its final name, or was removed."""
+        """Open and lock the file, but never one that was just renamed or removed by another run."""
         while True:
             lock = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
             try:
@@ -157,17 +151,18 @@ class PartFile:
 
     @contextlib.contextmanager
     def ending(self, *, keep: bool, error: BaseException | None = None) -> Iterator[None]:
-        """Stands around what completes and closes the file; after it the file has its name, or is gone.
+        """Complete and close the file in this block; after it the file has its name, or is removed.
 
-        Signals are held back meanwhile, so that a second Ctrl-C loses nothing. Where the run has ended in an error
-        already, one says no more than that; else it acts afterwards.
+        Signals are deferred meanwhile, so that a second Ctrl-C loses nothing. They are delivered afterwards, unless the
+        run has ended in an error already.
 
         Args:
-            keep: whether it is to have its name.
-            error: what the run ended in, if it did; it is told what becomes of the file.
+            keep: whether the file gets its name.
+            error: error that ended the run, if there was one; it gets a note about the file.
 
         Raises:
-            CotargetError: the file could not be completed, as on a full disk; after an error it only gets a note.
+            CotargetError: the file could not be completed, for example on a full disk; after an error it only gets a
+                note.
         """
         kept, held = False, HeldSignals()
         held.let_hurry()
@@ -196,20 +191,20 @@ class PartFile:
 
 
 def check_writable(path: Path) -> None:
-    """Refuse a result that could not be written, before the work and not after it.
+    """Refuse a result that cannot be written, before the work and not after it.
 
     Raises:
-        ConfigError: another run is writing it, or its folder may not be written to.
+        ConfigError: another run is writing it, or its folder is not writable.
     """
     with PartFile(path).ending(keep=False):
         pass
 
 
 def _lock(descriptor: int) -> None:
-    """Lock a file, where its file system knows locks.
+    """Lock a file, if its file system supports locks.
 
     Raises:
-        BlockingIOError: somebody else has locked it.
+        BlockingIOError: another process has locked it.
     """
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -220,17 +215,17 @@ def _lock(descriptor: int) -> None:
 
 
 def said(path: Path, failure: OSError | CotargetError) -> CotargetError:
-    """An error that names the file; a full disk's does not."""
+    """Make an error that names the file, which a full disk's error does not."""
     return (
         failure if isinstance(failure, CotargetError) else ConfigError(f"{path}: cannot be written: {failure.strerror}")
     )
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Replace a file's content in one step, also when the program or the power fails half-way.
+    """Replace a file's content in one step, even if the program or the power fails halfway.
 
     Raises:
-        ConfigError: the file cannot be written, or another run is writing it for longer than a file takes.
+        ConfigError: the file cannot be written, or another run keeps writing it.
     """
     part = PartFile(path, PATIENCE_S)
     with part.ending(keep=True), part.path.open("wb") as file:
@@ -240,16 +235,16 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 class CsvFile:
-    """A table as csv; appears under its name only when complete. A context manager."""
+    """Write a table as csv, under its name only when it is complete. A context manager."""
 
     def __init__(self, path: Path, columns: Sequence[str], *, keep: bool = False, line_end: str = "\r\n") -> None:
-        """Prepare to write.
+        """Open the table for writing.
 
         Args:
             path: the file.
-            columns: its first line.
-            keep: whether the rows so far are kept where the block ends in an error.
-            line_end: behind each line.
+            columns: names of the columns.
+            keep: whether to keep the rows so far if the block ends in an error.
+            line_end: end of each line.
 
         Raises:
             ConfigError: the file cannot be written.
@@ -274,17 +269,17 @@ class CsvFile:
         self._rows += 1
 
     def __enter__(self) -> "CsvFile":
-        """Give the table itself."""
+        """Return the table itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Complete the file and give it its name; after an error, remove it or keep the rows that it has.
+        """Complete the file and give it its name; after an error, remove it or keep the rows so far.
 
         Raises:
-            ConfigError: the file could not be completed, as on a full disk.
+            ConfigError: the file could not be completed, for example on a full disk.
         """
         keep = not self._broken and (error is None or (self._keep and self._rows > 0))
         with self._part.ending(keep=keep, error=error):
-            self._file.close()  # which writes what is left, and may find the disk full
+            self._file.close()  # flushes the rest, and may find the disk full

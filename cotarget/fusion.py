@@ -1,9 +1,8 @@
-"""What is known of every track in 3D, and what both cameras show of the one that is followed.
+"""Fuse fixed- and zoom-camera measurements into one 3D state per track.
 
-Each track of the wide view has a filter of its own; the one followed is besides looked for in the zoom view, which
-triangulates its depth and shows any error of head or calibration.
-
-Where head and lens were when a frame was exposed, which is earlier than the newest that their devices have told.
+Each track of the fixed camera has its own target filter. The followed track is also registered in the zoom image, which
+triangulates its depth and shows errors of the head and of the calibration. `StateHistory` interpolates the states of
+head and lens to the exposure time of each zoom frame. Measurements: docs/design-notes.md.
 """
 
 import math
@@ -28,23 +27,23 @@ from cotarget.pantilt import towards
 from cotarget.rig import Frame, Image, PanTiltState, ZoomState
 from cotarget.tracking.track import Track, missing, room_inside
 
-REMEMBERED_S = 2.0  # more than any latency [s]
-# A cubic through the two states before a time and the two after it: the head's acceleration is constant for longer than
-# states are apart. Where that changes, it is off by 0.024 degrees for states 40 ms apart, a straight line by 0.041.
+REMEMBERED_S = 2.0  # longer than any latency [s]
+# States for the cubic interpolation: two before a time and two after it. A straight line through the nearest two is
+# off by 0.041 degrees where the head's acceleration changes, the cubic by 0.024.
 POINTS = 4
-# States are kept no nearer together than this [s]: through two that are, a cubic shows their rounding many times over.
+# Least time between two kept states [s]: a cubic through closer ones multiplies their rounding.
 SPACING_S = 0.01
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Head and lens at one time.
+    """Pan, tilt and focal length at one time.
 
     Attributes:
-        pan: [rad].
-        tilt: [rad].
-        nominal_px: what the lens told [px].
-        speed: of the head, both axes together [rad/s].
+        pan: pan as the head reports it [rad].
+        tilt: tilt as the head reports it [rad].
+        nominal_px: nominal focal length, as the lens reports it [px].
+        speed: speed of the head over both axes together [rad/s].
     """
 
     pan: float
@@ -54,19 +53,19 @@ class Pose:
 
 
 class StateHistory:
-    """The latest states of head and lens, each with its own time."""
+    """Recent states of head and lens, each with its own time, for interpolation."""
 
     def __init__(self) -> None:
         self._heads: deque[tuple[float, ...]] = deque()
         self._lenses: deque[tuple[float, ...]] = deque()
 
     def add(self, head: PanTiltState, lens: ZoomState) -> None:
-        """Remember what both devices say now; one that says the time of before is ignored."""
+        """Add the newest states of both devices; ignore a state that is no newer than the last one."""
         _append(self._heads, (head.t, head.pan, head.tilt))
         _append(self._lenses, (lens.t, math.log(lens.focal_px)))
 
     def at(self, t: float) -> Pose | None:
-        """Head and lens at a time [s]; None for one that is not between states remembered."""
+        """Interpolate head and lens to time t [s]; None if t is not between two kept states."""
         if not (_spans(self._heads, t) and _spans(self._lenses, t)):
             return None
         near = _around(self._heads, t)
@@ -92,14 +91,14 @@ def _spans(kept: "deque[tuple[float, ...]]", t: float) -> bool:
 
 
 def _around(kept: "deque[tuple[float, ...]]", t: float) -> Array:
-    """The states nearest to a time, at most `POINTS`, as rows."""
+    """Return the at most `POINTS` states nearest to a time, as rows."""
     after = bisect_right(kept, t, key=lambda state: state[0])
     first = min(max(after - POINTS // 2, 0), max(len(kept) - POINTS, 0))
     return np.array([kept[i] for i in range(first, min(first + POINTS, len(kept)))])
 
 
 def _cubic(times: Array, t: float) -> tuple[Array, Array]:
-    """Weights of values at those times for the value at t and for its derivative there (Lagrange), (n,) each."""
+    """Weights of values at given times for the value at t and for its derivative (Lagrange), (n,) each."""
     n = len(times)
     weights, slopes = np.ones(n), np.zeros(n)
     for k in range(n):
@@ -114,36 +113,36 @@ def _cubic(times: Array, t: float) -> tuple[Array, Array]:
     return weights, slopes
 
 
-# Of more tracks than these only the first have a filter; there is no telling a hundred moving things apart.
+# Most tracks with a filter: more than a dozen moving objects cannot be kept apart anyway.
 MOST_FILTERS = 12
-# The time of a frame, of the head's state and of the lens's are known to each other this well [s].
+# Standard deviation of the time between a frame and the states of head and lens [s].
 TIME_SIGMA_S = 2e-3
-# A size or a head's bias that is this many times what was assumed is no chance; a right one comes to 1 or 2.
+# A size or head bias beyond this many prior standard deviations is taken as wrong; a right one comes to 1 or 2.
 WRONG = 4.0
-# Whoever is in both views and yet not found in the zoom view for so long is not where he is thought to be [s]. A bird
-# that is where it should be was missed for 0.8 s at most, a person or a book for a frame or two.
+# A target that both cameras should see and that the zoom image does not show for this long is elsewhere [s]. A bird at
+# the right place was missed for 0.8 s at most, a person or a book for a frame or two.
 UNFOUND_S = 1.5
-# Then he is looked for as far around as this leaves: standard deviations of size and depth together, and of the head's
-# bias [rad]. A size told twice too large is 0.7.
+# The search is then widened by these standard deviations: logarithm of size and depth together, head bias [rad]. A
+# nominal size twice too large is 0.7.
 INFLATED_SIZE, INFLATED_BIAS = 0.4, 5e-3
-# A find so near to where it was expected, in standard deviations, is no surprise.
+# A registration within this many standard deviations of the expected place agrees with the estimate.
 NEAR = 3.0
-# So long after the wide view has shown it a target may have gone elsewhere [s].
+# Longest time since the last measurement for which a target still counts as seen [s].
 JUST_SEEN_S = 0.2
-# Of more zoom frames than these the oldest wait no longer for the wide view of their time.
+# Most zoom frames that wait for a fixed frame of their time; beyond it the oldest are dropped.
 MOST_WAITING = 30
 MakeFinder = Callable[[Calibration, TargetConfig], Finder]
 
 
 class TargetFusion:
-    """The filters of all tracks, from one frame to the next.
+    """The target filters of all tracks, updated frame by frame.
 
     Args:
-        calibration: of the rig, for the streams in use.
-        target: what is followed.
-        size: (width, height) of the wide view [px].
-        closed_loop: whether the target is looked for in the zoom view too.
-        finder: makes what looks for it there, anew for each target that is followed.
+        calibration: calibration of the rig, for the streams in use.
+        target: profile of the target to follow.
+        size: (width, height) of the fixed camera's image [px].
+        closed_loop: whether the target is also registered in the zoom image.
+        finder: makes the finder for the zoom image; called once for each followed track.
     """
 
     def __init__(
@@ -165,21 +164,21 @@ class TargetFusion:
         self._zoom_t = math.inf
         self._unfound_s = 0.0
         self._finder = finder(calibration, target)
-        self._waiting: deque[Frame] = deque(maxlen=MOST_WAITING)  # zoom frames without a wide view of their time
-        self._apart_s = 0.0  # by which the newest zoom frame was newer than the newest wide one
+        self._waiting: deque[Frame] = deque(maxlen=MOST_WAITING)  # zoom frames without a fixed frame of their time
+        self._apart_s = 0.0  # time of the newest zoom frame less that of the newest fixed frame
         self._to_base = calibration.T_base_fixed
         self.states = StateHistory()
 
     def update_fixed(
         self, frame: Frame, tracks: Sequence[Track], mask: Image | None, favoured: Collection[int] = ()
     ) -> None:
-        """Take a frame of the wide view into account.
+        """Update the filters with the tracks of one fixed-camera frame.
 
         Args:
-            frame: the frame.
-            tracks: after it, the eldest first.
-            mask: the detector's foreground, (H, W).
-            favoured: numbers of tracks that have a filter before others.
+            frame: frame of the fixed camera.
+            tracks: tracks after that frame, the oldest first.
+            mask: foreground of the detector, (H, W).
+            favoured: ids of tracks that get a filter before others.
         """
 
         def last(track: Track) -> tuple[bool, ...]:
@@ -187,7 +186,7 @@ class TargetFusion:
                 track.id != self._followed,
                 track.id not in favoured,
                 not track.confirmed,
-                track.id not in self._filters,  # or else who is known would be forgotten for somebody new
+                track.id not in self._filters,  # a new track must not displace a filter in use
             )
 
         known = sorted(tracks, key=last)[:MOST_FILTERS]
@@ -203,31 +202,31 @@ class TargetFusion:
                 self._filters[track.id] = TargetFilter(self._calibration, self._target, self._assumed)
             found = self._filters[track.id]
             box, sigma_px = track.box, None
-            if track.shared:  # it is inside of what covers others too, and the finder would learn those
+            if track.shared:  # its box covers other targets too, and the finder would learn those
                 inside = Detection(track.center_px, np.zeros(2), track.score, clipped=True)  # this frame shows no size
                 room = room_inside(box.size_px, track.size_px)
                 found.update_fixed(inside, frame.t, sigma_px=np.hypot(room, track.size_px / 2))
                 continue
             lacks = missing(track.size_px, box.size_px)
-            if lacks.any() and isinstance(box, Detection):  # a piece of it, which tells no size and its middle badly
+            if lacks.any() and isinstance(box, Detection):  # a part of the target: no size, and a poor centre
                 sigma_px = np.hypot(lacks, box.size_px) / 2
                 found.update_fixed(replace(box, clipped=True), frame.t, sigma_px=sigma_px)
                 continue
             if track.id == self._followed and isinstance(box, Detection):
                 sight = self._finder.update_fixed(frame, box, mask)
-                if sight is not None:  # the very point that both views show
+                if sight is not None:  # the same body point that the zoom image measures
                     box, sigma_px = replace(box, center_px=sight.body_px), sight.body_sigma_px
             size_px = track.larger_side_px if self._target.dimension == "wingspan" else None
             found.update_fixed(box, frame.t, sigma_px=sigma_px, size_px=size_px)
 
     def update_zoom(self, frame: Frame | None, wide_t: float) -> ZoomMeasurement | None:
-        """Look for the followed target in the zoom view, and take it into account where it is found.
+        """Register the followed target in the zoom image and update its filter.
 
-        A frame that is newer than the wide view waits until that has shown the target at about its time.
+        A zoom frame newer than the fixed camera's waits until the fixed camera has shown the target at about its time.
 
         Args:
-            frame: of the zoom view; None where there is no new one.
-            wide_t: when the newest wide frame was exposed [s].
+            frame: frame of the zoom camera; None if there is no new one.
+            wide_t: exposure time of the newest fixed frame [s].
         """
         if not self._closed_loop:
             return None
@@ -238,15 +237,14 @@ class TargetFusion:
             self._waiting.clear()
             return None
         due = next((each for each in reversed(self._waiting) if self._finder.sight_at(each.t) is not None), None)
-        done_t = (
-            wide_t - LATEST_S if due is None else due.t
-        )  # what is older was not seen then, or will not be looked at
+        # Older frames had no sight of the target, or are superseded.
+        done_t = wide_t - LATEST_S if due is None else due.t
         while self._waiting and self._waiting[0].t <= done_t:
             self._waiting.popleft()
         return None if due is None else self._look_close(due)
 
     def _look_close(self, frame: Frame) -> ZoomMeasurement | None:
-        """Look for the followed target in a frame of whose time the wide view has shown it."""
+        """Register the followed target in a zoom frame for which the fixed camera has a sight of it."""
         assert self._followed is not None, "who asks has looked"
         pose, estimate = self.states.at(frame.t), self.estimate(self._followed, frame.t)
         if pose is None or estimate is None:
@@ -258,7 +256,7 @@ class TargetFusion:
         seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
         if seen is None:
             return None
-        # The wrong size, or a wrong calibration, has it looked for beside where it is, and never be found.
+        # With a wrong size or calibration the search would look beside the target for ever, so it is widened.
         inflated = _inflated(estimate).appearance(pose.pan, pose.tilt, pose.nominal_px) if self._overdue else None
         pan, tilt = pose.pan + estimate.bias[0], pose.tilt + estimate.bias[1]
         covariance = (seen if inflated is None else inflated).covariance
@@ -267,8 +265,8 @@ class TargetFusion:
         if found is not None:
             self._filters[self._followed].update_zoom(
                 found.center_px,
-                # Both views show the same point, but wings and limbs move it: with its own error alone, each of their
-                # beats would be the target's.
+                # Both cameras show the same point, but wings and limbs move it. With the registration's own error
+                # alone, the filter would take their beats for motion of the target.
                 np.hypot(found.sigma_px, found.body_sigma_px),
                 pose.pan,
                 pose.tilt,
@@ -280,11 +278,11 @@ class TargetFusion:
 
     @property
     def _overdue(self) -> bool:
-        """Whether the zoom view should have shown the target long since."""
+        """Whether the zoom image has failed to show the target for too long."""
         return self._unfound_s > UNFOUND_S
 
     def _count_unfound(self, frame: Frame, found: ZoomMeasurement | None, seen: Appearance, estimate: Estimate) -> None:
-        """Note for how long the target was not where the zoom view should show it."""
+        """Count the time for which the zoom image should have shown the target and did not."""
         passed, self._zoom_t = min(max(frame.t - self._zoom_t, 0.0), JUST_SEEN_S), frame.t
         size = np.array(frame.image.shape[1::-1])
         if found is not None:
@@ -298,11 +296,14 @@ class TargetFusion:
             self._unfound_s += passed
 
     def warnings(self, number: int, t: float) -> list[str]:
-        """What speaks against what was told of a target, or against the calibration, in words.
+        """Describe what contradicts the nominal size of a target or the calibration.
 
         Args:
-            number: of the track that is followed.
-            t: the time [s].
+            number: id of the followed track.
+            t: time [s].
+
+        Returns:
+            One sentence for each contradiction; empty if there is none.
         """
         estimate = self.estimate(number, t)
         if estimate is None:
@@ -321,18 +322,18 @@ class TargetFusion:
         return found
 
     def follow(self, number: int | None) -> None:
-        """Look for another track in the zoom view from now on."""
+        """Register another track in the zoom image from now on; None for no track."""
         if number != self._followed:
             self._followed, self._unfound_s = number, 0.0
             self._finder = self._make_finder(self._calibration, self._target)
 
     def count_seen_well(self, track: Track, seconds: float, longest_px: float) -> None:
-        """Note whether a track was well in the close-up, by where head and lens have told that they were at its time.
+        """Add to the time for which a track was seen well in the close-up, by the reported states at its time.
 
         Args:
-            track: as the newest wide frame has it.
-            seconds: for how long [s] it counts.
-            longest_px: longest focal length, as the lens tells it [px].
+            track: the track after the newest fixed frame.
+            seconds: time that this frame counts for [s].
+            longest_px: longest nominal focal length of the lens [px].
         """
         pose, estimate = self.states.at(track.t), self.estimate(track.id, track.t)
         if pose is None or estimate is None or track.t - estimate.measured_t > JUST_SEEN_S:
@@ -341,12 +342,12 @@ class TargetFusion:
             self._seen_s[track.id] = self._seen_s.get(track.id, 0.0) + seconds
 
     def estimate(self, number: int, t: float) -> Estimate | None:
-        """A track at a time [s]; None where it is not known."""
+        """Estimate a track at time t [s]; None if it has no filter or no measurement by then."""
         found = self._filters.get(number)
         return None if found is None else found.at(t)
 
     def candidates(self, tracks: Sequence[Track], t: float) -> list[Candidate]:
-        """What a policy chooses from, at a time [s]: the confirmed tracks."""
+        """List the confirmed tracks that a selection policy may choose from at time t [s]."""
         return [
             Candidate(
                 track,
@@ -360,14 +361,14 @@ class TargetFusion:
         ]
 
     def _direction(self, known: TargetFilter, t: float, later: float) -> Array:
-        """Pan and tilt of a target as seen from the head, (2,) [rad], the zoom camera's place on it aside."""
+        """Pan and tilt of a target from the head, (2,) [rad]; the zoom camera's offset on the head is neglected."""
         estimate = known.at(t + later)
         assert estimate is not None, "what is known at a time is known later"
         return np.array(towards(self._to_base.apply(estimate.x_fixed)))
 
 
 def _contradicted(estimate: Estimate) -> list[str]:
-    """What both views together make other than it was told or calibrated, in words."""
+    """Describe where size and head bias, as both cameras show them, contradict their priors."""
     wrong = []
     if abs(estimate.size_deviation) > WRONG:
         wrong.append(f"both views make it {estimate.size:.2g} m and not {estimate.target.size:.2g} m")
@@ -377,7 +378,7 @@ def _contradicted(estimate: Estimate) -> list[str]:
 
 
 def _inflated(estimate: Estimate) -> Estimate:
-    """The same estimate, as if size and head were hardly known: their ratio to the depth is what the wide view sees."""
+    """Widen the covariance of size and head bias; the ratio of size to depth, which the fixed camera sees, stays."""
     P = estimate.state_covariance.copy()
     P[np.ix_([L, K], [L, K])] += INFLATED_SIZE**2
     P[[PAN, TILT], [PAN, TILT]] += INFLATED_BIAS**2

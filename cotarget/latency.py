@@ -1,18 +1,13 @@
-"""Measures how late cameras and head are, by what moves: at bring-up, and in tests against a known truth.
+"""Measure the latencies of cameras, head and lens from recorded motion.
 
-- The zoom camera against the head's reports: the head is wiggled, and its angle and the picture's shift are the same
-  motion, the one later than the other.
-- The fixed camera against the zoom camera: a board swings before both.
-- The head against its commands: from a command to where the acceleration that follows began.
+- Zoom camera against the head's reports: the head wiggles, and its angle and the image's shift show the same motion.
+- Fixed camera against the zoom camera: a board swings in front of both.
+- Head against its commands: from a command to the start of the acceleration that follows.
+- Lens against its commands: the lens zooms in and out; tracked corners (Lucas and Kanade) and a similarity through them
+  give the scale from frame to frame, and the first part of each way, extrapolated back, gives the start.
 
-Two records of one motion are matched by the delay between them at which one is best told by the other times a factor,
-plus a constant.
-
-Measures how late the zoom lens obeys, by how the zoom camera's picture grows: from a command to where that begins.
-
-The lens is sent in and out a few times. From frame to frame the scale is told by corners that are followed (Lucas and
-Kanade) and a similarity through them; the first part of each way, back to where the picture had its old scale, tells
-when the lens set out.
+Two records of one motion are matched by the delay at which one is best explained by the other times a factor, plus a
+constant. The choice of intervals: docs/design-notes.md.
 """
 
 import itertools
@@ -35,27 +30,27 @@ from cotarget.geometry import Array, RigidTransform, pose
 from cotarget.rig import Camera, Frame, Image, PanTiltState, Rig
 from cotarget.targeting import aim
 
-GROWTH = 2.0  # how far the lens zooms in, or as far as it can; less than LEAST_GROWTH tells nothing
+GROWTH = 2.0  # zoom factor of a measurement, or the lens's whole range; less than LEAST_GROWTH measures nothing
 LEAST_GROWTH = 1.1
-WAYS = 6  # in and out
-BEFORE_S, AFTER_S = 0.5, 0.5  # frames are kept from so long before a command to so long after the lens stands [s]
-# Of a way in the logarithm of the scale, the part that tells where it began: beyond what the corners' noise makes, and
-# before most of it, because no lens goes evenly all the way.
+WAYS = 6  # number of ways, in and out alternately
+BEFORE_S, AFTER_S = 0.5, 0.5  # frames are kept from this long before a command to this long after the lens stands [s]
+# Part of a way, in the logarithm of the scale, from which its start is extrapolated: beyond the corners' noise, and
+# before most of the way, because no lens travels evenly all the way.
 FIRST, LAST = 0.08, 0.5
-# The whole way must be what the device says it is, as a part of that; otherwise something else made the picture grow.
+# Largest relative difference between the image's growth and the lens's report; beyond it something else made it grow.
 AS_TOLD = 0.25
 CORNERS, WEAKEST, APART_PX = 200, 0.01, 8
-FEWEST_CORNERS = 12  # with fewer no scale is told
+FEWEST_CORNERS = 12  # with fewer corners there is no scale
 
 
 @dataclass(frozen=True)
 class LensLatency:
-    """What zooming in and out tells.
+    """Result of zooming in and out.
 
     Attributes:
-        command: from a command to the start of the lens's motion, the median over all [s].
-        spread: half the interquartile range of these [s].
-        frames: of the zoom camera.
+        command: time from a command to the start of the lens's motion, median over all ways [s].
+        spread: half the interquartile range of that time [s].
+        frames: number of frames of the zoom camera.
     """
 
     command: float
@@ -64,14 +59,14 @@ class LensLatency:
 
 
 def measure_lens(rig: Rig, late_s: float = 0.0) -> LensLatency:
-    """Zoom in and out a few times, and watch the picture grow and shrink.
+    """Measure the lens's command delay from the growth of the image while it zooms in and out.
 
     Args:
-        rig: its head is left where it is.
-        late_s: by how much the zoom camera's frames are dated too late, as `cotarget.latency.measure_head` tells [s].
+        rig: the rig; its head stays where it is.
+        late_s: latency error of the zoom camera, by which its frames are dated too late, see `measure_head` [s].
 
     Raises:
-        CalibrationError: the lens hardly zooms or does not come to rest, or the picture does not grow as the lens says.
+        CalibrationError: the lens hardly zooms or does not come to rest, or the image does not grow as reported.
         StaleFrameError: frames stopped coming.
     """
     shortest, longest = rig.zoom.focal_range
@@ -104,11 +99,11 @@ def measure_lens(rig: Rig, late_s: float = 0.0) -> LensLatency:
 
 
 def began(times: Array, part: Array) -> float:
-    """When a way began, of which the first part goes evenly [s].
+    """Extrapolate the start of a way whose first part is even [s].
 
     Args:
-        times: of frames, increasing [s], (n,).
-        part: of the way that is done in each, from 0 to 1, (n,).
+        times: times of the frames, increasing [s], (n,).
+        part: part of the way done in each frame, 0 to 1, (n,).
     """
     moving = int(np.argmax(part >= LAST))
     standing = int(np.flatnonzero(part[:moving] < FIRST)[-1]) if moving and (part[:moving] < FIRST).any() else 0
@@ -120,7 +115,7 @@ def began(times: Array, part: Array) -> float:
 
 
 def scales(images: Sequence[Image]) -> Array:
-    """Logarithm of how many times larger each picture is than the first one, (n,); nan from where that is not told."""
+    """Logarithm of each image's scale relative to the first one, (n,); nan from where it is unknown."""
     found = [0.0]
     greys = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in images]
     for one, other in itertools.pairwise(greys):
@@ -129,7 +124,7 @@ def scales(images: Sequence[Image]) -> Array:
 
 
 def _scale(before: Image, after: Image) -> float:
-    """The same of two that follow each other."""
+    """Logarithm of the scale between two successive images; nan if too few corners are tracked."""
     corners = cv2.goodFeaturesToTrack(before, CORNERS, WEAKEST, APART_PX)
     if corners is None or len(corners) < FEWEST_CORNERS:
         return math.nan
@@ -142,7 +137,7 @@ def _scale(before: Image, after: Image) -> float:
 
 
 def _lens_frames(rig: Rig, until: float) -> list[Frame]:
-    """The zoom camera's frames until a time [s]."""
+    """Read the zoom camera's frames until a time [s]."""
     frames: list[Frame] = []
     while rig.clock.now() < until:
         frames.append(rig.zoom.read(newer_than=frames[-1].t if frames else None))
@@ -150,7 +145,7 @@ def _lens_frames(rig: Rig, until: float) -> list[Frame]:
 
 
 def _moving_frames(rig: Rig, before: Sequence[Frame]) -> list[Frame]:
-    """The frames that follow until the lens has stood for a while."""
+    """Read the zoom camera's frames until the lens has stood still for `AFTER_S`."""
     frames, clock = list(before[-1:]), rig.clock
     deadline, rests = clock.now() + LENS_TIMEOUT, math.inf
     while clock.now() < rests:
@@ -169,23 +164,23 @@ def _moving_frames(rig: Rig, before: Sequence[Frame]) -> list[Frame]:
     return frames[1:]
 
 
-WIGGLE = np.radians(1.5)  # of the head to each side: some 18 px of a usual wide lens [rad]
-# Between its turns [s]: no multiple of usual frame periods, so that frames fall on all parts of the motion.
+WIGGLE = np.radians(1.5)  # motion of the head, some 18 px of a usual wide lens [rad]
+# Times between turns [s]: no multiples of usual frame periods, so that frames fall on all parts of the motion.
 TURNS_EVERY = (0.53, 0.47, 0.61)
 WIGGLE_SECONDS, SWING_SECONDS = 8.0, 10.0
-LOOK = 0.01  # how long to wait for a frame before looking at the head again [s]
-LONGEST_DELAY = 0.6  # that is looked for, either way [s]
-COARSE = 0.01  # steps of the delays tried first [s]
-FEWEST = 20  # samples of a motion
-AGREEMENT = 0.9  # of both records, as their correlation; less is no measurement
-ASIDE_DEG = 5.0  # a head that looks farther to the side may see more where it looks straight ahead
-EARLY = 0.4  # of a turn's way, in which the head still accelerates
-BOARD_SHARE, BOARD_TURNED = 0.35, 15.0  # of the wide view's width that a board fills, and how it is turned [degrees]
+LOOK = 0.01  # longest wait for a frame before the head's state is read again [s]
+LONGEST_DELAY = 0.6  # largest delay searched, of either sign [s]
+COARSE = 0.01  # step of the coarse search [s]
+FEWEST = 20  # fewest samples of a motion
+AGREEMENT = 0.9  # least correlation of two records
+ASIDE_DEG = 5.0  # farther from straight ahead than this, the message suggests pointing the head there
+EARLY = 0.4  # part of a turn's way in which the head still accelerates
+BOARD_SHARE, BOARD_TURNED = 0.35, 15.0  # part of the fixed image's width that the board fills; its turn [degrees]
 
 
 @dataclass(frozen=True)
 class Delay:
-    """By how much one record is later than another [s], and how well they agree (correlation, at most 1)."""
+    """Delay of one record against another [s], and their agreement (correlation, at most 1)."""
 
     seconds: float
     agreement: float
@@ -193,12 +188,12 @@ class Delay:
 
 @dataclass(frozen=True)
 class HeadLatency:
-    """What a wiggle of the head tells.
+    """Result of wiggling the head.
 
     Attributes:
-        zoom: by how much the zoom camera's frames are dated too late; to be added to its latency.
-        command: from a command to the start of motion [s].
-        frames: of the zoom camera.
+        zoom: delay by which the zoom camera's frames are dated too late; to be added to its latency.
+        command: time from a command to the start of motion [s].
+        frames: number of frames of the zoom camera.
     """
 
     zoom: Delay
@@ -207,14 +202,14 @@ class HeadLatency:
 
 
 def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
-    """Wiggle the head and watch it through the zoom camera.
+    """Measure the latencies of zoom camera and head by wiggling the head.
 
     Args:
-        rig: its lens is sent to the shortest focal length, and its head back to where it was.
-        seconds: for how long [s].
+        rig: the rig; its lens goes to the shortest focal length, and its head back to where it was.
+        seconds: duration [s].
 
     Raises:
-        CalibrationError: the picture does not move with the head: it shows nothing, or something that moves by itself.
+        CalibrationError: the image does not move with the head: it has no structure, or something in it moves.
         StaleFrameError: frames stopped coming.
     """
     _zoom_out(rig)
@@ -259,17 +254,17 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
 def measure_fixed(
     rig: Rig, calibration: Calibration, board: BoardConfig, seconds: float = SWING_SECONDS
 ) -> tuple[Delay, int]:
-    """Watch a swinging board with both cameras.
+    """Measure the latency of the fixed camera against the zoom camera with a swinging board.
 
     Args:
-        rig: whose zoom camera is dated right already.
-        calibration: of it, to look at the board with both cameras.
-        board: that swings.
-        seconds: how long to watch.
+        rig: the rig, with the latency of its zoom camera already right.
+        calibration: calibration of the rig, to look at the board with both cameras.
+        board: the board that swings.
+        seconds: duration [s].
 
     Returns:
-        By how much the fixed camera's frames are dated too late, to be added to its latency; and how many frames of it
-        showed the board.
+        Delay by which the fixed camera's frames are dated too late, to be added to its latency; and the number of its
+        frames that showed the board.
 
     Raises:
         CalibrationError: one of the cameras does not see the board often enough, or the records do not agree.
@@ -309,16 +304,16 @@ def measure_fixed(
 
 
 def delay_between(t: Array, values: Array, t_other: Array, other: Array) -> Delay:
-    """By how much a record of a motion is dated later than another one of it.
+    """Find the delay by which one record of a motion is dated later than another.
 
     Args:
         t: times of the record [s], (n,).
-        values: the motion there, in any unit, (n,).
+        values: the motion at these times, in any unit, (n,).
         t_other: times of the other record, increasing [s], (m,).
-        other: the same motion there, times any factor plus any constant, (m,).
+        other: the same motion, times any factor plus any constant, (m,).
 
     Returns:
-        The delay d for which values(t) is best told by other(t - d); no agreement where nothing moves.
+        The delay d at which other(t - d) best explains values(t); an agreement of 0 if nothing moves.
     """
     if np.ptp(values) == 0 or np.ptp(other) == 0:
         return Delay(0.0, 0.0)
@@ -339,7 +334,7 @@ def delay_between(t: Array, values: Array, t_other: Array, other: Array) -> Dela
 
 
 def picture_shifts(images: Sequence[Image]) -> Array:
-    """How far each picture is shifted to the side against the first one [px], (n,), by phase correlation."""
+    """Horizontal shift of each image against the first one, by phase correlation [px], (n,)."""
     greys = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32) for image in images]
     window = cv2.createHanningWindow(greys[0].shape[::-1], cv2.CV_32F)
     return np.array([cv2.phaseCorrelate(greys[0], grey, window)[0][0] for grey in greys])
@@ -348,18 +343,18 @@ def picture_shifts(images: Sequence[Image]) -> Array:
 def command_delay(
     starts: Sequence[tuple[float, float, float]], states: Sequence[PanTiltState], acceleration: float
 ) -> float:
-    """From a command to where the motion that follows began, the median over all commands [s].
+    """Delay from a command to the start of the motion that follows, median over all commands [s].
 
-    An axis that begins at t0 has gone acceleration / 2 (t - t0)^2 at t, as long as it accelerates: each report in the
-    first part of the way tells t0.
+    An axis that starts at t0 has gone acceleration / 2 (t - t0)^2 at t while it accelerates, so each report in the
+    first part of the way gives t0.
 
     Args:
-        starts: of each command the time [s], and from where to where the axis is sent [rad].
-        states: the head's reports.
-        acceleration: of the axis [rad/s^2].
+        starts: for each command its time [s], and the axis's start and goal [rad].
+        states: reports of the head.
+        acceleration: acceleration of the axis [rad/s^2].
 
     Returns:
-        nan where no report fell into the early part of any turn.
+        The delay; nan if no report fell into the early part of any turn.
     """
     times = np.array([state.t for state in states])
     pans = np.array([state.pan for state in states])
@@ -374,7 +369,7 @@ def command_delay(
 
 
 def in_both_views(calibration: Calibration, board: BoardConfig) -> RigidTransform:
-    """A pose of the board ahead of the fixed camera, of a good size in its view, T_fixed_board."""
+    """Pose of a board ahead of the fixed camera, of a good size in its image, T_fixed_board."""
     points = board_points(board)
     width = float(np.ptp(points[:, 0]))
     depth = calibration.fixed.focal_px[0] * width / (BOARD_SHARE * calibration.fixed.size[0])
@@ -384,7 +379,7 @@ def in_both_views(calibration: Calibration, board: BoardConfig) -> RigidTransfor
 
 
 def _zoom_out(rig: Rig) -> None:
-    """Send the lens to its shortest focal length and wait until it stands there."""
+    """Zoom the lens out and wait until it stands."""
     rig.zoom.zoom(rig.zoom.focal_range[0])
     wait_for_lens(rig)
 
@@ -392,7 +387,7 @@ def _zoom_out(rig: Rig) -> None:
 def _frames(
     rig: Rig, camera: Camera, until: float, newer_than: float | None, states: list[PanTiltState] | None = None
 ) -> Iterator[Frame]:
-    """Frames of a camera as they come until a time, the head looked at in between where its states are kept."""
+    """Yield frames of a camera until a time, and read the head's states in between if they are kept."""
     while rig.clock.now() < until:
         if states is not None:
             state = rig.head.state()

@@ -1,22 +1,11 @@
-"""Scores, computed from rows alone: whoever has a steps.csv can recompute every figure.
+"""Score runs and tracks: close-ups and wear from the rows of steps.csv, tracks on a film from labels.
 
-A row says, for one zoom frame, what was commanded and what was really so. `cotarget.evaluation` makes rows from Steps
-and
-the simulation's truth; the scores only read rows.
+A `Row` holds, for one zoom frame, what was commanded and the ground truth. `cotarget.evaluation` makes rows from Steps
+and the simulation's truth. Scores use rows alone, so every figure can be recomputed from a steps.csv.
 
-The field's figures: of a target that was held, by the truth, and of tracks on a film, by labels.
-
-What one zoom frame truly shows of a target, and whether that is a good close-up.
-
-What is so in each zoom frame beside what was commanded: the rows of which every figure is made, and steps.csv.
-
-How well the wide view's tracks keep to a target that somebody labelled: scores of a table of tracks beside labels.
-
-The table is the one that `cotarget.detect_video.run_on_film` writes, and a label a box around the target in one frame;
-a frame
-may have several, and frames without any say nothing of what is found in them, but that a track which is never on a
-label is false. Where there are labels a track is false as it is beside the truth: off all of them for half a second on
-end.
+`score_tracks` compares the table that `cotarget.detect_video.run_on_film` writes with labels: boxes around targets in
+single frames. A frame may have several labels. In frames without labels, only a track that is never on a label counts,
+as false.
 """
 
 import csv
@@ -31,27 +20,27 @@ import numpy as np
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array
 
-# In frame: at least half of the silhouette visible, and at least half as large as wanted.
+# In frame: least visible part of the silhouette, and least size ratio.
 VISIBLE_IN_FRAME = 0.5
 SIZE_IN_FRAME = 0.5
-# A close-up is good with the whole target visible at 0.8 to 1.25 of the wanted size.
+# Range of the size ratio of a good close-up.
 GOOD_SIZE = (0.8, 1.25)
-SERVED_S = 1.0  # of good close-up in all, and a target counts as served
-WHOLLY_VISIBLE = 0.999  # the silhouette's area is counted on a grid; a rim of less is rounding
+SERVED_S = 1.0  # total time of good close-ups from which a target counts as served [s]
+WHOLLY_VISIBLE = 0.999  # least visible part of a wholly visible target; its area is counted on a grid and rounded
 
 
 @dataclass(frozen=True)
 class Closeup:
-    """A target in a zoom frame.
+    """Ground truth of a target in one zoom frame.
 
     Attributes:
         u_px: true position of the target's body centre in the zoom image [px]; nan behind the camera.
-        v_px: likewise.
+        v_px: its v coordinate [px].
         width_px: width of the zoom image [px].
-        height_px: its height [px].
+        height_px: height of the zoom image [px].
         size_px: true size of the wanted dimension in the zoom image [px]; nan behind the camera.
-        wanted_px: size wanted, or what the longest focal length gives where that is less [px].
-        visible: fraction of the true silhouette visible in the zoom image.
+        wanted_px: wanted size, or the size at the longest focal length if that is less [px].
+        visible: part of the true silhouette visible in the zoom image, 0 to 1.
     """
 
     u_px: float
@@ -69,12 +58,12 @@ class Closeup:
 
     @property
     def size_ratio(self) -> float:
-        """True size over the size wanted; 0 for a target behind the camera, which shows nothing of it."""
+        """True size over the wanted size; 0 for a target behind the camera."""
         return 0.0 if math.isnan(self.size_px) else self.size_px / self.wanted_px
 
     @property
     def in_frame(self) -> bool:
-        """Whether the target is in the close-up, by the definition above."""
+        """Whether the target is in frame: centre inside, at least half visible, at least half as large as wanted."""
         return self.inside and self.visible >= VISIBLE_IN_FRAME and self.size_ratio >= SIZE_IN_FRAME
 
     @property
@@ -84,54 +73,54 @@ class Closeup:
 
     @property
     def tpo_px(self) -> float:
-        """Target point offset: distance from the image's centre; half the diagonal for a frame without it [px]."""
+        """Target point offset: distance from the image's centre; half the diagonal if the target is not inside [px]."""
         if not self.inside:
             return math.hypot(self.width_px, self.height_px) / 2
         return math.hypot(self.u_px - (self.width_px - 1) / 2, self.v_px - (self.height_px - 1) / 2)
 
 
-# --- rows ---
+# Rows of steps.csv
 
 
 @dataclass(frozen=True)
 class Row:
-    """One new zoom frame, and the fixed frame that the loop had acted on when it came.
+    """One new zoom frame, and the fixed frame that the pipeline had processed when it came.
 
-    What is said of the wide view is at that fixed frame's own time; all else is at the zoom frame's.
+    Values in the fixed image are at that fixed frame's time; all others are at the zoom frame's.
 
     Attributes:
         t_s: middle of the zoom frame's exposure [s].
         t_fixed_s: middle of the fixed frame's exposure [s].
-        state: what the loop was doing.
-        track: number of the track followed; -1 for none.
+        state: state of the pipeline.
+        track: id of the followed track; -1 for none.
         u_px: true position of the target's body centre in the zoom image [px]; nan behind the camera.
-        v_px: likewise.
+        v_px: its v coordinate [px].
         width_px: width of the zoom image [px].
-        height_px: its height [px].
+        height_px: height of the zoom image [px].
         size_px: true size of the wanted dimension in the zoom image [px]; nan behind the camera.
-        wanted_px: size wanted, or what the longest focal length gives where that is less [px].
-        visible: fraction of the true silhouette visible in the zoom image.
-        in_wide: whether the target is wholly in the wide view.
-        u_wide_px: true position in the wide image [px].
-        v_wide_px: likewise.
-        u_detected_px: middle of the followed track's detection in the wide image [px]; nan where it is not seen alone.
-        v_detected_px: likewise.
+        wanted_px: wanted size, or the size at the longest focal length if that is less [px].
+        visible: part of the true silhouette visible in the zoom image, 0 to 1.
+        in_wide: whether the target is wholly in the fixed image.
+        u_wide_px: true position in the fixed image [px].
+        v_wide_px: its v coordinate [px].
+        u_detected_px: centre of the followed track's detection in the fixed image [px]; nan without one of its own.
+        v_detected_px: its v coordinate [px].
         decoded: whether the target's marker decodes in the zoom image.
-        decoded_wide: whether it decodes in the wide image.
-        off_target: numbers of the confirmed tracks that are off every target, as "3 7".
+        decoded_wide: whether the target's marker decodes in the fixed image.
+        off_target: ids of the confirmed tracks that are off every target, as "3 7".
         range_m: true distance from the zoom camera [m].
-        depth_m: estimated depth [m]; nan where nothing was aimed at.
-        pan_commanded_deg: last command [degrees].
-        tilt_commanded_deg: likewise.
-        focal_commanded_px: last command, nominal [px].
+        depth_m: estimated depth [m]; nan if nothing was aimed at.
+        pan_commanded_deg: last commanded pan [degrees].
+        tilt_commanded_deg: last commanded tilt [degrees].
+        focal_commanded_px: last commanded nominal focal length [px].
         pan_deg: true pan at the zoom frame's time [degrees].
-        tilt_deg: likewise.
+        tilt_deg: true tilt at the zoom frame's time [degrees].
         focal_px: true focal length at the zoom frame's time [px].
-        target: name of the target that is followed.
-        head_commands: how many the head was sent until then, whether its goal changed or not.
-        lens_commands: how many the lens was sent until then.
-        on_target: the confirmed tracks that the fixed frame shows alone, each with every target that it is on, the
-            nearest first, as "3:bird 3:bird2 7:bird".
+        target: name of the followed target.
+        head_commands: commands sent to the head until then, whether its goal changed or not.
+        lens_commands: commands sent to the lens until then.
+        on_target: confirmed tracks with a detection of their own in the fixed frame, each with every target that it is
+            on, the nearest first, as "3:bird 3:bird2 7:bird".
     """
 
     t_s: float
@@ -168,7 +157,7 @@ class Row:
 
     @property
     def closeup(self) -> Closeup:
-        """What the zoom frame shows."""
+        """Ground truth of the zoom frame."""
         return Closeup(self.u_px, self.v_px, self.width_px, self.height_px, self.size_px, self.wanted_px, self.visible)
 
     @property
@@ -178,12 +167,12 @@ class Row:
 
     @property
     def size_ratio(self) -> float:
-        """True size over the size wanted; 0 for a target behind the camera, which shows nothing of it."""
+        """True size over the wanted size; 0 for a target behind the camera."""
         return self.closeup.size_ratio
 
     @property
     def in_frame(self) -> bool:
-        """Whether the target is in the close-up."""
+        """Whether the target is in frame."""
         return self.closeup.in_frame
 
     @property
@@ -193,22 +182,22 @@ class Row:
 
     @property
     def tpo_px(self) -> float:
-        """Target point offset: distance from the image's centre; half the diagonal for a frame without it [px]."""
+        """Target point offset: distance from the image's centre; half the diagonal if the target is not inside [px]."""
         return self.closeup.tpo_px
 
     @property
     def tpo_deg(self) -> float:
-        """The same as an angle [degrees]."""
+        """Target point offset as an angle [degrees]."""
         return math.degrees(math.atan(self.tpo_px / self.focal_px))
 
     @property
     def tpe_px(self) -> float:
-        """Target point error: distance from the detection to the truth in the wide view [px]; nan without one."""
+        """Target point error: distance of the detection from the truth in the fixed image [px]; nan without one."""
         return math.hypot(self.u_wide_px - self.u_detected_px, self.v_wide_px - self.v_detected_px)
 
 
 def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    """Write steps.csv, one line a zoom frame."""
+    """Write steps.csv, one line for each zoom frame."""
     names = [f.name for f in dataclasses.fields(Row)]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -220,7 +209,7 @@ def read_rows(path: Path) -> list[Row]:
     """Read steps.csv.
 
     Raises:
-        ConfigError: the file is missing, or is not a steps.csv.
+        ConfigError: the file is missing, or is no steps.csv.
     """
     kinds = {f.name: f.type for f in dataclasses.fields(Row)}
     parse: dict[object, Callable[[str], object]] = {int: int, float: float, str: str, bool: _truth_value}
@@ -246,29 +235,29 @@ def _truth_value(text: str) -> bool:
     return text == "True"
 
 
-# --- tracked ---
+# Tracks on a film, scored by labels
 
 LABELS = ("frame", "x_px", "y_px", "width_px", "height_px")
-# Frames that no detector is judged by: the background has a second to be learnt.
+# Frames at the start that are not scored, because the background takes a second to be learnt.
 LEARNING_FRAMES = 30
 
 
 @dataclass(frozen=True)
 class Label:
-    """A box around a target: its middle (u, v), (2,), and width and height, (2,) [px]."""
+    """A box around a target: centre (u, v), (2,), and width and height, (2,) [px]."""
 
     center_px: Array
     size_px: Array
 
     @property
     def larger_side_px(self) -> float:
-        """The larger of its sides."""
+        """Larger side of the box [px]."""
         return float(self.size_px.max())
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """A confirmed track in one frame: the frame's number and time, the track's number, and its middle (u, v) [px]."""
+    """A confirmed track in one frame: frame number and time, track id, and centre (u, v), (2,) [px]."""
 
     frame: int
     t: float
@@ -278,20 +267,20 @@ class Tracked:
 
 @dataclass(frozen=True)
 class TrackScore:
-    """How well tracks keep to what is labelled. Each is None where nothing is labelled, or nothing was found.
+    """Agreement of tracks with labels. A value is None if nothing is labelled or nothing was found.
 
-    A track is on a target when it is no farther from the label's middle than the label's larger side.
+    A track is on a target if its distance from the label's centre is at most the label's larger side.
 
     Attributes:
-        labelled_frames: that are judged: those after LEARNING_FRAMES, up to the film's last.
-        on_target_ratio: of these, in how many a track is on a label.
-        numbers: how many different tracks were on a label in them.
-        offset_px_median: of the track on it, from the label's middle [px].
-        fragmentation_per_min: how often no track was on a label for longer than 0.2 s, a minute of labelled frames.
-        false_tracks: tracks that were off every label for 0.5 s on end in frames that have labels, or that lived for
+        labelled_frames: labelled frames that are scored: those after LEARNING_FRAMES, up to the film's last.
+        on_target_ratio: part of these in which a track is on a label.
+        numbers: number of different tracks on a label in these.
+        offset_px_median: median distance of the track from the label's centre [px].
+        fragmentation_per_min: gaps of more than 0.2 s without a track on a label, per minute of labelled frames.
+        false_tracks: tracks that were off every label for 0.5 s without a break in labelled frames, or that lived for
             0.5 s and were never on one.
-        false_tracks_per_min: the same, a minute of the film.
-        labels_beyond_end: labelled frames that the film does not have; they are not judged, and of another film maybe.
+        false_tracks_per_min: false tracks per minute of the film.
+        labels_beyond_end: labelled frames that the film does not have; they are not scored, and may belong to another.
     """
 
     labelled_frames: int
@@ -311,16 +300,16 @@ def score_tracks(
     frames: int,
     learning_frames: int = LEARNING_FRAMES,
 ) -> TrackScore:
-    """Score tracks.
+    """Score tracks on a film by labels.
 
     Args:
-        tracks: the confirmed ones of every frame.
-        labels: by the frame's number, from 0; those of frames that the film does not have are left out, and counted.
-        rate_hz: frames a second.
-        frames: how many the film has.
-        learning_frames: so many at its beginning are not judged.
+        tracks: confirmed tracks of every frame.
+        labels: labels by frame number, from 0; those of frames beyond the film's end are left out and counted.
+        rate_hz: frames per second.
+        frames: number of frames of the film.
+        learning_frames: frames at the start that are not scored.
     """
-    offsets: dict[int, dict[int, float]] = {}  # by frame and track, of those on a label
+    offsets: dict[int, dict[int, float]] = {}  # by frame and track, for tracks on a label
     lives: dict[int, list[Tracked]] = {}
     for each in tracks:
         lives.setdefault(each.track, []).append(each)
@@ -350,7 +339,7 @@ def score_tracks(
 def _is_false(
     life: Sequence[Tracked], labels: Mapping[int, Sequence[Label]], offsets: Mapping[int, Mapping[int, float]]
 ) -> bool:
-    """Whether a track was off every label for half a second on end; a frame without labels ends what was before it."""
+    """Whether a track was off every label for half a second without a break; an unlabelled frame is a break."""
     if not any(each.track in offsets.get(each.frame, ()) for each in life):
         return life[-1].t - life[0].t >= FALSE_S - ROUNDING_S
     since: Tracked | None = None
@@ -367,20 +356,20 @@ def _is_false(
 
 
 def _gaps(on: Sequence[bool], frames: Sequence[int], rate_hz: float) -> int:
-    """How often there was no track for longer than 0.2 s, in frames that are labelled one after the other."""
+    """Count gaps of more than 0.2 s without a track, within successive labelled frames."""
     breaks, lacking = 0, 0
     for i, is_on in enumerate(on):
         if is_on or (i and frames[i] != frames[i - 1] + 1):
             lacking = 0
         if not is_on:
             lacking += 1
-            # Counted once, when it has lasted for long enough.
+            # Count a gap once, when it becomes long enough.
             breaks += lacking / rate_hz > BREAK_S + ROUNDING_S >= (lacking - 1) / rate_hz
     return breaks
 
 
 def read_labels(path: Path) -> dict[int, list[Label]]:
-    """Read labels: a csv with frame (from 0), x_px, y_px (of the top-left pixel, from 0), width_px and height_px.
+    """Read labels from a csv: frame (from 0), x_px, y_px (of the top-left pixel, from 0), width_px and height_px.
 
     Raises:
         ConfigError: the file is missing, is no such table, or has no row.
@@ -412,13 +401,13 @@ def read_tracks(path: Path) -> list[Tracked]:
 
 
 def _table(path: Path, names: Sequence[str], what: str) -> list[dict[str, float]]:
-    """The numbers of a csv's columns.
+    """Read columns of numbers from a csv.
 
     Raises:
         ConfigError: the file is missing, lacks a column, or holds something else.
     """
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:  # as spreadsheets write it
+        with path.open(newline="", encoding="utf-8-sig") as file:  # spreadsheets write a byte order mark
             reader = csv.DictReader(file)
             if missing := [name for name in names if name not in (reader.fieldnames or ())]:
                 raise ValueError(f"it has no column '{missing[0]}'; it wants {', '.join(names)}")
@@ -435,48 +424,48 @@ def _table(path: Path, names: Sequence[str], what: str) -> list[dict[str, float]
         raise ConfigError(f"{path}: is no table of {what}: {error}") from None
 
 
-# Acquired: in frame for this long on end [s].
+# Time in frame without a break after which a target is acquired [s].
 ACQUIRED_S = 0.5
-# The clock starts when the target is wholly in the wide view, after the background had this long to be learnt, from
-# the first row on [s].
+# Time from the first row for which the background is learnt; the clock starts when the target is then wholly in the
+# fixed image [s].
 BACKGROUND_S = 2.0
-# In-frame runs broken for longer than this count as fragmentation [s].
+# Shortest break of a run in frame that counts as fragmentation [s].
 BREAK_S = 0.2
-# A track counts as false when it was confirmed and off every target for this long on end [s].
+# Time off every target without a break after which a confirmed track is false [s].
 FALSE_S = 0.5
 ROUNDING_S = 1e-6  # frame times are sums and differences of binary fractions
 
 
 @dataclass(frozen=True)
 class Score:
-    """How well a target was held; None where it was never acquired, or never there.
+    """Scores of one run; None if the target was never acquired, or never there.
 
-    Wear, false tracks and ID switches are counted, like the yield, from when the target was wholly in the wide view.
+    Wear, false tracks and ID switches count, like the yield, from when the target was wholly in the fixed image.
 
     Attributes:
-        frames: zoom frames since the target was wholly in the wide view.
-        time_to_acquire_s: from then to the first half second in frame [s].
+        frames: zoom frames since the target was wholly in the fixed image.
+        time_to_acquire_s: time from then to the first half second in frame [s].
         closeup_yield: good close-ups over all those frames, acquisition included.
-        in_frame_ratio: frames in frame over all frames after acquisition, the lost ones too.
-        tpo_px_median: of the frames after acquisition [px].
-        tpo_width_median: the same over the width of the image.
-        tpo_deg_median: the same as an angle [degrees].
-        size_ratio_median: of the frames after acquisition; one with the target behind the camera counts as 0.
-        wanted_px: size wanted [px], median.
-        range_m: true range [m], median.
-        tpe_px_median: the detection's error in the wide view, of the frames that have one [px].
-        fragmentation_per_min: in-frame runs broken for more than 0.2 s [1/min].
-        identification: frames in which the marker decodes in the close-up, over all those that the yield counts. It is
-            helped: the marker is looked for about the target's true box alone, in a part of the image that was enlarged
-            twice, and a bird carries it on either flank, under its belly, and on its wings above and below.
-        identification_wide: the same in the wide view, for comparison, and helped in the same ways.
-        commands_per_min: commands that the head was sent, whether its goal changed or not [1/min].
-        reversals_per_min: changes of direction of its goals from row to row, both axes together [1/min].
-        false_tracks_per_min: tracks that were confirmed and off every target for 0.5 s on end [1/min].
-        lens_commands_per_min: commands that the lens was sent [1/min].
-        id_switches_per_min: how often a track was on another target than before, of all tracks (ID switches after Li,
-            Huang and Nevatia 2009, "Learning to associate") [1/min]. One that is off every target after it was on one
-            is a false track.
+        in_frame_ratio: frames in frame over all frames after acquisition, including those in which it was lost.
+        tpo_px_median: median target point offset after acquisition [px].
+        tpo_width_median: median target point offset after acquisition, over the image's width.
+        tpo_deg_median: median target point offset after acquisition, as an angle [degrees].
+        size_ratio_median: median size ratio after acquisition; a frame with the target behind the camera counts as 0.
+        wanted_px: median wanted size [px].
+        range_m: median true range [m].
+        tpe_px_median: median target point error in the fixed image, over frames with a detection [px].
+        fragmentation_per_min: breaks of more than 0.2 s while in frame [1/min].
+        identification: part of the frames in which the marker decodes in the close-up. It is helped: the marker is
+            searched only around the target's true box, in a part of the image that is enlarged twice, and a bird
+            carries it on either flank, under its belly, and on its wings above and below.
+        identification_wide: part of the frames in which it decodes in the fixed image, helped in the same ways.
+        commands_per_min: commands sent to the head, whether its goal changed or not [1/min].
+        reversals_per_min: changes of direction of the head's goals from row to row, both axes together [1/min].
+        false_tracks_per_min: tracks that were confirmed and off every target for 0.5 s without a break [1/min].
+        lens_commands_per_min: commands sent to the lens [1/min].
+        id_switches_per_min: how often a track moved from one target to another, over all tracks (ID switches after Li,
+            Huang and Nevatia 2009, "Learning to associate") [1/min]. A track that leaves its target for none is a false
+            track instead.
     """
 
     frames: int
@@ -501,7 +490,7 @@ class Score:
 
 
 def score(rows: Sequence[Row]) -> Score:
-    """Score one run of following one target; see the fields of `Score` for the definitions."""
+    """Score one run that follows one target; the fields of `Score` hold the definitions."""
     learnt_s = rows[0].t_s + BACKGROUND_S - ROUNDING_S if rows else 0.0
     start = next((i for i, row in enumerate(rows) if row.in_wide and row.t_s >= learnt_s), None)
     if start is None:
@@ -538,7 +527,7 @@ def score(rows: Sequence[Row]) -> Score:
 
 
 def _acquired(rows: Sequence[Row]) -> int | None:
-    """Index of the first row of the first half second in frame on end."""
+    """Index of the first row of the first half second in frame without a break."""
     begin: int | None = None
     for i, row in enumerate(rows):
         if not row.in_frame:
@@ -551,12 +540,12 @@ def _acquired(rows: Sequence[Row]) -> int | None:
 
 
 def _per_minute(count: int, rows: Sequence[Row]) -> float | None:
-    """Events over the time from the first row to the last [1/min]; None for no time."""
+    """Events per minute, over the time from the first row to the last; None if that is zero."""
     return count / ((rows[-1].t_s - rows[0].t_s) / 60) if len(rows) > 1 else None
 
 
 def _breaks(rows: Sequence[Row]) -> int:
-    """How often the target was out of frame for longer than 0.2 s."""
+    """Count the times for which the target was out of frame for more than 0.2 s."""
     breaks, since = 0, None
     for row in rows:
         if row.in_frame:
@@ -568,21 +557,21 @@ def _breaks(rows: Sequence[Row]) -> int:
 
 
 def _reversals(rows: Sequence[Row]) -> int:
-    """How often an axis's commanded changes turned round, pauses aside."""
+    """Count changes of direction of the commanded axes; pauses do not matter."""
     changes = np.diff([[row.pan_commanded_deg, row.tilt_commanded_deg] for row in rows], axis=0)
     return int(sum(np.count_nonzero(np.diff(np.sign(axis[axis != 0]))) for axis in changes.T))
 
 
 def _on(row: Row) -> list[tuple[str, str]]:
-    """Which track is on which target in a row."""
+    """Pairs of a track and a target that it is on, in a row."""
     return [(track, target) for track, target in (pair.split(":") for pair in row.on_target.split())]
 
 
 def false_tracks(off: Iterable[tuple[float, Collection[Hashable]]]) -> int:
-    """How many tracks were confirmed and off every target for half a second on end.
+    """Count tracks that were confirmed and off every target for half a second without a break.
 
     Args:
-        off: of each frame its time [s], and which tracks were.
+        off: time of each frame [s], and the confirmed tracks that are off every target in it.
     """
     false: set[Hashable] = set()
     since: dict[Hashable, float] = {}
@@ -593,10 +582,10 @@ def false_tracks(off: Iterable[tuple[float, Collection[Hashable]]]) -> int:
 
 
 def id_switches(on: Iterable[Iterable[tuple[Hashable, str]]]) -> int:
-    """How often a track was on another target than before: on that no more, and on one.
+    """Count how often a track leaves its target and is on another one.
 
     Args:
-        on: of each frame which track was on which target; one on several is told with each, the nearest first.
+        on: pairs of track and target in each frame; a track on several targets has a pair for each, the nearest first.
     """
     switches = 0
     was_on: dict[Hashable, str] = {}

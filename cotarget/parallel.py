@@ -1,4 +1,4 @@
-"""Runs a few long jobs side by side, each in a process of its own, because an OpenGL context belongs to one thread."""
+"""Run a few long jobs side by side, each in its own process, because an OpenGL context belongs to one thread."""
 
 import contextlib
 import multiprocessing
@@ -13,7 +13,7 @@ from cotarget.errors import CotargetError
 
 Result = TypeVar("Result")
 Report = Callable[[int, int], None]
-ORPHANED = 1  # exit status of a process whose parent has gone
+ORPHANED = 1  # exit status of a process whose parent has ended
 
 
 def run_side_by_side(
@@ -24,17 +24,18 @@ def run_side_by_side(
     """Run ``job(*arguments[i], report)`` for every i at the same time.
 
     Args:
-        job: a function at the top of a module; its last argument is a function to tell (done, of how much).
-        arguments: of each run; they and the results are pickled.
-        report: told (done, of how much) over all jobs.
+        job: a function at the top level of a module; it reports its progress by report(done, total).
+        arguments: arguments of each run; they and the results are pickled.
+        report: called with (done, total) over all jobs.
 
     Returns:
         The results, in the order of the arguments.
 
     Raises:
-        CotargetError: whatever a job raised, or a job that died; the others are ended then.
+        CotargetError: a job raised it, or a job's process died; the other jobs are ended. Other errors of a job are
+            raised as they are.
     """
-    context = multiprocessing.get_context("spawn")  # a forked process would share the parent's OpenGL
+    context = multiprocessing.get_context("spawn")  # a forked process would share the parent's OpenGL context
     processes, pipes = [], []
     results: dict[int, Result] = {}
     progress = dict.fromkeys(range(len(arguments)), (0, 1))
@@ -71,7 +72,7 @@ def run_side_by_side(
 
 
 def _work(job: Callable[..., Any], given: tuple[Any, ...], pipe: Connection) -> None:
-    """One process: run the job, send its progress and its result."""
+    """Run the job in this process; send its progress and its result."""
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its jobs itself
 
@@ -86,7 +87,7 @@ def _work(job: Callable[..., Any], given: tuple[Any, ...], pipe: Connection) -> 
 
 @contextlib.contextmanager
 def interrupts_kept_from_children() -> Iterator[None]:
-    """Processes started meanwhile never hear Ctrl-C, which reaches all of them; the one that started them ends them."""
+    """Let processes started in this block ignore Ctrl-C, which reaches all of them; their parent ends them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -98,10 +99,10 @@ def interrupts_kept_from_children() -> Iterator[None]:
 
 
 def end_with_parent(*then: Callable[[], Any]) -> None:
-    """Let this process end as soon as its parent has gone, however that was ended; call it first of all.
+    """End this process as soon as its parent has ended in any way; call it first.
 
     Args:
-        then: what to call after that, where a process may have one first call alone, as one of a pool.
+        then: functions to call after that, for process pools that take only one initializer.
     """
     parent = multiprocessing.parent_process()
     if parent is not None:
@@ -112,4 +113,4 @@ def end_with_parent(*then: Callable[[], Any]) -> None:
 
 def _end_after(parent: int) -> None:
     wait([parent])
-    os._exit(ORPHANED)  # whatever the job is at; there is nobody to tell
+    os._exit(ORPHANED)  # without cleaning up, because the job may be in any state

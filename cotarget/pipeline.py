@@ -1,11 +1,8 @@
-"""The one pipeline: look, detect, track, aim, command; yields one Step a frame and knows no backend.
+"""Run the pipeline: detect, track, estimate, aim and command, and yield one `Step` per frame.
 
-Everything that records, draws, scores or prints consumes Steps.
-
-Looking through both cameras: what can be acted on, and what is wrong with it, in words.
-
-The wide camera sets the pace, and without it nothing can be done. The zoom camera may be blind for a moment, because
-its lens moves, its line is slow or it is lost and found again: the wide view is followed all the same.
+The pipeline sees only a `Rig`, so it is the same on every backend. Whatever records, draws, scores or prints consumes
+Steps. `FrameSource` reads both cameras. The fixed camera sets the pace, and without it the run ends. The zoom camera
+may fail for a moment, because its lens moves, its line is slow or it reconnects; the run goes on without it.
 """
 
 import enum
@@ -33,52 +30,52 @@ from cotarget.targeting import Aim
 from cotarget.tracking.track import Track, settings_for
 from cotarget.tracking.tracker import Tracker
 
-# Longer than this nobody waits for a zoom frame that is not there yet, but for the first [s].
+# Longest wait for a zoom frame, except for the first [s].
 ZOOM_WAIT_S = 2e-3
-# Frames of the wide camera that repeat, or whose times jump, may do so for that long [s]. Nobody steers by them, and
-# a head that moves is halted meanwhile, by the watchdog; so often they are asked for anew [s].
+# Frames of the fixed camera may repeat, or jump in time, for this long, and are read again this often [s]. They are
+# not acted on, and the watchdog halts a moving head meanwhile.
 REPEATED_S, AGAIN_S = 0.5, 5e-3
-# So long a camera waits for a frame by itself [s]; if none has come by then, none will.
+# Longest wait of a camera for its next frame [s]; later none will come.
 PATIENCE_S = 1.0
-# A zoom camera that gives the same frame for so long shows nothing new [s] ...
+# Time after which a zoom camera that repeats a frame is reported [s].
 BLIND_S = 0.5
-# ... and after so long it is gone [s]: longer than a driver that has lost its camera looks for it, which is 5 s.
+# Time after which it is an error [s]: longer than the 5 s for which a driver tries to reconnect to its camera.
 GONE_S = 10.0
-# Pictures of a live camera differ by their noise; one that stays the same to the last bit for so long is old [s].
+# Time after which an image that stays the same to the last bit is reported [s]: images of a live camera have noise.
 FROZEN_S = 1.0
-ROWS = 16  # every so many rows of a picture are compared first; where one differs, it is another picture
+ROWS = 16  # every 16th row is compared first, which shows most differences
 
 
 class FrameSource:
-    """The newest frames of both cameras.
+    """Read the newest frames of both cameras and report what is wrong with them.
 
     Args:
-        fixed: the wide camera.
+        fixed: the fixed camera.
         zoom: the zoom camera.
-        clock: the rig's.
+        clock: clock of the rig.
 
     Attributes:
-        interval: from the wide frame before to the newest [s]; inf for the first.
-        zoom_is_new: whether the newest zoom frame shows what was not seen before: another time, and another picture,
-            but where the wide view has not changed either since that picture came first.
+        interval: time from the previous fixed frame to the newest [s]; inf for the first.
+        zoom_is_new: whether the newest zoom frame has a new time and a new image; an unchanged image counts as new
+            while the fixed image has not changed either since it first came.
     """
 
     def __init__(self, fixed: Camera, zoom: Camera, clock: Clock) -> None:
         self._fixed, self._zoom, self._clock = fixed, zoom, clock
         self._wide: Frame | None = None
         self._close: Frame | None = None
-        # By the times of wide frames:
+        # In times of fixed frames:
         self._now = self._picture_t = self._close_t = self._shown_t = -math.inf
         self._why_blind = self._why_late = ""
-        self._looked_t = -math.inf  # by the rig's clock
+        self._looked_t = -math.inf  # on the rig's clock
         self.interval, self.zoom_is_new = math.inf, False
 
     def read_fixed(self) -> Frame:
-        """Wait for the next wide frame; those that repeat or cannot be true are passed over for a while.
+        """Wait for the next frame of the fixed camera; skip repeated or impossible ones for a while.
 
         Raises:
-            StaleFrameError: there is none, or for too long none that is newer, and not from later than now.
-            DeviceError: it is of another size.
+            StaleFrameError: no frame came, or none that is newer and not from the future for too long.
+            DeviceError: the frame has another size.
         """
         self._why_late, until, timeout = "", math.inf, PATIENCE_S
         while True:
@@ -95,7 +92,7 @@ class FrameSource:
                 timeout = until - now
 
     def _next_wide(self, timeout: float, until: float) -> Frame:
-        """The next wide frame, by a time. Raises as `read_fixed` does, but at once."""
+        """Read the next fixed frame by a given time. Raises as `read_fixed` does, but at once."""
         before = self._wide
         frame = self._fixed.read(None if before is None else before.t, timeout)
         _check_size(frame, self._fixed, "fixed")
@@ -107,7 +104,7 @@ class FrameSource:
         now = self._clock.now()
         if (ahead := frame.t - now) > FUTURE_S:
             raise StaleFrameError(f"the fixed camera's frame is from {ahead:.2f} s in the future; mind the clock")
-        if now > until:  # its times have jumped back, and have now come up with the last one
+        if now > until:  # its times jumped back and have now reached the last one
             raise StaleFrameError(self._why_late)
         if before is None or not _same(frame.image, before.image):
             self._picture_t = frame.t
@@ -116,11 +113,11 @@ class FrameSource:
         return frame
 
     def read_zoom(self) -> Frame:
-        """The newest zoom frame, which may be an old one; the first is waited for.
+        """Return the newest zoom frame, which may be an old one; wait for the first.
 
         Raises:
-            StaleFrameError: there has been none at all, or no new one for so long that there will be none.
-            DeviceError: it is of another size.
+            StaleFrameError: no frame came at all, or no new one for `GONE_S`.
+            DeviceError: the frame has another size.
         """
         before, self._why_blind = self._close, ""
         try:
@@ -143,7 +140,7 @@ class FrameSource:
         return before
 
     def troubles(self) -> list[str]:
-        """What is wrong with the newest frames."""
+        """Describe what is wrong with the newest frames, one message each."""
         found = []
         if self._why_late:
             found.append(f"{self._why_late}; this one is {self.interval:.2f} s after the last")
@@ -156,16 +153,16 @@ class FrameSource:
         return found
 
     def _blindness(self) -> str:
-        """For how long the zoom camera has shown nothing new, and why, where it says so."""
+        """Describe for how long the zoom camera has shown nothing new, and why if that is known."""
         why = self._why_blind and f": {self._why_blind}"
         return f"the zoom camera has shown nothing new for {self._now - self._close_t:.1f} s{why}"
 
 
 def _check_size(frame: Frame, camera: Camera, name: str) -> None:
-    """Refuse a frame of another size: the calibration would put everything in it elsewhere.
+    """Refuse a frame of another size, for which the calibration would be wrong.
 
     Raises:
-        DeviceError: it is.
+        DeviceError: the frame has another size than the camera.
     """
     height, width = frame.image.shape[:2]
     if (width, height) != camera.size:
@@ -177,33 +174,33 @@ def _check_size(frame: Frame, camera: Camera, name: str) -> None:
 
 
 def _same(a: Image, b: Image) -> bool:
-    """Whether two pictures of a camera are the same to the last bit."""
+    """Whether two images are the same to the last bit."""
     return a is b or (np.array_equal(a[::ROWS], b[::ROWS]) and np.array_equal(a, b))
 
 
-# Longest interval between frames that is taken for the rhythm of commands [s]; a longer one was a gap.
+# Longest interval that counts as the period of commands [s]; a longer one was a gap between frames.
 LONGEST_INTERVAL_S = 0.2
 
 
 class State(enum.StrEnum):
-    """What the loop is doing."""
+    """State of the pipeline."""
 
     SEARCHING = "searching"  # nothing to follow; the lens is at its shortest
     FOLLOWING = "following"  # the head follows the target
     COASTING = "coasting"  # the target is out of sight for a moment; the head follows its prediction
-    LOST = "lost"  # out of sight for longer: the lens zooms out, the head goes on as long as it is known where to
+    LOST = "lost"  # out of sight for longer: the lens zooms out; the head goes on while the prediction is certain
     UNREACHABLE = "unreachable"  # the target is seen but cannot be aimed at
 
 
 @dataclass(frozen=True)
 class FollowSettings(ControllerSettings):
-    """How the loop follows, and how it drives head and lens.
+    """Settings of a run, with those of the controller.
 
     Attributes:
         zoom_out_after_s: how long a target may be out of sight before the lens zooms out [s].
-        closed_loop: whether the target is looked for in the zoom view too.
-        finder: makes what looks for it there.
-        policy: makes, for each run, what decides which of several targets is followed; the first by default.
+        closed_loop: whether the target is also registered in the zoom image.
+        finder: makes the finder for the zoom image.
+        policy: makes the target selection for a run; first come by default.
     """
 
     zoom_out_after_s: float = 0.4
@@ -213,34 +210,34 @@ class FollowSettings(ControllerSettings):
 
     @classmethod
     def of(cls, config: RigConfig, **changes: Any) -> "FollowSettings":
-        """The settings for a rig: how late its head and lens obey, and whatever else is given by name."""
+        """Make the settings for a rig, with the command delays of its head and lens, and given changes by name."""
         return cls(command_delay_s=config.command_delay_s, lens_delay_s=config.lens_delay_s, **changes)
 
 
 @dataclass(frozen=True)
 class Step:
-    """One turn of the loop.
+    """Result of one frame.
 
     Attributes:
-        index: from 0.
-        t: when it was done, on the rig's clock [s].
-        state: what the loop was doing, and
-        reason: why, where that needs words, and what is wrong with what it acts on.
-        fixed: the frame that it acted on.
-        zoom: the newest zoom frame at that time; an old one while the zoom camera is blind, which `reason` says.
-        mask: the detector's foreground, (H, W), or None.
-        detections: in the fixed frame.
-        tracks: after them.
-        target: the track that is followed.
-        aim: what was solved; None when nothing was aimed at.
-        commanded: pan, tilt [rad] and nominal focal length [px] as really commanded last.
-        head: the head's state.
-        lens: the lens's state.
-        estimate: of the target in 3D, for the time of the fixed frame.
-        found: the target in the zoom view, where it was looked for and found; that is in this Step's zoom frame, or in
-            an earlier one, of the time that `found` says, where the wide view comes later.
-        head_commands: how many the head was sent since the run began.
-        lens_commands: how many the lens was sent.
+        index: number of the step, from 0.
+        t: time at which it was done, on the rig's clock [s].
+        state: state of the pipeline.
+        reason: reason for that state, and warnings about what it acts on; may be empty.
+        fixed: frame of the fixed camera.
+        zoom: newest zoom frame at that time; an old one while the zoom camera gives none, see `reason`.
+        mask: foreground of the detector, (H, W), or None.
+        detections: detections in the fixed frame.
+        tracks: tracks after these detections.
+        target: the followed track.
+        aim: the solved aim; None if nothing was aimed at.
+        commanded: last command: pan, tilt [rad] and nominal focal length [px], after clipping and rounding.
+        head: state of the head.
+        lens: state of the lens.
+        estimate: 3D estimate of the target at the time of the fixed frame.
+        found: the target in the zoom image, if it was found. It belongs to this zoom frame, or to an earlier one whose
+            time it has, if the fixed camera is later.
+        head_commands: commands sent to the head since the run began.
+        lens_commands: commands sent to the lens since the run began.
     """
 
     index: int
@@ -274,25 +271,25 @@ def follow(
 ) -> Iterator[Step]:
     """Follow a target and yield one Step for each frame of the fixed camera.
 
-    What is left out comes from the configuration that the rig was opened from.
+    Missing arguments come from the configuration that the rig was opened from.
 
     Args:
         rig: any rig; the caller closes it.
-        calibration: of that rig.
-        target: what to follow, or its name in the rig's configuration.
-        detector: finds it in the fixed camera's image; by default the one that the target's configuration names.
-        seconds: for how long on the rig's clock [s].
-        settings: delays and habits; by default the delays of the rig's configuration.
+        calibration: calibration of that rig.
+        target: target profile, or its name in the rig's configuration.
+        detector: detector for the fixed camera's images; by default the one that the target profile names.
+        seconds: duration on the rig's clock [s].
+        settings: settings of the run; by default with the delays of the rig's configuration.
 
     Raises:
         CalibrationError: the calibration has no T.
-        ConfigError: the target is unknown, the rig has no configuration to take it from, or the calibration is of
-            another aspect ratio than the rig's streams.
-        StaleFrameError: frames of the fixed camera stopped coming, or came too late to act on, or again; or the zoom
-            camera shows nothing new for 10 s. Until then the wide view alone is followed, and every Step says so.
-        DeviceError: a device failed; frames have another size than before among others.
+        ConfigError: the target is unknown, the rig has no configuration to take it from, or the calibration has another
+            aspect ratio than the rig's streams.
+        StaleFrameError: frames of the fixed camera stopped coming, came too late to act on, or repeated; or the zoom
+            camera showed nothing new for 10 s. Until then the run goes on without it, and every Step says so.
+        DeviceError: a device failed, or its frames changed their size.
     """
-    calibration.hand_eye()  # refused now, and not when the first target is seen
+    calibration.hand_eye()  # raises with the first step, not when the first target is seen
     wanted = opened_from(rig).target(target) if isinstance(target, str) else target
     if detector is None:
         detector = make_detector(wanted, opened_from(rig).rate_hz)
@@ -306,7 +303,7 @@ def follow(
 
 
 class _Loop:
-    """One run of `follow`."""
+    """State of one run of `follow`."""
 
     def __init__(
         self, rig: Rig, calibration: Calibration, target: TargetConfig, detector: Detector, settings: FollowSettings
@@ -320,11 +317,11 @@ class _Loop:
         self._frames = FrameSource(rig.fixed, rig.zoom, rig.clock)
         self._beyond: set[int] = set()  # tracks that could not be aimed at
         self._policy = settings.policy()
-        self._seen_t: dict[int, float] = {}  # when each track was seen last
+        self._seen_t: dict[int, float] = {}  # time at which each track was last seen
         self._index = 0
 
     def turn(self) -> Step:
-        """One frame of the fixed camera."""
+        """Process one frame of the fixed camera."""
         rig, fusion = self._rig, self._fusion
         frame = self._frames.read_fixed()
         interval = min(self._frames.interval, LONGEST_INTERVAL_S)
@@ -369,12 +366,12 @@ class _Loop:
         return step
 
     def _read_states(self) -> None:
-        """Ask the devices where they are."""
+        """Read the states of head and lens."""
         self._head, self._lens = self._rig.head.state(), self._rig.zoom.state()
         self._fusion.states.add(self._head, self._lens)
 
     def _why_searching(self, tracks: list[Track]) -> str:
-        """Why nobody is followed."""
+        """Explain why no track is followed."""
         if unmet := self._policy.unmet:
             return unmet
         if not tracks:
@@ -384,10 +381,10 @@ class _Loop:
         return "what is detected is not believed yet"
 
     def _choose(self, tracks: list[Track]) -> Track | None:
-        """Whom to follow."""
+        """Select the track to follow."""
         now = self._rig.clock.now()
         candidates = self._fusion.candidates(tracks, now)
-        if self._beyond:  # whoever could not be aimed at may have come nearer
+        if self._beyond:  # an unreachable target may have become reachable
             estimates = {number: self._fusion.estimate(number, now) for number in self._beyond}
             self._beyond = {
                 n for n, each in estimates.items() if each is not None and not self._controller.can_reach(each)
@@ -399,7 +396,7 @@ class _Loop:
         return next((track for track in tracks if track.id == number), None)
 
     def _drive(self, chosen: Track, t: float, interval: float) -> tuple[State, str, Aim | None]:
-        """Command head and lens; what the loop is doing then, why, and what was aimed at."""
+        """Command head and lens; return the state, its reason, and the aim."""
         seen_t = self._seen_t[chosen.id]
         if t - seen_t > self._settings.zoom_out_after_s:
             reason, aim = self._search(chosen, seen_t, interval)
@@ -413,7 +410,7 @@ class _Loop:
         return State.COASTING if chosen.missed else State.FOLLOWING, zoom, drive.aim
 
     def _search(self, chosen: Track, seen_t: float, interval: float) -> tuple[str, Aim | None]:
-        """Look for a target that is out of sight; what the head does, and what it is aimed at."""
+        """Point where a target out of sight should be; return what the head does, and the aim."""
         try:
             aim = self._controller.search(self._predict(chosen), seen_t, interval)
         except UnreachableError as error:
@@ -423,5 +420,5 @@ class _Loop:
         return "looked for where it should be", aim
 
     def _predict(self, chosen: Track) -> Predict:
-        """The target at any time."""
+        """Give the target's estimate as a function of time."""
         return lambda t: self._fusion.estimate(chosen.id, t)

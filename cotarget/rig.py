@@ -1,6 +1,6 @@
-"""What the pipeline sees of a rig: frames, four small device Protocols and a clock.
+"""Define the rig that the pipeline sees: frames, device states, limits, and the Protocols of the devices.
 
-A rig is the MuJoCo simulation, real devices, or a recording; the pipeline cannot tell which. Every blocking call
+A rig is the MuJoCo simulation, real devices, or a recording; the pipeline cannot distinguish them. Every blocking call
 advances the rig's own clock, which is simulated time in the simulation.
 """
 
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 Image = npt.NDArray[np.uint8]
 Angles = tuple[float, float]  # pan and tilt [rad]
-Speed = float | tuple[float, float]  # of both axes of a head, or of pan and tilt each [rad/s]
+Speed = float | tuple[float, float]  # one speed for both axes of a head, or one each for pan and tilt [rad/s]
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One image and when its light fell: ``image`` (H, W, 3) BGR, ``t`` the middle of the exposure [s]."""
+    """One image with its time: ``image`` (H, W, 3) BGR, ``t`` the middle of the exposure [s]."""
 
     image: Image
     t: float
@@ -33,7 +33,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class ZoomState:
-    """The lens as its device tells it: nominal focal length [px], whether it moves, and when that was [s]."""
+    """State that the lens reports: nominal focal length [px], whether it moves, and the time of this state [s]."""
 
     focal_px: float
     moving: bool
@@ -42,7 +42,7 @@ class ZoomState:
 
 @dataclass(frozen=True)
 class PanTiltState:
-    """The head as its device tells it: angles [rad], whether it moves, and when that was [s]."""
+    """State that the head reports: angles [rad], whether it moves, and the time of this state [s]."""
 
     pan: float
     tilt: float
@@ -51,19 +51,19 @@ class PanTiltState:
 
 
 def to_step(angle: float, step: float) -> float:
-    """Where an axis stands that is sent to an angle [rad]: the nearest of its steps [rad]; 0 for a continuous one."""
+    """Round an angle [rad] to the nearest step of an axis [rad]; a step of 0 is continuous."""
     return round(angle / step) * step if step else angle
 
 
 @dataclass(frozen=True)
 class PanTiltLimits:
-    """What a pan-tilt unit can do.
+    """Limits of a pan-tilt unit.
 
     Attributes:
         pan: lowest and highest pan [rad].
         tilt: lowest and highest tilt [rad].
         speed: highest speed of either axis [rad/s].
-        acceleration: of either axis [rad/s^2].
+        acceleration: acceleration of either axis [rad/s^2].
         step: resolution of either axis [rad]; 0 for a continuous head.
     """
 
@@ -74,7 +74,7 @@ class PanTiltLimits:
     step: float
 
     def capped(self, speed: Speed | None) -> tuple[float, float]:
-        """The speeds of pan and tilt to ask for [rad/s]: never above the highest, which is meant by None.
+        """Limit the speeds of pan and tilt to the highest [rad/s]; None stands for the highest.
 
         Raises:
             DeviceError: a speed is not above zero.
@@ -93,14 +93,14 @@ class PanTiltLimits:
 
 
 class Camera(Protocol):
-    """A camera that streams."""
+    """A camera that streams frames."""
 
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) [px]."""
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
+        """Wait for the newest frame; with ``newer_than`` [s], for one exposed after that time.
 
         Raises:
             StaleFrameError: no such frame arrived within ``timeout`` [s].
@@ -108,88 +108,88 @@ class Camera(Protocol):
 
 
 class ZoomCamera(Camera, Protocol):
-    """A camera whose focal length can be commanded. Focal lengths are the device's nominal pixels of its stream."""
+    """A camera with a zoom lens. Focal lengths are nominal, in pixels of its stream."""
 
     @property
     def still_size(self) -> tuple[int, int]:
-        """(width, height) of full stills [px]; that of the stream, where the device has no separate stills."""
+        """(width, height) of full stills [px]; that of the stream if the device has no separate stills."""
 
     @property
     def focal_range(self) -> tuple[float, float]:
-        """Shortest and longest focal length [px]."""
+        """Shortest and longest nominal focal length [px]."""
 
     def zoom(self, focal_px: float) -> float:
-        """Start the lens moving and return at once the focal length [px] that it will really reach."""
+        """Start the lens moving and return at once the focal length that it will really reach [px]."""
 
     def state(self) -> ZoomState:
-        """Tell the lens's state now."""
+        """Return the lens's state now."""
 
     def capture(self) -> Frame:
-        """Take a full still, where the device has one; otherwise the next frame."""
+        """Take a full still if the device has one; otherwise read the next frame."""
 
 
 class PanTilt(Protocol):
-    """A two-axis head."""
+    """A two-axis pan-tilt head."""
 
     @property
     def limits(self) -> PanTiltLimits:
-        """What the unit can do."""
+        """Limits of the unit."""
 
     def state(self) -> PanTiltState:
-        """Tell the head's state now."""
+        """Return the head's state now."""
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         """Command both axes [rad]; return what was commanded after clipping and rounding to steps.
 
-        Each axis goes on its own way, no faster than its ``speed``, and comes to rest at its goal.
+        Each axis moves by itself, no faster than its ``speed``, and comes to rest at its goal.
         """
 
     def halt(self) -> None:
-        """Stop at once; safe even if the program dies next."""
+        """Stop at once; the head must stay stopped even if the program ends next."""
 
 
 class Clock(Protocol):
-    """The rig's time."""
+    """The rig's clock."""
 
     def now(self) -> float:
-        """Seconds on the rig's clock."""
+        """Time on the rig's clock [s]."""
 
     def sleep_until(self, t: float) -> None:
-        """Return when the clock shows ``t`` [s]."""
+        """Wait until the clock shows ``t`` [s]."""
 
 
 class Board(Protocol):
-    """Somebody, or something, that can hold a calibration board."""
+    """A person or device that holds a calibration board on request."""
 
     @property
     def patience(self) -> float:
-        """How long it may take until the board is held still where it was wished [s]; 0 where it is there at once."""
+        """Longest time until the board is held still at the requested pose [s]; 0 if it is there at once."""
 
     def present(self, T_fixed_board: RigidTransform | None) -> None:
-        """Wish for the board at a pose (its first corner's frame), or for no board; nobody is told the result."""
+        """Request the board at a pose (of its first corner's frame), or no board; the result is not reported."""
 
     def swing(self, T_fixed_board: RigidTransform) -> None:
-        """Wish for the board to be swung to and fro along its x axis about a pose, until the next wish."""
+        """Request the board to swing to and fro along its x axis about a pose, until the next request."""
 
 
 class Rig(Protocol):
-    """The whole: two cameras, a head, a clock and a board. A context manager that halts, then closes."""
+    """Two cameras, a head, a clock and a board. A context manager that halts, then closes."""
 
     @property
     def fixed(self) -> Camera:
-        """The stationary wide camera."""
+        """The fixed camera."""
 
     @property
     def zoom(self) -> ZoomCamera:
-        """The zoom camera on the pan-tilt unit."""
+        """The zoom camera on the head."""
 
     @property
     def head(self) -> PanTilt:
-        """The pan-tilt unit."""
+        """The pan-tilt head."""
 
     @property
     def clock(self) -> Clock:
-        """The rig's time."""
+        """The rig's clock."""
 
     @property
     def board(self) -> Board:
@@ -199,7 +199,7 @@ class Rig(Protocol):
         """Halt the head and release the devices."""
 
     def __enter__(self) -> "Rig":
-        """Give the rig itself."""
+        """Return the rig itself."""
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -208,7 +208,7 @@ class Rig(Protocol):
 
 
 def opened_from(rig: Rig) -> "RigConfig":
-    """The configuration that a rig was opened from, its attribute ``config``.
+    """Return the configuration that a rig was opened from, its attribute ``config``.
 
     Raises:
         ConfigError: the rig was made in another way and has none.

@@ -1,4 +1,7 @@
-"""From a pixel and a depth, or a track, to an Aim: pan, tilt and focal length. Pure: no device, no clock."""
+"""Solve an aim (pan, tilt and focal length) from a pixel and a depth, or from a point, with its error budget.
+
+These are pure functions: no device and no clock.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,25 +20,26 @@ from cotarget.pantilt import Pointing, nearest, shortcut, solve
 Method = Literal["exact", "paper-table", "paper-example"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
-# The ray of the wanted pixel depends a little on the focal length and the focal length on the range along that ray;
-# each round shrinks what is left by the lever arm over the range times the wanted pixel's offset from the principal
-# point over the shortest focal length: some 1e-4 in the middle of the image, so that three rounds do; 3e-2 at its rim.
+# Most rounds of solving the focal length. The ray of the wanted pixel depends a little on the focal length, and the
+# focal length on the range along that ray. Each round shrinks the error by the lever arm over the range times the
+# wanted pixel's offset from the principal point over the shortest focal length: some 1e-4 in the image's centre, where
+# three rounds suffice; 3e-2 at its border.
 FOCAL_ROUNDS = 12
-FOCAL_FOUND = 1e-7  # relative change of the focal length, worth less than 1e-4 px at the wanted pixel
-# Standard deviation of what is rounded to the nearest whole number.
+FOCAL_FOUND = 1e-7  # relative change of the focal length at which it is found, worth less than 1e-4 px
+# Standard deviation of the error of rounding to a whole number.
 ROUNDED = 1 / np.sqrt(12)
 
 
 @dataclass(frozen=True)
 class Reach:
-    """What head and lens can do, and where the head is.
+    """Limits of head and lens, and where the head is.
 
     Attributes:
         pan: lowest and highest pan [rad].
         tilt: lowest and highest tilt [rad].
         focal_px: shortest and longest nominal focal length [px].
-        now: where the head is, (pan, tilt) [rad].
-        step: the head's resolution [rad].
+        now: pan and tilt of the head now [rad].
+        step: resolution of the head [rad].
     """
 
     pan: tuple[float, float]
@@ -47,7 +51,7 @@ class Reach:
 
 @dataclass(frozen=True)
 class WantedSize:
-    """How large the target shall be: its size [m], the size wanted in the image [px], and whether that is a height."""
+    """Size of a target [m], its wanted size in the image [px], and whether that is a height."""
 
     size: float
     wanted_px: float
@@ -56,16 +60,16 @@ class WantedSize:
 
 @dataclass(frozen=True)
 class Aim:
-    """Where to point and how far to zoom.
+    """Solved pan, tilt and focal length for a target.
 
     Attributes:
-        pan: [rad].
-        tilt: [rad].
-        focal_px: the true focal length that this means [px].
-        nominal_px: what to tell the lens [px].
-        limited: whether the lens's range cut the focal length.
-        x_fixed: the target in the fixed camera's frame [m], (3,).
-        range: from the zoom camera to the target [m].
+        pan: pan to command [rad].
+        tilt: tilt to command [rad].
+        focal_px: true focal length [px].
+        nominal_px: nominal focal length to command [px].
+        limited: whether the lens's range limits the focal length.
+        x_fixed: target position [m], (3,).
+        range: distance from the zoom camera to the target [m].
     """
 
     pan: float
@@ -78,28 +82,28 @@ class Aim:
 
     @property
     def depth(self) -> float:
-        """Along the fixed camera's axis [m]."""
+        """Depth along the fixed camera's optical axis [m]."""
         return float(self.x_fixed[2])
 
 
 def depth_of(
     calibration: Calibration, target: TargetConfig, size_px: float, center_px: Array, *, upright: bool = False
 ) -> float:
-    """Estimate a target's depth from how large it appears: z = f x_size / u_measured.
+    """Estimate a target's depth from its apparent size: z = f x_size / u_measured.
 
     Args:
-        calibration: gives the fixed camera.
-        target: its known size and which dimension that is.
-        size_px: the measured dimension in the fixed view [px].
-        center_px: where its middle is in the fixed view, (2,) [px].
-        upright: for a wingspan, whether the larger side of the box was its height.
+        calibration: calibration with the fixed camera.
+        target: target profile, with its size and which dimension that is.
+        size_px: measured dimension in the fixed image [px].
+        center_px: centre of the target in the fixed image, (2,) [px].
+        upright: for a wingspan, whether the larger side of the box is its height.
     """
     vertical = target.dimension == "height" or (target.dimension == "wingspan" and upright)
     return depth_from_size(calibration.fixed, target.size, size_px, np.asarray(center_px, float), vertical=vertical)
 
 
 def point_at(calibration: Calibration, pixel: Array, depth: float) -> Array:
-    """Where a pixel at a depth is, x_fixed [m], (3,).
+    """Position of a pixel at a depth, x_fixed [m], (3,).
 
     Raises:
         UnreachableError: no ray projects to that pixel, or the depth is not in front of the camera.
@@ -132,15 +136,15 @@ def aim(
     The target is either a point, or a pixel of the fixed camera with its depth.
 
     Args:
-        calibration: the rig.
-        x_fixed: the target in the fixed camera's frame [m], (3,).
-        reach: limits, and where the head is now; by default any angles, and the focal lengths that were calibrated.
-        pixel: the target in the fixed camera's image, (2,) [px].
-        depth: along the fixed camera's axis [m].
-        closeup: how large the target is wanted; decides the focal length.
-        nominal_px: the focal length where no close-up is asked for; the shortest by default.
+        calibration: calibration of the rig.
+        x_fixed: target position [m], (3,).
+        reach: limits, and where the head is; by default any angles, and the calibrated focal lengths.
+        pixel: target in the fixed image, (2,) [px].
+        depth: depth along the fixed camera's optical axis [m].
+        closeup: wanted size of the target, which decides the focal length.
+        nominal_px: nominal focal length if no size is wanted [px]; the shortest by default.
         method: the exact inverse, or the paper's shortcut in one of its two readings.
-        zoom_pixel: where in the zoom image the target is wanted, (2,) [px]; its centre by default.
+        zoom_pixel: wanted place of the target in the zoom image, (2,) [px]; its centre by default.
 
     Raises:
         CalibrationError: the calibration has no T.
@@ -155,7 +159,7 @@ def aim(
         reach = Reach((-math.pi, math.pi), (-math.pi, math.pi), (focal_px[0], focal_px[-1]))
     x_base = calibration.in_base(x_fixed)  # (6)
     wanted = calibration.zoom.stops[0].image_center_px if zoom_pixel is None else np.asarray(zoom_pixel, dtype=float)
-    if closeup:  # begin near: with the range from the base
+    if closeup:  # start with the distance from the base for the range
         nominal_px = calibration.zoom.nominal_for(focal_for_size(closeup.size, closeup.wanted_px, math.hypot(*x_base)))
     nominal, limited = _limit(reach.focal_px[0] if nominal_px is None else nominal_px, reach)
     lens = calibration.zoom.at(nominal)
@@ -170,7 +174,7 @@ def aim(
         if closeup:
             z = float(pointing.range * ray[2]) / math.hypot(*ray)
             focal = focal_for_size(closeup.size, closeup.wanted_px, z)  # (17)
-            if closeup.vertical:  # that is fy; the lens is told by fx
+            if closeup.vertical:  # this focal length is fy, and the lens is commanded by fx
                 fx, fy = lens.focal_px
                 focal *= fx / fy
             previous = nominal
@@ -193,21 +197,20 @@ def aim(
 def error_budget(
     calibration: Calibration, pixel: Array, found: Aim, reach: Reach, *, size_px: float | None = None
 ) -> dict[str, float]:
-    """What each cause alone leaves of error in the line of sight, one standard deviation [rad].
+    """Standard deviation of the line of sight that each error source causes alone [rad].
 
     Args:
-        calibration: the rig.
-        pixel: of the target in the fixed view, (2,).
-        found: the aim at it.
-        reach: gives the head's resolution.
-        size_px: where the depth came from a measured size, that size [px].
+        calibration: calibration of the rig.
+        pixel: target in the fixed image, (2,).
+        found: aim at it.
+        reach: resolution of the head.
+        size_px: measured size from which the depth comes, if it does [px].
 
     Returns:
-        "steps": rounding to the head's steps; "pixel": a pixel known to the nearest whole one; "size", where a size
-        was given: that likewise, by way of the depth; "calibration", where it has a covariance: what its own noise
-        leaves; and "total".
+        "steps": rounding to the head's steps; "pixel": a pixel rounded to a whole one; "size", if a size was given: the
+        same for the size, by way of the depth; "calibration", if it has a covariance: its own noise; and "total".
     """
-    # A target just inside a limit may lie beyond it when it is moved a little: here only angles count.
+    # A target just inside a limit may move beyond it, so the limits do not apply here.
     free = replace(reach, pan=(-np.inf, np.inf), tilt=(-np.inf, np.inf), now=(found.pan, found.tilt))
 
     def moved(du: float, dv: float, depth: float) -> float:
@@ -231,13 +234,13 @@ def error_budget(
 
 
 def _limit(nominal_px: float, reach: Reach) -> tuple[float, bool]:
-    """Limit a focal length to the lens's range; whether that changed it."""
+    """Limit a focal length to the lens's range; return whether that changed it."""
     limited = min(max(nominal_px, reach.focal_px[0]), reach.focal_px[1])
     return limited, limited != nominal_px
 
 
 def _paper(calibration: Calibration, x_fixed: Array, method: Method, reach: Reach) -> Pointing:
-    """The paper's shortcut as one reachable solution."""
+    """Solve by the paper's shortcut and choose the reachable solution."""
     reading: Literal["table", "example"] = "table" if method == "paper-table" else "example"
     found = shortcut(x_fixed, calibration.T_zoom0_fixed, calibration.hand_eye(), reading)
     if not np.isfinite(found.pan):

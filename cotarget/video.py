@@ -1,6 +1,7 @@
-"""Films in and out: any that PyAV can decode, and H.264 yuv420p that any player and browser opens.
+"""Read films that PyAV can decode, and write H.264 yuv420p films that any player and browser opens.
 
-Which frame of a film is which, so that one that cannot be decoded takes no number from those after it.
+`Places` numbers the frames as they are decoded, so that a frame that cannot be decoded keeps its number and does not
+shift those after it. The choice of x264's settings: docs/design-notes.md.
 """
 
 import contextlib
@@ -18,65 +19,65 @@ from cotarget.errors import CotargetError
 from cotarget.files import PartFile
 from cotarget.rig import Frame, Image
 
-# Codecs of which a packet without a picture is nothing unusual.
+# Codecs in which a packet without a frame is normal.
 HIDES_FRAMES = ("vp8",)
-# One of these that is smaller says that the picture before it stays [bytes], as FFmpeg's MAX_NVOP_SIZE has it.
+# Codecs in which a packet smaller than this repeats the previous frame [bytes], FFmpeg's MAX_NVOP_SIZE.
 REPEATS, SMALLEST = ("mpeg4",), 20
 
 
 class Places:
-    """Numbers the frames of a film as they are decoded.
+    """Number the frames of a film as they are decoded.
 
-    A packet makes a frame. As long as the decoder refuses none, frames are counted, whatever packets are without one.
-    After that, packets that were to be seen before a frame and did not become one were lost, and keep their numbers;
-    and so were those behind the last frame.
-    Where packets do not say when they are to be seen, or may be one of two of a frame, frames are counted all the time.
+    A packet makes a frame. Until the decoder refuses a packet, frames are counted, even if some packets make none.
+    After that, packets due before a decoded frame that did not become frames were lost and keep their numbers; so do
+    those after the last frame. If packets have no presentation time, or a frame may have two packets, frames are only
+    counted.
 
     Attributes:
-        number: of the newest frame, from 0.
-        reason: why the first packet was refused, in brackets; empty where none was.
+        number: number of the newest frame, from 0.
+        reason: reason why the first packet was refused, in brackets; empty if none was.
     """
 
     def __init__(self, stream: av.VideoStream) -> None:
-        """Begin with a film whose packets were not decoded yet."""
-        stream.codec_context.copy_opaque = True  # a frame has its packet's
+        """Prepare to number a film from which no packet was decoded yet."""
+        stream.codec_context.copy_opaque = True  # so that a frame carries its packet's number
         codec = stream.codec_context.name
         self.number, self.reason = -1, ""
         self._known, self._smallest = codec not in HIDES_FRAMES, SMALLEST if codec in REPEATS else 0
-        # By packet: its part of the film, its time in that, and whether it has to become a frame.
+        # For each packet: its part of the film, its time in that part, and whether it must become a frame.
         self._waiting: dict[int, tuple[int, int, bool]] = {}
         self._packets = self._part = self._time = 0
         self._begun = False
         self._refused = self._refused_inside = self._lost = 0
-        # Number of the first that was lost, and of the frame after the first refusal.
+        # Number of the first lost frame, and of the first frame after a refusal.
         self._first: int | None = None
         self._first_refused: int | None = None
 
     def expect(self, packet: av.Packet) -> None:
-        """Take note of a packet that is going to be decoded."""
+        """Register a packet before it is decoded."""
         if not packet.size or not self._known:
             return
         if packet.pts is None:
             self._forget()
             return
         if packet.dts is not None:
-            self._part += packet.dts < self._time  # where films were joined, time begins again
+            self._part += packet.dts < self._time  # time restarts where films were joined
             self._time = packet.dts
-        self._begun = self._begun or packet.is_keyframe  # nothing can be decoded before
+        self._begun = self._begun or packet.is_keyframe  # nothing can be decoded before a keyframe
         needed = self._begun and packet.size >= self._smallest and not packet.is_discard
         packet.opaque = self._packets
         self._waiting[self._packets] = self._part, packet.pts, needed
         self._packets += 1
 
     def refuse(self, error: av.error.FFmpegError) -> None:
-        """Count a packet that cannot be decoded."""
+        """Count a packet that the decoder refused."""
         self._refused += 1
         self.reason = self.reason or f" ({reason_of(error)})"
 
     def take(self, picture: av.VideoFrame) -> None:
-        """Number a frame."""
+        """Assign a number to a decoded frame."""
         place = self._waiting.pop(picture.opaque, None) if isinstance(picture.opaque, int) else None
-        if place is None or picture.interlaced_frame:  # which may have a packet for each of its two fields
+        if place is None or picture.interlaced_frame:  # an interlaced frame may have a packet for each field
             self._forget()
         else:
             self._lose([packet for packet, at in self._waiting.items() if at[:2] < place[:2]])
@@ -86,12 +87,12 @@ class Places:
         self._refused_inside = self._refused
 
     def _forget(self) -> None:
-        """From now on only count."""
+        """Stop tracking packets; from now on frames are only counted."""
         self._known = False
         self._waiting.clear()
 
     def _lose(self, packets: list[int]) -> None:
-        """Leave out the numbers of packets that did not become frames, where anything was refused."""
+        """Skip the numbers of packets that did not become frames, if any packet was refused."""
         count = sum(self._waiting.pop(packet)[2] for packet in packets)
         if not (self._refused and count):
             return
@@ -100,13 +101,13 @@ class Places:
         self.number += count
 
     def told(self, *, ended: bool) -> str:
-        """Say what was lost, after the last frame; empty where nothing was.
+        """Describe what was lost, after the last frame; empty if nothing was.
 
         Args:
-            ended: whether it is told otherwise that the film ends there, so that what follows is no more to be told.
+            ended: whether the message already says that the film ends early, so that packets after it do not count.
         """
         lost, refused = self._lost, self._refused_inside
-        if not ended:  # PyAV tells of no refusal once the decoder has given a frame of the last ones
+        if not ended:  # PyAV reports no refusal once the decoder has returned a frame of the last packets
             lost, refused = lost + sum(needed for _, _, needed in self._waiting.values()), self._refused
         if not (count := max(lost, refused)):
             return ""
@@ -116,41 +117,40 @@ class Places:
 
 
 def reason_of(error: Exception) -> str:
-    """The first line of an error, without the path that FFmpeg appends."""
+    """First line of an error, without the path that FFmpeg appends."""
     return (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0]
 
 
-# For a film that does not say how fast it is [frames/s].
+# Frame rate of a film that does not state its own [Hz].
 FALLBACK_RATE_HZ = 25.0
 # x264's constant quality: 18 is close to invisible loss, 23 its default; boxes and digits stay sharp at 20.
 QUALITY = "20"
-# x264's trade of time against size: this costs a fifth of its default's time and gives files a tenth larger.
+# x264's trade of time against size: this takes a fifth of its default's time for files a tenth larger.
 PRESET = "veryfast"
-# Containers whose header tells how long they are; elsewhere FFmpeg goes by what is there, or by the rate of bits.
+# Containers whose header holds the duration; for others FFmpeg estimates it from the content or the bit rate.
 TELL_DURATION = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "flv", "asf")
-MICROSECONDS = 1e6  # in which FFmpeg tells it, a second
-# A film is not short by less than the longer of these: the last frame's length and edits at the end are told roughly.
+MICROSECONDS = 1e6  # FFmpeg's units of duration per second
+# Least shortfall of a film, the longer of the two: the last frame's length and edits at the end are stated roughly.
 SHORT_S, SHORT_FRAMES = 0.5, 3
 
 
 class Film:
-    """A film, opened; iterate over it for its frames. A context manager.
+    """Read a film: iterate over it for its frames. A context manager.
 
-    What cannot be decoded is left out, and `shortfall` says so. What is looked at for that: packets that the decoder
-    refuses, those without a frame once it has refused one, or behind the last frame; and where the film ends, against
-    what its header says.
-    Pictures that are decoded with faults are not found, nor are packets that a container has lost altogether, in the
-    middle of it, but for AVI, which says how many there are, and not which are lost.
+    Frames that cannot be decoded are left out, and `shortfall` says so. It considers packets that the decoder refuses;
+    packets without a frame after the first refusal, or after the last frame; and the end of the film against its
+    header. It does not find frames decoded with errors, nor packets missing from the container, except in AVI, whose
+    header has the number of frames.
 
     Attributes:
-        path: its file.
+        path: file of the film.
         size: (width, height) [px].
-        rate_hz: its mean frames a second.
-        count: how many frames it says it has; None where it does not say.
-        number: of the newest frame given, from 0: its place in the film, where those that could not be decoded have
-            theirs too; so what is said of numbered frames, as labels are, stays true of a film that is damaged.
-        shortfall: known after the last frame: why there are fewer than the film has; empty where it is whole, and where
-            it cannot be known.
+        rate_hz: mean frame rate [Hz].
+        count: number of frames by the header; None if it has none.
+        number: number of the newest frame, from 0. Frames that cannot be decoded have numbers too, so that labels by
+            number stay valid for a damaged film.
+        shortfall: reason why frames are missing, known after the last frame; empty if the film is whole, or if that
+            cannot be known.
     """
 
     def __init__(self, path: Path) -> None:
@@ -180,11 +180,11 @@ class Film:
         self.count: int | None = stream.frames or None
         self.number = -1
         self.shortfall = ""
-        self._slots = 0  # of the stream's own time, in frames
-        self._end = 0.0  # of what was read of pictures and sound, by the film's own time [s]
+        self._slots = 0  # end of what was read, in frames of the stream's own time
+        self._end = 0.0  # end of what was read of pictures and sound, in the film's time [s]
 
     def __enter__(self) -> "Film":
-        """Give the film itself."""
+        """Return the film itself."""
         return self
 
     def __exit__(
@@ -194,12 +194,12 @@ class Film:
         self._container.close()
 
     def __iter__(self) -> Iterator[Frame]:
-        """Decode the frames in order; times are the film's own [s], or by the count where it has none.
+        """Decode the frames in order; times are the film's own [s], or from the frame rate if it has none.
 
-        Those that cannot be decoded are left out, and a file that is cut short ends early; `shortfall` says so then.
+        Frames that cannot be decoded are left out, and a truncated file ends early; `shortfall` says so afterwards.
 
         Raises:
-            CotargetError: nothing can be decoded, or the picture's size changes on the way.
+            CotargetError: nothing can be decoded, or the image's size changes.
         """
         places, self._slots = Places(self._container.streams.video[0]), 0
         reason, damaged, size = "", False, self.size
@@ -223,14 +223,14 @@ class Film:
         self.shortfall = "; ".join(filter(None, (places.told(ended=bool(ending)), ending)))
 
     def _pictures(self, places: Places) -> Iterator[av.VideoFrame]:
-        """What can be decoded of the first video stream; packets of all streams are looked at for where they end."""
+        """Decode the first video stream; packets of all streams are read to find their end."""
         pictures = self._container.streams.video[0]
         for packet in self._container.demux():
             if packet.pts is not None and packet.time_base is not None:
                 self._end = max(self._end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
             if packet.stream is pictures and packet.dts is not None:
                 self._slots = max(self._slots, packet.dts + (packet.duration or 1))
-            # An empty one stands for the frame before it, but for the last of all, which has no time and ends the work.
+            # An empty packet repeats the frame before it; the very last one has no time and flushes the decoder.
             if packet.stream is pictures and (packet.size or packet.dts is None):
                 places.expect(packet)
                 try:
@@ -243,16 +243,16 @@ class Film:
                     yield picture
 
     def _shortfall(self, damaged: bool) -> str:
-        """What the container says beyond what was read of it; and whether the last frame is damaged."""
+        """Describe what the container states beyond what was read, or that the last frame is damaged."""
         stream, container = self._container.streams.video[0], self._container
         begin, told = 0.0, 0.0
         if container.format.name == "avi" and stream.frames and stream.time_base is not None:
-            told = float(stream.frames * stream.time_base)  # its duration is worked out from the file's size
+            told = float(stream.frames * stream.time_base)  # FFmpeg estimates AVI's duration from the file's size
         elif container.format.name in TELL_DURATION and container.duration is not None:
             begin, told = (container.start_time or 0) / MICROSECONDS, container.duration / MICROSECONDS
         if begin + told - self._end > max(SHORT_S, SHORT_FRAMES / self.rate_hz):
             return f"the film says that it lasts {told:.1f} s, and ends at {max(self._end - begin, 0.0):.1f} s"
-        # Of an AVI every frame is a slot of its time, an empty one too; those that are lost leave the others earlier.
+        # In AVI every frame is a slot of its time, even an empty one; a lost frame makes the others come too early.
         if container.format.name == "avi" and (lost := stream.frames - self._slots) > 0:
             told_count = f"of the {stream.frames} frames that it says it has {lost} are lost"
             return f"{told_count}, and those after them come too early"
@@ -260,18 +260,18 @@ class Film:
 
 
 class FilmWriter:
-    """Writes a film as H.264 yuv420p; it appears under its name only when complete. A context manager."""
+    """Write a film as H.264 yuv420p, under its name only when it is complete. A context manager."""
 
     def __init__(self, path: Path, rate_hz: float, *, keep: bool = False) -> None:
-        """Prepare to write.
+        """Open a film for writing.
 
         Args:
-            path: the film, with a suffix that names a container, such as .mp4.
-            rate_hz: frames a second.
-            keep: whether the frames so far are kept as a film where the block ends in an error.
+            path: file of the film, with a suffix that names a container, such as .mp4.
+            rate_hz: frame rate [Hz].
+            keep: whether to keep the frames so far as a film if the block ends in an error.
 
         Raises:
-            CotargetError: the folder is missing or the suffix names no container, or another run is writing the film.
+            CotargetError: the folder is missing, the suffix names no container, or another run is writing the film.
         """
         self._path, self._keep, self._broken = path, keep, False
         self._part = PartFile(path)
@@ -284,7 +284,7 @@ class FilmWriter:
                 raise self._said(error) from None
 
     def write(self, image: Image) -> None:
-        """Append an image, (H, W, 3) BGR; an odd side is made even by repeating its last row or column.
+        """Append an image, (H, W, 3) BGR; an odd side is extended by repeating its last row or column.
 
         Raises:
             CotargetError: the container cannot hold H.264, or the disk is full.
@@ -309,16 +309,16 @@ class FilmWriter:
         return CotargetError(f"{self._path}: cannot be written ({reason_of(error)}); name e.g. an .mp4")
 
     def __enter__(self) -> "FilmWriter":
-        """Give the writer itself."""
+        """Return the writer itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Complete the film and give it its name; after an error, remove it or keep what there is.
+        """Complete the film and give it its name; after an error, remove it or keep the frames so far.
 
         Raises:
-            CotargetError: the film could not be completed, as on a full disk.
+            CotargetError: the film could not be completed, for example on a full disk.
         """
         keep = self._stream is not None and not self._broken and (error is None or self._keep)
         with self._part.ending(keep=keep, error=error):
@@ -334,7 +334,7 @@ class FilmWriter:
 
 
 def join_films(parts: Sequence[Path], path: Path) -> None:
-    """Put films of one size and rate, as `FilmWriter` writes them, one after the other without encoding them again."""
+    """Concatenate films of one size and rate, as `FilmWriter` writes them, without encoding them again."""
     with av.open(str(path), "w") as joined:
         stream, shift = None, 0
         for part in parts:
@@ -345,7 +345,7 @@ def join_films(parts: Sequence[Path], path: Path) -> None:
                     stream.time_base = source.time_base
                 end = 0
                 for packet in film.demux(source):
-                    if packet.dts is None:  # the demuxer's mark of the end
+                    if packet.dts is None:  # the demuxer's end marker
                         continue
                     end = max(end, packet.pts + packet.duration)
                     packet.pts, packet.dts = packet.pts + shift, packet.dts + shift

@@ -1,1 +1,1 @@
-"""Command the head and the zoom lens."""
+"""Control the head and the zoom lens, and choose which target they follow."""

@@ -1,6 +1,7 @@
-"""From an estimate to commands: where the head is sent so that it keeps up, and how far the lens zooms in.
+"""Command head and lens from a target's estimate, predicted over the delays.
 
-The head is spared by a dead zone; how far the lens may zoom in follows from how surely the target will be in the image.
+The head is held while the target stays in the deadband (`cotarget.control.head`). The zoom follows from the
+probability that the target stays in the image (`cotarget.control.zoom`).
 """
 
 import dataclasses
@@ -18,20 +19,20 @@ from cotarget.estimation import Estimate
 from cotarget.rig import Angles, PanTiltState, Rig
 from cotarget.targeting import Aim, Reach, aim
 
-NO_CHANGE = 1e-6  # of the logarithm of the focal length
+NO_CHANGE = 1e-6  # least change of the logarithm of the focal length that is commanded
 Predict = Callable[[float], Estimate | None]
 
 
 @dataclass(frozen=True)
 class ControllerSettings:
-    """How head and lens are driven.
+    """Settings of the controller.
 
     Attributes:
-        command_delay_s: from a command to the start of the head's motion [s].
-        lens_delay_s: likewise of the lens's [s]; as the head's by default.
-        predict: whether the target's motion is allowed for; without it the head is sent where the target was seen.
-        head_controller: how the head keeps up, and when it is left alone.
-        zoom: when the lens zooms in and out.
+        command_delay_s: time from a command to the start of the head's motion [s].
+        lens_delay_s: time from a command to the start of the lens's motion [s]; by default that of the head.
+        predict: whether to predict the target's motion; without it the head goes to where the target was seen.
+        head_controller: settings of the head controller.
+        zoom: settings of the zoom controller.
     """
 
     command_delay_s: float = 0.0
@@ -43,12 +44,12 @@ class ControllerSettings:
 
 @dataclass(frozen=True)
 class Drive:
-    """What a frame led to.
+    """Result of driving head and lens for one frame.
 
     Attributes:
-        aim: at where the target will be when a command given now takes effect.
-        chance: that the whole target will be in the next zoom frame.
-        zoom_reason: why the lens is where it is, as `cotarget.control.zoom` says it.
+        aim: aim at where the target will be when a command given now takes effect.
+        chance: probability that the whole target is in the next zoom frame.
+        zoom_reason: reason for the focal length, see `cotarget.control.zoom.ZoomChoice`.
     """
 
     aim: Aim
@@ -58,14 +59,14 @@ class Drive:
 
 @dataclass(frozen=True)
 class _Course:
-    """Where the head shall be.
+    """Wanted motion of the head.
 
     Attributes:
-        effect_t: when a command given now takes effect [s].
-        target: the target then.
-        first: the aim at it.
-        then: the aim at where it is a frame later, at the same focal length.
-        goal_sigmas: of a target that is carried elsewhere, how surely the head's next goal is known [rad].
+        effect_t: time at which a command given now takes effect [s].
+        target: estimate of the target at that time.
+        first: aim at it.
+        then: aim one frame later, at the same focal length.
+        goal_sigmas: standard deviations of the next goal's pan and tilt, for a target carried by hand [rad].
     """
 
     effect_t: float
@@ -76,12 +77,12 @@ class _Course:
 
 
 class Controller:
-    """Drives head and lens after one target at a time; remembers what was commanded, and how often.
+    """Drive head and lens after one target at a time; remember what was commanded, and how often.
 
     Args:
-        rig: its head, lens and clock.
-        calibration: of that rig, for its streams.
-        settings: how.
+        rig: rig whose head, lens and clock are used.
+        calibration: calibration of that rig, for its streams.
+        settings: settings of the controller.
     """
 
     def __init__(self, rig: Rig, calibration: Calibration, settings: ControllerSettings = ControllerSettings()) -> None:
@@ -91,19 +92,19 @@ class Controller:
         self._head_controller = HeadController(rig.head.limits, settings.head_controller)
         state = rig.head.state()
         self.commanded = (state.pan, state.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
-        self.head_commands, self.lens_commands = 0, 1  # sent so far
+        self.head_commands, self.lens_commands = 0, 1  # number sent so far
 
     def drive(self, predict: Predict, seen_t: float, interval: float, *, shape: float = 1.0) -> Drive:
         """Send head and lens after a target.
 
         Args:
-            predict: the target at any time [s].
-            seen_t: when it was seen last [s].
-            interval: from one command to the next [s].
+            predict: gives the target's estimate at any time [s].
+            seen_t: time at which it was last seen [s].
+            interval: time from one command to the next [s].
             shape: width over height of its box.
 
         Raises:
-            UnreachableError: no pan and tilt within the limits do it, or nothing is known of it.
+            UnreachableError: no pan and tilt within the limits do it, or there is no estimate yet.
         """
         course = self._course(predict, seen_t, interval)
         self._command_head(course, interval)
@@ -127,19 +128,19 @@ class Controller:
         return Drive(course.first, choice.chance, choice.reason)
 
     def search(self, predict: Predict, seen_t: float, interval: float) -> Aim | None:
-        """Zoom out, and send the head to where a target should be that is out of sight.
+        """Zoom out, and point the head where a target out of sight should be.
 
         Args:
-            predict: the target at any time [s].
-            seen_t: when it was seen last [s].
-            interval: from one command to the next [s].
+            predict: gives the target's estimate at any time [s].
+            seen_t: time at which it was last seen [s].
+            interval: time from one command to the next [s].
 
         Returns:
-            The aim at it; None where it may as well be outside of all that the zoom camera sees, and the head waits:
-            one standard deviation of where it is reaches beyond the border of the widest close-up.
+            The aim; None if the head waits, because one standard deviation of the target's place reaches beyond the
+            border of the zoom image at the shortest focal length.
 
         Raises:
-            UnreachableError: no pan and tilt within the limits do it, or nothing is known of it.
+            UnreachableError: no pan and tilt within the limits do it, or there is no estimate yet.
         """
         self.zoom_out()
         course = self._course(predict, seen_t, interval)
@@ -150,7 +151,7 @@ class Controller:
         return course.first
 
     def _course(self, predict: Predict, seen_t: float, interval: float) -> _Course:
-        """Where the head shall be. Raises as `drive` does."""
+        """Compute the wanted motion of the head. Raises as `drive` does."""
         now = self._rig.clock.now()
         effect = now + self._settings.command_delay_s
         times = (effect, effect + interval) if self._settings.predict else (seen_t, seen_t)
@@ -158,7 +159,7 @@ class Controller:
         if at_effect is None or then is None:
             raise UnreachableError("where the target is was not seen yet")
         state = self._rig.head.state()
-        self._head_controller.head.saw(state)  # a head that was halted, or is slow, is not where it was sent
+        self._head_controller.head.saw(state)  # a halted or slow head is not where it was sent
         reach = reach_of(self._rig, state)
         first = self._aim(at_effect, reach)
         later = predict(effect + self._settings.head_controller.ahead_s) if at_effect.carried else None
@@ -166,7 +167,7 @@ class Controller:
         return _Course(effect, at_effect, first, self._aim(then, reach, first), goal_sigmas)
 
     def _command_head(self, course: _Course, interval: float) -> None:
-        """Send the head, if that is worth it."""
+        """Send the head unless it is held."""
         effect, first, then = course.effect_t, course.first, course.then
         rates = (then.pan - first.pan) / interval, (then.tilt - first.tilt) / interval
         pan, tilt, focal = self.commanded
@@ -193,7 +194,7 @@ class Controller:
             self.lens_commands += 1
 
     def can_reach(self, estimate: Estimate) -> bool:
-        """Whether the head can point at where a target is estimated to be."""
+        """Whether the head can point at an estimated target."""
         try:
             self._aim(estimate, reach_of(self._rig))
         except UnreachableError:
@@ -201,11 +202,11 @@ class Controller:
         return True
 
     def _true(self, nominal_px: float) -> float:
-        """The true focal length at a nominal one [px]."""
+        """True focal length at a nominal one [px]."""
         return self._calibration.zoom.at(nominal_px).focal_px[0]
 
     def _aim(self, estimate: Estimate, reach: Reach, zoomed: Aim | None = None) -> Aim:
-        """Solve for an estimate, the head's bias allowed for; at the focal length of another aim, if there is one."""
+        """Solve the aim at an estimate, corrected by the head's bias; at the focal length of another aim if given."""
         if zoomed is None:
             found = aim(self._calibration, estimate.x_fixed, reach, closeup=estimate.closeup)
         else:
@@ -217,7 +218,7 @@ class Controller:
 
 
 def goal_sigmas_of(target: Estimate, aimed: Aim) -> Angles:
-    """How surely the pan and tilt at a target are known, near to an aim: standard deviations [rad]; 0 out of sight."""
+    """Standard deviations of the pan and tilt at a target, near an aim [rad]; 0 if it is behind the camera."""
     seen = target.appearance(aimed.pan, aimed.tilt, aimed.nominal_px)
     if seen is None:
         return 0.0, 0.0
@@ -226,6 +227,6 @@ def goal_sigmas_of(target: Estimate, aimed: Aim) -> Angles:
 
 
 def reach_of(rig: Rig, state: PanTiltState | None = None) -> Reach:
-    """What a rig's head and lens can do, and where the head is; asked by default."""
+    """Collect the limits of a rig's head and lens, and where the head is; by default its state is read."""
     limits, head = rig.head.limits, rig.head.state() if state is None else state
     return Reach(limits.pan, limits.tilt, rig.zoom.focal_range, (head.pan, head.tilt), limits.step)

@@ -1,13 +1,9 @@
-"""Which of several targets the zoom camera looks at: the paper's first-come, nearest deadline, most served, chosen.
+"""Choose which of several tracks to follow: first come, nearest deadline, most served, or the user's choice.
 
-A policy knows tracks of the wide view, what it costs to turn to each, and how long each has been seen well so far. The
-two that schedule look at every target for a while and go on to the next (nearest deadline after Costello et al. 2004,
-"Scheduling an active camera to observe people"); they differ where not all can be had: the nearest deadline runs after
-whoever leaves first, the other plans the order that serves most.
-
-In which order targets are looked at: when each would have been seen for long enough, and what serves most.
-
-Which of several targets a run follows, as a recording keeps it and the commands' options say it.
+A policy sees the confirmed tracks of the fixed camera, the travel time of the head to each, and how long each was seen
+well so far. The two scheduling policies look at every target for a while and go on to the next. They differ when not
+all can be reached: `nearest-deadline` (after Costello et al. 2004, "Scheduling an active camera to observe people")
+turns to the target that leaves first; `most-served` plans the order that serves most targets.
 """
 
 import math
@@ -22,28 +18,27 @@ from cotarget.geometry import Array
 from cotarget.rig import Angles, PanTiltLimits
 from cotarget.tracking.track import Track
 
-# A good close-up of a second is what a target should have; some more for what the plan does not know [s].
+# Time for which each target is looked at: a second of good close-up, and some reserve for the plan's errors [s].
 LOOK_S = 1.2
-# From a head that has arrived to a close-up that is good: the lens's travel and a frame [s].
+# Time from the head's arrival to a good close-up: the lens's travel and a frame [s].
 SETTLE_S = 0.6
-# An order of more targets than these is not searched whole, which takes some 3 ms for these; those that leave first
-# are taken.
+# Most targets whose orders are all searched, which takes some 3 ms; of more, those that leave first are taken.
 MOST_PLANNED = 7
-# How fast a target goes round the head is taken over this time [s].
+# Time over which a target's angular rate is computed [s].
 RATE_S = 0.1
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A confirmed track, as a policy sees it; where it is, is worked out for those policies that ask.
+    """A confirmed track that a policy may choose; its direction is computed on demand.
 
     Attributes:
-        track: in the wide view.
-        where: gives pan and tilt that point at it so many seconds from now, (2,) [rad].
-        leaves_in: how long until it leaves the wide view [s]; inf for one that does not.
-        seen_s: how long it has been well in the close-up so far [s].
+        track: track in the fixed camera.
+        where: gives pan and tilt that point at the target a number of seconds from now, (2,) [rad].
+        leaves_in: time until it leaves the fixed image [s]; inf if it does not.
+        seen_s: how long it was well in the close-up so far [s].
         reachable: whether the head can point at it.
-        likely: whether both views together make it what was told; so does whoever was not looked at yet.
+        likely: whether both cameras agree with its nominal size; true until the zoom camera has looked at it.
     """
 
     track: Track
@@ -55,41 +50,41 @@ class Candidate:
 
     @property
     def id(self) -> int:
-        """The track's number."""
+        """Id of the track."""
         return self.track.id
 
     @cached_property
     def at(self) -> Array:
-        """Pan and tilt that point at it now, (2,) [rad]."""
+        """Pan and tilt that point at the target now, (2,) [rad]."""
         return self.where(0.0)
 
     @cached_property
     def rate(self) -> Array:
-        """How fast these change, (2,) [rad/s]."""
+        """Rates of pan and tilt, (2,) [rad/s]."""
         return (self.where(RATE_S) - self.at) / RATE_S
 
     def after(self, seconds: float) -> Angles:
-        """Pan and tilt that point at it so many seconds from now if it goes on like this [rad]."""
+        """Extrapolate pan and tilt a number of seconds from now [rad]."""
         (pan, tilt), (pan_rate, tilt_rate) = self._line
         return pan + pan_rate * seconds, tilt + tilt_rate * seconds
 
     @cached_property
     def _line(self) -> tuple[Angles, Angles]:
-        """Where it is and how fast it goes, in plain numbers, which a plan asks for thousands of times."""
+        """Angles and rates as floats, which a plan needs thousands of times."""
         (pan, tilt), (pan_rate, tilt_rate) = self.at.tolist(), self.rate.tolist()
         return (pan, tilt), (pan_rate, tilt_rate)
 
 
 @dataclass(frozen=True)
 class SelectionState:
-    """What an order is made from.
+    """Input of a plan.
 
     Attributes:
-        waiting: those not seen for long enough yet; who leaves first comes first.
-        current: the number of the track followed before.
+        waiting: targets not seen for long enough yet, in the order in which they leave.
+        current: id of the track followed so far.
         head: pan and tilt now [rad].
-        limits: the head's.
-        look_s: how long each is looked at [s].
+        limits: limits of the head.
+        look_s: time for which each target is looked at [s].
     """
 
     waiting: Sequence[Candidate]
@@ -100,7 +95,7 @@ class SelectionState:
 
 
 class Plan(NamedTuple):
-    """The best order: how many targets it serves, when it is over [s from now], and the number of the first."""
+    """Best order: number of targets served, end of the order [s from now], and id of the first target."""
 
     served: int
     end: float
@@ -108,10 +103,11 @@ class Plan(NamedTuple):
 
 
 def plan(state: SelectionState) -> Plan:
-    """The order that serves most before they leave, and is over first; if nobody can be had, who would be done first.
+    """Plan the order that serves most targets before they leave, and of these the one that ends first.
 
-    Of orders of the same targets with the same one last only the one over first is gone on with: whoever sets out
-    earlier from the same target is nowhere later (dynamic programming after Held and Karp 1962).
+    If no target can be served, the plan names the one that would be done first. Of orders of the same targets with the
+    same last one, only the one that ends first is continued, because an earlier start from the same target never
+    arrives later (dynamic programming after Held and Karp 1962).
     """
     planned = state.waiting[:MOST_PLANNED]
     alone = [(done_in(c, state, state.head, 0.0), c) for c in planned]
@@ -125,7 +121,7 @@ def plan(state: SelectionState) -> Plan:
                 if done >> i & 1:
                     continue
                 end = done_in(candidate, state, there, order.end)
-                if end > candidate.leaves_in:  # nobody waits for what cannot be had
+                if end > candidate.leaves_in:  # it cannot be served
                     continue
                 key, found = (done | 1 << i, i), Plan(order.served + 1, end, order.first)
                 if key not in longer or _worth(found) > _worth(longer[key]):
@@ -139,49 +135,49 @@ def plan(state: SelectionState) -> Plan:
 
 
 def _worth(order: Plan) -> tuple[int, float, int]:
-    """What makes an order better than another."""
+    """Sort key of orders, the best one largest."""
     return order.served, -order.end, -order.first
 
 
 def travel_s(way: Angles, limits: PanTiltLimits) -> float:
-    """How long the head takes from rest to rest over a way in pan and tilt [rad], both axes at once [s]."""
+    """Travel time of the head from rest to rest, over an angle of pan and tilt [rad] with both axes at once [s]."""
     longest = max(abs(way[0]), abs(way[1]))
-    if math.isinf(limits.acceleration):  # at its speed at once, or there at once
+    if math.isinf(limits.acceleration):  # full speed at once, or a jump
         return longest / limits.speed
-    if longest * limits.acceleration <= limits.speed**2:  # it never reaches its speed
+    if longest * limits.acceleration <= limits.speed**2:  # it does not reach full speed
         return 2 * math.sqrt(longest / limits.acceleration)
     return longest / limits.speed + limits.speed / limits.acceleration
 
 
 def done_in(candidate: Candidate, state: SelectionState, head: Angles, now: float) -> float:
-    """When a target will have been seen for long enough if it comes next; it moves on meanwhile [s from now].
+    """Time until a target has been seen for long enough if it comes next, with its motion meanwhile [s from now].
 
     Args:
         candidate: the target.
-        state: gives the head's limits, and who is looked at already.
-        head: pan and tilt then [rad].
-        now: when it sets out [s from now].
+        state: limits of the head, and the target followed so far.
+        head: pan and tilt at the start [rad].
+        now: time of the start [s from now].
     """
     arrival = now
     if now > 0 or candidate.id != state.current:  # the head is not there already
-        for _ in range(2):  # the way depends on when the head arrives; the second time is right to a few hundredths
+        for _ in range(2):  # the way depends on the arrival; two rounds agree to a few hundredths
             pan, tilt = candidate.after(arrival)
             arrival = now + travel_s((pan - head[0], tilt - head[1]), state.limits)
         arrival += SETTLE_S
     return arrival + max(state.look_s - candidate.seen_s, 0.0)
 
 
-# --- whom ---
+# Choice as options and recordings state it
 
 
 @dataclass(frozen=True)
 class TargetChoice:
-    """Which of several targets a run follows: one of these, or the first that comes where nothing is said.
+    """Which target a run follows: one of these; with none of them, the first that comes.
 
     Attributes:
-        policy: its name, of `cotarget.control.selection.POLICIES`.
-        click: the target at this pixel of the wide view (u, v).
-        track: the track of this number.
+        policy: name of a policy in `POLICIES`.
+        click: pixel of the fixed image that shows the target (u, v).
+        track: id of a track.
     """
 
     policy: str | None = None
@@ -189,12 +185,12 @@ class TargetChoice:
     track: int | None = None
 
 
-# Nothing is said.
+# No choice: the first target that comes.
 ANY_TARGET = TargetChoice()
 
 
 def choice_table(target_choice: TargetChoice) -> dict[str, Any]:
-    """Write whom a run follows."""
+    """Convert a choice to a table for a recording."""
     parts = {
         "policy": target_choice.policy,
         "click": target_choice.click and list(target_choice.click),
@@ -204,10 +200,10 @@ def choice_table(target_choice: TargetChoice) -> dict[str, Any]:
 
 
 def parse_choice(table: Any) -> TargetChoice:
-    """Read whom a run followed.
+    """Parse the table of a choice from a recording.
 
     Raises:
-        ValueError: it is no such table.
+        ValueError: the table is no choice.
     """
     if not isinstance(table, dict) or len(table) > 1 or not table.keys() <= {"policy", "click", "track"}:
         raise ValueError(f"{table!r} is not one of policy, click and track")
@@ -221,39 +217,39 @@ def parse_choice(table: Any) -> TargetChoice:
     return TargetChoice(click=(float(click[0]), float(click[1])))
 
 
-# A click means the target in whose box it is, or one whose middle is within this part of the image's width.
+# A click selects the target whose box holds it, or one whose centre is within this part of the image's width.
 CLICK_PART = 0.08
-# Whoever was chosen and lost is looked for so long [s]: a person behind a tree or a car, a bird behind a roof. A track
-# that begins meanwhile is taken for the same target if it is no more than so many times as large or as small and no
-# farther than so many of its sizes, and this part of the way gone meanwhile, from where the old one would be.
+# A chosen target that was lost is searched for this long [s]: a person behind a tree or car, a bird behind a roof. A
+# track that begins meanwhile is the same target if its size differs by no more than this factor and its distance from
+# the extrapolated place is no more than this many sizes plus this part of the way gone meanwhile.
 RETURNS_S, RETURN_SIZES, RETURN_TIMES, RETURN_PART = 3.0, 2.0, 2.0, 0.5
 
 
 class Policy(Protocol):
-    """Chooses whom to follow; told everything at every frame."""
+    """Chooses the track to follow; called in every frame."""
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
-        """The number of the track to follow; None for none.
+        """Return the id of the track to follow; None for no track.
 
         Args:
             candidates: all confirmed tracks.
             head: pan and tilt now, (2,) [rad].
-            limits: the head's speed and acceleration.
+            limits: limits of the head.
         """
 
     def favours(self, track: Track) -> bool:
-        """Whether a track must be among the candidates, even where there are more than can be."""
+        """Whether a track must become a candidate, even if there are more tracks than candidates."""
 
     @property
     def unmet(self) -> str:
-        """What was asked for and is not there, in words; empty where it is there, or where anybody will do."""
+        """What was chosen and is not there, as a message; empty if it is there or any target will do."""
 
 
 def _eligible(candidates: Sequence[Candidate]) -> Sequence[Candidate]:
-    """Those that the head can point at; where it can point at none, all of them, so that it is said why.
+    """Filter candidates to those that the head can reach and that are likely targets.
 
-    Of these the likely ones, such as no cloud that was taken for a person; where none is, all, as size or calibration
-    may be wrong.
+    If none can be reached, all stay, so that the run can report why. If none is likely, all reachable ones stay, since
+    nominal size or calibration may be wrong. An unlikely one is for example a cloud taken for a person.
     """
     reachable = [candidate for candidate in candidates if candidate.reachable] or candidates
     return [candidate for candidate in reachable if candidate.likely] or reachable
@@ -261,38 +257,37 @@ def _eligible(candidates: Sequence[Candidate]) -> Sequence[Candidate]:
 
 @dataclass
 class FirstCome:
-    """The paper's policy: follow the first target until it disappears, then the next."""
+    """Follow the first target until it disappears, then the next: the paper's policy."""
 
     _id: int | None = None
     unmet = ""
 
     def favours(self, track: Track) -> bool:
-        """No: whoever came first has the lowest number, and is a candidate as long as it is there."""
+        """Favour no track: the first has the lowest id and stays a candidate anyway."""
         return False
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
-        """The one followed before, if it is still there, can be reached and is likely, or else the eldest that is."""
+        """Keep the target followed so far while it is eligible, or else take the oldest eligible one."""
         ids = [candidate.id for candidate in _eligible(candidates)]
         if self._id not in ids:
             self._id = min(ids, default=None)
         return self._id
 
 
-LONGEST_LOOKS = 2.5  # the longest that somebody is kept who is not seen, in looks
+LONGEST_LOOKS = 2.5  # longest time for a target that is not seen, in looks
 
 
 @dataclass
 class Rounds:
-    """Look at every target for a while and go on to the next; once all were seen, at whoever was seen least.
+    """Look at every target for a while and go on to the next; after all were seen, at the one seen least.
 
-    Turning away costs the way, and the time until the lens has settled again: whoever turned before that would see
-    nobody. So each is kept for SETTLE_S unless it is gone or was seen for long enough; and once all were, for a look
-    more, and until it has been seen longer than another by a whole look or that takes too long: it may be hidden from
-    the zoom camera alone.
+    Turning away costs the way and the time until the lens has settled. So each target is kept for SETTLE_S at least,
+    unless it is gone or was seen for long enough. After all were seen, each is kept for one look more, and until it is
+    a whole look ahead of another or that takes too long, because it may be hidden from the zoom camera alone.
 
     Attributes:
-        next_of: gives the number of the next one; asked at every frame, and never without anybody waiting.
-        look_s: how long each is looked at [s].
+        next_of: gives the id of the next target; called only while targets wait.
+        look_s: time for which each target is looked at [s].
     """
 
     next_of: Callable[[SelectionState], int]
@@ -302,11 +297,11 @@ class Rounds:
     unmet = ""
 
     def favours(self, track: Track) -> bool:
-        """No: there is no telling whose turn it would be."""
+        """Favour no track: whose turn comes next is unknown."""
         return False
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
-        """The next one, as long as somebody waits."""
+        """Return the next target that waits, or the one seen least if none waits."""
         candidates = _eligible(candidates)
         waiting = sorted((c for c in candidates if c.seen_s < self.look_s), key=lambda c: (c.leaves_in, c.id))
         t = max((c.track.t for c in candidates), default=-math.inf)
@@ -319,12 +314,12 @@ class Rounds:
         return self._id
 
     def _turn(self, number: int | None, t: float) -> None:
-        """Look at somebody from a time on [s]."""
+        """Look at a target from time t on [s]."""
         if number != self._id:
             self._id, self._since = number, t
 
     def _least_seen(self, candidates: Sequence[Candidate], t: float) -> int | None:
-        """Whoever was seen least; the one followed before until it is a whole look ahead, or that takes too long."""
+        """The target seen least; the current one until it is a whole look ahead or that takes too long."""
         others = [c for c in candidates if c.id != self._id]
         current = next((c for c in candidates if c.id == self._id), None)
         if not others:
@@ -337,7 +332,7 @@ class Rounds:
 
 
 def nearest_deadline(state: SelectionState) -> int:
-    """The one followed before to its end; then whoever leaves first of those that can still be seen."""
+    """Keep the current target until it is served; then take the first to leave of those that can still be served."""
     if state.current in {c.id for c in state.waiting}:
         return state.current
     in_time = [c for c in state.waiting if done_in(c, state, state.head, 0.0) <= c.leaves_in]
@@ -345,9 +340,9 @@ def nearest_deadline(state: SelectionState) -> int:
 
 
 def most_served(state: SelectionState) -> int:
-    """The first of the order that serves most before they leave; the one followed before while it can still be had.
+    """Keep the current target while it can be served; then take the first of the order that serves most.
 
-    When a target leaves is known badly: whoever made another plan at every frame would look at nobody for long enough.
+    When a target leaves is known badly, and a new plan in every frame would look at no target for long enough.
     """
     current = next((c for c in state.waiting if c.id == state.current), None)
     if current is not None and done_in(current, state, state.head, 0.0) <= current.leaves_in:
@@ -357,15 +352,15 @@ def most_served(state: SelectionState) -> int:
 
 @dataclass
 class Chosen:
-    """Follow what the user chose, by its number or by a click into the wide view, and nothing else.
+    """Follow the target that the user chose by id or by a click into the fixed image, and no other.
 
-    A target that was out of sight for longer than its track lives comes back under another number. Whoever turns up
-    soon after where it would have gone is taken for it.
+    A target out of sight for longer than its track lives comes back under a new id. A track that begins soon after,
+    near where the target would have gone, is taken for it.
 
     Attributes:
-        number: of the track.
-        pixel: of the click (u, v).
-        width_px: of the wide view; a click that far from everything, as a part of it, means nothing.
+        number: id of the track.
+        pixel: pixel of the click (u, v).
+        width_px: width of the fixed image; `CLICK_PART` of it is the largest distance of a click.
     """
 
     number: int | None = None
@@ -373,11 +368,11 @@ class Chosen:
     width_px: float = math.inf
     _found: int | None = field(default=None, init=False)
     _there: bool = field(default=False, init=False)
-    _last: Candidate | None = field(default=None, init=False)  # as it was seen last
-    _newest: int = field(default=0, init=False)  # of the tracks that were there beside it then
+    _last: Candidate | None = field(default=None, init=False)  # when it was last seen
+    _newest: int = field(default=0, init=False)  # largest id of the tracks at that time
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
-        """The chosen one while it is there."""
+        """Return the chosen target while it is there; None otherwise."""
         if self._found is None:
             self._found = self.number if self.pixel is None else self._clicked(candidates)
         there = {candidate.id: candidate for candidate in candidates}
@@ -391,14 +386,14 @@ class Chosen:
         return self._found
 
     def favours(self, track: Track) -> bool:
-        """Whether it is the chosen one, or may be."""
+        """Whether a track is the chosen target, or may be."""
         if self._found is None:
             return self._means(track)
         return track.id == self._found or (not self._there and self._is_back(track))
 
     @property
     def unmet(self) -> str:
-        """Which choice means none of the tracks."""
+        """The choice that no track meets, as a message; empty if a track meets it."""
         if self._there:
             return ""
         if self.pixel is None:
@@ -409,7 +404,7 @@ class Chosen:
         )
 
     def _is_back(self, track: Track) -> bool:
-        """Whether a track may be of the chosen one, which was lost and has not left the wide view."""
+        """Whether a track may continue the chosen target, which was lost inside the fixed image."""
         if self._last is None or track.id <= self._newest:
             return False
         last, gone_s = self._last.track, track.t - self._last.track.t
@@ -420,19 +415,19 @@ class Chosen:
         return 1 / RETURN_TIMES <= resized <= RETURN_TIMES and self._off_course(track) <= room
 
     def _off_course(self, track: Track) -> float:
-        """How far a track is from where the chosen one would be by now [px]."""
+        """Distance of a track from the extrapolated place of the chosen target [px]."""
         assert self._last is not None, "who asks has looked"
         last = self._last.track
         return float(np.linalg.norm(track.center_px - last.center_px - last.velocity_px * (track.t - last.t)))
 
     def _clicked(self, candidates: Sequence[Candidate]) -> int | None:
-        """The track under a click, or the nearest that is near."""
+        """Find the track under the click, or the nearest within reach."""
         near = [c.track for c in candidates if self._means(c.track)]
         inside = [track for track in near if self._inside(track)]
         return min(inside or near, key=self._away).id if near else None
 
     def _means(self, track: Track) -> bool:
-        """Whether a choice may mean a track."""
+        """Whether a track can be the one chosen, by id or by click."""
         if self.pixel is None:
             return track.id == self.number
         return self._inside(track) or self._away(track) <= CLICK_PART * self.width_px
@@ -442,17 +437,17 @@ class Chosen:
         return bool(np.all(np.abs(self._off(track)) <= track.size_px / 2))
 
     def _away(self, track: Track) -> float:
-        """How far a click is from a track's middle [px]."""
+        """Distance of the click from a track's centre [px]."""
         return float(np.linalg.norm(self._off(track)))
 
     def _off(self, track: Track) -> Array:
-        """From a click to a track's middle, (2,) [px]."""
+        """Vector from the click to a track's centre, (2,) [px]."""
         assert self.pixel is not None, "who asks has looked"
         return np.asarray(track.center_px - np.array(self.pixel))
 
 
 def leaves_in(track: Track, size: tuple[int, int]) -> float:
-    """How long until a track's middle leaves an image of (width, height), if it goes on like this [s]."""
+    """Time until a track's centre leaves an image of (width, height) at its present velocity [s]."""
     times = []
     for at, speed, side in zip(track.center_px, track.velocity_px, size, strict=True):
         if speed:
@@ -461,7 +456,7 @@ def leaves_in(track: Track, size: tuple[int, int]) -> float:
     return float(max(min(times, default=math.inf), 0.0))
 
 
-# By the names that users call them.
+# Policies by the names that users give.
 POLICIES: Mapping[str, Callable[[], Policy]] = {
     "first-come": FirstCome,
     "nearest-deadline": partial(Rounds, nearest_deadline),

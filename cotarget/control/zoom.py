@@ -1,11 +1,11 @@
-"""How far to zoom in: as close as is wanted while the target surely stays in the image, and out before it is lost.
+"""Choose the focal length: as close as wanted while the target surely stays in the image.
 
-Pure: everything is in tangents at the zoom camera and in times that the caller gives. Focal lengths are true ones [px].
+The lens zooms in to the wanted size, but no further than the whole target is in the next zoom frame with a probability
+of 95 %; it zooms out below 80 %. Probabilities are for the first frame that a command can change, even if the lens
+travels longer, because the next frame corrects it on its way. The comparison: docs/design-notes.md.
 
-Chances are for the first frame that a command can change, though the lens may travel on for a second: the next frame
-corrects it on its way. Counting with what may become of the target until the lens arrives, unseen all the while, keeps
-it too wide: of birds 25 m away that are in frame all the time as it is, 56 % of the frames were good close-ups, and not
-69 %; counting with a fifth of the whole way out besides, 22 %. For persons it changed nothing.
+No device and no clock are used: angles are tangents at the zoom camera, and the caller gives the times. Focal lengths
+are true ones [px].
 """
 
 import math
@@ -17,23 +17,23 @@ from cotarget.estimation.measurement_model import Appearance, Estimate
 from cotarget.geometry import Array
 from cotarget.tracking.track import Track
 
-# Halvings of the range of focal lengths, tenfold or so, until it is known to a thousandth.
+# Bisections of the range of focal lengths, tenfold or so, to a thousandth.
 HALVINGS = 12
-# Well seen is whoever is wholly in the image with this chance, at such a part of the wanted size; as `cotarget.metrics`
-# has a good close-up.
+# A target is seen well if it is wholly in the image with this probability, at a size ratio in this range; the range is
+# that of a good close-up in `cotarget.metrics`.
 SEEN_WELL, GOOD_SIZE = 0.8, (0.8, 1.25)
 
 
 @dataclass(frozen=True)
 class ZoomSettings:
-    """When to zoom in and out.
+    """Settings of the zoom controller.
 
     Attributes:
-        sure: chance that the whole target is in the image with which the lens zooms in ...
-        unsure: ... and below which it zooms out; between them it stays.
-        rim_px: so near to the image's border the target shall not come [px].
-        deadband: a smaller relative change of the focal length is not worth moving the lens for.
-        settle_s: for so long after it had to zoom out the lens does not zoom in [s].
+        sure: probability that the whole target is in the image up to which the lens zooms in.
+        unsure: probability below which it zooms out; between the two it stays.
+        rim_px: margin at the image's border that the target must not enter [px].
+        deadband: relative change of the focal length below which the lens is not commanded.
+        settle_s: time after a forced zoom out in which the lens does not zoom in [s].
     """
 
     sure: float = 0.95
@@ -45,14 +45,13 @@ class ZoomSettings:
 
 @dataclass(frozen=True)
 class ExpectedTarget:
-    """The target as it will stand to the line of sight when the next frame is exposed.
+    """Predicted place and size of the target in the next zoom frame.
 
     Attributes:
-        offset: where its middle will be from the image's centre, that is the way that the head has still to go, right
-            and down [tangent], (2,).
-        covariance: of that [tangent^2], (2, 2).
+        offset: offset of its centre from the image's centre, right and down [tangent], (2,).
+        covariance: covariance of the offset [tangent^2], (2, 2).
         half: half its width and height [tangent], (2,).
-        size_sigma: relative standard deviation of these.
+        size_sigma: relative standard deviation of the size.
     """
 
     offset: Array
@@ -63,12 +62,12 @@ class ExpectedTarget:
 
 @dataclass(frozen=True)
 class ZoomChoice:
-    """What the lens shall do.
+    """Decision on the lens.
 
     Attributes:
-        focal_px: where it shall be [px].
-        chance: that the whole target is then in the image.
-        reason: why, in a word or two: "wanted", "unsure", "about to be lost", "settling" or "lost".
+        focal_px: chosen focal length [px].
+        chance: probability that the whole target is then in the image.
+        reason: "wanted", "unsure", "about to be lost", "settling" or "lost".
     """
 
     focal_px: float
@@ -77,7 +76,7 @@ class ZoomChoice:
 
 
 def shape_of(track: Track) -> float:
-    """A track's usual width over its height."""
+    """Width over height of a track's usual box."""
     width, height = track.size_px.tolist()
     return float(width / height)
 
@@ -85,17 +84,17 @@ def shape_of(track: Track) -> float:
 def expect(
     estimate: Estimate, pan: float, tilt: float, nominal_px: float, *, shape: float = 1.0
 ) -> ExpectedTarget | None:
-    """Work out how a target will stand to the line of sight.
+    """Predict the target in the zoom image.
 
     Args:
-        estimate: of the target, for the time when the next frame is exposed.
-        pan: where the head will be then [rad].
-        tilt: likewise.
-        nominal_px: any focal length near the one in question; it only matters for the lens's centre.
+        estimate: estimate of the target at the next zoom frame's exposure.
+        pan: pan of the head then [rad].
+        tilt: tilt of the head then [rad].
+        nominal_px: any focal length near the one in question; it only affects the principal point.
         shape: width over height of the target's box.
 
     Returns:
-        None where it will be behind the zoom camera.
+        The prediction; None if the target will be behind the zoom camera.
     """
     seen = estimate.appearance(pan, tilt, nominal_px)
     return None if seen is None else _expected(estimate, seen, shape)
@@ -119,14 +118,14 @@ def _expected(estimate: Estimate, seen: Appearance, shape: float) -> ExpectedTar
 def is_seen_well(
     estimate: Estimate, pan: float, tilt: float, nominal_px: float, longest_px: float, *, shape: float = 1.0
 ) -> bool:
-    """Whether a target is wholly in the close-up and about as large as wanted, as far as is known.
+    """Whether a target is wholly in the close-up and about as large as wanted, by its estimate.
 
     Args:
-        estimate: of the target, for the time of that close-up.
-        pan: where the head was then [rad].
-        tilt: likewise.
-        nominal_px: what the lens told then [px].
-        longest_px: the most that it can tell [px]; a target that is too far off for the wanted size need not have it.
+        estimate: estimate of the target at the close-up's time.
+        pan: pan of the head then [rad].
+        tilt: tilt of the head then [rad].
+        nominal_px: nominal focal length then [px].
+        longest_px: longest nominal focal length [px]; it limits the size wanted of a far target.
         shape: width over height of the target's box.
     """
     seen = estimate.appearance(pan, tilt, nominal_px)
@@ -140,13 +139,13 @@ def is_seen_well(
 
 
 def chance_inside(expected: ExpectedTarget, focal_px: float, size: tuple[int, int], rim_px: float = 0.0) -> float:
-    """The chance that the whole target is in the image.
+    """Probability that the whole target is in the image.
 
     Args:
-        expected: how it stands to the line of sight; its size's doubt widens each side, and both axes count alone.
+        expected: predicted target; the uncertainty of its size widens each side, and the axes are independent.
         focal_px: focal length [px].
         size: (width, height) of the image [px].
-        rim_px: that is not counted as image, all around [px].
+        rim_px: margin at the border that does not count as image [px].
     """
     chance = 1.0
     for axis in range(2):
@@ -166,14 +165,14 @@ def longest_focal(
     focal_range: tuple[float, float],
     rim_px: float = 0.0,
 ) -> float:
-    """The longest focal length at which the whole target is in the image with some chance.
+    """Find the longest focal length at which the whole target is in the image with a given probability.
 
     Args:
-        expected: how it stands to the line of sight.
-        chance: that is asked for, 0 to 1.
+        expected: predicted target.
+        chance: probability, 0 to 1.
         size: (width, height) of the image [px].
-        focal_range: shortest and longest focal length [px]; the shortest is the answer also where it does not do.
-        rim_px: that is not counted as image, all around [px].
+        focal_range: shortest and longest focal length [px]; the shortest is returned even if it does not suffice.
+        rim_px: margin at the border that does not count as image [px].
     """
     low, high = focal_range
     if chance_inside(expected, high, size, rim_px) >= chance:
@@ -188,17 +187,17 @@ def longest_focal(
 
 
 class ZoomController:
-    """Decides on the lens from one frame to the next, with hysteresis, so that it does not hunt."""
+    """Decide on the focal length in every frame, with hysteresis, so that the lens does not hunt."""
 
     def __init__(
         self, focal_range: tuple[float, float], size: tuple[int, int], settings: ZoomSettings = ZoomSettings()
     ) -> None:
-        """Begin without a history.
+        """Create a controller without history.
 
         Args:
             focal_range: shortest and longest focal length [px].
             size: (width, height) of the zoom image [px].
-            settings: when to zoom in and out.
+            settings: settings of the controller.
         """
         self._range = focal_range
         self._size = size
@@ -213,14 +212,14 @@ class ZoomController:
         t: float,
         now_px: float | None = None,
     ) -> ZoomChoice:
-        """Decide where the lens shall be.
+        """Decide on the focal length.
 
         Args:
-            expected: how the target will stand to the line of sight; None where it is lost.
-            wanted_px: focal length at which it is as large as wanted [px].
-            commanded_px: where the lens was last sent [px].
-            t: the time now [s].
-            now_px: where the lens is now [px]; there by default.
+            expected: predicted target; None if it is lost.
+            wanted_px: focal length at which the target has the wanted size [px].
+            commanded_px: focal length commanded last [px].
+            t: time now [s].
+            now_px: focal length now [px]; the commanded one by default.
         """
         if expected is None:
             self._out_t = t
@@ -240,7 +239,7 @@ class ZoomController:
         change = math.log(goal / commanded_px)
         if change > settings.deadband:
             if t - self._out_t < settings.settle_s:
-                # What it had to zoom out for may have passed before it got there: no farther out than is needed now.
+                # The reason to zoom out may have passed before the lens got there: stop where it is enough now.
                 here = commanded_px if now_px is None else now_px
                 return choice(max(commanded_px, min(goal, here)), "settling")
             return choice(goal, reason)
@@ -253,7 +252,7 @@ class ZoomController:
 
 
 def _below(value: float, sigma: float) -> float:
-    """The chance that a normal variable with that sigma is below a value."""
+    """Probability that a zero-mean normal variable is below a value."""
     if sigma <= 0:
         return 1.0 if value > 0 else 0.0
     return 0.5 * math.erfc(-value / (sigma * math.sqrt(2)))

@@ -1,9 +1,9 @@
-"""Finding targets in the wide view: by colour (the book), by motion (a person), as a speck that changes (a bird).
+"""Detect targets in the fixed camera: by colour (a book), by motion (a person), by contrast and change (a bird).
 
-`make_detector` knows four by name: "colour"; "mog2", the paper's adaptive Gaussian mixture, its foreground cleaned and
-joined to pieces of a target's size; "motion", the same with what foliage and light need; and "speck", for small targets
-that may hover, seen by a camera that may shake. `ExternalDetector` makes a fifth of any function from a picture to
-boxes.
+`make_detector` makes one of four by name: "colour"; "mog2", the paper's adaptive Gaussian mixture, with its foreground
+cleaned and joined to regions of a target's size; "motion", the same mixture made robust against foliage and light; and
+"speck", for small targets that may hover, seen by a camera that may shake. `ExternalDetector` makes a detector of any
+function from an image to boxes.
 """
 
 import cv2
@@ -33,16 +33,15 @@ __all__ = [
 
 
 def make_detector(target: TargetConfig, rate_hz: float, template: Image | None = None) -> Detector:
-    """Make the detector that a target's configuration asks for.
+    """Make the detector that a target profile names.
 
     Args:
-        target: the target.
-        rate_hz: the camera's nominal frames a second.
-        template: (h, w, 3) BGR picture of the target, for one that is found by its colour; the configured
-            picture by default.
+        target: target profile.
+        rate_hz: nominal frame rate of the camera [Hz].
+        template: image of the target for the detector "colour", (h, w, 3) BGR; that of the target profile by default.
 
     Raises:
-        ConfigError: a colour target without a usable template.
+        ConfigError: a colour target has no usable template.
     """
     kind: str = target.detector
     if kind == "speck":

@@ -1,4 +1,8 @@
-"""What moves: an adaptive Gaussian mixture of the background, morphology and connected pieces (person, bird)."""
+"""Detect motion with an adaptive Gaussian mixture of the background, morphology and connected components.
+
+It detects persons and birds, and is robust against shadows, changes of light and swaying foliage; `plain` gives the
+paper's settings. The reasons for the settings: docs/design-notes.md.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,36 +13,36 @@ import numpy as np
 from cotarget.detection.base import Detection, box_detection, check_size, flood
 from cotarget.rig import Frame, Image
 
-# What MOG2 writes into its mask: 255 is foreground, 127 a shadow.
+# Values in MOG2's mask: 255 is foreground, 127 a shadow.
 FOREGROUND = 255
-# A light that was switched on or a camera that was nudged stays so: after so long [s] the background is learnt anew.
-# Left to itself the mixture would take as long as it remembers, and what moves meanwhile would not be seen.
+# Time for which foreground may fill the image, as after a change of light or a nudge, before the background is learnt
+# again [s]. The mixture alone would take as long as its history, and targets would not be seen meanwhile.
 FLOODED_S = 0.2
 
 
 @dataclass(frozen=True)
 class BackgroundSettings:
-    """What moves like the target.
+    """Settings of the background mixture and of the targets' size and shape.
 
     Attributes:
-        history_s: how far back the background's colours are remembered [s].
+        history_s: memory of the background mixture [s].
         background_part: the colours that make up this part of a pixel's history are its background. Many colours
-            (0.9) hide foliage, but then a target that stops melts away after a tenth of the history.
-        warm_up_s: no detection before the background has been learnt for this long [s].
-        threshold: squared distance to the background, in variances, from which a pixel counts as foreground.
-        shadows: whether to tell shadows apart from the target.
-        brightest: the background in a light up to so many times brighter, when the sun comes out, is no target where
-            most of what changed is that: the mixture tells shadows, but nothing that is brighter; 1 for not at all.
-        sway_px: how far the background itself sways [px]: a pixel is no target where its colour lies between the
-            darkest and the brightest that the background has within this distance; 0 for a rigid background.
-        opening_px: specks thinner than this are removed; 0 for none.
+            (0.9) hide foliage, but a target that stops then fades after a tenth of the history.
+        warm_up_s: time for which the background is learnt before anything is detected [s].
+        threshold: squared distance to the background, in variances, from which a pixel is foreground.
+        shadows: whether to separate shadows from the target.
+        brightest: largest factor by which the background may brighten, as when the sun comes out, and stay background,
+            if that explains most of the foreground; the mixture knows shadows but no light. 1 for none.
+        sway_px: distance by which the background sways [px]: a pixel is background if its colour lies between the
+            darkest and the brightest background colour within this distance; 0 for a rigid background.
+        opening_px: foreground thinner than this is removed; 0 for none.
         bridge_px: (width, height) of gaps that are closed within one target.
-        smallest_px: smallest width and height of a target.
+        smallest_px: least width and height of a target.
         smallest_area_px: fewest foreground pixels of a target.
         widest: largest width as a multiple of the height.
-        largest: largest side of a target as a fraction of the image's.
-        flat: what is thinner than this part of the height of a wide piece lies on the ground, such as the edge of a
-            shadow, and is no part of the target; 0 for nothing.
+        largest: largest side of a target as a part of the image's.
+        flat: parts of a wide component thinner than this part of its height lie on the ground, such as the edge of a
+            shadow, and are no part of the target; 0 for none.
     """
 
     history_s: float
@@ -57,19 +61,18 @@ class BackgroundSettings:
     flat: float
 
 
-# The background's colours are taken out of the mixture this often [s]; it costs a third of a frame's work.
+# Interval at which the background image is read from the mixture, a third of a frame's work [s].
 BACKGROUND_UPDATE_S = 0.25
-# Up to this part of the picture its foreground pixels are quicker looked up one by one than the picture is as a whole.
+# Part of foreground pixels up to which it is faster to process them one by one than the whole image.
 FEW = 0.01
-# Levels by which a pixel must leave the background's range: five standard deviations of the sensor's noise of 2, and
-# coding.
+# Margin beside the background's range [grey levels]: five standard deviations of a sensor's noise of 2, and coding.
 MARGIN = 15
-# A piece wider than this part of its height may be a target and what lies flat. Without that it is none if it is wider
-# than high, such as the middle of a cloud.
+# A component wider than the first part of its height may be a target and something flat. What is left of it without the
+# flat parts must be no wider than the second, unlike for example the middle of a cloud.
 WIDE, UPRIGHT = 0.7, 1.0
-# The plain mixture remembers 120 frames at 30 a second [s].
+# Memory of OpenCV's default mixture, 120 frames at 30 a second [s].
 PLAIN_HISTORY_S = 4.0
-# A bird may be as small as four pixels, so that nothing is opened away; it casts no shadow on the sky.
+# A bird may be as small as four pixels, so nothing is opened; it casts no shadow on the sky.
 BIRD = BackgroundSettings(
     history_s=8.0,
     background_part=0.9,
@@ -86,8 +89,8 @@ BIRD = BackgroundSettings(
     largest=0.3,
     flat=0.0,
 )
-# A person stops at times, casts a shadow, falls apart into limbs and trunk one above the other, and stands upright
-# (1.3 still lets two or three side by side pass, but not a patch of light on the ground).
+# A person stops at times, casts a shadow, falls apart into limbs and trunk above each other, and stands upright. A
+# ratio of 1.3 admits two or three persons side by side, but no patch of light on the ground.
 PERSON = BackgroundSettings(
     history_s=20.0,
     background_part=0.7,
@@ -107,9 +110,9 @@ PERSON = BackgroundSettings(
 
 
 def plain(settings: BackgroundSettings) -> BackgroundSettings:
-    """The paper's detector: the mixture with OpenCV's part of the background; nothing against sway or light.
+    """Give the paper's detector: the mixture with OpenCV's background ratio, and nothing against sway or light.
 
-    What of the foreground is taken together, and how large a target may be, the paper does not say: that is as here.
+    The paper does not say how foreground is grouped or how large a target may be, so these settings stay.
     """
     return replace(
         settings,
@@ -123,14 +126,14 @@ def plain(settings: BackgroundSettings) -> BackgroundSettings:
 
 
 class BackgroundDetector:
-    """What differs from an adaptive Gaussian mixture of the background (Zivkovic 2004), as connected pieces."""
+    """Detect what differs from an adaptive Gaussian mixture of the background (Zivkovic 2004)."""
 
     def __init__(self, settings: BackgroundSettings, rate_hz: float) -> None:
-        """Begin without a background.
+        """Create a detector without a background.
 
         Args:
-            settings: what moves like the target.
-            rate_hz: the camera's nominal frames a second, for frames whose times do not tell.
+            settings: settings of the mixture and of the targets.
+            rate_hz: nominal frame rate, for frames whose times do not increase [Hz].
         """
         self._settings = settings
         self._interval = 1.0 / rate_hz
@@ -142,15 +145,15 @@ class BackgroundDetector:
         self._model.setBackgroundRatio(settings.background_part)
         self._t: float | None = None
         self._learnt = 0.0
-        self._since: float | None = None  # when so much changed that it is no target
-        self._known: tuple[Image, float] | None = None  # background, and when it was taken out of the mixture
+        self._since: float | None = None  # time since which foreground fills the image
+        self._known: tuple[Image, float] | None = None  # background image, and when it was read from the mixture
         self._range: tuple[Image, Image] | None = None
         self._range_of: Image | None = None
         self._shape: tuple[int, ...] | None = None
         self.mask: Image | None = None
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """Find what moves, largest first.
+        """Detect moving targets, largest first.
 
         Raises:
             CotargetError: the image's size changed.
@@ -178,29 +181,29 @@ class BackgroundDetector:
         return self._boxes(mask)
 
     def _forget(self) -> None:
-        """Learn the background anew from the next picture on."""
+        """Learn the background again from the next image on."""
         self._learnt, self._t, self._since, self._known = 0.0, None, None, None
 
     def _rate(self, t: float) -> float:
-        """Learning rate for a frame at ``t`` [s]: fast while there is little to remember."""
+        """Learning rate for a frame at ``t`` [s]: high while little has been learnt."""
         dt = self._interval if self._t is None else t - self._t
         self._t = t
         if dt <= 0:
             dt = self._interval
         anew, self._learnt = not self._learnt, self._learnt + dt
-        if anew:  # nothing of what the mixture may have learnt before
+        if anew:  # discard whatever the mixture learnt before
             return 1.0
         return min(1.0, dt / min(self._settings.history_s, 2 * self._learnt))
 
     def _background(self) -> Image:
-        """The background's colours, of a moment ago at most."""
+        """Background image, at most `BACKGROUND_UPDATE_S` old."""
         learnt, known = self._learnt, self._known
         if known is None or not BACKGROUND_UPDATE_S <= learnt <= known[1] + BACKGROUND_UPDATE_S:
             known = self._known = self._model.getBackgroundImage(), learnt
         return known[0]
 
     def _unlit(self, mask: Image, image: Image) -> Image:
-        """A mask without the background in a brighter light, where most of what changed is that."""
+        """Remove background in a brighter light from a mask, if that explains most of it."""
         if cv2.countNonZero(mask) < FEW * mask.size:
             return mask
         there = np.flatnonzero(mask != 0)
@@ -216,7 +219,7 @@ class BackgroundDetector:
         return mask
 
     def _sway(self) -> tuple[Image, Image]:
-        """The darkest and the brightest that the background has nearby: what sways does not leave that range."""
+        """Darkest and brightest background colours nearby, the range of a swaying background."""
         background = self._background()
         if self._range is None or self._range_of is not background:
             nearby = np.ones((2 * self._settings.sway_px + 1,) * 2, np.uint8)
@@ -227,13 +230,13 @@ class BackgroundDetector:
         return self._range
 
     def _boxes(self, mask: Image) -> list[Detection]:
-        """Boxes of the connected pieces, largest first."""
+        """Find the boxes of the connected components, largest first."""
         settings = self._settings
         height, width = mask.shape
         found = []
         largest_w, largest_h = settings.largest * width, settings.largest * height
         for x, y, w, h in pieces(mask, settings.bridge_px):
-            # Their gaps were only bridged: the box is that of the mask's own pixels inside.
+            # The component's gaps are bridged, so its box is that of the mask's own pixels.
             for first, last in self._upright(mask[y : y + h, x : x + w]):
                 inside = mask[y : y + h, x + first : x + last]
                 area = cv2.countNonZero(inside)
@@ -251,7 +254,7 @@ class BackgroundDetector:
         return [detection for _, detection in found]
 
     def _upright(self, piece: Image) -> list[tuple[int, int]]:
-        """From which column to which a piece of a mask is a target: where it is wide, without what lies flat."""
+        """Find the column ranges of a component that stand upright, without what lies flat."""
         height, width = piece.shape
         if not self._settings.flat or width <= WIDE * height:
             return [(0, width)]
@@ -264,11 +267,11 @@ class BackgroundDetector:
 
 
 def pieces(mask: Image, bridge_px: tuple[int, int]) -> list[Sequence[int]]:
-    """Left, top, width and height of the connected pieces of a mask, (H, W) [px], half a gap on each side included.
+    """Find the connected components of a mask (H, W), as left, top, width and height [px].
 
-    Gaps of up to (across, down) count as none.
+    Gaps of up to (across, down) are closed, and half a gap is included on each side.
     """
-    left, top, width, height = cv2.boundingRect(mask)  # mostly small, and all the rest needs no look
+    left, top, width, height = cv2.boundingRect(mask)  # mostly small, which saves processing the rest
     if not width:
         return []
     across, down = bridge_px
@@ -280,10 +283,10 @@ def pieces(mask: Image, bridge_px: tuple[int, int]) -> list[Sequence[int]]:
 
 
 def _outside(mask: Image, image: Image, colours: tuple[Image, Image]) -> Image:
-    """The part of a mask, (H, W), 0 or 255, where an image leaves a range of colours."""
+    """Restrict a mask (H, W), 0 or 255, to pixels whose colour is outside a range."""
     if cv2.countNonZero(mask) > FEW * mask.size:
         return cv2.subtract(mask, cv2.inRange(image, *colours))
-    there = np.flatnonzero(mask != 0)  # of truth values: ten times as quick as of bytes
+    there = np.flatnonzero(mask != 0)  # of booleans, which is ten times as fast as of bytes
     if len(there):
         pixels, darkest, brightest = (
             each.reshape(-1, 3).take(there, axis=0).reshape(-1, 1, 3) for each in (image, *colours)

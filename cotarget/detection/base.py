@@ -1,9 +1,8 @@
-"""What a detector takes and gives.
+"""Define what a detector takes and returns, and wrap external detectors.
 
-Boxes are (u, v) middle and (width, height), in pixels whose (0, 0) is the centre of the top-left one, so that the
-box of a single lit pixel at column 3 is centred on u = 3 and 1 wide.
-
-Any detector from elsewhere, a neural network for instance: a function from a picture to boxes.
+A box has a centre (u, v) and a size (width, height). Pixel (0, 0) is the centre of the top-left pixel, so the box of a
+single lit pixel at column 3 is centred on u = 3 and 1 wide. `ExternalDetector` makes a detector of any function from an
+image to boxes, such as a neural network.
 """
 
 import math
@@ -20,18 +19,18 @@ from cotarget.errors import CotargetError
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
-# A target is small: when more of the picture than this changed at once, the light or the camera did.
+# Largest part of foreground that may be small targets; beyond it, the light or the camera has changed.
 MOST_FOREGROUND = 0.3
 
 
 @dataclass(frozen=True)
 class Detection:
-    """One target seen in one frame.
+    """One target detected in one frame.
 
     Attributes:
-        center_px: middle of the box (u, v), (2,).
-        size_px: its width and height, (2,).
-        score: how sure the detector is, 0 to 1.
+        center_px: centre of the box (u, v), (2,).
+        size_px: width and height of the box, (2,).
+        score: confidence of the detector, 0 to 1.
         clipped: whether the image's border cuts the box, so that its size is only a lower bound.
     """
 
@@ -42,39 +41,39 @@ class Detection:
 
 
 class Detector(Protocol):
-    """Finds targets of one kind in the frames of one camera."""
+    """Detects targets of one kind in the frames of one camera."""
 
     @property
     def mask(self) -> Image | None:
-        """The last frame's foreground, (H, W), 0 to 255; for pictures."""
+        """Foreground of the last frame, (H, W), 0 to 255."""
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """Find the targets, best first; [] where there is none."""
+        """Detect the targets, best first; [] if there is none."""
 
 
 def flood(mask: Image | None) -> float:
-    """The part of a picture that is foreground, 0 to 1, where that is too much to be targets; else 0."""
+    """Return the part of an image that is foreground, 0 to 1, if that is too much to be targets; otherwise 0."""
     part = 0.0 if mask is None else cv2.countNonZero(mask) / mask.size
     return part if part > MOST_FOREGROUND else 0.0
 
 
 def box_detection(x: int, y: int, w: int, h: int, score: float, shape: tuple[int, ...]) -> Detection:
-    """Make a detection of a box of whole pixels.
+    """Make a detection from a box of whole pixels.
 
     Args:
-        x: its first column [px].
-        y: its first row [px].
-        w: how many columns it has [px].
-        h: how many rows [px].
-        score: how sure the detector is, 0 to 1.
-        shape: of the image, (H, W, ...); a box at its border is clipped.
+        x: first column [px].
+        y: first row [px].
+        w: number of columns [px].
+        h: number of rows [px].
+        score: confidence of the detector, 0 to 1.
+        shape: shape of the image, (H, W, ...); a box at its border is clipped.
     """
     clipped = x <= 0 or y <= 0 or x + w >= shape[1] or y + h >= shape[0]
     return Detection(np.array([x + (w - 1) / 2, y + (h - 1) / 2]), np.array([w, h], dtype=float), score, clipped)
 
 
 def check_size(shape: tuple[int, ...] | None, image: Image) -> None:
-    """Refuse an image of another shape than before.
+    """Refuse an image whose shape differs from that of the last one.
 
     Raises:
         CotargetError: the image's size changed.
@@ -86,29 +85,29 @@ def check_size(shape: tuple[int, ...] | None, image: Image) -> None:
         )
 
 
-# --- external ---
+# External detectors
 
-# (left column, top row, width, height) [px], and the score from 0 to 1 as a fifth where the detector has one.
+# (left column, top row, width, height) [px], and a score from 0 to 1 as an optional fifth number.
 Box = Sequence[float]
 FindBoxes = Callable[[Image], Sequence[Box]]
 WHAT_A_BOX_IS = (
     "a box is (left, top, width, height) in pixels with a width and height above 0, and a score from 0 to 1 as a fifth "
     "where there is one"
 )
-# What a box without a score gets.
+# Score of a box without one.
 UNKNOWN_SCORE = 0.5
-# So many characters of a wrong answer are shown.
+# Longest part of a wrong answer that a message quotes [characters].
 SHOWN = 80
 
 
 class ExternalDetector:
-    """Makes a Detector of a function; what it returns is checked, because it comes from outside."""
+    """Make a detector of a function; the result is checked, because it comes from outside the project."""
 
     def __init__(self, find: FindBoxes) -> None:
         """Wrap a function.
 
         Args:
-            find: given a (H, W, 3) BGR picture, returns the targets' boxes; the box of a single lit pixel at column
+            find: takes an image, (H, W, 3) BGR, and returns the targets' boxes; the box of a single lit pixel at column
                 3 and row 5 is (3, 5, 1, 1).
         """
         self._find = find
@@ -116,10 +115,10 @@ class ExternalDetector:
         self.mask: Image | None = None
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """Find what the function finds, the surest first; boxes are cut to the image.
+        """Detect what the function finds, best first; boxes are cut to the image.
 
         Raises:
-            CotargetError: the image's size changed, or the function returned something else than boxes.
+            CotargetError: the image's size changed, or the function did not return boxes.
         """
         check_size(self._shape, frame.image)
         self._shape = frame.image.shape
@@ -130,7 +129,7 @@ class ExternalDetector:
             low = np.array([left, top])
             cut = np.clip([low, np.add(low, (width, height))], 0.0, size)
             if (cut[1] - cut[0]).min() <= 0:
-                continue  # wholly outside
+                continue  # wholly outside the image
             clipped = bool((cut[0] <= 0).any() or (cut[1] >= size).any())
             found.append(Detection((cut[0] + cut[1] - 1) / 2, cut[1] - cut[0], score, clipped))
         found.sort(key=lambda detection: -detection.score)
@@ -138,7 +137,7 @@ class ExternalDetector:
 
 
 def _listed(boxes: Sequence[Box]) -> Iterable[Box]:
-    """What the function returned, as something to go through.
+    """Convert the function's result to a list of boxes.
 
     Raises:
         CotargetError: it is no sequence, or a single box.
@@ -156,10 +155,10 @@ def _listed(boxes: Sequence[Box]) -> Iterable[Box]:
 
 
 def _check(box: Box) -> tuple[float, float, float, float, float]:
-    """A box with its score.
+    """Check a box and complete it with a score.
 
     Raises:
-        CotargetError: it is none.
+        CotargetError: it is no box.
     """
     try:
         numbers = [float(x) for x in box]
@@ -173,5 +172,5 @@ def _check(box: Box) -> tuple[float, float, float, float, float]:
 
 
 def _short(value: object) -> str:
-    """A value in one line that is not too long."""
+    """Format a value on one line, shortened."""
     return textwrap.shorten(repr(value), SHOWN, placeholder=" ...")

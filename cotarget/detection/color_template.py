@@ -1,10 +1,8 @@
-"""What has a template's colour, located to a fraction of a pixel (the book).
+"""Detect targets that have a template's colour, located to a fraction of a pixel by a fit of the template.
 
-Fitting a template to a small patch: middle and size to a fraction of a pixel.
-
-The patch is modelled as the template, scaled, slightly turned and blurred, in front of a background that is a plane:
-``gain alpha template + (1 - alpha) (b0 + bu u + bv v)``. Gauss-Newton over the five numbers of the pose and the four of
-the brightness (Lucas and Kanade's method with a model of the background).
+The fit models a patch as the template, scaled, slightly turned and blurred, in front of a background that is a plane:
+``gain alpha template + (1 - alpha) (b0 + bu u + bv v)``. It is a Gauss-Newton iteration over the five numbers of the
+pose and the four of the brightness (the method of Lucas and Kanade, with a model of the background).
 """
 
 import math
@@ -17,22 +15,22 @@ from cotarget.errors import ConfigError
 from cotarget.geometry import Array
 from cotarget.rig import Frame, Image
 
-# How far beyond a target's coarse box its pixels are looked at [px]: blur and subsampled chroma reach about 3 px.
+# Margin around a target's coarse box that is included [px]: blur and subsampled chroma reach about 3 px.
 MARGIN_PX = 4
-# The template is prepared at this many samples a pixel of the patch, so that linear interpolation loses nothing.
+# Samples of the template per pixel of the patch, so that linear interpolation loses nothing.
 OVERSAMPLING = 4
 # Standard deviation of lens, pixel and coding together [px]; a wrong value blurs all edges alike and biases no size.
 BLUR_PX = 1.2
-# Steps of the derivative: u, v, width, height [px] and turn [rad]; small against the blur.
+# Steps of the numerical derivatives: u, v, width, height [px] and turn [rad]; small against the blur.
 DERIVATIVE = np.array([0.1, 0.1, 0.1, 0.1, 0.02])
-# The largest change in one iteration, likewise: the linearisation holds within the blur.
+# Largest change in one iteration, in the same units: the linearisation holds within the blur.
 LARGEST_STEP = np.array([1.0, 1.0, 1.0, 1.0, 0.1])
 ITERATIONS = 12
-# Converged when no parameter changes by more [px, rad].
+# Largest change of a parameter after convergence [px, rad].
 CONVERGED = 0.01
-# A result whose sides differ from the coarse ones by more than this factor is no result.
+# Largest factor between fitted and coarse sides; beyond it the fit is rejected.
 LARGEST_CHANGE = 1.7
-# A target is seldom turned by more [rad]; keeps the turn from running away where a few pixels cannot show it.
+# Standard deviation of a target's turn [rad]; it keeps the turn bounded where a few pixels cannot determine it.
 TURN_SIGMA = 0.15
 
 
@@ -42,14 +40,14 @@ def fit_template(
     """Fit a template to a patch.
 
     Args:
-        template: (h, w) picture of the target alone, cut to its outline.
-        patch: (H, W) a small part of an image around it.
-        center: coarse middle in the patch (u, v) [px], (2,).
-        size: coarse width and height [px], (2,).
+        template: picture of the target alone, cut to its outline, (h, w).
+        patch: part of an image around the target, (H, W).
+        center: coarse centre in the patch (u, v), (2,) [px].
+        size: coarse width and height, (2,) [px].
 
     Returns:
-        Middle and size [px], (2,) each, of the target itself, as if it were not turned; and the part of the
-        patch's variation that is explained, 0 to 1. None when the fit does not converge.
+        Centre and size of the target [px], (2,) each, as if it were not turned; and the explained part of the patch's
+        variance, 0 to 1. None if the fit does not converge.
     """
     source = _prepare(template, size)
     height, width = patch.shape
@@ -66,7 +64,7 @@ def fit_template(
             (_render(source, pose + d, plane) @ brightness - basis @ brightness) / d.sum() for d in np.diag(DERIVATIVE)
         ]
         J = np.column_stack([*columns, basis])
-        # The turn's prior, in the units of the residual, is one more equation.
+        # The prior on the turn is one more equation, in units of the residual.
         noise = max(1e-6, float(np.std(residual)))
         prior = np.zeros(9)
         prior[4] = noise / TURN_SIGMA
@@ -87,7 +85,7 @@ def fit_template(
 
 
 def _prepare(template: np.ndarray, size: Array) -> np.ndarray:
-    """The template and its outline, blurred as in the patch, ``OVERSAMPLING`` times as fine, with a margin."""
+    """Resample the template and its outline ``OVERSAMPLING`` times as fine as the patch, with its blur and a margin."""
     width, height = (max(2, round(OVERSAMPLING * float(side))) for side in size)
     small = cv2.resize(template, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
     both = np.stack([small, np.ones_like(small)], axis=-1)
@@ -97,11 +95,11 @@ def _prepare(template: np.ndarray, size: Array) -> np.ndarray:
 
 
 def _render(source: np.ndarray, pose: Array, plane: np.ndarray) -> np.ndarray:
-    """The four basis images of a pose, (pixels, 4): the template, and the background where it is not covered."""
+    """Render the four basis images of a pose, (pixels, 4): the template, and the background that it does not cover."""
     height, width = source.shape[:2]
     inner = np.array([width, height]) - 2 * OVERSAMPLING * MARGIN_PX
     c, s = np.cos(pose[4]), np.sin(pose[4])
-    # From the patch's pixels to the source's: turn back about the middle, then scale.
+    # From the patch's pixels to the source's: turn back about the centre, then scale.
     A = np.array([[c, s], [-s, c]]) * (inner / pose[2:4])[:, None]
     shift = (np.array([width, height]) - 1) / 2 - A @ pose[:2]
     seen = cv2.warpAffine(
@@ -114,43 +112,44 @@ def _render(source: np.ndarray, pose: Array, plane: np.ndarray) -> np.ndarray:
     return basis.reshape(-1, 4).astype(float)
 
 
-# A template whose mean colour is closer to grey than this tells nothing by its colour [grey levels].
+# Least chroma of the template's mean colour; a greyer one cannot be found by colour [grey levels].
 LEAST_CHROMA = 20.0
-# The template's strongest colour is that of which this part of it in per cent is weaker.
+# Percentile of the template's chroma that counts as its strongest colour.
 STRONG = 75
-# A pixel is taken for the template's colour when it has at least this part of its chroma ...
+# Least part of the template's chroma of a pixel of its colour ...
 LEAST_WEIGHT = 0.35
-# ... and its chroma points at most this far away from the template's (tangent of the angle in the chroma plane).
+# ... and the largest deviation of its hue (tangent of the angle in the chroma plane).
 HUE_TANGENT = 0.6
-# The template's chroma becomes this value of a byte, so that brighter light does not saturate.
+# Byte value of the template's chroma, so that brighter light does not saturate.
 CHROMA_BYTE = 128.0
-# Fewest pixels of a target that is found by its colour.
+# Fewest pixels of a target.
 LEAST_PIXELS = 12
-# A target this small beside the image is looked for; a larger patch of its colour is the scene.
+# Largest side of a target as a part of the image's; a larger region of its colour is the scene.
 LARGEST_COLOURED = 0.5
-# A detection must explain this part of the variation around it.
+# Least explained variance of a detection.
 LEAST_FIT = 0.3
-# A fit takes milliseconds: of all patches of the colour the largest are looked at, and of these the likeliest fitted.
+# Most regions compared with the template, the largest first, and most fitted, the likeliest first: a fit takes
+# milliseconds.
 MOST_LOOKED_AT, MOST_FITTED = 100, 8
-# Patch and template are compared at this width and height, with this part of their sides around them [px].
+# Size at which a region is compared with the template [px], and the margin around both, in parts of their sides.
 LOOK, AROUND = (16, 16), 0.25
-# A patch whose larger side is longer is fitted at a scale at which it is not [px]: no worse, for its noise is averaged.
+# Longest side of a region that is fitted at full scale [px]; a larger one is reduced, which averages its noise.
 LARGEST_FITTED_PX = 48.0
 
 
 class ColorTemplateDetector:
-    """What has a template's colour, located to a fraction of a pixel by fitting the template to it.
+    """Detect targets by a template's colour, and locate them to a fraction of a pixel by fitting the template.
 
-    Everything happens in one plane: a pixel's chroma along the template's mean chroma. It is linear in the colour,
-    so that blur, mixed pixels at the border and subsampled chroma bias nothing, and it is zero for grey, so that
-    shadows and white walls do not matter.
+    All computations use one plane: a pixel's chroma along the template's mean chroma. It is linear in the colour, so
+    blur, mixed pixels at the border and subsampled chroma cause no bias. It is zero for grey, so shadows and white
+    walls do not matter.
     """
 
     def __init__(self, template: Image) -> None:
-        """Learn the colour and what of the template has it.
+        """Learn the template's colour, and which parts of it have that colour.
 
         Args:
-            template: (h, w, 3) BGR picture of the target, cut to its outline; its scale does not matter.
+            template: picture of the target, cut to its outline, (h, w, 3) BGR; its scale does not matter.
 
         Raises:
             ConfigError: the template is grey, or most of it is.
@@ -177,14 +176,14 @@ class ColorTemplateDetector:
         self.mask: Image | None = None
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """Find what has the template's colour and shape, the best likeness first.
+        """Detect targets of the template's colour and shape, best first.
 
         Raises:
             CotargetError: the image's size changed.
         """
         check_size(self._shape, frame.image)
         self._shape = frame.image.shape
-        tests = cv2.transform(frame.image, self._tests)  # saturates at 0: a wrong hue fails one of the last two
+        tests = cv2.transform(frame.image, self._tests)  # saturates at 0, so a wrong hue fails one of the last two
         self.mask = cv2.inRange(tests, (LEAST_WEIGHT * CHROMA_BYTE, 1, 1), (255, 255, 255))
         joined = cv2.dilate(self.mask, np.ones((3, 3), np.uint8))
         boxes = []
@@ -200,7 +199,7 @@ class ColorTemplateDetector:
         return sorted((d for d in fitted if d is not None and d.score >= LEAST_FIT), key=lambda d: -d.score)
 
     def _likeliest(self, plane: Image, boxes: list[Detection]) -> list[Detection]:
-        """Those that look most like the template in the plane of its colour (H, W): MOST_FITTED at most."""
+        """Select at most MOST_FITTED boxes that look most like the template in the plane of its colour (H, W)."""
         if len(boxes) <= MOST_FITTED:
             return boxes
 
@@ -213,19 +212,19 @@ class ColorTemplateDetector:
         return sorted(largest, key=likeness, reverse=True)[:MOST_FITTED]
 
     def _refine(self, image: Image, coarse: Detection) -> Detection | None:
-        """Locate the target in its coarse box to a fraction of a pixel; None where the template does not fit."""
+        """Locate the target in its coarse box to a fraction of a pixel; None if the template does not fit."""
         scale = math.ceil(float(coarse.size_px.max()) / LARGEST_FITTED_PX)
         low = np.maximum(0, np.rint(coarse.center_px - coarse.size_px / 2 - scale * MARGIN_PX)).astype(int)
         high = np.rint(coarse.center_px + coarse.size_px / 2 + scale * MARGIN_PX).astype(int) + 1
         high = np.minimum(high, image.shape[1::-1])
-        high -= (high - low) % scale  # of pixels all alike
+        high -= (high - low) % scale  # so that all reduced pixels are alike
         part = image[low[1] : high[1], low[0] : high[0]].astype(np.float32) @ self._along.astype(np.float32)
         if scale > 1:
             width, height = ((high - low) // scale).tolist()
             part = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA)
-            # As blurred as the fit takes it to be; at this scale the camera's own blur is hardly any.
+            # Blur as much as the fit assumes; at this scale the camera's own blur is negligible.
             part = np.asarray(cv2.GaussianBlur(part, (0, 0), BLUR_PX * math.sqrt(1 - 1 / scale**2)), np.float32)
-        corner = low + (scale - 1) / 2  # where the first of its pixels has its middle
+        corner = low + (scale - 1) / 2  # centre of the first reduced pixel
         fit = fit_template(self._plane, part, (coarse.center_px - corner) / scale, coarse.size_px / scale)
         if fit is None:
             return None
@@ -234,6 +233,6 @@ class ColorTemplateDetector:
 
 
 def _normalised(picture: Image) -> Array:
-    """The same with a mean of 0 and a length of 1; all 0 where nothing is to be seen."""
+    """Normalise an image to a mean of 0 and a length of 1; all 0 for a uniform one."""
     off = picture - np.mean(picture)
     return np.asarray(off / max(1e-9, float(np.linalg.norm(off))))

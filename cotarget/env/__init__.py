@@ -1,9 +1,9 @@
-"""Gymnasium environments on the simulated rig; to import this registers them.
+"""Provide Gymnasium environments on the simulated rig; importing this module registers them.
 
-`cotarget/Follow-v0`: a target is to be held in the close-up, by commands to head and lens. `cotarget/Schedule-v0`: of
-several targets one is to be chosen in every frame. `gymnasium.make("cotarget/Follow-v0", target="person")` after an
-import, or `gymnasium.make("cotarget.env:cotarget/Follow-v0")` without. What they take, show and reward is told by their
-classes; what is really so they tell in `info` alone.
+`cotarget/Follow-v0` holds a target in the close-up by commands to head and lens. `cotarget/Schedule-v0` chooses one of
+several targets in every frame. Make one by `gymnasium.make("cotarget/Follow-v0", target="person")` after an import, or
+by `gymnasium.make("cotarget.env:cotarget/Follow-v0")` without one. The classes describe actions, observations and
+rewards. Only `info` holds ground truth.
 """
 
 import gymnasium

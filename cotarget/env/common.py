@@ -1,9 +1,4 @@
-"""What both environments share: the rig, an episode's world, its frames and their pictures.
-
-What the environments are given, checked: whoever gives something else is told so in one line.
-
-What commands and states of a rig are as numbers between -1 and 1.
-"""
+"""Share what both environments need: checked arguments, units of actions, the episode's world, and its pictures."""
 
 import math
 import reprlib
@@ -40,26 +35,26 @@ from cotarget.sim.targets.random_paths import SECONDS, in_view
 from cotarget.sim.truth import CameraName, Outlines, part_seen
 from cotarget.sim.world import SimWorld
 
-# Sides of pictures: fewer pixels show nothing, and more are hardly meant, as one such picture takes 50 MB.
+# Least and largest side of a picture: fewer pixels show nothing, and one picture of the largest size takes 50 MB.
 SMALLEST_PX, LARGEST_PX = 8, 4096
-# Of the ways of a few episodes, this part at least is to be seen in another scene than the one that they are made for.
+# Check of a scene: seeds of the episodes tried, least part of their paths that is visible, and every how many knots.
 TRIED_SEEDS, LEAST_SEEN, EVERY_KNOT = range(3), 0.5, 5
-# The rig where none is given: the default one, without what makes pictures costly.
+# Default rig of the environments: the default one without the effects that make pictures costly.
 DEFAULT_RIG = RigConfig(
     sim=SimConfig(effects=SimEffects(noise=False, jpeg=False, distortion=False, blur=False, multisampling=False))
 )
 
 
 def told(given: object) -> str:
-    """What was given, for messages: on one line, and not all of it where that is long."""
+    """Format a given value for messages, on one line and shortened."""
     return " ".join(reprlib.repr(given).split())
 
 
 def name_of(what: str, given: object, known: Collection[str]) -> str:
-    """A name of those that there are.
+    """Check that a name is a known one.
 
     Raises:
-        ConfigError: it is another.
+        ConfigError: it is unknown.
     """
     if isinstance(given, str) and given in known:
         return given
@@ -67,12 +62,12 @@ def name_of(what: str, given: object, known: Collection[str]) -> str:
 
 
 def rig_of(given: object) -> RigConfig:
-    """The simulated rig that is meant: one, or its rig.toml; the default one for None.
+    """Resolve a simulated rig: a configuration, its rig.toml, or None for the default one.
 
-    Its head goes no farther than the soft limits.
+    The soft limits become those of its head.
 
     Raises:
-        ConfigError: it is none, not simulated, impossible, or too slow.
+        ConfigError: it is no rig, not simulated, impossible, or too slow.
     """
     if isinstance(given, Path | str):
         given = load_config(Path(given))
@@ -82,7 +77,7 @@ def rig_of(given: object) -> RigConfig:
     if config.backend != "sim":
         raise ConfigError(f"rig: its backend is '{config.backend}'; environments are on 'sim' alone")
     if given is not None:
-        check_config(config)  # one made in Python was not
+        check_config(config)  # a configuration made in Python was not checked yet
         _check_waits(config.sim)
     pan_deg, tilt_deg = config.head_limits_deg
     head = replace(config.sim.head, pan_deg=pan_deg, tilt_deg=tilt_deg)
@@ -90,7 +85,7 @@ def rig_of(given: object) -> RigConfig:
 
 
 def _check_waits(sim: SimConfig) -> None:
-    """Refuse cameras whose frames are longer in coming than anybody waits."""
+    """Refuse cameras whose frames take longer than the pipeline waits."""
     waits_s = {"fixed.rate_hz": 1 / sim.fixed.rate_hz}
     if sim.effects.latency:
         waits_s |= {"fixed.latency_s": sim.fixed.latency_s, "zoom.latency_s": sim.zoom.latency_s}
@@ -100,15 +95,15 @@ def _check_waits(sim: SimConfig) -> None:
 
 
 def check_scene(sim: SimConfig, name: str, paths: Callable[[str, int], Mapping[str, Sequence[Waypoint]]]) -> None:
-    """Refuse a scene in which a target is seldom to be seen, where it would be in the outdoor one.
+    """Refuse a scene that hides most of the targets' paths, which are made for the outdoor scene.
 
     Args:
-        sim: its scene.
-        name: of the target.
-        paths: the ways of an episode, by name and seed.
+        sim: simulation with the scene.
+        name: name of the target.
+        paths: gives the paths of an episode by name and seed.
 
     Raises:
-        ConfigError: it is such a scene.
+        ConfigError: less than half of the paths is visible.
     """
     if sim.scene == SimConfig.scene:
         return
@@ -123,7 +118,7 @@ def check_scene(sim: SimConfig, name: str, paths: Callable[[str, int], Mapping[s
 
 
 def calibration_of(given: object) -> Calibration | None:
-    """The calibration that is meant: one, or its file; None for none.
+    """Resolve a calibration: one, its file, or None.
 
     Raises:
         ConfigError: it is something else.
@@ -137,10 +132,10 @@ def calibration_of(given: object) -> Calibration | None:
 
 
 def noise_of(given: object) -> TruthNoise:
-    """The noise that is meant.
+    """Check the noise of the detections.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: it is no `TruthNoise`.
     """
     if isinstance(given, TruthNoise):
         return given
@@ -148,10 +143,10 @@ def noise_of(given: object) -> TruthNoise:
 
 
 def seconds_of(given: object) -> float:
-    """How long an episode takes [s].
+    """Check the length of an episode [s].
 
     Raises:
-        ConfigError: that is no time, or longer than targets have ways for.
+        ConfigError: it is not positive, or longer than the targets' paths.
     """
     if isinstance(given, Real) and 0 < float(given) <= SECONDS:
         return float(given)
@@ -159,10 +154,10 @@ def seconds_of(given: object) -> float:
 
 
 def size_of(given: object) -> Size:
-    """The size of pictures (width, height) [px].
+    """Check the size of pictures, (width, height) [px].
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: it is no such size.
     """
     size = tuple(given) if isinstance(given, list | tuple) else ()
     whole = all(isinstance(side, int | np.integer) and SMALLEST_PX <= side <= LARGEST_PX for side in size)
@@ -174,7 +169,7 @@ def size_of(given: object) -> Size:
 
 
 def reward_of(given: object) -> float:
-    """A reward.
+    """Check a reward.
 
     Raises:
         ConfigError: it is no finite number.
@@ -195,15 +190,15 @@ def check_options(given: object) -> None:
         raise ConfigError(f"options: reset knows no {told(first)}; it takes a seed only")
 
 
-# --- units ---
+# Commands and states as numbers from -1 to 1
 
 Vector = npt.NDArray[np.float32]
 Command = tuple[float, float, float]  # pan and tilt [rad], nominal focal length [px]
-LONGEST_AGE_S = 1.0  # ages are told up to this [s]
+LONGEST_AGE_S = 1.0  # largest age in an observation [s]
 
 
 def box(ranges: Iterable[tuple[float, float]], rows: int | None = None) -> gymnasium.spaces.Box:
-    """A space of numbers within these ranges (lowest, highest), (n,), or of so many rows of them, (rows, n)."""
+    """Make a space of numbers within ranges (lowest, highest), (n,), or of rows of them, (rows, n)."""
     low, high = np.array(list(ranges), dtype=np.float32).T
     if rows is not None:
         low, high = np.tile(low, (rows, 1)), np.tile(high, (rows, 1))
@@ -211,18 +206,18 @@ def box(ranges: Iterable[tuple[float, float]], rows: int | None = None) -> gymna
 
 
 def within(values: Sequence[float] | Sequence[Sequence[float]], space: gymnasium.spaces.Box) -> Vector:
-    """Values as an element of a space, clipped to its ranges."""
+    """Clip values to the ranges of a space."""
     return np.minimum(np.maximum(np.array(values, dtype=np.float32), space.low), space.high)
 
 
 @dataclass(frozen=True)
 class Units:
-    """The ranges of head and lens, which -1 to 1 stand for.
+    """Ranges of head and lens, mapped to -1 to 1.
 
     Attributes:
-        pan: lowest and highest [rad].
-        tilt: likewise.
-        focal_px: shortest and longest nominal focal length [px]; between them evenly in the logarithm.
+        pan: lowest and highest pan [rad].
+        tilt: lowest and highest tilt [rad].
+        focal_px: shortest and longest nominal focal length [px]; the mapping is even in its logarithm.
     """
 
     pan: tuple[float, float]
@@ -231,11 +226,11 @@ class Units:
 
     @classmethod
     def of(cls, config: RigConfig) -> "Units":
-        """Those of a rig: the head's limits, the soft ones included."""
+        """Make the units of a rig, with the head's soft limits."""
         return cls(*config.head_limits, config.focal_range_px)
 
     def command(self, action: npt.ArrayLike) -> Command:
-        """What an action (pan, tilt, focal length) from -1 to 1 commands; beyond that it is clipped.
+        """Convert an action (pan, tilt, focal length), clipped to -1 to 1, to a command.
 
         Raises:
             ConfigError: it is not three finite numbers.
@@ -255,11 +250,11 @@ class Units:
         )
 
     def action(self, command: Command) -> Vector:
-        """The action that commands this, (3,)."""
+        """Convert a command to an action, (3,)."""
         return np.array(self.numbers(*command), dtype=np.float32)
 
     def numbers(self, pan: float, tilt: float, focal_px: float) -> tuple[float, float, float]:
-        """Pan, tilt [rad] and nominal focal length [px] as numbers, which are from -1 to 1 within the ranges."""
+        """Scale pan, tilt [rad] and nominal focal length [px] to numbers, -1 to 1 within the ranges."""
         (low_pan, high_pan), (low_tilt, high_tilt), (short, long) = self.pan, self.tilt, self.focal_px
         return (
             2 * (pan - low_pan) / (high_pan - low_pan) - 1,
@@ -268,34 +263,34 @@ class Units:
         )
 
 
-# What a rig tells of itself, and the range of each number.
+# Features of a rig, with the range of each.
 RIG_FEATURES = {
-    "pan": (-1.0, 1.0),  # of the head, as in an action
+    "pan": (-1.0, 1.0),  # reported by the head, as in an action
     "tilt": (-1.0, 1.0),
-    "focal": (-1.0, 1.0),  # of the lens, as in an action
-    "pan_commanded": (-1.0, 1.0),  # what was commanded last, after rounding to steps
+    "focal": (-1.0, 1.0),  # reported by the lens, as in an action
+    "pan_commanded": (-1.0, 1.0),  # last command, after rounding to steps
     "tilt_commanded": (-1.0, 1.0),
     "focal_commanded": (-1.0, 1.0),
     "head_moves": (0.0, 1.0),
     "lens_moves": (0.0, 1.0),
-    "age_s": (0.0, LONGEST_AGE_S),  # of the wide camera's frame
-    "closeup_age_s": (0.0, LONGEST_AGE_S),  # of the zoom camera's
-    "gone": (0.0, 1.0),  # part of the episode
+    "age_s": (0.0, LONGEST_AGE_S),  # of the fixed camera's frame
+    "closeup_age_s": (0.0, LONGEST_AGE_S),  # of the zoom camera's frame
+    "gone": (0.0, 1.0),  # part of the episode that has passed
 }
 
 
 def rig_numbers(
     units: Units, head: PanTiltState, lens: ZoomState, commanded: Command, ages_s: tuple[float, float], gone: float
 ) -> list[float]:
-    """The numbers of RIG_FEATURES.
+    """Compute the RIG_FEATURES.
 
     Args:
-        units: of the rig.
-        head: its state.
-        lens: likewise.
-        commanded: last.
-        ages_s: of the wide camera's newest frame and of the zoom camera's [s].
-        gone: part of the episode.
+        units: units of the rig.
+        head: state of the head.
+        lens: state of the lens.
+        commanded: last command.
+        ages_s: ages of the newest frames of the fixed and the zoom camera [s].
+        gone: part of the episode that has passed.
     """
     return [
         *units.numbers(head.pan, head.tilt, lens.focal_px),
@@ -318,14 +313,14 @@ RENDER_SIZE: Size = (320, 240)  # of each of the two pictures that `render` puts
 
 
 class Episode:
-    """A world from one reset to the next."""
+    """World, detector and ground truth of one episode."""
 
     def __init__(self, config: RigConfig, noise: TruthNoise) -> None:
-        """Build it.
+        """Open the world.
 
         Args:
-            config: the rig, and who is in its world.
-            noise: of the detections.
+            config: the rig, with the targets in its world.
+            noise: noise of the detections.
         """
         self.config = config
         self.world = SimWorld(config, rendered=())
@@ -336,17 +331,17 @@ class Episode:
         self._eye, self._to_fixed = fixed.translation, fixed.rotation.as_matrix().T
 
     def direction(self, name: str, t: float) -> Array:
-        """Where a target's middle truly is from the wide camera, in its frame, a unit vector, (3,)."""
+        """True direction of a target's centre from the fixed camera, a unit vector in its frame, (3,)."""
         way = self._to_fixed @ (self.outlines.center(name, t) - self._eye)
         return way / math.sqrt(way @ way)
 
 
 class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
-    """An environment on the simulated rig; see `Follow` and `Schedule`.
+    """Base of the environments on the simulated rig; see `Follow` and `Schedule`.
 
     Attributes:
-        config: the rig; its targets and seed are an episode's.
-        units: what actions and observations of the rig stand for.
+        config: the rig; each episode sets its targets and seed.
+        units: units of actions and observations.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012  as gymnasium has it
@@ -361,10 +356,10 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         noise: TruthNoise,
         render_mode: str | None,
     ) -> None:
-        """Check what all have in common.
+        """Check the arguments that all environments share.
 
         Raises:
-            ConfigError: an argument makes no sense.
+            ConfigError: an argument is invalid.
         """
         name_of("observation", observation, KINDS)
         if render_mode is not None:
@@ -377,11 +372,11 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         self._observation, self._size = observation, size_of(image_size)
         self._last = max(round(seconds_of(seconds) * self.config.rate_hz), 1)
         self._episode: Episode | None = None
-        self._opened: dict[Size, SizedPictures] = {}  # of the episode
+        self._opened: dict[Size, SizedPictures] = {}  # for the present episode
 
     @property
     def episode(self) -> Episode:
-        """The one that runs.
+        """The present episode.
 
         Raises:
             ResetNeeded: there is none.
@@ -392,33 +387,33 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
 
     @property
     def calibration(self) -> Calibration:
-        """The one given, or that which is exactly true of the episode's rig."""
+        """The given calibration, or the exact one of the episode's rig."""
         return true_calibration(self.episode.world) if self._calibration is None else self._calibration
 
     @property
     def times(self) -> tuple[float, float]:
-        """When the newest frame of the wide camera was exposed, and of the zoom camera [s]."""
+        """Exposure times of the newest frames of the fixed and the zoom camera [s]."""
         raise NotImplementedError
 
     def told_of(self, name: str) -> TargetConfig:
-        """What the pipeline is told of a target, whose detections are the truth with noise whatever its detector is."""
+        """Target profile for the pipeline; its detector is the default one, as all detections come from the truth."""
         return replace(self.config.target(name), detector=DEFAULT_TARGETS[name].detector)
 
     def render(self) -> Picture | None:
-        """Both views side by side, RGB, where the render mode is "rgb_array"."""
+        """Render both cameras side by side, RGB, if the render mode is "rgb_array"."""
         if self.render_mode is None:
             return None
         return np.hstack(self._look(RENDER_SIZE))
 
     def close(self) -> None:
-        """Release everything; more than once does no harm."""
+        """Release everything; may be called again."""
         for pictures in self._opened.values():
             pictures.close()
         self._opened.clear()
         self._end()
 
     def _begin(self, seed: int | None, options: Mapping[str, Any] | None) -> int:
-        """End the episode before; the seed of the next one's world.
+        """Seed the generator, and draw the seed of the next episode's world.
 
         Raises:
             ConfigError: options are given; there are none.
@@ -428,7 +423,7 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         return int(self.np_random.integers(2**31))
 
     def _open(self, paths: Mapping[str, tuple[Waypoint, ...]], seed: int) -> Episode:
-        """Begin an episode with targets on these paths, drawn by what drew the one before."""
+        """Open an episode with targets on given paths, reusing the renderers of the previous one."""
         self._end()
         sim = replace(self.config.sim, seed=seed, targets=tuple(paths), paths=paths)
         self._episode = Episode(replace(self.config, sim=sim), self._noise)
@@ -437,22 +432,22 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         return self._episode
 
     def _end(self) -> None:
-        """Let go of the episode, if there is one."""
+        """Close the episode, if there is one."""
         if self._episode is not None:
             self._episode.rig.close()
             self._episode = None
 
     def _picture_spaces(self) -> dict[str, gymnasium.Space[Any]]:
-        """Of the pictures in an observation."""
+        """Spaces of the pictures in an observation."""
         width, height = self._size
         return {name: gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8) for name in ("wide", "closeup")}
 
     def _pictures(self) -> dict[str, Picture]:
-        """The newest, for an observation."""
+        """Render the pictures of an observation."""
         return dict(zip(("wide", "closeup"), self._look(self._size), strict=True))
 
     def _look(self, size: Size) -> list[Picture]:
-        """Through the wide camera and through the zoom camera, RGB."""
+        """Render the newest frames of the fixed and the zoom camera, RGB."""
         episode = self.episode
         if size not in self._opened:
             self._opened[size] = episode.world.pictures(size)
@@ -463,5 +458,5 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
 
 
 def corners(box: tuple[Array, Array] | None) -> Array:
-    """Left, top, right and bottom of a box [px], (4,); at infinity where there is none."""
+    """Left, top, right and bottom of a box [px], (4,); infinite if there is none."""
     return np.full(4, np.inf) if box is None else np.concatenate(box)

@@ -31,43 +31,43 @@ from cotarget.sim.targets.random_paths import LONE, SECONDS, lone_path
 from cotarget.tracking.track import settings_for
 from cotarget.tracking.tracker import Tracker
 
-# What the tracker knows of the target, and the range of each number; 0 where it knows of none.
+# Features of the target's track, with the range of each; 0 without a track.
 TRACK_FEATURES = {
     "known": (0.0, 1.0),  # whether there is a confirmed track
-    "detected": (0.0, 1.0),  # whether the newest frame had it
-    "confidence": (0.0, 1.0),  # 1 / (1 + (s / d)^2): s of the middle's standard deviation, d of the larger side
-    "u": (-1.0, 1.0),  # its middle, from the left to the right edge of the wide image
+    "detected": (0.0, 1.0),  # whether the newest frame detected it
+    "confidence": (0.0, 1.0),  # 1 / (1 + (s / d)^2): s the centre's standard deviation, d the larger side
+    "u": (-1.0, 1.0),  # centre, from the left to the right edge of the fixed image
     "v": (-1.0, 1.0),  # from the top to the bottom
-    "du": (-4.0, 4.0),  # how fast that changes [1/s]
+    "du": (-4.0, 4.0),  # rate of that [1/s]
     "dv": (-4.0, 4.0),
-    "width": (0.0, 1.0),  # of its box, as a part of the image's
+    "width": (0.0, 1.0),  # width of its box, as a part of the image's
     "height": (0.0, 1.0),
-    "larger_side": (0.0, 1.0),  # over the last wing beats, as a part of the image's width
-    "unseen_s": (0.0, LONGEST_AGE_S),  # since a detection
+    "larger_side": (0.0, 1.0),  # larger side over the last wing beats, as a part of the image's width
+    "unseen_s": (0.0, LONGEST_AGE_S),  # time since the last detection
 }
 
 
 class Follow(RigEnv[Any, Vector]):
     """Hold a target in the close-up.
 
-    A step is a frame of the wide camera. The world, the target's way and size, and the noise are an episode's own, by
-    the seed; an episode ends by truncation after its seconds.
+    A step is a frame of the fixed camera. The world, the target's path and size, and the noise follow from the
+    episode's seed. An episode is truncated after its seconds.
 
-    Action: `Box(-1, 1, (3,))`, of pan and tilt within the head's limits and of the focal length within the lens's
-    range, evenly in its logarithm. The head goes there as fast as it can, the lens as well, and both comes into effect
-    after the rig's delay.
+    Action: `Box(-1, 1, (3,))`, pan and tilt within the head's limits, and the focal length within the lens's range,
+    even in its logarithm. Head and lens go there as fast as they can, after the rig's delay.
 
-    Observation: with "tracks" a `Box` of TRACK_FEATURES and then RIG_FEATURES, of detections from the truth with a
-    detector's noise; with "images" a `Dict` of the pictures `wide` and `closeup`, RGB, and `rig`, the RIG_FEATURES.
+    Observation: with "tracks" a `Box` of TRACK_FEATURES and then RIG_FEATURES, from detections that are the ground
+    truth with a detector's noise; with "images" a `Dict` of the pictures `wide` and `closeup`, RGB, and `rig`, the
+    RIG_FEATURES.
 
     Reward: 1 for a step whose new zoom frame is a good close-up (`cotarget.metrics.Closeup.good`): the whole target is
-    in it, at 0.8 to 1.25 times the size wanted; else 0. Actions show in it as late as the rig is.
+    visible at 0.8 to 1.25 of the wanted size; else 0. Actions take effect after the rig's delays.
 
-    `info`, which alone tells the truth, of that zoom frame unless it says otherwise: `t` and `t_closeup`, when the
-    newest frames were exposed [s]; `good`; `in_frame`; `offset_px`, from the picture's middle to the target's, and half
-    the picture's diagonal (400 px of 640x480) where that is not in it; `size_ratio`, over the size wanted;
-    `center_px`; `box_closeup` and, of the wide frame, `box_wide`, as left, top, right, bottom [px]; `direction` from
-    the wide camera, in its own axes, a unit vector. What is behind a camera is at infinity, and 0 of the size wanted.
+    `info` alone holds ground truth, of that zoom frame unless said otherwise: `t` and `t_closeup`, exposure times of
+    the newest frames [s]; `good`; `in_frame`; `offset_px`, distance of the target from the picture's centre, or half
+    the diagonal (400 px of 640x480) if it is not inside; `size_ratio`, size over the wanted size; `center_px`;
+    `box_closeup` and, of the fixed frame, `box_wide`, as left, top, right, bottom [px]; `direction` from the fixed
+    camera, in its own axes, a unit vector. Behind a camera, positions are infinite and the size ratio is 0.
     """
 
     def __init__(
@@ -81,24 +81,23 @@ class Follow(RigEnv[Any, Vector]):
         noise: TruthNoise = DETECTOR_NOISE,
         render_mode: str | None = None,
     ) -> None:
-        """Make the environment; a world there is from the first reset on.
+        """Create the environment; its world is made at the first reset.
 
         Args:
             target: book, person or bird.
             observation: "tracks" or "images".
-            rig: a simulated one, or its rig.toml; the default one without noise, JPEG, distortion, blur and
-                antialiasing, where none is given. Its `[sim]` counts without targets, models, paths and seed, of its
-                `[targets]` the one of this name without its detector, of its `[safety]` the ranges of pan and tilt.
-                The ways that targets go are made for the outdoor scene; one in which less than half of them can be
-                seen is refused.
-            calibration: that a policy may use, or its file; the true one by default.
-            seconds: of an episode, at most 20 [s].
+            rig: a simulated rig or its rig.toml; by default the default rig without noise, JPEG, distortion, blur and
+                antialiasing. Its `[sim]` counts except targets, models, paths and seed; of its `[targets]`, the one of
+                this name except its detector; of its `[safety]`, the ranges of pan and tilt. The targets' paths are
+                made for the outdoor scene; a scene in which less than half of them is visible is refused.
+            calibration: calibration that a policy may use, or its file; the true one by default.
+            seconds: length of an episode, at most 20 [s].
             image_size: (width, height) of the pictures, 8 to 4096 each [px].
-            noise: of the detections.
+            noise: noise of the detections.
             render_mode: "rgb_array", or None for no `render`.
 
         Raises:
-            ConfigError: an argument makes no sense.
+            ConfigError: an argument is invalid.
         """
         self.name = name_of("target", target, LONE)
         super().__init__(observation, rig, calibration, seconds, image_size, noise, render_mode)
@@ -115,11 +114,11 @@ class Follow(RigEnv[Any, Vector]):
 
     @property
     def times(self) -> tuple[float, float]:
-        """When the newest frame of the wide camera was exposed, and of the zoom camera [s]."""
+        """Exposure times of the newest frames of the fixed and the zoom camera [s]."""
         return self.wide.t, self.closeup.t
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode: another at every time, the same one after the same seed."""
+        """Begin an episode: a new one each time, the same one after the same seed."""
         seed = self._begin(seed, options)
         rig = self._open(lone_path(self.name, seed), seed).rig
         self._tracker = Tracker(settings_for(self.target), rig.fixed.size)
@@ -131,7 +130,7 @@ class Follow(RigEnv[Any, Vector]):
         return self._observe(), self._info(self._judge())
 
     def step(self, action: Vector) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Command head and lens, and wait for the next frame of the wide camera."""
+        """Command head and lens, and wait for the next frame of the fixed camera."""
         rig = self.episode.rig
         pan, tilt, focal_px = self.units.command(action)
         self._commanded = *rig.head.move(pan, tilt), rig.zoom.zoom(focal_px)
@@ -144,13 +143,13 @@ class Follow(RigEnv[Any, Vector]):
         return self._observe(), reward, False, self._index >= self._last, self._info(judged)
 
     def _detect(self) -> None:
-        """Search the newest frame of the wide camera."""
+        """Detect and track in the newest frame of the fixed camera."""
         self.detections: list[Detection] = self.episode.detector.detect(self.wide)
         tracks = self._tracker.update(self.detections, self.wide.t)
         self._track = tracks[0] if tracks and tracks[0].confirmed else None
 
     def _judge(self) -> Closeup:
-        """What the newest zoom frame truly shows of the target."""
+        """Ground truth of the target in the newest zoom frame."""
         return closeup_of(self.episode.outlines, self.name, self.target, self.closeup.t)
 
     def _observe(self) -> Any:
@@ -165,7 +164,7 @@ class Follow(RigEnv[Any, Vector]):
         return within([*self._track_numbers(), *numbers], self._track_space)
 
     def _track_numbers(self) -> list[float]:
-        """Those of TRACK_FEATURES."""
+        """Compute the TRACK_FEATURES; zeros without a track."""
         track = self._track
         if track is None:
             return [0.0] * len(TRACK_FEATURES)
@@ -187,7 +186,7 @@ class Follow(RigEnv[Any, Vector]):
         ]
 
     def _info(self, judged: Closeup) -> dict[str, Any]:
-        """The truth."""
+        """Collect the ground truth."""
         (t, t_closeup), outlines = self.times, self.episode.outlines
         return {
             "t": t,

@@ -1,13 +1,11 @@
-"""The project's own pipeline as policies of the environments, to compare others with.
+"""Offer the pipeline as policies of the environments, as a baseline for others.
 
-Policies are called with an observation and give an action. These do not read the observation: they look at what it is
-made from. Of the truth they know no more than that, and the environment's calibration of its rig, which is exact by
-default.
+A policy is called with an observation and returns an action. These policies ignore the observation and read the frames
+and detections behind it. Of the ground truth they know no more than that, and the environment's calibration, which is
+exact by default.
 
-The rig as the pipeline wants it, in front of an environment: frames are those of the last step, commands are wishes.
-
-An environment's action says where the head shall go and not how fast, but the pipeline turns it at the target's own
-speed. So each step sends it to where, going as fast as it can, it is by the next step where the wish would have it.
+An environment's action has no speed, but the pipeline turns the head at the target's speed. So each step commands the
+goal at which the head, at full speed, is by the next step where the pipeline's own command would have it.
 """
 
 import math
@@ -28,19 +26,19 @@ from cotarget.pipeline import FollowSettings, Step, follow
 from cotarget.rig import Board, Clock, Frame, Image, PanTiltLimits, PanTiltState, Speed
 from cotarget.safety.safe_rig import clipped
 
-NEAR = 1e-6  # of an angle [rad]
+NEAR = 1e-6  # tolerance of an angle [rad]
 
 
 class Desk:
-    """A rig and a detector for `cotarget.pipeline.follow`, which wants them."""
+    """A rig and a detector for `cotarget.pipeline.follow` that read an environment's last step."""
 
     mask: Image | None = None
 
     def __init__(self, env: Follow) -> None:
-        """Sit down before an environment that was reset.
+        """Wrap an environment that was reset.
 
         Args:
-            env: its episode is the rig's.
+            env: the environment; its episode provides the rig.
         """
         rig = env.episode.rig
         self._env, self._interval = env, 1 / env.config.rate_hz
@@ -51,11 +49,11 @@ class Desk:
         self._model = HeadModel(rig.head.limits)
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """What was found in the newest frame."""
+        """Return the detections of the newest frame."""
         return self._env.detections
 
     def command(self) -> Command:
-        """What to command now, so that the wishes come true."""
+        """Compute the command that carries out the pipeline's requests."""
         state, wish = self.head.state(), self.head.wish
         self._model.saw(state)
         if wish is None:
@@ -71,13 +69,13 @@ class Desk:
         return pan, tilt, self.zoom.wish
 
     def _hurried(self, x: float, v: float, goal: float, speed: float) -> float:
-        """The goal that has an axis as far by the next step as another one, to which it goes more slowly [rad].
+        """Find the goal that at full speed brings an axis as far by the next step as a slower command would [rad].
 
         Args:
-            x: where it is [rad].
-            v: how fast [rad/s].
-            goal: the other one [rad].
-            speed: that it would go at [rad/s].
+            x: position [rad].
+            v: speed [rad/s].
+            goal: goal of the slower command [rad].
+            speed: speed of the slower command [rad/s].
         """
         limits, interval = self.head.limits, self._interval
         there, _ = axis_at(interval, x, v, goal, speed, limits.acceleration)
@@ -91,29 +89,29 @@ class Desk:
         return float(brentq(beyond, x - far, x + far, xtol=NEAR))
 
     def close(self) -> None:
-        """Nothing is its own."""
+        """Do nothing: the environment owns the devices."""
 
     def __enter__(self) -> "Desk":
-        """Give the rig itself."""
+        """Return the rig itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing is its own."""
+        """Do nothing: the environment owns the devices."""
 
 
 class Eye:
-    """A camera whose newest frame is the environment's."""
+    """A camera whose newest frame is that of the environment."""
 
     def __init__(self, newest: Callable[[], Frame], size: tuple[int, int]) -> None:
         self._newest, self.size = newest, size
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """The newest frame."""
+        """Return the newest frame."""
         return self._newest()
 
 
 class WishedLens(Eye):
-    """The zoom camera, whose lens goes nowhere before the next step."""
+    """The zoom camera; its lens moves only with the environment's next step."""
 
     def __init__(self, env: Follow) -> None:
         lens = env.episode.rig.zoom
@@ -122,42 +120,42 @@ class WishedLens(Eye):
         self.wish = lens.state().focal_px
 
     def zoom(self, focal_px: float) -> float:
-        """Note the wish."""
+        """Store the requested focal length [px], within the lens's range."""
         shortest, longest = self.focal_range
         self.wish = min(max(focal_px, shortest), longest)
         return self.wish
 
     def capture(self) -> Frame:
-        """The newest frame."""
+        """Return the newest frame."""
         return self.read()
 
 
 class WishedHead:
-    """The head, which goes nowhere before the next step."""
+    """The head; it moves only with the environment's next step."""
 
     def __init__(self, limits: PanTiltLimits, state: Callable[[], PanTiltState]) -> None:
         self.limits, self.state = limits, state
         self.wish: HeadCommand | None = None
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
-        """Note the wish, within the limits."""
+        """Store the requested command, within the limits."""
         pan, tilt = clipped(pan, tilt, self.limits)
         self.wish = HeadCommand(pan, tilt, speed)
         return pan, tilt
 
     def halt(self) -> None:
-        """Take the wish back."""
+        """Drop the requested command."""
         self.wish = None
 
 
 class PipelinePolicy:
-    """`cotarget.pipeline.follow` as a policy of `cotarget/Follow-v0`, by the wide view alone."""
+    """Use `cotarget.pipeline.follow` as a policy of `cotarget/Follow-v0`, with the fixed camera alone."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        """Begin.
+        """Create the policy.
 
         Args:
-            env: to act in, wrapped or not.
+            env: environment to act in, wrapped or not.
 
         Raises:
             ConfigError: it is another environment.
@@ -169,7 +167,7 @@ class PipelinePolicy:
         self._seen: Frame | None = None
 
     def __call__(self, observation: object) -> Vector:
-        """What the pipeline commands after the newest frames; asked again before the next step, the same."""
+        """Return the pipeline's command after the newest frames; the same one until the next step."""
         env = self._env
         if env.episode is not self._episode:
             self._episode, self._desk = env.episode, Desk(env)
@@ -184,14 +182,14 @@ class PipelinePolicy:
 
 
 class SchedulingPolicy:
-    """One of `cotarget.control.selection` as a policy of `cotarget/Schedule-v0`."""
+    """Use a policy of `cotarget.control.selection` in `cotarget/Schedule-v0`."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], policy: str = "most-served") -> None:
-        """Begin.
+        """Create the policy.
 
         Args:
-            env: to act in, wrapped or not.
-            policy: its name.
+            env: environment to act in, wrapped or not.
+            policy: name of the policy.
 
         Raises:
             ConfigError: it is another environment, or there is no such policy.
@@ -202,7 +200,7 @@ class SchedulingPolicy:
         self._episode: Episode | None = None
 
     def __call__(self, observation: object) -> int:
-        """The number of the slot of whom the policy looks at; the first where it looks at nobody."""
+        """Return the slot of the track that the policy selects; the first slot if it selects none."""
         env = self._env
         if env.episode is not self._episode:
             self._episode, self._policy = env.episode, self._make()

@@ -1,4 +1,4 @@
-"""`cotarget/Schedule-v0`: choose whom of several targets to look at; the pipeline does the rest."""
+"""`cotarget/Schedule-v0`: choose which of several targets to follow; the pipeline does the rest."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -35,31 +35,31 @@ from cotarget.rig import PanTiltLimits
 from cotarget.sim.targets.random_paths import GROUPED, SECONDS, group_paths
 from cotarget.tracking.track import Track
 
-SLOTS = 8  # for tracks: five targets, and those that were lost and found under another number
-SERVED_REWARD = 5.0  # for each: as much as looking on at one of them is worth in as many seconds
+SLOTS = 8  # for tracks: five targets, and those that were lost and found again under another id
+SERVED_REWARD = 5.0  # per served target: as much as as many seconds of good close-ups
 
-# What a policy knows of a track (`cotarget.control.selection.Candidate`), and the range of each number; 0 in an empty
+# Features of a track that a policy sees (`cotarget.control.selection.Candidate`), with the range of each; 0 in an empty
 # slot.
 CANDIDATE_FEATURES = {
     "there": (0.0, 1.0),  # whether the slot has a track
-    "followed": (0.0, 1.0),  # whether it is the one looked at
-    "detected": (0.0, 1.0),  # whether the newest frame had it
-    "pan": (-1.0, 1.0),  # where the head points at it, as a part of its range
+    "followed": (0.0, 1.0),  # whether it is the followed track
+    "detected": (0.0, 1.0),  # whether the newest frame detected it
+    "pan": (-1.0, 1.0),  # pan that points at it, as a part of the head's range
     "tilt": (-1.0, 1.0),
-    "pan_rate": (-1.0, 1.0),  # how fast that changes [1/s]
+    "pan_rate": (-1.0, 1.0),  # rate of that [1/s]
     "tilt_rate": (-1.0, 1.0),
-    "leaves_in": (0.0, 1.0),  # until it leaves the wide view, as a part of the longest episode
-    "seen": (0.0, 1.0),  # how long it has been well in the close-up, as a part of what policies look at each
+    "leaves_in": (0.0, 1.0),  # time until it leaves the fixed image, as a part of the longest episode
+    "seen": (0.0, 1.0),  # time well in the close-up, as a part of the time for which policies look at each
     "reachable": (0.0, 1.0),  # whether the head can point at it
 }
 
 
 class Asked:
-    """The policy that the pipeline is given: it does what the action says.
+    """Policy for the pipeline that selects the track of the action.
 
     Attributes:
-        candidates: the newest.
-        number: of the track to look at.
+        candidates: candidates of the newest frame.
+        number: id of the track to follow.
     """
 
     unmet = "nobody is asked for"
@@ -69,36 +69,36 @@ class Asked:
         self.number: int | None = None
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
-        """The one asked for, while it is there."""
+        """Return the track of the action, while it is there."""
         self.candidates = tuple(candidates)
         return self.number if self.number in {candidate.id for candidate in candidates} else None
 
     def favours(self, track: Track) -> bool:
-        """Whether it is the one asked for."""
+        """Whether a track is that of the action."""
         return track.id == self.number
 
 
 class Schedule(RigEnv[dict[str, Any], int]):
-    """Choose whom of five targets to look at; the project's own pipeline does everything else.
+    """Choose which of five targets to follow; the project's pipeline does everything else.
 
-    A step is a frame of the wide camera. Five persons or birds come into the wide view, cross it and leave; their ways
-    and sizes, and the noise, are an episode's own, by the seed. An episode ends by truncation after its seconds.
+    A step is a frame of the fixed camera. Five persons or birds enter the fixed image, cross it and leave. Their paths
+    and sizes, and the noise, follow from the episode's seed. An episode is truncated after its seconds.
 
-    Action: `Discrete(8)`, the slot of the track to look at, which the pipeline heeds from the next frame on. A track
-    keeps its slot for as long as it is confirmed. Whoever chooses an empty slot looks at nobody: the head waits and
-    the lens zooms out. `info["action_mask"]` has 1 for each slot that is not empty.
+    Action: `Discrete(8)`, the slot of the track to follow from the next frame on. A track keeps its slot while it is
+    confirmed. With an empty slot no track is followed: the head waits and the lens zooms out. `info["action_mask"]` is
+    1 for each slot with a track.
 
-    Observation: a `Dict` of `tracks`, the CANDIDATE_FEATURES of each slot, (8, 10), with 0 everywhere in an empty one;
-    `rig`, the RIG_FEATURES; and with "images" the pictures `wide` and `closeup`, RGB, besides. The detections are from
-    the truth, with a detector's noise.
+    Observation: a `Dict` of `tracks`, the CANDIDATE_FEATURES of each slot, (8, 10), all 0 in an empty one; `rig`, the
+    RIG_FEATURES; and with "images" also the pictures `wide` and `closeup`, RGB. The detections are the ground truth
+    with a detector's noise.
 
-    Reward: the seconds for which each target was well in the close-up since the zoom frame before
-    (`cotarget.metrics.Closeup.good`), and `served_reward` for each that has been so for a second in all by now.
+    Reward: the seconds for which each target was well in the close-up since the previous zoom frame
+    (`cotarget.metrics.Closeup.good`), and `served_reward` for each target that reaches one second of that in all.
 
-    `info`, which alone tells the truth: `t` and `t_closeup`, when the newest frames were exposed [s]; of the targets,
-    which are `kind`, `kind2` to `kind5`, `good` in that zoom frame, (5,); `good_s` so far [s]; `box_closeup` and
-    `box_wide` as left, top, right, bottom [px], (5, 4), at infinity behind the camera; `direction` from the wide
-    camera, unit vectors, (5, 3); and how many are `served`.
+    `info` alone holds ground truth: `t` and `t_closeup`, exposure times of the newest frames [s]; for the targets
+    `kind`, `kind2` to `kind5`: `good` in that zoom frame, (5,); `good_s` so far [s]; `box_closeup` and `box_wide` as
+    left, top, right, bottom [px], (5, 4), infinite behind the camera; `direction` from the fixed camera, unit vectors,
+    (5, 3); and the number of `served` targets.
     """
 
     def __init__(
@@ -113,21 +113,21 @@ class Schedule(RigEnv[dict[str, Any], int]):
         served_reward: float = SERVED_REWARD,
         render_mode: str | None = None,
     ) -> None:
-        """Make the environment; a world there is from the first reset on.
+        """Create the environment; its world is made at the first reset.
 
         Args:
-            kind: of the targets: person or bird.
-            observation: "tracks", or "images" to see both views besides.
+            kind: kind of the targets, person or bird.
+            observation: "tracks", or "images" to include the pictures of both cameras.
             rig: as in `cotarget.env.Follow`.
-            calibration: that the pipeline uses, or its file; the true one by default.
-            seconds: of an episode, at most 20 [s].
+            calibration: calibration for the pipeline, or its file; the true one by default.
+            seconds: length of an episode, at most 20 [s].
             image_size: (width, height) of the pictures, 8 to 4096 each [px].
-            noise: of the detections.
-            served_reward: for each target served.
+            noise: noise of the detections.
+            served_reward: reward for each served target.
             render_mode: "rgb_array", or None for no `render`.
 
         Raises:
-            ConfigError: an argument makes no sense.
+            ConfigError: an argument is invalid.
         """
         self.kind = name_of("kind", kind, GROUPED)
         super().__init__(observation, rig, calibration, seconds, image_size, noise, render_mode)
@@ -142,12 +142,12 @@ class Schedule(RigEnv[dict[str, Any], int]):
 
     @property
     def times(self) -> tuple[float, float]:
-        """When the newest frame of the wide camera was exposed, and of the zoom camera [s]."""
+        """Exposure times of the newest frames of the fixed and the zoom camera [s]."""
         return self._step.fixed.t, self._step.zoom.t
 
     @property
     def candidates(self) -> Sequence[Candidate]:
-        """The confirmed tracks, as a policy of the pipeline sees them."""
+        """Confirmed tracks, as a policy of the pipeline sees them."""
         return self._asked.candidates
 
     @property
@@ -157,15 +157,15 @@ class Schedule(RigEnv[dict[str, Any], int]):
 
     @property
     def limits(self) -> PanTiltLimits:
-        """The head's."""
+        """Limits of the head."""
         return self.episode.rig.head.limits
 
     def slot_of(self, number: int | None) -> int:
-        """The slot of a track; the first where it has none."""
+        """Return the slot of a track; the first slot if it has none."""
         return self._slots.index(number) if number is not None and number in self._slots else 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode: another at every time, the same one after the same seed."""
+        """Begin an episode: a new one each time, the same one after the same seed."""
         seed = self._begin(seed, options)
         paths = group_paths(self.kind, seed)
         episode, self._asked = self._open(paths, seed), Asked()
@@ -184,12 +184,12 @@ class Schedule(RigEnv[dict[str, Any], int]):
         return self._observe(), self._info(self._good())
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Look at whom a slot has, and wait for the next frame of the wide camera.
+        """Follow the track of a slot and wait for the next frame of the fixed camera.
 
         Raises:
             ConfigError: there is no such slot, or no episode.
         """
-        self.episode  # noqa: B018  whether there is one
+        self.episode  # noqa: B018  raises if there is none
         if not self.action_space.contains(action):
             raise ConfigError(f"action: {told(action)} is not the number of a slot, 0 to {SLOTS - 1}")
         self._asked.number = self._slots[action]
@@ -206,12 +206,12 @@ class Schedule(RigEnv[dict[str, Any], int]):
         return self._observe(), reward, False, self._index >= self._last, self._info(good)
 
     def _end(self) -> None:
-        """Let go of the episode, and of the pipeline in it."""
+        """Close the episode and its pipeline."""
         super()._end()
         self._steps = iter(())
 
     def _turn(self) -> None:
-        """One turn of the pipeline; tracks come into slots and leave them."""
+        """Run the pipeline for one frame, and update the slots of the tracks."""
         self._step = next(self._steps)
         numbers = [candidate.id for candidate in self.candidates]
         self._slots = [number if number in numbers else None for number in self._slots]
@@ -220,12 +220,12 @@ class Schedule(RigEnv[dict[str, Any], int]):
                 self._slots[self._slots.index(None)] = number
 
     def _good(self) -> dict[str, bool]:
-        """Which targets are well in the newest zoom frame."""
+        """Whether each target is well in the newest zoom frame."""
         outlines, t = self.episode.outlines, self._step.zoom.t
         return {name: closeup_of(outlines, name, self.target, t).good for name in self._good_s}
 
     def _served(self) -> int:
-        """How many targets have been well in the close-up for long enough."""
+        """Number of targets that were well in the close-up for long enough."""
         return sum(seconds >= SERVED_S - ROUNDING_S for seconds in self._good_s.values())
 
     def _observe(self) -> dict[str, Any]:
@@ -238,7 +238,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
         return {**seen, **self._pictures()} if self._observation == "images" else seen
 
     def _candidate_numbers(self, candidate: Candidate | None) -> list[float]:
-        """Those of CANDIDATE_FEATURES."""
+        """Compute the CANDIDATE_FEATURES of a candidate; zeros for an empty slot."""
         if candidate is None:
             return [0.0] * len(CANDIDATE_FEATURES)
         followed = self._step.target is not None and self._step.target.id == candidate.id
@@ -259,7 +259,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
         ]
 
     def _info(self, good: dict[str, bool]) -> dict[str, Any]:
-        """The truth."""
+        """Collect the ground truth."""
         (t, t_closeup), episode, names = self.times, self.episode, list(good)
         outlines = episode.outlines
         return {

@@ -1,7 +1,7 @@
-"""Normalised correlation of a weighted colour template with an image that may end inside it, to a part of a sample.
+"""Correlate a weighted colour template with an image, with subpixel maxima; the image may end inside the template.
 
-The weights say how much each sample of the template counts; where the image has no samples, they count for nothing
-(Padfield, Masked object registration in the Fourier domain, 2012, with weights in place of the template's mask).
+The weights say how much each sample of the template counts; samples outside the image count nothing (Padfield, *Masked
+object registration in the Fourier domain*, 2012, with weights in place of the template's mask).
 """
 
 import math
@@ -13,23 +13,23 @@ import numpy as np
 from cotarget.geometry import Array
 
 Samples = np.ndarray  # float32, (H, W) or (H, W, 3)
-# Variance of what is no signal in one sample, all three colours together: keeps a flat patch from being alike to every
-# other. Where 10 grey levels are one, a sensor's noise of 2 levels in each colour leaves about as much.
+# Noise variance of one sample, all three colours together. It keeps a flat patch from correlating with every other flat
+# patch. Where 10 grey levels are one unit, a sensor's noise of 2 levels in each colour leaves about as much.
 NOISE_VARIANCE = 0.1
-# A sum of weights below this is none at all; float32 sums of some 10^4 terms are good to about as much.
+# Least sum of weights, the rounding error of float32 sums of some 10^4 terms.
 LEAST_WEIGHT = 1e-3
-# A maximum whose curvature is below this is flat.
+# Least curvature of a maximum; flatter ones are not interpolated further.
 FLAT = 1e-6
 
 
 @dataclass(frozen=True)
 class Likeness:
-    """How alike a template is to an image at each place of its top-left sample, (H - h + 1, W - w + 1) each.
+    """Correlation of a template at each place of its top-left sample, (H - h + 1, W - w + 1) each.
 
     Attributes:
         score: normalised correlation, -1 to 1.
-        gain: by how much brighter and darker the image is than the template where they agree.
-        seen: the part of the template's weight that lies inside the image, 0 to 1.
+        gain: contrast of the image over that of the template.
+        seen: part of the template's weight inside the image, 0 to 1.
     """
 
     score: np.ndarray
@@ -38,13 +38,13 @@ class Likeness:
 
 
 def correlate(image: Samples, inside: Samples | None, template: Samples, weight: Samples) -> Likeness:
-    """Correlate a weighted template with an image everywhere.
+    """Correlate a weighted template with an image at every place.
 
     Args:
-        image: (H, W, 3) float32, anything where it is not valid.
-        inside: (H, W) float32, 1 where the image is valid and 0 elsewhere; None where all of it is.
-        template: (h, w, 3) float32.
-        weight: (h, w) float32, 0 to 1.
+        image: image, (H, W, 3) float32; any values where it is not valid.
+        inside: 1 where the image is valid and 0 elsewhere, (H, W) float32; None if all of it is valid.
+        template: template, (h, w, 3) float32.
+        weight: weight of each sample of the template, 0 to 1, (h, w) float32.
     """
     mean = np.einsum("ij,ijk->k", weight, template) / weight.sum()
     template = template - mean.astype(np.float32)
@@ -75,14 +75,14 @@ def correlate(image: Samples, inside: Samples | None, template: Samples, weight:
 
 
 def summit(score: np.ndarray, at: tuple[int, int]) -> Array | None:
-    """Locate a maximum to a part of a sample by a parabola along each axis.
+    """Locate a maximum to a part of a sample, by a parabola along each axis.
 
     Args:
-        score: (H, W).
-        at: its row and column, or those of a neighbour.
+        score: values, (H, W).
+        at: row and column of the maximum or of a neighbour.
 
     Returns:
-        Its (u, v), (2,); None where there is no maximum, or it lies on the border.
+        The maximum (u, v), (2,); None if there is none, or if it lies on the border.
     """
     y, x = at
     low_y, low_x = max(y - 1, 0), max(x - 1, 0)
@@ -100,28 +100,28 @@ def summit(score: np.ndarray, at: tuple[int, int]) -> Array | None:
 
 
 def resample(image: np.ndarray, A: Array, size: tuple[int, int]) -> tuple[Samples, Samples | None]:
-    """Sample an image on another grid, averaged over the new grid's samples where that is coarser.
+    """Resample an image on another grid, with averages where that grid is coarser.
 
     Args:
-        image: (H, W) or (H, W, 3).
-        A: from the new grid's samples (u, v) to the image's pixels, (2, 3).
+        image: image, (H, W) or (H, W, 3).
+        A: affine map from the new grid's samples (u, v) to the image's pixels, (2, 3).
         size: (width, height) of the new grid.
 
     Returns:
-        The samples, continued beyond the image's border by what is there, and where they are inside, (height, width)
-        with 0 and 1; None where all of them are.
+        The samples, extended beyond the image by its border pixels; and where they are inside the image, (height,
+        width) of 0 and 1, or None if all are.
     """
     corners = np.array([[0.0, 0.0], [size[0] - 1, 0.0], [size[0] - 1, size[1] - 1], [0.0, size[1] - 1]])
     seen = corners @ A[:, :2].T + A[:, 2]
     limit = np.array(image.shape[1::-1])
     pitch = float(np.sqrt(abs(np.linalg.det(A[:, :2]))))
-    factor = 2 ** max(0, round(math.log2(pitch)))  # halving is far faster than any other reduction
+    factor = 2 ** max(0, round(math.log2(pitch)))  # halving is far faster than other reductions
     low = np.clip(np.floor(seen.min(axis=0) - 2 * factor).astype(int), 0, limit - 1)
     high = np.clip(np.ceil(seen.max(axis=0) + 2 * factor).astype(int) + 1, low + 1, limit)
     part = image[low[1] : high[1], low[0] : high[0]]
     for _ in range(round(math.log2(factor))):
         part = _halved(part)
-    M = A.copy()  # from the new grid to the reduced part, whose pixel i covers `factor` pixels
+    M = A.copy()  # from the new grid to the reduced image, whose pixel i covers `factor` pixels
     M[:, 2] -= low
     M = M / factor
     M[:, 2] += 0.5 / factor - 0.5
@@ -136,7 +136,7 @@ def resample(image: np.ndarray, A: Array, size: tuple[int, int]) -> tuple[Sample
 
 
 def _halved(image: np.ndarray) -> np.ndarray:
-    """An image half as large, means of 2 x 2 pixels; an odd last row or column is left out, a single one kept."""
+    """Halve an image by means of 2 x 2 pixels; an odd last row or column is dropped, a single one is kept."""
     height, width = image.shape[:2]
     half = max(width // 2, 1), max(height // 2, 1)
     even = image[: max(height // 2 * 2, 1), : max(width // 2 * 2, 1)]
@@ -144,5 +144,5 @@ def _halved(image: np.ndarray) -> np.ndarray:
 
 
 def _slide(image: Samples, kernel: Samples) -> np.ndarray:
-    """Plain correlation, summed over the colours."""
+    """Correlate without normalisation, summed over the colours."""
     return cv2.matchTemplate(image, np.ascontiguousarray(kernel, dtype=np.float32), cv2.TM_CCORR)

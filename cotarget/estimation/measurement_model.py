@@ -1,9 +1,7 @@
-"""What is known of a target at one time: position in 3D, size, and where the zoom camera would see it.
+"""Predict what the zoom camera sees of a target, with derivatives, and hold the estimate of a target at one time.
 
-What the moved zoom camera sees of a direction, with derivatives: in tangents, without distortion.
-
-The same geometry as `cotarget.pantilt`, for one point at a time and with floats in place of arrays, because it is asked
-for in every frame: it takes less than a tenth of their time.
+The geometry is that of `cotarget.pantilt` (Eq. 2), in tangents without distortion. It handles one point at a time in
+floats instead of arrays, because it runs for every frame: that takes less than a tenth of the time.
 """
 
 import math
@@ -21,12 +19,14 @@ from cotarget.targeting import WantedSize
 
 @dataclass(frozen=True)
 class SightLine:
-    """The moved zoom camera, as it sees a target at (a, b, 1) e^l: along d = view (a, b, 1, e^-l) (Eq. 2).
+    """Linear map from a target's direction to the zoom camera's frame, at one pose of the head.
+
+    A target at (a, b, 1) e^l in the fixed camera's frame is seen along d = view (a, b, 1, e^-l) (Eq. 2).
 
     Attributes:
-        view: rotation from the fixed camera's frame, and where that camera is in the zoom camera's frame [m], (3, 4).
-        by_pan: its derivative by the pan that the head reports, (3, 4).
-        by_tilt: likewise by the tilt.
+        view: rotation from the fixed to the zoom camera's frame, and the fixed camera's position in it [m], (3, 4).
+        by_pan: derivative of view by the reported pan, (3, 4).
+        by_tilt: derivative of view by the reported tilt, (3, 4).
     """
 
     view: Array
@@ -34,12 +34,14 @@ class SightLine:
     by_tilt: Array
 
     def seen(self, x: Array) -> tuple[Array, Array, Array]:
-        """Where a state (13,) appears.
+        """Predict where a target in a given state appears.
+
+        Args:
+            x: state, see `cotarget.estimation.motion_model`, (13,).
 
         Returns:
-            Tangents in the zoom camera, head's bias included, (2,); their derivatives by (a, b, l, pan, tilt), (2, 5);
-            and the direction d itself, whose third coordinate is the depth in the zoom camera over that in the fixed
-            one, (3,).
+            Tangents in the zoom camera's frame, head bias included, (2,); their derivatives by (a, b, l, pan, tilt),
+            (2, 5); and d, whose third coordinate is the ratio of the depths in the zoom and the fixed camera, (3,).
         """
         nearness = math.exp(-x[L])
         p = np.array([x[A], x[B], 1.0, nearness])
@@ -51,10 +53,10 @@ class SightLine:
 
 
 class Sights:
-    """Makes the Sight at any pan, tilt and focal length of one rig."""
+    """Compute the zoom camera's sight line at any pan, tilt and focal length of one rig."""
 
     def __init__(self, calibration: Calibration) -> None:
-        """Take from the calibration what does not change.
+        """Extract from the calibration what does not depend on pan, tilt and focal length.
 
         Raises:
             CalibrationError: the calibration has no T.
@@ -72,7 +74,7 @@ class Sights:
         self._across_twice = self._across @ across
 
     def at(self, pan: float, tilt: float, nominal_px: float) -> SightLine:
-        """The Sight where the head reports pan and tilt [rad] and the lens its nominal focal length [px]."""
+        """Compute the sight line at reported pan and tilt [rad] and nominal focal length [px]."""
         head = self._head
         true_pan = head.pan_scale * pan + head.pan_zero
         true_tilt = head.tilt_scale * tilt + head.tilt_zero
@@ -80,9 +82,9 @@ class Sights:
         c, s = math.cos(true_pan), math.sin(true_pan)
         unpan = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
         unpan_slope = np.array([[-s, 0.0, -c], [0.0, 0.0, 0.0], [c, 0.0, -s]]) * head.pan_scale
-        # x_zoom = unhand (untilt (unpan x_base - dz) + dz - hand_t), the inverse of Eqs. 2 and 6
+        # x_zoom = unhand (untilt (unpan x_base - dz) + dz - hand_t), from Eqs. 2 and 6
         c, s = math.cos(true_tilt), math.sin(true_tilt)
-        after_pan = self._unhand - s * self._across + (1 - c) * self._across_twice  # unhand untilt, after Rodrigues
+        after_pan = self._unhand - s * self._across + (1 - c) * self._across_twice  # unhand untilt, Rodrigues' formula
         turn = head.tilt_scale * (s * self._across_twice - c * self._across)
         panned = unpan @ self._fixed
         panned[:, 3] -= self._dz
@@ -99,14 +101,14 @@ _BY_SIZE[[L, K, G]] = -1.0, 1.0, 1.0
 
 @dataclass(frozen=True)
 class Appearance:
-    """Where a target will be in the zoom image.
+    """Predicted appearance of a target in the zoom image.
 
     Attributes:
-        offset_px: from the image's centre, right and down, (2,).
-        covariance: of it [px^2], (2, 2).
-        size_px: the target's known dimension as it will appear.
-        size_sigma: its standard deviation, relative.
-        focal_px: true focal length (fx, fy), (2,).
+        offset_px: offset from the image's centre, right and down, (2,) [px].
+        covariance: covariance of the offset [px^2], (2, 2).
+        size_px: apparent size of the target's known dimension [px].
+        size_sigma: standard deviation of that size, relative.
+        focal_px: true focal lengths (fx, fy), (2,) [px].
     """
 
     offset_px: Array
@@ -123,19 +125,19 @@ class Appearance:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """One target at one time.
+    """Estimate of one target at one time.
 
     Attributes:
-        t: the time that it is for [s].
-        measured_t: when the newest measurement before that was made [s].
-        state: see `cotarget.estimation.motion_model`, (13,).
-        state_covariance: (13, 13).
-        carried: whether a hand may be carrying it elsewhere, by where it was found lately.
-        size_prior: standard deviation of the true size over the told one, as it was assumed.
-        bias_prior: likewise of the head's bias [rad].
-        target: what was told of it.
-        calibration: of the rig.
-        sights: likewise, prepared.
+        t: time of the estimate [s].
+        measured_t: time of the newest measurement before it [s].
+        state: state, see `cotarget.estimation.motion_model`, (13,).
+        state_covariance: covariance of the state, (13, 13).
+        carried: whether the target jumped recently and may be carried by hand.
+        size_prior: standard deviation of the size's prior, relative.
+        bias_prior: standard deviation of the head bias's prior, per axis [rad].
+        target: target profile.
+        calibration: calibration of the rig.
+        sights: sight lines of that calibration.
     """
 
     t: float
@@ -157,45 +159,45 @@ class Estimate:
 
     @property
     def depth(self) -> float:
-        """Along the fixed camera's axis [m]."""
+        """Depth along the fixed camera's optical axis [m]."""
         return math.exp(self.state[L])
 
     @property
     def bias(self) -> tuple[float, float]:
-        """What to take from the pan and tilt that are solved for, because the head points that much too far [rad]."""
+        """Pointing bias (pan, tilt), to subtract from the solved angles before they are commanded [rad]."""
         return float(self.state[PAN]), float(self.state[TILT])
 
     @property
     def size(self) -> float:
-        """The target's true size [m], as far as both views tell."""
+        """Estimated true size of the target [m]."""
         return self.target.size * math.exp(self.state[K])
 
     @property
     def size_deviation(self) -> float:
-        """How far the true size is from the told one, in the standard deviations that were assumed; 0 is as told."""
+        """Deviation of the true size from the nominal one, in prior standard deviations."""
         return float(self.state[K]) / self.size_prior
 
     @property
     def bias_deviation(self) -> float:
-        """How far the head's bias is, in the standard deviations that were assumed; above 4, calibrate again."""
+        """Magnitude of the head's bias, in prior standard deviations; above 4, calibrate again."""
         return math.hypot(*self.bias) / self.bias_prior
 
     @property
     def closeup(self) -> WantedSize:
-        """How large the target shall be, for `aim`: its size as it shows itself now, foreshortened or not."""
+        """Wanted size of the target for `aim`, from its present apparent size, foreshortened or not."""
         apparent = self.target.size * math.exp(self.state[K] + self.state[G])
         return WantedSize(apparent, self.target.wanted_px, self.target.dimension == "height")
 
     def appearance(self, pan: float, tilt: float, nominal_px: float) -> Appearance | None:
-        """Where the target appears in the zoom image, the head's bias included.
+        """Predict where and how large the target appears in the zoom image, head bias included.
 
         Args:
-            pan: what the head reports then [rad].
-            tilt: likewise.
-            nominal_px: what the lens reports then [px].
+            pan: reported pan [rad].
+            tilt: reported tilt [rad].
+            nominal_px: nominal focal length [px].
 
         Returns:
-            None where the target is behind the camera.
+            The appearance; None if the target is behind the zoom camera.
         """
         tangent, J, d = self.sights.at(pan, tilt, nominal_px).seen(self.state)
         if d[2] <= 0:
@@ -206,7 +208,7 @@ class Estimate:
         P = self.state_covariance
         size = math.exp(self.state[K] + self.state[G] - self.state[L]) * self.target.size / d[2]
         return Appearance(
-            # Straight lines from the principal point: near the centre, where it matters, distortion does not.
+            # Distortion is neglected; near the image's centre, where the target should be, it is small.
             offset_px=focal * tangent + np.array(lens.center_px) - lens.image_center_px,
             covariance=J @ P[_SEEN_TWICE] @ J.T,
             size_px=size * float(focal[1 if self.target.dimension == "height" else 0]),

@@ -1,19 +1,19 @@
-"""The state of one target and how it moves in time: a manoeuvring point, in units of its own depth.
+"""Model a target's motion: a Singer process in coordinates divided by the target's own depth.
 
-The state is x = (a, b, l, w, c, k, g, pan, tilt), 13 numbers: the tangents a = X/Z and b = Y/Z and the logarithm l of
-the depth Z in the fixed camera's frame; velocity w and acceleration c, each divided by the depth (3 + 3); the logarithm
-k of the true size over the told one, a constant; the logarithm g of the apparent size over the true one, which attitude
-and limbs change; and the head's pointing bias [rad], the true angle less the reported one. The wide view measures a and
-b and the size l - k - g, all linearly, and in the motion the depth itself nowhere appears: it only scales the noise. So
-bearings can never pretend to have told the depth, whatever the linearisation does (Stallard's modified spherical
-coordinates, 1987, in tangents).
+The state is x = (a, b, l, w, c, k, g, pan, tilt), 13 numbers:
 
-The acceleration decays as Singer's (1970), c' = -c / tau + white noise.
+- a = X/Z, b = Y/Z: tangents in the fixed camera's frame; l: logarithm of the depth Z;
+- w, c: velocity and acceleration, each divided by the depth (3 + 3);
+- k: logarithm of the true size over the nominal one, a constant;
+- g: logarithm of the apparent size over the true one, which attitude and limbs change;
+- pan, tilt: the head's pointing bias, the true angle less the reported one [rad].
 
-What is assumed of a target and of the rig before anything is measured, for each kind of target.
+The fixed camera measures a, b and the size l - k - g, all linearly. The depth itself appears nowhere in the motion and
+only scales the noise, so bearings alone can never pretend to have measured it (modified spherical coordinates of
+Stallard, 1987, in tangents). The acceleration decays after Singer (1970): c' = -c / tau + white noise.
 
-Accelerations and time constants were chosen on simulated tracks, by the error of the prediction 0.2 and 0.6 s ahead as
-long as its covariance stayed honest; `cotarget.estimation` says against what.
+`EstimationSettings` holds what is assumed before anything is measured, for each kind of target. The comparison of
+motion models and the choice of the numbers: docs/design-notes.md.
 """
 
 import functools
@@ -26,26 +26,26 @@ from cotarget.calibration import Calibration, predicted_pointing
 from cotarget.config import TargetConfig
 from cotarget.geometry import Array
 
-# What the head's rounding, its play and the middle of a box leave of bias, whatever the calibration says [rad].
+# Bias left by the head's rounding and play and by the centre of a box, whatever the calibration says [rad].
 LEAST_BIAS = 5e-4
-# The bias of a rig whose calibration does not say how good it is: 0.04 degrees [rad].
+# Bias of a rig whose calibration does not say how good it is: 0.04 degrees [rad].
 USUAL_BIAS = 7e-4
-# Nearer than this many of its own sizes a target spans more than a right angle: it fills the view of any lens that the
-# fixed camera is likely to have, and no pointing at it helps.
+# Least depth, in sizes of the target. Nearer, it spans more than a right angle, fills the view of any likely fixed
+# camera, and pointing at it is no use.
 NEAREST_SIZES = 0.5
-USUAL_DEPTH = 15.0  # [m]; a target whose size is not seen, at first
+USUAL_DEPTH = 15.0  # initial depth of a target without a measured size [m]
 
 
 @dataclass(frozen=True)
 class Jump:
-    """How a target moves that was found elsewhere than it could be: a hand carries it, or it was mistaken.
+    """Motion of a target after it was found where it could not be: it was carried there, or was mistaken.
 
     Attributes:
-        speed: standard deviation, across the line of sight, of its velocity when it is found [m/s]
-        acceleration: ... and of its acceleration [m/s^2], then and ...
-        seconds: ... for so long: whoever carries it speeds up and brakes [s].
-        by_hand_s: how long an acceleration lasts meanwhile of what is carried by hand [s]; None of what goes by itself,
-            of which they last as long as always.
+        speed: standard deviation of the velocity after a jump, across the line of sight [m/s].
+        acceleration: standard deviation of the acceleration after a jump, across the line of sight [m/s^2].
+        seconds: how long this motion lasts; a hand that carries something speeds up and brakes meanwhile [s].
+        by_hand_s: time constant of the acceleration meanwhile, of targets carried by hand [s]; None for targets that
+            move by themselves, whose time constant stays.
     """
 
     speed: float = 3.0
@@ -56,21 +56,21 @@ class Jump:
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """How a target moves, and how slowly what is unknown about it and the head changes.
+    """Motion of a target, and of the slow unknowns: size, attitude and the head's bias.
 
     Attributes:
         acceleration: standard deviation of the acceleration along each axis [m/s^2].
-        manoeuvre_s: how long an acceleration lasts [s]; much less than between frames makes the velocity a random
-            walk ("constant velocity"), much more the acceleration constant.
+        manoeuvre_s: time constant of the acceleration [s]. Much less than a frame's time makes the velocity a random
+            walk; much more makes the acceleration constant.
         speed: standard deviation of the velocity along each axis [m/s].
-        size_sigma: of the true size over the told one, relative; constant for one target.
-        attitude_mean: of the logarithm of the apparent size over the true one; negative where it is foreshortened.
-        attitude_sigma: its standard deviation.
-        attitude_s: how long an attitude lasts [s].
-        bias_sigma: of the head's pan and tilt each [rad].
-        bias_s: how long such a bias lasts [s].
-        nearest: no target is nearer to the fixed camera than this, along its axis [m].
-        jump: how it moves when it was found elsewhere than it could be.
+        size_sigma: standard deviation of k, the logarithm of the true size over the nominal one.
+        attitude_mean: mean of g, the logarithm of the apparent size over the true one; negative if foreshortened.
+        attitude_sigma: standard deviation of g.
+        attitude_s: time constant of g [s].
+        bias_sigma: standard deviation of the head's bias, in pan and tilt each [rad].
+        bias_s: time constant of that bias [s].
+        nearest: least depth of a target, along the fixed camera's axis [m].
+        jump: motion after the target was found where it could not be.
     """
 
     acceleration: float
@@ -87,41 +87,44 @@ class MotionSettings:
 
     @property
     def fading_s(self) -> float:
-        """The time constant of a velocity that its own acceleration then holds at the speed above [s]."""
+        """Time constant of a velocity whose random acceleration keeps its standard deviation at `speed` [s]."""
         return self.speed**2 / (self.acceleration**2 * self.manoeuvre_s) + self.manoeuvre_s
 
 
 @dataclass(frozen=True)
 class EstimationSettings:
-    """How a target moves, how well it is measured, and what is done about measurements that do not fit.
+    """Motion and measurement noise of a target, and the treatment of measurements that do not fit.
 
     Attributes:
-        motion: how it moves.
-        noise_px: standard deviation of the middle of a box in the wide view that does not depend on its size [px].
-        noise_of_size: the part that does, as a fraction of the box's side (limbs and wings that move).
-        noise_s: how long an error of that middle lasts [s].
-        size_noise: standard deviation of a box's side, relative.
-        size_noise_px: the part that does not depend on its size [px].
-        size_s: how long an error of the side lasts [s]; half a wing beat or step.
-        unsized_s: how long a velocity along the axis lasts while the wide view shows a piece of the target only [s]:
-            long enough for a moment behind a post; whoever fills the view has mostly stopped.
-        head_sigma: of the angles that the head reports for a frame [rad]; rounding of 0.05 degrees leaves that.
-        gate: largest squared innovation, in variances, of a middle; 99.9 % of a chi-square with two degrees of freedom.
-        jump_gate: beyond this it is either wrong or elsewhere: ten standard deviations. Between the two it counts less.
-        size_gate: likewise of a size; 99.7 % with one.
-        misses: so many measurements beyond jump_gate on end are believed.
-        zoom_misses: likewise in the zoom view, while the wide view has no surprise: then size or head is doubted.
-        consistent_nis: a mean surprise below which the wide view counts as having none.
-        mean_innovation_gain: weight of the newest innovation in the zoom view in their mean, in standard deviations.
-        most_mean_innovation: largest such mean; beyond it size and head are doubted too. Of white noise it is 0.23 for
-        each axis.
-        depth_sigma: of the depth's logarithm, before a size is seen.
-        depth_inflation: what is added to it where the target has jumped, or looks of quite another size.
-        size_inflation: what is added to the sigma of size and depth together, where the zoom view contradicts them.
-        bias_inflation: what is then added to the sigma of the head's bias [rad].
-        nis_gain: weight of the newest measurement in the mean surprise.
-        most_noise_scale: most by which surprise multiplies the acceleration's variance.
-        history_s: how late a measurement may come after the newest one [s].
+        motion: motion of the target.
+        noise_px: standard deviation of a box's centre in the fixed image, the part independent of its size [px].
+        noise_of_size: the part proportional to the box's side, from moving limbs and wings.
+        noise_s: how long an error of that centre lasts [s].
+        size_noise: relative standard deviation of a box's side.
+        size_noise_px: standard deviation of a box's side, the part independent of its size [px].
+        size_s: how long an error of the side lasts, half a wing beat or step [s].
+        unsized_s: time constant of the velocity along the axis while the fixed camera shows only a part of the target:
+            long enough for a moment behind a post; a target that fills the view has mostly stopped [s].
+        head_sigma: standard deviation of the angles reported for a frame; rounding of 0.05 degrees leaves that [rad].
+        gate: gate on the NIS of a centre, 99.9 % of a chi-square with two degrees of freedom; beyond it, a measurement
+            counts less.
+        jump_gate: beyond this NIS, ten standard deviations, a measurement is wrong or the target is elsewhere.
+        size_gate: gate on the NIS of a size, 99.7 % of a chi-square with one degree of freedom.
+        misses: measurements in a row beyond their gate after which they are believed.
+        zoom_misses: rejected zoom measurements in a row, while the fixed camera is consistent, after which size and
+            head bias are inflated.
+        consistent_nis: mean NIS below which the fixed camera counts as consistent.
+        mean_innovation_gain: weight of the newest innovation in the mean innovation of the zoom camera.
+        most_mean_innovation: mean innovation, in standard deviations, beyond which size and head bias are inflated;
+            for white noise it is 0.23 along each axis.
+        depth_sigma: standard deviation of the logarithm of the depth, before a size is measured.
+        depth_inflation: standard deviation added to it after a jump, and to it and g after rejected sizes.
+        size_inflation: standard deviation added to the logarithms of size and depth together, after contradictions by
+            the zoom camera.
+        bias_inflation: standard deviation then added to the head's bias [rad].
+        nis_gain: weight of the newest measurement in the mean NIS.
+        most_noise_scale: largest factor on the variance of the acceleration.
+        history_s: how late a measurement may arrive after the newest one [s].
     """
 
     motion: MotionSettings
@@ -151,17 +154,17 @@ class EstimationSettings:
 
     @property
     def jump_noise_scale(self) -> float:
-        """By what the acceleration's variance is larger than usual where it was found elsewhere."""
+        """Least factor on the variance of the acceleration after a jump."""
         return max(1.0, (self.motion.jump.acceleration / self.motion.acceleration) ** 2)
 
     @functools.cached_property
     def jump_motion(self) -> MotionSettings:
-        """How it moves when it was found elsewhere, the larger acceleration aside."""
+        """Motion after a jump: time constants only, `jump_noise_scale` raises the acceleration."""
         by_hand_s = self.motion.jump.by_hand_s
         return self.motion if by_hand_s is None else replace(self.motion, manoeuvre_s=by_hand_s)
 
 
-# A hand that reaches somewhere speeds up and brakes within a second or so.
+# A hand that reaches for something speeds up and brakes within about a second.
 HAND = Jump(acceleration=5.0, seconds=1.25, by_hand_s=0.15)
 BOOK = EstimationSettings(
     MotionSettings(0.5, 0.5, 0.7, 0.01, attitude_sigma=0.01, attitude_s=2.0, jump=HAND),
@@ -173,7 +176,7 @@ BOOK = EstimationSettings(
     misses=2,
 )
 PERSON = EstimationSettings(MotionSettings(0.8, 0.7, 1.2, 0.04))
-# The larger side of a bird's box is anything from its body's length to its wingspan.
+# The larger side of a bird's box varies from its body's length to its wingspan.
 BIRD = EstimationSettings(
     MotionSettings(6.5, 2.5, 7.0, 0.075, attitude_mean=-0.35, attitude_sigma=0.3, attitude_s=1.0),
     noise_of_size=0.06,
@@ -181,19 +184,18 @@ BIRD = EstimationSettings(
     size_noise=0.1,
     size_s=0.06,  # a quarter of a wing beat
 )
-# How a target moves that is told to stand (but for being carried elsewhere), walk or fly.
+# Motion by the target profile's `motion`; a standing target may still be carried elsewhere.
 KINDS = {"standing": BOOK, "walking": PERSON, "flying": BIRD}
 
 
 def estimation_settings_for(target: TargetConfig, calibration: Calibration | None = None) -> EstimationSettings:
-    """Choose the settings for a target's kind; a calibration that knows its own error gives the head's bias.
+    """Choose the settings for a target's kind, with the head's bias from the calibration's covariance.
 
-    How well it is measured, and in what attitudes it shows itself, follows from its detector and dimension; how it
-    moves does too, unless that is told.
+    Measurement noise and attitude follow from detector and dimension. So does the motion, unless the profile names one.
 
     Args:
-        target: the target.
-        calibration: of the rig.
+        target: target profile.
+        calibration: calibration of the rig; None, or one without covariance, leaves the usual bias.
     """
     settings = PERSON
     if target.detector == "colour":
@@ -213,41 +215,41 @@ def estimation_settings_for(target: TargetConfig, calibration: Calibration | Non
     if calibration is None or calibration.covariance is None:
         return settings
     middle = calibration.fixed.image_center_px
-    sigma = float(predicted_pointing(calibration, middle, USUAL_DEPTH)) / math.sqrt(2)  # of one axis
+    sigma = float(predicted_pointing(calibration, middle, USUAL_DEPTH)) / math.sqrt(2)  # along one axis
     if not np.isfinite(sigma):
         return settings
     return replace(settings, motion=replace(settings.motion, bias_sigma=math.hypot(LEAST_BIAS, sigma)))
 
 
 STATES = 13
-MOVING = 9  # the first of them move; the rest drift
+MOVING = 9  # position, velocity and acceleration, (a, b, l, w, c); the other four drift
 A, B, L, K, G, PAN, TILT = 0, 1, 2, 9, 10, 11, 12
 W, C = slice(3, 6), slice(6, 9)
-SEEN = [A, B, L, PAN, TILT]  # what the zoom view depends on
-# A target comes no nearer in one prediction than this part of its depth, whatever its velocity is thought to be.
+SEEN = [A, B, L, PAN, TILT]  # components that a measurement in the zoom image depends on
+# Least ratio of new to old depth in one prediction, whatever the velocity is.
 NEAREST = 0.2
-# Below this part of the acceleration's time constant, Singer's noise is that of white jerk to better than 2 %, while
-# its closed form loses its digits.
+# Below this ratio of time step to time constant, Singer's noise is that of white jerk to better than 2 %, while its
+# closed form loses its digits.
 SHORT = 0.03
 _UNIT = np.eye(MOVING)
-MOST_UNCERTAINTY = 0.5  # of the logarithm's variance
-# However long nothing is measured, no more is doubted than this, in standard deviations: that it is anywhere in view, a
-# factor of some five in the depth, three in size and attitude, and six degrees of the head.
+MOST_UNCERTAINTY = 0.5  # largest variance of the logarithm of the depth that widens the noise
+# Largest standard deviations, however long nothing is measured: the target is anywhere in view, its depth is known to a
+# factor of some five, size and attitude to three, the head's bias to six degrees.
 MOST_SIGMA = np.array([3.0, 3.0, 1.5, *[1e2] * 3, *[1e3] * 3, 1.0, 1.0, 0.1, 0.1])
 _MOST_VARIANCE = MOST_SIGMA**2
-CACHED = 1024  # spans of time; frames come at regular ones
+CACHED = 1024  # cached time steps; frames come at regular intervals
 
 
 @dataclass(frozen=True)
 class Span:
-    """What depends on the span of time alone.
+    """Parts of a prediction that depend only on the time step.
 
     Attributes:
-        linear: the motion before it is divided by the new depth, (13, 13).
-        noise: of position, velocity and acceleration for a unit variance of the acceleration, (9, 9).
-        drift: variances that size and bias gain, (13, 13).
-        dt: the span [s].
-        reach: what an acceleration adds to the position [s^2].
+        linear: linear motion before the division by the new depth, (13, 13).
+        noise: covariance of position, velocity and acceleration for unit variance of the acceleration, (9, 9).
+        drift: variances that attitude and bias gain, (13, 13).
+        dt: time step [s].
+        reach: position gained per unit of acceleration [s^2].
     """
 
     linear: Array
@@ -259,12 +261,12 @@ class Span:
 
 @functools.lru_cache(maxsize=CACHED)
 def span_of(dt: float, motion: MotionSettings) -> Span:
-    """Work out a span of time ``dt`` > 0 [s]."""
+    """Compute the parts of a prediction over a time step ``dt`` > 0 [s]; cached."""
     tau = motion.manoeuvre_s
     rho = math.exp(-dt / tau)
     gain = -tau * math.expm1(-dt / tau)
     reach = tau * (dt - gain)
-    # A depth that is not measured must not run away: its velocity fades, so that it keeps within the target's speed.
+    # An unmeasured depth must not run away: its velocity fades, so that its variance stays at the target's speed.
     fade = math.exp(-dt / motion.fading_s)
     attitude, bias = math.exp(-dt / motion.attitude_s), math.exp(-dt / motion.bias_s)
     linear = np.diag([*[1.0] * 5, fade, *[rho] * 3, 1.0, attitude, bias, bias])
@@ -278,7 +280,7 @@ def span_of(dt: float, motion: MotionSettings) -> Span:
 
 
 def _singer(dt: float, tau: float) -> Array:
-    """Covariance of (position, velocity, acceleration) after ``dt`` for a unit variance of the acceleration, (3, 3)."""
+    """Covariance of (position, velocity, acceleration) after ``dt``, for unit variance of the acceleration, (3, 3)."""
     T = dt / tau
     if T < SHORT:
         jerk = 2 / tau
@@ -300,22 +302,25 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, noise_scale
 
     Args:
         x: state, (13,).
-        P: its covariance, (13, 13).
-        dt: how far ahead [s].
-        motion: how the target moves.
-        noise_scale: by what the acceleration's variance is larger than usual.
+        P: covariance, (13, 13).
+        dt: time step [s].
+        motion: motion of the target.
+        noise_scale: factor on the variance of the acceleration.
+
+    Returns:
+        Predicted state (13,) and covariance (13, 13).
     """
     if dt <= 0:
         return x, P
     span = span_of(dt, motion)
-    closer = 1 + float(x[5]) * dt + float(x[8]) * span.reach  # the new depth over the old one
+    closer = 1 + float(x[5]) * dt + float(x[8]) * span.reach  # new depth over old depth
     ratio = max(closer, NEAREST, min(motion.nearest * math.exp(-x[L]), 1.0))
     y = span.linear @ x
     log_depth = float(x[L]) + math.log(ratio)
     y[:MOVING] /= ratio
     y[L] = log_depth
     y[G] += motion.attitude_mean * (1 - span.linear[G, G])
-    if closer < ratio:  # it would be nearer than it can be: it has stopped
+    if closer < ratio:  # nearer than possible, so the target has stopped
         y[[5, 8]] = 0.0
     F = span.linear.copy()
     F[:MOVING] /= ratio
@@ -327,18 +332,18 @@ def propagate(x: Array, P: Array, dt: float, motion: MotionSettings, noise_scale
         F[:MOVING, 5] -= shrink * dt
         F[:MOVING, 8] -= shrink * span.reach
     P = F @ P @ F.T + span.drift
-    # Noise of the position along the axis scales all that is divided by the depth.
+    # Position noise along the axis scales everything that is divided by the depth.
     N = _UNIT.copy()
     N[:, L] -= y[:MOVING]
     N[L, L] = 1.0
-    # The mean of 1 / depth^2 over all depths that it may have: an uncertain depth makes the noise larger.
+    # The mean of 1 / depth^2 over the depth's distribution: an uncertain depth makes the noise larger.
     sigma = motion.acceleration * math.exp(min(P[L, L], MOST_UNCERTAINTY) - log_depth)
     P[:MOVING, :MOVING] += N @ span.noise @ N.T * (noise_scale * sigma * sigma)
     return y, _bounded(P)
 
 
 def _bounded(P: Array) -> Array:
-    """Scale what is doubted more than it may be; correlations stay, and with them that it is a covariance."""
+    """Scale variances down to their limits; correlations stay, so the result is still a covariance."""
     variances = P.diagonal()
     if (variances <= _MOST_VARIANCE).all():
         return P

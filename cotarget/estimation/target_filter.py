@@ -1,8 +1,11 @@
-"""One target's filter in 3D: time-stamped measurements of both cameras, in any order, to an Estimate at any time.
+"""Estimate one target's 3D state from both cameras with an iterated extended Kalman filter.
 
-The filter's corrections: a middle in either view and an apparent size, each against wild measurements.
+Measurements carry the time of their exposure and may arrive in any order: a late one is inserted at its time, and the
+corrections after it are repeated. The state is that of `cotarget.estimation.motion_model`. A centre in either image and
+an apparent size are corrected one after the other, each with a gate.
 
-The filter's whole memory after a measurement: state, covariance, and how surprising the last ones were.
+A pan bias and a wrong depth look alike along the baseline. Pointing needs only their sum, which is measured; the depth
+by itself is as good as the calibration. Gates and inflations: docs/design-notes.md.
 """
 
 import bisect
@@ -35,27 +38,26 @@ from cotarget.estimation.motion_model import (
 from cotarget.geometry import Array
 from cotarget.tracking.track import Measurement
 
-FARTHEST = 1e5  # [m]; nothing is seen from farther away
+FARTHEST = 1e5  # largest depth of a target [m]
 
 
 @dataclass(frozen=True)
 class Node:
-    """One point in time of a filter.
+    """State of the filter at one time.
 
     Attributes:
-        t: [s].
+        t: time [s].
         x: state, see `cotarget.estimation.motion_model`, (13,).
-        P: its covariance, (13, 13).
-        nis: squared innovation over what was expected, averaged over the last measurements of the middle.
-        noise_scale: by what the acceleration's variance is larger than usual.
-        missed_wide: how many measurements in the wide view were turned away on end.
-        missed_zoom: likewise in the zoom view.
-        missed_size: likewise of the size.
-        size_t: when the size was last measured [s].
-        mean_innovation: innovation in the zoom view over its standard deviation, averaged over the last second or so,
-        (2,).
-        wide_t: when the wide view last corrected the middle [s]; a start, at first or elsewhere, is no correction.
-        moved_t: when it was last found elsewhere than it could be [s].
+        P: covariance of the state, (13, 13).
+        nis: running mean of the normalised innovation squared per dimension, of centres in both images.
+        noise_scale: factor on the variance of the acceleration.
+        missed_wide: centres in the fixed image rejected in a row.
+        missed_zoom: centres in the zoom image rejected in a row.
+        missed_size: sizes rejected in a row.
+        size_t: time of the last size measurement [s].
+        wide_t: time of the last correction by a centre in the fixed image [s]; a start or restart is no correction.
+        moved_t: time of the last jump, when the target was found where it could not be [s].
+        mean_innovation: running mean of the innovation in the zoom image, in standard deviations along u and v, (2,).
     """
 
     t: float
@@ -72,16 +74,16 @@ class Node:
     mean_innovation: tuple[float, float] = (0.0, 0.0)
 
     def jumped(self, jump: Jump) -> bool:
-        """Whether it was found elsewhere so lately that it may be on its way still."""
+        """Whether the last jump is so recent that the target may still be on its way."""
         return self.t < self.moved_t + jump.seconds
 
 
 def sound(node: Node, nearest: float) -> Node | None:
-    """The same with a depth that can be and a covariance that is symmetric; None where it tells nothing any more.
+    """Bound the depth and symmetrise the covariance of a node; None if it is not finite or not positive.
 
     Args:
-        node: after a measurement.
-        nearest: no target is nearer than this [m].
+        node: node after a measurement.
+        nearest: least depth of a target [m].
     """
     x, P = node.x.copy(), (node.P + node.P.T) / 2
     if not (np.isfinite(x).all() and np.isfinite(P).all() and (P.diagonal() > 0).all()):
@@ -90,18 +92,21 @@ def sound(node: Node, nearest: float) -> Node | None:
     return replace(node, x=x, P=P)
 
 
-# --- correct ---
+# Corrections by measurements
 
-ROUNDS = 4  # of an iterated correction
-SOONEST = 1e-3  # two measurements at once are that far apart [s]
-SETTLED = 1e-3  # it has converged when the depth changes by less than this part
+ROUNDS = 4  # most rounds of an iterated correction
+SOONEST = 1e-3  # least time between two measurements, in the variance of repeated errors [s]
+SETTLED = 1e-3  # the iteration ends when the logarithm of the depth changes by less
 
 
 @dataclass(frozen=True)
 class SizeSeen:
-    """An apparent size: the logarithm of the depth that it means for a target as large as told, and its sigma.
+    """An apparent size, as the depth at which a target of nominal size looks that large.
 
-    Of a target that is only seen in part it is a bound: it is at least that large in the image, so at most so far away.
+    Attributes:
+        log_depth: logarithm of that depth.
+        sigma: standard deviation of that logarithm.
+        bound: whether it is an upper bound only: a clipped target is at least that large, so at most that far.
     """
 
     log_depth: float
@@ -111,7 +116,7 @@ class SizeSeen:
 
 @dataclass(frozen=True)
 class WideSeen:
-    """A target's middle in the wide view: tangents (2,), their covariance (2, 2), and its size."""
+    """A target's centre in the fixed image: tangents (2,), their covariance (2, 2), and the apparent size."""
 
     t: float
     tangent: Array
@@ -120,13 +125,13 @@ class WideSeen:
 
     @property
     def key(self) -> tuple[float, int]:
-        """What measurements are sorted by."""
+        """Sort key: time, and the fixed camera before the zoom camera."""
         return self.t, 0
 
 
 @dataclass(frozen=True)
 class ZoomSeen:
-    """A target's middle in the zoom view: tangents (2,), their covariance (2, 2), and where it looked."""
+    """A target's centre in the zoom image: tangents (2,), their covariance (2, 2), and the camera's sight line."""
 
     t: float
     tangent: Array
@@ -135,15 +140,15 @@ class ZoomSeen:
 
     @property
     def key(self) -> tuple[float, int]:
-        """What measurements are sorted by."""
+        """Sort key: time, and the fixed camera before the zoom camera."""
         return self.t, 1
 
 
 def begin(seen: WideSeen, settings: EstimationSettings) -> Node:
-    """The state after the first measurement.
+    """Initialise the state from the first measurement.
 
-    No time is set in it by which the next would count less: an error that both share leaves the velocity that the two
-    tell as it is.
+    `wide_t` stays unset, so that the second measurement counts fully: an error that both share does not change the
+    velocity between them.
     """
     motion = settings.motion
     x = np.zeros(STATES)
@@ -162,7 +167,7 @@ def begin(seen: WideSeen, settings: EstimationSettings) -> Node:
 
 
 def correct_wide(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node:
-    """Take a middle and a size in the wide view into account."""
+    """Correct a node with a centre and a size in the fixed image."""
     if seen.size is None or seen.size.bound:
         node = _slowed(node, settings)
     PHt = node.P[:, :2]
@@ -174,7 +179,7 @@ def correct_wide(node: Node, seen: WideSeen, settings: EstimationSettings) -> No
         if node.missed_wide + 1 < settings.misses:
             return replace(node, missed_wide=node.missed_wide + 1, missed_zoom=0, mean_innovation=(0.0, 0.0))
         return _size(_elsewhere(node, seen, settings), seen.size, settings)
-    if nis > settings.gate:  # measured worse than thought: it counts as much as one that just passes
+    if nis > settings.gate:  # worse than its noise says: it counts as much as one at the gate
         S_inv = _inverse(PHt[:2] + R * (nis / settings.gate))
         nis = float(innovation @ S_inv @ innovation)
     gain = PHt @ S_inv
@@ -186,10 +191,10 @@ def correct_wide(node: Node, seen: WideSeen, settings: EstimationSettings) -> No
 
 
 def correct_zoom(node: Node, seen: ZoomSeen, settings: EstimationSettings) -> Node:
-    """Take a middle in the zoom view into account, iterated because the depth enters in no linear way."""
+    """Correct a node with a centre in the zoom image, iterated because the depth enters nonlinearly."""
     if node.missed_zoom >= settings.zoom_misses or math.hypot(*node.mean_innovation) > settings.most_mean_innovation:
         node = replace(node, P=_inflated(node.P, settings), missed_zoom=0, mean_innovation=(0.0, 0.0))
-    # While the wide view surprises too, it is the target that moved, and neither its size nor the head is to blame.
+    # If the fixed image contradicts the state too, the target has moved, and neither its size nor the head is wrong.
     missed = node.missed_zoom + (node.missed_wide == 0 and node.nis < settings.consistent_nis)
     x = node.x
     nis = 0.0
@@ -214,23 +219,23 @@ def correct_zoom(node: Node, seen: ZoomSeen, settings: EstimationSettings) -> No
 
 
 def _size(node: Node, size: SizeSeen | None, settings: EstimationSettings) -> Node:
-    """Take an apparent size into account: l - k - g."""
+    """Correct a node with an apparent size, which measures l - k - g."""
     if size is None:
         return node
     P = node.P
     h = np.zeros(STATES)
     h[L], h[K], h[G] = 1.0, -1.0, -1.0
-    # Limbs and wings move the box's sides together for a while: sizes of frames soon after each other tell less.
+    # Limbs and wings move the box's sides together for a while, so sizes in quick succession share their error.
     variance = size.sigma**2 * _repeated(node.t - node.size_t, settings.size_s)
     Ph = P @ h
     S = float(h @ Ph) + variance
     innovation = size.log_depth - float(h @ node.x)
-    if size.bound and innovation >= 0:  # it is no farther away already
+    if size.bound and innovation >= 0:  # the state is nearer than the bound already
         return node
     if innovation * innovation > settings.size_gate * S:
         if node.missed_size + 1 < settings.misses:
             return replace(node, missed_size=node.missed_size + 1)
-        # Turned or come nearer, against all expectation: let both give way.
+        # The target has turned or come nearer unexpectedly: inflate depth and attitude.
         P = P.copy()
         P[L, L] += settings.depth_inflation**2
         P[G, G] += settings.depth_inflation**2
@@ -242,7 +247,7 @@ def _size(node: Node, size: SizeSeen | None, settings: EstimationSettings) -> No
 
 
 def _slowed(node: Node, settings: EstimationSettings) -> Node:
-    """Forget a motion along the axis that sizes have told, where none tells whether it goes on."""
+    """Let the velocity along the axis fade while no size measures it."""
     if math.isinf(node.size_t):
         return node
     rho = math.exp(-(node.t - node.wide_t) / settings.unsized_s)
@@ -257,7 +262,7 @@ def _slowed(node: Node, settings: EstimationSettings) -> Node:
 
 
 def _with_noise_scale(node: Node, nis: float, settings: EstimationSettings) -> Node:
-    """Keep count of how surprising measurements are; a target that surprises manoeuvres harder than usual."""
+    """Update the mean NIS and scale the process noise with it: a target beyond prediction manoeuvres harder."""
     mean = node.nis + settings.nis_gain * (nis / 2 - node.nis)
     noise_scale = min(max(mean, 1.0), settings.most_noise_scale)
     if node.jumped(settings.motion.jump):
@@ -266,8 +271,8 @@ def _with_noise_scale(node: Node, nis: float, settings: EstimationSettings) -> N
 
 
 def _mean_innovation(node: Node, S: Array, innovation: Array, settings: EstimationSettings) -> tuple[float, float]:
-    """Average the zoom view's innovations: what always lies to one side is no noise, however small it is."""
-    if node.nis >= settings.consistent_nis:  # the target moves otherwise than thought, which says nothing of the head
+    """Average the zoom image's innovations; a mean far from zero shows a bias, however small it is."""
+    if node.nis >= settings.consistent_nis:  # the target manoeuvres, so its innovation shows nothing of the head
         return 0.0, 0.0
     g = settings.mean_innovation_gain
     u, v = node.mean_innovation
@@ -278,17 +283,17 @@ def _mean_innovation(node: Node, S: Array, innovation: Array, settings: Estimati
 
 
 def _elsewhere(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node:
-    """Start anew where the target was seen on end; what is known of its size and of the head stays known."""
+    """Restart position and motion at the measured place after a jump; size and head bias stay."""
     motion = settings.motion
     nearness = math.exp(-node.x[L])
     x, P = node.x.copy(), node.P.copy()
     x[:2] = seen.tangent
-    x[C] = 0.0  # its velocity is the best guess still: one that is carried off is soon farther off
+    x[C] = 0.0  # the velocity stays the best guess: a target that is carried off is soon farther off
     moved = [A, B, *range(W.start, C.stop)]
     P[moved] = 0.0
     P[:, moved] = 0.0
     P[:2, :2] = seen.R
-    # Along the axis only sizes tell, and badly: there it is taken for no faster than usual.
+    # Along the axis only sizes measure, and badly: the target is taken as no faster there than usual.
     speeds = motion.jump.speed, motion.jump.speed, motion.speed
     accelerations = motion.jump.acceleration, motion.jump.acceleration, motion.acceleration
     P[range(3, 9), range(3, 9)] = (np.array([*speeds, *accelerations]) * nearness) ** 2
@@ -307,9 +312,9 @@ def _elsewhere(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node
 
 
 def _inflated(P: Array, settings: EstimationSettings) -> Array:
-    """What the zoom view does not find where it should be: either the told size is wrong, or the head is."""
+    """Inflate size, depth and head bias after zoom images that contradict them."""
     P = P.copy()
-    # Size and depth may be wrong together: by what the wide view sees, their ratio stays known.
+    # Size and depth are inflated together, because the fixed image keeps their ratio known.
     P[np.ix_([L, K], [L, K])] += settings.size_inflation**2
     P[PAN, PAN] += settings.bias_inflation**2
     P[TILT, TILT] += settings.bias_inflation**2
@@ -317,34 +322,33 @@ def _inflated(P: Array, settings: EstimationSettings) -> Array:
 
 
 def _repeated(interval: float, lasting_s: float) -> float:
-    """By what a variance counts more where errors last that long [s] and measurements come so soon [s]."""
+    """Factor on a variance whose error lasts lasting_s [s], for measurements an interval apart [s]."""
     return max(1.0, 2 * lasting_s / max(interval, SOONEST))
 
 
 def _inverse(S: Array) -> Array:
-    """The inverse of a 2x2 matrix; numpy's takes five times as long."""
+    """Invert a 2x2 matrix; numpy takes five times as long."""
     (a, b), (c, d) = S.tolist()
     det = a * d - b * c
     return np.array([[d / det, -b / det], [-c / det, a / det]])
 
 
 class TargetFilter:
-    """Where one target is in 3D and how fast it moves, how large it is, and by how much the head points wrongly.
+    """Iterated extended Kalman filter of one target: position, velocity, size, and the head's pointing bias.
 
-    Measurements may come in any order, because each says when its light fell. Those of the last second or so are kept,
-    and a late one is taken into account by going over all that came after it once more: the result is the same as if
-    all had come in order.
+    Measurements may come in any order. Those of the last `history_s` are kept; a late one is inserted at its time and
+    the later ones are repeated, so the result is the same as if all had come in order.
     """
 
     def __init__(
         self, calibration: Calibration, target: TargetConfig, settings: EstimationSettings | None = None
     ) -> None:
-        """Begin without a measurement.
+        """Create a filter without measurements.
 
         Args:
-            calibration: of the rig, for the streams in use.
-            target: its told size, and which dimension that is.
-            settings: how it moves and is measured; by default those of its kind.
+            calibration: calibration of the rig, for the streams in use.
+            target: target profile, with the nominal size and which dimension that is.
+            settings: motion and measurement settings; by default those of the target's kind.
 
         Raises:
             CalibrationError: the calibration has no T.
@@ -353,26 +357,25 @@ class TargetFilter:
         self._target = target
         self._settings = settings or estimation_settings_for(target, calibration)
         self._sights = Sights(calibration)
-        self._base: Node | None = None  # the state before the first measurement kept
+        self._base: Node | None = None  # state before the first kept measurement
         self._seen: list[WideSeen | ZoomSeen] = []
-        self._nodes: list[Node | None] = []  # the state after each of them, as far as gone over
+        self._nodes: list[Node | None] = []  # states after the measurements processed so far
 
     def update_fixed(
         self, detection: Measurement, t: float, *, sigma_px: Array | None = None, size_px: float | None = None
     ) -> bool:
-        """Take a detection in the wide view into account.
+        """Add a detection in the fixed image.
 
         Args:
-            detection: its box; one that is clipped tells of its size only that it is no smaller.
-            t: when the frame's light fell [s].
-            sigma_px: standard deviation of the middle, (2,) [px]; by default from the settings and the box's size,
-                and half a clipped box more, whose hidden part may be as large again.
-            size_px: the known dimension in the image [px], where it is better known than from this box alone, as
-                the largest over a wing beat.
+            detection: bounding box; the size of a clipped one is only a lower bound.
+            t: exposure time of the frame [s].
+            sigma_px: standard deviation of the centre, (2,) [px]; by default from the settings and the box's size,
+                with half the box in addition if it is clipped, whose hidden part may be as large again.
+            size_px: known dimension in the image [px], if it is better known than from this box alone, such as the
+                largest over a wing beat.
 
         Returns:
-            Whether it could be taken: not when it is older than all that is kept, or has been taken already, or no ray
-            leads to its pixel.
+            False if the measurement is older than all that is kept, is a duplicate, or has a pixel without a ray.
         """
         found = self._calibration.fixed.tangents(detection.center_px)
         if found is None:
@@ -403,20 +406,20 @@ class TargetFilter:
         *,
         head_sigma: float | None = None,
     ) -> bool:
-        """Take what the zoom camera sees of the target into account.
+        """Add a centre of the target in the zoom image.
 
         Args:
-            pixel: middle of the target in the zoom image, (2,) [px].
-            sigma_px: its standard deviation, one for u and v or one for each, (2,) [px].
-            pan: what the head reported for the time of this frame [rad].
-            tilt: likewise.
-            nominal_px: what the lens reported for that time [px].
-            t: when the frame's light fell [s].
-            head_sigma: standard deviation of what the head reports [rad]; larger while it moves and its time is
-                known badly. By default from the settings.
+            pixel: centre of the target in the zoom image, (2,) [px].
+            sigma_px: standard deviation of that centre, one value or one each along u and v, (2,) [px].
+            pan: pan reported for the time of the frame [rad].
+            tilt: tilt reported for the time of the frame [rad].
+            nominal_px: nominal focal length reported for that time [px].
+            t: exposure time of the frame [s].
+            head_sigma: standard deviation of the reported angles [rad]; larger while the head moves and the time is
+                uncertain. By default from the settings.
 
         Returns:
-            Whether it could be taken, see `update_fixed`.
+            False if the measurement was not added, see `update_fixed`.
         """
         lens = self._calibration.zoom.at(nominal_px)
         found = lens.tangents(pixel)
@@ -428,10 +431,10 @@ class TargetFilter:
         return self._insert(ZoomSeen(t, z, R, self._sights.at(pan, tilt, nominal_px)))
 
     def at(self, t: float) -> Estimate | None:
-        """The estimate for a time [s], later than the newest measurement or up to a second or so before it.
+        """Estimate the target at a time [s], after the newest measurement or up to `history_s` before it.
 
         Returns:
-            None before the first detection in the wide view, or longer ago than measurements are kept.
+            The estimate; None before the first detection in the fixed image, or earlier than measurements are kept.
         """
         node = self._before(t)
         if node is None:
@@ -452,17 +455,17 @@ class TargetFilter:
         )
 
     def knows(self, t: float) -> bool:
-        """Whether there is an estimate for a time [s]."""
+        """Whether there is an estimate for time t [s]."""
         return self._before(t) is not None
 
     def _propagate(self, node: Node, t: float) -> tuple[Array, Array]:
-        """Predict state and covariance at a time that is no earlier [s]."""
+        """Predict state and covariance from a node to time t [s], which is no earlier."""
         settings = self._settings
         motion = settings.jump_motion if node.jumped(settings.motion.jump) else settings.motion
         return propagate(node.x, node.P, t - node.t, motion, node.noise_scale)
 
     def _before(self, t: float) -> Node | None:
-        """The newest state that is no later than a time [s]."""
+        """Return the newest node that is no later than time t [s]."""
         self._run()
         node = next((node for node in reversed(self._nodes) if node is not None and node.t <= t), self._base)
         return None if node is None or node.t > t else node
@@ -473,7 +476,7 @@ class TargetFilter:
         return dimension == "height" or (dimension == "wingspan" and height > width)
 
     def _size(self, size_px: float, tangent_per_px: float, *, bound: bool) -> SizeSeen | None:
-        """What a size in the image [px] tells, or a part of it."""
+        """Convert a size in the image [px], or a lower bound of it, to a size measurement."""
         if not size_px > 0:
             return None
         settings = self._settings
@@ -481,18 +484,18 @@ class TargetFilter:
         return SizeSeen(math.log(self._target.size / (size_px * abs(tangent_per_px))), sigma, bound)
 
     def _insert(self, seen: WideSeen | ZoomSeen) -> bool:
-        """Put a measurement where its time belongs; what came after it will be gone over again."""
+        """Insert a measurement at its time and discard the nodes after it."""
         if not math.isfinite(seen.t) or (self._base is not None and seen.t < self._base.t):
             return False
         at = bisect.bisect_left(self._seen, seen.key, key=lambda each: each.key)
-        if at < len(self._seen) and self._seen[at].key == seen.key:  # a frame that is repeated tells nothing new
+        if at < len(self._seen) and self._seen[at].key == seen.key:  # a repeated frame
             return False
         self._seen.insert(at, seen)
         del self._nodes[at:]
         return True
 
     def _run(self) -> None:
-        """Go over the measurements not gone over yet, and forget the oldest."""
+        """Process the measurements without a node, and drop those older than the history."""
         for seen in self._seen[len(self._nodes) :]:
             before = self._nodes[-1] if self._nodes else self._base
             self._nodes.append(self._step(before, seen))
@@ -501,7 +504,7 @@ class TargetFilter:
             self._seen.pop(0)
 
     def _step(self, node: Node | None, seen: WideSeen | ZoomSeen) -> Node | None:
-        """The state after one more measurement."""
+        """Propagate a node to a measurement's time and correct it."""
         settings = self._settings
         nearest = settings.motion.nearest
         if node is None:
@@ -512,5 +515,5 @@ class TargetFilter:
             corrected = correct_wide(node, seen, settings)
         else:
             corrected = correct_zoom(node, seen, settings)
-        # What makes no sense of it is as good as not measured.
+        # A correction that is not finite is left out.
         return sound(corrected, nearest) or sound(node, nearest)

@@ -1,10 +1,8 @@
-"""Where the target is in a zoom frame, by registering the wide view's patch of it there.
+"""Register the fixed camera's patch of a target in the zoom image.
 
-Finding the target in the zoom camera's own view: the very patch that the wide view sees, registered at its scale.
-
-Registering the wide view's patch of a target in a zoom image, whose scale and turn there are known.
-
-What the wide view shows of the target: a patch of it, how much each of its pixels counts, and the body's middle.
+`look` cuts out patch, weights and centre of the body. They are warped to the zoom image's scale and rotation by
+the Jacobian of (2) at the target's depth and matched by weighted normalised correlation, first coarsely, then finely. A
+place counts only if it leads the next best one. The source of the numbers: docs/design-notes.md.
 """
 
 import math
@@ -25,23 +23,20 @@ from cotarget.geometry import Array
 from cotarget.pantilt import base_head
 from cotarget.rig import Frame, Image
 
-# Around the target's box counts a margin of this part of its larger side, and at least so many pixels, ...
+# Margin around the target's box that counts: this part of its larger side, and at least this many pixels.
 MARGIN, LEAST_MARGIN_PX = 0.2, 2.0
-# ... but little: it tells the outline, and belongs to a background that the other camera sees displaced.
+# Weight of the margin: it shows the outline, but its background appears displaced in the other camera.
 MARGIN_WEIGHT = 0.1
-# The pixels at the outline are partly the target's, and missing from the foreground as often as not.
+# Weight of the pixels at the outline: they are partly the target's, and missing from the foreground half of the time.
 RIM_WEIGHT = 0.3
-# A foreground that fills less of the box than this is none, and one that fills all of it tells where the target is but
-# not its outline; then what is not coloured as its surroundings is taken for it, and, failing that, an ellipse.
+# Parts of the box that a usable foreground fills: less is none, and more shows the place but not the outline. Otherwise
+# the pixels whose colour differs from the surroundings are used, or else an ellipse.
 LEAST_FOREGROUND, MOST_FOREGROUND = 0.15, 0.9
 STANDS_OUT = 3.0  # standard deviations of the surroundings' colours
-# The background's colours are taken for spread by no less than this, one standard deviation [grey levels]; and from
-# fewer of its pixels than these nothing is learnt.
+# Least standard deviation of the background's colours [grey levels], and fewest pixels from which it is computed.
 LEAST_SPREAD, LEAST_BACKGROUND = 10.0, 12
-# How far the true middle of the body is from where it is taken to be, one standard deviation in parts of the box's
-# sides, measured on the simulated targets. Whoever stands upright is in the middle of the height, and across it where
-# half of the foreground lies on either side, whatever the limbs reach for. A bird's wings move the box by twice as
-# much as they move the foreground's median.
+# Standard deviation of the body's centre along u and v, in parts of the box's sides, measured on simulated targets: of
+# the box alone, of upright bodies (median of the foreground across), of flying ones (median), and by colour.
 BOX_SIGMA = np.array([0.08, 0.18])
 UPRIGHT_SIGMA = np.array([0.03, 0.006])
 FLYING_SIGMA = np.array([0.05, 0.12])
@@ -51,17 +46,17 @@ Pixels = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class FixedView:
-    """The target as one wide frame shows it. What only a search for it needs is worked out when it is asked for.
+    """The target as one fixed-camera frame shows it; derived images are computed on demand.
 
     Attributes:
-        t: when [s].
-        body_px: the middle of its body there (u, v), (2,).
-        body_sigma_px: how far off that may be along u and v, one standard deviation, (2,).
-        size_px: width and height of its box, (2,).
-        patch: the image around it, (h, w, 3) BGR.
-        corner_px: the patch's top-left pixel in the frame, (2,).
-        foreground: the pixels of the patch that are the target's, (h, w).
-        outside_px: how far beyond its box each pixel of the patch lies [px], (h, w); none inside it.
+        t: exposure time [s].
+        body_px: centre of the body (u, v), (2,).
+        body_sigma_px: standard deviation of that centre along u and v, (2,).
+        size_px: width and height of the bounding box, (2,).
+        patch: image around the box, (h, w, 3) BGR.
+        corner_px: the patch's top-left pixel in the frame (u, v), (2,).
+        foreground: whether each pixel of the patch is the target's, (h, w).
+        outside_px: distance of each pixel of the patch from the box, 0 inside it [px], (h, w).
     """
 
     t: float
@@ -75,33 +70,33 @@ class FixedView:
 
     @property
     def side_px(self) -> float:
-        """The larger side of its box [px]."""
+        """Larger side of the box [px]."""
         return float(self.size_px.max())
 
     @cached_property
     def weight(self) -> Samples:
-        """How much each pixel of the patch counts, (h, w), 0 to 1."""
+        """Weight of each pixel of the patch, 0 to 1, (h, w)."""
         around = MARGIN_WEIGHT * np.clip(1 - self.outside_px / _margin(self.size_px), 0, 1)
         return np.maximum(np.where(self.foreground, 1.0, RIM_WEIGHT * self._grown), around).astype(np.float32)
 
     @cached_property
     def whitening(self) -> Array:
-        """Mixes the colours so that the background varies by one in each direction of colour, (3, 3).
+        """Colour transform that gives the background unit variance in every direction of colour, (3, 3).
 
-        What looks like the background's own variety then counts for little.
+        The background's own texture then counts for little.
         """
         return _whitening(self.patch[self._grown == 0])
 
     @cached_property
     def _grown(self) -> Image:
-        """The foreground and its rim, (h, w), 1 or 0."""
+        """Foreground dilated by its rim, 1 or 0, (h, w)."""
         return cv2.dilate(self.foreground.astype(np.uint8), np.ones((3, 3), np.uint8))
 
     def at_pitch(self, pitch_px: float) -> tuple[Samples, Samples, Array]:
-        """The patch and its weights, sampled every ``pitch_px`` of the frame's pixels about the body's middle.
+        """Resample patch and weights every ``pitch_px`` pixels of the fixed image, around the body's centre.
 
         Returns:
-            Template (h, w, 3), weights (h, w), and the sample (u, v) where the body's middle is, (2,).
+            Template (h, w, 3), weights (h, w), and the body's centre in samples (u, v), (2,).
         """
         first = np.floor((self.corner_px - self.body_px) / pitch_px)
         last = np.ceil((self.corner_px + np.array(self.patch.shape[1::-1]) - 1 - self.body_px) / pitch_px)
@@ -113,16 +108,16 @@ class FixedView:
 
 
 def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetConfig) -> FixedView | None:
-    """Cut the target out of a wide frame.
+    """Cut the target out of a fixed-camera frame.
 
     Args:
-        frame: the wide view's.
-        detection: of the target in it.
-        mask: the detector's foreground there, (H, W), or None.
-        target: which dimension of it is known, and how it is found.
+        frame: frame of the fixed camera.
+        detection: detection of the target in it.
+        mask: foreground of the detector, (H, W), or None.
+        target: target profile; its detector and dimension decide where the centre of the body is.
 
     Returns:
-        None where the box holds no pixel of the frame.
+        The cut-out; None if the box holds no pixel of the frame.
     """
     center, size = np.asarray(detection.center_px, dtype=float), np.maximum(detection.size_px, 1.0)
     if not (np.isfinite(center).all() and np.isfinite(size).all()):
@@ -131,7 +126,7 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetC
     limit = np.array(frame.image.shape[1::-1])
     low = np.maximum(np.floor(center - size / 2 - margin).astype(int), 0)
     high = np.minimum(np.ceil(center + size / 2 + margin).astype(int) + 1, limit)
-    if (high - low < 1).any():  # nor does its surroundings
+    if (high - low < 1).any():  # box and margin are outside the frame
         return None
     here = slice(low[1], high[1]), slice(low[0], high[0])
     patch = frame.image[here].copy()
@@ -163,18 +158,18 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetC
 
 
 def _margin(size: Array) -> float:
-    """How much of a box's surroundings counts [px]."""
+    """Width of the margin around a box of a given size [px]."""
     return max(LEAST_MARGIN_PX, MARGIN * float(size.max()))
 
 
 def _is_outline(foreground: Pixels, in_box: Pixels) -> bool:
-    """Whether a foreground is the target's outline: neither next to nothing nor all of its box."""
+    """Whether a foreground shows the target's outline: it fills neither too little nor nearly all of the box."""
     part = np.count_nonzero(foreground) / max(int(np.count_nonzero(in_box)), 1)
     return bool(LEAST_FOREGROUND < part < MOST_FOREGROUND)
 
 
 def _stands_out(patch: Image, in_box: Pixels) -> Pixels:
-    """Where the colours in the box are none that are around it."""
+    """Mark the pixels of the box whose colour differs from the surroundings."""
     background = patch[~in_box]
     if len(background) < LEAST_BACKGROUND or np.ptp(patch) == 0:
         return np.zeros_like(in_box)
@@ -183,47 +178,47 @@ def _stands_out(patch: Image, in_box: Pixels) -> Pixels:
 
 
 def _whitening(background: Image) -> Array:
-    """The mix of colours, (3, 3), in which colours (n, 3) vary by no more than one in any direction."""
+    """Compute the transform, (3, 3), that whitens background colours (n, 3)."""
     if len(background) < LEAST_BACKGROUND:
         return np.eye(3) / LEAST_SPREAD
     variances, directions = np.linalg.eigh(np.cov(background.T) + LEAST_SPREAD**2 * np.eye(3))
     return (directions / np.sqrt(variances)) @ directions.T
 
 
-# --- registration ---
+# Registration at known scale and rotation
 
-# The target is looked for where it is expected, within this many standard deviations.
+# The search covers this many standard deviations around the expected place.
 GATE_SIGMAS = 3.0
-# First with few samples along its larger side, everywhere; then with more, around what was found.
+# Samples along the target's larger side: coarse for the whole search, fine around the coarse result.
 COARSE_SAMPLES, FINE_SAMPLES = 14.0, 40.0
-# No finer than this many samples a pixel of the wide view: there is no more in it.
+# Most samples per pixel of the fixed image, which holds no more detail.
 FINEST = 4.0
-# How far to search to each side, at most, in coarse samples; and in fine ones, beside half a coarse one.
+# Largest search to each side: in coarse samples; and in fine ones, beyond half a coarse one.
 WIDEST_SEARCH, FINE_SEARCH = 48, 1
-# What the wide view's lens, pixels and coding blur together, one standard deviation [px]; chosen on rendered books.
+# Blur of the fixed camera's lens, pixels and coding, one standard deviation [px]; chosen on rendered books.
 WIDE_BLUR_PX = 0.7
-# The best place leads the next best by this much, and no more of the target is out of view.
+# Least lead of the best place over the next best, and least part of the target inside the zoom image.
 LEAST_LEAD, LEAST_SEEN = 0.12, 0.6
-# Both cameras show it with a similar contrast.
+# Range of the contrast in the zoom image over that in the fixed image.
 LOWEST_GAIN, HIGHEST_GAIN = 0.25, 4.0
-# A place away from the expected one counts as less alike, by this times its squared distance in standard deviations.
+# Penalty on the score, per squared distance from the expected place in standard deviations.
 PRIOR_WEIGHT = 0.01
-# Two places that are apart by less than this part of the target's box are one.
+# Places closer than this part of the target's box are one place.
 ONE_PLACE = 0.5
-# Standard deviation of a registration, in pixels of the wide view and in samples, where likeness is lacking by as much
-# as is usual; measured on the simulated targets.
+# Standard deviation of a registration, in pixels of the fixed image and in samples, at the usual lack of likeness;
+# measured on the simulated targets.
 SIGMA_PX, SIGMA_SAMPLES = 0.08, 0.08
 USUAL_LACK, LEAST_LACK = 0.1, 0.04  # 1 - score
 
 
 @dataclass(frozen=True)
 class ZoomView:
-    """How the wide view's surroundings of the target appear in a zoom frame.
+    """Local mapping from the fixed image around the target to a zoom image.
 
     Attributes:
-        center_px: where the target is expected, (2,).
-        covariance: of that [px^2], (2, 2).
-        J: zoom pixels a wide pixel at the target's depth, (2, 2).
+        center_px: expected centre of the target in the zoom image (u, v), (2,).
+        covariance: covariance of that centre [px^2], (2, 2).
+        J: Jacobian at the target's depth, zoom pixels per fixed pixel, (2, 2).
     """
 
     center_px: Array
@@ -232,19 +227,19 @@ class ZoomView:
 
     @property
     def scale(self) -> float:
-        """Zoom pixels a wide pixel."""
+        """Zoom pixels per pixel of the fixed image."""
         return math.sqrt(abs(float(np.linalg.det(self.J))))
 
 
 @dataclass(frozen=True)
 class Place:
-    """The best place of a search.
+    """Best place of a search.
 
     Attributes:
-        center_px: where the sight's middle is in the zoom frame, (2,).
-        score: how alike both are there, -1 to 1.
-        lead: by how much more than elsewhere.
-        seen: the part of the target that is inside the zoom frame, 0 to 1.
+        center_px: body's centre in the zoom image (u, v), (2,).
+        score: normalised correlation, -1 to 1.
+        lead: score less that of the next best place.
+        seen: part of the target inside the zoom image, 0 to 1.
         sigma_px: standard deviation of the place along u and v each [px].
     """
 
@@ -256,10 +251,15 @@ class Place:
 
 
 def register(image: Image, sight: FixedView, view: ZoomView) -> Place | None:
-    """Find the place in a zoom image that is most alike to a sight of the target: first coarsely, then finely.
+    """Find a target's cut-out in a zoom image, first coarsely, then finely.
+
+    Args:
+        image: zoom image, (H, W, 3) BGR.
+        sight: the target in the fixed image.
+        view: mapping from the fixed to the zoom image.
 
     Returns:
-        None where nothing is alike, two places are, or what is alike goes on beyond the gate.
+        The place; None if nothing correlates, if two places do, or if the maximum lies beyond the gate.
     """
     finest = max(1 / FINEST, 1 / view.scale)
     coarse, fine = (max(sight.side_px / samples, finest) for samples in (COARSE_SAMPLES, FINE_SAMPLES))
@@ -276,18 +276,18 @@ def register(image: Image, sight: FixedView, view: ZoomView) -> Place | None:
 def _search(
     image: Image, sight: FixedView, view: ZoomView, pitch: float, around_px: Array, reach: int | None
 ) -> Place | None:
-    """Find the place in a zoom image that is most alike to a sight, sampled every ``pitch`` wide pixels.
+    """Find the place of highest correlation with a cut-out sampled every ``pitch`` fixed pixels.
 
     Args:
-        image: the zoom frame's.
-        sight: the target.
-        view: how the wide view appears in the zoom frame.
-        pitch: [px of the wide view].
-        around_px: middle of the search in the zoom frame, (2,).
-        reach: how many samples to each side; None for all of the gate, which alone then counts.
+        image: zoom image, (H, W, 3) BGR.
+        sight: the target in the fixed image.
+        view: mapping from the fixed to the zoom image.
+        pitch: distance of samples [px of the fixed image].
+        around_px: centre of the search in the zoom image (u, v), (2,).
+        reach: samples to each side; None for the whole gate, which then limits the search.
     """
     template, weight, middle = sight.at_pitch(pitch)
-    step = view.J * pitch  # zoom pixels a sample
+    step = view.J * pitch  # zoom pixels per sample
     back = np.linalg.inv(step)
     spread = back @ view.covariance @ back.T + np.diag((sight.body_sigma_px / pitch) ** 2)
     sides = np.full(2, WIDEST_SEARCH if reach is None else reach)
@@ -296,7 +296,7 @@ def _search(
     A = np.column_stack([step, around_px - step @ (middle + sides)])
     width, height = (np.array(weight.shape[::-1]) + 2 * sides).tolist()
     samples, inside = resample(image, A, (width, height))
-    if pitch < 1:  # the wide view's blur, in samples, where they show it
+    if pitch < 1:  # blur the zoom samples as the fixed camera does, where the sampling resolves it
         samples = cv2.GaussianBlur(samples, (0, 0), WIDE_BLUR_PX / pitch)
     mix = sight.whitening
     likeness = correlate(cv2.transform(samples, mix), inside, cv2.transform(template, mix), weight)
@@ -309,20 +309,20 @@ def _search(
 
 
 def _best(likeness: Likeness, distance: Array, apart: Array, origin_px: Array, step: Array) -> Place | None:
-    """The best place of a search, if it is one.
+    """Choose the best place of a search; None if it is out of bounds or no maximum.
 
     Args:
-        likeness: at every place.
-        distance: squared, of every place from the expected one, in standard deviations.
-        apart: two places so far apart along u or v are two, (2,) [samples].
-        origin_px: where the first place is in the zoom frame, (2,).
+        likeness: correlation at every place.
+        distance: squared distance of every place from the expected one, in standard deviations.
+        apart: least distance of two distinct places along u and v, (2,) [samples].
+        origin_px: first place of the search in the zoom image (u, v), (2,).
         step: from one place to the next, (2, 2) [px].
     """
     allowed = (likeness.gain > LOWEST_GAIN) & (likeness.gain < HIGHEST_GAIN)
     allowed &= (likeness.seen >= LEAST_SEEN) & (distance <= GATE_SIGMAS**2)
     score = np.where(allowed, likeness.score - PRIOR_WEIGHT * distance, -1.0)
     row, column = (int(i) for i in np.unravel_index(int(np.argmax(score)), score.shape))
-    # The expectation may have drawn it one sample aside; what goes on rising, beyond the gate, is something else.
+    # The prior may have moved the best place by one sample. A score that still rises beyond the gate is another object.
     top = summit(likeness.score, (row, column))
     if not allowed[row, column] or top is None:
         return None
@@ -338,34 +338,33 @@ def _best(likeness: Likeness, distance: Array, apart: Array, origin_px: Array, s
     )
 
 
-# How far apart in time the two views of a find may be: limbs and wings move [s].
+# Largest time between the two frames of a registration: limbs and wings move [s].
 LONGEST_APART_S = 0.1
-# By so much one camera's frames may come later than the other's [s]; for so long wide frames are kept.
+# Largest delay of one camera's frames against the other's [s]; fixed frames are kept for that long.
 LATEST_S = 0.5
-# A small step for derivatives, as a part of the depth.
+# Step for derivatives, in parts of the depth.
 STEP = 1e-3
-# Lens, head and the times of frames are never known better than this, one standard deviation [px].
+# Least standard deviation of the expected place, from lens, head and frame times [px].
 LEAST_SIGMA_PX = 1.0
-# A find is sure that is at least this much alike, and less alike than finds lately were by no more than this; what
-# they were fades by so much a second.
+# A match is sure with at least this score, and at most this much below the usual score, which fades by this a second.
 SURE_SCORE, LARGEST_DROP, FADING = 0.7, 0.15, 0.1
-# One that is less alike, but by so much, is believed for this long after a sure one [s], where it goes on from the last
-# find: that was no longer ago than this [s], and beside the expected place by as much as this one, within so many
-# pixels of the wide view and such a part of the target's box.
+# A weaker match counts with at least this score, this soon after a sure one [s], and this soon after the last match
+# [s], if its offset from the expected place has changed by no more than this many pixels of the fixed image plus this
+# part of the box.
 LEAST_SCORE, BELIEVED_S, LONGEST_GAP_S = 0.55, 0.5, 0.15
 STEADY_PX, STEADY_OF_SIDE = 0.5, 0.15
 
 
 @dataclass(frozen=True)
 class Expected:
-    """Where the target is expected when a zoom frame was exposed, and how the zoom camera stood then.
+    """Expected position of the target at a zoom frame's time, with the zoom camera's state then.
 
     Attributes:
-        x_fixed: the target in the fixed camera's frame [m], (3,).
-        covariance: of where that appears in the zoom frame [px^2], (2, 2).
-        pan: as the head reports it, its known bias taken into account [rad].
-        tilt: likewise.
-        nominal_px: focal length as the lens reports it [px].
+        x_fixed: target position [m], (3,).
+        covariance: covariance of its place in the zoom image [px^2], (2, 2).
+        pan: reported pan plus its estimated bias [rad].
+        tilt: reported tilt plus its estimated bias [rad].
+        nominal_px: nominal focal length [px].
     """
 
     x_fixed: Array
@@ -377,16 +376,16 @@ class Expected:
 
 @dataclass(frozen=True)
 class ZoomMeasurement:
-    """The target in a zoom frame: one point of it, taken for the middle of its body, as both views show it.
+    """Measurement of the body's centre in a zoom image, by registration.
 
     Attributes:
-        center_px: that point in the zoom frame (u, v), (2,).
-        sigma_px: how far it may be from the same point in the wide view, along u and v each, one standard deviation.
-        body_sigma_px: how far it may be from the true middle of the body, likewise, (2,).
-        score: how alike both views are there, 0 to 1.
-        seen: the part of the target that is inside the zoom frame, 0 to 1.
-        size_px: the width and height of the wide view's box as large as the zoom frame shows them, (2,).
-        t: when the zoom frame was exposed [s].
+        center_px: the centre in the zoom image (u, v), (2,).
+        sigma_px: standard deviation against the same point in the fixed image, along u and v each [px].
+        body_sigma_px: standard deviation of that point against the body's true centre, along u and v, (2,) [px].
+        score: normalised correlation, 0 to 1.
+        seen: part of the target inside the zoom image, 0 to 1.
+        size_px: width and height of the detection's box at the zoom image's scale, (2,).
+        t: exposure time of the zoom frame [s].
     """
 
     center_px: Array
@@ -399,27 +398,27 @@ class ZoomMeasurement:
 
 
 class Finder(Protocol):
-    """Finds the target that is followed in the zoom view; the docstrings of `CloseupFinder` say what is what."""
+    """Finds the followed target in zoom images; `CloseupFinder` describes the methods."""
 
     def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> FixedView | None:
-        """Remember the target as a wide frame shows it."""
+        """Store the target as a fixed-camera frame shows it."""
 
     def sight_at(self, t: float) -> object | None:
-        """What the wide view showed of the target at about a time [s]; None where it did not, or has not yet."""
+        """Return the stored cut-out nearest to time t [s]; None if none is near enough."""
 
     def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
         """Find the target in a zoom frame."""
 
 
 class CloseupFinder:
-    """Finds in the zoom view what the wide view's detector has found; one for each target that is followed."""
+    """Register the fixed camera's detections of one target in the zoom image."""
 
     def __init__(self, calibration: Calibration, target: TargetConfig) -> None:
-        """Begin without a sight of the target.
+        """Create a finder without cut-outs.
 
         Args:
-            calibration: of the rig, for the streams in use.
-            target: what is followed.
+            calibration: calibration of the rig, for the streams in use.
+            target: target profile.
 
         Raises:
             CalibrationError: the calibration has no T.
@@ -431,18 +430,18 @@ class CloseupFinder:
         self._sights: deque[FixedView] = deque()
         self._usual_score, self._sure_t = 0.0, -math.inf
         self._last_t = -math.inf
-        self._last_offset: Array = np.zeros(2)  # beside the expected place, in wide pixels
+        self._last_offset: Array = np.zeros(2)  # from the expected place, in pixels of the fixed image
 
     def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> FixedView | None:
-        """Remember the target as a wide frame shows it.
+        """Store the target as a fixed-camera frame shows it.
 
         Args:
-            frame: of the wide view.
-            detection: of the target in that very frame.
-            mask: the detector's foreground there, (H, W); without it an ellipse in the box.
+            frame: frame of the fixed camera.
+            detection: detection of the target in that frame.
+            mask: foreground of the detector, (H, W); without it, the colours or an ellipse in the box are used.
 
         Returns:
-            What was seen, the middle of the body in particular; None where the box holds no pixel of the frame.
+            The cut-out, with the centre of the body; None if the box holds no pixel of the frame.
         """
         sight = look(frame, detection, mask, self._target)
         if sight is not None:
@@ -452,7 +451,7 @@ class CloseupFinder:
         return sight
 
     def sight_at(self, t: float) -> FixedView | None:
-        """What the wide view showed of the target at about a time [s]; None where it did not, or has not yet."""
+        """Return the stored cut-out nearest to time t [s]; None if none is within `LONGEST_APART_S`."""
         near = min(self._sights, key=lambda sight: abs(sight.t - t), default=None)
         return None if near is None or abs(near.t - t) > LONGEST_APART_S else near
 
@@ -460,11 +459,11 @@ class CloseupFinder:
         """Find the target in a zoom frame.
 
         Args:
-            frame: of the zoom camera.
-            expected: where it should be.
+            frame: frame of the zoom camera.
+            expected: expected position of the target.
 
         Returns:
-            None where it is not there, or not for sure.
+            The measurement; None if the target is not found, or not with certainty.
         """
         sight, view = self.sight_at(frame.t), self.view(expected)
         if sight is None or view is None:
@@ -483,7 +482,7 @@ class CloseupFinder:
         )
 
     def _believes(self, place: Place, sight: FixedView, view: ZoomView, t: float) -> bool:
-        """Whether a place is sure, or goes on from what was; remembers it if so."""
+        """Decide whether a match is sure, or weaker but continuous with the last ones; store it if so."""
         offset = np.asarray(np.linalg.solve(view.J, place.center_px - view.center_px), dtype=float)
         usual = self._usual_score - FADING * abs(t - self._sure_t)
         if place.score >= max(SURE_SCORE, usual - LARGEST_DROP):
@@ -497,11 +496,11 @@ class CloseupFinder:
         return True
 
     def view(self, expected: Expected) -> ZoomView | None:
-        """Where in the zoom frame the target is expected; None behind a camera or beyond its lens."""
+        """Map the surroundings of the target to the zoom image; None behind a camera or outside its lens model."""
         x, covariance = np.asarray(expected.x_fixed, dtype=float), np.asarray(expected.covariance, dtype=float)
         if not (np.isfinite(x).all() and np.isfinite(covariance).all() and x[2] > 0):
             return None
-        # A small cross at the target, parallel to the wide image.
+        # A small cross at the target, parallel to the fixed image plane, for numerical derivatives.
         cross = x + STEP * x[2] * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], dtype=float)
         calibration, nominal = self._calibration, expected.nominal_px
         T_base_head = base_head(expected.pan, expected.tilt, calibration.head)

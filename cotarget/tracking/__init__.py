@@ -1,1 +1,1 @@
-"""Track detections over time in the fixed view."""
+"""Track detections over time in the fixed camera's image."""

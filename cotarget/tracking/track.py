@@ -1,13 +1,8 @@
-"""One target's motion filter: a constant-velocity Kalman filter over (u, v, du, dv) with a history of sizes.
+"""Filter one track in the image: constant velocity in (u, v), with histories of size and travel.
 
-It is driven by white acceleration, so that frames may come at any times. To the outside it is told as a frozen
-``Track``; the filter's own state stays here. Neither motion nor measurement mixes u and v: each has its own filter.
-
-The Kalman filter of one coordinate in the image and its velocity, driven by white acceleration.
-
-In floats: numpy takes ten times as long for so few numbers, and every track of a frame has two of these.
-
-What the boxes of the last seconds tell: a target's usual size, its largest, and how far it has come.
+The Kalman filter is driven by white acceleration, so frames may come at any times. Neither motion nor measurement mixes
+u and v, so each coordinate has a filter of its own. They compute in floats: numpy takes ten times as long for so few
+numbers, and every track has two of them in every frame. Users of the tracker see a frozen `Track`.
 """
 
 import math
@@ -39,7 +34,7 @@ class Spread:
     speed: float
 
     def after(self, dt: float, noise: float) -> "Spread":
-        """What it grows to over ``dt`` [s], forward or back, by white acceleration [px^2/s^3]."""
+        """Predict the covariance over ``dt`` [s], forward or back, with white acceleration [px^2/s^3]."""
         span = abs(dt)
         return Spread(
             self.at + dt * (2 * self.both + dt * self.speed) + noise * span**3 / 3,
@@ -56,19 +51,19 @@ def covariance_of(u: Spread, v: Spread) -> Array:
 
 
 class AxisFilter:
-    """A coordinate [px] and its velocity [px/s]."""
+    """Kalman filter of one image coordinate [px] and its velocity [px/s]."""
 
     def __init__(self, at: float, variance: float, speed_variance: float) -> None:
         self.at, self.speed = at, 0.0
         self.spread = Spread(variance, 0.0, speed_variance)
 
     def predict(self, dt: float, noise: float) -> None:
-        """Move on by ``dt`` [s] with white acceleration [px^2/s^3]."""
+        """Predict ``dt`` [s] ahead with white acceleration [px^2/s^3]."""
         self.at += dt * self.speed
         self.spread = self.spread.after(dt, noise)
 
     def correct(self, measured: float, variance: float) -> None:
-        """Take a measurement [px] with its variance [px^2] into account."""
+        """Correct with a measurement [px] and its variance [px^2]."""
         P = self.spread
         S = P.at + variance
         innovation, gain, speed_gain = measured - self.at, P.at / S, P.both / S
@@ -77,16 +72,15 @@ class AxisFilter:
         self.spread = Spread(P.at - gain * P.at, P.both - gain * P.both, P.speed - speed_gain * P.both)
 
 
-# --- boxhistory ---
+# Histories of a track's size and travel
 
-# The larger side over a wing beat is that of which this part is smaller: the maximum, but deaf to one frame in ten that
-# is wrong.
+# Quantile of the larger side over a wing beat that counts as its maximum, robust against one wrong frame in ten.
 BEAT_PART = 0.9
-# Where a target was and is, is the median of so many boxes, at most this part of all: an outline flickers.
+# Boxes whose median gives a start or end of the travel, because outlines flicker; at most this part of all boxes.
 ENDS, END_PART = 3, 1 / 3
-# A way of which one step makes up more than this part was not gone but jumped: to another thing's outline.
+# Largest part of the travel in one step; beyond it the outline jumped to that of another thing.
 LARGEST_STEP = 2 / 3
-# A step that is no longer than this is no jump: an outline is of whole pixels, and flickers [px].
+# A shorter step is no jump: outlines consist of whole pixels and flicker [px].
 LEAST_JUMP_PX = 3.0
 # An edge this near to the image's border may lie beyond it [px].
 BORDER_PX = 0.5
@@ -94,7 +88,7 @@ Edges = tuple[float, float]
 
 
 class SizeHistory:
-    """The sizes of the last boxes.
+    """Usual and largest size of a track, from its last boxes.
 
     Attributes:
         size: usual width and height [px], (2,).
@@ -102,11 +96,11 @@ class SizeHistory:
     """
 
     def __init__(self, size_s: float, beat_s: float) -> None:
-        """Begin with no box.
+        """Create a history without boxes.
 
         Args:
-            size_s: over so long the usual size is taken [s].
-            beat_s: over so long the larger side [s].
+            size_s: window of the usual size [s].
+            beat_s: window of the larger side [s].
         """
         self._size_s, self._beat_s = size_s, beat_s
         self._boxes: deque[_Sides] = deque()
@@ -114,19 +108,19 @@ class SizeHistory:
         self.larger_side = 0.0
 
     def note(self, t: float, width: float, height: float, clipped: bool) -> None:
-        """Remember a box, and work out the sizes anew.
+        """Add a box and update the sizes.
 
         Args:
-            t: when it was seen [s].
-            width: of the box [px].
-            height: of the box [px].
-            clipped: whether the image's border cuts it.
+            t: time of the frame [s].
+            width: width of the box [px].
+            height: height of the box [px].
+            clipped: whether the image's border cuts the box.
         """
         boxes = self._boxes
         boxes.append(_Sides(t, width, height, clipped))
         while boxes[0].t < t - max(self._size_s, self._beat_s):
             boxes.popleft()
-        # The border makes boxes smaller: those that it did not cut count, or else the largest of those it did.
+        # The border makes boxes smaller: the uncut ones count, or else the largest of the cut ones.
         recent = [box for box in boxes if box.t >= t - self._size_s]
         whole = [box for box in recent if not box.clipped]
         middle = statistics.median if whole else max
@@ -139,7 +133,7 @@ class SizeHistory:
 
 @dataclass(frozen=True, slots=True)
 class _Sides:
-    """Width and height of a box at a time [s], and whether the image's border cut it."""
+    """Width and height of a box at a time [s], and whether the image's border cuts it."""
 
     t: float
     width: float
@@ -148,27 +142,27 @@ class _Sides:
 
 
 class Trail:
-    """The way that the last boxes have come."""
+    """Travel of a track, from its last boxes."""
 
     def __init__(self, span_s: float, image_size: tuple[int, int] | None = None) -> None:
-        """Begin with no box.
+        """Create a history without boxes.
 
         Args:
-            span_s: how far back it goes [s].
-            image_size: (width, height) [px]; with it a box that its border cuts tells its way by its other edges.
+            span_s: window of the travel [s].
+            image_size: (width, height) [px]; with it, only the visible edges of a clipped box count.
         """
         self._span_s = span_s
         self._extents = image_size or (None, None)
         self._boxes: deque[_Place] = deque()
 
     def note(self, t: float, center: tuple[float, float], size: tuple[float, float], clipped: bool) -> None:
-        """Remember a box.
+        """Add a box.
 
         Args:
-            t: when it was seen [s].
-            center: its middle (u, v) [px].
-            size: its width and height [px].
-            clipped: whether the image's border cuts it.
+            t: time of the frame [s].
+            center: centre of the box (u, v) [px].
+            size: width and height of the box [px].
+            clipped: whether the image's border cuts the box.
         """
         across, down = (_edges(*of, clipped) for of in zip(center, size, self._extents, strict=True))
         step = _way([self._boxes[-1].edges], [(across, down)]) if self._boxes else 0.0
@@ -177,10 +171,10 @@ class Trail:
             self._boxes.popleft()
 
     def travel(self) -> float:
-        """How far the target has come, edge by edge [px]; 0 where it jumped there.
+        """Compute how far the target has moved, edge by edge [px]; 0 if it jumped.
 
-        A thing that comes has both its edges come the same way. A cloud or a shadow that drifts slowly behind others
-        grows, shrinks and falls apart, and takes its middle with it; an edge or two stay.
+        Both edges of a moving target move the same way. A cloud or a shadow that drifts slowly behind others grows,
+        shrinks and falls apart, which moves its centre, while an edge or two stay.
         """
         edges = [box.edges for box in self._boxes]
         count = max(1, min(ENDS, int(END_PART * len(edges))))
@@ -191,7 +185,7 @@ class Trail:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """A box's edges along u and v at a time [s], and how long the step was that led there [px]."""
+    """Edges of a box along u and v at a time [s], and the length of the step to it [px]."""
 
     t: float
     edges: tuple[Edges, Edges]
@@ -199,7 +193,7 @@ class _Place:
 
 
 def _edges(center: float, size: float, extent: int | None, clipped: bool) -> Edges:
-    """Where a box begins and ends along one axis [px]; nan for an edge beyond the border of an image so wide."""
+    """Low and high edge of a box along one axis [px]; nan for an edge at or beyond the border of a clipped box."""
     low, high = center - size / 2, center + size / 2
     if not clipped or extent is None:
         return low, high
@@ -207,12 +201,12 @@ def _edges(center: float, size: float, extent: int | None, clipped: bool) -> Edg
 
 
 def _way(before: Sequence[tuple[Edges, Edges]], after: Sequence[tuple[Edges, Edges]]) -> float:
-    """How far both edges of some boxes have moved the same way [px]; one alone where the other was not seen."""
+    """Length of the common motion of both edges between two groups of boxes [px]; of one edge if only that is seen."""
     return math.hypot(*(_shift([box[i] for box in before], [box[i] for box in after]) for i in range(2)))
 
 
 def _shift(before: Sequence[Edges], after: Sequence[Edges]) -> float:
-    """That along one axis."""
+    """Common motion of both edges along one axis [px]; 0 if they move in opposite directions."""
     moved = []
     for i in range(2):
         was = [edges[i] for edges in before if not math.isnan(edges[i])]
@@ -225,7 +219,7 @@ def _shift(before: Sequence[Edges], after: Sequence[Edges]) -> float:
 
 
 def _quantile(values: Sequence[float], part: float) -> float:
-    """The value of which a part of others is smaller, linearly between two; numpy's takes forty times as long."""
+    """Quantile with linear interpolation; numpy takes forty times as long."""
     ordered = sorted(values)
     at = part * (len(ordered) - 1)
     low = int(at)
@@ -234,9 +228,9 @@ def _quantile(values: Sequence[float], part: float) -> float:
 
 
 Sides = TypeVar("Sides", Array, float)
-# The middle of a box that the image's border cuts is off by this part of it: what is hidden may be as large again.
+# Error of a clipped box's centre, in parts of the box: the hidden part may be as large again.
 CUT = 0.5
-# A box that is smaller than this part of its target's usual one is a piece of it, which may be any.
+# A box smaller than this part of its target's usual size shows an unknown part of it.
 PIECE = 0.7
 
 
@@ -245,7 +239,7 @@ class Measurement(Protocol):
 
     @property
     def center_px(self) -> Array:
-        """Middle of the box (u, v) [px], (2,)."""
+        """Centre of the box (u, v) [px], (2,)."""
 
     @property
     def size_px(self) -> Array:
@@ -253,7 +247,7 @@ class Measurement(Protocol):
 
     @property
     def score(self) -> float:
-        """How sure the detector is, 0 to 1."""
+        """Confidence of the detector, 0 to 1."""
 
     @property
     def clipped(self) -> bool:
@@ -262,26 +256,25 @@ class Measurement(Protocol):
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """How tracks are born, moved and dropped.
+    """Settings of the image filter and of a track's life cycle.
 
     Attributes:
         acceleration_px: typical acceleration in the image [px/s^2].
-        manoeuvre_s: how long such an acceleration lasts [s]; acceleration_px^2 manoeuvre_s is the filter's noise.
-        noise_px: standard deviation of a detection's centre that does not depend on its size [px].
-        noise_of_size: the part that does, as a fraction of the box's side (limbs and wings that move).
-        speed_px: standard deviation of the speed that a new target may have [px/s].
-        confirm_hits: detections before a track is believed ...
-        confirm_s: ... and how long it must have been followed [s] ...
-        confirm_travel: ... and how far it must have come, in larger sides of its box (0: it may stand still) ...
-        travel_s: ... within so long [s] ...
-        confirm_score: ... and what its detections' scores must average, the last ones most (0: any will do).
-        score_s: over this time they are averaged [s]; a new track begins at 0.
-        doubt_score: a confirmed track ends when its average falls below this.
-        lose_s: a confirmed track dies after this long without a detection [s], or after as long as it had been seen,
-            where that is less.
-        drop_s: one that was never confirmed, after this long [s].
+        manoeuvre_s: time constant of the acceleration [s]; acceleration_px^2 manoeuvre_s is the process noise.
+        noise_px: standard deviation of a detection's centre, the part independent of its size [px].
+        noise_of_size: the part proportional to the box's side, from moving limbs and wings.
+        speed_px: standard deviation of a new track's speed [px/s].
+        confirm_hits: fewest detections of a confirmed track.
+        confirm_s: least age of a confirmed track [s].
+        confirm_travel: least travel of a confirmed track, in larger sides of its box; 0 if it may stand still.
+        travel_s: window of that travel [s].
+        confirm_score: least average score of a confirmed track, the last detections weighted most; 0 for any.
+        score_s: time constant of the average score [s]; a new track begins at 0.
+        doubt_score: average score below which a confirmed track ends.
+        lose_s: time without a detection after which a confirmed track ends [s]; its age if that is less.
+        drop_s: time without a detection after which an unconfirmed track ends [s].
         size_s: window of the size's median [s].
-        beat_s: window of the largest size; some two wing beats [s].
+        beat_s: window of the largest size, some two wing beats [s].
     """
 
     acceleration_px: float = 150.0
@@ -303,15 +296,15 @@ class TrackerSettings:
 
 
 def settings_for(target: TargetConfig) -> TrackerSettings:
-    """Choose the tracker's settings for a target.
+    """Choose the tracker's settings for a target profile.
 
-    A colour is found to a fraction of a pixel. What is found by its motion jitters with limbs and wings, and
-    must have moved before it is believed: whoever comes straight on is, once he has gone that far aside.
+    A colour is located to a fraction of a pixel. Detections by motion jitter with limbs and wings, and the track must
+    travel before it is confirmed; a person who walks straight towards the camera is confirmed after moving sideways.
     """
     detector: str = target.detector
     if detector == "colour":
         return TrackerSettings(noise_px=0.2, noise_of_size=0.01)
-    if detector == "speck":  # it may hover: what tells it from a thing that stands is its score
+    if detector == "speck":  # a small target may hover, so its score decides and not its travel
         return TrackerSettings(acceleration_px=250.0, noise_of_size=0.2, confirm_score=0.5, doubt_score=0.2)
     if target.dimension == "wingspan":
         return TrackerSettings(acceleration_px=250.0, noise_of_size=0.2, confirm_travel=0.5)
@@ -320,21 +313,21 @@ def settings_for(target: TargetConfig) -> TrackerSettings:
 
 @dataclass(frozen=True)
 class Track:
-    """One target as far as it is known at time ``t``.
+    """State of one track at time ``t``.
 
     Attributes:
-        id: its number, from 1, never used again.
-        t: the time that this state is for [s].
-        confirmed: whether it has been consistent for long enough to be believed.
-        missed: frames since its last detection; 0 when the last frame had it.
-        center_px: filtered middle (u, v), (2,).
-        velocity_px: (du, dv) [px/s], (2,).
+        id: number of the track, from 1, never reused.
+        t: time of this state [s].
+        confirmed: whether the track is consistent enough to be followed.
+        missed: frames since its last detection; 0 if the last frame had one.
+        center_px: filtered centre (u, v), (2,).
+        velocity_px: velocity (du, dv) [px/s], (2,).
         size_px: filtered width and height, (2,).
-        larger_side_px: the larger side over the last wing beats [px].
-        covariance: of (u, v, du, dv), (4, 4).
-        score: of the last detection, 0 to 1.
+        larger_side_px: larger side over the last wing beats [px].
+        covariance: covariance of (u, v, du, dv), (4, 4).
+        score: score of the last detection, 0 to 1.
         box: the last detection.
-        shared: whether that covers other targets too, so that it tells only what this one is inside of.
+        shared: whether that detection covers other tracks too, so that it only bounds this one's place.
     """
 
     id: int
@@ -352,7 +345,7 @@ class Track:
 
 
 class ImageFilter:
-    """The Kalman filters and the size history of one track."""
+    """Kalman filters, histories and life cycle of one track."""
 
     def __init__(
         self,
@@ -372,7 +365,7 @@ class ImageFilter:
         self.confirmed = False
         self.mean_score = 0.0
         self._sizes = SizeHistory(settings.size_s, settings.beat_s)
-        # Of who stands, or is confirmed, nobody asks.
+        # Travel is needed until the track is confirmed, and only if the settings ask for it.
         self._trail = Trail(settings.travel_s, image_size) if settings.confirm_travel else None
         self._note(detection)
         self._u, self._v = (
@@ -382,12 +375,12 @@ class ImageFilter:
 
     @property
     def center(self) -> tuple[float, float]:
-        """The middle (u, v) [px]."""
+        """Centre (u, v) [px]."""
         return self._u.at, self._v.at
 
     @property
     def place_variance(self) -> tuple[float, float]:
-        """Of the middle [px^2]; u and v know nothing of each other."""
+        """Variances of the centre along u and v, which are uncorrelated [px^2]."""
         return self._u.spread.at, self._v.spread.at
 
     @property
@@ -396,13 +389,13 @@ class ImageFilter:
         return self._sizes.size
 
     def predict(self, t: float) -> None:
-        """Move the filter to time ``t`` [s]."""
+        """Predict the track at time ``t`` [s]."""
         for axis in (self._u, self._v):
             axis.predict(t - self.t, self.noise)
         self.t = t
 
     def correct(self, detection: Measurement) -> None:
-        """Take a detection of this target alone into account."""
+        """Correct with a detection of this track alone."""
         weight = 1 - math.exp(-(self.t - self.seen) / self.settings.score_s)
         self.mean_score += weight * (detection.score - self.mean_score)
         self._measure(detection.center_px.tolist(), self.variance(detection))
@@ -421,7 +414,7 @@ class ImageFilter:
                 self._trail = None
 
     def share(self, detection: Measurement) -> None:
-        """Take a detection into account that covers other targets too: all it tells is that this one is inside."""
+        """Correct with a detection that covers other tracks too: this track is somewhere inside it."""
         room = room_inside(detection.size_px, self.size)
         inside = np.clip(self.center, detection.center_px - room, detection.center_px + room)
         self._measure(inside.tolist(), ((self.size / 4) ** 2 + room**2).tolist())
@@ -429,13 +422,13 @@ class ImageFilter:
 
     @property
     def patience_s(self) -> float:
-        """How long it lives without a detection [s]."""
+        """Longest time without a detection before the track ends [s]."""
         if not self.confirmed:
             return self.settings.drop_s
         return min(self.settings.lose_s, self.seen - self.born)
 
     def is_over(self, image_size: tuple[int, int] | None) -> bool:
-        """Whether the track has been without a detection for too long, has left the image, or is not believed."""
+        """Whether the track ends: no detection for too long, outside the image, or a score that is too low."""
         if self.missed and image_size is not None:
             width, height = image_size
             if not (-0.5 <= self._u.at <= width - 0.5 and -0.5 <= self._v.at <= height - 0.5):
@@ -445,7 +438,7 @@ class ImageFilter:
         return self.t - self.seen > self.patience_s
 
     def track(self) -> Track:
-        """What the outside sees."""
+        """Give the state as a frozen `Track`."""
         return Track(
             id=self.number,
             t=self.t,
@@ -462,7 +455,7 @@ class ImageFilter:
         )
 
     def variance(self, detection: Measurement) -> list[float]:
-        """Variance of a detection's centre [px^2], (2,); in floats, which is quicker."""
+        """Variances of a detection's centre along u and v [px^2]; in floats, which is faster."""
         part = CUT if detection.clipped else self.settings.noise_of_size
         sides = zip(self.size.tolist(), detection.size_px.tolist(), strict=True)
         return [
@@ -471,20 +464,20 @@ class ImageFilter:
         ]
 
     def _note(self, detection: Measurement) -> None:
-        """Remember a box."""
+        """Add a box to the histories."""
         (u, v), (width, height) = detection.center_px.tolist(), detection.size_px.tolist()
         self._sizes.note(self.t, width, height, detection.clipped)
         if self._trail is not None:
             self._trail.note(self.t, (u, v), (width, height), detection.clipped)
 
     def _has_travelled(self) -> bool:
-        """Whether it has come far enough to be believed."""
+        """Whether the track has travelled far enough to be confirmed."""
         if self._trail is None:
             return True
         return self._trail.travel() >= self.settings.confirm_travel * max(1.0, *self.size.tolist())
 
     def _measure(self, center: Sequence[float], variance: Sequence[float]) -> None:
-        """Take a measured centre [px] with its variance [px^2] into account, both (2,)."""
+        """Correct with a measured centre [px] and its variances [px^2], (2,) each."""
         for axis, at, spread in zip((self._u, self._v), center, variance, strict=True):
             axis.correct(at, spread)
         self.seen = self.t
@@ -492,23 +485,23 @@ class ImageFilter:
 
 
 def missing(usual: Array, size: Array) -> Array:
-    """How much of a target's usual width and height a box lacks [px], (..., 2), if it is a piece of it; else 0."""
+    """Missing width and height of a box that shows only a part of its target [px], (..., 2); 0 if it shows all."""
     return np.asarray(np.where(size < PIECE * usual, usual - size, 0.0))
 
 
 def room_inside(around: Array, size: Array) -> Array:
-    """How far to either side of a box's middle a target of a usual size that is inside may be [px], (2,)."""
+    """Largest distance of a target's centre from that of a larger box around it [px], (2,)."""
     return np.maximum(0.0, (around - size) / 2)
 
 
 def center_variance(settings: TrackerSettings, size: Sides, part: Sides, lacks: Sides) -> Sides:
-    """Variance of a box's middle [px^2], (..., 2), or along one axis.
+    """Variance of a box's centre [px^2], (..., 2), or along one axis.
 
     Args:
-        settings: how well middles are measured.
-        size: of the box [px], (..., 2).
-        part: of it that the middle is off by, (..., 1): `noise_of_size`, or CUT.
-        lacks: what `missing` says, (..., 2).
+        settings: noise of centres.
+        size: size of the box [px], (..., 2).
+        part: error of the centre in parts of the size, `noise_of_size` or CUT, (..., 1).
+        lacks: missing size, see `missing` [px], (..., 2).
     """
     off, lost = part * size, lacks / 2
     return settings.noise_px**2 + off * off + lost * lost

@@ -1,7 +1,7 @@
-"""From detections in single frames to tracks with a number, a velocity, a size and an honest uncertainty.
+"""Track detections over frames: association, and the life cycle of tracks.
 
-Every track has its own motion filter; detections are assigned to tracks by the Hungarian method inside a
-Mahalanobis gate.
+Detections are assigned to tracks by the Hungarian method, inside a gate on the Mahalanobis distance of place and size.
+Each track is filtered by `cotarget.tracking.track`. The source of the numbers: docs/design-notes.md.
 """
 
 import math
@@ -25,44 +25,42 @@ from cotarget.tracking.track import (
 )
 
 __all__ = ["Measurement", "Track", "Tracker", "TrackerSettings", "settings_for"]
-# A cost that no assignment inside the gate reaches, so that it marks pairs that must not be matched.
+# Cost of pairs that must not be matched; no assignment inside the gate reaches it.
 IMPOSSIBLE = 1e6
-# 99.9 % of a chi-square with three degrees of freedom, two of place and one of size: of true detections one in a
-# thousand is turned away.
+# Gate: 99.9 % of a chi-square with three degrees of freedom, two of place and one of size.
 GATE_CHI2 = 16.3
-# Wings, limbs and what hides a part make a box half as large or twice as large as before, one standard deviation of the
-# logarithm of its side. A twig that is seen a little later where a bird has gone behind a tree is smaller still.
+# Standard deviation of the logarithm of a box's side: wings, limbs and occluders make it half or twice as large. A twig
+# that appears where a bird has gone behind a tree is smaller still.
 SIZE_SIGMA = 0.5
-# What is more likely something else than a target is believed less: that likelihood ratio counts, down to this score.
+# Scores below 0.5 count as a likelihood ratio, down to this score.
 LEAST_SCORE = 0.01
-# Objects that turn up anew somewhere in the image [1/s]: on real films of birds and of a dozen people up to 4. What
-# turns up while a track misses its target must more likely be this target than one of them, as after 0.8 s a gate of
-# four standard deviations reaches over 250 px. With 1 and more, tracks on these films jump to nobody else by more than
-# 100 px; with 8 and more, a bird that turns while it is hidden is not found again. These films have 640x512 pixels; a
-# smaller image has no more of them on each pixel.
+# Rate of new objects anywhere in an image of that area [1/s]; a smaller image has no more per pixel. A detection must
+# more likely be the missing target than a new object, because after 0.8 s the gate reaches over 250 px. Real films of
+# birds and people have up to 4 a second; below 1, tracks jump to other targets, and from 8 on, hidden birds are not
+# found again.
 NEWCOMERS_HZ, LEAST_AREA_PX = 2.0, 640 * 512
-# A box that overlaps a track's by this much may be its target even outside the gate: it grew into something else.
+# Overlap from which a box may belong to a track even outside the gate: the target merged with something else.
 OVERLAP_ENOUGH = 0.3
-# What perfect overlap of the boxes is worth against the Mahalanobis distance squared.
+# Reduction of the cost for perfect overlap, in squared Mahalanobis distance.
 OVERLAP_BONUS = 4.0
-# A detection that covers this much of a track's predicted box explains that track, even where another has won it.
+# A detection that covers this part of a track's predicted box explains the track, even if another has won it.
 COVERED = 0.6
-# Of more detections in a frame than these the rest is left out: snow, rain or flicker must not hold up the next frame.
-# Real films of birds and of a dozen people have up to 10.
+# Most detections of a frame that are used: snow, rain or flicker must not delay the next frame. Real films of birds and
+# of a dozen people have up to 10.
 MOST_DETECTIONS = 100
-# The usual time between frames is the median of so many; before a second frame has come it is taken for this [s].
+# Intervals whose median is the usual time between frames, and its value before the second frame [s].
 INTERVALS, FIRST_INTERVAL_S = 5, 1.0
 
 
 class Tracker:
-    """Turns each frame's detections into tracks; numbers are never reused."""
+    """Turn each frame's detections into tracks with ids that are never reused."""
 
     def __init__(self, settings: TrackerSettings | None = None, image_size: tuple[int, int] | None = None) -> None:
-        """Begin with no tracks.
+        """Create a tracker without tracks.
 
         Args:
-            settings: how tracks are born, moved and dropped.
-            image_size: (width, height) [px]; with it a track ends when it leaves the image.
+            settings: settings of filters and life cycle.
+            image_size: (width, height) [px]; with it, a track ends when it leaves the image.
         """
         self._settings = settings or TrackerSettings()
         self._image_size = image_size
@@ -73,17 +71,17 @@ class Tracker:
 
     @property
     def tracks(self) -> list[Track]:
-        """All tracks as of the last update; confirmed ones first, then by age."""
+        """All tracks after the last update; confirmed ones first, then by age."""
         return sorted((s.track() for s in self._tracks), key=lambda track: (not track.confirmed, track.id))
 
     def update(self, detections: Sequence[Measurement], t: float) -> list[Track]:
-        """Take one frame's detections into account.
+        """Update the tracks with one frame's detections.
 
         Args:
-            detections: what was found, best first. Of more than MOST_DETECTIONS those next to confirmed tracks are
-                taken, then the best.
-            t: when the frame's light fell [s]. A frame that is not newer than the last one tells nothing and is
-                ignored; a clock that jumped back by more than a track lives starts everything anew.
+            detections: detections, best first. Of more than MOST_DETECTIONS, those next to confirmed tracks are used,
+                then the best.
+            t: exposure time of the frame [s]. A frame that is not newer than the last one is ignored; after a clock
+                that jumped back by more than a track lives, tracking restarts.
 
         Returns:
             All tracks at ``t``; confirmed ones first, then by age.
@@ -116,10 +114,10 @@ class Tracker:
         return self.tracks
 
     def _begin(self, t: float) -> None:
-        """Move all tracks to a new frame's time, but for those that a gap between frames has outlived.
+        """Predict all tracks to a frame's time and end those that did not survive a gap between frames.
 
-        The room in which a target is looked for grows with the gap, until whatever appears would be taken for it. The
-        usual time between frames is no such gap, even where a track lives no longer.
+        The search area grows with the gap, until any detection would match. The usual time between frames is no such
+        gap, even for a track that lives no longer.
         """
         usual = statistics.median(self._intervals)
         self._tracks = [state for state in self._tracks if t - state.seen <= state.patience_s + usual]
@@ -130,7 +128,7 @@ class Tracker:
         self._t = t
 
     def _worth(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
-        """The detections to be taken, in their order: no more than MOST_DETECTIONS."""
+        """Select at most MOST_DETECTIONS detections, in their order."""
         if len(detections) <= MOST_DETECTIONS:
             return detections
         distance = np.full(len(detections), np.inf)
@@ -141,7 +139,7 @@ class Tracker:
         return [detections[j] for j in sorted(np.argsort(distance, kind="stable")[:MOST_DETECTIONS].tolist())]
 
     def _bear(self, detections: Sequence[Measurement], t: float) -> None:
-        """Begin a track at each detection that does not cover one."""
+        """Start a track at each detection that does not cover an existing one."""
         if not detections:
             return
         at, size = _boxes_of(self._tracks)
@@ -149,22 +147,22 @@ class Tracker:
         free = np.all(_shared(at, size, center, extent) <= COVERED * _area(size)[:, None], axis=0)
         covers = _shared(center, extent, center, extent) > COVERED * _area(extent)[:, None]
         for j, detection in enumerate(detections):
-            if free[j]:  # whoever covers what is born here is no other
+            if free[j]:  # detections that cover this new track are no further target
                 free &= ~covers[j]
                 self._tracks.append(ImageFilter(self._next_id, detection, t, self._settings, self._image_size))
                 self._next_id += 1
 
 
 class _Pairs:
-    """Every track beside every detection, (tracks, detections): a hundred of each are ten thousand pairs.
+    """Comparison of every track with every detection, as arrays (tracks, detections).
 
     Attributes:
-        distance: squared, of place (Mahalanobis) and of size, in variances; a low score counts as distance too.
-        log_volume: logarithm of the determinant of the innovation's covariance.
-        covered: the part of the track's box that the detection covers, 0 to 1.
+        distance: squared distance of place (Mahalanobis) and of size, in variances, plus the cost of a low score.
+        log_volume: logarithm of the determinant of the innovation covariance.
+        covered: part of the track's box that the detection covers, 0 to 1.
         overlap: intersection over union of the boxes, 0 to 1.
-        confirmed: which tracks are.
-        possible: which detections may be of which track.
+        confirmed: whether each track is confirmed.
+        possible: whether each detection may belong to each track.
     """
 
     def __init__(
@@ -173,7 +171,7 @@ class _Pairs:
         detections: Sequence[Measurement],
         image_size: tuple[int, int] | None,
     ) -> None:
-        """Compare tracks and detections, some of each; without the image's (width, height) [px] none is a newcomer."""
+        """Compare tracks and detections, at least one of each; new objects need the image's (width, height) [px]."""
         self.confirmed = [state.confirmed for state in states]
         (at, size), (center, extent) = _boxes_of(states), _boxes(detections)
         spread = np.array([state.place_variance for state in states])[:, None]
@@ -183,7 +181,7 @@ class _Pairs:
         spread = spread + center_variance(settings, extent, np.where(cut, CUT, settings.noise_of_size)[:, None], lacks)
         own, other = _area(size)[:, None], _area(extent)
         resized = np.log(other / own) / 2 / SIZE_SIGMA
-        # Of what the border cuts there is more, and of a target that it cut nobody knows how much more.
+        # A clipped box may be larger than it shows, and a track last seen clipped is of unknown size.
         known = np.array([[not state.detection.clipped] for state in states])
         resized = np.where(cut, np.where(known, np.maximum(resized, 0.0), 0.0), resized)
         off = (center - at[:, None]) ** 2 / spread
@@ -194,16 +192,16 @@ class _Pairs:
         shared = _shared(at, size, center, extent)
         self.covered: Array = shared / own
         self.overlap: Array = shared / (own + other - shared)
-        # A box that grew into another still overlaps its track.
+        # A target whose box merged with another still overlaps its track.
         near = (self.distance <= GATE_CHI2) & (self.distance + self.log_volume <= _least_likely(states, image_size))
         self.possible = near | (self.overlap > OVERLAP_ENOUGH)
 
 
 def _least_likely(states: Sequence[ImageFilter], image_size: tuple[int, int] | None) -> Array:
-    """The distance and logarithm of volume beyond which a detection is more likely a newcomer, (tracks, 1).
+    """Largest distance plus log volume at which a detection is no new object, (tracks, 1).
 
-    One that was hidden for so long comes back at a rate of about one in as long again, with the density of a normal
-    distribution; newcomers come anywhere. Of a target that the last frame had no such question is asked.
+    A target hidden for some time reappears at a rate of about once in that time, with a normal density; new objects
+    appear anywhere. A track that the last frame detected has no such limit.
     """
     limits = np.full((len(states), 1), np.inf)
     if image_size is not None:
@@ -215,28 +213,28 @@ def _least_likely(states: Sequence[ImageFilter], image_size: tuple[int, int] | N
 
 
 def _boxes_of(states: Sequence[ImageFilter]) -> tuple[Array, Array]:
-    """Middles and sizes of tracks [px], (n, 2) each."""
+    """Centres and sizes of tracks [px], (n, 2) each."""
     at, size = [state.center for state in states], [state.size for state in states]
     return np.array(at).reshape(-1, 2), np.array(size).reshape(-1, 2)
 
 
 def _boxes(detections: Sequence[Measurement]) -> tuple[Array, Array]:
-    """Those of detections."""
+    """Centres and sizes of detections [px], (n, 2) each."""
     center, size = [each.center_px for each in detections], [each.size_px for each in detections]
     return np.array(center).reshape(-1, 2), np.array(size).reshape(-1, 2)
 
 
 def _shared(at: Array, size: Array, center: Array, extent: Array) -> Array:
-    """Area that n boxes share with m others [px^2], (n, m); middles and sizes are (n, 2) and (m, 2)."""
+    """Intersection areas of n boxes with m others [px^2], (n, m); centres and sizes are (n, 2) and (m, 2)."""
     low = np.maximum((at - size / 2)[:, None], center - extent / 2)
     high = np.minimum((at + size / 2)[:, None], center + extent / 2)
     return _area(np.maximum(0.0, high - low))
 
 
 def _belongs(state: ImageFilter, detection: Measurement, image_size: tuple[int, int] | None) -> bool:
-    """Whether a lone detection may be of a lone track, as `_Pairs` says it: mostly in a fifth of the time.
+    """Whether a single detection may belong to a single track; the result of `_Pairs`, mostly in a fifth of the time.
 
-    Where the boxes overlap enough, nothing that speaks against it counts.
+    If the boxes overlap enough, they match whatever their distance is.
     """
     if _overlap(state, detection) > OVERLAP_ENOUGH:
         return True
@@ -254,15 +252,15 @@ def _overlap(state: ImageFilter, detection: Measurement) -> float:
 
 
 def _area(sides: Array) -> Array:
-    """Product of the last axis's two, (..., 2) to (...)."""
+    """Area or product of two sides, (..., 2) to (...)."""
     return np.asarray(sides[..., 0] * sides[..., 1])
 
 
 def _assign(pairs: _Pairs) -> dict[int, int]:
     """Match tracks to detections one to one: {index of the track: index of the detection}.
 
-    Confirmed tracks choose first: one that coasts knows badly where its target is, and a new track that was begun there
-    meanwhile knows it well, yet it is the old target that was found again.
+    Confirmed tracks are matched first: a coasting track knows its target's place badly, and a new track begun there
+    meanwhile knows it well, yet the detection is the old target, found again.
     """
     cost = np.where(pairs.possible, pairs.distance + pairs.log_volume - OVERLAP_BONUS * pairs.overlap, IMPOSSIBLE)
     matches: dict[int, int] = {}
@@ -278,7 +276,7 @@ def _assign(pairs: _Pairs) -> dict[int, int]:
 
 
 def _crowds(pairs: _Pairs, matches: dict[int, int]) -> dict[int, int]:
-    """Find detections that cover two or more confirmed tracks: {index of such a track: the detection}."""
+    """Find detections that cover two or more confirmed tracks: {index of the track: index of the detection}."""
     crowds: dict[int, int] = {}
     if sum(pairs.confirmed) < 2:
         return crowds
