@@ -1,12 +1,10 @@
-"""The wide camera on an Axis video server: a thread that drains its stream and keeps the newest picture.
+"""The fixed camera on an Axis video server, read over HTTP.
 
-A consumer that read the stream itself would fall behind it: what it has not read yet waits in buffers, and grows old.
-
-What a camera needs of an Axis video server: who it is, whether its input has video, and the stream of pictures.
+`AxisCamera` drains the MJPEG stream on its own thread and keeps the newest image. A consumer that read the stream
+itself would fall behind: unread images wait in buffers and grow old. `VideoServer` speaks the server's HTTP interface,
+`WebDevice` any device's HTTP with basic or digest authentication.
 
 Sources: Axis' VAPIX HTTP API, versions 2 and 3, and the manual of the 241Q.
-
-Asks a device over HTTP: basic or digest authentication as it wants, and every failure in one line.
 """
 
 import contextlib
@@ -30,38 +28,38 @@ if TYPE_CHECKING:
     import httpx
 
 
-# Where the password is, if not in rig.toml.
+# Environment variable of the password, where rig.toml has none.
 PASSWORD_VARIABLE = "COTARGET_PASSWORD"
 # Version 2 of the interface keeps the parameters under "view" on some devices.
 PARAMETER_PATHS = ("/axis-cgi/param.cgi", "/axis-cgi/view/param.cgi")
 STATUS_PATH = "/axis-cgi/videostatus.cgi"
 STREAM_PATH = "/axis-cgi/mjpg/video.cgi"
-# A stream without a byte for so long has stalled [s]; or for so many pictures, where they are rare.
+# A stream has stalled after this time without a byte [s], or after this many frame periods where that is longer.
 SILENCE_S, SILENCE_PICTURES = 2.0, 3.0
 
 
 class BusyError(DeviceError):
-    """The server is there, but has no time now."""
+    """The server has no capacity at the moment; try again later."""
 
 
 class RefusedError(DeviceError):
-    """The server has no such stream for us."""
+    """The server refuses this stream."""
 
 
 class LoginError(RefusedError):
-    """The server wants another user or password."""
+    """The server refuses the user or the password."""
 
 
 @dataclass(frozen=True)
 class Identity:
-    """What a server says of itself; empty, and None, where it does not say.
+    """What a video server reports about itself; what it does not report is empty or None.
 
     Attributes:
-        brand: its maker.
-        product: its number, such as "241Q".
-        firmware: version of its firmware.
-        api: version of its HTTP interface.
-        inputs: how many cameras it has.
+        brand: maker.
+        product: product number, such as "241Q".
+        firmware: version of the firmware.
+        api: version of the HTTP interface.
+        inputs: number of camera inputs.
     """
 
     brand: str
@@ -73,24 +71,24 @@ class Identity:
 
 @dataclass(frozen=True)
 class Stream:
-    """A stream under way: the boundary that it announces, and its bytes as they arrive."""
+    """An open stream: the boundary that its header announces, and its bytes as they arrive."""
 
     boundary: str | None
     pieces: Iterator[bytes]
 
 
 class VideoServer:
-    """An Axis video server, or a network camera, which is one with a single input.
+    """An Axis video server; a network camera counts as one with a single input.
 
     Args:
-        config: where it is, and what is wanted of it.
+        config: address, input and image settings of the fixed camera.
 
     Attributes:
-        name: how messages call it.
-        silence_s: a stream without a byte for so long has stalled [s].
+        name: the server's name in messages.
+        silence_s: a stream has stalled after this time without a byte [s].
 
     Raises:
-        ConfigError: the config does not say where it is.
+        ConfigError: the config has no usable address.
         DeviceError: httpx is missing.
     """
 
@@ -104,23 +102,26 @@ class VideoServer:
             raise ConfigError(f"hardware.fixed.url: {error}") from None
 
     def end(self) -> None:
-        """Break off what another thread reads; nothing can be asked from now on."""
+        """Break off a request that another thread reads, and refuse further requests."""
         self._web.end()
 
     def close(self) -> None:
-        """Give up what is held for asking."""
+        """Release the HTTP client."""
         self._web.close()
 
     def identify(self) -> Identity | None:
-        """What the server says of itself; None where it has no parameters to list, or does not show them.
+        """Ask the server for its brand, product, firmware and inputs.
+
+        Returns:
+            None where the server lists no parameters, or not for this user.
 
         Raises:
-            DeviceError: it cannot be reached.
+            DeviceError: the server cannot be reached.
         """
         for path in PARAMETER_PATHS:
             told = self._parameters(path, "root.Brand")
             if told is None:
-                return None  # asking on with a wrong password might lock the user out
+                return None  # repeated wrong passwords may lock the user out
             if told:
                 for group in ("root.Properties", "root.ImageSource"):
                     told |= self._parameters(path, group) or {}
@@ -135,10 +136,10 @@ class VideoServer:
         return None
 
     def has_video(self) -> bool | None:
-        """Whether a camera is connected to the input; None where the server does not say.
+        """Ask whether a camera is connected to the input; None where the server does not say.
 
         Raises:
-            DeviceError: it cannot be reached.
+            DeviceError: the server cannot be reached.
         """
         camera = self._config.camera
         text = self._web.text(STATUS_PATH, {"status": str(camera)}) or ""
@@ -146,10 +147,10 @@ class VideoServer:
         return None if match is None else match[1] is None
 
     def check(self) -> str:
-        """Refuse a server that says that it cannot be the right one; the version of its interface, where it says so.
+        """Refuse a server that reports itself as the wrong one; return the version of its HTTP interface, or "".
 
         Raises:
-            DeviceError: it cannot be reached, or is no Axis, or has no such input or no video there.
+            DeviceError: the server cannot be reached, is no Axis, has no such input, or has no video there.
         """
         identity, camera = self.identify(), self._config.camera
         if identity is not None:
@@ -164,11 +165,11 @@ class VideoServer:
         return "" if identity is None else identity.api
 
     def describe(self) -> str:
-        """Who the server is, in a line.
+        """Describe the server in one line.
 
         Raises:
-            RefusedError: it tells nothing, and has no stream for us either, which says why.
-            DeviceError: it cannot be reached.
+            RefusedError: the server reports nothing about itself and has no stream either; the message says why.
+            DeviceError: the server cannot be reached.
         """
         identity, video = self.identify(), self.has_video()
         if identity is None and video is None:
@@ -183,15 +184,15 @@ class VideoServer:
 
     @contextlib.contextmanager
     def stream(self, api: str = "") -> Iterator[Stream]:
-        """Open the stream of pictures.
+        """Open the image stream for the length of a with block.
 
         Args:
-            api: version of the HTTP interface, as `identify` told it.
+            api: version of the HTTP interface, from `identify`.
 
         Raises:
             BusyError: the server has no place for another viewer now.
-            RefusedError: it has no such stream for us.
-            DeviceError: it cannot be reached, or breaks the stream off; also while it is read.
+            RefusedError: the server has no such stream for this user.
+            DeviceError: the server cannot be reached, or the stream breaks off; also while it is read.
         """
         config = self._config
         rate = f"{max(round(config.rate_hz), 1)}"
@@ -199,7 +200,7 @@ class VideoServer:
         if config.resolution:
             query["resolution"] = config.resolution
         if api.startswith("2"):
-            query["des_fps"] = rate  # what version 2 calls it
+            query["des_fps"] = rate  # the name of fps in version 2
         with self._web.ask(STREAM_PATH, query) as response:
             kind = response.headers.get("content-type", "")
             if response.status_code != 200 or not kind.lower().strip().startswith("multipart/"):
@@ -207,7 +208,7 @@ class VideoServer:
             yield Stream(boundary_of(kind), self._web.pieces(response))
 
     def _parameters(self, path: str, group: str) -> dict[str, str] | None:
-        """Parameters by their names without "root."; none where there are none, None where they are not for us."""
+        """List a group of parameters, names without "root."; {} where there are none, None where access is refused."""
         text = self._web.text(path, {"action": "list", "group": group})
         if text is None:
             return None
@@ -217,7 +218,7 @@ class VideoServer:
         }
 
     def _refusal(self, response: "httpx.Response") -> DeviceError:
-        """Why there is no stream, and what would be right."""
+        """Make the error for a response that is no stream, with what would be right."""
         status, config, name = response.status_code, self._config, self.name
         if status == 401 and not (self._user and self._password):
             missing = f"the environment variable {PASSWORD_VARIABLE}"
@@ -246,7 +247,7 @@ class VideoServer:
 
 
 def _access(config: HardwareFixed) -> tuple[str, str, str]:
-    """The address without a login, the user and the password."""
+    """Split the configured address into URL without login, user and password."""
     if not config.url:
         raise ConfigError("hardware.fixed.url: missing; give the video server's address, such as http://192.168.0.90")
     try:
@@ -259,27 +260,27 @@ def _access(config: HardwareFixed) -> tuple[str, str, str]:
     return f"{parts.scheme}://{host}{parts.path}".rstrip("/"), user, password
 
 
-# --- webdevice ---
+# HTTP access to a device
 
-# On a local network a device that lives takes a connection within milliseconds [s].
+# On a local network a running device accepts a connection within milliseconds [s].
 CONNECT_S = 2.0
-# No text that we ask for is longer [bytes], nor in more pieces, which might come one by one for ever.
+# Limits of a text answer [bytes], [pieces]: a device may send a text without end, byte by byte.
 LONGEST_TEXT, MOST_PIECES = 65536, 64
-# What is quoted of a device's own words [characters].
+# Longest quotation of a device's text in a message [characters].
 LONGEST_QUOTE = 60
 
 
 class WebDevice:
-    """A device that speaks HTTP; a connection lasts as long as a question.
+    """A device that speaks HTTP; every request has its own connection.
 
     Args:
-        url: its address, without user and password; messages call it so.
-        user: empty where there is none.
-        password: never shown.
-        silence_s: a device that has not sent a byte for so long has stopped [s].
+        url: address without user and password; messages use it as the name.
+        user: user name; empty for none.
+        password: never shown in messages.
+        silence_s: a device has stopped sending after this time without a byte [s].
 
     Raises:
-        ConfigError: the address is none.
+        ConfigError: the address is invalid.
         DeviceError: httpx is missing.
     """
 
@@ -287,7 +288,7 @@ class WebDevice:
         self.url = url
         self._user, self._password = user, password
         self._scheme = ""
-        self._asked: socket.socket | None = None  # of the answer that is being read
+        self._asked: socket.socket | None = None  # of the response that is being read
         self._ended = False
         self._lock = threading.Lock()
         self._httpx = _import_httpx()
@@ -295,11 +296,11 @@ class WebDevice:
             self._client: httpx.Client = self._httpx.Client(
                 base_url=url,
                 timeout=self._httpx.Timeout(silence_s, connect=CONNECT_S),
-                # Reading all certificates of the machine takes longer than a connection.
+                # Loading the machine's certificates takes longer than a connection; http needs none.
                 verify=url.startswith("https:"),
-                # Proxies and logins of the environment are not meant for a device.
+                # Proxies and logins of the environment do not apply to a local device.
                 trust_env=False,
-                # A connection that was kept may have died meanwhile; a new one costs a millisecond.
+                # A kept connection may be dead by the next request; a new one costs a millisecond.
                 limits=self._httpx.Limits(max_keepalive_connections=0),
                 headers={"Connection": "close", "Accept-Encoding": "identity", "User-Agent": "cotarget"},
             )
@@ -307,7 +308,7 @@ class WebDevice:
             raise ConfigError(f"'{url}' is not like http://192.168.0.90") from None
 
     def end(self) -> None:
-        """Break off what another thread reads; nothing can be asked from now on."""
+        """Break off a request that another thread reads, and refuse further requests."""
         with self._lock:
             self._ended = True
             if self._asked is not None:
@@ -316,15 +317,15 @@ class WebDevice:
                     self._asked.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """Give up what the client holds."""
+        """Release the HTTP client."""
         self._client.close()
 
     @contextlib.contextmanager
     def ask(self, path: str, query: dict[str, str]) -> Iterator["httpx.Response"]:
-        """Ask, with the authentication that the device wants, and hold its answer while it is read.
+        """Send a GET request, with the authentication that the device demands, and hold the response for a with block.
 
         Raises:
-            DeviceError: it cannot be reached, or does not speak HTTP.
+            DeviceError: the device cannot be reached, or does not speak HTTP.
         """
         response = self._send(path, query)
         if self._challenged(response):
@@ -334,7 +335,7 @@ class WebDevice:
             yield response
 
     def text(self, path: str, query: dict[str, str]) -> str | None:
-        """A short text; empty where the device has none, None where it is not for us.
+        """Request a short text; empty where the device has none, None where access is refused.
 
         Raises:
             DeviceError: as `ask`.
@@ -345,7 +346,7 @@ class WebDevice:
             return self.read(response) if response.status_code == 200 else ""
 
     def read(self, response: "httpx.Response") -> str:
-        """The text of an answer; only its beginning if it is long."""
+        """Read the text of a response, cut at `LONGEST_TEXT` bytes."""
         text = bytearray()
         for piece, _ in zip(self.pieces(response), range(MOST_PIECES), strict=False):
             text += piece
@@ -354,16 +355,16 @@ class WebDevice:
         return text[:LONGEST_TEXT].decode("latin-1")
 
     def pieces(self, response: "httpx.Response") -> Iterator[bytes]:
-        """The bytes of an answer as they arrive.
+        """Yield the bytes of a response as they arrive.
 
         Raises:
-            DeviceError: the device broke it off, or has stopped sending.
+            DeviceError: the device broke off or stopped sending.
         """
         with self._understood():
             yield from response.iter_raw()
 
     def quote(self, text: str) -> str:
-        """A device's own words, fit for a line; it might even send the password back."""
+        """Quote a device's text in one printable line; a password that the device repeats is masked."""
         if self._password:
             text = text.replace(self._password, "***")
         text = " ".join("".join(c if c.isprintable() else " " for c in text).split())
@@ -374,7 +375,7 @@ class WebDevice:
             return self._client.send(self._client.build_request("GET", path, params=query), stream=True)
 
     def _challenged(self, response: "httpx.Response") -> bool:
-        """Whether to ask again because the device wants a kind of authentication that was not tried."""
+        """Choose the authentication that the device demands; return whether to send the request again."""
         if response.status_code != 401 or not self._user:
             return False
         schemes = [line.split(" ")[0].lower() for line in response.headers.get_list("www-authenticate")]
@@ -388,7 +389,7 @@ class WebDevice:
 
     @contextlib.contextmanager
     def _held(self, response: "httpx.Response") -> Iterator[None]:
-        """Let `end` break off this answer."""
+        """Register a response so that `end` can break it off."""
         with self._lock:
             if self._ended:
                 raise DeviceError(f"{self.url} is closed")
@@ -401,9 +402,9 @@ class WebDevice:
 
     @contextlib.contextmanager
     def _understood(self) -> Iterator[None]:
-        """Say in a line what went wrong in httpx."""
+        """Turn httpx's exceptions into a DeviceError of one line."""
         httpx = self._httpx
-        # The last three are what httpx makes of challenges that it does not understand.
+        # httpx raises the last three for authentication challenges that it cannot parse.
         wrong = (httpx.HTTPError, httpx.StreamError, httpx.InvalidURL, LookupError, ValueError, NotImplementedError)
         try:
             yield
@@ -434,30 +435,33 @@ def _import_httpx() -> ModuleType:
     return httpx
 
 
+# The fixed camera
+
 log = logging.getLogger(__name__)
-# How long the first picture may take; a server that is busy is asked again until then [s].
+# Time limit for the first image; a busy server is asked again until then [s].
 OPEN_S = 5.0
-# Before the stream is opened again: after it worked, and at most; after a refusal, which might lock the user out [s].
+# Pauses before the stream is opened again: shortest, after a stream that worked; longest; after a refusal, because
+# repeated logins may lock the user out [s].
 SHORTEST_PAUSE_S, LONGEST_PAUSE_S, REFUSED_PAUSE_S = 0.05, 0.4, 2.0
-# Pictures of a live camera differ by their noise; a stream that repeats one for so long is frozen [s].
+# Images of a live camera differ by their noise; a stream that repeats one image for this time is frozen [s].
 FROZEN_S = 1.0
-# A stream that has been silent for so long is said to have stalled, should somebody ask for a picture [s].
+# Error messages name the stream's silence as the cause from this time without a byte on [s].
 QUIET_S = 0.2
-# A stream that brings bytes, but no whole picture for so many times the silence of a stalled one, is opened anew.
+# A stream that brings bytes but no whole image is opened again after this multiple of `silence_s`.
 FRUITLESS_SILENCES = 2.0
-# The thread ends at once, but for a connection that is just being made, or a server that is slow to answer [s].
+# Time limit for the thread to end [s]; only a connection being made, or a slow server, delays it.
 JOIN_S = 10.0
 
 
 @dataclass(frozen=True)
 class Counters:
-    """What came of a stream.
+    """Frame counts of a stream.
 
     Attributes:
-        frames: new whole pictures.
-        repeated: pictures that were the same, byte for byte, as the one before.
-        broken: pictures that were cut short or could not be decoded; of those that nobody read the latter is not known.
-        reconnects: how often the stream was opened again.
+        frames: new whole images.
+        repeated: images equal, byte for byte, to the one before.
+        broken: images that were cut short or failed to decode; only images that are read are decoded.
+        reconnects: number of times that the stream was opened again.
     """
 
     frames: int = 0
@@ -467,18 +471,18 @@ class Counters:
 
 
 class AxisCamera:
-    """A camera of an Axis video server; close it after use.
+    """The fixed camera on an Axis video server; close it after use.
 
-    A frame's time is that of its first byte's arrival, less the latency of the config. A picture is decoded when it is
-    read: a consumer that is slower than the stream saves the time of the others, and none holds up the stream.
+    A frame's time is the arrival of its first byte, less the configured latency. An image is decoded when it is read: a
+    slow consumer decodes only the images that it uses, and never holds up the stream.
 
     Args:
-        config: where it is, and what is expected of it.
-        clock: the rig's.
+        config: address of the server, and the expected image size, rate and latency.
+        clock: the rig's clock.
 
     Raises:
-        ConfigError: the config does not say where it is, or expects another size.
-        DeviceError: the server cannot be reached, refuses us, or has no pictures.
+        ConfigError: the config has no address, or another image size than the stream.
+        DeviceError: the server cannot be reached, refuses the stream, or sends no images.
     """
 
     def __init__(self, config: HardwareFixed, clock: Clock) -> None:
@@ -488,18 +492,18 @@ class AxisCamera:
         self._closing = threading.Event()
         self._decoder, self._decoding = JpegDecoder(), threading.Lock()
         self._decoded: tuple[JpegPicture, Image] | None = None
-        # All that follows is shared with the thread, and guarded by this.
+        # Guards everything below, which is shared with the thread.
         self._new = threading.Condition()
         self._counters = Counters()
         self._picture: JpegPicture | None = None  # the newest
-        self._last = b""  # its bytes, kept where it could not be decoded too
-        self._fresh = self._heard = clock.now()  # when the newest came, and the last byte
-        self._spoilt = self._frozen = False  # what came since the newest: broken ones, or the same
-        self._trouble = ""  # why there is no stream; empty while there is one
-        self._refused: DeviceError | None = None  # why there never was one
-        self._failed = ""  # why there will be none any more
-        self._asked = False  # whether the server was asked why there are no new ones
-        self._video: bool | None = None  # what it said: whether the input has a signal
+        self._last = b""  # its bytes, kept even if it cannot be decoded
+        self._fresh = self._heard = clock.now()  # arrival of the newest image, and of the last byte
+        self._spoilt = self._frozen = False  # since the newest image: broken ones, repeated ones
+        self._trouble = ""  # why there is no stream; empty while one is open
+        self._refused: DeviceError | None = None  # why no stream could ever be opened
+        self._failed = ""  # why the thread has ended
+        self._asked = False  # whether the server was asked for its video signal since the newest image
+        self._video: bool | None = None  # its answer: whether the input has a signal
         self._thread = threading.Thread(target=self._run, name="axis", daemon=True)
         try:
             self._api = self._server.check()
@@ -516,7 +520,7 @@ class AxisCamera:
 
     @property
     def counters(self) -> Counters:
-        """What came of the stream so far."""
+        """Frame counts of the stream so far."""
         with self._new:
             return self._counters
 
@@ -524,11 +528,11 @@ class AxisCamera:
         """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
 
         Raises:
-            StaleFrameError: no such frame arrived within ``timeout`` [s], and why.
-            DeviceError: the pictures have another size than at the start, the camera is closed, or its driver failed.
+            StaleFrameError: no such frame arrived within ``timeout`` [s]; the message says why.
+            DeviceError: the image size changed, the camera is closed, or its driver failed.
         """
         deadline = self._clock.now() + timeout
-        # What came before a stall is no answer to somebody who wants to see what is.
+        # A frame from before a stall does not show the present scene.
         oldest = deadline - timeout - self._config.latency_s - self._server.silence_s
         after = oldest if newer_than is None else max(oldest, newer_than)
         while True:
@@ -548,7 +552,7 @@ class AxisCamera:
                 return Frame(image, self._time(picture))
 
     def close(self) -> None:
-        """End the stream and the thread; once more does no harm."""
+        """End the stream and the thread; may be called again."""
         self._closing.set()
         self._server.end()
         with self._new:
@@ -576,13 +580,13 @@ class AxisCamera:
         return picture.t - self._config.latency_s
 
     def _ready(self, after: float) -> bool:
-        """Whether there is something to tell: a picture from after then, one of another size, or the end."""
+        """Return whether `read` can return or raise: a newer image, one of another size, a failure, or the end."""
         picture = self._picture
         told = picture is not None and (self._time(picture) > after or picture.size != self.size)
         return told or bool(self._failed) or self._closing.is_set()
 
     def _decode(self, picture: JpegPicture) -> Image | None:
-        """The picture's image, read-only; None, and counted, if it has none."""
+        """Decode an image, read-only; None if it is damaged, which is counted."""
         with self._decoding:
             if self._decoded is not None and self._decoded[0] is picture:
                 return self._decoded[1]
@@ -601,7 +605,7 @@ class AxisCamera:
         return f"{self._server.name} now sends {now} where it sent {was}: set its resolution back, or open it anew"
 
     def _why(self, timeout: float) -> str:
-        """Why there is no newer picture."""
+        """Explain why there is no newer image."""
         now, name = self._clock.now(), self._server.name
         if self._trouble:
             reason = f"{self._trouble}; reconnecting"
@@ -617,10 +621,10 @@ class AxisCamera:
         return f"no new picture for {now - self._fresh:.1f} s: {reason}{video}"
 
     def _run(self) -> None:
-        """What the thread does."""
+        """Run the thread."""
         try:
             self._keep_open()
-        except Exception as error:  # a thread must not die in silence
+        except Exception as error:  # readers must learn that the thread has ended
             log.debug("the driver of the fixed camera failed", exc_info=True)
             with self._new:
                 self._failed = f"the driver of the fixed camera failed: {error!r}"
@@ -628,7 +632,7 @@ class AxisCamera:
                 self._new.notify_all()
 
     def _keep_open(self) -> None:
-        """Keep a stream open until the end."""
+        """Open the stream, and open it again whenever it ends, until the camera is closed."""
         pause = 0.0
         while not self._closing.wait(pause):
             frames = self._counters.frames
@@ -647,7 +651,7 @@ class AxisCamera:
                 self._ask_for_video()
 
     def _stream(self) -> tuple[DeviceError, bool]:
-        """Open the stream and take its pictures until it ends; why it did, and whether it was open."""
+        """Open the stream and take its images until it ends; return why it ended, and whether it was open."""
         opened = False
         try:
             with self._server.stream(self._api) as stream:
@@ -674,13 +678,14 @@ class AxisCamera:
                 if now - fruitful > FRUITLESS_SILENCES * self._server.silence_s:
                     raise DeviceError(f"{self._server.name} sends no whole pictures")
                 if frozen and not self._asked:
-                    # Asked while this stream is not drained, the time of the next picture would be wrong.
+                    # The server is asked for its signal after this stream is closed: a stream that is not drained
+                    # meanwhile would give the next image a wrong time.
                     raise DeviceError(f"{self._server.name} repeats the same picture")
         finally:
             self._take([], reader.broken - broken + reader.unfinished, None)
 
     def _take(self, pictures: list[JpegPicture], broken: int, now: float | None) -> bool:
-        """Note what came; whether the pictures have been the same for too long."""
+        """Record images and broken ones; return whether the stream is frozen."""
         with self._new:
             self._heard = self._heard if now is None else now
             counters = replace(self._counters, broken=self._counters.broken + broken)
@@ -700,18 +705,18 @@ class AxisCamera:
 
     def _ask_for_video(self) -> None:
         video = None
-        with contextlib.suppress(DeviceError):  # it is just one more thing that fails
+        with contextlib.suppress(DeviceError):  # the stream's own error is reported already
             video = self._server.has_video()
         with self._new:
             self._asked, self._video = True, video
 
 
 def probe(config: HardwareFixed) -> str:
-    """Say in a line who the video server is, by harmless questions.
+    """Describe the video server in one line, by queries that change nothing.
 
     Raises:
-        ConfigError: the config does not say where it is.
-        DeviceError: it cannot be reached, or tells nothing.
+        ConfigError: the config has no address.
+        DeviceError: the server cannot be reached, or reports nothing.
     """
     with contextlib.closing(VideoServer(config)) as server:
         return server.describe()
