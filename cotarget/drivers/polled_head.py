@@ -1,13 +1,9 @@
 """The pan-tilt unit PTU-D46 behind the Rig's `PanTilt` Protocol.
 
-What the thread that owns the line to a PTU-D46 does: it polls positions all the time, and sends what is wished.
-
-One turn is one exchange, or the few of one move. Other threads only append wishes to queues and read the newest
-snapshot: no locks, so that a signal handler may halt the head whatever it interrupted.
-
-Where the axes of a PTU-D46 are, from polls one after the other, and whether they turn.
-
-What other threads wish of the one that owns the line to a PTU-D46, and what became of it.
+`D46Head` is the head that the pipeline sees. A thread of its own runs `Loop`, the only user of the serial line: it
+polls both axes all the time and sends the commands of other threads. One turn of the loop is one exchange with the
+unit, or the few exchanges of one move. Other threads only append requests to queues and read the newest `Snapshot`,
+without locks, so that a signal handler may halt the head whatever code it interrupted.
 """
 
 import atexit
@@ -49,13 +45,22 @@ from cotarget.drivers.ptu_protocol import (
 from cotarget.errors import ConfigError, DeviceError, HaltedError
 from cotarget.rig import Clock, PanTiltLimits, PanTiltState, Speed
 
+# Axis positions from polls
+
 # An axis stands when it has stayed at one step for longer than the slowest speed, 31 steps/s, takes for a step [s].
 STILL_S = 0.035
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Where the axes were at one time [steps, s]; between two polls of an axis it is taken to turn evenly."""
+    """Positions of both axes at one time, interpolated between polls.
+
+    Attributes:
+        pan: position [steps].
+        tilt: position [steps].
+        moving: whether a move is under way or an axis has not stood for long enough.
+        t: time of the positions [s].
+    """
 
     pan: float
     tilt: float
@@ -64,23 +69,23 @@ class Snapshot:
 
 
 class AxisTrack:
-    """What is known of one axis from polls and orders."""
+    """Position, goal and rest of one axis, from its polls and commands."""
 
     def __init__(self, name: AxisName, facts: AxisFacts) -> None:
         self.name, self.facts = name, facts
         self.polls: deque[tuple[float, int]] = deque(maxlen=2)
-        self.goal: int | None = None  # as last ordered, None after a halt
-        self.speed: int | None = None  # the same
+        self.goal: int | None = None  # of the last command [steps]; None after a halt
+        self.speed: int | None = None  # of the last command [steps/s]
         self._valid = -float("inf")
         self._since: float | None = None
 
     @property
     def position(self) -> int:
-        """The newest [steps]."""
+        """Position of the newest poll [steps]."""
         return self.polls[-1][1]
 
     def add(self, t: float, position: int) -> None:
-        """Take a poll into account."""
+        """Add a poll: the position [steps] at ``t`` [s]."""
         if t < self._valid:
             self._since = None
         elif self._since is None or position != self.position:
@@ -88,46 +93,46 @@ class AxisTrack:
         self.polls.append((t, position))
 
     def expect_motion(self, t: float) -> None:
-        """Count it as turning, until polls after ``t`` [s] show that it stands."""
+        """Count the axis as moving, until polls after ``t`` [s] show that it stands."""
         self._valid, self._since = t, None
 
     def stands(self) -> bool:
-        """Whether it has stayed at one step for long enough."""
+        """Return whether the axis has stayed at one step for `STILL_S`."""
         return self._since is not None and self.polls[-1][0] - self._since >= STILL_S
 
     def at(self, t: float) -> float:
-        """Position at a time between the last two polls [steps]."""
+        """Interpolate the position [steps] at a time [s] between the last two polls."""
         (t0, x0), (t1, x1) = self.polls[0], self.polls[-1]
         share = (t - t0) / (t1 - t0) if t1 > t0 else 1.0
         return x0 + (x1 - x0) * min(max(share, 0.0), 1.0)
 
 
-# --- d46wishes ---
+# Requests of other threads
 
 Request = TypeVar("Request")
 
 
 class DroppedError(HaltedError):
-    """A move did not come to its end because of another wish."""
+    """A move ended early because of a halt, a newer move, or the end of the driver."""
 
 
 class CutError(DeviceError):
-    """A move did not come to its end because the line was silent, so that the head was halted."""
+    """A move ended early because the line was silent and the head was halted."""
 
 
 @dataclass(eq=False)
 class Move:
-    """A wish to go somewhere.
+    """A request to move both axes.
 
     Attributes:
-        number: counts wishes; a move older than a halt is not sent any more.
+        number: sequence number of the request; a move numbered before a halt is not sent any more.
         goals: of pan and tilt [steps].
         speeds: of pan and tilt [steps/s].
-        wait: whether somebody waits for its end, and is told the error.
-        deadline: when it should have arrived [s], once it is sent.
-        cuts: how often it was set out on anew after the line was silent.
-        error: why it did not arrive.
-        done: set when the head has arrived, or never will.
+        wait: whether the caller waits for the end, and so receives the error.
+        deadline: time by which the head should have arrived [s]; None until the move is sent.
+        cuts: how often the move was sent again after the line was silent.
+        error: why the head did not arrive.
+        done: set when the head has arrived, or will not.
     """
 
     number: int
@@ -140,18 +145,18 @@ class Move:
     done: threading.Event = field(default_factory=threading.Event)
 
     def finish(self, error: DeviceError | None = None) -> None:
-        """Tell whoever waits."""
+        """End the move and wake the caller that waits."""
         self.error = error
         self.done.set()
 
 
 @dataclass(eq=False)
 class Halt:
-    """A wish to stop.
+    """A request to stop both axes.
 
     Attributes:
-        number: counts wishes, as a move's does.
-        answered: whether the unit has said that it stops.
+        number: sequence number of the request, shared with moves.
+        answered: whether the unit acknowledged the halt.
         done: set when it has, or will not.
     """
 
@@ -161,44 +166,44 @@ class Halt:
 
 
 def drained(queue: deque[Request]) -> list[Request]:
-    """Take all wishes out of a queue that others go on filling."""
+    """Take all requests out of a queue that other threads go on filling."""
     return [queue.popleft() for _ in range(len(queue))]
 
 
-# --- d46loop ---
+# The thread that owns the line
 
 log = logging.getLogger(__name__)
 Meaning = TypeVar("Meaning")
-TRIES = 3  # of one exchange, each but the first after getting back in step
-PATIENCE_S = 2.0  # for a move, beyond its way and its run-up [s]
-LOOP_HALT_S = 0.3  # for the answer to a halt, beyond the time to brake: some units may answer when they stand
+TRIES = 3  # of one exchange; the line is synchronised again before each but the first
+PATIENCE_S = 2.0  # for a move, beyond its travel and its acceleration [s]
+LOOP_HALT_S = 0.3  # for the answer to a halt, beyond the time to brake: a unit may answer only when it stands [s]
 
 
 class Loop:
-    """The owner of the line.
+    """Poll the unit and send requests; the only user of the serial line.
 
     Args:
-        line: to a unit that was made ready.
-        unit: what it said about itself.
-        clock: the rig's.
-        delay: from an order to the start of motion [s].
+        line: to a unit that `connect` has made ready.
+        unit: what the unit reported about itself.
+        clock: the rig's clock.
+        delay: time from a command to the start of motion [s].
 
     Attributes:
-        moves: wishes to go somewhere; the newest wins.
-        halts: wishes to stop; they come first.
-        halted: the number of the newest wish to stop that was taken out of the queue.
-        closing: set when no more wishes will come.
-        braking_s: the time that a halt can take [s].
-        rests: whether the unit has acknowledged the last halt, after which nothing is sent any more.
-        errors: what nobody was told yet.
-        snapshot: the newest.
+        moves: requests to move; the newest wins.
+        halts: requests to stop; they come before moves.
+        halted: number of the newest halt that was taken out of the queue.
+        closing: set when no more requests will come.
+        braking_s: longest time to stop the axes [s].
+        rests: whether the unit acknowledged the last halt, after which nothing more is sent.
+        errors: failure of a move without a waiting caller; the next call raises it.
+        snapshot: the newest positions.
     """
 
     def __init__(self, line: Line, unit: UnitInfo, clock: Clock, delay: float) -> None:
         self._line, self._clock, self._delay = line, clock, delay
         self._tracks = (AxisTrack("P", unit.pan), AxisTrack("T", unit.tilt))
         self._next = 0  # the axis to poll
-        self._polled = True  # since the last move, so that moves in quick succession leave the line to polls too
+        self._polled = True  # since the last move: moves in quick succession must not displace the polls
         self._active: Move | None = None
         self.moves: deque[Move] = deque()
         self.halts: deque[Halt] = deque()
@@ -213,10 +218,10 @@ class Loop:
         line.hurry = lambda: self.closing or bool(self.halts)
 
     def turn(self) -> None:
-        """Do the next thing.
+        """Do the most urgent exchange: a halt, then a move, then a poll.
 
         Raises:
-            PositionLostError: nobody knows where the head is.
+            PositionLostError: the head's position may be lost.
             DeviceError: the head cannot be used any more.
         """
         try:
@@ -235,7 +240,7 @@ class Loop:
         refuse_events(self._line)
 
     def stop_for_good(self, reason: DeviceError) -> None:
-        """Halt a last time, as well as can be, and tell everybody who waits."""
+        """Halt the head a last time, and end all requests with an error."""
         self.closing = True
         if not isinstance(reason, LostError):
             self._halt_at_last(LOOP_HALT_S if isinstance(reason, SilentError) else LOOP_HALT_S + self.braking_s)
@@ -245,7 +250,7 @@ class Loop:
             halt.done.set()
 
     def _halt_at_last(self, patience: float) -> None:
-        # A unit that was switched off and on echoes again, and stale answers may come first.
+        # A unit that was switched off and on echoes commands again, and late answers may come first.
         try:
             halt_outright(self._line, patience)
             self.rests = True
@@ -254,7 +259,7 @@ class Loop:
 
     def _halt(self) -> None:
         requests = drained(self.halts)
-        # Threads that halt at once may get here in another order than they were numbered in.
+        # Threads that halt at the same time may queue their requests out of order.
         self.halted = max([self.halted, *(request.number for request in requests)])
         try:
             self._abandon(DroppedError("the move was halted"))
@@ -266,7 +271,7 @@ class Loop:
                 request.done.set()
 
     def _stop(self) -> None:
-        """Order the halt and wait for the answer."""
+        """Send the halt and wait for its answer."""
         for track in self._tracks:
             track.goal = None
         for left in reversed(range(HALT_TRIES)):
@@ -279,7 +284,7 @@ class Loop:
         self._expect_motion()
 
     def _move(self) -> None:
-        # A snapshot that says moving must be there before the wish leaves the queue: see D46Head.state.
+        # The snapshot must say moving before the request leaves the queue: D46Head.state reads both.
         self.snapshot = Snapshot(self.snapshot.pan, self.snapshot.tilt, True, self.snapshot.t)
         requests = drained(self.moves)
         fresh = [request for request in requests if request.number > self.halted]
@@ -320,7 +325,7 @@ class Loop:
         self._exchange(command(name, value), ptu_protocol.done, self._other_request)
 
     def _other_request(self) -> str:
-        """Why the move under way is not to be sent any further; empty if there is no reason."""
+        """Return why the move under way must not be sent any further; empty if it may."""
         if self.halts or self.closing or self._line.events:
             return "the move was halted"
         return "another move took this one's place" if self.moves else ""
@@ -348,7 +353,7 @@ class Loop:
             try:
                 position, t = self._exchange(command(track.name + "P"), ptu_protocol.bare_integer)
                 break
-            except RefusedError:  # the question itself may have been garbled on its way
+            except RefusedError:  # the query itself may have been garbled on its way
                 if attempt == TRIES - 1:
                     raise
         track.add(t, position)
@@ -361,7 +366,13 @@ class Loop:
         unless: Callable[[], str] = lambda: "",
         patience: float = QUICK_S,
     ) -> tuple[Meaning, float]:
-        """Ask or order, and once more after getting back in step, unless there is a reason not to."""
+        """Send one command and read its answer; repeat after an error.
+
+        Each repetition comes after the line is synchronised, unless ``unless`` returns a reason to stop.
+
+        Returns:
+            The answer's meaning, and its time [s].
+        """
         for attempt in range(TRIES):
             try:
                 answer = self._line.ask(order, patience)
@@ -380,7 +391,7 @@ class Loop:
         raise AssertionError("unreachable")
 
     def _give_up(self, move: Move, error: DeviceError) -> None:
-        """Halt a move that failed, and tell whoever waits for it or asks next."""
+        """Halt a move that failed; its waiting caller, or the next call of the head, gets the error."""
         self._active = None
         self._stop()
         if not move.wait:
@@ -388,13 +399,13 @@ class Loop:
         move.finish(error)
 
     def _abandon(self, reason: DroppedError) -> None:
-        """Forget the move under way because of another wish; only who waits for it is told."""
+        """End the move under way because of another request; only a waiting caller gets the error."""
         if self._active is not None:
             self._active.finish(reason)
             self._active = None
 
     def _take_up_again(self, cut: CutError) -> None:
-        """Set out anew on a move that somebody waits for; who does not wait sends another, or looks at the state."""
+        """Queue a cut move again if its caller waits for it; other callers send a new move or read the state."""
         move, self._active = self._active, None
         assert move is not None
         if not move.wait or move.cuts == TRIES:
@@ -402,10 +413,10 @@ class Loop:
             return
         move.cuts += 1
         move.deadline = None
-        self.moves.appendleft(move)  # behind it may be a newer one, which takes its place, or a halt before it
+        self.moves.appendleft(move)  # a newer move in the queue replaces it, a halt drops it
 
     def _late(self, move: Move, deadline: float) -> bool:
-        """Whether an axis was seen elsewhere than at its goal after the deadline; this thread may be late itself."""
+        """Return whether a poll after the deadline shows an axis off its goal; a late thread alone does not count."""
         tracks = zip(self._tracks, move.goals, strict=True)
         seen = min(track.polls[-1][0] for track in self._tracks)
         return seen > deadline and any(track.position != goal for track, goal in tracks)
@@ -423,36 +434,37 @@ class Loop:
         return all(track.stands() for track in self._tracks)
 
     def _look(self) -> Snapshot:
-        """Both axes at the time of the older one's newest poll."""
+        """Make a snapshot of both axes at the older one of their newest polls."""
         pan, tilt = self._tracks
         t = min(pan.polls[-1][0], tilt.polls[-1][0])
         return Snapshot(pan.at(t), tilt.at(t), self._active is not None or not self._stand(), t)
 
 
-STANDS_S = 5.0  # for a head that turned when it was opened to stand after the halt
-HALT_S = 1.0  # for a halt to be acknowledged, beyond braking, with a line that has to be got back in step first
-CLOSE_S = 5.0  # for the thread to end
-LOOK_S = 0.2  # how often somebody who waits for a move looks whether the thread still lives
+# The head
+
+STANDS_S = 5.0  # time limit for a head that turned when it was opened to stand after the halt [s]
+HALT_S = 1.0  # time limit for the answer to a halt, beyond braking; synchronising the line may come first [s]
+CLOSE_S = 5.0  # time limit for the thread to end [s]
+LOOK_S = 0.2  # a caller that waits for a move checks with this period whether the thread still runs [s]
 NOTHING_SAID = SafetyConfig()
-ROUNDING = 1e-9  # of a speed that is a whole number of steps but for the conversion from degrees
+ROUNDING = 1e-9  # relative; keeps a speed of whole steps/s from being rounded down after its conversion from degrees
 
 
 class D46Head:
-    """A PTU-D46, opened, compared with the configuration, and standing.
+    """A PTU-D46 that is open, checked against the configuration, and standing.
 
-    A thread of its own owns the line: it polls the positions all the time and sends commands as they come. What goes
-    wrong there is raised by the next call of any method, and for good if the position may be lost: then no program
-    opens the head any more until it was reset. Nothing here resets the unit.
+    A thread polls the positions and sends commands. The next call of any method raises an error that occurred there. If
+    the position may be lost, the error is permanent: a marker file keeps every program from opening the head until
+    `cotarget reset-head`. Nothing here resets the unit.
 
     Args:
-        config: where the unit is, and what it is expected to say.
-        clock: the rig's.
-        safety: a speed cap that the unit must be able to keep, and a stop file, beside which is remembered that the
-            position is lost.
+        config: port, baud rate, limits, step and signs that the unit must report.
+        clock: the rig's clock.
+        safety: speed cap, which the unit must be able to keep, and stop file, beside which the marker file lies.
 
     Raises:
-        ConfigError: the unit is another than the configuration says.
-        DeviceError: there is no unit, or none that can be used as it is.
+        ConfigError: the unit differs from the configuration.
+        DeviceError: there is no unit, or it cannot be used in its state.
     """
 
     def __init__(self, config: HardwareHead, clock: Clock, safety: SafetyConfig = NOTHING_SAID) -> None:
@@ -479,21 +491,21 @@ class D46Head:
             raise
         self._thread = threading.Thread(target=self._run, name=f"PTU-D46 at {config.port}", daemon=True)
         self._thread.start()
-        atexit.register(self.close)  # a program that ends without closing it must not leave it turning
+        atexit.register(self.close)  # a program that ends without closing the head must not leave it turning
 
     @property
     def limits(self) -> PanTiltLimits:
-        """What the unit can do, by its own account; its speed is at most the configured one."""
+        """Limits that the unit reports; the speed is at most the configured one."""
         return self._limits
 
     def state(self) -> PanTiltState:
-        """Where the head was when it was last polled; at once.
+        """Return the positions of the last poll, at once.
 
         Raises:
-            DeviceError: something went wrong since the last call, or the line is dead.
+            DeviceError: an error occurred since the last call, or the line is dead.
         """
         self._raise_what_happened()
-        # In this order: the loop says that it moves before it takes a wish out of the queue.
+        # In this order: the loop sets the snapshot to moving before it takes a request out of the queue.
         waiting = bool(self._loop.moves)
         seen = self._loop.snapshot
         pan, tilt = self._angles(seen.pan, seen.tilt)
@@ -505,15 +517,15 @@ class D46Head:
         Args:
             pan: angle [rad].
             tilt: angle [rad].
-            speed: of both axes or of each [rad/s]; the configured one unless given, and never above that. The unit
-                takes it in whole steps a second, rounded down, and turns no slower than it can.
-            wait: return only when the head stands there.
+            speed: of both axes or of each [rad/s]; by default, and at most, the configured one. The unit takes whole
+                steps/s, rounded down, and has a lowest speed.
+            wait: return only when the head stands at the goal.
 
         Returns:
-            What was commanded after clipping to the limits and rounding to steps [rad].
+            The commanded angles after clipping to the limits and rounding to steps [rad].
 
         Raises:
-            DeviceError: a value is no number, the head did not arrive, or something went wrong since the last call.
+            DeviceError: an angle is not finite, the head did not arrive, or an error occurred since the last call.
         """
         number = next(self._numbers)
         self._raise_what_happened()
@@ -532,13 +544,13 @@ class D46Head:
         return self._angles(a, b)
 
     def halt(self) -> None:
-        """Stop at once, before anything else; return when the unit has acknowledged it.
+        """Stop both axes before anything else is sent; return when the unit has acknowledged it.
 
-        May be called from any thread and from a signal handler, as often as one likes. A move that somebody is about
-        to command at that moment is not sent any more.
+        May be called from any thread and from a signal handler, any number of times. A move that another thread
+        commands at the same moment is not sent any more.
 
         Raises:
-            DeviceError: the unit did not acknowledge it.
+            DeviceError: the unit did not acknowledge the halt.
         """
         if self._closed:
             return
@@ -555,7 +567,7 @@ class D46Head:
         raise DeviceError(f"the pan-tilt unit at {self._line.name} did not acknowledge a halt: it does not answer")
 
     def close(self) -> None:
-        """Halt, end the thread and release the port; nothing is raised, and a second time does nothing."""
+        """Halt, end the thread and release the port; never raises, and may be called again."""
         if self._closed:
             return
         self._closed = self._loop.closing = True
@@ -572,20 +584,20 @@ class D46Head:
                 self._loop.turn()
         except DeviceError as error:
             reason = error
-        except Exception as error:  # a mistake in the driver must not leave the head turning
+        except Exception as error:  # a bug in the driver must not leave the head turning
             log.debug("the driver of the pan-tilt unit failed", exc_info=True)
             reason = DeviceError(f"the driver of the pan-tilt unit failed: {error!r}")
         self._dead = reason
         self._loop.stop_for_good(reason)
-        self._remember(reason)  # after the halt: a disk that hangs must not keep the head from that
+        self._remember(reason)  # after the halt: a hanging disk must not delay it
 
     def _remember(self, error: BaseException) -> None:
-        """Let no program move the head before it was reset, if its position may be lost."""
+        """Write the marker file if the position may be lost; then no program opens the head before its reset."""
         if isinstance(error, PositionLostError):
             self._lost.note(str(error))
 
     def _angles(self, pan: float, tilt: float) -> tuple[float, float]:
-        """The unit's steps as angles [rad]."""
+        """Convert steps of the unit to angles [rad]."""
         return self._signs[0] * pan * self.unit.pan.step, self._signs[1] * tilt * self.unit.tilt.step
 
     def _raise_what_happened(self) -> None:
@@ -613,7 +625,7 @@ class D46Head:
 
 
 def _limits(unit: UnitInfo, config: HardwareHead) -> PanTiltLimits:
-    """What the unit can do, in the sense of rig.toml."""
+    """Convert the unit's limits to radians with the signs of rig.toml."""
     (pan, tilt), step = (unit.pan, unit.tilt), unit.pan.step
     return PanTiltLimits(
         pan=_radians(pan.degrees(config.pan_sign)),
@@ -629,15 +641,15 @@ def _radians(degrees: tuple[float, float]) -> tuple[float, float]:
 
 
 def _steps(speed: float, axis: AxisFacts) -> int:
-    """A speed [rad/s] as the unit's own number [steps/s], rounded down, within its bounds."""
+    """Convert a speed [rad/s] to steps/s, rounded down, within the axis' bounds."""
     return min(max(math.floor(speed / axis.step * (1 + ROUNDING)), axis.slowest, 1), axis.fastest)
 
 
 def _refuse_too_slow(key: str, cap_deg_s: float | None, unit: UnitInfo, port: str) -> None:
-    """Refuse a cap that the unit cannot keep.
+    """Refuse a speed cap below the unit's lowest speed.
 
     Raises:
-        ConfigError: with what it can.
+        ConfigError: the cap is too low; the message names the lowest speed.
     """
     slowest = max(max(axis.slowest, 1) * math.degrees(axis.step) for axis in (unit.pan, unit.tilt))
     if cap_deg_s is not None and cap_deg_s * (1 + ROUNDING) < slowest:
