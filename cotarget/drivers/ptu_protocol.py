@@ -1,13 +1,12 @@
-"""The PTU-D46's ASCII protocol: commands as bytes, and what the unit's answers mean. No I/O and no time.
+"""The PTU-D46's serial protocol: commands, answers and the line.
 
-Sources: Directed Perception's PTU-D46 manual 2.14.0 (2006) and Command Reference Manual 3.00D (2008). Answers are read
-leniently, because firmware versions differ in wording, but a line that may have been garbled is refused.
+The first part turns commands into bytes and answers into values, without I/O or time. `Line` exchanges one command at a
+time, with deadlines, and synchronises again after an error. An error of pyserial or of the operating system becomes a
+one-line DeviceError that names the port.
 
-The serial line to a PTU-D46: one command in flight, deadlines, and a way back in step when something went wrong.
+Answers are read leniently, because firmware versions differ in wording, but a line that may be garbled is refused.
 
-What pyserial and the operating system raise becomes a one-line DeviceError that names the port.
-
-What goes wrong with a line to a PTU-D46, but for answers that are no good.
+Sources: Directed Perception's PTU-D46 manual 2.14.0 (2006) and Command Reference Manual 3.00D (2008).
 """
 
 import contextlib
@@ -21,11 +20,11 @@ from cotarget.drivers.serial_line import Port, open_port
 from cotarget.errors import DeviceError
 from cotarget.rig import Clock
 
-NO_DATA = "returned no data"  # pyserial, of a port that has gone
+NO_DATA = "returned no data"  # pyserial's text for a port that has disappeared
 
 
 class SilentError(DeviceError):
-    """No answer came in time."""
+    """The unit did not answer in time."""
 
 
 class LostError(DeviceError):
@@ -37,7 +36,7 @@ class LostError(DeviceError):
 
 
 class RestartedError(DeviceError):
-    """The unit was switched off and on, and has forgotten where it is."""
+    """The unit was switched off and on; its position may be lost."""
 
     def __init__(self, name: str) -> None:
         super().__init__(
@@ -45,26 +44,27 @@ class RestartedError(DeviceError):
         )
 
 
-# After a command. A carriage return would do too, but makes some units put a line feed before the answer.
+# Ends a command. A carriage return would too, but makes some units send a line feed before the answer.
 DELIMITER = b" "
 HALT = b"H "
-ARCSECONDS = 3600.0  # a degree
-# Longer lines than the longest answer by far are another device's [bytes].
+ARCSECONDS = 3600.0  # in a degree
+# A longer line comes from another device; the longest answer is far shorter [bytes].
 LONGEST_LINE = 4096
-SHOWN = 40  # so much of a strange line is quoted in an error [characters]
-# Told at any time, even inside of another answer: a pan or tilt limit was hit, the cable was pulled.
-# Errors too begin with an exclamation mark, but go on with a space or, to be safe, with a small letter.
+SHOWN = 40  # longest quotation of an invalid line in an error [characters]
+# Events may come at any time, even inside of another answer: a pan or tilt limit was hit, the cable was pulled.
+# Errors also begin with an exclamation mark, followed by a space or, as a precaution, a small letter.
 EVENT = re.compile(rb"!([PTD])(?![a-z])")
 EVENT_INSIDE = re.compile(rb"!([PTD])")
 PLAIN = re.compile(rb"[\x20-\x7e\t]*")
-# Numbers stand by themselves: digits that something is glued to were garbled. Nine digits are enough for any.
+# Numbers stand alone: digits next to other characters were garbled. No number has more than nine digits.
 INTEGER = re.compile(r"(?<!\S)[-+]?[0-9]{1,9}(?=[.,;]?(?:\s|$))")
 DECIMAL = re.compile(r"(?<!\S)[0-9]{1,9}(?:\.[0-9]{1,9})?(?=[.,;]?(?:\s|$))")
-# Words that tell modes, whatever stands around them.
+# Words that name a mode; the text around them differs between firmware versions.
 ECHO_ON, ECHO_OFF = (re.compile(rf"echo.*\b{word}\b", re.IGNORECASE) for word in ("on", "off"))
 TERSE, VERBOSE = re.compile("terse", re.IGNORECASE), re.compile("verbose", re.IGNORECASE)
 INDEPENDENT, VELOCITY = re.compile("indep", re.IGNORECASE), re.compile("veloc", re.IGNORECASE)
-# What a unit says when it is switched on, before it calibrates itself; its answer to V has a star and a space before.
+# The banner of a unit that is switched on, before it calibrates itself. The answer to V, a star before the same
+# words, is no banner.
 BANNER = re.compile(rb"^(?!\s*\*\s).*pan[- ]?tilt", re.IGNORECASE | re.MULTILINE)
 AxisName = Literal["P", "T"]
 AXES: tuple[AxisName, AxisName] = ("P", "T")
@@ -73,7 +73,7 @@ EVENT_WORDS = {"P": "pan hit its limit (!P)", "T": "tilt hit its limit (!T)", "D
 
 
 class ReplyError(DeviceError):
-    """What came back is no answer of a PTU-D46 to what was asked."""
+    """What arrived is no answer of a PTU-D46 to the command."""
 
 
 class RefusedError(DeviceError):
@@ -82,12 +82,12 @@ class RefusedError(DeviceError):
 
 @dataclass(frozen=True)
 class Reply:
-    """One line of the unit's.
+    """One line from the unit, parsed.
 
     Attributes:
-        text: what it says after the ``*`` or ``!``.
-        refused: whether it is an error.
-        echo: what stands before, the command itself where the unit echoes.
+        text: text after the ``*`` or ``!``.
+        refused: whether the line is an error.
+        echo: text before the mark: the command, where the unit echoes.
     """
 
     text: str
@@ -96,29 +96,29 @@ class Reply:
 
 
 def command(name: str, value: int | None = None) -> bytes:
-    """The bytes of a command, such as ``PP-120``; without a value it is a query or an order."""
+    """Encode a command, such as ``PP-120``; without a value it is a query or an order."""
     return f"{name}{'' if value is None else value}".encode("ascii") + DELIMITER
 
 
 def shown(data: bytes) -> str:
-    """Bytes as a short quotation for an error message of one line."""
+    """Quote bytes in at most `SHOWN` characters, for an error message of one line."""
     text = ascii(data.strip())[2:-1]
     return f"'{text}'" if len(text) <= SHOWN else f"'{text[:SHOWN]}...'"
 
 
 def split_events(data: bytes) -> tuple[bytes, tuple[str, ...]]:
-    """Take what the unit told in between out of its bytes: the rest, and "P", "T" or "D" of each in order."""
+    """Separate events from other bytes; return those bytes, and "P", "T" or "D" for each event in order."""
     start = EVENT.sub(b"", data).lstrip()
-    # An answer that is no error has no other exclamation marks: there even "!Pos" is an event in front of "os".
+    # An answer that is no error contains no other exclamation marks: in it even "!Pos" is the event "!P" before "os".
     pattern = EVENT if start.startswith(b"!") or b"*" not in start else EVENT_INSIDE
     return pattern.sub(b"", data), tuple(found.decode("ascii") for found in pattern.findall(data))
 
 
 def parse(line: bytes) -> Reply | None:
-    """Read one line whose events are taken out; None if nothing is left of it.
+    """Parse one line without events; None if it is empty.
 
     Raises:
-        ReplyError: it is no answer.
+        ReplyError: the line is no answer of a PTU-D46.
     """
     line = line.strip(b"\r\n\t \0")
     if not line:
@@ -135,21 +135,21 @@ def parse(line: bytes) -> Reply | None:
 
 
 def integer(text: str) -> int:
-    """The number that an answer tells: the first integer after " is ", or the first of a terse answer.
+    """Parse the number in an answer: the first integer after " is ", or the first of a terse answer.
 
-    Never the last one of the line, which may be the 2 of "positions/sec^2".
+    Never the last integer of the line, which may be the 2 of "positions/sec^2".
 
     Raises:
-        ReplyError: there is none.
+        ReplyError: the answer has no integer.
     """
     return int(_number(INTEGER, text))
 
 
 def bare_integer(text: str) -> int:
-    """The number that a terse answer consists of.
+    """Parse a terse answer that consists of one integer.
 
     Raises:
-        ReplyError: it consists of something else.
+        ReplyError: the answer is anything else.
     """
     found = INTEGER.fullmatch(text)
     if found is None:
@@ -158,10 +158,10 @@ def bare_integer(text: str) -> int:
 
 
 def arcseconds(text: str) -> float:
-    """The resolution that an answer to ``PR`` or ``TR`` tells [seconds of arc].
+    """Parse the resolution in an answer to ``PR`` or ``TR`` [seconds of arc].
 
     Raises:
-        ReplyError: there is none, or it is zero.
+        ReplyError: the answer has none, or it is zero.
     """
     value = float(_number(DECIMAL, text))
     if value == 0.0:
@@ -170,38 +170,38 @@ def arcseconds(text: str) -> float:
 
 
 def done(text: str) -> None:
-    """The answer to an order: nothing but the star. Anything more answers something else.
+    """Check that an answer to an order is the star alone; more text answers another command.
 
     Raises:
-        ReplyError: it says more.
+        ReplyError: the answer has text.
     """
     if text:
         raise ReplyError(f"{shown(text.encode())} answers something else")
 
 
 def echoing(text: str) -> bool:
-    """Whether the answer to ``E`` says that the unit echoes.
+    """Parse the answer to ``E``: whether the unit echoes.
 
     Raises:
-        ReplyError: it says neither.
+        ReplyError: the answer says neither or both.
     """
     return _either(text, ECHO_ON, ECHO_OFF)
 
 
 def terse(text: str) -> bool:
-    """Whether the answer to ``F`` says that the unit is terse.
+    """Parse the answer to ``F``: whether the unit is terse.
 
     Raises:
-        ReplyError: it says neither.
+        ReplyError: the answer says neither or both.
     """
     return _either(text, TERSE, VERBOSE)
 
 
 def independent(text: str) -> bool:
-    """Whether the answer to ``C`` says that positions can be commanded, rather than velocities alone.
+    """Parse the answer to ``C``: whether the unit takes positions, rather than velocities alone.
 
     Raises:
-        ReplyError: it says neither.
+        ReplyError: the answer says neither or both.
     """
     return _either(text, INDEPENDENT, VELOCITY)
 
@@ -215,53 +215,57 @@ def _number(pattern: re.Pattern[str], text: str) -> str:
 
 
 def _either(text: str, one: re.Pattern[str], other: re.Pattern[str]) -> bool:
-    """Whether an answer says the one and not the other."""
+    """Return whether an answer matches the first pattern and not the second.
+
+    Raises:
+        ReplyError: the answer matches neither or both.
+    """
     yes, no = one.search(text) is not None, other.search(text) is not None
     if yes == no:
         raise ReplyError(f"{shown(text.encode())} does not tell the mode that was asked for")
     return yes
 
 
-# --- line ---
+# The line
 
 log = logging.getLogger(__name__)
 Meaning = TypeVar("Meaning")
-# Beyond the time that the bytes take on the wire [s]:
+# Time limits, beyond the time that the bytes take on the wire [s]:
 PATIENCE_S = 1.0  # for an answer while a unit is opened
-QUICK_S = 0.08  # for an answer in the middle of work, so that a silent unit is noticed while it can still be halted
-LAST_S = 0.8  # for the answer that tells that a unit which was silent is in step again
-LAST_TRIES = 10  # to hear from a unit that is silent, before it counts as dead
-HURRY_S = 0.05  # for the answer in flight when somebody wants the head halted
-QUIET_S = 0.03  # of silence, after which no more of an old answer is expected
-DRAIN_S = 0.15  # but something that never stops talking is not listened to for longer
-BITS = 10  # of a byte on the wire, 8N1
-WORDY_ANSWER = 100  # the longest of a healthy unit, with its echo [bytes]
-TERSE_ANSWER = 40  # the longest but for its version, once echo and words are off [bytes]
-MOST_LINES = 64  # that are skipped in search of one answer
-HEARD = 200  # so much of what was last heard is kept for error messages [bytes]
+QUICK_S = 0.08  # for an answer during operation: a silent unit must be noticed while it can still be halted
+LAST_S = 0.8  # for the answer that confirms that a silent unit is synchronised again
+LAST_TRIES = 10  # queries to a silent unit before it counts as dead
+HURRY_S = 0.05  # for the answer in flight when the head is to be halted
+QUIET_S = 0.03  # of silence, after which an old answer counts as complete
+DRAIN_S = 0.15  # for draining, where a device never stops sending
+BITS = 10  # per byte on the wire, 8N1
+WORDY_ANSWER = 100  # longest answer with words and echo [bytes]
+TERSE_ANSWER = 40  # longest answer but the version's, with echo and words off [bytes]
+MOST_LINES = 64  # skipped in search of one answer
+HEARD = 200  # received bytes kept for error messages
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What the unit says, and when it said it, or looked at what it tells [s]."""
+    """Text of an answer, and the time [s] at which the unit answered or read the queried value."""
 
     text: str
     t: float
 
 
 class Line:
-    """Strict lockstep with a unit; of one thread at a time.
+    """Exchange of one command at a time with a unit; used by one thread at a time.
 
     Args:
         port: an open port whose reads return empty after a short while.
-        name: the port's, for error messages.
-        baud: of the serial line, also where it ends at a terminal server.
-        clock: the rig's.
+        name: name of the port, for error messages.
+        baud: baud rate, also of the serial line behind a terminal server.
+        clock: the rig's clock.
 
     Attributes:
-        events: "P", "T" and "D" as the unit told them, until somebody takes them out.
-        strict: set when the unit's echo is off: from then on nothing may stand before an answer.
-        hurry: whether the head is to be halted now, so that what is in flight is not waited for long.
+        events: "P", "T" and "D" as the unit sent them; the user of the line removes them.
+        strict: set once the unit's echo is off; from then on text before an answer is an error.
+        hurry: returns whether the head is to be halted now, so that an answer in flight gets `HURRY_S` at most.
     """
 
     def __init__(self, port: Port, name: str, baud: int, clock: Clock) -> None:
@@ -269,7 +273,7 @@ class Line:
         self.name, self.baud = name, baud
         self._byte_s = BITS / baud
         self._buffer = b""
-        self._strange = b""  # the line that was no answer
+        self._strange = b""  # the last line that was no answer
         self._heard = b""
         self.events: list[str] = []
         self.strict = False
@@ -277,7 +281,7 @@ class Line:
 
     @property
     def heard(self) -> bytes:
-        """The last that came over the line, whatever it was."""
+        """The last received bytes, of any kind."""
         return self._heard
 
     def ask(self, order: bytes, patience: float = QUICK_S, skipping: bool = False) -> Answer:
@@ -285,13 +289,13 @@ class Line:
 
         Args:
             order: the command with its delimiter.
-            patience: how long the unit may take beyond the wire's time [s].
-            skipping: whether lines that are no answers may come first.
+            patience: how long the unit may take beyond the time on the wire [s].
+            skipping: whether to skip lines that are no answers.
 
         Raises:
             SilentError: no complete answer came in time.
             ReplyError: what came is no answer.
-            RefusedError: the unit refused.
+            RefusedError: the unit refused the command.
             LostError: the port failed.
         """
         self._expect_nothing()
@@ -301,16 +305,26 @@ class Line:
         if reply.refused:
             what = order.decode("ascii").strip()
             raise RefusedError(f"the pan-tilt unit at {self.name} refused {what}: {reply.text}")
-        # The unit looks between the command's last byte and the answer's first, unless the line is faster than it says.
+        # The unit reads the value between the command's last byte and the answer's first. These are in the wrong
+        # order where the line is faster than its baud rate.
         start, end = sent + len(order) * self._byte_s, first - self._byte_s
         return Answer(reply.text, (start + end) / 2 if start <= end else (sent + first) / 2)
 
     def query(
         self, order: bytes, understand: Callable[[str], Meaning], patience: float = QUICK_S, tries: int = 3
     ) -> tuple[Meaning, float]:
-        """Ask what can be asked again: what the answer means, and when that was [s].
+        """Send a command that is safe to repeat; return its answer's meaning and time [s].
 
-        Only for queries and orders that do no harm twice; a move relative to where the head is would.
+        For queries, and for orders that do no harm twice; a relative move would.
+
+        Args:
+            order: the command with its delimiter.
+            understand: parses the answer's text, and raises ReplyError where that is no answer.
+            patience: as in `ask` [s].
+            tries: number of attempts.
+
+        Raises:
+            DeviceError: as `ask`, after the last attempt.
         """
         for attempt in range(tries):
             try:
@@ -323,17 +337,17 @@ class Line:
         raise AssertionError("unreachable")
 
     def resync(self, reason: DeviceError) -> bool:
-        """Get back in step: silence, then questions whose answers cannot be taken for a position.
+        """Synchronise with the unit again: wait for silence, then send queries whose answers are no numbers.
 
-        Answers come in order, so nothing that was late can still follow the answer to a later question. That question
-        is each time another than those before, so that their late answers are not taken for its own.
+        No answer to them can be taken for a position. Answers come in order, so no late answer can follow the answer to
+        a later query. Each query differs from the ones before, so that a late answer to those is not taken for its own.
 
         Returns:
-            Whether the line was silent for so long that the head was told to halt.
+            Whether a halt was sent, because the unit was silent.
 
         Raises:
-            SilentError: the unit does not answer any more; it was told to halt.
-            RestartedError: it was switched off and on.
+            SilentError: the unit does not answer any more; a halt was sent.
+            RestartedError: the unit was switched off and on.
             LostError: the port failed.
         """
         log.info("%s: back in step after: %s", self.name, reason)
@@ -355,7 +369,7 @@ class Line:
         return True
 
     def drain(self, quiet_s: float, most_s: float) -> bytes:
-        """Read until nothing came for a while, or for long enough [s]; what came, without events."""
+        """Read until ``quiet_s`` of silence or for ``most_s`` [s]; return the bytes without events."""
         start = last = self._clock.now()
         data, self._buffer = self._buffer, b""
         while (now := self._clock.now()) - last < quiet_s and now - start < most_s:
@@ -364,7 +378,7 @@ class Line:
         return self._without_events(data)
 
     def write(self, data: bytes) -> None:
-        """Send bytes and expect nothing.
+        """Send bytes without waiting for an answer.
 
         Raises:
             LostError: the port failed.
@@ -376,7 +390,7 @@ class Line:
 
     def close(self) -> None:
         """Release the port."""
-        # pyserial leaves a socket open if the other side closed first
+        # pyserial leaves a socket open if the other side closed first.
         socket = getattr(self._port, "_socket", None)
         with contextlib.suppress(OSError):
             self._port.close()
@@ -384,7 +398,7 @@ class Line:
             socket.close()
 
     def nonsense(self, error: DeviceError) -> DeviceError:
-        """What to say of a unit whose answers were no good for the last time."""
+        """Make the error for a unit whose answers stayed invalid or absent."""
         if isinstance(error, SilentError):
             return error
         return DeviceError(f"the pan-tilt unit at {self.name} answers, but not what it was asked: {error}")
@@ -394,7 +408,7 @@ class Line:
         return self._clock.now() + patience + (len(order) + answer) * self._byte_s
 
     def _expect_nothing(self) -> None:
-        """Look at what came unasked: events are welcome, anything else is an answer that nobody waited for."""
+        """Check bytes that came without a query: events are kept, any other text is an error."""
         self._buffer += self._read(wait=False)
         if self._buffer:
             rest = self._without_events(self._buffer).strip()
@@ -406,7 +420,7 @@ class Line:
                 raise ReplyError(f"{shown(rest)} came unasked")
 
     def _reply(self, deadline: float, skipping: bool) -> tuple[Reply, float]:
-        """The next line that is an answer, and when its first byte came [s]."""
+        """Read the next line that is an answer; return it and the time of its first byte [s]."""
         for _ in range(MOST_LINES):
             line, first = self._next_line(deadline)
             line = self._without_events(line)
@@ -424,12 +438,12 @@ class Line:
         raise ReplyError(f"{self.name} sends lines without end, but no answer of a PTU-D46")
 
     def _next_line(self, deadline: float) -> tuple[bytes, float]:
-        """One line and when its first byte came [s]."""
+        """Read one line; return it and the time of its first byte [s]."""
         first = self._clock.now()
         begun = bool(self._buffer)
         while b"\n" not in self._buffer:
             now = self._clock.now()
-            late = now > deadline  # a thread that slept too long still reads what came meanwhile
+            late = now > deadline  # a thread that slept too long still reads what has arrived
             data = self._read(wait=not late)
             if data and not begun:
                 first, begun = self._clock.now(), True
@@ -445,7 +459,7 @@ class Line:
         return line, first
 
     def _answers(self, question: bytes, right: Callable[[str], bool], patience: float) -> bool:
-        """Whether a question is answered in time, whatever else comes before."""
+        """Send a query and return whether the right answer comes in time; other lines may come first."""
         self.write(question)
         deadline = self._deadline(question, patience)
         for _ in range(MOST_LINES):
@@ -472,21 +486,21 @@ class Line:
         return rest
 
     def _read(self, wait: bool = True) -> bytes:
-        """What has come; if nothing has, wait a little for the first byte."""
+        """Read the bytes that have arrived; if there are none, wait for the first one until the port's timeout."""
         try:
             there = self._port.in_waiting
             data = self._port.read(max(there, 1)) if there or wait else b""
-        except OSError as error:  # in_waiting raises the system's own, read and write pyserial's
+        except OSError as error:  # in_waiting raises the system's errors, read and write pyserial's
             raise LostError(self.name, error) from error
         self._heard = (self._heard + data)[-HEARD:]
         return data
 
 
 def open_line(name: str, baud: int, clock: Clock) -> Line:
-    """Open the line at a port by the name or URL that pyserial knows it by.
+    """Open the line at a port by pyserial's name or URL of it.
 
     Raises:
-        ConfigError: no port is named.
-        DeviceError: it cannot be opened.
+        ConfigError: the name is empty.
+        DeviceError: the port cannot be opened.
     """
     return Line(open_port(name, baud), name, baud, clock)
