@@ -4,12 +4,12 @@ import time
 
 
 class MonotonicClock:
-    """The machine's own clock, which nobody sets."""
+    """The machine's monotonic clock, which setting the time of day does not change."""
 
     def now(self) -> float:
-        """Seconds since some start."""
+        """Return the seconds since an arbitrary start."""
         return time.monotonic()
 
     def sleep_until(self, t: float) -> None:
-        """Return when the clock shows ``t`` [s]."""
+        """Sleep until the clock shows ``t`` [s]."""
         time.sleep(max(t - self.now(), 0.0))

@@ -1,18 +1,11 @@
-"""A zoom camera by gphoto2, such as Canon's PowerShots that can be shot from a computer.
+"""The zoom camera through libgphoto2, such as a Canon PowerShot that takes remote commands.
 
-What the thread of a gphoto2 camera shares with those who use the camera.
+libgphoto2 is not safe for several threads. One thread therefore owns the camera: `Shooting` opens it, does the most
+urgent job, and opens it again after a loss. The lens comes first and its latest command wins; then come stills; then
+viewfinder frames. `SharedState` carries commands and results between that thread and the callers of `GphotoCamera`.
+Errors that end the connection are passed on as LinkError; a busy camera is asked again.
 
-What a gphoto2 camera does: move its lens, take stills, show frames. Each knows when it is due, and does one step.
-
-All of it happens on the camera's one thread. Errors after which the connection is good for nothing are passed on as
-LinkError; being busy is waited for.
-
-Makes an opened gphoto2 camera ready: in shooting mode, with the configured settings, and a lens that can be sent.
-
-One thread's work with a gphoto2 camera: it opens it, does what is most urgent, and finds it again when it was lost.
-
-libgphoto2 is not safe for several threads. The lens comes first and its latest command wins; then stills; and while
-there is nothing else to do, frames of the viewfinder.
+Measurements and faults of the library: docs/design-notes.md.
 """
 
 import contextlib
@@ -43,21 +36,21 @@ from cotarget.rig import Clock, Frame, Image, ZoomState
 
 @dataclass
 class SharedState:
-    """What the camera's thread shares with others, who hold ``changed`` to look at it or to change it.
+    """Commands to the camera's thread and its results; hold ``changed`` to read or write them.
 
     Attributes:
-        changed: told of every change.
-        frame: the newest of the viewfinder.
-        arrived: when it did [s].
-        wanted: the position that the lens is to have.
-        order: counts the lens's commands.
-        standing: whether the lens has taken the last of them.
-        motion: where the lens is; None before the camera is open.
-        lens_trouble: why the lens does not do what it was told; empty if it does.
-        called: whether the camera's thread has something new to do.
-        still: who waits for a still.
-        trouble: what keeps frames from coming; empty while they come.
-        dropped: frames that were broken, late or of another size.
+        changed: notified at every change.
+        frame: the newest viewfinder frame.
+        arrived: arrival of that frame [s].
+        wanted: commanded lens position.
+        order: sequence number of the lens command.
+        standing: whether the lens has reached the last command.
+        motion: estimated motion of the lens; None before the camera is open.
+        lens_trouble: why the lens does not follow its command; empty if it does.
+        called: whether the camera's thread has a new command.
+        still: future of the still that a caller waits for.
+        trouble: why no frames come; empty while they come.
+        dropped: number of frames that were broken, late or of another size.
         gone: why the camera cannot be used any more; empty while it can.
     """
 
@@ -76,7 +69,7 @@ class SharedState:
     gone: str = ""
 
     def dismiss(self, why: str) -> None:
-        """Let everybody know that the camera cannot be used any more."""
+        """Mark the camera as unusable, and end every wait for it."""
         with self.changed:
             self.gone, self.called = self.gone or why, True
             still, self.still = self.still, None
@@ -85,27 +78,27 @@ class SharedState:
             still.set_exception(DeviceError(why))
 
 
-# --- gphoto_setup ---
+# Setup of an opened camera
 
 log = logging.getLogger(__name__)
-# gphoto2's names: what switches a camera to shooting, and where its stills go. They stay out of its card, because a
-# still in memory is sent at once, and so that a card does not fill up.
+# gphoto2's names of the settings for shooting mode and for the destination of stills. Stills go to memory: they are
+# sent at once, and the card does not fill up.
 SHOOTING, TARGET, MEMORY = "capture", "capturetarget", "Internal RAM"
-# A busy camera is told apart from a wrong value by its ranges, which are checked before: both come back as -2.
+# -2 means busy or a wrong value; values are checked against the setting's range before, so that here it means busy.
 BUSY = frozenset({BAD_PARAMETERS, CAMERA_BUSY})
 BUSY_PAUSE_S, BUSY_PATIENCE_S = 0.1, 3.0
-LATEST = 2**31  # date that libgphoto2 can tell [s since 1970]
+LATEST = 2**31  # first date that libgphoto2 cannot express [s since 1970]
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class ZoomSetting:
-    """The setting that moves the lens.
+    """The camera setting that moves the lens.
 
     Attributes:
-        name: gphoto2's.
-        lens: what its positions mean.
-        values: how each position is written.
+        name: gphoto2's name of the setting.
+        lens: focal lengths of the positions.
+        values: value of the setting for each position.
     """
 
     name: str
@@ -114,7 +107,7 @@ class ZoomSetting:
 
 
 def patiently(clock: Clock, call: Callable[[], T]) -> T:
-    """Do a call again for a while, as long as the camera is busy."""
+    """Repeat a call for `BUSY_PATIENCE_S` while the camera is busy."""
     deadline = clock.now() + BUSY_PATIENCE_S
     while True:
         try:
@@ -126,13 +119,13 @@ def patiently(clock: Clock, call: Callable[[], T]) -> T:
 
 
 def set_up(link: CameraLink, config: HardwareZoom, clock: Clock, camera: str) -> ZoomSetting:
-    """Bring an opened camera to where it follows.
+    """Switch an opened camera to shooting mode and apply the configured settings.
 
     Args:
-        link: open.
-        config: what is wanted.
-        clock: the rig's.
-        camera: its name, for messages.
+        link: to the camera, open.
+        config: settings, lens table and sizes of the zoom camera.
+        clock: the rig's clock.
+        camera: name of the camera, for messages.
 
     Raises:
         ConfigError: the camera has no such setting or value, or cannot be zoomed as configured.
@@ -140,8 +133,8 @@ def set_up(link: CameraLink, config: HardwareZoom, clock: Clock, camera: str) ->
     """
     if SHOOTING in link.names():
         patiently(clock, lambda: link.put(SHOOTING, 1))
-    names = link.names()  # PowerShots show their lens only when they shoot
-    # Even where it shows memory already: what was never set it shows so, and has PowerShots use the card.
+    names = link.names()  # PowerShots list their lens setting only in shooting mode
+    # Set even where the setting reads memory already: PowerShots show memory and use the card until it is set.
     own = TARGET not in names or TARGET in config.settings
     if not own and MEMORY in patiently(clock, lambda: link.get(TARGET)).choices:
         patiently(clock, lambda: link.put(TARGET, MEMORY))
@@ -158,14 +151,14 @@ def _apply(link: CameraLink, clock: Clock, camera: str, names: Collection[str], 
     _check(setting, f"hardware.zoom.settings.{name}", value)
     patiently(clock, lambda: link.put(name, value))
     got = patiently(clock, lambda: link.get(name)).value
-    if setting.kind == "date":  # it goes on
+    if setting.kind == "date":  # the camera's clock advances
         return
     if got != value and not (isinstance(got, float) and got == float(value)):
         log.warning("the %s took '%s' for its setting '%s' as '%s'", camera, value, name, got)
 
 
 def _check(setting: Setting, where: str, value: str) -> None:
-    """Refuse a value that a setting cannot have."""
+    """Refuse a value that a setting does not take."""
     if setting.readonly:
         raise ConfigError(f"{where}: this camera's can only be read; it is '{setting.value}'")
     if setting.kind == "choice" and value not in setting.choices:
@@ -183,7 +176,7 @@ def _check(setting: Setting, where: str, value: str) -> None:
 def _zoom_setting(
     link: CameraLink, config: HardwareZoom, clock: Clock, camera: str, names: Collection[str]
 ) -> ZoomSetting:
-    """What moves the lens, checked against the table of its focal lengths."""
+    """Find the setting that moves the lens, and check it against the configured lens table."""
     name, (first, last) = config.zoom_key, (config.lens[0][0], config.lens[-1][0])
     if name not in names:
         known = shortened(names, name)
@@ -211,7 +204,7 @@ def _zoom_setting(
 
 
 def _positions(setting: Setting) -> dict[int, str | float]:
-    """Where a setting can send a lens, and how that is written; empty where it is no lens's."""
+    """List a setting's lens positions and the value that selects each; empty if the setting moves no lens."""
     if setting.kind == "range":
         step = setting.step if setting.step > 0 else 1.0
         count = int((setting.high - setting.low) / step) + 1
@@ -221,7 +214,7 @@ def _positions(setting: Setting) -> dict[int, str | float]:
 
 
 def position_in(setting: Setting) -> float | None:
-    """The lens's position that a setting shows [1]; None where it shows none."""
+    """Read the lens position [1] from a setting; None where it shows none."""
     return _number(setting.value)
 
 
@@ -232,34 +225,34 @@ def _number(value: str | float) -> float | None:
         return None
 
 
-# --- gphoto_duties ---
+# Jobs of the camera's thread: each says when it is due, and does one step
 
-# A lens whose setting reads otherwise is looked at again until this long after it should stand, and then sent again.
+# A lens that does not read as commanded is read again until `VERIFY_S` after it should stand, and then sent again [s].
 VERIFY_PAUSE_S, VERIFY_S, LENS_TRIES = 0.1, 1.0, 2
-# A viewfinder that has no new frame yet gives the last one again. It is asked again soon, so that the new one is dated
-# when it appears; but not so often for ever.
+# A viewfinder without a new frame returns the last one again. It is asked again after a short pause, so that the new
+# frame's arrival time is right; after `REPEAT_LIMIT_S` without a new frame, only once a frame period [s].
 REPEAT_PAUSE_S, REPEAT_LIMIT_S = 0.005, 1.0
-# A lens that comes out when the viewfinder is switched on takes its time until the first frame.
+# Time limit for the first frame [s]: the lens may extend when the viewfinder is switched on.
 FIRST_FRAME_S = 10.0
-# A frame is the newest for this long, or this many frames, whichever is longer; after that the viewfinder is blind.
-# Whoever follows waits for a frame then and lets the head come to rest, which it shall within half a second of the
-# fault. A frame that took longer to come is as old as that perhaps, and not handed out at all.
+# A frame is current for this time [s], or this number of frame periods where that is longer. Without a current frame
+# `read` waits, and the pipeline stops the head, which must happen within half a second of the fault. A frame that took
+# longer to arrive may be older than this, and is dropped.
 FRESH_S, FRESH_FRAMES = 0.2, 2.0
 
 
 class Patience:
-    """How long a camera has been busy."""
+    """Time limit for a camera that stays busy."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._since: float | None = None
 
     def reset(self) -> None:
-        """The camera did what it was asked."""
+        """Note that the camera has done what was requested."""
         self._since = None
 
     def next_try(self, error: LinkError) -> float | None:
-        """When to try again [s]; None if it has been busy for too long. Passes on what no waiting cures."""
+        """Return when to try again [s]; None after `BUSY_PATIENCE_S`. Raises the error if the connection is lost."""
         if error.code in LOST:
             raise error
         now = self._clock.now()
@@ -268,17 +261,21 @@ class Patience:
 
 
 class LensJob:
-    """Sends the lens where the latest command wants it, and reads back whether it went."""
+    """Send the lens to the latest command, and verify that it went there."""
 
     def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, shared: SharedState) -> None:
         self._config, self._clock, self._link, self._shared = config, clock, link, shared
         self._zoom: ZoomSetting | None = None
-        self._order = -1  # being carried out
+        self._order = -1  # the command being carried out
         self._sent, self._tries, self._due, self._deadline = False, 0, 0.0, 0.0
         self._patience = Patience(clock)
 
     def begin(self, zoom: ZoomSetting, first: bool) -> None:
-        """Look where a camera just opened has its lens; it is sent back to where it was before the camera was lost."""
+        """Read the lens position of a camera just opened.
+
+        At the first opening that position becomes the command. After a loss the lens is sent back to the command from
+        before.
+        """
         self._zoom, self._order, shared = zoom, -1, self._shared
         reading = position_in(patiently(self._clock, lambda: self._link.get(zoom.name)))
         position = zoom.lens.positions[0] if reading is None else reading
@@ -291,14 +288,14 @@ class LensJob:
             self._order = shared.order if shared.standing else -1
 
     def due(self) -> float:
-        """When there is something to do [s]."""
+        """Return when the next step is due [s]."""
         with self._shared.changed:
             if self._shared.lens_trouble or (self._shared.standing and self._order == self._shared.order):
                 return math.inf
             return self._due if self._order == self._shared.order else -math.inf
 
     def run(self) -> None:
-        """Send or verify."""
+        """Send the command, or verify the last one."""
         with self._shared.changed:
             order, wanted = self._shared.order, self._shared.wanted
         if order != self._order:
@@ -340,13 +337,13 @@ class LensJob:
 
     def _give_up(self, wanted: int, why: str) -> None:
         with self._shared.changed:
-            if self._shared.order == self._order:  # a newer command deserves its own chance
+            if self._shared.order == self._order:  # the failure does not concern a newer command
                 self._shared.lens_trouble = f"the zoom camera's lens did not go to position {wanted}: {why}"
                 self._shared.changed.notify_all()
 
 
 class StillJob:
-    """Takes a still for whoever waits for one."""
+    """Take a still for the caller that waits for one."""
 
     def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, shared: SharedState) -> None:
         self._config, self._clock, self._link, self._shared = config, clock, link, shared
@@ -356,17 +353,17 @@ class StillJob:
         self._decoder = JpegDecoder()
 
     def due(self) -> float:
-        """When there is something to do [s]."""
+        """Return when the next attempt is due [s]."""
         with self._shared.changed:
             if self._shared.still is None:
                 return math.inf
             return self._due if self._shared.still is self._future else -math.inf
 
     def run(self) -> None:
-        """Take it."""
+        """Try to take the still."""
         with self._shared.changed:
             future = self._shared.still
-        if future is None:  # nobody waits any more
+        if future is None:  # the caller has given up
             return
         if future is not self._future:
             self._future = future
@@ -414,7 +411,7 @@ class StillJob:
 
 
 class ViewJob:
-    """Fetches frames of the viewfinder and publishes the newest."""
+    """Fetch viewfinder frames and publish the newest."""
 
     def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, shared: SharedState) -> None:
         self._config, self._clock, self._link, self._shared = config, clock, link, shared
@@ -424,11 +421,11 @@ class ViewJob:
         self._decoder = JpegDecoder()
 
     def begin(self) -> None:
-        """Wait for the first frame of a camera that was just opened.
+        """Wait for the first frame of a camera just opened.
 
         Raises:
-            ConfigError: it is of another size than configured.
-            DeviceError: there is none.
+            ConfigError: the frame has another size than configured.
+            DeviceError: no frame came.
         """
         deadline = self._clock.now() + FIRST_FRAME_S
         while True:
@@ -450,11 +447,11 @@ class ViewJob:
         self._publish(data, image, arrived)
 
     def due(self) -> float:
-        """When the next frame is to be fetched [s]."""
+        """Return when the next frame is to be fetched [s]."""
         return self._due
 
     def run(self) -> None:
-        """Fetch a frame; one that the camera showed before is not a frame."""
+        """Fetch a frame; publish it if it is new, whole, in time and of the configured size."""
         begin = self._clock.now()
         try:
             data = self._link.preview()
@@ -484,7 +481,7 @@ class ViewJob:
             trouble = "its frames are {} x {} now".format(*size_of(image))
         else:
             trouble = f"its frames take {took:.2g} s to come"
-            self._data = data  # or it would be taken for a new one if it came once more, in time
+            self._data = data  # a repetition that comes in time must not count as new
         with self._shared.changed:
             self._shared.dropped += 1
             self._shared.trouble = trouble
@@ -498,31 +495,31 @@ class ViewJob:
 
 
 def freshness(config: HardwareZoom) -> float:
-    """For how long a frame is the newest [s]."""
+    """Return for how long a frame counts as the newest [s]."""
     return max(FRESH_S, FRESH_FRAMES / config.rate_hz)
 
 
 def size_of(image: Image) -> tuple[int, int]:
-    """(width, height) [px]."""
+    """Return (width, height) of an image [px]."""
     return image.shape[1], image.shape[0]
 
 
-# --- gphoto_work ---
+# The camera's thread
 
-# A camera on USB that another program left in the middle of something answers at the second attempt.
+# A camera on USB that another program left in the middle of an exchange answers at the second attempt.
 USB_TRIES = 2
-# A lost camera is looked for after this pause, doubled each time, until this long after the loss.
+# A lost camera is opened again after this pause, doubled each time, until `RECONNECT_S` after the loss [s].
 FIRST_PAUSE_S, RECONNECT_S = 0.1, 5.0
 
 
 class Shooting:
-    """The camera's work; all methods are called from one thread.
+    """Open the camera and run its jobs; all methods are called from one thread.
 
     Args:
-        config: the camera's.
-        clock: the rig's.
+        config: the zoom camera's configuration.
+        clock: the rig's clock.
         link: to the camera, not open yet.
-        shared: where commands come from and results go.
+        shared: commands and results.
     """
 
     def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, shared: SharedState) -> None:
@@ -535,11 +532,11 @@ class Shooting:
         self._pause = FIRST_PAUSE_S
 
     def open(self) -> ZoomSetting:
-        """Open the camera, and see that it is as configured.
+        """Open the camera and check it against the configuration.
 
         Raises:
-            ConfigError: it is another camera than configured.
-            DeviceError: it does not answer, or not as it should.
+            ConfigError: the camera differs from the configuration.
+            DeviceError: the camera does not answer, or not correctly.
         """
         tries = USB_TRIES if self._config.port.startswith("usb:") else 1
         for left in reversed(range(tries)):
@@ -551,13 +548,13 @@ class Shooting:
                 self._clock.sleep_until(self._clock.now() + FIRST_PAUSE_S)
             except CotargetError:
                 raise
-            except Exception as error:  # a user can do nothing with a traceback
+            except Exception as error:  # the user gets one line; the traceback goes to the debug log
                 log.debug("opening the zoom camera failed", exc_info=True)
                 raise DeviceError(f"the camera at '{self._config.port}' cannot be used: {error!r}") from error
         raise AssertionError("the last attempt succeeds or fails")
 
     def close(self) -> None:
-        """Let the camera leave shooting, if it still answers, and disconnect."""
+        """Leave shooting mode, if the camera still answers, and disconnect."""
         if self._connected:
             try:
                 if SHOOTING in self._link.names():
@@ -567,7 +564,7 @@ class Shooting:
         self._disconnect()
 
     def work(self) -> float:
-        """Do the most urgent thing that is due; return when something is due again [s]."""
+        """Do one step of the most urgent job that is due; return when the next one is due [s]."""
         now = self._clock.now()
         if self._shared.gone:
             return math.inf
@@ -584,12 +581,12 @@ class Shooting:
             log.warning("the zoom camera at '%s' is lost: %s", self._config.port, error)
             self._lost_at, self._pause = self._clock.now(), FIRST_PAUSE_S
             self._wait(error)
-            self._disconnect()  # takes 5 s where the camera is silent
+            self._disconnect()  # takes 5 s if the camera is silent
             return self._attempt
         return min(job.due() for job in jobs)
 
     def _connect(self, first: bool) -> ZoomSetting:
-        """Open the link and everything behind it; what fails leaves it closed."""
+        """Open the camera and begin its jobs; disconnect if anything fails."""
         try:
             camera = self._link.open()
             zoom = set_up(self._link, self._config, self._clock, camera)
@@ -609,7 +606,7 @@ class Shooting:
             log.debug("closing the camera: %s", error)
 
     def _look_again(self) -> None:
-        """Try to find a lost camera."""
+        """Try to open a lost camera again."""
         try:
             self._connect(first=False)
         except (LinkError, DeviceError) as error:
@@ -617,7 +614,7 @@ class Shooting:
                 self._give_up(error)
             else:
                 self._wait(error)
-        except ConfigError as error:  # it came back as another one
+        except ConfigError as error:  # another camera is at the port now
             self._give_up(error)
         else:
             log.info("the zoom camera at '%s' is back", self._config.port)
@@ -633,36 +630,36 @@ class Shooting:
         self._shared.dismiss(why)
 
 
-# Opening takes 1 to 2 s; a camera that brings its lens out, or is busy, some more.
+# The zoom camera
+
+# Time limit for opening [s]: it takes 1 to 2 s, longer if the lens extends or the camera is busy.
 OPEN_LIMIT_S = 30.0
-# A still with focusing, flash and a slow line.
+# Time limit for a still, with focusing, flash and a slow line [s].
 STILL_LIMIT_S = 30.0
-# Leaving takes two round trips; libgphoto2 waits 2.5 s for each where a camera is silent, and a program that ends
-# because of that shall not hang.
+# Time limit for disconnecting [s]. It takes two round trips, and libgphoto2 waits 2.5 s for each where the camera is
+# silent; a program that ends for that reason must not hang.
 CLOSE_LIMIT_S = 3.0
 
 
 class GphotoCamera:
-    """A camera whose lens, viewfinder and stills gphoto2 drives, on a thread of its own.
+    """The zoom camera: lens, viewfinder and stills through libgphoto2, on a thread of its own.
 
-    A frame's time is when its last byte came, less ``latency_s``: however the camera makes the driver wait, that is
-    what a latency measured at bring-up contains. A still's time is the middle of the call that takes it, its transfer
-    apart where the camera sends it apart: the shutter opens somewhere within, so the error is at most half that time.
-    Frames that took too long to come to be dated so are dropped. While a still is taken the viewfinder is blind, and
-    `read` waits.
+    A frame's time is the arrival of its last byte, less ``latency_s``, which is measured in the same way at bring-up. A
+    still's time is the middle of the call that takes it, without its transfer where the camera sends it separately; the
+    error is at most half that call. Frames that took too long to arrive are dropped. While a still is taken no
+    viewfinder frames come, and `read` waits.
 
-    The lens's position between commands is the driver's own estimate from ``lens_speed`` and ``command_delay_s``. A
-    camera that is lost is looked for again for some seconds, and its lens sent back; then it is gone, and every call
-    says so.
+    The lens position between commands is an estimate from ``lens_speed`` and ``command_delay_s``. A lost camera is
+    opened again for up to `RECONNECT_S` and its lens sent back; after that every call raises.
 
     Args:
-        config: which camera, and what is known of it.
-        clock: the rig's, in real time.
-        link: to the camera, not open yet; None for gphoto2.
+        config: port, model, settings, sizes and lens of the camera.
+        clock: the rig's clock, in real time.
+        link: to the camera, not open yet; None for libgphoto2.
 
     Raises:
-        ConfigError: the camera is another than configured, or gphoto2 is not installed.
-        DeviceError: it is not there, or does not answer.
+        ConfigError: the camera differs from the configuration, or gphoto2 is not installed.
+        DeviceError: the camera is not there, or does not answer.
     """
 
     def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink | None = None) -> None:
@@ -685,7 +682,7 @@ class GphotoCamera:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of the viewfinder's frames [px]."""
+        """(width, height) of viewfinder frames [px]."""
         return self._config.size
 
     @property
@@ -695,12 +692,12 @@ class GphotoCamera:
 
     @property
     def focal_range(self) -> tuple[float, float]:
-        """Shortest and longest nominal focal length [px] of the viewfinder's frames."""
+        """Shortest and longest nominal focal length [px] of viewfinder frames."""
         return self._lens.focal_range
 
     @property
     def dropped(self) -> int:
-        """How many frames were broken, late or of another size, and therefore not handed out."""
+        """Number of frames dropped because they were broken, late or of another size."""
         with self._shared.changed:
             return self._shared.dropped
 
@@ -734,7 +731,7 @@ class GphotoCamera:
         """Start the lens moving; return at once the nominal focal length [px] of the position that it will reach.
 
         Raises:
-            DeviceError: it is no focal length, or the camera is gone.
+            DeviceError: the focal length is not positive and finite, or the camera is gone.
         """
         if not focal_px > 0 or math.isinf(focal_px):
             raise DeviceError(f"the lens cannot go to a focal length of {focal_px} px")
@@ -748,10 +745,10 @@ class GphotoCamera:
         return self._lens.focal_at(position)
 
     def state(self) -> ZoomState:
-        """The lens's state now: moving until it should have arrived, and its setting was read back.
+        """Return the lens state now: moving until it should have arrived and its setting reads the command.
 
         Raises:
-            DeviceError: the lens did not go where it was sent, or the camera is gone.
+            DeviceError: the lens did not reach its command, or the camera is gone.
         """
         shared = self._shared
         with shared.changed:
@@ -767,8 +764,8 @@ class GphotoCamera:
         """Take a full still.
 
         Raises:
-            ConfigError: stills are of another size than configured.
-            DeviceError: the camera took none.
+            ConfigError: stills have another size than configured.
+            DeviceError: the camera took no still.
         """
         shared = self._shared
         with self._still_turn:
@@ -787,7 +784,7 @@ class GphotoCamera:
                         shared.still = None
 
     def close(self) -> None:
-        """Let the camera go; harmless when that was done before."""
+        """End the thread and release the camera; may be called again."""
         self._shared.dismiss("the zoom camera is closed")
         self._thread.join(CLOSE_LIMIT_S)
         if self._thread.is_alive():
@@ -798,7 +795,7 @@ class GphotoCamera:
             raise DeviceError(self._shared.gone)
 
     def _run(self, work: Shooting, opened: "Future[ZoomSetting]") -> None:
-        """The camera's thread."""
+        """Run the camera's thread."""
         try:
             opened.set_result(work.open())
         except Exception as error:
@@ -807,7 +804,7 @@ class GphotoCamera:
         try:
             while not self._shared.gone:
                 self._rest_until(work.work())
-        except Exception as error:  # a thread must not die in silence
+        except Exception as error:  # callers must learn that the thread has ended
             log.debug("the driver of the zoom camera failed", exc_info=True)
             self._shared.dismiss(f"the driver of the zoom camera failed: {error!r}")
         finally:
@@ -815,7 +812,7 @@ class GphotoCamera:
                 work.close()
 
     def _rest_until(self, due: float) -> None:
-        """Wait until something is due, or somebody wants something."""
+        """Wait until a job is due, or a caller has a command."""
         shared = self._shared
         with shared.changed:
             shared.changed.wait_for(

@@ -1,8 +1,7 @@
-"""Gets to know the PTU-D46 at a port: learns its manner of speaking, reads what it is, compares that with rig.toml.
+"""Connection to a PTU-D46: identify the unit, compare it with rig.toml, and reset it.
 
-Also a harmless look at a unit outside of a rig; for its reset see `cotarget.drivers.ptu_d46`.
-
-The reset of a PTU-D46, which an operator has consented to: it turns through its whole range to find its limits.
+`connect` prepares a unit for `D46Head`. `probe` queries a unit without a rig. `reset` turns the unit through its whole
+range to find its limits; an operator must have consented to it.
 """
 
 import contextlib
@@ -32,21 +31,21 @@ from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
 from cotarget.rig import Clock
 
 log = logging.getLogger(__name__)
-TRIES = 2  # to come to terms with a unit that was interrupted in the middle of something
-GREETING_QUIET_S, GREETING_MOST_S = 0.25, 1.5  # at open nobody knows what it was last asked
-# Limits differ by a few steps from unit to unit and from reset to reset; more than this is another unit.
+TRIES = 2  # to greet a unit that was interrupted in the middle of an exchange
+GREETING_QUIET_S, GREETING_MOST_S = 0.25, 1.5  # [s]; at open the unit's last command is unknown
+# Limits differ by a few steps from unit to unit and from reset to reset; a larger difference is another unit's.
 LIMITS_DEG = 3.0
-STEP_SHARE = 2e-3  # of the resolution; the unit and people round it
-# A halt is sent behind a delimiter: what noise has left at the unit ends there, and is refused in the halt's place.
+STEP_SHARE = 2e-3  # tolerance relative to the resolution, which the unit and rig.toml round
+# A delimiter before the halt ends what noise may have left at the unit; the unit refuses that and not the halt.
 HALT_NOW, HALT_TRIES = DELIMITER + HALT, 2
 
 
 @dataclass(frozen=True)
 class AxisFacts:
-    """What a unit says about one of its axes.
+    """What a unit reports about one of its axes.
 
     Attributes:
-        arcseconds: of a step.
+        arcseconds: size of a step [seconds of arc].
         lowest: position [steps].
         highest: position [steps].
         slowest: speed [steps/s].
@@ -67,14 +66,21 @@ class AxisFacts:
         return math.radians(self.arcseconds / ptu_protocol.ARCSECONDS)
 
     def degrees(self, sign: int) -> tuple[float, float]:
-        """Lowest and highest angle in the sense of rig.toml, whose sign differs from the unit's or not [degrees]."""
+        """Convert the limits to degrees with rig.toml's sign of the axis: lowest, highest."""
         a, b = (sign * end * self.arcseconds / ptu_protocol.ARCSECONDS for end in (self.lowest, self.highest))
         return min(a, b), max(a, b)
 
 
 @dataclass(frozen=True)
 class UnitInfo:
-    """What a unit says about itself: its version, its step mode as far as it knows it, its axes."""
+    """What a unit reports about itself.
+
+    Attributes:
+        version: firmware version, in the unit's words.
+        mode: step mode, in the unit's words; empty where the firmware does not report it.
+        pan: facts of the pan axis.
+        tilt: facts of the tilt axis.
+    """
 
     version: str
     mode: str
@@ -83,17 +89,17 @@ class UnitInfo:
 
     @property
     def braking_s(self) -> float:
-        """Time to stop from the highest speed [s]."""
+        """Longest time to stop from the highest speed [s]."""
         return max(axis.fastest / axis.acceleration for axis in (self.pan, self.tilt))
 
 
 def connect(line: Line, config: HardwareHead) -> UnitInfo:
-    """Come to terms with the unit, check that it is the one that rig.toml describes, and make it ready; it halts.
+    """Greet the unit, halt it, check it against rig.toml, and set it to take positions.
 
     Raises:
         ConfigError: rig.toml describes another unit.
-        PositionLostError: nobody knows where it is.
-        DeviceError: there is no unit, or none that can be used as it is.
+        PositionLostError: the unit's position may be lost.
+        DeviceError: there is no unit, or it cannot be used in its state.
     """
     greet(line)
     try:
@@ -110,10 +116,10 @@ def connect(line: Line, config: HardwareHead) -> UnitInfo:
 
 
 def refuse_events(line: Line) -> None:
-    """Raise where the unit has told of a limit or a cable: its motor lost steps, or nobody knows what it did.
+    """Raise if the unit has reported a limit or a cable event: a motor may have lost steps.
 
     Raises:
-        PositionLostError: with what it told.
+        PositionLostError: an event was reported; the message names it.
     """
     if line.events:
         what = " and ".join(dict.fromkeys(ptu_protocol.EVENT_WORDS[event] for event in line.events))
@@ -121,15 +127,15 @@ def refuse_events(line: Line) -> None:
 
 
 def restarted(line: Line) -> PositionLostError:
-    """What to say of a unit that was switched off and on."""
+    """Make the error for a unit that was switched off and on."""
     return PositionLostError(line.name, "was switched off and on, so that its position may be lost")
 
 
 def halt_outright(line: Line, patience: float) -> None:
-    """Halt a unit that may echo again or have answers left to send; nothing else can be asked of the line afterwards.
+    """Halt a unit that may echo again or still send old answers; the line takes no other command afterwards.
 
     Raises:
-        DeviceError: it did not acknowledge that in time.
+        DeviceError: the unit did not acknowledge the halt in time.
     """
     line.hurry, line.strict = (lambda: False), False
     for left in reversed(range(HALT_TRIES)):
@@ -142,7 +148,7 @@ def halt_outright(line: Line, patience: float) -> None:
 
 
 def greet(line: Line) -> None:
-    """Switch the unit's echo and words off, whatever it was left at.
+    """Switch the unit's echo and verbose answers off, from any earlier mode.
 
     Raises:
         DeviceError: there is no unit.
@@ -150,7 +156,7 @@ def greet(line: Line) -> None:
     for _ in range(TRIES):
         line.write(DELIMITER)
         line.drain(GREETING_QUIET_S, GREETING_MOST_S)
-        line.events.clear()  # from before anybody listened, as after a reset or a start
+        line.events.clear()  # from before the line was opened, as after a reset or a start
         try:
             for order in ("ED", "FT"):
                 line.ask(command(order), PATIENCE_S)
@@ -164,19 +170,19 @@ def greet(line: Line) -> None:
 
 
 def identify(line: Line) -> UnitInfo:
-    """Ask the unit what it is.
+    """Query the unit's version, step mode and axes.
 
     Raises:
-        DeviceError: it does not say.
+        DeviceError: the unit does not answer.
     """
     return UnitInfo(_told(line, "V"), _told(line, "WP"), _axis(line, "P"), _axis(line, "T"))
 
 
 def refuse_uncalibrated(name: str, unit: UnitInfo) -> None:
-    """Refuse a unit that does not know where it is.
+    """Refuse a unit that has not found its limits.
 
     Raises:
-        DeviceError: with what an operator can do about it.
+        DeviceError: an axis has no range; the message names the remedy.
     """
     for word, axis in (("pan", unit.pan), ("tilt", unit.tilt)):
         if axis.lowest >= axis.highest:
@@ -187,10 +193,10 @@ def refuse_uncalibrated(name: str, unit: UnitInfo) -> None:
 
 
 def compare(name: str, unit: UnitInfo, config: HardwareHead) -> None:
-    """Compare what the unit says with what rig.toml expects.
+    """Compare the unit's steps and limits with rig.toml.
 
     Raises:
-        ConfigError: with both and what to write.
+        ConfigError: they differ; the message has both, and what to write.
     """
     for word, axis in (("pan", unit.pan), ("tilt", unit.tilt)):
         own = axis.arcseconds / ptu_protocol.ARCSECONDS
@@ -213,10 +219,10 @@ def compare(name: str, unit: UnitInfo, config: HardwareHead) -> None:
 
 
 def probe(port: str, baud: int) -> str:
-    """Look who is at a port, by questions that change nothing: version and number on the network.
+    """Query version and network number of the unit at a port; nothing is changed.
 
     Raises:
-        DeviceError: no pan-tilt unit, or another program has it.
+        DeviceError: there is no pan-tilt unit, or another program uses it.
     """
     with rig_lock(port), contextlib.closing(open_line(port, baud, MonotonicClock())) as line:
         try:
@@ -246,7 +252,7 @@ def _axis(line: Line, axis: AxisName) -> AxisFacts:
 
 
 def _halt(line: Line, patience: float) -> None:
-    """Halt a unit that is in step."""
+    """Halt a unit whose line is synchronised."""
     for left in reversed(range(HALT_TRIES)):
         try:
             line.query(HALT_NOW, ptu_protocol.done, patience)
@@ -257,7 +263,7 @@ def _halt(line: Line, patience: float) -> None:
 
 
 def _told(line: Line, question: str) -> str:
-    """What the unit answers, in its own words; nothing where its firmware is too old for the question."""
+    """Query a text; empty where the firmware is too old for the query."""
     try:
         return line.query(command(question), str, PATIENCE_S)[0]
     except RefusedError:
@@ -265,7 +271,7 @@ def _told(line: Line, question: str) -> str:
 
 
 def _make_independent(line: Line) -> None:
-    """See to it that positions can be commanded, and not velocities alone."""
+    """Set the unit to take positions, and not velocities alone."""
     try:
         try:
             if ptu_protocol.independent(line.ask(command("C"), PATIENCE_S).text):
@@ -282,7 +288,7 @@ def _alike(found: tuple[float, float], expected: tuple[float, float]) -> bool:
 
 
 def _stranger(line: Line) -> DeviceError:
-    """Tell why there is no pan-tilt unit to talk with, from what was heard."""
+    """Make the error for a port without a usable pan-tilt unit, from the received bytes."""
     heard, events = line.heard, ptu_protocol.split_events(line.heard)[1]
     if not heard.strip():
         return DeviceError(
@@ -297,10 +303,10 @@ def _stranger(line: Line) -> DeviceError:
     )
 
 
-# --- d46reset ---
+# Reset
 
-RESET_S = 120.0  # no manual says how long a reset takes; published drivers wait up to a minute
-# For the answer to a halt, braking included. No manual says whether a unit hears one while it resets itself.
+RESET_S = 120.0  # time limit; no manual gives a reset's duration, and published drivers wait up to a minute [s]
+# For the answer to a halt, braking included [s]. No manual says whether a unit takes a halt during its reset.
 HALT_S = 2.0
 HALTED = "it was halted"
 NOT_HALTED = (
@@ -309,23 +315,23 @@ NOT_HALTED = (
 
 
 def reset(config: HardwareHead, clock: Clock, lost: PositionLostMarker, stopped: Callable[[], str | None]) -> UnitInfo:
-    """Let the unit find its limits anew; until that has succeeded, its position counts as lost.
+    """Let the unit find its limits again; its position counts as lost until that has succeeded.
 
-    Whatever ends it before, Ctrl-C and other exceptions included, sends a halt and waits a little for the answer;
-    where none comes, the error or the log says so.
+    Anything that ends the reset early, Ctrl-C included, sends a halt and waits `HALT_S` for the answer. Where none
+    comes, the error or the log says so.
 
     Args:
-        config: where the unit is.
+        config: port and baud rate of the unit.
         clock: for deadlines.
-        lost: what is remembered of the unit.
-        stopped: asked all the time: why the head must not move, None while it may.
+        lost: marker file of the unit's port.
+        stopped: polled all the time; returns why the head must not move, None while it may.
 
     Returns:
         The unit, with the limits that it found.
 
     Raises:
-        EmergencyStopError: it was stopped.
-        DeviceError: it failed.
+        EmergencyStopError: ``stopped`` returned a reason.
+        DeviceError: the reset failed.
     """
     with rig_lock(config.port), contextlib.closing(open_line(config.port, config.baud, clock)) as line:
         greet(line)
@@ -342,8 +348,8 @@ def reset(config: HardwareHead, clock: Clock, lost: PositionLostMarker, stopped:
 
 
 def _turn(line: Line, stopped: Callable[[], str | None]) -> None:
-    """Order the reset and wait for its end."""
-    line.hurry = lambda: stopped() is not None  # what is in flight is then not waited for any more
+    """Send the reset and wait for its end."""
+    line.hurry = lambda: stopped() is not None  # ends the wait for the reset's answer
     try:
         said = line.ask(command("R"), RESET_S, skipping=True).text
         log.info("%s: reset: %s", line.name, said)
@@ -363,7 +369,7 @@ def _refuse_if_stopped(stopped: Callable[[], str | None], more: str = "") -> Non
 
 
 def _halt_after_reset(line: Line) -> str:
-    """Halt the unit; how that went."""
+    """Halt the unit; return the outcome in words."""
     with contextlib.suppress(DeviceError):
         halt_outright(line, HALT_S)
         return HALTED
@@ -371,10 +377,10 @@ def _halt_after_reset(line: Line) -> str:
 
 
 def _expect_both_axes(line: Line) -> None:
-    """See to it that both axes met their limits; a unit may be set to leave one or both out of its resets.
+    """Check that both axes met their limits; a unit may be set to leave one or both out of its resets.
 
     Raises:
-        DeviceError: one did not.
+        DeviceError: an axis did not.
     """
     left_out = [ptu_protocol.AXIS_WORDS[axis] for axis in ptu_protocol.AXES if axis not in line.events]
     line.events.clear()

@@ -1,4 +1,4 @@
-"""Opens the real devices as one Rig; whatever happens, the head is halted and every device released."""
+"""Open the real devices as one Rig; every exit halts the head and releases all devices."""
 
 import contextlib
 import sys
@@ -14,16 +14,16 @@ from cotarget.drivers.polled_head import D46Head
 from cotarget.errors import ConfigError
 from cotarget.rig import Board
 
-# How long one of Python's threads may keep the others waiting [s], where Python's own is 5 ms: a driver's thread that
-# waits for its turn makes every command late.
+# Python's thread switch interval [s], instead of 5 ms: a driver's thread that waits for its turn delays every command.
+# Measurements: docs/design-notes.md.
 SWITCH_INTERVAL = 5e-4
 NEEDED = (("head", "port", "/dev/ttyUSB0"), ("fixed", "url", "http://192.168.0.90"), ("zoom", "port", "usb:"))
 
 
 class HardwareRig:
-    """The real rig: devices that are open, and what closes them."""
+    """The real rig: open devices, and the stack that closes them."""
 
-    real_time = True  # its time passes by itself: the safety layer watches it from a thread
+    real_time = True  # time passes without calls: the safety layer's watchdog needs a thread
 
     def __init__(
         self,
@@ -40,11 +40,11 @@ class HardwareRig:
         self._opened = opened
 
     def close(self) -> None:
-        """Halt the head and release the devices; more than once does no harm."""
+        """Halt the head and release the devices; may be called again."""
         self._opened.close()
 
     def __enter__(self) -> "HardwareRig":
-        """Give the rig itself."""
+        """Return the rig itself."""
         return self
 
     def __exit__(
@@ -55,13 +55,13 @@ class HardwareRig:
 
 
 def open_hardware(config: RigConfig) -> HardwareRig:
-    """Open the devices that a configuration names, the head last, so that it does not move where another is missing.
+    """Open the devices of a configuration; the head comes last and does not move where another device is missing.
 
-    From then on this process's threads take turns more often (`SWITCH_INTERVAL`).
+    Shortens the thread switch interval of this process (`SWITCH_INTERVAL`).
 
     Raises:
-        ConfigError: a device is not named, or is not as configured.
-        DeviceError: a device could not be opened, or another program has them.
+        ConfigError: a device is not named, or differs from the configuration.
+        DeviceError: a device could not be opened, or another program uses it.
     """
     hardware = config.hardware
     for table, key, example in NEEDED:

@@ -1,31 +1,31 @@
-"""Opens serial ports and what stands in for them, and says in one line why one cannot be opened."""
+"""Serial ports by pyserial: list and open them, and name in one line why a port cannot be opened."""
 
 import errno
 from typing import Protocol
 
 from cotarget.errors import ConfigError, DeviceError
 
-SLICE_S = 0.01  # how long a read waits, so how often one that waits longer looks at its deadline
-WRITE_S = 0.5  # a line that takes no bytes for so long is dead
+SLICE_S = 0.01  # timeout of one read; a longer wait checks its deadline with this period [s]
+WRITE_S = 0.5  # a line that takes no bytes for this time is dead [s]
 
 
 class InUseError(DeviceError):
-    """Another program has it."""
+    """Another program uses the device."""
 
 
 class NoPermissionError(DeviceError):
-    """This user may not use it."""
+    """This user has no permission to use the device."""
 
 
 class Port(Protocol):
-    """What of pyserial's ports is used."""
+    """The part of pyserial's ports that the drivers use."""
 
     @property
     def in_waiting(self) -> int:
-        """How many bytes can be read at once."""
+        """Number of bytes that can be read without waiting."""
 
     def read(self, size: int = 1, /) -> bytes:
-        """Wait for bytes until the port's own timeout."""
+        """Read bytes, waiting until the port's own timeout."""
 
     def write(self, data: bytes, /) -> int | None:
         """Send bytes."""
@@ -35,7 +35,7 @@ class Port(Protocol):
 
 
 def ports() -> list[tuple[str, str]]:
-    """The serial ports of this machine: each one's name and what it is.
+    """List this machine's serial ports: name and description of each.
 
     Raises:
         DeviceError: pyserial is missing.
@@ -48,11 +48,11 @@ def ports() -> list[tuple[str, str]]:
 
 
 def open_port(name: str, baud: int) -> Port:
-    """Open a port by the name or URL that pyserial knows it by.
+    """Open a port by pyserial's name or URL of it.
 
     Raises:
-        ConfigError: no port is named.
-        DeviceError: it cannot be opened.
+        ConfigError: the name is empty.
+        DeviceError: the port cannot be opened.
     """
     if not name:
         raise ConfigError("hardware.head.port: names no port, such as /dev/ttyUSB0 or socket://host:4000")
@@ -62,11 +62,11 @@ def open_port(name: str, baud: int) -> Port:
         raise _no_pyserial(error) from error
     url = "://" in name
     try:
-        # Two programs on one port would take each other's answers.
+        # Exclusive: two programs on one port would read each other's answers.
         return serial.serial_for_url(
             name, baudrate=baud, timeout=SLICE_S, write_timeout=WRITE_S, exclusive=None if url else True
         )
-    except Exception as error:  # the drivers behind odd ports and URLs raise what they like
+    except Exception as error:  # pyserial's handlers of URLs raise exceptions of many types
         raise _why_not(name, error) from error
 
 
@@ -75,7 +75,7 @@ def _no_pyserial(error: ImportError) -> DeviceError:
 
 
 def _why_not(name: str, error: Exception) -> DeviceError:
-    """Say in one line why a port cannot be opened and what would help."""
+    """Make the error for a port that cannot be opened, with a remedy."""
     match getattr(error, "errno", None):
         case errno.ENOENT | errno.ENXIO | errno.ENODEV:
             there = ", ".join(sorted(device for device, _ in ports())) or "none"
