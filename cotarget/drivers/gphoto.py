@@ -1,17 +1,13 @@
-"""The thin layer of gphoto2 calls, with a Protocol, so that tests can put a camera of their own in its place.
+"""Calls of python-gphoto2 behind a Protocol, so that tests can replace the camera.
 
-Of python-gphoto2's calls some keep Python's interpreter lock while they wait for the camera, so that a hung camera
-would stop every thread, the head's included. Opening, settings, previews and stills let it go; leaving does not, so it
-is called past Python. Listing the settings' names and looking for cameras do not wait for a camera.
+Some calls of python-gphoto2 hold Python's interpreter lock while they wait for the camera; a hung camera would then
+stop every thread, the head's included. Opening, settings, previews and stills release the lock. Disconnecting does not,
+so it is called through ctypes. Listing settings and detecting cameras do not wait for a camera.
 
-Keeps libgphoto2 from doing to the user, and to this process, what nobody expects.
-
-It remembers its own settings in memory, instead of in a file of the user's. It would write where stills go, and who we
-are to network cameras, to ~/.gphoto/settings or ~/.config/gphoto/settings, and the gphoto2 command would behave
-otherwise from then on. Another HOME would keep it from that, but that is the whole process's; since 2.5.32 libgphoto2
-lets a program answer in place of the file.
-
-Where a camera is, as gphoto2 must be told it, and whether it can be there.
+Two side effects of libgphoto2 are prevented. It writes its settings (where stills go, and this program's identity for
+network cameras) to ~/.gphoto/settings or ~/.config/gphoto/settings, which would change the gphoto2 command. Since
+2.5.32 a program may answer in place of the file; another HOME would change the whole process. It also closes descriptor
+0, see `standard_input_kept`.
 """
 
 import contextlib
@@ -29,9 +25,9 @@ from typing import Any, Literal, Protocol
 
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError
 
-# Who we are to cameras that pair: always the same, so that nothing needs remembering. "cotarget" twice, in hex.
+# This program's identity for cameras that pair: constant, so that nothing is stored. "cotarget" twice, in hex.
 GUID = ":".join(f"{byte:02x}" for byte in b"cotarget" * 2)
-# libgphoto2's results, and the bytes that it has for a value.
+# libgphoto2's result codes, and the size of its buffer for a value [bytes].
 FOUND, UNKNOWN, ROOM = 0, -1, 255
 GET = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_void_p, ctypes.c_void_p)
 PUT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_void_p)
@@ -39,16 +35,16 @@ PUT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_
 
 @functools.cache
 def library() -> ctypes.CDLL:
-    """The libgphoto2 that python-gphoto2 calls; called by ctypes, its functions let other threads run."""
+    """Load the libgphoto2 that python-gphoto2 uses; calls through ctypes release the interpreter lock."""
     return ctypes.CDLL(importlib.import_module("gphoto2._camera").__file__)
 
 
 @functools.cache
 def keep_settings_in_memory() -> tuple[object, object]:
-    """Answer for libgphoto2's file of settings from now on; the older versions that cannot be told keep their file.
+    """Answer in place of libgphoto2's settings file from now on; versions before 2.5.32 keep the file.
 
     Returns:
-        The two functions, which must live as long as the library.
+        The two callbacks, which must live as long as the library.
     """
     memory = {(b"ptp2_ip", b"guid"): GUID.encode()}
 
@@ -74,8 +70,8 @@ def keep_settings_in_memory() -> tuple[object, object]:
 def standard_input_kept() -> Iterator[None]:
     """Keep descriptor 0, which libgphoto2 closes whenever it disconnects from a network camera.
 
-    Whatever opened next would get the number, a socket or a serial port, and be closed by the next disconnection. The
-    mistake is known there (github.com/gphoto/libgphoto2, pull request 1287).
+    The next socket or serial port to be opened would get the number, and be closed by the next disconnection. The bug
+    is known (github.com/gphoto/libgphoto2, pull request 1287).
     """
     try:
         kept = os.dup(0)
@@ -90,25 +86,25 @@ def standard_input_kept() -> Iterator[None]:
 
 
 def _drivers() -> list[ctypes.CDLL]:
-    """The drivers of PTP cameras: PyPI's package has a second copy of the library for them."""
+    """Load the drivers of PTP cameras, for which PyPI's package has a second copy of the library."""
     folder = os.environ.get("CAMLIBS")  # set by python-gphoto2 when it is imported
     return [] if folder is None else [ctypes.CDLL(str(path)) for path in Path(folder).glob("ptp2.so")]
 
 
-# --- gphoto_port ---
+# Ports
 
-# PTP/IP's own TCP port (CIPA DC-005), for commands and events alike.
+# PTP/IP's own TCP port (CIPA DC-005), for commands and for events.
 NETWORK_PORT, HIGHEST_PORT = "15740", 65535
 NETWORK = re.compile(r"ptpip:([^:\s]+)(?::(\d+))?(?::(\d+))?", re.ASCII)
-LISTENING_S = 2.5  # as long as libgphoto2 waits
+LISTENING_S = 2.5  # libgphoto2's own time limit to connect [s]
 USB = re.compile(r"usb:(?:(\d+),(\d+))?", re.ASCII)
 
 
 def full_port(port: str) -> str:
-    """A port as gphoto2 must be told it: of network cameras the address, and both TCP ports.
+    """Complete a port for gphoto2: a network camera's needs its numeric address and both TCP ports.
 
     Raises:
-        ConfigError: it is no port of gphoto2, or its host is unknown.
+        ConfigError: the text is no port of gphoto2, or its host is unknown.
     """
     if USB.fullmatch(port):
         return port
@@ -119,18 +115,18 @@ def full_port(port: str) -> str:
     if max(int(commands), int(events)) > HIGHEST_PORT:
         raise ConfigError(f"hardware.zoom.port: '{port}' has a TCP port above {HIGHEST_PORT}")
     try:
-        address = socket.getaddrinfo(host, None, socket.AF_INET)[0][4][0]  # gphoto2 knows no names
+        address = socket.getaddrinfo(host, None, socket.AF_INET)[0][4][0]  # gphoto2 resolves no names
     except (OSError, UnicodeError) as error:
         raise ConfigError(f"hardware.zoom.port: there is no host '{host}' in '{port}'") from error
-    # Without a second port gphoto2 would take the usual one for events, whatever the first is.
+    # Without a second port gphoto2 would take 15740 for events, even where the first port differs.
     return f"ptpip:{address}:{commands}:{events}"
 
 
 def check_listening(port: str) -> None:
-    """Refuse a port where nobody listens, before libgphoto2 does so with lines of its own on stderr.
+    """Refuse a network address where no camera listens; libgphoto2 would print lines of its own to stderr.
 
     Raises:
-        DeviceError: nobody listens there.
+        DeviceError: the connection failed.
     """
     _, address, commands, _ = port.split(":")
     try:
@@ -140,10 +136,10 @@ def check_listening(port: str) -> None:
 
 
 def check_permission(port: str) -> None:
-    """Refuse a camera on USB that belongs to another user: gphoto2 would speak of a general I/O error.
+    """Refuse a USB camera without permission for this user; gphoto2 would report a general I/O error.
 
     Raises:
-        DeviceError: with what to do.
+        DeviceError: there is no permission; the message names the remedy.
     """
     match = USB.fullmatch(port)
     device = Path("/dev/bus/usb", *(match.groups() if match else ()))
@@ -155,7 +151,7 @@ def check_permission(port: str) -> None:
 
 
 def shortened(names: Iterable[str], wanted: str, most: int = 12) -> str:
-    """Valid choices for the end of a message, those most like what was wanted first: cameras have a hundred."""
+    """List valid choices for a message, those most like ``wanted`` first, at most ``most`` of them."""
     names = sorted(set(names))
     near = [name for name in names if wanted.lower() in name.lower()]
     near += difflib.get_close_matches(wanted, names, n=most, cutoff=0.4)
@@ -164,16 +160,18 @@ def shortened(names: Iterable[str], wanted: str, most: int = 12) -> str:
     return (", ".join(shown) or "none") + (f" and {more} more" if more else "")
 
 
+# Calls
+
 # libgphoto2's result codes, gphoto2/gphoto2-port-result.h and gphoto2-result.h.
 BAD_PARAMETERS, IO, TIMEOUT = -2, -7, -10
 IO_READ, IO_WRITE, USB_CLEAR_HALT, USB_FIND, USB_CLAIM, IO_LOCK = -34, -35, -51, -52, -53, -60
 CAMERA_BUSY = -110
-# After these the connection is good for nothing; it has to be made anew.
+# After these errors the connection is unusable and must be made again.
 LOST = frozenset({IO, TIMEOUT, IO_READ, IO_WRITE, USB_CLEAR_HALT, USB_FIND, USB_CLAIM, IO_LOCK})
 MISSING = "gphoto2 is not installed; pip install 'cotarget[hardware]'"
-# The protocol's own model name, for cameras in a network; gphoto2 cannot look for those.
+# gphoto2's model name for any network camera; it cannot detect those.
 NETWORK_MODEL = "PTP/IP Camera"
-# What to do about errors that a user can do something about; what goes wrong with a network camera says nothing itself.
+# Remedies for errors that a user can correct; the codes of a network camera do not say what is wrong.
 NETWORK_HINT = "; is it a PTP/IP camera, switched on, and used by no other program?"
 HINTS = {
     USB_CLAIM: "; another program holds it: unmount it (gio mount -s gphoto2), or end gvfs-gphoto2-volume-monitor",
@@ -183,7 +181,7 @@ HINTS = {
 
 
 class LinkError(Exception):
-    """A gphoto2 call failed.
+    """A call of libgphoto2 failed.
 
     Attributes:
         code: libgphoto2's result code.
@@ -196,17 +194,17 @@ class LinkError(Exception):
 
 @dataclass(frozen=True)
 class Setting:
-    """One of a camera's settings.
+    """A setting of a camera.
 
     Attributes:
-        kind: "range" has a number for value, "switch" 0 or 1, "choice" one of its choices, "date" seconds since 1970,
-            "text" anything.
-        value: what it is now.
-        low: a range's least value.
-        high: a range's greatest value.
-        step: between a range's values.
-        choices: the values that a choice can have.
-        readonly: whether it can only be read.
+        kind: type of the value: "range" a number, "switch" 0 or 1, "choice" one of ``choices``, "date" seconds since
+            1970, "text" any text.
+        value: present value.
+        low: least value of a range.
+        high: greatest value of a range.
+        step: step between values of a range.
+        choices: valid values of a choice.
+        readonly: whether the setting can only be read.
     """
 
     kind: Literal["range", "switch", "choice", "date", "text"]
@@ -219,47 +217,47 @@ class Setting:
 
 
 class CameraLink(Protocol):
-    """What the driver asks of gphoto2, all of it from one thread. What fails raises LinkError."""
+    """The camera calls that the driver uses, all from one thread. Each raises LinkError where libgphoto2 fails."""
 
     def open(self) -> str:
-        """Connect, perhaps again after `close`; return the camera's name.
+        """Connect, possibly again after `close`; return the camera's name.
 
         Raises:
-            ConfigError: there can be no such port or model.
-            DeviceError: the camera is not there, or not ours to open.
+            ConfigError: the port or model is invalid.
+            DeviceError: the camera is not there, or may not be used.
         """
 
     def close(self) -> None:
-        """Disconnect; harmless when there is no connection."""
+        """Disconnect; does nothing without a connection."""
 
     def names(self) -> list[str]:
-        """The names of the camera's settings."""
+        """List the names of the camera's settings."""
 
     def get(self, name: str) -> Setting:
-        """Read one setting."""
+        """Read a setting."""
 
     def put(self, name: str, value: str | float) -> None:
-        """Write one setting."""
+        """Write a setting."""
 
     def preview(self) -> bytes:
-        """A frame of the viewfinder, as the camera encodes it."""
+        """Fetch a viewfinder frame, as the camera encodes it."""
 
     def shoot(self) -> tuple[str, str]:
-        """Take a still; return its folder and name."""
+        """Take a still; return its folder and name on the camera."""
 
     def fetch(self, still: tuple[str, str]) -> bytes:
-        """The contents of a still."""
+        """Fetch the contents of a still."""
 
 
 class GphotoLink:
-    """A camera by python-gphoto2.
+    """A camera through python-gphoto2.
 
     Args:
-        port: as gphoto2 writes it.
-        model: as gphoto2 calls it; empty for the one that it finds there.
+        port: in gphoto2's notation.
+        model: gphoto2's name of the model; empty for the camera that is at the port.
 
     Raises:
-        ConfigError: there can be no such port.
+        ConfigError: the port is invalid.
     """
 
     def __init__(self, port: str, model: str) -> None:
@@ -282,17 +280,17 @@ class GphotoLink:
                 camera.set_port_info(ports.get_info(ports.lookup_path(port)))
                 camera.init()
             except gp.GPhoto2Error as error:
-                camera = None  # disconnected here
+                camera = None  # frees the object, which disconnects, inside of standard_input_kept
                 raise LinkError(error.code, error.string, NETWORK_HINT * self._port.startswith("ptpip:")) from error
         self._camera = camera
         return model
 
     def look(self) -> str:
-        """Look for the camera, and whether it may be opened, without opening it; what is there.
+        """Detect the camera and check the permission for it without opening it; describe it in one line.
 
         Raises:
-            ConfigError: there can be no such model, or gphoto2 is not installed.
-            DeviceError: it is not there, or not ours to open.
+            ConfigError: the model is unknown, or gphoto2 is not installed.
+            DeviceError: the camera is not there, or may not be used.
         """
         gp = _gphoto2()
         ports, abilities = gp.PortInfoList(), gp.CameraAbilitiesList()
@@ -305,7 +303,7 @@ class GphotoLink:
         return f"{model} at {port}" if port.startswith("usb:") else f"something listens at {port}"
 
     def _find(self, ports: Any, abilities: Any) -> tuple[str, str]:
-        """The model's name and the port in full."""
+        """Find the camera: its model's name and its full port."""
         port = self._port
         if self._model:
             _check_model(self._model, abilities)
@@ -323,7 +321,7 @@ class GphotoLink:
         return here[0]
 
     def close(self) -> None:
-        """Disconnect, without making other threads wait for a camera that does not answer."""
+        """Disconnect without blocking other threads while the camera does not answer."""
         camera, self._camera = self._camera, None
         if camera is not None:
             with standard_input_kept():
@@ -331,11 +329,11 @@ class GphotoLink:
                 del camera
 
     def names(self) -> list[str]:
-        """The names of the camera's settings."""
+        """List the names of the camera's settings."""
         return [str(name) for name in self._call("list_config").keys()]  # noqa: SIM118 - a CameraList is no dict
 
     def get(self, name: str) -> Setting:
-        """Read one setting."""
+        """Read a setting."""
         gp, widget = self._gp, self._call("get_single_config", name)
         kind, value, readonly = widget.get_type(), widget.get_value(), bool(widget.get_readonly())
         if kind == gp.GP_WIDGET_RANGE:
@@ -351,7 +349,7 @@ class GphotoLink:
         return Setting("text", str(value), readonly=readonly)
 
     def put(self, name: str, value: str | float) -> None:
-        """Write one setting."""
+        """Write a setting."""
         gp, widget = self._gp, self._call("get_single_config", name)
         kind = widget.get_type()
         if kind == gp.GP_WIDGET_RANGE:
@@ -363,17 +361,17 @@ class GphotoLink:
         self._call("set_single_config", name, widget)
 
     def preview(self) -> bytes:
-        """A frame of the viewfinder."""
-        file = self._call("capture_preview")  # owns the data until they are copied
+        """Fetch a viewfinder frame."""
+        file = self._call("capture_preview")  # owns the data until bytes() has copied them
         return bytes(file.get_data_and_size())
 
     def shoot(self) -> tuple[str, str]:
-        """Take a still; return its folder and name."""
+        """Take a still; return its folder and name on the camera."""
         path = self._call("capture", self._gp.GP_CAPTURE_IMAGE)
         return str(path.folder), str(path.name)
 
     def fetch(self, still: tuple[str, str]) -> bytes:
-        """The contents of a still."""
+        """Fetch the contents of a still."""
         file = self._call("file_get", *still, self._gp.GP_FILE_TYPE_NORMAL)
         return bytes(file.get_data_and_size())
 
@@ -386,11 +384,11 @@ class GphotoLink:
 
 
 def cameras() -> list[str]:
-    """The cameras that gphoto2 sees on this machine's USB, "model at port" each; none of them is opened.
+    """List the cameras on this machine's USB as "model at port"; none is opened.
 
     Raises:
         ConfigError: gphoto2 is not installed.
-        DeviceError: it cannot look.
+        DeviceError: the detection failed.
     """
     gp = _gphoto2()
     try:
@@ -400,11 +398,11 @@ def cameras() -> list[str]:
 
 
 def probe(port: str, model: str) -> str:
-    """Look for a configured camera without opening it; what is there.
+    """Detect a configured camera without opening it; describe it in one line.
 
     Raises:
-        ConfigError: there can be no such port or model, or gphoto2 is not installed.
-        DeviceError: it is not there, or not ours to open.
+        ConfigError: the port or model is invalid, or gphoto2 is not installed.
+        DeviceError: the camera is not there, or may not be used.
     """
     return GphotoLink(port, model).look()
 

@@ -1,13 +1,11 @@
-"""Pictures out of a stream of JPEGs (multipart/x-mixed-replace): bytes in, whole pictures out, no input or output.
+"""Read and decode JPEG images from a multipart/x-mixed-replace stream.
 
-Servers differ in how they write the boundary, their Content-Length may be missing or wrong, bytes may follow a picture,
-and parts are cut short. So a picture is taken for what the JPEG itself says, from its first marker to its last (ITU-T
-T.81, annex B), and boundaries only serve to notice a cut one. Waiting for the boundary after a picture would cost a
-frame's time besides.
+`Walk` finds the parts of a JPEG by its markers (ITU-T T.81, annex B). `JpegDecoder` decodes whole images and refuses
+damaged ones. `MultipartReader` takes the stream's bytes and returns whole images. Nothing here does I/O.
 
-JPEGs as they come off a wire: decoded if they are whole, and refused otherwise.
-
-Where a JPEG's parts are, by its own markers (ITU-T T.81, annex B): no decoding, and no input or output.
+Servers differ in how they write the boundary, Content-Length may be missing or wrong, bytes may follow an image, and
+parts are cut short. An image is therefore taken from its first marker to its last, and the boundary only shows that an
+image was cut. Waiting for the boundary after an image would also cost a frame period.
 """
 
 import itertools
@@ -23,10 +21,10 @@ import numpy as np
 
 from cotarget.rig import Image
 
-# Within compressed data 0xff is followed by a zero, a restart marker or another 0xff; all else is a marker.
+# Within compressed data 0xff is followed by a zero, a restart marker or another 0xff; any other byte makes a marker.
 MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 EOI, SOS, DRI = 0xD9, 0xDA, 0xDD
-# Frame headers, which carry the size: C0 to CF but for tables (C4, CC) and a reserved one (C8).
+# Frame headers, which hold the size: C0 to CF except tables (C4, CC) and a reserved marker (C8).
 SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 # Markers that are followed by a length: frame headers, tables, scans, application data and comments.
 SEGMENTS = SIZED | {0xC4, 0xCC} | frozenset(range(SOS, 0xF0)) | {0xFE}
@@ -35,16 +33,16 @@ SIZED_LENGTH = 5
 
 
 class Walk:
-    """Goes through one JPEG's markers as its bytes arrive.
+    """Parser of one JPEG's markers, as its bytes arrive.
 
     Attributes:
-        position: as far as it has come.
-        end: one past its last byte, once that is there.
-        broken: whether it is no JPEG.
+        position: index of the next byte to parse.
+        end: index after the last byte, once that has arrived.
+        broken: whether the data are no JPEG.
         size: (width, height) [px].
-        frame: where its frame header's marker is.
-        scans: where the compressed data of each of its scans begin and end.
-        restarts: whether it defines an interval between restart markers.
+        frame: index of the frame header's marker.
+        scans: (begin, end) of the compressed data of each scan.
+        restarts: whether an interval between restart markers is defined.
     """
 
     def __init__(self) -> None:
@@ -58,16 +56,16 @@ class Walk:
         self._in_scan = False
 
     def advance(self, data: bytes | bytearray) -> None:
-        """Go on as far as the data allows."""
+        """Parse as far as the data allow; they begin with the bytes of earlier calls."""
         while self.end is None and not self.broken:
             if not (self._scan(data) if self._in_scan else self._segment(data)):
                 return
 
     def _scan(self, data: bytes | bytearray) -> bool:
-        """Go through compressed data to the next marker; whether there is one."""
+        """Skip compressed data up to the next marker; return whether there is one."""
         match = MARKER.search(data, self.position)
         if match is None:
-            # The last byte may be a marker's first.
+            # The last byte may be the first of a marker.
             self.position = max(len(data) - 1, self.position)
             return False
         self.position = match.start()
@@ -78,13 +76,13 @@ class Walk:
         return True
 
     def _segment(self, data: bytes | bytearray) -> bool:
-        """Go over one marker and what belongs to it; whether it is all there."""
+        """Parse one marker and its segment; return whether it has arrived completely."""
         start = self.position
         while data[start : start + 2] == b"\xff\xff":
-            start += 1  # a marker may be preceded by any number of these
+            start += 1  # any number of 0xff may precede a marker
         self.position = start
         if len(data) < start + 4:
-            # An end of the picture before any scan would be shorter than this, but is none either.
+            # Only an end marker before any scan is shorter than this, and that is no valid image.
             self.broken = len(data) > start and data[start] != 0xFF
             return False
         marker, length = data[start + 1], int.from_bytes(data[start + 2 : start + 4])
@@ -95,7 +93,7 @@ class Walk:
             return False
         if marker in SIZED:
             self.frame = start
-            # A second one belongs to no sequential or progressive JPEG; nor does a size without height.
+            # A sequential or progressive JPEG has one frame header, with a height.
             again, self.size = self.size != (0, 0), _size(data[start + 4 : start + 2 + length])
             self.broken = again or 0 in self.size
         self.position = start + 2 + length
@@ -108,49 +106,49 @@ class Walk:
 
 
 def _size(header: bytes | bytearray) -> tuple[int, int]:
-    """(width, height) of a frame header, which holds precision, height and width; zeros for one that is too short."""
+    """Read (width, height) from a frame header of precision, height and width; zeros if it is too short."""
     if len(header) < SIZED_LENGTH:
         return 0, 0
     return int.from_bytes(header[3:5]), int.from_bytes(header[1:3])
 
 
-# --- jpeg ---
+# Decoding
 
 START_OF_IMAGE, END_OF_IMAGE = b"\xff\xd8", b"\xff\xd9"
-# Frame headers of sequential JPEGs with Huffman's code, whose only scan holds block after block.
+# Frame headers of sequential JPEGs with Huffman coding, which hold block after block in their only scan.
 SEQUENTIAL = (0xC0, 0xC1)
-BLOCK = 8  # to each side [px]
-LONGEST_SIDE = 65535  # that a frame header can tell [px]
-# Some cameras put further bytes before a picture's last marker (github.com/ros-drivers/axis_camera, issue 51: 651 of
-# them). One whose last so many pictures had too many is such a one, and theirs are not damaged.
+BLOCK = 8  # side [px]
+LONGEST_SIDE = 65535  # that a frame header can express [px]
+# Some cameras put further bytes before an image's last marker (github.com/ros-drivers/axis_camera, issue 51: 651 of
+# them). Excess bytes are accepted once they are usual: after `USUAL` images with them, at most.
 USUAL = 5
-# More than the blocks of a unit take where all their bits are zero.
+# More bytes than a unit's blocks take if all their bits are zero.
 ZEROS = bytes(4096)
 
 
 class JpegDecoder:
-    """Decodes JPEGs; safe to use from any thread.
+    """Decoder of JPEG images that refuses damaged ones; safe to use from any thread.
 
-    OpenCV shows whatever is left of a damaged picture and says so on stderr only. So FFmpeg's decoder looks at it
-    first: told to, it refuses codes that make no sense, and data that end before a unit (of some blocks, T.81, A.2)
-    begins. After most damage the codes make sense again soon, but there are more units or fewer than there were. So
-    the picture is checked under a header that tells of one unit more: its data must suffice to begin that one, and must
-    not without their last byte, unless that is this camera's way. Progressive pictures, and those with restart markers,
-    are only decoded as they are.
+    OpenCV decodes what is left of a damaged image and only prints to stderr. FFmpeg's decoder therefore checks the
+    image first. With err_detect=explode it refuses invalid codes, and data that end before a unit (of some blocks,
+    T.81, A.2) begins. After most damage the codes become valid again soon, but the number of units changes. The image
+    is therefore checked under a header with one unit more. Its data must suffice to begin that unit, and must not
+    without their last byte, unless this camera usually sends excess bytes. Progressive images, and those with restart
+    markers, are only decoded as they are.
     """
 
     def __init__(self) -> None:
         self._checker = av.CodecContext.create("mjpeg", "r")
         self._checker.options = {"err_detect": "explode"}
-        self._checker.thread_count = 1  # more of them would give each picture with the next
-        self._exact = 0  # how many pictures lately had no byte too many, more than had some
+        self._checker.thread_count = 1  # with more threads an image comes out only with the next one
+        self._exact = 0  # recent images without excess bytes less those with some, 0 to USUAL
         self._lock = threading.Lock()
 
     def decode(self, jpeg: bytes) -> Image | None:
-        """The image as the sensor has it, (H, W, 3) BGR and read-only; None if it is damaged, cut short or no JPEG.
+        """Decode an image, (H, W, 3) BGR and read-only; None if it is damaged, cut short or no JPEG.
 
         Args:
-            jpeg: its bytes; what follows its end does no harm.
+            jpeg: bytes of the image; bytes after its end are ignored.
         """
         walk = Walk()
         walk.advance(jpeg)
@@ -161,7 +159,7 @@ class JpegDecoder:
             if not self._whole(jpeg, walk):
                 return None
         try:
-            # A camera that is told to turn its pictures does so; a note in them to turn them is none of ours.
+            # The EXIF orientation is ignored: the image must stay as the sensor has it.
             flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
             image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), flags)
         except cv2.error:
@@ -172,25 +170,26 @@ class JpegDecoder:
         return image
 
     def _whole(self, jpeg: bytes, walk: Walk) -> bool:
-        """Whether the data of a picture are as many as its blocks take."""
+        """Return whether an image has the data that its blocks need, neither less nor more."""
         unit = _unit(jpeg, walk)
         if unit is None:
             return self._decodes(jpeg)
         units = math.prod(math.ceil(side / each) for side, each in zip(walk.size, unit, strict=True))
-        # One row of units if a side can be so long; of large stills the next number that makes some even rows.
+        # The header with one unit more: one row of units if a side can be that long. For large stills, the next
+        # number of units that fills whole rows.
         count, size = next((n, size) for n in itertools.count(units + 1) if (size := _sides(n, unit)))
         header, data = _resized(jpeg[: walk.scans[0][0]], walk.frame, size), _data(jpeg, walk)
         if count > units + 1:
             enough = self._decodes(jpeg)
         else:
-            # Beyond the end all bits are zero. They may make no unit; then this tells nothing.
+            # FFmpeg reads zeros beyond the end. If zeros are no valid unit, the check above says nothing.
             enough = self._decodes(header + data + END_OF_IMAGE) or (
                 self._decodes(jpeg) and not self._decodes(header + data + ZEROS + END_OF_IMAGE)
             )
         return enough and self._usual(exact=not self._decodes(header + data[:-1] + END_OF_IMAGE))
 
     def _usual(self, exact: bool) -> bool:
-        """Note whether a picture has no byte too many; whether it may be so."""
+        """Record whether an image has no excess bytes; return whether that is acceptable for this camera."""
         usual = exact or self._exact == 0
         self._exact = min(self._exact + 1, USUAL) if exact else max(self._exact - 1, 0)
         return usual
@@ -203,11 +202,11 @@ class JpegDecoder:
 
 
 def _unit(jpeg: bytes, walk: Walk) -> tuple[int, int] | None:
-    """(width, height) of a unit of the picture's only scan [px]; None where it is another kind of JPEG."""
-    # FFmpeg does not miss the data where it looks for a restart marker.
+    """Find (width, height) of a unit of the image's only scan [px]; None for another kind of JPEG."""
+    # FFmpeg does not notice missing data where it looks for a restart marker.
     if jpeg[walk.frame + 1] not in SEQUENTIAL or len(walk.scans) != 1 or walk.restarts:
         return None
-    # The frame header: marker, length, precision, height, width, then the number of components and 3 bytes for each.
+    # Frame header: marker, length, precision, height, width, then the number of components and 3 bytes for each.
     components = jpeg[walk.frame + 9]
     sampling = jpeg[walk.frame + 11 : walk.frame + 10 + 3 * components : 3]
     if components == 1:
@@ -217,7 +216,7 @@ def _unit(jpeg: bytes, walk: Walk) -> tuple[int, int] | None:
 
 
 def _sides(units: int, unit: tuple[int, int]) -> tuple[int, int] | None:
-    """A size [px] of so many units, as wide as can be; None if there is none."""
+    """Find the widest size [px] that has this number of units; None if there is none."""
     columns, rows = (LONGEST_SIDE // each for each in unit)
     fewest = math.ceil(units / columns)
     found = next((n for n in range(fewest, rows + 1) if units % n == 0), None)
@@ -225,37 +224,39 @@ def _sides(units: int, unit: tuple[int, int]) -> tuple[int, int] | None:
 
 
 def _resized(header: bytes, frame: int, size: tuple[int, int]) -> bytes:
-    """A picture's header with another size in it."""
+    """Replace the size in an image's header."""
     return header[: frame + 5] + size[1].to_bytes(2) + size[0].to_bytes(2) + header[frame + 9 :]
 
 
 def _data(jpeg: bytes, walk: Walk) -> bytes:
-    """A scan's compressed data, without the bytes that may fill up what is before a marker."""
+    """Cut out a scan's compressed data, without the fill bytes before its last marker."""
     start, end = walk.scans[0]
     return jpeg[start:end].rstrip(b"\xff")
 
 
-# A picture of more bytes is garbage: a hundred times a coarse 4CIF one.
+# The stream
+
+# Longest image [bytes]; more is garbage: a hundred times a coarse 4CIF image.
 LONGEST_PICTURE = 16_000_000
-# After a broken picture the next boundary is looked for in as many bytes, then any picture.
+# After a broken image the next boundary is searched in this number of bytes, after that the start of any image.
 LONGEST_SKIP = 1_000_000
-# A marker and a half: nothing else that a server sends between pictures looks like it.
+# Start of an image: a marker and the first byte of the next. Nothing else between images contains these bytes.
 START = b"\xff\xd8\xff"
-# So many pieces are told apart by their time of arrival; more of them, which only a wicked server sends, are not.
+# Longest list of arrival times; further pieces, which only a hostile server sends, share the last time.
 MOST_ARRIVALS = 10_000
-# A part's header, for streams that do not keep to the boundary that they announce.
+# Begin of a part's header, for streams whose boundary differs from the announced one.
 HEADERS = (b"\r\nContent-Type:", b"\r\nContent-type:")
 BOUNDARY = re.compile(r"""boundary\s*=\s*(?:"([^"]*)"|([^\s;]+))""", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class JpegPicture:
-    """A whole JPEG.
+    """A whole JPEG image.
 
     Attributes:
         jpeg: its bytes.
-        size: (width, height) as it says [px].
-        t: when its first byte arrived [s].
+        size: (width, height) in its header [px].
+        t: arrival of its first byte [s].
     """
 
     jpeg: bytes
@@ -264,19 +265,19 @@ class JpegPicture:
 
 
 def boundary_of(content_type: str) -> str | None:
-    """The boundary that a Content-Type announces, without quotes and the dashes that some put before it."""
+    """Extract the boundary from a Content-Type, without quotes and without the dashes that some servers add."""
     match = BOUNDARY.search(content_type)
     return None if match is None else (match[1] or match[2] or "").strip().lstrip("-") or None
 
 
 class MultipartReader:
-    """Reads pictures from a stream, piece by piece; no bytes make it raise.
+    """Reader of images from a stream that arrives in pieces; no bytes make it raise.
 
     Args:
-        boundary: what `boundary_of` gave; None where none is announced.
+        boundary: from `boundary_of`; None where none is announced.
 
     Attributes:
-        broken: how many pictures were begun and dropped.
+        broken: number of images that began and were dropped.
     """
 
     def __init__(self, boundary: str | None = None) -> None:
@@ -284,18 +285,18 @@ class MultipartReader:
         self._delimiters = own + HEADERS
         self.broken = 0
         self._data = bytearray()
-        self._arrivals: deque[tuple[int, float]] = deque()  # how many bytes of the data came when
-        self._picture: Walk | None = None  # of the picture that the data begins with
-        self._skipped: int | None = None  # bytes dropped since a broken picture; None otherwise
-        self._searched = 0  # how much of the data holds no delimiter
+        self._arrivals: deque[tuple[int, float]] = deque()  # (number of bytes, time of arrival) of the data's pieces
+        self._picture: Walk | None = None  # of the image at the start of the data
+        self._skipped: int | None = None  # bytes dropped since a broken image; None if there was none
+        self._searched = 0  # number of leading bytes known to hold no delimiter
 
     @property
     def unfinished(self) -> bool:
-        """Whether a picture has begun that has not ended."""
+        """Whether an image has begun and not ended."""
         return self._picture is not None
 
     def feed(self, data: bytes, t: float) -> list[JpegPicture]:
-        """Take the next bytes, which arrived at ``t`` [s]; return the pictures that they complete."""
+        """Add bytes that arrived at ``t`` [s]; return the images that they complete."""
         if data:
             self._data += data
             if len(self._arrivals) < MOST_ARRIVALS:
@@ -309,7 +310,7 @@ class MultipartReader:
         return pictures
 
     def _skip(self) -> bool:
-        """After a broken picture drop what is left of it; whether that is done."""
+        """Drop the rest of a broken image; return whether that is done."""
         if self._skipped is None:
             return True
         found = self._delimiter()
@@ -322,7 +323,7 @@ class MultipartReader:
         return True
 
     def _begin(self) -> bool:
-        """Drop what comes before a picture; whether the data begins with one."""
+        """Drop the bytes before an image; return whether the data begin with one."""
         if self._picture is None:
             start = self._data.find(START)
             self._drop(max(len(self._data) - len(START) + 1, 0) if start < 0 else start)
@@ -332,7 +333,7 @@ class MultipartReader:
         return True
 
     def _continue(self, pictures: list[JpegPicture]) -> bool:
-        """Walk on through a picture; whether it came to an end, good or bad."""
+        """Parse on through an image; return whether it ended, whole or broken."""
         walk = self._picture
         assert walk is not None
         walk.advance(self._data)
@@ -354,15 +355,15 @@ class MultipartReader:
         return True
 
     def _delimiter(self) -> int | None:
-        """Where the data first holds a delimiter."""
+        """Find the index of the first delimiter in the data; None if there is none."""
         places = [place for d in self._delimiters if (place := self._data.find(d, self._searched)) >= 0]
-        # Not beyond the first: it is asked for again. The longest may lie across the end of the data.
+        # Not beyond the first, which later calls must find again. A delimiter may lie across the end of the data.
         longest = max(map(len, self._delimiters))
         self._searched = min(places, default=max(len(self._data) - longest + 1, 0))
         return min(places, default=None)
 
     def _drop(self, count: int) -> None:
-        """Forget the first bytes of the data."""
+        """Delete the first bytes of the data, with their arrival times."""
         del self._data[:count]
         self._searched = max(self._searched - count, 0)
         while count:
