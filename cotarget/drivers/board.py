@@ -1,9 +1,9 @@
-"""Who holds the calibration board before real cameras: a person who is told where, or a program at a socket.
+"""The calibration board before real cameras, held by a person or by a program at a socket.
 
-The program's protocol is one JSON object a line: `{"present": {"translation": [x, y, z], "rotvec_deg": [rx, ry, rz]}}`
-asks for the board at T_fixed_board [m, degrees], `{"present": null}` for no board, `{"swing": {...}}` for one that
-swings along its x axis until the next wish. The answer `{"ok": true}` comes when it is so, `{"error": "..."}` when it
-cannot be.
+The program's protocol is one JSON object a line. `{"present": {"translation": [x, y, z], "rotvec_deg": [rx, ry, rz]}}`
+requests the board at T_fixed_board [m, degrees], `{"present": null}` no board, and `{"swing": {...}}` a board that
+swings along its x axis until the next request. The answer `{"ok": true}` comes when that is done, `{"error": "..."}` if
+it is not possible.
 """
 
 import json
@@ -18,41 +18,41 @@ from cotarget.errors import DeviceError
 from cotarget.geometry import RigidTransform, pose_dict
 from cotarget.rig import Board
 
-PERSONS_PATIENCE = 60.0  # to walk there, turn the board and hold it still [s]
+PERSONS_PATIENCE = 60.0  # time to walk there, turn the board and hold it still [s]
 CONNECT_TIMEOUT, ANSWER_TIMEOUT = 3.0, 60.0  # a robot arm may take its time [s]
 LONGEST_ANSWER = 65536  # bytes
-TURNED_DEG = 5.0  # a board turned by less faces the camera, to a person
+TURNED_DEG = 5.0  # a smaller rotation is not mentioned to a person
 
 
 class ClosingBoard(Board, Protocol):
-    """A board whose holder is to be let go."""
+    """A board whose holder has a connection to close."""
 
     def close(self) -> None:
-        """Let go; more than once does no harm."""
+        """Close the connection; may be called again."""
 
 
 def make_board(config: HardwareBoard) -> ClosingBoard:
-    """Open who holds the board.
+    """Open the configured holder of the board: a person, or a program at a socket.
 
     Raises:
-        DeviceError: nobody is there.
+        DeviceError: no program listens at the socket.
     """
     address = socket_address(config.presenter)
     return PersonBoard(sys.stderr) if address is None else SocketBoard(*address)
 
 
 def probe(config: HardwareBoard) -> str:
-    """Look whether somebody is there to hold the board, without asking for it; who.
+    """Check that the board's holder is there, without a request for the board; describe the holder.
 
     Raises:
-        DeviceError: nobody is there.
+        DeviceError: no program listens at the socket.
     """
     make_board(config).close()
     return "a person" if socket_address(config.presenter) is None else f"a program at {config.presenter}"
 
 
 class PersonBoard:
-    """A person, who reads where to hold the board."""
+    """A person who holds the board where a printed text says."""
 
     patience = PERSONS_PATIENCE
 
@@ -60,25 +60,25 @@ class PersonBoard:
         self._out = out
 
     def present(self, T_fixed_board: RigidTransform | None) -> None:
-        """Say where to hold the board, or that it is not needed any more."""
+        """Print where to hold the board, or that it is not needed any more."""
         self._say("take the board away" if T_fixed_board is None else in_words(T_fixed_board))
 
     def swing(self, T_fixed_board: RigidTransform) -> None:
-        """Say where to swing the board."""
+        """Print where to swing the board."""
         self._say(f"{in_words(T_fixed_board)}; swing it left and right by 15 cm, to and fro in two seconds")
 
     def close(self) -> None:
-        """There is nothing to let go."""
+        """Do nothing; a person has no connection."""
 
     def _say(self, text: str) -> None:
         print(f"\n{text}", file=self._out, flush=True)
 
 
 class SocketBoard:
-    """A program at a socket: a robot, or an emulated rig.
+    """A program at a socket that holds the board: a robot, or an emulated rig.
 
     Raises:
-        DeviceError: nobody listens there.
+        DeviceError: no program listens there.
     """
 
     patience = 0.0
@@ -95,23 +95,23 @@ class SocketBoard:
         self._lines = self._socket.makefile("rb")
 
     def present(self, T_fixed_board: RigidTransform | None) -> None:
-        """Ask for the board and wait until it is there.
+        """Request the board at a pose, or no board, and wait until that is done.
 
         Raises:
-            DeviceError: it cannot be, or the program is gone.
+            DeviceError: the pose is not possible, or the program is gone.
         """
         self._ask("present", T_fixed_board)
 
     def swing(self, T_fixed_board: RigidTransform) -> None:
-        """Ask for the board to swing.
+        """Request a board that swings about a pose.
 
         Raises:
-            DeviceError: it cannot, or the program is gone.
+            DeviceError: that is not possible, or the program is gone.
         """
         self._ask("swing", T_fixed_board)
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._lines.close()
         self._socket.close()
 
@@ -124,7 +124,7 @@ class SocketBoard:
             raise DeviceError(f"{self._name}: the board's holder does not answer: {error}") from None
         try:
             answer = json.loads(line)
-        except (ValueError, RecursionError):  # the latter of brackets without end
+        except (ValueError, RecursionError):  # the latter for endless brackets
             said = f"said {line[:40]!r}" if line else "is gone"
             raise DeviceError(f"{self._name}: the board's holder {said}") from None
         if not (isinstance(answer, dict) and answer.get("ok") is True):
@@ -133,7 +133,7 @@ class SocketBoard:
 
 
 def in_words(T_fixed_board: RigidTransform) -> str:
-    """Tell a person where the board's first corner goes, and how the board is turned, as the fixed camera sees it."""
+    """Describe a board pose to a person: place of its first corner, and rotation, as seen by the fixed camera."""
     x, y, z = T_fixed_board.translation
     normal = T_fixed_board.rotation.as_matrix()[:, 2]
     yaw, pitch = np.degrees(np.arctan2(normal[0], normal[2])), np.degrees(np.arctan2(normal[1], normal[2]))

@@ -1,11 +1,12 @@
-"""Keeps a second program from a rig that one already has, before either would blame the devices for the other.
+"""Locks of the hardware rig: one program at a time, and no motion of a head whose position may be lost.
 
-Remembers from one program to the next that the position of a PTU-D46 may be lost.
+`rig_lock` refuses a second program before either one blames the devices for the other's commands.
 
-A unit that hit a limit, stalled or was switched off goes on counting from a wrong position, and nothing that it says
-later tells: its limits, and the soft ones inside them, are off by what was lost. So a file says it until the unit has
-found its limits anew. It lies beside the rig's stop file, or else in the user's state folder, and it concerns every
-head there, so that a unit which comes back at another port, as adapters do, is not trusted either.
+`PositionLostMarker` stores from one program to the next that the position of a PTU-D46 may be lost. A unit that hit a
+limit, stalled or was switched off goes on counting from a wrong position, and no later answer shows it: its limits, and
+the soft limits inside them, are off by the loss. The marker is a file that stays until the unit has found its limits
+again. It lies beside the rig's stop file, or else in the user's state folder. It applies to every head of the rig,
+because a serial adapter may come back at another port.
 """
 
 import contextlib
@@ -24,25 +25,28 @@ from cotarget.errors import DeviceError
 
 log = logging.getLogger(__name__)
 SUFFIX = ".position-lost"
-STATE_HOME, STATE_HOME_DEFAULT = "XDG_STATE_HOME", "~/.local/state"  # by the XDG base directory specification
-WITHOUT_STOP_FILE = Path("cotarget") / "head"  # below that
+STATE_HOME, STATE_HOME_DEFAULT = "XDG_STATE_HOME", "~/.local/state"  # XDG base directory specification
+WITHOUT_STOP_FILE = Path("cotarget") / "head"  # below the state folder
 NO_REASON = "the position of a pan-tilt unit may be lost; see that it is free, then run cotarget reset-head"
-LONGEST_NAME, LONGEST_REASON = 100, 500  # characters of a port's name in a file's, and of a reason that is shown
+LONGEST_NAME, LONGEST_REASON = 100, 500  # port in the file's name, reason in messages [characters]
 
 
 class PositionLostError(DeviceError):
-    """Where the unit is nobody knows, whatever it says, until it was reset."""
+    """The unit's position may be lost; the head must not move before its reset."""
 
     def __init__(self, name: str, what: str) -> None:
         super().__init__(f"the pan-tilt unit at {name} {what}; see that it is free, then run cotarget reset-head")
 
 
 class PositionLostMarker:
-    """What is remembered of the unit at a port.
+    """Marker file for the lost position of the unit at a port.
 
     Args:
-        port: the unit's.
-        stop_file: of the rig; None where it has none.
+        port: port of the unit.
+        stop_file: stop file of the rig; None where it has none.
+
+    Attributes:
+        file: path of the marker.
     """
 
     def __init__(self, port: str, stop_file: Path | None) -> None:
@@ -52,10 +56,10 @@ class PositionLostMarker:
         self.file = self._folder / f"{self._begin}{name}{SUFFIX}"
 
     def refuse(self) -> None:
-        """Raise while the position of any unit that this rig may have is not to be trusted.
+        """Raise if there is a marker for any unit of this rig.
 
         Raises:
-            DeviceError: with the reason, and what ends it.
+            DeviceError: a marker exists; the message has its reason, and the remedy.
         """
         try:
             files = sorted(self._folder.iterdir())
@@ -70,7 +74,7 @@ class PositionLostMarker:
                 raise DeviceError(f"{_reason(file)} (or, where no unit is at that port any more, remove {file})")
 
     def note(self, reason: str) -> None:
-        """Remember it; where that fails the log says so."""
+        """Write the marker; a failure is logged."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             self.file.write_text(f"{reason}\n", encoding="utf-8")
@@ -78,7 +82,7 @@ class PositionLostMarker:
             log.error("%s: cannot be written (%s), so that nobody will remember: %s", self.file, error.strerror, reason)
 
     def forget(self) -> None:
-        """The unit was reset.
+        """Remove the marker after a reset.
 
         Raises:
             DeviceError: the file cannot be removed.
@@ -96,7 +100,7 @@ def _state_home() -> Path:
 
 
 def _reason(file: Path) -> str:
-    """What a file says, as one line."""
+    """Read a marker's reason as one line."""
     try:
         said = file.read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -106,17 +110,17 @@ def _reason(file: Path) -> str:
 
 @contextlib.contextmanager
 def rig_lock(port: str) -> Iterator[None]:
-    """Have the rig whose pan-tilt unit is at a port to oneself; the claim ends with the process, however that ends.
+    """Lock the rig whose pan-tilt unit is at a port; the lock ends with the block, or with the process in any way.
 
-    It is a name that Linux lets one socket of a machine have at a time. Elsewhere, and among containers, the ports and
-    cameras themselves have to refuse a second program.
+    The lock is an abstract socket name, which Linux gives to one socket of a machine at a time. On other systems, and
+    between containers, only the ports and cameras themselves refuse a second program.
 
     Raises:
-        InUseError: another program has it.
+        InUseError: another program has the lock.
     """
     url = "://" in port
     if not sys.platform.startswith("linux") or not (url or Path(port).exists()):
-        yield  # a port that is not there is nobody's
+        yield  # a port that does not exist needs no lock
         return
     address = port if url else str(Path(port).resolve())
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:

@@ -1,4 +1,4 @@
-"""Zoom lenses that are driven by position: which focal length a position has, and where the lens is while it moves."""
+"""Zoom lenses that are driven by position: focal length of a position, and estimated position during a motion."""
 
 from dataclasses import dataclass, replace
 
@@ -7,12 +7,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class LensTable:
-    """What a zoom lens's positions mean.
+    """Focal lengths of a zoom lens's positions.
 
     Attributes:
-        knots: (position, focal length [mm]) of some positions, both increasing; between them the logarithm of the
-            focal length is interpolated.
-        positions: where the lens can be sent, increasing and within the knots.
+        knots: (position, focal length [mm]), both increasing; the logarithm of the focal length is interpolated.
+        positions: positions to which the lens can be sent, increasing and within the knots.
         pitch_mm: size of a pixel of the stream [mm].
     """
 
@@ -21,32 +20,32 @@ class LensTable:
     pitch_mm: float
 
     def focal_at(self, position: float) -> float:
-        """Nominal focal length at a position [px]; beyond the knots that of the nearest one."""
+        """Return the nominal focal length [px] at a position; beyond the knots that of the nearest one."""
         at, mm = zip(*self.knots, strict=True)
         return float(np.exp(np.interp(position, at, np.log(mm)))) / self.pitch_mm
 
     def position_for(self, focal_px: float) -> int:
-        """The nearest position [1] to a nominal focal length [px] that the lens can be sent to."""
+        """Return the position [1] nearest to a nominal focal length [px], of those that the lens can be sent to."""
         at, mm = zip(*self.knots, strict=True)
         exact = np.interp(np.log(focal_px * self.pitch_mm), np.log(mm), at)
         return min(self.positions, key=lambda position: abs(position - exact))
 
     @property
     def focal_range(self) -> tuple[float, float]:
-        """Shortest and longest nominal focal length [px] that the lens can be sent to."""
+        """Shortest and longest nominal focal length [px] of the positions."""
         return self.focal_at(self.positions[0]), self.focal_at(self.positions[-1])
 
 
 @dataclass(frozen=True)
 class LensMotion:
-    """Where a lens is, by its own speed: for devices that do not tell.
+    """Estimated motion of a lens at constant speed, for devices that do not report its position.
 
     Attributes:
-        start: position at the start of the motion.
-        goal: position at its end.
-        t: when it starts [s].
-        speed: positions a second.
-        before: what the lens did until then; None for a lens that stood.
+        start: position at the start.
+        goal: position at the end.
+        t: start time [s].
+        speed: [positions/s].
+        before: motion until the start; None for a lens that stood.
     """
 
     start: float
@@ -56,7 +55,7 @@ class LensMotion:
     before: "LensMotion | None" = None
 
     def position(self, t: float) -> float:
-        """Where the lens is at a time [s]."""
+        """Return the position at a time [s]."""
         if t < self.t:
             return self.start if self.before is None else self.before.position(t)
         way = self.speed * (t - self.t)
@@ -66,9 +65,9 @@ class LensMotion:
 
     @property
     def arrives(self) -> float:
-        """When the lens stands at its goal [s]."""
+        """Time at which the lens arrives at its goal [s]."""
         return self.t + abs(self.goal - self.start) / self.speed
 
     def toward(self, goal: float, t: float) -> "LensMotion":
-        """The motion of a lens that heads for another goal from a time on [s]."""
+        """Return the motion to another goal that starts at a time [s]."""
         return LensMotion(self.position(t), goal, t, self.speed, replace(self, before=None))
