@@ -1,9 +1,8 @@
-"""Wraps any Rig: soft limits, a speed cap, a watchdog, an emergency stop, no stale frames, halt on every way out.
+"""Safety layer in front of any Rig: soft limits, speed cap, watchdog, emergency stop, frame age, halt at every exit.
 
-What it cannot do: it lives in the same process as the program that it watches. Where that process is killed at once
-(SIGKILL), frozen (SIGSTOP; Ctrl-Z is another signal, at which the head is halted first), or held by a C library that
-keeps Python's lock, nothing runs here; the head then ends at the goal of its last command, which lies within the soft
-limits.
+It runs in the same process as the program that it watches. It cannot act when that process is killed at once (SIGKILL),
+frozen (SIGSTOP; on Ctrl-Z, another signal, the head is halted first), or blocked by a C library that holds Python's
+interpreter lock. The head then ends at the goal of its last command, which lies within the soft limits.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -27,7 +26,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # These import numpy and SciPy, for which `cotarget stop` must not wait.
+    # Imported on demand: these import numpy and SciPy, and `cotarget stop` must start fast.
     if name == "SafeRig":
         from cotarget.safety.safe_rig import SafeRig
 

@@ -1,11 +1,7 @@
-"""A rig with the safety layer in front; it halts on every way out.
+"""A rig with the safety layer in front: limits, watchdog, emergency stop, and a halt at every exit.
 
-The devices of a rig as the safety layer shows them: the same Protocols, with refusals in front.
-
-In the simulation time passes only inside calls, so each call also watches, and a long one is made in two where the
-watchdog is due in between. A rig in real time has a thread for that.
-
-Soft limits inside the device's own, and a speed cap; pure arithmetic on angles and speeds.
+The devices keep their Protocols and refuse what is unsafe. A rig in real time has a watchdog thread. In the simulation
+time passes only inside calls, so each call runs the watchdog, and a long call is split where the watchdog is due.
 """
 
 import atexit
@@ -35,26 +31,26 @@ from cotarget.safety.signals import end_politely
 from cotarget.safety.stop_file import refuse_if_stopped
 from cotarget.safety.watchdog import Guard, Watcher
 
-# A frame cannot be from later than now; this much is left for a latency that is compensated too far [s].
+# A frame cannot be from the future; this tolerance allows for a configured latency that is too long [s].
 FUTURE_S = 0.05
-# A loaded unit may take this much longer than its speed and acceleration say.
+# A loaded unit may take longer than its speed and acceleration give, by this factor.
 SLOWNESS = 1.5
-FINE = 1e-9  # rounding of an angle [rad]
+FINE = 1e-9  # rounding error of an angle [rad]
 
 
 class SafeHead:
-    """A pan-tilt unit that cannot be sent outside the soft limits nor faster than the cap, nor move while stopped."""
+    """A head that keeps the soft limits and the speed cap, and does not move while stopped."""
 
     def __init__(self, head: PanTilt, limits: PanTiltLimits, guard: Guard) -> None:
         self._head, self._limits, self._guard = head, limits, guard
 
     @property
     def limits(self) -> PanTiltLimits:
-        """The soft limits."""
+        """Soft limits, within the device's own."""
         return self._limits
 
     def state(self) -> PanTiltState:
-        """The head's state now."""
+        """Return the head's state now."""
         self._guard.on_call()
         state = self._head.state()
         self._guard.saw(state, self._limits.step)
@@ -65,7 +61,7 @@ class SafeHead:
 
         Raises:
             EmergencyStopError: the head is stopped.
-            DeviceError: an angle is not a number, a speed is not above zero, or the device did not obey.
+            DeviceError: an angle is not a number, a speed is not above zero, or the device failed or left the limits.
         """
         pan, tilt = clipped(pan, tilt, self._limits)
         speeds = self._limits.capped(speed)
@@ -77,7 +73,7 @@ class SafeHead:
             said = self._head.move(pan, tilt, asked, wait)
         except BaseException as error:
             if self._guard.end(motion, arrived=False) and isinstance(error, Exception):
-                self._guard.refuse_if_stopped()  # which is why the device failed
+                self._guard.refuse_if_stopped()  # the halt made the device fail
             raise
         if self._guard.end(motion, arrived=wait):
             self._guard.refuse_if_stopped()
@@ -90,30 +86,30 @@ class SafeHead:
         return said
 
     def halt(self) -> None:
-        """Stop at once."""
+        """Stop both axes at once."""
         self._guard.halt()
 
     def _patience(self, goal: tuple[float, float], speed: float) -> float:
-        """How long the device may wait for the head to arrive [s]."""
+        """Estimate how long the device may wait for the head to arrive [s]."""
         acceleration = self._limits.acceleration
         if math.isinf(speed):
-            return 0.0  # only a simulated head is so fast, and nobody watches its waiting
+            return 0.0  # only a simulated head has infinite speed, and its wait is not watched
         state = self._head.state()
         way = max(abs(goal[0] - state.pan), abs(goal[1] - state.tilt))
         peak = min(speed, math.sqrt(way * acceleration))
         from_rest = way / peak + peak / acceleration if way > 0 else 0.0
-        # A head that turns the other way brakes first, and makes up for it then.
+        # A head that turns the other way must brake first, and then come back.
         return SLOWNESS * (from_rest + (2 * self._limits.speed / acceleration if state.moving else 0.0))
 
 
 def _inside(angle: float, bounds: tuple[float, float], limits: PanTiltLimits) -> bool:
-    """Whether an angle is within bounds, but for a step; nan is not."""
+    """Return whether an angle is within bounds, with a tolerance of one step; nan is not."""
     slack = limits.step + FINE
     return bounds[0] - slack <= angle <= bounds[1] + slack
 
 
 class SafeCamera:
-    """A camera whose frames are refused when they are too old to act on, or cannot be true."""
+    """A camera that refuses frames that are too old to act on, or from the future."""
 
     def __init__(self, camera: Camera, clock: Clock, guard: Guard, max_age_s: float, name: str) -> None:
         self._camera, self._clock, self._guard = camera, clock, guard
@@ -126,7 +122,7 @@ class SafeCamera:
         return self._camera.size
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Wait for the newest frame.
+        """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
 
         Raises:
             StaleFrameError: no new frame came, or the newest is too old to act on.
@@ -144,10 +140,10 @@ class SafeCamera:
         return frame
 
     def accept(self, frame: Frame, now: float) -> None:
-        """Take a frame that was read at this time for a sign of life if it is newer than all before.
+        """Check a frame that was read at ``now`` [s]; one newer than all before is a sign of life.
 
         Raises:
-            StaleFrameError: it is from later than now.
+            StaleFrameError: the frame is from the future.
         """
         ahead = frame.t - now
         if not ahead <= FUTURE_S:
@@ -174,7 +170,7 @@ class SafeCamera:
 
 
 class SafeZoomCamera:
-    """The zoom camera. Its lens moves inside the camera and harms nobody: an emergency stop leaves it alone."""
+    """The zoom camera with checked frames. An emergency stop leaves the lens alone: it moves inside the camera."""
 
     def __init__(self, camera: ZoomCamera, stream: SafeCamera, clock: Clock) -> None:
         self._camera, self._stream, self._clock = camera, stream, clock
@@ -195,7 +191,7 @@ class SafeZoomCamera:
         return self._camera.focal_range
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Wait for the newest frame.
+        """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
 
         Raises:
             StaleFrameError: no new frame came, or the newest is too old to act on.
@@ -207,14 +203,14 @@ class SafeZoomCamera:
         return self._camera.zoom(focal_px)
 
     def state(self) -> ZoomState:
-        """The lens's state now."""
+        """Return the lens's state now."""
         return self._camera.state()
 
     def capture(self) -> Frame:
-        """Take a full still. It may be old when it arrives, because it is large; but not older than its request.
+        """Take a full still. It may be old when it arrives, because it is large, but not older than the request.
 
         Raises:
-            StaleFrameError: it is.
+            StaleFrameError: the still is older than the request.
         """
         asked = self._clock.now()
         frame = self._camera.capture()
@@ -225,17 +221,17 @@ class SafeZoomCamera:
 
 
 class SafeClock:
-    """The clock of a simulation, which stops on the way where the watchdog is due."""
+    """A simulation's clock that runs the watchdog when it is due during a sleep."""
 
     def __init__(self, clock: Clock, guard: Guard) -> None:
         self._clock, self._guard = clock, guard
 
     def now(self) -> float:
-        """Seconds on the rig's clock."""
+        """Return the time on the rig's clock [s]."""
         return self._clock.now()
 
     def sleep_until(self, t: float) -> None:
-        """Return when the clock shows ``t`` [s]."""
+        """Sleep until the clock shows ``t`` [s]."""
         deadline = self._guard.deadline()
         if deadline is not None and deadline < t:
             self._clock.sleep_until(deadline)
@@ -243,16 +239,16 @@ class SafeClock:
         self._clock.sleep_until(t)
 
 
-# --- limits ---
+# Soft limits and speed cap
 
-ROUNDING = 1e-9  # of a step; limits that are a multiple of a step are one after the conversion from degrees too
+ROUNDING = 1e-9  # in steps; keeps a limit of whole steps whole after its conversion from degrees
 
 
 def soft_limits(device: PanTiltLimits, config: SafetyConfig) -> PanTiltLimits:
-    """The tighter of the device's limits and the configured ones.
+    """Combine the device's limits with the configured ones; the tighter ones hold.
 
     Raises:
-        ConfigError: they leave nothing.
+        ConfigError: no angle is left.
     """
     return dataclasses.replace(
         device,
@@ -263,7 +259,7 @@ def soft_limits(device: PanTiltLimits, config: SafetyConfig) -> PanTiltLimits:
 
 
 def clipped(pan: float, tilt: float, limits: PanTiltLimits) -> tuple[float, float]:
-    """Clip to the limits; with steps to the outermost step inside them, so that rounding cannot lead outside.
+    """Clip angles to the limits; with steps to the outermost step inside them, so that rounding cannot lead outside.
 
     Raises:
         DeviceError: an angle is not a number.
@@ -276,7 +272,11 @@ def clipped(pan: float, tilt: float, limits: PanTiltLimits) -> tuple[float, floa
 def _within(
     soft_deg: tuple[float, float] | None, device: tuple[float, float], step: float, name: str
 ) -> tuple[float, float]:
-    """The tighter of both limits [rad]; soft ones that leave nothing of the device's are a mistake."""
+    """Intersect soft limits [degrees] with the device's [rad].
+
+    Raises:
+        ConfigError: nothing is left.
+    """
     if soft_deg is None:
         return device
     low, high = max(math.radians(soft_deg[0]), device[0]), min(math.radians(soft_deg[1]), device[1])
@@ -293,11 +293,13 @@ def _clip(angle: float, limits: tuple[float, float], step: float) -> float:
 
 
 def _outermost(limits: tuple[float, float], step: float) -> tuple[float, float]:
-    """The outermost steps inside the limits; the limits themselves for a head without steps."""
+    """Return the outermost steps inside the limits; the limits themselves for a head without steps."""
     if step > 0:
         return math.ceil(limits[0] / step - ROUNDING) * step, math.floor(limits[1] / step + ROUNDING) * step
     return limits
 
+
+# The guarded rig
 
 log = logging.getLogger(__name__)
 
@@ -305,19 +307,19 @@ log = logging.getLogger(__name__)
 class SafeRig:
     """A rig whose head keeps the limits, is watched, and can be stopped; closing it halts the head first.
 
-    A rig that has an attribute ``real_time`` that is true is watched by a thread; its head must let itself be halted
-    from any thread at any time. Every other rig's time passes inside calls alone, and each call watches.
+    A rig whose attribute ``real_time`` is true is watched by a thread; its head must accept a halt from any thread at
+    any time. Time of any other rig passes only inside calls, and each call runs the watchdog.
     """
 
     def __init__(self, rig: Rig, config: SafetyConfig) -> None:
-        """Put the layer in front of a rig, which belongs to it from now on and is closed if that fails.
+        """Take over a rig and guard it; if that fails, the rig is closed.
 
         Raises:
             ConfigError: the soft limits leave nothing of the device's range.
-            EmergencyStopError: there is a stop file.
+            EmergencyStopError: a stop file exists.
         """
         self._rig = rig
-        self.config: RigConfig | None = getattr(rig, "config", None)  # what it was opened from
+        self.config: RigConfig | None = getattr(rig, "config", None)  # the configuration that the rig was opened from
         self._closed = False
         self._watcher: Watcher | None = None
         self._undo_signals: Callable[[], None] = lambda: None
@@ -334,7 +336,7 @@ class SafeRig:
             self.zoom: ZoomCamera = SafeZoomCamera(rig.zoom, guarded(rig.zoom, "zoom"), rig.clock)
             self.clock: Clock = rig.clock if real_time else SafeClock(rig.clock, self._guard)
             self.board: Board = rig.board
-            atexit.register(self.close)  # for a rig that nobody closes
+            atexit.register(self.close)  # for a rig that the program does not close
             if real_time:
                 self._undo_signals = end_politely(self._guard.halt)
                 self._watcher = Watcher(self._guard)
@@ -344,49 +346,49 @@ class SafeRig:
             raise
 
     def stop(self, reason: str) -> None:
-        """Emergency stop: halt the head, and refuse every move until `clear`; from any thread."""
+        """Emergency stop: halt the head, and refuse every move until `clear`; may be called from any thread."""
         self._guard.stop(reason)
 
     def clear(self) -> str | None:
         """End the emergency stop, which only an operator may decide; return its reason.
 
         Raises:
-            EmergencyStopError: there still is a stop file.
+            EmergencyStopError: a stop file exists.
         """
         return self._guard.clear()
 
     @property
     def stopped(self) -> str | None:
-        """The reason of the emergency stop; None if there is none."""
+        """Reason of the emergency stop; None if there is none."""
         return self._guard.reason
 
     def close(self) -> None:
-        """Halt the head, then close the rig; a signal meanwhile acts only after that.
+        """Halt the head, then close the rig; signals are deferred until that is done.
 
         Raises:
-            Exception: whatever the device raised when it could not be halted, or closed.
+            Exception: as the device raised it when it could not be halted, or closed.
         """
         self._close(deliver=True)
 
     def __enter__(self) -> "SafeRig":
-        """Give the rig itself."""
+        """Return the rig itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Halt, then close; a failure of that does not hide the error that led here."""
+        """Halt, then close; a failure does not hide the error that led here."""
         if error is None:
             self.close()
             return
         log.info("halting the head: %s", kind.__name__ if kind else error)
         try:
-            self._close(deliver=isinstance(error, Exception))  # a second Ctrl-C says no more than the first
+            self._close(deliver=isinstance(error, Exception))  # after Ctrl-C a second one adds nothing
         except Exception as failure:
             self._tell(failure)
 
     def _tell(self, failure: BaseException) -> None:
-        """Say why the rig could not be closed, unless that was said before."""
+        """Log why the rig could not be closed, unless that is logged already."""
         if str(failure) == self._guard.told:
             log.error("the head could not be halted to the end")
         else:
@@ -401,7 +403,7 @@ class SafeRig:
             try:
                 held.hold()
                 break
-            except (KeyboardInterrupt, SystemExit) as error:  # just before the signals were held
+            except (KeyboardInterrupt, SystemExit) as error:  # a signal just before the deferral
                 interrupt = error
         errors: list[BaseException] = []
         self._closed = True
@@ -414,7 +416,7 @@ class SafeRig:
         for failure in errors[1:]:
             log.info("while the rig was closed: %s", failure)
         if deliver and errors and (interrupt is not None or held.pending):
-            self._tell(errors[0])  # what ends the program now tells nothing of it
+            self._tell(errors[0])  # the signal that ends the program now hides this error
         if deliver and interrupt is not None:
             raise interrupt
         if deliver:
@@ -423,7 +425,7 @@ class SafeRig:
             raise next((e for e in errors if not isinstance(e, Exception)), errors[0])
 
     def _leave(self) -> None:
-        """End what this layer has going in the process."""
+        """Remove this layer's threads, signal handlers and exit hook."""
         if self._watcher is not None:
             self._watcher.close()
             self._guard.close()

@@ -1,4 +1,4 @@
-"""Signals: none may keep the head from being halted, and none may end a program with a moving head behind it."""
+"""Handle signals that end or suspend the process, so that the head is halted first."""
 
 import logging
 import os
@@ -12,24 +12,23 @@ from cotarget.files import ENDING
 
 log = logging.getLogger(__name__)
 
-# Signals that would freeze the process, watchdog and all: Ctrl-Z, and use of a terminal that another program has.
+# Signals that suspend the process with its watchdog: Ctrl-Z, and use of a terminal that another program has.
 FREEZING = tuple(getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTTOU") if hasattr(signal, name))
-SHELL_STATUS = 128  # a shell's exit status for a signal is this and its number
+SHELL_STATUS = 128  # a shell's exit status for a signal is this plus its number
 
 
 def end_politely(halt: Callable[[], None] | None = None) -> Callable[[], None]:
-    """Let no signal end or freeze the process with a head that turns.
+    """Install signal handlers that halt the head before the process ends or is suspended.
 
-    One that would end it on the spot raises SystemExit, so that ``with`` blocks are left. One that would freeze it does
-    so once the head is halted, and not at all where that fails; afterwards the program goes on as after any halt.
-    Handlers that the program itself has set stay.
+    A signal that would end the process raises SystemExit, so that ``with`` blocks are left. A signal that would suspend
+    it does so once the head is halted, and not at all if the halt fails; resumed, the program goes on as after any
+    halt. Handlers that the program has set stay.
 
     Args:
-        halt: halts the head, and may be called from a signal's handler; without it the signals that would freeze the
-            process end it too.
+        halt: halts the head, callable from a signal handler; if None, the suspending signals end the process too.
 
     Returns:
-        What undoes it.
+        A function that removes the handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         return lambda: None

@@ -1,4 +1,4 @@
-"""The emergency stop across processes: while a certain file exists, the head does not move; its content says why."""
+"""Emergency stop across processes: while a certain file exists, the head does not move; the file holds the reason."""
 
 import os
 from pathlib import Path
@@ -6,20 +6,20 @@ from pathlib import Path
 from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
 
 NO_REASON = "no reason given"
-LONGEST_REASON = 200  # characters of the file's first line that are shown
+LONGEST_REASON = 200  # shown part of the file's first line [characters]
 
 
 def stop_reason(path: Path | None) -> str | None:
-    """Why the head must not move; None if it may.
+    """Read why the head must not move; None if it may.
 
-    A file that cannot be looked at stops too: nobody knows then whether somebody has called for a stop. One that is a
-    pipe is not waited for; one on a file system that hangs is (see `cotarget.safety.watchdog`).
+    An unreadable file also stops the head, because it may be a stop. Opening a pipe does not block. A file system that
+    hangs blocks this call (see `cotarget.safety.watchdog`).
     """
     if path is None:
         return None
     try:
         with open(path, "rb", buffering=0, opener=_without_waiting) as file:
-            content = file.read(4 * LONGEST_REASON) or b""  # a character takes at most 4 bytes
+            content = file.read(4 * LONGEST_REASON) or b""  # UTF-8 takes at most 4 bytes per character
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
@@ -34,10 +34,10 @@ def _without_waiting(path: str, flags: int) -> int:
 
 
 def refuse_if_stopped(path: Path | None) -> None:
-    """Raise while the file exists, and where nobody could make it.
+    """Raise while the stop file exists, or if it could not be made.
 
     Raises:
-        EmergencyStopError: with the reason, and how to clear it.
+        EmergencyStopError: the file exists; the message has the reason, and how to clear it.
         ConfigError: its folder does not exist.
     """
     if path is not None and not path.parent.is_dir():
@@ -47,7 +47,7 @@ def refuse_if_stopped(path: Path | None) -> None:
 
 
 def stopped_by_file(path: Path | None, reason: str) -> EmergencyStopError:
-    """The error that says why, and how to clear it."""
+    """Make the error with the reason of the stop, and how to clear it."""
     return EmergencyStopError(
         f"emergency stop: {reason}; when it is safe to move, run 'cotarget clear --rig FILE' or remove {path}"
     )
@@ -61,9 +61,9 @@ def write_stop_file(path: Path, reason: str) -> None:
     """Stop every rig that watches this file; a reader finds the whole reason or no file.
 
     Raises:
-        DeviceError: the file cannot be made, so nothing is stopped by it.
+        DeviceError: the file cannot be made, so nothing is stopped.
     """
-    if not path.parent.is_dir():  # made now it would stop nobody: a rig whose stop file has no folder is not opened
+    if not path.parent.is_dir():  # a folder made here would stop no rig: none opens without it
         raise DeviceError(f"{path}: NOT stopped: {_no_folder(path)}")
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -75,15 +75,15 @@ def write_stop_file(path: Path, reason: str) -> None:
             temporary.replace(path)
         except OSError:
             temporary.unlink(missing_ok=True)
-            path.touch()  # a full disk still has room for a file without a reason
+            path.touch()  # a full disk still takes an empty file
     except OSError as error:
         raise DeviceError(f"{path}: NOT stopped: the file cannot be written: {error.strerror}") from None
 
 
 def clear_stop_file(path: Path) -> str | None:
-    """End the stop; return its reason, or None where there was none.
+    """End the stop; return its reason, or None if there was none.
 
-    What is removed is what is returned: a stop that is called meanwhile stays.
+    The file whose reason is returned is the one removed: a stop that is written meanwhile stays.
 
     Raises:
         DeviceError: the file cannot be removed, so the stop lasts.

@@ -1,11 +1,9 @@
-"""Knows whether the head may be moving and whether it may move, and halts it when it may not.
+"""The watchdog of a rig: decide whether the head may move, and halt it when it may not.
 
-Devices, the watching thread and the operator all come here, each from a thread of its own. The lock is held for
-bookkeeping only and never while a device is called, so that a device that hangs keeps nobody from halting the head.
-
-Looks at the stop file on a thread of its own: a file system that hangs must keep nobody from halting the head.
-
-The thread that watches over a rig in real time, also while the program hangs.
+`Guard` keeps the state. Devices, the watchdog's thread (`Watcher`) and the operator call it, each from a thread of its
+own. Its lock is held for bookkeeping only, never during a call of a device, so that a hanging device cannot keep
+another thread from halting the head. `StopLook` reads the stop file on a thread of its own for the same reason: a file
+system may hang.
 """
 
 import logging
@@ -20,18 +18,18 @@ from cotarget.errors import DeviceError, EmergencyStopError
 from cotarget.rig import Clock, PanTilt, PanTiltState
 from cotarget.safety.stop_file import stop_reason, stopped_by_file
 
-LOOK_POLL_S = 0.05  # a look takes well below a millisecond; it is waited for in slices of this [s]
-# So many slices without an answer, and nobody knows whether somebody has called for a stop. They are counted rather
-# than timed, so that a machine that stood still does not count as a file that cannot be looked at.
+LOOK_POLL_S = 0.05  # reading the stop file takes well below 1 ms; the answer is awaited in slices of this time [s]
+# After this number of slices without an answer the file counts as a stop. Slices are counted and not timed, so that a
+# suspended machine does not count as an unreadable file.
 MOST_MISSED = 6
-# A look that began this lately is good enough for a command, which then waits for none: who watches halts the head for
-# a file that came meanwhile [s].
+# A command uses an answer no older than this without waiting for a new one; the watchdog halts the head for a file
+# that appears after it [s].
 RECENT_S = 2 * LOOK_POLL_S
-LOOK_JOIN_S = 0.2  # for the thread to end, if it is not held by the file [s]
+LOOK_JOIN_S = 0.2  # time limit for the thread to end, which a hanging file may block [s]
 
 
 class StopLook:
-    """Tells why the head must not move, within a time that does not depend on the file.
+    """Reader of the stop file, with a time limit that does not depend on the file system.
 
     Args:
         path: of the stop file; None for none, which never stops.
@@ -47,10 +45,12 @@ class StopLook:
         self._closed = False
 
     def reason(self, longest: float | None = None) -> str | None:
-        """What a look that begins now says; a file that has not answered for long counts as a stop.
+        """Read the stop file, beginning now; return the reason of a stop, or None.
+
+        A file that does not answer counts as a stop.
 
         Args:
-            longest: how long to wait for it, and then take the last answer [s]; None to wait for an answer.
+            longest: how long to wait for a new answer before the last one is returned [s]; None to wait for it.
         """
         if self._path is None or self._closed:
             return self._reason
@@ -72,12 +72,12 @@ class StopLook:
                     return self._reason
 
     def is_clear(self) -> bool:
-        """Whether a recent look found no stop; at once."""
+        """Return at once whether a recent answer found no stop."""
         with self._changed:
             return self._path is None or (self._reason is None and monotonic() - self._looked_at <= RECENT_S)
 
     def close(self) -> None:
-        """End the thread; one that the file holds ends when the file lets it go."""
+        """End the thread; a thread that the file blocks ends when the file answers."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -94,27 +94,29 @@ class StopLook:
             begun = monotonic()
             try:
                 reason = stop_reason(self._path)
-            except Exception as error:  # who cannot look lets nothing move
+            except Exception as error:  # an unreadable file counts as a stop
                 reason = f"the file cannot be read: {error}"
             with self._changed:
                 self._answered, self._reason, self._missed, self._looked_at = question, reason, 0, begun
                 self._changed.notify_all()
 
 
+# State of the watchdog
+
 log = logging.getLogger(__name__)
-HALT_TRIES = 2  # when the rig is closed; a driver's own deadlines bound each
-AT_GOAL = math.radians(0.1)  # as near as this, and a step, a head that rests has arrived [rad]
+HALT_TRIES = 2  # when the rig is closed; the driver limits the time of each
+AT_GOAL = math.radians(0.1)  # a head that rests within this and a step of its goal has arrived [rad]
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A command to the head.
+    """A command to the head that is under way.
 
     Attributes:
         goal: pan and tilt [rad].
-        halts: how many halts there had been when it was given.
-        patience_s: how long the device itself may wait for the head to arrive; 0 where it does not [s].
-        on_its_way: whether the device has not yet returned from it.
+        halts: number of halts before the command.
+        patience_s: how long the device itself may wait for the head to arrive [s]; 0 if it does not wait.
+        on_its_way: whether the device's call has not yet returned.
     """
 
     goal: tuple[float, float]
@@ -124,49 +126,49 @@ class Motion:
 
 
 class Guard:
-    """The memory of a rig's watchdog and emergency stop.
+    """State of a rig's watchdog and emergency stop.
 
-    The head may be moving from a command until a halt, until the device has waited for its arrival, or until it is
-    seen to rest at the goal. Through that time there must be a sign of life every ``watchdog_s``: a command, or a
-    frame newer than all before.
+    The head may be moving from a command until a halt, until the device has waited for its arrival, or until a state
+    shows it at rest at the goal. In that time there must be a sign of life every ``watchdog_s``: a command, or a frame
+    newer than all before.
 
     Args:
         head: the device.
-        clock: the rig's.
-        config: how long without a sign of life, and the stop file.
-        threaded: whether a thread calls `watch`. Where none does, each call on the rig has to.
+        clock: the rig's clock.
+        config: watchdog time and stop file.
+        threaded: whether a thread calls `watch`; otherwise each call on the rig must.
 
     Attributes:
-        told: why the head could not be halted, as the log has it already; empty where it has not.
+        told: why the head could not be halted, as already logged; empty if it could.
     """
 
     def __init__(self, head: PanTilt, clock: Clock, config: SafetyConfig, *, threaded: bool) -> None:
         self.threaded, self.told = threaded, ""
         self._head, self._clock = head, clock
         self._timeout_s, self._stop_file = config.watchdog_s, config.stop_file
-        self._look = StopLook(config.stop_file)  # idle where no thread watches: time does not pass by itself then
-        self._lock = threading.RLock()  # reentrant: a signal's handler may call stop() anywhere
+        self._look = StopLook(config.stop_file)  # unused without a watching thread: time passes only inside calls then
+        self._lock = threading.RLock()  # reentrant: a signal handler may call stop() anywhere
         self._motion: Motion | None = None
         self._alive_at = -math.inf
         self._halts = 0
-        self._owed: str | None = None  # why the head has still to be halted, where that failed
-        self._stopped: str | None = None  # by this process
+        self._owed: str | None = None  # why a halt failed that must be repeated
+        self._stopped: str | None = None  # reason of an emergency stop by this process
         self._stopped_by_file: str | None = None
         self._shut = False
 
     def begin(self, goal: tuple[float, float], patience_s: float = 0.0) -> Motion:
-        """Note that a command is about to be given.
+        """Register a command before it is sent.
 
         Raises:
             EmergencyStopError: the head is stopped.
-            DeviceError: the rig is closed, or the head has still to be halted and cannot be.
+            DeviceError: the rig is closed, or a halt that must be repeated fails again.
         """
         if not self.threaded:
             self.watch()
         elif (self._stopped_by_file is None and self._look.is_clear()) or not self._heed_stop_file():
             self._halt_if_owed()
         with self._lock:
-            halts = self._halts  # before anything is asked: a signal's handler may stop the head in between
+            halts = self._halts  # read first: a signal handler may stop the head in between
             self.refuse_if_stopped()
             if self._shut:
                 raise DeviceError("the rig is closed, so the head does not move any more")
@@ -177,11 +179,12 @@ class Guard:
             return self._motion
 
     def end(self, motion: Motion, arrived: bool) -> bool:
-        """Note that the device has returned from a command, and whether the head has arrived.
+        """Register that the device's call has returned, and whether the head has arrived.
 
         Returns:
-            Whether the head was halted meanwhile. Then the command may have reached the unit after the halt, and the
-            head has been halted once more.
+            Whether the head was halted during the call. The command may have reached the unit after the halt, so the
+                head is
+            halted again.
         """
         with self._lock:
             interrupted = self._halts != motion.halts
@@ -189,20 +192,20 @@ class Guard:
             if self._motion is motion and not interrupted:
                 self._motion = None if arrived else replace(motion, patience_s=0.0, on_its_way=False)
         if interrupted:
-            self._halt()  # the command may have come behind the halt
+            self._halt()  # the command may have reached the unit after the halt
         return interrupted
 
     def alive(self, now: float) -> None:
-        """Note a sign of life: a frame newer than all before, read at this time [s]."""
+        """Register a sign of life at ``now`` [s]: a frame newer than all before."""
         self._alive_at = now
 
     def on_call(self) -> None:
-        """Watch, where no thread does."""
+        """Run the watchdog, if no thread does."""
         if not self.threaded:
             self.watch()
 
     def saw(self, state: PanTiltState, step: float) -> None:
-        """Note where the head says it is: one that rests at its goal needs no watching."""
+        """Register a state of the head; a head that rests at its goal ends the motion."""
         with self._lock:
             motion = self._motion
             if motion is None or motion.on_its_way or state.moving:
@@ -212,27 +215,27 @@ class Guard:
                 self._motion = None
 
     def deadline(self) -> float | None:
-        """When the head will be halted without a sign of life, on the rig's clock [s]; None while it rests."""
+        """Return when the head is halted without a sign of life, on the rig's clock [s]; None while it rests."""
         with self._lock:
             return None if self._motion is None else self._alive_at + self._motion.patience_s + self._timeout_s
 
     def pause(self, longest: float) -> float:
-        """How long nobody need watch [s]."""
+        """Return how long `watch` need not be called [s], at most ``longest``."""
         deadline = self.deadline()
         if deadline is None or self._owed is not None:
             return longest
         return min(max(deadline - self._clock.now(), 0.0), longest)
 
     def watch(self) -> None:
-        """Halt the head if that is due: no sign of life, a stop file, or a halt that failed before."""
-        # First what needs no file system; then its answer is waited for no longer than until that is due again.
+        """Halt the head for an overdue sign of life, a stop file, or a halt that failed before."""
+        # First the check without a file system; then the file is awaited no longer than until that check is due again.
         tried = self._halt_if_overdue()
         if not (self._heed_stop_file(self.pause(math.inf)) or tried):
             self._halt_if_owed()
 
     def _halt_if_overdue(self) -> bool:
-        """Halt the head if there was no sign of life in time; whether that was so."""
-        # In this order, a clock that goes forward shows no less than when the last sign of life was noted.
+        """Halt the head if no sign of life came in time; return whether that was so."""
+        # In this order: read after the last sign of life, a clock that runs forward cannot show an earlier time.
         alive_at, deadline = self._alive_at, self.deadline()
         if deadline is None or self._owed is not None:
             return False
@@ -248,10 +251,10 @@ class Guard:
         return True
 
     def halt(self) -> None:
-        """Halt the head because the program says so; where the device fails, the watchdog tries again.
+        """Halt the head on the program's request; if the device fails, the watchdog tries again.
 
         Raises:
-            Exception: whatever the device raised.
+            Exception: as the device raised it.
         """
         with self._lock:
             motion, self._halts = self._motion, self._halts + 1
@@ -264,9 +267,9 @@ class Guard:
         self._rests(motion)
 
     def stop(self, reason: str) -> None:
-        """Halt the head, and let it not move until `clear`."""
+        """Halt the head, and refuse moves until `clear`."""
         with self._lock:
-            self._stopped = reason  # first of all, so that no command slips in behind the halt
+            self._stopped = reason  # first, so that no command follows the halt
         log.warning("emergency stop: %s", reason)
         self._halt()
 
@@ -274,7 +277,7 @@ class Guard:
         """End this process's emergency stop; return its reason.
 
         Raises:
-            EmergencyStopError: there still is a stop file.
+            EmergencyStopError: a stop file exists.
         """
         if (there := self._stop_file_says()) is not None:
             raise stopped_by_file(self._stop_file, there)
@@ -288,10 +291,10 @@ class Guard:
         return self._stopped if self._stopped is not None else self._stop_file_says()
 
     def refuse_if_stopped(self) -> None:
-        """Raise while the head is stopped, by what was last seen of the stop file.
+        """Raise while the head is stopped, by the last answer about the stop file.
 
         Raises:
-            EmergencyStopError: with the reason, and how to clear it.
+            EmergencyStopError: the head is stopped; the message has the reason, and how to clear it.
         """
         if self._stopped is not None:
             raise EmergencyStopError(f"emergency stop: {self._stopped}; the head moves again after clear()")
@@ -299,10 +302,10 @@ class Guard:
             raise stopped_by_file(self._stop_file, self._stopped_by_file)
 
     def shut(self) -> None:
-        """Halt the head for good.
+        """Halt the head for good, before the rig is closed.
 
         Raises:
-            Exception: whatever the device raised at the last of several tries.
+            Exception: as the device raised it at the last of `HALT_TRIES` tries.
         """
         with self._lock:
             self._shut, self._halts = True, self._halts + 1
@@ -310,23 +313,23 @@ class Guard:
             try:
                 self._head.halt()
                 break
-            except Exception:  # told by who closes the rig
+            except Exception:  # whatever closes the rig reports it
                 if not left:
                     raise
         with self._lock:
             self._motion = self._owed = None
 
     def close(self) -> None:
-        """End the look-out for a stop file."""
+        """End the thread that reads the stop file."""
         self._look.close()
 
     def _halt(self) -> None:
-        """Halt the head; where the device fails, say so and owe it."""
+        """Halt the head; if the device fails, log that and schedule another try."""
         with self._lock:
             motion, self._halts = self._motion, self._halts + 1
         try:
             self._head.halt()
-        except Exception as error:  # whatever it is, the head has to be halted all the same
+        except Exception as error:  # after any failure the halt must be repeated
             with self._lock:
                 first, self._owed = self._owed is None, str(error)
             if first and not self._shut:
@@ -336,7 +339,7 @@ class Guard:
         self._rests(motion)
 
     def _rests(self, motion: Motion | None) -> None:
-        """Note that a halt was obeyed; a command given meanwhile is watched on."""
+        """Register a successful halt; a command sent after ``motion`` stays under watch."""
         with self._lock:
             late, self._owed = self._owed is not None, None
             if self._motion is motion:
@@ -345,11 +348,11 @@ class Guard:
             log.warning("the head is halted now")
 
     def _stop_file_says(self, longest: float | None = None) -> str | None:
-        """Why the stop file stops the head; None if it does not. See `StopLook.reason`."""
+        """Read why the stop file stops the head; None if it does not. See `StopLook.reason`."""
         return self._look.reason(longest) if self.threaded else stop_reason(self._stop_file)
 
     def _heed_stop_file(self, longest: float | None = None) -> bool:
-        """Look for a stop file, and halt the head for a new one; whether there is a new one."""
+        """Read the stop file, and halt the head for a new one; return whether there is a new one."""
         reason = self._stop_file_says(longest)
         with self._lock:
             new = reason is not None and self._stopped_by_file is None
@@ -360,19 +363,19 @@ class Guard:
         return new
 
     def _halt_if_owed(self) -> None:
-        """Try again to halt a head that could not be halted."""
+        """Repeat a halt that failed."""
         if self._owed is not None:
             self._halt()
 
 
-# --- watcher ---
+# The watchdog's thread
 
-POLL_S = 0.05  # between looks at the stop file, and between tries to halt a head that could not be halted [s]
-JOIN_S = 2.0  # a halt's own deadline and some [s]
+POLL_S = 0.05  # period of reading the stop file, and of repeating a failed halt [s]
+JOIN_S = 2.0  # time limit for the thread to end: longer than a halt takes [s]
 
 
 class Watcher:
-    """Watches until it is closed; looks exactly when the watchdog is due, and every ``POLL_S`` anyway."""
+    """Thread of a rig in real time that calls `Guard.watch` when a sign of life is due, and every `POLL_S`."""
 
     def __init__(self, guard: Guard) -> None:
         self._guard = guard
@@ -381,7 +384,7 @@ class Watcher:
         self._thread.start()
 
     def close(self) -> None:
-        """Watch no longer."""
+        """End the thread."""
         self._leave.set()
         if self._thread is not threading.current_thread():
             self._thread.join(JOIN_S)
@@ -394,7 +397,7 @@ class Watcher:
             try:
                 self._guard.watch()
                 pause = self._guard.pause(POLL_S)
-            except Exception as error:  # a clock that fails, say: who cannot watch lets nothing move
+            except Exception as error:  # such as a failing clock: without a watchdog nothing may move
                 pause = POLL_S
                 if self._guard.reason is None:
                     self._guard.stop(f"the watchdog failed: {error}")
