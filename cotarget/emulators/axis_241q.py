@@ -1,17 +1,8 @@
-"""An Axis 241Q video server on HTTP: VAPIX 2 as its manuals tell it, in front of feeds of pictures.
+"""Emulated Axis 241Q video server: VAPIX 2 over HTTP/1.0, as its manuals describe it, in front of feeds of images.
 
-Snapshots, MJPEG streams, parameters, the state of the inputs, authentication; and what can go wrong with each. A thread
-serves a connection: a viewer that is slow holds up no other, and gets the newest picture when it is ready for one.
-
-What an Axis 241Q answers in plain text: its parameters, its inputs, the size of a picture, and a head it has not.
-
-Who may look: basic and digest authentication of RFC 2617 with qop=auth, from the server's side.
-
-Requests read and replies written: as much HTTP/1.0 as an Axis video server speaks. Bytes in, bytes out.
-
-Pictures as an Axis video server gives them: asked for by VAPIX's arguments, scaled, and encoded once for all.
-
-Sending pictures to one viewer: single, or as the parts of a stream, with whatever is to be wrong with them.
+`AxisServer` gives snapshots, MJPEG streams, parameters and the state of the inputs, with basic or digest
+authentication, and has faults that can be switched on (`AXIS_FAULTS`). A thread serves each connection: a slow viewer
+delays no other one, and gets the newest image when it is ready.
 """
 
 import base64
@@ -46,20 +37,22 @@ from cotarget.emulators.plant import Feed, Picture
 from cotarget.errors import DeviceError
 from cotarget.rig import Image
 
-# Longest request line, largest body [bytes] and most arguments; beyond them a client is not one that we serve.
+# HTTP requests and replies
+
+# Limits of a request: its line [bytes], its body [bytes], its arguments. More is refused.
 LINE_BYTES = 8192
 BODY_BYTES = 65536
 MAX_ARGUMENTS = 64
-# How clients call a form that they send; PyPI's axis calls it plain text, and real units take it.
+# Content types of a form; the package axis on PyPI sends plain text, which real units accept.
 FORMS = ("application/x-www-form-urlencoded", "text/plain")
 
 
 class HttpError(Exception):
-    """A request that is answered by a status instead of what it asks for.
+    """A request that is refused with an HTTP status.
 
     Attributes:
-        status: of the answer.
-        headers: its further header lines.
+        status: of the reply.
+        headers: further header lines of the reply.
     """
 
     def __init__(self, status: HTTPStatus, headers: Iterable[str] = ()) -> None:
@@ -70,14 +63,14 @@ class HttpError(Exception):
 
 @dataclass(frozen=True)
 class HttpRequest:
-    """One request.
+    """A parsed HTTP request.
 
     Attributes:
         method: such as "GET".
-        target: as it stands in the request line, with the arguments.
+        target: as in the request line, with the arguments.
         path: of the target, without the arguments.
-        arguments: of the target and of a form in the body; the last of a name counts.
-        headers: case does not matter in their names.
+        arguments: of the target and of a form in the body; the last value of a name counts.
+        headers: names are not case-sensitive.
     """
 
     method: str
@@ -88,10 +81,10 @@ class HttpRequest:
 
 
 def read_request(stream: BinaryIO) -> HttpRequest | None:
-    """Read one request; None where the client closed without one.
+    """Read one request; None if the client closed without one.
 
     Raises:
-        HttpError: it is no request that can be understood.
+        HttpError: the request cannot be parsed.
         OSError: the connection broke.
     """
     line = stream.readline(LINE_BYTES)
@@ -111,7 +104,7 @@ def read_request(stream: BinaryIO) -> HttpRequest | None:
 
 
 def _form(headers: Message, stream: BinaryIO) -> list[tuple[str, str]]:
-    # The body is read even where it is not used: closing a socket with bytes unread may lose the answer on its way.
+    # The body is read even if it is not used: closing a socket with unread bytes may lose the reply.
     length = int(headers.get("Content-Length", "0"))
     if not 0 <= length <= BODY_BYTES:
         raise ValueError
@@ -124,27 +117,27 @@ def _form(headers: Message, stream: BinaryIO) -> list[tuple[str, str]]:
 
 
 def reply_head(status: HTTPStatus, headers: Iterable[str] = ()) -> bytes:
-    """Status line, headers and the empty line."""
+    """Encode status line, headers and the empty line of a reply."""
     lines = [f"HTTP/1.0 {status.value} {status.phrase}", *headers, "", ""]
     return "\r\n".join(lines).encode("latin-1")
 
 
 def text_reply(text: str) -> bytes:
-    """An answer in plain text; as in the manual its end is the connection's."""
+    """Encode a reply in plain text; as in the manual, it ends with the connection."""
     return reply_head(HTTPStatus.OK, ["Content-Type: text/plain"]) + text.encode("latin-1", "replace")
 
 
 def error_reply(error: HttpError) -> bytes:
-    """The answer to a request that is refused: a page that says its status."""
+    """Encode the reply to a refused request: a page with its status."""
     body = f"<HTML><BODY><H1>{error.status.value} {error.status.phrase}</H1></BODY></HTML>\r\n".encode("latin-1")
     headers = [*error.headers, "Content-Type: text/html", f"Content-Length: {len(body)}"]
     return reply_head(error.status, headers) + body
 
 
-# --- axis_auth ---
+# Authentication: basic and digest of RFC 2617 with qop=auth
 
 Scheme = Literal["digest", "basic"]
-# How long a nonce is good [s], and how many are remembered; an older one is answered by a new one and "stale".
+# How long a nonce is valid [s], and how many are stored; an older one gets a new nonce and "stale".
 NONCE_LIFE_S = 300.0
 MAX_NONCES = 1000
 
@@ -158,14 +151,14 @@ def _same(a: str, b: str) -> bool:
 
 
 class Authenticator:
-    """Checks the authorization of requests; safe to use from any thread.
+    """Check the authorization of requests; safe to use from any thread.
 
     Args:
-        user: who may look; empty where everybody may.
+        user: user name; empty if everyone may connect.
         password: of that user.
         scheme: of authentication.
-        realm: that the client is told.
-        now: the time [s].
+        realm: in the challenge to the client.
+        now: returns the time [s].
     """
 
     def __init__(
@@ -177,7 +170,7 @@ class Authenticator:
         self._lock = threading.Lock()
 
     def refuse(self, request: HttpRequest) -> str | None:
-        """The challenge that a request must be answered with; None where it is allowed."""
+        """Return the challenge that refuses a request; None if it is allowed."""
         if not self._user:
             return None
         scheme, _, rest = request.headers.get("Authorization", "").partition(" ")
@@ -194,7 +187,7 @@ class Authenticator:
         return None if self._fresh(fields["nonce"], fields["nc"]) else self.challenge(stale=True)
 
     def challenge(self, stale: bool = False) -> str:
-        """The line that asks a client to authenticate itself; ``stale`` where only its nonce is too old."""
+        """Make the header line that demands authentication; ``stale`` if only the client's nonce is too old."""
         if self._scheme == "basic":
             return f'WWW-Authenticate: Basic realm="{self._realm}"'
         nonce, now = secrets.token_hex(16), self._now()
@@ -228,7 +221,7 @@ class Authenticator:
         return _same(field("response"), wanted) and known
 
     def _fresh(self, nonce: str, count: str) -> bool:
-        # A nonce of ours, not too old, and not used with this count before: a request overheard is of no use.
+        # The nonce must be this server's, not too old, and new with this count: a recorded request cannot be replayed.
         with self._lock:
             issued = self._issued.get(nonce)
             if issued is None or self._now() - issued > NONCE_LIFE_S or count in self._used[nonce]:
@@ -237,14 +230,14 @@ class Authenticator:
             return True
 
 
-# --- axis_pictures ---
+# Images: requested by VAPIX arguments, scaled, and encoded once for all viewers
 
 Size = tuple[int, int]
 Standard = Literal["PAL", "NTSC"]
 Camera = int | Literal["quad"]
 # The 241Q has four inputs; one without a feed has no video.
 INPUTS = (1, 2, 3, 4)
-# Sizes by VAPIX's names [px]; NTSC's pictures are 480/576 as high.
+# Sizes by VAPIX's names [px]; NTSC images are 480/576 as high.
 PAL_SIZES: Mapping[str, Size] = {
     "4CIF": (704, 576),
     "2CIFEXP": (704, 576),
@@ -252,36 +245,36 @@ PAL_SIZES: Mapping[str, Size] = {
     "CIF": (352, 288),
     "QCIF": (176, 144),
 }
-# Sides that are accepted as WxH [px]: nothing smaller, and nothing larger than this or the camera's own.
+# Sizes accepted as WxH [px]: from the smallest side to this size, or the camera's own where that is larger.
 SMALLEST_SIDE, LARGEST_SIZE = 16, (768, 576)
-# Axis' default compression, at which the JPEG quality is the one that the server was opened with; linear up to 0, the
-# finest, and down to 100. What the ARTPEC's own scale is, nobody says.
+# Axis' default compression, at which the JPEG quality is the server's ``quality``; linear from there to 0, the finest,
+# and to 100. The ARTPEC chip's own scale is not documented.
 DEFAULT_COMPRESSION = 30
 FINEST_QUALITY, COARSEST_QUALITY = 100, 10
-# An input without a signal is shown as a flat picture that says so (BGR).
+# Colour (BGR) of the image of an input without a signal.
 NO_VIDEO_COLOUR = (160, 40, 20)
-# Encoded variants (camera, size, compression) that are remembered.
+# Number of stored variants (camera, size, compression).
 MAX_VARIANTS = 64
 
 
 def named_sizes(standard: Standard) -> dict[str, Size]:
-    """The sizes that have names, in a television standard."""
+    """List the named sizes of a television standard [px]."""
     height = {"PAL": 576, "NTSC": 480}[standard]
     return {name: (size[0], size[1] * height // 576) for name, size in PAL_SIZES.items()}
 
 
 @dataclass(frozen=True)
 class Order:
-    """What a client asks of pictures.
+    """A client's request for images.
 
     Attributes:
-        camera: number of the input, or all four in one.
+        camera: number of the input, or all four in one image.
         size: (width, height) [px]; None for the camera's own.
         compression: 0 to 100, less is finer.
-        rate_hz: most pictures a second; 0 for all.
-        duration: of the stream [s]; 0 for ever.
-        count: of pictures in the stream; 0 for no end.
-        show_length: whether a single picture tells its length.
+        rate_hz: highest frame rate; 0 for no limit.
+        duration: of the stream [s]; 0 for no end.
+        count: number of images in the stream; 0 for no end.
+        show_length: whether a snapshot has a Content-Length.
     """
 
     camera: Camera
@@ -294,15 +287,15 @@ class Order:
 
 
 def parse_order(arguments: Mapping[str, str], camera: str | None, sizes: Mapping[str, Size]) -> Order:
-    """Read VAPIX's arguments of pictures; unknown ones are passed over, as the server does.
+    """Parse VAPIX's arguments for images; unknown ones are ignored, as by the server.
 
     Args:
         arguments: of the request.
-        camera: the one that the path names, if it does.
-        sizes: that have names.
+        camera: camera in the path, if there is one.
+        sizes: the named sizes.
 
     Raises:
-        HttpError: a value makes no sense (400).
+        HttpError: a value is invalid (400).
     """
     which = arguments.get("camera", camera or "1")
     if which != "quad" and which not in map(str, INPUTS):
@@ -324,7 +317,7 @@ def _number(arguments: Mapping[str, str], name: str, highest: float, default: fl
         value = float(arguments.get(name, default))
     except ValueError:
         raise HttpError(HTTPStatus.BAD_REQUEST) from None
-    if not 0 <= value <= highest:  # also true of nan
+    if not 0 <= value <= highest:  # refuses nan too
         raise HttpError(HTTPStatus.BAD_REQUEST)
     return value
 
@@ -341,13 +334,13 @@ def _size(text: str, sizes: Mapping[str, Size]) -> Size | None:
 
 
 class Pace:
-    """Thins pictures out to a rate without making those that are left any older.
+    """Limiter of the frame rate that delays no image.
 
     Args:
-        rate_hz: pictures a second; 0 lets all of them pass.
+        rate_hz: images a second; 0 for no limit.
     """
 
-    # A picture passes this part of a period early, so that a source at just this rate loses none to its jitter.
+    # An image may come this part of a period early, so that jitter loses none of a source at exactly this rate.
     EARLY = 0.25
 
     def __init__(self, rate_hz: float) -> None:
@@ -355,10 +348,10 @@ class Pace:
         self._due = -math.inf
 
     def due(self, now: float) -> bool:
-        """Whether the picture that is there ``now`` [s] is one to send."""
+        """Return whether the image that is there ``now`` [s] is to be sent."""
         if now < self._due - self.EARLY * self._period:
             return False
-        # Counted on from when it was due, so that the mean is right; a source that is too slow saves up half a period.
+        # Counted from the due time, so that the mean rate is right; a slower source gains half a period at most.
         self._due = max(self._due, now - self._period / 2) + self._period
         return True
 
@@ -373,13 +366,13 @@ class _Variant:
 
 
 class Pictures:
-    """The server's inputs, and their newest JPEG of every size that is asked for; safe to use from any thread.
+    """The server's inputs, and their newest JPEG of every requested size; safe to use from any thread.
 
     Args:
         feeds: by the number of the input.
         quality: of JPEG, 0 to 100, at Axis' default compression.
         faults: of the server.
-        blank: size of the picture of an input without feed [px].
+        blank: size of the image of an input without feed [px].
     """
 
     def __init__(self, feeds: Mapping[int, Feed], quality: int, faults: Faults, blank: Size) -> None:
@@ -388,29 +381,29 @@ class Pictures:
         self._lock = threading.Lock()
 
     def video(self, camera: int) -> bool:
-        """Whether an input has a signal."""
+        """Return whether an input has a signal."""
         return camera in self._feeds and "no-video" not in self._faults
 
     def wait(self, camera: Camera, after: int, timeout: float) -> Picture | None:
-        """The newest picture above an index, as the camera gives it; None if none comes within ``timeout`` [s]."""
+        """Wait for the newest image above an index, unscaled; None if none comes within ``timeout`` [s]."""
         feed = self._feeds.get(min(self._feeds, default=1) if camera == "quad" else camera)
         if feed is not None:
             return feed.newest(after, timeout)
         if after >= 0:
-            time.sleep(timeout)  # an input without signal has a rate too
+            time.sleep(timeout)  # an input without a signal also has a frame rate
         return Picture(blank_picture(self._blank), after + 1, time.monotonic())
 
     def own_size(self, camera: int) -> Size:
-        """(width, height) of what an input gives to a client that asks for no size [px]."""
+        """Return (width, height) of an input's images for a client that requests no size [px]."""
         feed = self._feeds.get(camera)
         picture = None if feed is None else feed.newest()
         return self._blank if picture is None else (picture.image.shape[1], picture.image.shape[0])
 
     def check(self, order: Order, picture: Picture) -> None:
-        """Refuse an order for a size that a camera cannot give.
+        """Refuse a request for a size that a camera cannot give.
 
         Raises:
-            HttpError: no such size (400).
+            HttpError: the size is out of range (400).
         """
         if order.size is None:
             return
@@ -419,12 +412,12 @@ class Pictures:
             raise HttpError(HTTPStatus.BAD_REQUEST)
 
     def size(self, order: Order, picture: Picture) -> Size:
-        """(width, height) of what an order gets [px]."""
+        """Return (width, height) of the image that a request gets [px]."""
         size = order.size or (picture.image.shape[1], picture.image.shape[0])
         return (size[0] // 2, size[1] // 2) if "resolution" in self._faults else size
 
     def jpeg(self, order: Order, picture: Picture) -> tuple[int, bytes]:
-        """The JPEG of a picture, or of a newer one that somebody else had encoded already, and its index."""
+        """Encode an image, or take a newer one that another viewer's thread has encoded; return its index and JPEG."""
         size, blank = self.size(order, picture), "no-video" in self._faults
         with self._lock:
             if len(self._variants) > MAX_VARIANTS:
@@ -452,20 +445,20 @@ class Pictures:
 
 
 def scaled(image: Image, size: Size) -> Image:
-    """An image in another size (width, height) [px]; its shape may change, as PAL's and NTSC's do."""
+    """Scale an image to (width, height) [px]; the aspect ratio may change, as with PAL and NTSC."""
     if (image.shape[1], image.shape[0]) == size:
         return image
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def encode(image: Image, quality: int) -> bytes:
-    """A JPEG, at a quality of 0 to 100."""
+    """Encode a JPEG at a quality of 0 to 100."""
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return bytes(data)
 
 
 def blank_picture(size: Size) -> Image:
-    """What is shown of an input without a signal."""
+    """Make the image of an input without a signal."""
     image = np.full((size[1], size[0], 3), NO_VIDEO_COLOUR, np.uint8)
     scale = size[0] / 400
     cv2.putText(image, "No video", (size[0] // 10, size[1] // 2), cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255))
@@ -473,7 +466,7 @@ def blank_picture(size: Size) -> Image:
 
 
 def damaged(data: bytes, index: int) -> bytes:
-    """A JPEG of the same length with bytes destroyed: by turns at its start, at its end and amid its data."""
+    """Destroy bytes of a JPEG, keeping its length: in turn at its start, at its end and in the middle."""
     quarter = len(data) // 4
     match index % 3:
         case 0:
@@ -484,22 +477,22 @@ def damaged(data: bytes, index: int) -> bytes:
             return data[: 2 * quarter] + bytes(quarter) + data[3 * quarter :]
 
 
-# --- axis_answers ---
+# Answers in plain text
 
-# The 241Q's last firmware; VAPIX 2 goes with it.
+# The 241Q's last firmware, which has VAPIX 2.
 FIRMWARE = "4.48"
-# Arguments of ptz.cgi that ask for motion.
+# Arguments of ptz.cgi that request motion.
 PTZ_MOTIONS = ("move", "pan", "tilt", "rpan", "rtilt", "zoom", "rzoom", "center", "areazoom")
 
 
 def parameters(serial: str, standard: str, sizes: Iterable[str], resolutions: Iterable[str]) -> dict[str, str]:
-    """The parameters that `param.cgi` lists, in its order.
+    """Make the parameters that `param.cgi` lists, in its order.
 
     Args:
         serial: number of the unit.
         standard: of the television signal.
-        sizes: the names of those that it has.
-        resolutions: what each input gives to a client that asks for no size.
+        sizes: names of the sizes.
+        resolutions: of each input, for a client that requests no size.
     """
     sizes = list(sizes)
     listed = {
@@ -542,7 +535,7 @@ def parameters(serial: str, standard: str, sizes: Iterable[str], resolutions: It
 
 
 def list_parameters(listed: Mapping[str, str], arguments: Mapping[str, str]) -> str:
-    """Answer `param.cgi?action=list`, with ``group`` for some only; an unknown group is told of in the text."""
+    """Answer `param.cgi?action=list`, with ``group`` for some only; the text names an unknown group."""
     if arguments.get("action") != "list":
         return f"# Error: Unknown action '{arguments.get('action', '')}'\n"
     lines = []
@@ -557,7 +550,7 @@ def video_status(video: Callable[[int], bool], arguments: Mapping[str, str]) -> 
     """Answer `videostatus.cgi?status=1,2`: which inputs have a signal.
 
     Raises:
-        HttpError: the server has no such input (400).
+        HttpError: there is no such input (400).
     """
     asked = arguments.get("status", ",".join(map(str, INPUTS))).split(",")
     if not set(asked) <= set(map(str, INPUTS)):
@@ -571,9 +564,9 @@ def image_size(size: Size) -> str:
 
 
 def fixed_ptz(arguments: Mapping[str, str]) -> str | None:
-    """Answer `com/ptz.cgi` for a camera that stands still; None where there is nothing to say (204).
+    """Answer `com/ptz.cgi` for a stationary camera; None for an empty answer (204).
 
-    It is at zero and can go nowhere else, and an order to move is refused. The real server's words are not known.
+    The camera is at zero, its limits are zero, and a request to move is refused. The real server's wording is unknown.
     """
     match arguments.get("query"):
         case "position":
@@ -587,29 +580,29 @@ def fixed_ptz(arguments: Mapping[str, str]) -> str | None:
             return f"Error: unknown query '{query}'\n"
 
 
-# --- axis_stream ---
+# Streams
 
 BOUNDARY = "--myboundary"
-# How often a sender that waits for something looks whether its server closes or its client has gone [s].
+# Period with which a waiting sender checks whether the server closes or the client is gone [s].
 LOOK_S = 0.1
-# How long the first picture of a camera is waited for [s].
+# Time limit for a camera's first image [s].
 FIRST_PICTURE_S = 2.0
-# What is missing, or too much, of a length that is wrong [bytes].
+# Error of a wrong Content-Length [bytes].
 LENGTH_ERROR = 777
-# Faults that end streams which are under way.
+# Faults that end open streams.
 ENDING = ("unauthorized", "busy", "refuse")
 
 
 class Sender:
-    """Sends pictures over one connection.
+    """Send images over one connection, with the faults that are on.
 
     Args:
         connection: to the client.
         pictures: of the server.
         faults: of the server.
         closing: set when the server closes.
-        early_boundary: whether a boundary is sent at once after its picture, instead of just before the next.
-        sent: told each part's picture index, and when its first byte is sent [s].
+        early_boundary: whether a boundary is sent at once after its image, instead of just before the next.
+        sent: called with each part's image index and the time at which its first byte is sent [s].
     """
 
     def __init__(
@@ -625,10 +618,10 @@ class Sender:
         self._early, self._sent = early_boundary, sent
 
     def first(self, order: Order) -> Picture:
-        """The newest picture of a camera.
+        """Wait for the newest image of a camera.
 
         Raises:
-            HttpError: it has none (503), or not of the size that is asked for (400).
+            HttpError: there is none (503), or not of the requested size (400).
         """
         deadline = time.monotonic() + FIRST_PICTURE_S
         while not self._closing.is_set() and time.monotonic() < deadline:
@@ -638,7 +631,7 @@ class Sender:
         raise HttpError(HTTPStatus.SERVICE_UNAVAILABLE)
 
     def snapshot(self, order: Order) -> None:
-        """Send a single picture."""
+        """Send a single image."""
         index, data = self._pictures.jpeg(order, self.first(order))
         headers, data = self._spoil(index, data)
         if not order.show_length:
@@ -646,7 +639,7 @@ class Sender:
         self._send(reply_head(HTTPStatus.OK, headers), data, b"")
 
     def stream(self, order: Order) -> None:
-        """Send pictures, always the newest next, until the order is fulfilled or nobody listens any more."""
+        """Send images, always the newest next, until the request is fulfilled or the client is gone."""
         self.first(order)
         dashes = "--" if "dashed-boundary" in self._faults else ""
         kind = f"Content-Type: multipart/x-mixed-replace;boundary={dashes}{BOUNDARY[2:]}"
@@ -681,9 +674,9 @@ class Sender:
         return self._send(head.encode(), data, tail.encode())
 
     def _spoil(self, index: int, data: bytes) -> tuple[list[str], bytes]:
-        """The headers and bytes of a picture, with the faults that are on."""
+        """Make the headers and bytes of an image, with the faults that are on."""
         length = len(data)
-        if "wrong-length" in self._faults:  # by turns too long and too short
+        if "wrong-length" in self._faults:  # in turn too long and too short
             length += LENGTH_ERROR if index % 2 else -LENGTH_ERROR
         if "corrupt" in self._faults:
             data = damaged(data, index)
@@ -691,7 +684,7 @@ class Sender:
         return headers[:1] if "no-length" in self._faults else headers, data
 
     def _send(self, head: bytes, data: bytes, tail: bytes) -> bool:
-        """Send a picture; whether the connection is still good for another."""
+        """Send an image; return whether the connection can take another."""
         whole, middle = head + data + tail, len(head) + len(data) // 2
         if "cut" in self._faults:
             self._connection.sendall(whole[:middle])
@@ -706,32 +699,34 @@ class Sender:
         return True
 
     def _gone(self) -> bool:
-        """Whether the client has closed its side; it is not expected to say anything."""
+        """Return whether the client has closed its side; a viewer sends nothing."""
         readable, _, _ = select.select([self._connection], [], [], 0)
         return bool(readable) and not self._connection.recv(1, socket.MSG_PEEK)
 
 
-# What can be wrong with the server. Those that refuse a client (unauthorized, busy, refuse) also end the streams under
-# way, as a server does that starts anew with other settings.
+# The server
+
+# Faults. Those that refuse a client (unauthorized, busy, refuse) also end open streams, as a server does that restarts
+# with other settings.
 AXIS_FAULTS = (
-    "stall",  # a picture stops half way, and goes on when the fault is off
+    "stall",  # an image stops half way, and goes on when the fault is off
     "cut",  # the connection closes half way
-    "corrupt",  # bytes of the JPEG are destroyed, by turns at its start, at its end and amid its data
-    "wrong-length",  # Content-Length, by turns too short and too long
+    "corrupt",  # bytes of the JPEG are destroyed, in turn at its start, at its end and in the middle
+    "wrong-length",  # Content-Length is in turn too short and too long
     "no-length",  # no Content-Length
-    "dashed-boundary",  # a stream's header tells its boundary with the dashes
-    "unauthorized",  # 401 whatever the password
+    "dashed-boundary",  # the boundary in a stream's header has the leading dashes
+    "unauthorized",  # 401 for any password
     "busy",  # 503
-    "no-video",  # the inputs have no signal, and their pictures say so
-    "frozen",  # the same JPEG again and again
-    "resolution",  # half the size that was asked for
+    "no-video",  # the inputs have no signal, and their images show that
+    "frozen",  # the same JPEG is repeated
+    "resolution",  # half the requested size
     "refuse",  # connections are closed at once
 )
-# How long a client may take to say what it wants, or to take a picture [s].
+# Time limit for a client to send its request, or to receive an image [s].
 PATIENCE_S = 30.0
-# Connections at a time, viewers and others.
+# Largest number of connections, viewers and others.
 MAX_CONNECTIONS = 64
-# How long, and how often, a refused client is listened to until it closes [s].
+# Time limit [s] and number of reads for a refused client to close.
 DRAIN_S, DRAIN_READS = 1.0, 64
 LAST_PORT = 65535
 # SO_LINGER on, 0 s: closing sends a reset.
@@ -750,15 +745,15 @@ PATHS = {
 
 @dataclass(frozen=True)
 class AxisUnit:
-    """What differs from one unit to another.
+    """Properties that differ between units.
 
     Attributes:
         serial: number of the unit, which is its MAC address.
         standard: of the television signal.
-        viewers: streams at a time.
-        early_boundary: whether a stream's boundary is sent at once after a picture, instead of just before the next;
-            the bytes are the same, but the first of a part then come a picture too early.
-        parameters: besides those of a 241Q, or in their place; by full names such as "root.Brand.ProdNbr".
+        viewers: largest number of streams.
+        early_boundary: whether a stream's boundary is sent at once after an image, instead of just before the next; the
+            bytes are the same, but the first ones of a part come a frame period early.
+        parameters: further or replaced parameters, by full names such as "root.Brand.ProdNbr".
     """
 
     serial: str = "00408C000241"
@@ -769,23 +764,23 @@ class AxisUnit:
 
 
 class AxisServer:
-    """The server, from its construction until it is closed; a context manager.
+    """The emulated server, which runs from its construction until it is closed; a context manager.
 
     Args:
-        feeds: of pictures, by the number of the input, from 1 to 4.
+        feeds: of images, by the number of the input, from 1 to 4.
         host: address to listen at.
-        port: to listen at; 0 for any that is free.
-        user: who may look; empty where everybody may.
+        port: to listen at; 0 for any free port.
+        user: user name; empty if everyone may connect.
         password: of that user.
         auth: scheme of authentication.
         quality: of JPEG, 0 to 100, at Axis' default compression of 30.
-        faults: of `AXIS_FAULTS`; to be switched on and off at any time.
-        sent: told, for each part of each stream, the index of its picture and when its first byte is sent, on the
-            machine's monotonic clock [s].
-        unit: which unit it is.
+        faults: of `AXIS_FAULTS`; may be switched on and off at any time.
+        sent: called for each part of each stream with the index of its image and the time at which its first byte is
+            sent, on the machine's monotonic clock [s].
+        unit: properties of the unit.
 
     Raises:
-        DeviceError: the address cannot be listened at.
+        DeviceError: the address is invalid or in use.
     """
 
     def __init__(
@@ -837,12 +832,12 @@ class AxisServer:
 
     @property
     def viewers(self) -> int:
-        """How many streams are under way."""
+        """Number of open streams."""
         with self._lock:
             return self._viewers
 
     def close(self) -> None:
-        """End every connection and every thread; once more does no harm."""
+        """End every connection and every thread; may be called again."""
         if self._closing.is_set():
             return
         self._closing.set()
@@ -880,7 +875,7 @@ class AxisServer:
 
     def _run(self, connection: socket.socket) -> None:
         try:
-            with contextlib.suppress(OSError):  # the client has gone, or is too slow; nobody is left to be told
+            with contextlib.suppress(OSError):  # the client is gone or too slow; no reply can reach it
                 connection.settimeout(PATIENCE_S)
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 try:
@@ -942,7 +937,7 @@ class AxisServer:
 
     @contextlib.contextmanager
     def _seat(self) -> Iterator[None]:
-        """One of the places for viewers.
+        """Reserve a place for a viewer.
 
         Raises:
             HttpError: all are taken (503).
@@ -967,7 +962,7 @@ class AxisServer:
 
 
 def _drain(connection: socket.socket) -> None:
-    """Take what a refused client still sends: closing with bytes unread may lose the answer on its way."""
+    """Read what a refused client still sends: closing with unread bytes may lose the reply."""
     connection.shutdown(socket.SHUT_WR)
     connection.settimeout(DRAIN_S)
     for _ in range(DRAIN_READS):
