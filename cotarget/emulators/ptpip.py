@@ -1,14 +1,10 @@
-"""A PTP/IP responder: one TCP port, one initiator at a time, an emulated device behind it.
+"""PTP/IP responder: an emulated device on one TCP port, for one initiator at a time.
 
-The session is packets in, packets out; around it stand the sockets and threads, and those faults that happen on the
-line: "hung" answers nothing, "slow" answers a second late, "cut" breaks the connection once in the middle of data, and
-for as long as the device is ``absent`` nobody listens.
-
-PTP without a transport: values and datasets as bytes, response codes, and what a device is; source: ISO 15740.
-
-PTP/IP as bytes: the packets that an initiator and a responder exchange over TCP; source: CIPA DC-005.
-
-A packet is its length (of itself, 4 bytes), its kind (4 bytes), and a body; all of it little-endian.
+The first part encodes PTP's values and datasets (ISO 15740). The second parses and encodes the packets of PTP/IP (CIPA
+DC-005): length of the whole packet (4 bytes), kind (4 bytes) and body, all little-endian. `CommandSession` turns
+packets into packets, and `PtpIpServer` holds the sockets, the threads and the faults of the line. With "hung" nothing
+is answered, with "slow" answers are a second late, "cut" breaks the connection once in the middle of data. While the
+device is ``absent``, the port is closed.
 """
 
 import contextlib
@@ -24,8 +20,10 @@ from typing import Protocol
 from cotarget.emulators.faults import Faults
 from cotarget.errors import CotargetError, DeviceError
 
-PARAMETERS = 5  # an operation or a response has no more
-LONGEST_STRING = 255  # UTF-16 units, the closing zero among them
+# PTP: values, datasets and response codes
+
+PARAMETERS = 5  # most parameters of an operation or a response
+LONGEST_STRING = 255  # UTF-16 units, with the closing zero
 ARRAY = 0x4000  # set in the data type of an array
 INT8, UINT8, INT16, UINT16, INT32, UINT32, INT64, UINT64 = range(1, 9)
 STRING = 0xFFFF
@@ -36,7 +34,7 @@ Value = int | str | tuple[int, ...]
 
 
 class Code(IntEnum):
-    """Response codes."""
+    """Response codes of PTP."""
 
     OK = 0x2001
     GENERAL_ERROR = 0x2002
@@ -55,12 +53,18 @@ class Code(IntEnum):
 
 
 class PtpError(CotargetError):
-    """Bytes that are no PTP, or that come at the wrong time."""
+    """The bytes are no valid PTP, or come out of turn."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a device answers to an operation; ``data`` where the operation is one that gives data, even if empty."""
+    """A device's answer to an operation.
+
+    Attributes:
+        code: response code.
+        parameters: of the response.
+        data: of an operation that returns data, even if empty; None for any other.
+    """
 
     code: int = Code.OK
     parameters: tuple[int, ...] = ()
@@ -68,23 +72,23 @@ class Answer:
 
 
 class PtpDevice(Protocol):
-    """What a responder stands in front of."""
+    """A device behind a responder."""
 
     def operate(self, code: int, parameters: tuple[int, ...], data: bytes) -> Answer:
-        """Do an operation: five parameters, those that were not sent 0, and the data that came along."""
+        """Carry out an operation, with five parameters (0 where one was not sent) and its data."""
 
     def disconnected(self) -> None:
-        """The initiator is gone."""
+        """Handle the end of the initiator's connection."""
 
 
 def array(values: Iterable[int], kind: int) -> bytes:
-    """An array of integers of a data type, after its length."""
+    """Encode an array of integers of a data type, after its length."""
     items = tuple(values)
     return struct.pack("<I", len(items)) + b"".join(encode(kind, item) for item in items)
 
 
 def string(text: str) -> bytes:
-    """A string after its length; an empty one is a length of 0."""
+    """Encode a string after its length; an empty one is a length of 0."""
     if not text:
         return b"\0"
     units = text.encode("utf-16-le")[: 2 * (LONGEST_STRING - 1)] + b"\0\0"
@@ -92,7 +96,7 @@ def string(text: str) -> bytes:
 
 
 def encode(kind: int, value: Value) -> bytes:
-    """A value as its data type has it."""
+    """Encode a value of a data type."""
     if isinstance(value, str):
         return string(value)
     if isinstance(value, tuple):
@@ -101,7 +105,7 @@ def encode(kind: int, value: Value) -> bytes:
 
 
 def decode(kind: int, data: bytes) -> Value:
-    """The value of a data type that is all of some bytes.
+    """Decode a value of a data type from all of the bytes.
 
     Raises:
         PtpError: the bytes are no such value.
@@ -124,7 +128,7 @@ def decode(kind: int, data: bytes) -> Value:
 
 @dataclass(frozen=True)
 class Range:
-    """Values from ``low`` to ``high`` by ``step``."""
+    """Values from ``low`` to ``high`` in steps of ``step``."""
 
     low: int
     high: int
@@ -136,11 +140,11 @@ class Property:
     """A property of a device.
 
     Attributes:
-        code: its number.
+        code: number of the property.
         kind: data type.
-        default: its value at first.
+        default: initial value.
         writable: whether the initiator may set it.
-        form: what may be set: a range, a list of values, or None for anything of that type.
+        form: valid values: a range, a list, or None for any value of the data type.
     """
 
     code: int
@@ -150,7 +154,7 @@ class Property:
     form: Range | tuple[Value, ...] | None = None
 
     def allows(self, value: Value) -> bool:
-        """Whether a value of the right type is one that may be set."""
+        """Return whether a value of the right type may be set."""
         match self.form:
             case None:
                 return True
@@ -160,7 +164,7 @@ class Property:
                 return value in values
 
     def describe(self, current: Value) -> bytes:
-        """The dataset that describes it, with its value now."""
+        """Encode the dataset that describes the property, with its present value."""
         head = struct.pack("<HHB", self.code, self.kind, self.writable)
         head += encode(self.kind, self.default) + encode(self.kind, current)
         match self.form:
@@ -175,20 +179,20 @@ class Property:
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """What a device is and can do; lists of codes, and names."""
+    """Identity and capabilities of a device: names, and lists of codes."""
 
-    extension: int  # the vendor's, as registered
+    extension: int  # registered number of the vendor's extension
     operations: tuple[int, ...]
     events: tuple[int, ...]
     properties: tuple[int, ...]
-    formats: tuple[int, ...]  # of objects that it shows
+    formats: tuple[int, ...]  # of the objects on the device
     maker: str
     model: str
     version: str
     serial: str
 
     def pack(self) -> bytes:
-        """The dataset, of PTP 1.0, of a camera that captures JPEG."""
+        """Encode the dataset, of PTP 1.0, of a camera that captures JPEG."""
         head = struct.pack("<HIH", 100, self.extension, 100) + string("") + struct.pack("<H", 0)
         lists = (self.operations, self.events, self.properties, (JPEG,), self.formats)
         names = (self.maker, self.model, self.version, self.serial)
@@ -196,13 +200,13 @@ class DeviceInfo:
 
 
 def storage_info(label: str) -> bytes:
-    """The dataset of a camera's memory: fixed RAM, a file system of its own, read and write, sizes unknown."""
+    """Encode the dataset of a camera's memory: fixed RAM with its own file system, read and write, sizes unknown."""
     return struct.pack("<HHHQQI", 3, 0x8001, 0, 0, 0, 0xFFFFFFFF) + string("") + string(label)
 
 
 @dataclass(frozen=True)
 class ObjectInfo:
-    """What a camera tells of an image in its memory; sizes in bytes and pixels."""
+    """Description of an image in a camera's memory; sizes in bytes and pixels."""
 
     storage: int
     length: int
@@ -213,7 +217,7 @@ class ObjectInfo:
     date: str  # of the capture, as "20080721T095816"
 
     def pack(self) -> bytes:
-        """The dataset, of a JPEG (EXIF) image in no folder."""
+        """Encode the dataset of a JPEG (EXIF) image without a folder."""
         plain = 0
         head = struct.pack("<IHHI", self.storage, JPEG, plain, self.length)
         thumb = struct.pack("<HIII", JPEG, self.thumb_length, *self.thumb_size)
@@ -221,17 +225,17 @@ class ObjectInfo:
         return head + thumb + rest + string(self.name) + string(self.date) * 2 + string("")
 
 
-# --- ptpip ---
+# PTP/IP: packets
 
 HEADER = struct.Struct("<II")
 LONGEST_PACKET = 1 << 20  # bytes; initiators send data in pieces of 64 KiB or less
-PIECE = 1 << 16  # bytes of data in one packet of ours
+PIECE = 1 << 16  # bytes of data in one packet of the responder
 GUID_LENGTH = 16
 VERSION = 0x00010000  # of PTP/IP: 1.0
 
 
 class Kind(IntEnum):
-    """Packets of PTP/IP."""
+    """Kinds of packets of PTP/IP."""
 
     INIT_COMMAND = 1
     INIT_COMMAND_ACK = 2
@@ -251,7 +255,7 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True)
 class InitCommand:
-    """The first packet of a command connection: who calls."""
+    """First packet of a command connection: GUID and name of the initiator."""
 
     guid: bytes
     name: str
@@ -259,14 +263,14 @@ class InitCommand:
 
 @dataclass(frozen=True)
 class InitEvent:
-    """The first packet of an event connection: the number of the command connection that it belongs to."""
+    """First packet of an event connection: number of the command connection that it belongs to."""
 
     connection: int
 
 
 @dataclass(frozen=True)
 class OperationRequest:
-    """An operation to do; ``sends_data`` where its data follows."""
+    """Request of an operation; with ``sends_data`` its data follow."""
 
     code: int
     transaction: int
@@ -276,7 +280,7 @@ class OperationRequest:
 
 @dataclass(frozen=True)
 class StartData:
-    """Data of ``total`` bytes follows."""
+    """Announcement of ``total`` bytes of data."""
 
     transaction: int
     total: int
@@ -284,7 +288,7 @@ class StartData:
 
 @dataclass(frozen=True)
 class Data:
-    """A piece of data; ``last`` for the last one."""
+    """A piece of data; ``last`` marks the last one."""
 
     transaction: int
     data: bytes
@@ -293,14 +297,14 @@ class Data:
 
 @dataclass(frozen=True)
 class Cancel:
-    """The transaction is wanted no more."""
+    """Cancellation of a transaction."""
 
     transaction: int
 
 
 @dataclass(frozen=True)
 class Probe:
-    """A question, or the ``answer``, whether the other side is still there."""
+    """Query whether the other side is still there, or with ``answer`` the answer to it."""
 
     answer: bool = False
 
@@ -309,16 +313,16 @@ Packet = InitCommand | InitEvent | OperationRequest | StartData | Data | Cancel 
 
 
 class PacketReader:
-    """Cuts a stream of bytes into the packets that an initiator may send."""
+    """Splitter of a stream of bytes into the packets that an initiator may send."""
 
     def __init__(self) -> None:
         self._pending = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Packet]:
-        """Add bytes, and give each packet that they complete.
+        """Add bytes, and yield each packet that they complete.
 
         Raises:
-            PtpError: these are no packets of an initiator.
+            PtpError: the bytes are no packets of an initiator.
         """
         self._pending += data
         while len(self._pending) >= HEADER.size:
@@ -333,10 +337,10 @@ class PacketReader:
 
 
 def parse_packet(kind: int, body: bytes) -> Packet:
-    """Tell what a packet of an initiator says.
+    """Parse a packet of an initiator.
 
     Raises:
-        PtpError: it says nothing that an initiator may say.
+        PtpError: an initiator sends no such packet.
     """
     match kind, len(body):
         case Kind.INIT_COMMAND, length if length >= GUID_LENGTH + 6 and length % 2 == 0:
@@ -361,35 +365,35 @@ def parse_packet(kind: int, body: bytes) -> Packet:
 
 
 def packet(kind: Kind, body: bytes = b"") -> bytes:
-    """The bytes of a packet."""
+    """Encode a packet."""
     return HEADER.pack(HEADER.size + len(body), kind) + body
 
 
 def init_command_ack(connection: int, guid: bytes, name: str) -> bytes:
-    """The responder's welcome on a command connection, with its number, GUID and name."""
+    """Encode the acceptance of a command connection, with its number and the responder's GUID and name."""
     body = struct.pack("<I", connection) + guid + name.encode("utf-16-le") + b"\0\0"
     return packet(Kind.INIT_COMMAND_ACK, body + struct.pack("<I", VERSION))
 
 
 def init_fail(reason: int) -> bytes:
-    """The responder's refusal of a connection: 1 rejected, 2 busy, 3 unspecified."""
+    """Encode the refusal of a connection: 1 rejected, 2 busy, 3 unspecified."""
     return packet(Kind.INIT_FAIL, struct.pack("<I", reason))
 
 
 def response(code: int, transaction: int, parameters: Iterable[int] = ()) -> bytes:
-    """The end of a transaction."""
+    """Encode the end of a transaction."""
     words = tuple(parameters)
     return packet(Kind.RESPONSE, struct.pack(f"<HI{len(words)}I", code, transaction, *words))
 
 
 def event(code: int, parameters: Iterable[int] = ()) -> bytes:
-    """An event on the event connection, of no transaction."""
+    """Encode an event of no transaction, for the event connection."""
     words = tuple(parameters)
     return packet(Kind.EVENT, struct.pack(f"<HI{len(words)}I", code, 0xFFFFFFFF, *words))
 
 
 def data_phase(transaction: int, data: bytes) -> Iterator[bytes]:
-    """The packets that bring data; an end packet there is even for none."""
+    """Yield the packets that carry data; even empty data end with an end packet."""
     yield packet(Kind.START_DATA, struct.pack("<IQ", transaction, len(data)))
     number = struct.pack("<I", transaction)
     last = max(len(data) - 1, 0) // PIECE * PIECE
@@ -398,38 +402,40 @@ def data_phase(transaction: int, data: bytes) -> Iterator[bytes]:
     yield packet(Kind.END_DATA, number + data[last:])
 
 
+# The responder
+
 LINE_FAULTS = ("hung", "slow", "cut")
-LOOK_S = 0.05  # between looks at whether the device is absent
-SLOW_S = 1.0  # that a slow answer takes; libgphoto2 waits for 2.5 s
-SUCCESSION_S = 1.0  # that a caller waits for the one before to be gone
+LOOK_S = 0.05  # period of checking whether the device is absent [s]
+SLOW_S = 1.0  # delay of a slow answer; libgphoto2 waits for 2.5 s [s]
+SUCCESSION_S = 1.0  # time limit for a new initiator to wait for the end of the one before [s]
 RECEIVE = 1 << 16  # bytes
-LONGEST_DATA = 1 << 20  # bytes that an operation may bring along; a property's value takes a few
-# libgphoto2 sends a request and its data apart and without TCP_NODELAY: unless the first is acknowledged at once, which
-# is an option of Linux, the second leaves 40 ms late.
+LONGEST_DATA = 1 << 20  # most data of an operation; a property's value takes a few bytes [bytes]
+# libgphoto2 sends a request and its data separately and without TCP_NODELAY. Unless the first is acknowledged at once,
+# which is an option of Linux, the second leaves 40 ms late.
 QUICK_ACK: int | None = getattr(socket, "TCP_QUICKACK", None)
 HIGHEST_PORT = 65535
-REJECTED, BUSY = 1, 2  # reasons of a refusal
+REJECTED, BUSY = 1, 2  # reasons of INIT_FAIL
 
 
 class CommandSession:
     """The transactions of one command connection.
 
     Args:
-        device: does the operations.
-        deaf: whether to do and answer nothing now.
+        device: carries out the operations.
+        deaf: returns whether to ignore operations now.
     """
 
     def __init__(self, device: PtpDevice, deaf: Callable[[], bool] = lambda: False) -> None:
         self._device, self._deaf = device, deaf
-        self._request: OperationRequest | None = None  # whose data is not all there
-        self._total = -1  # bytes of that data, as announced; -1 before it is
+        self._request: OperationRequest | None = None  # the operation whose data are incomplete
+        self._total = -1  # announced bytes of its data; -1 before the announcement
         self._data = bytearray()
 
     def receive(self, received: Packet) -> list[bytes]:
-        """Take a packet of the initiator; the packets to send back, if any.
+        """Process a packet of the initiator; return the packets to send back.
 
         Raises:
-            PtpError: the packet makes no sense now.
+            PtpError: the packet comes out of turn.
         """
         waiting = self._request
         match received:
@@ -469,19 +475,19 @@ class CommandSession:
 
 
 class PtpIpServer:
-    """Listens on one port for command and event connections of one initiator at a time.
+    """Server of command and event connections on one port, for one initiator at a time.
 
     Args:
         device: the device.
-        guid: its 16 bytes.
-        name: how it calls itself.
-        faults: knows those of `LINE_FAULTS`.
-        absent: whether the device is unplugged or off now; asked every `LOOK_S`.
-        host: where to listen.
-        port: where to listen; 0 for any.
+        guid: 16 bytes that identify the device.
+        name: name of the device.
+        faults: must know `LINE_FAULTS`.
+        absent: returns whether the device is unplugged or off now; called every `LOOK_S`.
+        host: address to listen at.
+        port: to listen at; 0 for any free port.
 
     Raises:
-        DeviceError: nobody can listen there.
+        DeviceError: the address is invalid or in use.
     """
 
     def __init__(
@@ -505,7 +511,7 @@ class PtpIpServer:
         self._address: tuple[str, int] = self._listener.getsockname()[:2]
         self._closing = threading.Event()
         self._numbers = itertools.count(1)
-        self._changed = threading.Condition()  # guards what follows
+        self._changed = threading.Condition()  # guards the attributes below
         self._open: set[socket.socket] = set()
         self._caller: int | None = None  # number of the command connection
         self._ears: dict[int, socket.socket] = {}  # event connections by the number of their command connection
@@ -515,11 +521,11 @@ class PtpIpServer:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """TCP port of the server."""
         return self._address[1]
 
     def send_event(self, code: int, parameters: Iterable[int]) -> None:
-        """Send an event to the initiator, if there is one that listens."""
+        """Send an event to the initiator, if it has an event connection."""
         with self._changed:
             ear = None if self._caller is None else self._ears.get(self._caller)
         if ear is not None and "hung" not in self._faults:
@@ -527,7 +533,7 @@ class PtpIpServer:
                 ear.sendall(event(code, parameters))
 
     def close(self) -> None:
-        """Stop listening, break the connections, and wait for the threads."""
+        """Close the port and the connections, and wait for the threads."""
         self._closing.set()
         self._acceptor.join()
         self._hang_up()
@@ -542,7 +548,7 @@ class PtpIpServer:
             elif self._listener is None:
                 try:
                     self._listener = listen(*self._address)
-                except OSError:  # somebody else has the port for now
+                except OSError:  # another program has the port for now
                     self._closing.wait(LOOK_S)
             else:
                 with contextlib.suppress(TimeoutError):
@@ -597,7 +603,7 @@ class PtpIpServer:
     def _command(self, connection: socket.socket, packets: Iterator[Packet]) -> None:
         number = next(self._numbers)
         with self._changed:
-            # A client that leaves and comes back at once is faster than the end of its first connection is noticed.
+            # A client may reconnect before the end of its first connection is noticed.
             if not self._changed.wait_for(lambda: self._caller is None, SUCCESSION_S):
                 connection.sendall(init_fail(BUSY))
                 return
@@ -643,7 +649,7 @@ class PtpIpServer:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens and whose accept() takes `LOOK_S` at most."""
+    """Open a listening socket whose accept() waits `LOOK_S` at most."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.create_server((host, port), family=family)
     listener.settimeout(LOOK_S)

@@ -1,11 +1,10 @@
-"""The unit behind the D46's commands: both axes, what is set and what is saved, limits, modes, the reset.
+"""The PTU-D46 behind its commands: unit profiles, axes, settings, limits, modes and reset.
 
-One axis as the unit's firmware sees it: what it believes of its position, its limits, speeds and ramps.
-
-The units that the D46 emulator can be: limits, resolution, speeds, and how each firmware words its replies.
+`UnitProfile` describes a model of unit: limits, resolution, speeds, and the wording of its replies. `UnitAxis` is one
+axis as the firmware counts it, in front of an `AxisPlant`. `Unit` holds the state that commands share.
 
 Sources: S1 = PTU-D46 manual v2.14.0 (2006), S2 = Command Reference Manual v3.00D (2008), S3 = PTU-E46 manual; and what
-published drivers read from real units. Where these disagree, the profiles do.
+published drivers read from real units. Where these disagree, the profiles do too.
 """
 
 import copy
@@ -16,26 +15,26 @@ from dataclasses import dataclass
 from cotarget.emulators.plant import AxisPlant
 from cotarget.errors import ConfigError
 
-# Arc seconds a degree.
+# Arc seconds in a degree.
 ARCSEC = 3600.0
-# Share of a step within which limits given in degrees count as reached [steps]: a rig's step is given to some digits.
+# Tolerance [steps] for limits given in degrees to count as whole steps: a rig's step has a few digits only.
 STEP_SLACK = 0.02
-# Position counts beyond this are no pan-tilt unit's: the finest E-series step over a whole turn is a tenth of it.
+# Largest position of any unit: ten times that of the finest E-series step over a whole turn.
 MOST_COUNTS = 1_000_000
 Range = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class Wording:
-    """What the sources word differently; ``{axis}`` becomes Pan or Tilt, ``{n}`` a number.
+    """Replies that the sources word differently; ``{axis}`` becomes Pan or Tilt, ``{n}`` a number.
 
     Attributes:
         offset: reply to the query of an axis' desired position.
-        speed: of its desired speed.
-        acceleration: of its acceleration.
-        resolution: of its resolution.
+        speed: reply to the query of its desired speed.
+        acceleration: reply to the query of its acceleration.
+        resolution: reply to the query of its resolution.
         too_fast: refusal of a speed above the upper bound.
-        illegal: refusal of what is not understood.
+        illegal: refusal of an invalid command.
         out_of_range: refusal of any other number.
         uncalibrated: refusal of a move before the reset; None if the limits of 0 refuse it.
         independent: reply to the query of the control mode, verbose and terse.
@@ -58,33 +57,33 @@ class Wording:
 
 @dataclass(frozen=True)
 class UnitProfile:
-    """One model of pan-tilt unit, as its firmware announces itself.
+    """A model of pan-tilt unit, with the behaviour of its firmware.
 
     Attributes:
         name: of the profile.
-        version: of the firmware; commands that came later are unknown to it.
+        version: of the firmware; later commands are unknown to it.
         title: reply to the query of the version.
         step: resolution of both axes [arc seconds].
-        resolution_digits: decimals of it in replies.
-        pan: lowest and highest position that the reset finds [steps].
-        tilt: the same of tilt.
-        stop_margin: from those to the mechanical stops [steps].
-        slip: steps lost when an axis runs into something.
+        resolution_digits: decimals of the resolution in replies.
+        pan: lowest and highest pan position that the reset finds [steps].
+        tilt: lowest and highest tilt position that the reset finds [steps].
+        stop_margin: distance from those positions to the mechanical stops [steps].
+        slip: steps lost when an axis meets an obstacle.
         speed: desired speed at power-up [steps/s].
-        base_speed: up to it a speed is there at once [steps/s].
+        base_speed: speed that an axis reaches without a ramp [steps/s].
         lowest_speed: lower bound at power-up [steps/s].
         highest_speed: upper bound at power-up [steps/s].
         ceiling: highest upper bound that can be set [steps/s].
         acceleration: at power-up [steps/s^2].
-        reset_speed: at which the stops are sought [steps/s].
+        reset_speed: speed of the reset [steps/s].
         tables_s: time to compute the tables after a change of acceleration or a bound [s].
-        boot_s: from power to being ready, without a reset [s].
-        leading_lf: whether a command ended by CR is answered after a line feed.
-        reset_at_once: whether RE, RP and RT reset now, rather than say what R and power-up do.
+        boot_s: time from power to readiness, without a reset [s].
+        leading_lf: whether the answer to a command that ends with CR begins with a line feed.
+        reset_at_once: whether RE, RP and RT reset now, rather than set what R and power-up do.
         halt_waits: whether H answers once the axes stand, rather than at once; the sources do not say.
         expansion: whether the unit has the ports A and B.
         slip_ring: whether it can turn without end.
-        greeting: what a TCP client is told when it connects; empty for a plain serial line.
+        greeting: text for a new TCP client; empty for a plain serial line.
         wording: of the replies.
     """
 
@@ -116,7 +115,7 @@ class UnitProfile:
 
     @property
     def banner(self) -> str:
-        """What it prints when it gets power, but for the star of readiness."""
+        """Text printed when the unit gets power, before the star of readiness."""
         return f"\r\n{self.title}\r\n"
 
     @classmethod
@@ -129,21 +128,21 @@ class UnitProfile:
         acceleration: float,
         name: str = "d46_sim",
     ) -> "UnitProfile":
-        """Announce a head that is known in degrees, such as a simulated rig's.
+        """Make a profile of a head whose range is known in degrees, such as a simulated rig's.
 
-        Its ramps start from rest (base speed 0), as the simulated head's do, and its stops are its limits, so that not
-        even a reset leaves them.
+        Its ramps start from rest (base speed 0), as the simulated head's do. Its stops are its limits, so that even a
+        reset stays within them.
 
         Args:
             pan: lowest and highest [degrees].
             tilt: lowest and highest [degrees].
             step: resolution of both axes [degrees].
-            speed: highest, and that of moves at power-up [degrees/s].
+            speed: highest speed, and speed of moves at power-up [degrees/s].
             acceleration: of both axes [degrees/s^2].
             name: of the profile.
 
         Raises:
-            ConfigError: the head does not move in steps, or its range in steps is no such unit's.
+            ConfigError: the step is not positive, or the range has too many steps for such a unit.
         """
         if not step > 0 or max(abs(angle) for angle in (*pan, *tilt)) / step > MOST_COUNTS:
             raise ConfigError(f"head.step: {step:g} degrees is no step of a PTU-D46; 0.0514286 is its usual one")
@@ -171,7 +170,7 @@ class UnitProfile:
         )
 
 
-# A PTU-D46-17.5 as it leaves the factory: half steps, limits of the examples in S1 and S2.
+# A PTU-D46-17.5 with factory settings: half steps, limits of the examples in S1 and S2.
 D46_STOCK = UnitProfile(
     name="d46_stock",
     version=(2, 14, 0),
@@ -180,8 +179,8 @@ D46_STOCK = UnitProfile(
     pan=(-3090, 3090),
     tilt=(-907, 604),
 )
-# The paper's range, +-180 and -80..+30 degrees, which needs the extended-range option; an older firmware, with the
-# wordings of S2 where S1 has others, of units that CARMEN and ASR met, and MRPT's prefix of numbers out of range.
+# The paper's range, +-180 and -80..+30 degrees, which needs the extended-range option. An older firmware: where S1 and
+# S2 differ it has S2's wording, that of units which the drivers CARMEN and ASR met, and MRPT's refusal of a number.
 D46_PAPER = UnitProfile(
     name="d46_paper",
     version=(2, 12, 1),
@@ -193,7 +192,7 @@ D46_PAPER = UnitProfile(
     highest_speed=1985,
     wording=Wording(
         offset="Target {axis} position is {n}",
-        acceleration="{axis} acceleration is {n} positions/sec/sec",  # ASR's parser allows no digit after the number
+        acceleration="{axis} acceleration is {n} positions/sec/sec",  # ASR's parser accepts no further digit
         resolution="{n} seconds arc per {axis} position",
         too_fast="{axis} speed cannot exceed {n} pos/sec",
         out_of_range="Value out of range",
@@ -201,7 +200,7 @@ D46_PAPER = UnitProfile(
         velocity=("PTU is in pure velocity control mode", "pure velocity"),
     ),
 )
-# An E-series unit: eight steps where a D46 has one.
+# An E-series unit: eight steps to one of a D46.
 E_SERIES = UnitProfile(
     name="e_series",
     version=(3, 2, 1),
@@ -238,27 +237,26 @@ E_SERIES = UnitProfile(
 PROFILES = {unit.name: unit for unit in (D46_STOCK, D46_PAPER, E_SERIES)}
 
 
-# --- d46_axis ---
+# Axes
 
-# Stands for "at once": a step motor that starts below its base speed needs no ramp [steps/s^2].
+# Stands for "at once": a stepper motor needs no ramp up to its base speed [steps/s^2].
 INSTANT = 1e6
-# Steps that a step of each mode W is divided into, against half steps: full, half, quarter, eighth, automatic (which
-# counts in its finest steps).
+# Positions in a half step, by the step mode of W: full, half, quarter, eighth, automatic (which counts eighth steps).
 FINENESS = {"F": 0.5, "H": 1.0, "Q": 2.0, "E": 4.0, "A": 4.0}
-# A command that takes time yields what it prints meanwhile, "" for nothing yet, and returns its answer.
+# A command that takes time: yields text to print meanwhile, "" for nothing yet, and returns its answer.
 Task = Generator[str, None, str]
 
 
 def plain_acceleration(distance: float, speed: float, base: float, acceleration: float) -> float:
-    """Acceleration of the plain trapezoid that takes as long, from rest, as one that starts and ends at a base speed.
+    """Compute the acceleration of a trapezoid from rest that takes as long as one that begins and ends at a base speed.
 
-    The plant knows no base speed; this keeps the duration of its moves.
+    The plant has no base speed; this keeps the duration of its moves.
 
     Args:
         distance: of the move [steps].
-        speed: highest on the way [steps/s].
-        base: reached at once [steps/s].
-        acceleration: above it [steps/s^2].
+        speed: highest speed of the move [steps/s].
+        base: speed reached without a ramp [steps/s].
+        acceleration: above the base speed [steps/s^2].
     """
     if base <= 0:
         return acceleration
@@ -270,14 +268,14 @@ def plain_acceleration(distance: float, speed: float, base: float, acceleration:
     else:
         duration = 2 * (math.sqrt(base**2 + acceleration * distance) - base) / acceleration
     plain = 4 * distance / duration**2
-    if plain * distance > speed**2:  # it would be faster than allowed halfway
+    if plain * distance > speed**2:  # its peak would exceed the highest speed
         plain = speed / (duration - distance / speed)
     return min(plain, INSTANT)
 
 
 @dataclass
 class AxisSettings:
-    """What can be set of an axis, and saved by DS; in positions of its step mode, and seconds."""
+    """Settings of an axis, which DS saves; in positions of its step mode, and seconds."""
 
     speed: int
     acceleration: int
@@ -292,12 +290,12 @@ class AxisSettings:
 
 
 class UnitAxis:
-    """An axis of the unit.
+    """One axis of the unit, as its firmware counts it.
 
     Args:
         name: "Pan" or "Tilt".
-        plant: its mechanics, in half steps.
-        unit: the model of the unit.
+        plant: mechanics of the axis, in half steps.
+        unit: profile of the unit.
         limits: lowest and highest position that a reset finds [half steps].
     """
 
@@ -310,22 +308,22 @@ class UnitAxis:
         )
         self.calibrated = True
         self.pending: int | None = None  # goal that waits for A or I
-        self.velocity = 0  # desired, in pure velocity mode
+        self.velocity = 0  # commanded, in pure velocity mode
         self.endless = False  # continuous pan of a slip ring
         self._unit = unit
         self._limits = limits
-        self._goal: int | None = None  # None where it was halted
-        self._shift = 0  # what the count is above the truth, after steps were lost or the power was gone
+        self._goal: int | None = None  # None after a halt
+        self._shift = 0  # count less true position, after steps were lost or power failed
         self._into_stop = 0  # direction in which the present move meets a stop
 
     @property
     def fineness(self) -> float:
-        """Positions a half step."""
+        """Number of positions in a half step."""
         return FINENESS[self.settings.step_mode]
 
     @property
     def resolution(self) -> float:
-        """Of a position [arc seconds]."""
+        """Size of a position [arc seconds]."""
         return self._unit.step / self.fineness
 
     @property
@@ -340,37 +338,37 @@ class UnitAxis:
 
     @property
     def position(self) -> int:
-        """Where the unit believes to be."""
+        """Position by the unit's own count."""
         return round(self.plant.position() * self.fineness) + self._shift
 
     @property
     def speed(self) -> float:
-        """How fast it turns, signed [positions/s]."""
+        """Present speed, signed [positions/s]."""
         return self.plant.speed() * self.fineness
 
     @property
     def desired(self) -> int:
-        """Where it is to go, now or on A or I."""
+        """Commanded position, of now or of the next A or I."""
         if self.pending is not None:
             return self.pending
         return self.position if self._goal is None else self._goal
 
     def moving(self) -> bool:
-        """Whether it turns, or is about to."""
+        """Return whether the axis moves, or is about to."""
         return self.plant.moving()
 
     def go(self, goal: int, speed: int | None = None) -> None:
-        """Move to a position, on the fly; a stop on the way is run into."""
+        """Move to a position, even during a move; a stop on the way is hit."""
         self._goal, self.pending = goal, None
         self._set_out(goal, self.settings.speed if speed is None else speed)
 
     def change_speed(self) -> None:
-        """Let the present move go on at the speed that is set now."""
+        """Continue the present move at the speed that is set now."""
         if self._goal is not None and self.moving():
             self._set_out(self._goal, self.settings.speed)
 
     def drive(self, velocity: int, limits: Range | None) -> None:
-        """Turn at a signed speed, until the limit or, without one, the stop; 0 halts."""
+        """Turn at a signed speed, up to the limit or, without one, to the stop; 0 halts."""
         self.velocity = velocity
         if velocity == 0:
             self.halt()
@@ -378,14 +376,14 @@ class UnitAxis:
         side = velocity > 0
         if limits is not None:
             self.go(limits[side], abs(velocity))
-        else:  # a step past the stop, so that it is met
+        else:  # a step beyond the stop, so that it is hit
             past = self._stops()[side] + (1 if side else -1)
             self.go(round(past * self.fineness) + self._shift, abs(velocity))
 
     def halt(self) -> None:
-        """Brake, and forget the goal."""
+        """Brake, and drop the goal."""
         speed, base, acceleration = abs(self.speed), self.settings.base, float(self.settings.acceleration)
-        if 0 < base < speed:  # the braking distance of a motor that stands as soon as it is down to its base speed
+        if 0 < base < speed:  # gives the braking distance of a motor that stops at its base speed
             acceleration *= speed**2 / (speed**2 - base**2)
         elif base >= speed:
             acceleration = INSTANT if base else acceleration
@@ -394,21 +392,21 @@ class UnitAxis:
         self.plant.halt(min(acceleration / self.fineness, INSTANT))
 
     def stopped_at_stop(self) -> bool:
-        """Whether the present move has just met its stop; steps were lost then."""
+        """Return whether the present move has just hit its stop, and lose steps there."""
         if not self._into_stop or self.moving():
             return False
         self.lose_steps(self._into_stop)
         return True
 
     def lose_steps(self, direction: int) -> None:
-        """Stand against something: the motor was driven on in ``direction``, the axis did not follow."""
+        """Stop at an obstacle: the count goes on in ``direction``, the axis does not."""
         self.plant.halt(INSTANT)
         self._goal = self.pending = None
         self._into_stop = self.velocity = 0
         self._shift += direction * self._unit.slip
 
     def lose_power(self) -> None:
-        """Stand, and take for 0 where that is."""
+        """Stop, and count the present position as 0."""
         self.plant.halt(INSTANT)
         self._goal = self.pending = None
         self._into_stop = self.velocity = 0
@@ -417,7 +415,7 @@ class UnitAxis:
         self._shift = -self.position
 
     def reset(self) -> Task:
-        """Run into both stops, find the limits from them, and go to 0."""
+        """Run into both stops, set the limits from them, and go to 0."""
         self.velocity = 0
         for stop in self._stops():
             self._send(stop, self._unit.reset_speed)
@@ -432,45 +430,47 @@ class UnitAxis:
         return ""
 
     def _stops(self) -> Range:
-        """Where the mechanics end [half steps]."""
+        """Return the positions of the mechanical stops [half steps]."""
         margin = self._unit.stop_margin
         return self._limits[0] - margin, self._limits[1] + margin
 
     def _set_out(self, goal: int, speed: int) -> None:
-        """Move at a speed [positions/s] to where the unit believes a position to be, or to the stop before it."""
+        """Move at a speed [positions/s] to a position by the unit's count, or to the stop before it."""
         aim = (goal - self._shift) / self.fineness
         lowest, highest = (-math.inf, math.inf) if self.endless else self._stops()
         self._into_stop = (aim > highest) - (aim < lowest)
         self._send(min(max(aim, lowest), highest), speed / self.fineness)
 
     def _send(self, aim: float, speed: float) -> None:
-        """Command the plant: half steps and half steps a second."""
+        """Command the plant, in half steps and half steps/s."""
         acceleration, base = self.settings.acceleration / self.fineness, self.settings.base / self.fineness
         distance = abs(aim - self.plant.position())
         self.plant.command(round(aim), speed, plain_acceleration(distance, speed, base, acceleration))
 
 
-BAUD = 9600  # of the serial line, as it leaves the factory [S1]
+# The unit
+
+BAUD = 9600  # factory setting of the serial line [S1]
 
 
 class RefusalError(Exception):
-    """A command that the unit answers with an exclamation mark and this message."""
+    """The unit refuses a command: it answers an exclamation mark and this message."""
 
 
 @dataclass
 class Settings:
-    """What DS saves, and DR and power-up restore.
+    """Settings that DS saves, and DR and power-up restore.
 
     Attributes:
         pan: of the pan axis.
         tilt: of the tilt axis.
-        echo: whether it returns every character.
+        echo: whether the unit echoes every character.
         verbose: whether replies to queries are sentences.
-        limits: E factory's, D none, U the user's.
+        limits: "E" for the factory's, "D" for none, "U" for the user's.
         reset: axes that R and power-up reset, of "PT".
-        immediate: whether positions are gone to at once, rather than on A or I.
-        scan_at_power_up: whether it scans by itself when it gets power.
-        network_id: 0 for a unit that has the line for itself.
+        immediate: whether positions are executed at once, rather than on A or I.
+        scan_at_power_up: whether the unit begins to scan at power-up.
+        network_id: number on a shared line; 0 for a unit that is alone on its line.
     """
 
     pan: AxisSettings
@@ -485,13 +485,13 @@ class Settings:
 
 
 class Unit:
-    """The state of a unit, and what more than one command does with it.
+    """State of a unit, with the operations that several commands use.
 
     Args:
         pan: mechanics of pan, in half steps.
-        tilt: mechanics of tilt.
-        profile: the model.
-        now: clock of the unit [s].
+        tilt: mechanics of tilt, in half steps.
+        profile: of the unit.
+        now: returns the unit's time [s].
     """
 
     def __init__(self, pan: AxisPlant, tilt: AxisPlant, profile: UnitProfile, now: Callable[[], float]) -> None:
@@ -503,28 +503,28 @@ class Unit:
         self._factory = copy.deepcopy(self.settings)
         self._saved = copy.deepcopy(self.settings)
         self.velocity_mode = False
-        self.selected = True  # whether commands on the network are for this unit
-        self.routed = False  # whether the line goes on to an expansion port
+        self.selected = True  # whether commands on a shared line are for this unit
+        self.routed = False  # whether the line is connected to an expansion port
         self.presets: dict[int, tuple[int, int]] = {}
-        self.scan: list[Task] = []  # what the autoscan does, an axis each
+        self.scan: list[Task] = []  # tasks of the autoscan, one for each axis
         self.baud = self.baud_at_power_up = BAUD
         self.byte_delay_s = 0.0
 
     @property
     def axes(self) -> tuple[UnitAxis, UnitAxis]:
-        """Pan and tilt."""
+        """Pan and tilt axis."""
         return self.pan, self.tilt
 
     def axis(self, letter: str) -> UnitAxis:
-        """The axis that P or T stands for."""
+        """Return the axis of the letter P or T."""
         return self.pan if letter == "P" else self.tilt
 
     def say(self, sentence: str, axis: UnitAxis, n: int) -> str:
-        """The answer to a query of a number."""
+        """Make the answer to a query of a number."""
         return sentence.format(axis=axis.name, n=n) if self.settings.verbose else str(n)
 
     def limits(self, axis: UnitAxis) -> Range | None:
-        """The positions allowed now; None if all are."""
+        """Return the positions allowed now; None if all are."""
         match self.settings.limits, axis.calibrated:
             case "D", _:
                 return None
@@ -538,7 +538,7 @@ class Unit:
         """Go to a position, now or on A or I.
 
         Raises:
-            RefusalError: it is beyond a limit, or the unit is in pure velocity mode.
+            RefusalError: the position is beyond a limit, or the unit is in pure velocity mode.
         """
         wording, limits = self.profile.wording, self.limits(axis)
         if self.velocity_mode:
@@ -557,10 +557,10 @@ class Unit:
         return ""
 
     def set_speed(self, axis: UnitAxis, speed: int) -> str:
-        """Take a speed, on the fly; in pure velocity mode it has a sign, and drives.
+        """Set a speed, even during a move; in pure velocity mode it is signed and starts the motion.
 
         Raises:
-            RefusalError: it is out of bounds.
+            RefusalError: the speed is out of bounds.
         """
         upper, lower = axis.settings.upper, max(axis.settings.lower, 1)
         size = abs(speed) if self.velocity_mode else speed
@@ -576,27 +576,27 @@ class Unit:
         return ""
 
     def set_velocity_mode(self, on: bool) -> None:
-        """Change the control mode; the axes halt."""
+        """Change the control mode; a change halts the axes."""
         if on != self.velocity_mode:
             self.velocity_mode = on
             for axis in self.axes:
                 axis.drive(0, None)
 
     def release_pending(self) -> None:
-        """Set out to the positions that waited."""
+        """Start the moves that wait for A or I."""
         for axis in self.axes:
             if axis.pending is not None:
                 axis.go(axis.pending)
 
     def standing(self, axes: Iterable[UnitAxis]) -> Task:
-        """Wait until axes stand."""
+        """Wait until the axes stand."""
         waited = tuple(axes)
         while any(axis.moving() for axis in waited):
             yield ""
         return ""
 
     def compute_tables(self, axis: UnitAxis, change: Callable[[], None]) -> Task:
-        """Change what is not changed on the fly: once the axis stands, and it takes its time."""
+        """Apply a change that is not possible during a move: wait until the axis stands, then for the tables."""
         yield from self.standing([axis])
         ready = self.now() + self.profile.tables_s
         while self.now() < ready:
@@ -605,14 +605,14 @@ class Unit:
         return ""
 
     def reset(self, letters: str) -> Task:
-        """Find the limits of the axes named, tilt first, as the replies of real units show."""
+        """Find the limits of the named axes, tilt first, as the replies of real units show."""
         for axis in (self.tilt, self.pan):
             if axis.letter in letters:
                 yield from axis.reset()
         return ""
 
     def start_scan(self, ranges: dict[str, Range]) -> None:
-        """Go to and fro between two positions of each axis named, until `end_scan`."""
+        """Move each named axis back and forth between two positions, until `end_scan`."""
 
         def sweep(axis: UnitAxis, ends: Range) -> Task:
             while True:
@@ -624,23 +624,23 @@ class Unit:
         self.scan = [sweep(self.axis(letter), ends) for letter, ends in ranges.items()]
 
     def end_scan(self) -> None:
-        """Stop the scan and go home."""
+        """Stop the scan and go to 0."""
         self.scan = []
         for axis in self.axes:
             axis.go(0)
 
     def save(self) -> None:
-        """Keep the settings for the next power-up."""
+        """Save the settings for the next power-up."""
         self._saved = copy.deepcopy(self.settings)
 
     def restore(self, factory: bool = False) -> None:
-        """Take the saved settings again, or the factory's; the control mode is independent then."""
+        """Restore the saved or the factory's settings; the control mode becomes independent."""
         self.settings = copy.deepcopy(self._factory if factory else self._saved)
         self.pan.settings, self.tilt.settings = self.settings.pan, self.settings.tilt
         self.set_velocity_mode(False)
 
     def lose_power(self) -> None:
-        """What a gap in the power does: all but the saved settings is forgotten, above all where the axes are."""
+        """Simulate a power failure: all state but the saved settings is lost, including the position."""
         self.velocity_mode = False
         self.restore()
         self.selected, self.routed = self.settings.network_id == 0, False
