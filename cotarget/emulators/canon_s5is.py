@@ -1,25 +1,19 @@
-"""A Canon PowerShot S5 IS behind PTP/IP, with ready pictures and a lens behind it.
+"""Emulated Canon PowerShot S5 IS on PTP/IP, in front of image feeds and a lens.
 
-It announces all that a real one announces, and does what remote shooting needs; the rest is answered with "operation
-not supported". There is no card in it: a still lies in its memory until the next one, or until it is switched off.
-Stills have their full size whatever the image size is set to; settings of exposure are kept and have no effect.
+It announces the operations, events and properties of a real camera, as one reported them to gphoto2 in July 2008
+(libgphoto2, camlibs/ptp2/cameras/canon-s5.txt), except for the serial number, and for image size and quality, which are
+at their best. It carries out what remote shooting needs and refuses the rest as not supported. It has no card: a still
+stays in memory until the next one, or until the camera is switched off. Stills always have their full size; exposure
+settings are stored and have no effect.
 
-Positions of the zoom beyond the lens's last are digital: they are accepted, the lens stays at its last, and nothing is
-cropped. The zoom reads back as it was set, whether the lens is there yet or not, and may be set while it moves. The
-viewfinder gives each of its pictures once and waits for the next one; it answers "busy" during a still and where no
-picture comes for a second. Nobody measured any of this on a real camera, nor whether leaving the shooting mode draws
-the lens in (here it does not). Faults of USB are not covered: PTP/IP is another transport.
+Behaviour that was not measured on a real camera is chosen so that a driver for this emulator expects little:
 
-What a Canon PowerShot S5 IS answers to each operation of PTP, whatever brings the operations to it.
+- Zoom positions beyond the lens's last are digital: they are accepted, the lens stays at its last, nothing is cropped.
+- The zoom reads back as commanded, even while the lens moves, and may be set during a motion. - The viewfinder gives
+each image once and waits for the next. It answers "busy" during a still, and after a second without an image. - The
+lens stays out when the camera leaves shooting mode.
 
-What is not known of the real camera is chosen so that a driver that works with this one expects little; `s5is` tells.
-
-The S5 IS's eyes: a viewfinder that gives each picture once, and a shutter that goes some time after its request.
-
-What a Canon PowerShot S5 IS announces: operations, events, properties.
-
-As one of them told gphoto2 in July 2008 (libgphoto2, camlibs/ptp2/cameras/canon-s5.txt), but for image size and
-quality, which stand at their best here, and the serial number. The properties of `shooting` exist only while it shoots.
+Faults of USB are not emulated: PTP/IP is another transport.
 """
 
 import logging
@@ -59,15 +53,17 @@ from cotarget.emulators.ptpip import (
 from cotarget.errors import CotargetError
 from cotarget.rig import Image
 
+# Viewfinder and stills
+
 THUMB_SIZE = (160, 120)  # px
-PICTURE_WAIT_S = 1.0  # at most, for the viewfinder's next picture
-SLICE_S = 0.1  # between looks at whether waiting is still wanted
+PICTURE_WAIT_S = 1.0  # time limit for the viewfinder's next image [s]
+SLICE_S = 0.1  # period of checking whether to go on waiting [s]
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """A still as JPEG, its size [px], and a small one."""
+    """A still as JPEG, its size [px], and its thumbnail as JPEG."""
 
     jpeg: bytes
     size: tuple[int, int]
@@ -75,31 +71,31 @@ class Exposure:
 
 
 class Viewfinder:
-    """Scaled pictures of a feed, as JPEG, each once.
+    """Scaled images of a feed as JPEG, each given once.
 
     Args:
-        feed: the pictures.
-        size: to scale them to [px].
+        feed: of images.
+        size: (width, height) of the viewfinder [px].
         quality: of JPEG, 1 to 100.
-        closing: set where nobody needs to wait any more.
+        closing: set when waits must end.
     """
 
     def __init__(self, feed: Feed, size: tuple[int, int], quality: int, closing: threading.Event) -> None:
         self._feed, self._size, self._quality, self._closing = feed, size, quality, closing
-        self._seen = -1  # index of the last picture given
+        self._seen = -1  # index of the last image given
         self._since: float | None = None
 
     @property
     def on(self) -> bool:
-        """Whether it is on."""
+        """Whether the viewfinder is on."""
         return self._since is not None
 
     def switch(self, on: bool) -> None:
-        """Turn it on, if it is not, or off."""
+        """Switch the viewfinder on or off; on again has no effect."""
         self._since = (time.monotonic() if self._since is None else self._since) if on else None
 
     def image(self) -> bytes | None:
-        """Wait for a picture that was exposed since it is on and was not given yet; None if there is none."""
+        """Wait for an image exposed since the viewfinder is on and not given yet; None if none comes."""
         deadline = time.monotonic() + PICTURE_WAIT_S
         while (since := self._since) is not None and time.monotonic() < deadline and not self._closing.is_set():
             picture = self._feed.newest(self._seen, SLICE_S)
@@ -112,13 +108,13 @@ class Viewfinder:
 
 
 class Shutter:
-    """Takes stills, each on a thread of its own.
+    """Take stills, each on a thread of its own.
 
     Args:
-        source: takes a picture at full size now, or a feed of such pictures.
+        source: takes a full-size image now, or a feed of such images.
         quality: of JPEG, 1 to 100.
         delay_s: from the request to the exposure [s].
-        closing: set where nobody needs the stills any more.
+        closing: set when stills are not needed any more.
     """
 
     def __init__(
@@ -128,13 +124,13 @@ class Shutter:
         self._threads: list[threading.Thread] = []
 
     def release(self, done: Callable[[Exposure | None], None]) -> None:
-        """Take a still, and hand it over when it is there; None where none could be taken."""
+        """Take a still, and call ``done`` with it, or with None if none could be taken."""
         self._threads = [thread for thread in self._threads if thread.is_alive()]
         self._threads.append(threading.Thread(target=self._run, args=(done,), daemon=True))
         self._threads[-1].start()
 
     def join(self) -> None:
-        """Wait for the threads, after ``closing`` was set."""
+        """Wait for the threads, after ``closing`` is set."""
         for thread in self._threads:
             thread.join()
 
@@ -165,35 +161,35 @@ class Shutter:
 
 
 def jpeg(image: Image, quality: int) -> bytes:
-    """An image as JPEG."""
+    """Encode an image as JPEG."""
     return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
-# --- s5is_camera ---
+# Operations
 
-MEMORY = 0x80000001  # the storage that is no card
+MEMORY = 0x80000001  # number of the internal memory as a storage
 FIRST_HANDLE = 0x81000000
-ALREADY_SO, REFUSED = 0xA009, 0xA005  # Canon's response codes: in that mode already; operation refused
+ALREADY_SO, REFUSED = 0xA009, 0xA005  # Canon's response codes: already in that mode; operation refused
 OBJECT_TRANSFER, MODE_CHANGED, CAPTURE_COMPLETE = 0xC009, 0xC00C, 0x400D  # events
-INTERRUPTING, CHECKED = (1, 2, 3, 4, 5), (3, 4, 5, 7)  # modes of event emulation, by how the events come
-EVENT_CONTAINER = 4  # its type in PTP over USB, whose layout CheckEvent uses
+INTERRUPTING, CHECKED = (1, 2, 3, 4, 5), (3, 4, 5, 7)  # event modes: sent at once, fetched by CheckEvent
+EVENT_CONTAINER = 4  # type of an event container in PTP over USB, whose layout CheckEvent uses
 INFO, OPEN, CLOSE, SET_VALUE, RESET_VALUE = 0x1001, 0x1002, 0x1003, 0x1016, 0x1017
 START_SHOOTING, END_SHOOTING, VIEWFINDER_ON, VIEWFINDER_OFF = 0x9008, 0x9009, 0x900B, 0x900C
 CAPTURE, VIEWFINDER_IMAGE, FOCUS_LOCK, FOCUS_UNLOCK = 0x901A, 0x901D, 0x9014, 0x9015
 SHOOTING_ONLY = frozenset((VIEWFINDER_ON, VIEWFINDER_OFF, CAPTURE, VIEWFINDER_IMAGE, FOCUS_LOCK, FOCUS_UNLOCK))
-# What a busy camera refuses; it still tells what it is and what happened.
+# Operations that a busy camera refuses; queries and events still work.
 NOT_WHEN_BUSY = SHOOTING_ONLY | {SET_VALUE, RESET_VALUE, START_SHOOTING, END_SHOOTING}
 OK = Answer()
 
 
 class S5isCamera:
-    """The camera; safe from any thread.
+    """The camera's operations; safe from any thread.
 
     Args:
-        viewfinder: its live pictures.
-        shutter: its stills.
-        lens: its zoom.
-        faults: which are on; of them "busy" is its own affair.
+        viewfinder: live images.
+        shutter: stills.
+        lens: zoom.
+        faults: active faults, of which this class uses "busy".
     """
 
     def __init__(self, viewfinder: Viewfinder, shutter: Shutter, lens: LensPlant, faults: Faults) -> None:
@@ -208,7 +204,7 @@ class S5isCamera:
         self._operations: dict[int, Callable[[tuple[int, ...], bytes], Answer]] = {
             0x1004: lambda words, data: Answer(data=array([MEMORY], UINT32)),  # storages
             0x1005: self._storage,
-            0x1006: lambda words, data: Answer(parameters=(0,)),  # objects; what lies in memory is not listed
+            0x1006: lambda words, data: Answer(parameters=(0,)),  # objects; stills in memory are not listed
             0x1007: lambda words, data: Answer(data=array([], UINT32)),
             0x1008: lambda words, data: self._of_still(words[0], self._still_info),
             0x1009: lambda words, data: self._of_still(words[0], lambda still: still.jpeg),
@@ -230,11 +226,11 @@ class S5isCamera:
         }
 
     def interrupt_by(self, send_event: Callable[[int, Iterable[int]], None]) -> None:
-        """Have events brought to the initiator at once, as code and parameters, where its mode is such."""
+        """Set the function that sends an event's code and parameters to the initiator at once."""
         self._interrupt = send_event
 
     def operate(self, code: int, parameters: tuple[int, ...], data: bytes) -> Answer:
-        """Do an operation."""
+        """Carry out an operation, with five parameters and its data."""
         with self._lock:
             if code == INFO:
                 return Answer(data=self._info())
@@ -251,25 +247,25 @@ class S5isCamera:
                 return Answer(REFUSED)
             if code in self._operations:
                 return self._operations[code](parameters, data)
-        if code == VIEWFINDER_IMAGE:  # waits, and must not hold up a power-off meanwhile
+        if code == VIEWFINDER_IMAGE:  # waits outside of the lock, so that a power-off is not delayed
             image = self._viewfinder.image()
             return Answer(Code.DEVICE_BUSY) if image is None else Answer(parameters=(len(image),), data=image)
         return Answer(Code.OPERATION_NOT_SUPPORTED)
 
     def disconnected(self) -> None:
-        """Close the session; the camera goes on shooting, with its viewfinder off."""
+        """Close the session; the camera stays in shooting mode, with its viewfinder off."""
         with self._lock:
             self._session = 0
             self._look(False)
 
     def unplugged(self) -> None:
-        """Go back to play mode, as it does without a computer."""
+        """Go back to play mode, as a camera does without a computer."""
         with self._lock:
             self.disconnected()
             self._shooting = False
 
     def switch_off(self) -> None:
-        """Forget settings and stills, and draw the lens in."""
+        """Drop settings and stills, and retract the lens."""
         with self._lock:
             self._reset()
         self._lens.command(0)
@@ -278,10 +274,10 @@ class S5isCamera:
         self._session = 0
         self._shooting = False
         self._look(False)
-        self._exposure: object | None = None  # the still under way
+        self._exposure: object | None = None  # marks the still under way
         self._taken: tuple[int, Exposure, str] | None = None  # handle, still, date
         self._events: deque[bytes] = deque()
-        self._clock_offset = 0  # seconds by which its clock was set
+        self._clock_offset = 0  # seconds by which the initiator set the clock
         self._values: dict[int, Value] = {code: prop.default for code, prop in self._all.items()}
 
     def _properties(self) -> dict[int, Property]:
@@ -353,7 +349,7 @@ class S5isCamera:
         return OK
 
     def _capture(self, _: tuple[int, ...], __: bytes) -> Answer:
-        # The viewfinder is blind until the still is taken: whatever it shows next was exposed after it.
+        # The viewfinder is off until the still is taken: its next image is exposed after it.
         live = self._viewfinder.on
         self._look(False)
         exposure = self._exposure = object()
@@ -362,7 +358,7 @@ class S5isCamera:
 
     def _keep(self, exposure: object, taken: Exposure | None, live: bool) -> None:
         with self._lock:
-            if exposure is not self._exposure:  # it was switched off meanwhile
+            if exposure is not self._exposure:  # the camera was switched off meanwhile
                 return
             self._exposure = None
             self._look(live and bool(self._session))
@@ -402,12 +398,12 @@ class S5isCamera:
         return Answer(answer.code)
 
 
-# --- s5is_tables ---
+# Tables of operations, events and properties
 
 MAKER, MODEL, VERSION, SERIAL = "Canon Inc.", "Canon PowerShot S5 IS", "1-3.2.1.0", "0" * 32
 EXTENSION = 0xB  # Canon's
 FORMATS = (0x3001, 0x3002, 0x3006, 0x300A, 0x3008, 0x3801, 0x3800, 0xB101, 0xBF01)
-DIGITAL = 6  # positions of the zoom beyond the last of the lens, which is 128
+DIGITAL = 6  # digital zoom positions beyond the lens's last, which is 128
 EVENT_EMULATE_MODE, TRANSFER_MODE, ZOOM, UNIX_TIME = 0xD045, 0xD029, 0xD02A, 0xD034
 # fmt: off
 OPERATIONS = (
@@ -423,7 +419,7 @@ EVENTS = (
 )
 # fmt: on
 def size_qualities() -> Iterator[tuple[int, ...]]:
-    """Height, width and number of each size in each of three qualities, as the camera lists them."""
+    """Yield height, width and number of each size in each of three qualities, as the camera lists them."""
     sizes = ((2448, 3264, 1, 5), (1944, 2592, 2, 5), (1536, 2048, 3, 5), (1200, 1600, 17, 1), (480, 640, 5, 5))
     for height, width, number, step in sizes:
         for quality in range(3):
@@ -460,7 +456,7 @@ ALWAYS = (
 
 
 def shooting(last: int) -> tuple[Property, ...]:
-    """The properties of a shooting camera whose lens has optical positions from 0 to ``last``."""
+    """Make the properties in shooting mode of a camera whose lens has positions 0 to ``last``."""
     return (
         Property(TRANSFER_MODE, UINT16, 15, True, (1, 2, 3)),
         Property(0xD006, UINT8, 5, True, (5, 3, 2)),  # image quality: superfine, fine, economy
@@ -493,28 +489,30 @@ def shooting(last: int) -> tuple[Property, ...]:
     )
 
 
-# "busy" refuses what shoots or sets; "gone" is unplugged, "power-off" what the camera's timer does: both for as long as
-# they are on. The others are the line's.
+# The server
+
+# "busy" refuses operations that shoot or set. The camera is unplugged while "gone" is on, and switched off, as by its
+# timer, while "power-off" is on. The others are faults of the line.
 S5IS_FAULTS = (*LINE_FAULTS, "busy", "gone", "power-off")
 GUID = bytes.fromhex("00000000000010008000000085c50148")
 
 
 class S5isServer:
-    """The camera on a TCP port that serves command and event connections of one initiator at a time.
+    """The emulated camera on a TCP port, for one initiator at a time; a context manager.
 
     Args:
-        preview: pictures of the viewfinder.
-        still: takes a picture at full size now, or a feed of such pictures.
+        preview: images of the viewfinder.
+        still: takes a full-size image now, or a feed of such images.
         lens: the zoom.
-        host: where to listen.
-        port: where to listen; 0 for any.
-        preview_size: of the viewfinder's pictures [px]; they are scaled by averaging areas.
+        host: address to listen at.
+        port: to listen at; 0 for any free port.
+        preview_size: (width, height) of the viewfinder's images, which are scaled by averaging areas [px].
         quality: of JPEG, 1 to 100.
-        faults: knows those of `S5IS_FAULTS`; None for a camera that has none.
+        faults: must know `S5IS_FAULTS`; None for a camera without faults.
         shutter_s: from the request of a still to its exposure, mostly focusing [s].
 
     Raises:
-        DeviceError: nobody can listen there.
+        DeviceError: the address is invalid or in use.
     """
 
     def __init__(
@@ -540,11 +538,11 @@ class S5isServer:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """TCP port of the server."""
         return self._server.port
 
     def close(self) -> None:
-        """Break the connections and end every thread."""
+        """Close the connections and end every thread."""
         self._closing.set()
         self._server.close()
         self._shutter.join()

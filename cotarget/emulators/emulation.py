@@ -1,4 +1,4 @@
-"""A whole rig behind its devices' protocols: one world, and servers for head, cameras, board, faults and truth."""
+"""Emulate a whole rig behind its devices' protocols: one world, and servers for head, cameras, board and control."""
 
 import contextlib
 import dataclasses
@@ -20,25 +20,25 @@ from cotarget.emulators.world import LiveWorld
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform, pose
 
-PREVIEW_SHARE = 2  # the viewfinder's pictures are smaller than stills by this
+PREVIEW_SHARE = 2  # the viewfinder's images are smaller than stills by this factor
 QUALITY = 90  # of JPEG, as the simulated cameras have by default
-PAN_SIGN = -1  # the D46's manual has positive pan turn left
+PAN_SIGN = -1  # positive pan turns left, as in the D46's manual
 LOCAL = "127.0.0.1"
 FAULTS: Mapping[str, tuple[str, ...]] = {"head": D46_FAULTS, "fixed": AXIS_FAULTS, "zoom": S5IS_FAULTS}
-COPIED = ("board", "safety", "targets")  # tables of the simulated rig's file that hold for the emulated one too
+COPIED = ("board", "safety", "targets")  # tables of the simulated rig's file that also hold for the emulated one
 
 
 @dataclasses.dataclass(frozen=True)
 class Ports:
-    """Where to listen; 0 for any port that is free.
+    """Address and ports to listen at; 0 for any free port.
 
     Attributes:
-        host: address of all of them.
+        host: address of all servers.
         head: TCP port of the head, beside its pseudo-terminal.
         fixed: HTTP port of the video server.
         zoom: PTP/IP port of the zoom camera.
-        board: port of who holds the board.
-        control: port of who switches faults and tells the truth.
+        board: port of the board's holder.
+        control: port for faults and ground truth.
     """
 
     host: str = LOCAL
@@ -50,17 +50,17 @@ class Ports:
 
 
 class Emulation:
-    """The emulated rig, from its construction until it is closed. A context manager.
+    """The emulated rig, from its construction until it is closed; a context manager.
 
     Args:
-        config: of the rig, as it runs in real time; see `cotarget.emulators.world.paced`.
+        config: of the simulated rig, in real time; see `cotarget.emulators.world.paced`.
         ports: where to listen.
-        user: who may look through the fixed camera; empty where everybody may.
+        user: user name of the video server; empty if everyone may connect.
         password: of that user.
 
     Raises:
-        ConfigError: the simulated rig is none that these devices could be.
-        DeviceError: a port cannot be had, or the machine cannot render.
+        ConfigError: these devices cannot have the simulated rig's sizes or steps.
+        DeviceError: a port cannot be opened, or the machine cannot render.
     """
 
     def __init__(self, config: RigConfig, ports: Ports = Ports(), *, user: str = "", password: str = "") -> None:
@@ -111,10 +111,10 @@ class Emulation:
             self._opened = opened.pop_all()
 
     def rig_toml(self, *, tcp: bool = False, beside: Mapping[str, Any] | None = None) -> str:
-        """The rig.toml that connects to it.
+        """Write the rig.toml that connects to this emulation.
 
         Args:
-            tcp: whether the head is reached by TCP in place of its pseudo-terminal.
+            tcp: whether the head is reached by TCP instead of its pseudo-terminal.
             beside: further tables, such as `copied_tables` of the simulated rig's own file.
         """
         sim = self.config.sim
@@ -157,7 +157,7 @@ class Emulation:
         return tomli_w.dumps({**tables, "targets": self._targets(tables.get("targets", {}))})
 
     def _targets(self, copied: Mapping[str, Any]) -> dict[str, Any]:
-        """Targets as they are wanted in the viewfinder's smaller pictures."""
+        """Scale the wanted sizes of targets to the viewfinder's smaller images."""
         return {
             name: {**copied.get(name, {}), "wanted_px": target.wanted_px / PREVIEW_SHARE}
             for name, target in self.config.targets.items()
@@ -165,19 +165,19 @@ class Emulation:
         }
 
     def close(self) -> None:
-        """End all servers, then the world; more than once does no harm."""
+        """End all servers, then the world; may be called again."""
         self._opened.close()
 
     def __enter__(self) -> "Emulation":
-        """Give the emulation itself."""
+        """Return the emulation itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
+        """Close the emulation."""
         self.close()
 
     def _hold(self, said: Any) -> Any:
-        """Answer who asks for the board."""
+        """Answer a request for the board."""
         (what, wish), *more = said.items()
         if more or what not in ("present", "swing"):
             raise ConfigError(f"unknown wish '{what}'; valid here: present, swing")
@@ -191,7 +191,7 @@ class Emulation:
         return {"ok": True}
 
     def _control(self, said: Any) -> Any:
-        """Switch a fault on or off, or tell the truth."""
+        """Switch a fault on or off, or answer with ground truth."""
         if "truth" in said:
             pan, tilt = self.world.head_truth()
             now = self.world.clock.now()
@@ -209,20 +209,20 @@ class Emulation:
         return {"ok": True}
 
     def switch(self, fault: str, on: bool = True) -> None:
-        """Switch a fault, named as device.fault.
+        """Switch a fault on or off by its full name, device.fault.
 
         Raises:
-            ConfigError: no such device or fault.
+            ConfigError: there is no such device or fault.
         """
         device, name = parse_fault(fault)
         self.faults[device].set(name, on)
 
 
 def parse_fault(fault: str) -> tuple[str, str]:
-    """Device and name of a fault, named as device.fault.
+    """Split a fault's full name, device.fault, into device and name.
 
     Raises:
-        ConfigError: no such device or fault.
+        ConfigError: there is no such device or fault.
     """
     device, _, name = fault.partition(".")
     if device not in FAULTS:
@@ -233,11 +233,11 @@ def parse_fault(fault: str) -> tuple[str, str]:
 
 
 def copied_tables(table: Mapping[str, Any], directory: Path) -> dict[str, Any]:
-    """The tables of a rig.toml that hold for any backend, with paths that hold in any folder.
+    """Copy the tables of a rig.toml that hold for any backend, with absolute paths.
 
     Args:
         table: the file as TOML has it.
-        directory: where it lies.
+        directory: folder of the file.
     """
     copied = {name: table[name] for name in COPIED if name in table}
     if "targets" in copied:

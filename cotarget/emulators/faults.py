@@ -1,4 +1,4 @@
-"""Faults that can be switched on in an emulated device while it runs."""
+"""Faults of an emulated device that can be switched on while it runs."""
 
 import threading
 from collections.abc import Iterable
@@ -7,20 +7,20 @@ from cotarget.errors import ConfigError, choices
 
 
 class Faults:
-    """Which of a device's faults are on; safe to use from any thread.
+    """The active faults of a device; safe to use from any thread.
 
     Args:
-        known: the names of all faults that the device has.
+        known: names of all faults that the device has.
     """
 
     def __init__(self, known: Iterable[str]) -> None:
         self._known = frozenset(known)
-        self._active = set[str]()  # no annotation: a method is named as the type
+        self._active = set[str]()  # no annotation: the method set hides the type
         self._changed = threading.Condition()
 
     @property
     def known(self) -> frozenset[str]:
-        """The names of all faults that the device has."""
+        """Names of all faults that the device has."""
         return self._known
 
     def set(self, name: str, on: bool = True) -> None:
@@ -36,13 +36,13 @@ class Faults:
             self._changed.notify_all()
 
     def __contains__(self, name: str) -> bool:
-        """Whether a fault is on; asking for one that the device does not have is a mistake in the device."""
+        """Return whether a fault is on; a name that the device does not have is a bug in the device."""
         assert name in self._known, name
         with self._changed:
             return name in self._active
 
     def take(self, name: str) -> bool:
-        """Whether a fault is on, and switch it off: for those that happen once."""
+        """Return whether a fault is on, and switch it off: for faults that happen once."""
         assert name in self._known, name
         with self._changed:
             on = name in self._active
@@ -50,6 +50,6 @@ class Faults:
             return on
 
     def wait_while(self, name: str, timeout: float) -> bool:
-        """Wait until a fault is off, at most ``timeout`` [s]; whether it is."""
+        """Wait until a fault is off, at most ``timeout`` [s]; return whether it is off."""
         with self._changed:
             return self._changed.wait_for(lambda: name not in self._active, timeout)

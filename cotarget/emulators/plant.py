@@ -1,6 +1,7 @@
-"""What the emulated devices' protocols stand in front of: pictures, axes, a lens. All of it is safe from any thread.
+"""Interfaces between the emulated devices and the simulated rig: image feeds, axes, a lens.
 
-The simulated world itself runs in `cotarget.emulators.world`; tests put ready-made pictures and their own axes here.
+All are safe from any thread. The simulated world runs in `cotarget.emulators.world`; tests use prepared images and
+their own axes.
 """
 
 import threading
@@ -17,7 +18,7 @@ class Picture:
 
     Attributes:
         image: (H, W, 3) BGR.
-        index: its number, which grows.
+        index: sequence number, increasing.
         t: middle of the exposure on the machine's monotonic clock [s].
     """
 
@@ -27,11 +28,11 @@ class Picture:
 
 
 class Feed:
-    """The newest picture of a camera, published by one thread and waited for by others.
+    """The newest image of a camera, published by one thread and awaited by others.
 
     Attributes:
-        moments: when the light of the newest picture fell, and when it was published, on the machine's monotonic clock
-            [s]; None before the first.
+        moments: (middle of the exposure, time of publication) of the newest image on the machine's monotonic clock [s];
+            None before the first.
     """
 
     def __init__(self) -> None:
@@ -40,13 +41,13 @@ class Feed:
         self._new = threading.Condition()
 
     def publish(self, picture: Picture) -> None:
-        """Replace the newest picture."""
+        """Replace the newest image."""
         with self._new:
             self._picture, self.moments = picture, (picture.t, time.monotonic())
             self._new.notify_all()
 
     def newest(self, after: int = -1, timeout: float = 0.0) -> Picture | None:
-        """The newest picture whose index is above ``after``; None if none comes within ``timeout`` [s]."""
+        """Wait for the newest image whose index is above ``after``; None if none comes within ``timeout`` [s]."""
 
         def there() -> bool:
             return self._picture is not None and self._picture.index > after
@@ -56,36 +57,36 @@ class Feed:
 
 
 class AxisPlant(Protocol):
-    """The mechanics of one axis of a pan-tilt unit, in the unit's own steps."""
+    """Mechanics of one axis of a pan-tilt unit, in the unit's steps."""
 
     def command(self, goal: int, speed: float, acceleration: float) -> None:
-        """Go there from now on, whatever it did before: steps, steps/s, steps/s^2."""
+        """Start a move to a goal [steps], at a speed [steps/s] and an acceleration [steps/s^2], even during a move."""
 
     def halt(self, acceleration: float) -> None:
-        """Brake from now on."""
+        """Start braking at an acceleration [steps/s^2]."""
 
     def position(self) -> int:
-        """Where it is now, by its own count [steps]."""
+        """Return the present position [steps]."""
 
     def speed(self) -> float:
-        """How fast it turns now, signed [steps/s]."""
+        """Return the present speed, signed [steps/s]."""
 
     def moving(self) -> bool:
-        """Whether it turns now, or is about to."""
+        """Return whether the axis moves, or is about to."""
 
 
 class LensPlant(Protocol):
-    """A stepping zoom lens."""
+    """A zoom lens with positions."""
 
     @property
     def last(self) -> int:
-        """The number of its last position, counted from 0."""
+        """Number of the last position, counted from 0."""
 
     def command(self, position: int) -> None:
-        """Go there from now on."""
+        """Start a move to a position."""
 
     def position(self) -> int:
-        """Where it is now."""
+        """Return the present position."""
 
     def moving(self) -> bool:
-        """Whether it moves now, or is about to."""
+        """Return whether the lens moves, or is about to."""

@@ -1,13 +1,9 @@
-"""What an emulated pan-tilt unit is reached by: a pseudo-terminal in place of a serial line, and a TCP port.
+"""Transports of emulated devices: a pseudo-terminal as a serial port, a TCP port, and a server of JSON lines.
 
-Each line serves one firmware from one thread of its own; a unit that is to be on both needs two firmwares in front of
-the same axes.
-
-The bytes between an emulated unit and its client: each takes its time, ten bits at the baud rate, in each direction.
-
-The times are planned ahead of the clock, so that a thread that wakes late does not slow the line.
-
-A server that answers one JSON object a line; what holds the board, and what switches faults, speak it.
+`SerialLine` and `TcpLine` serve an emulated unit, each with one firmware on one thread; a unit on both lines needs two
+firmwares in front of the same axes. `Wire` gives every byte its time on the line, ten bits at the baud rate, in each
+direction. Times are planned ahead of the clock, so that a thread that wakes late does not slow the line. `JsonLines`
+answers one JSON object a line, for the board and for the control port.
 """
 
 import abc
@@ -31,39 +27,41 @@ from typing import Any, Protocol, Self
 from cotarget.emulators.faults import Faults
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 
-BITS = 10  # of a byte: start, eight, stop
-# Bytes that wait to be taken by the firmware, beyond which the sender has to wait.
+# Bytes on the wire
+
+BITS = 10  # per byte: start, eight, stop
+# Most bytes under way to the firmware; beyond that the sender must wait.
 BACKLOG = 4096
 
 
 class Firmware(Protocol):
-    """What a line needs of the device behind it."""
+    """The device behind a line, as `Wire` uses it."""
 
     faults: Faults
 
     @property
     def baud(self) -> int:
-        """Of its serial port, from the byte after the last output on."""
+        """Baud rate of the serial port, from the byte after the last output on."""
 
     @property
     def byte_delay_s(self) -> float:
-        """Pause after each byte it sends [s]."""
+        """Pause after each sent byte [s]."""
 
     def set_baud(self, baud: int) -> None:
-        """Set its serial port, at power-up too."""
+        """Set the baud rate of the serial port, for power-up too."""
 
     def receive(self, data: bytes) -> None:
-        """Take what comes in."""
+        """Process bytes that arrive."""
 
     def output(self) -> bytes:
-        """What is to be sent by now."""
+        """Take the bytes that are to be sent by now."""
 
     def connected(self) -> None:
-        """Tell that a TCP client has connected."""
+        """Handle a new TCP client."""
 
 
 class Wire:
-    """The bytes under way between a firmware and its client, each with the time at which its last bit is there.
+    """Bytes under way between a firmware and its client, each with the arrival time of its last bit.
 
     Args:
         firmware: the device.
@@ -74,14 +72,14 @@ class Wire:
         self._firmware = firmware
         self._paced = paced
         self._noise = random.Random(0)
-        self._baud = firmware.baud  # at which the firmware sends what it gives out next
+        self._baud = firmware.baud  # baud rate of the firmware's next output
         self._in: deque[tuple[float, int, int | None]] = deque()
         self._out: deque[tuple[float, int, int]] = deque()
         self._in_free = self._out_free = 0.0
 
     @property
     def room(self) -> int:
-        """How many bytes more can be under way to the firmware."""
+        """Number of further bytes that can be under way to the firmware."""
         return max(BACKLOG - len(self._in), 0)
 
     def feed(self, data: bytes, now: float, baud: int | None = None) -> None:
@@ -90,7 +88,7 @@ class Wire:
         Args:
             data: the bytes.
             now: when they were sent [s].
-            baud: the client's; at another than the firmware's it hears noise. None for the firmware's own.
+            baud: the client's baud rate; if it differs from the firmware's, noise arrives. None for the firmware's own.
         """
         for byte in data:
             took = BITS / (baud or self._firmware.baud) if self._paced else 0.0
@@ -98,7 +96,7 @@ class Wire:
             self._in.append((self._in_free, byte, baud))
 
     def step(self, now: float, baud: int | None = None) -> bytes:
-        """Let the firmware have what has arrived by now; return what has arrived at the client, whose baud is given."""
+        """Pass to the firmware the bytes that have arrived; return those at a client with this baud rate."""
         while self._in and self._in[0][0] <= now:
             arrived, byte, sent_at = self._in.popleft()
             agreed = sent_at is None or sent_at == self._firmware.baud
@@ -112,18 +110,18 @@ class Wire:
         return bytes(due)
 
     def due(self) -> float | None:
-        """When the next byte arrives at either end [s]; None if none is under way."""
+        """Return when the next byte arrives at either end [s]; None if none is under way."""
         times = [way[0][0] for way in (self._in, self._out) if way]
         return min(times, default=None)
 
     def clear(self) -> None:
-        """Lose what is under way, and what the firmware has to say."""
+        """Drop the bytes under way, and the firmware's output."""
         self._in.clear()
         self._out.clear()
         self._firmware.output()
 
     def _collect(self, ready: float) -> None:
-        """Put on the wire what the firmware says; a change of its baud holds from the next output on."""
+        """Put the firmware's output on the wire; a change of its baud rate applies from the next output on."""
         for byte in self._firmware.output():
             took = BITS / self._baud + self._firmware.byte_delay_s if self._paced else 0.0
             self._out_free = max(self._out_free, ready) + took
@@ -131,22 +129,23 @@ class Wire:
         self._baud = self._firmware.baud
 
 
-# --- jsonlines ---
+# JSON lines
 
 LONGEST_LINE = 65536  # bytes
-HEARTBEAT = 0.1  # between looks whether the server shall end [s]
+HEARTBEAT = 0.1  # period of checking whether the server must end [s]
 
 
 class JsonLines:
-    """Serves any number of clients, each on a thread of its own. A context manager.
+    """Server of any number of clients, each on a thread of its own; a context manager.
 
     Args:
-        answer: what to say to an object; a `CotargetError`, and what a wrong object raises, becomes {"error": ...}.
-        host: to listen at.
-        port: to listen at; 0 for any that is free.
+        answer: makes the answer to an object; a `CotargetError`, or an error that a wrong object raises, becomes
+            {"error": ...}.
+        host: address to listen at.
+        port: to listen at; 0 for any free port.
 
     Raises:
-        DeviceError: the port cannot be had.
+        DeviceError: the address is invalid or in use.
     """
 
     def __init__(self, answer: Callable[[Any], Any], host: str = "127.0.0.1", port: int = 0) -> None:
@@ -166,23 +165,23 @@ class JsonLines:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening and hang up; more than once does no harm."""
+        """Close the port and the connections; may be called again."""
         self._server.shutdown()
         self._server.hang_up()
         self._server.server_close()
         self._thread.join()
 
     def __enter__(self) -> "JsonLines":
-        """Give the server itself."""
+        """Return the server itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
+        """Close the server."""
         self.close()
 
 
 class _Server(socketserver.ThreadingTCPServer):
-    """Remembers its clients, so that it can hang up on them."""
+    """TCP server that stores its clients, so that it can close their connections."""
 
     allow_reuse_address = True
     daemon_threads = True
@@ -192,20 +191,20 @@ class _Server(socketserver.ThreadingTCPServer):
         super().__init__(*arguments)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Remember the client."""
+        """Store the client and serve it."""
         self._clients.add(request)
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
-        """Forget the client."""
+        """Drop the client and close its connection."""
         self._clients.discard(request)
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that is gone is no error."""
+        """Ignore a client that is gone."""
 
     def hang_up(self) -> None:
-        """End every conversation."""
+        """Close every connection."""
         for request in list(self._clients):
             self.shutdown_request(request)
 
@@ -219,28 +218,30 @@ def _answered(answer: Callable[[Any], Any], line: bytes) -> Any:
         return {"error": f"not understood: {type(error).__name__}: {error}"}
 
 
-# How often a firmware that is told nothing is asked for what it says by itself, and a close is noticed [s].
+# Lines of a unit
+
+# Period of asking an idle firmware for output, and of checking whether the line closes [s].
 TICK_S = 0.005
-# A TCP client that reads nothing for so long is dropped [s].
+# A TCP client that reads nothing for this time is dropped [s].
 SEND_TIMEOUT_S = 1.0
 SPEEDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
 CODES = {baud: code for code, baud in SPEEDS.items()}
 
 
 def _wait(wire: Wire, readers: list[int]) -> list[int]:
-    """Wait for something to read, for the next byte to arrive, or for a tick; return what can be read."""
+    """Wait for input, for the next byte to arrive, or for a tick; return the readable descriptors."""
     due = wire.due()
     timeout = TICK_S if due is None else min(max(due - time.monotonic(), 0.0), TICK_S)
     return select.select(readers, [], [], timeout)[0]
 
 
 def _baud(slave: int) -> int | None:
-    """What the client has set; None on a line that was hung up, which is baud 0."""
+    """Return the baud rate that the client has set; None for baud 0, a line that was hung up."""
     return SPEEDS.get(termios.tcgetattr(slave)[5]) or None
 
 
 class _Line(abc.ABC):
-    """What both kinds of line have in common: a thread that serves the unit from when it is started to the close."""
+    """Common part of both lines: a thread that serves the unit until the line is closed."""
 
     def __init__(self, firmware: Firmware, wire: Wire) -> None:
         self._firmware, self._wire = firmware, wire
@@ -248,18 +249,18 @@ class _Line(abc.ABC):
         self._thread = threading.Thread(target=self._serve, name=f"d46 {type(self).__name__}", daemon=True)
 
     def close(self) -> None:
-        """Take the port away."""
+        """End the thread and remove the port."""
         self._closing.set()
         self._thread.join()
 
     def __enter__(self) -> Self:
-        """Give the line itself."""
+        """Return the line itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Take the port away."""
+        """Close the line."""
         self.close()
 
     def _serve(self) -> None:
@@ -275,34 +276,34 @@ class _Line(abc.ABC):
 
     @abc.abstractmethod
     def _is_plugged_in(self) -> bool:
-        """Whether the port is there."""
+        """Return whether the port exists."""
 
     @abc.abstractmethod
     def _plug_in(self) -> None:
-        """Let the port be there."""
+        """Make the port."""
 
     @abc.abstractmethod
     def _unplug(self) -> None:
-        """Let it be there no longer; more than once does no harm."""
+        """Remove the port; may be called again."""
 
     @abc.abstractmethod
     def _exchange(self) -> None:
-        """Pass on what is due, and wait for more."""
+        """Pass on the bytes that are due, and wait for more."""
 
 
 class SerialLine(_Line):
-    """A pseudo-terminal that behaves as a serial port with the firmware's unit at its end; a context manager.
+    """A pseudo-terminal that behaves as a serial port with the unit at its end; a context manager.
 
-    A client that sets another baud than the unit's exchanges noise with it. While the fault unplugged is on, the port
-    is gone; afterwards there is one again, maybe under another name.
+    A client with another baud rate than the unit exchanges noise with it. While the fault unplugged is on, the port
+    does not exist; afterwards there is one again, possibly with another name.
 
     Args:
         firmware: the unit.
-        baud: to set the unit to, as if `@` had done so before; None leaves it as it is. The port is there with it too,
-            until a client sets another.
+        baud: set for the unit, as by an earlier `@`; None leaves the unit's. The port has it too, until a client sets
+            another.
 
     Raises:
-        ConfigError: there is no such baud.
+        ConfigError: there is no such baud rate.
         DeviceError: the machine has no pseudo-terminal left.
     """
 
@@ -312,8 +313,8 @@ class SerialLine(_Line):
         if baud is not None:
             firmware.set_baud(baud)
         super().__init__(firmware, Wire(firmware))
-        self._ends: tuple[int, int] | None = None  # the emulator's and the client's; ours of the latter stays open,
-        self._port = ""  # or the former would fail whenever no client has it open
+        self._ends: tuple[int, int] | None = None  # emulator's and client's end; the latter stays open here too,
+        self._port = ""  # because without any open client's end the emulator's fails
         try:
             self._plug_in()
         except OSError as error:
@@ -322,11 +323,11 @@ class SerialLine(_Line):
 
     @property
     def port(self) -> str:
-        """Name of the port to open; empty while unplugged."""
+        """Name of the port; empty while unplugged."""
         return self._port
 
     def reserve(self) -> bool:
-        """Keep programs that lock the port from opening it, unless one has; whether none has."""
+        """Lock the port against programs that lock it too; return False if one has the lock."""
         try:
             if self._ends is not None:
                 fcntl.flock(self._ends[1], fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -335,8 +336,8 @@ class SerialLine(_Line):
         return True
 
     def release(self) -> None:
-        """Let programs open the port again."""
-        with contextlib.suppress(OSError):  # unplugged just now
+        """Unlock the port."""
+        with contextlib.suppress(OSError):  # unplugged meanwhile
             if self._ends is not None:
                 fcntl.flock(self._ends[1], fcntl.LOCK_UN)
 
@@ -366,7 +367,7 @@ class SerialLine(_Line):
         master, slave = self._ends
         arrived = self._wire.step(time.monotonic(), _baud(slave))
         if arrived:
-            with contextlib.suppress(BlockingIOError):  # nobody reads: a serial port loses bytes then
+            with contextlib.suppress(BlockingIOError):  # without a reader a serial port loses bytes
                 os.write(master, arrived)
         room = self._wire.room
         if master in _wait(self._wire, [master] if room else []):
@@ -375,21 +376,21 @@ class SerialLine(_Line):
 
 
 class TcpLine(_Line):
-    """A TCP port with the firmware's unit behind it, as of a serial device server; a context manager.
+    """A TCP port with the unit behind it, as of a serial device server; a context manager.
 
-    One client at a time. A second takes the first one's place, because a client that vanished without a word, its cable
-    pulled, would keep the unit for ever otherwise; the first finds its connection closed. While the fault unplugged is
-    on, nobody listens.
+    It serves one client at a time. A second client replaces the first, whose connection is closed: a client that
+    vanished, such as by a pulled cable, would otherwise block the unit for ever. While the fault unplugged is on, the
+    port is closed.
 
     Args:
         firmware: the unit.
-        host: address to listen at; this machine only by default.
-        port: to listen at; 0 for a free one.
-        paced: whether bytes take the time that they would take on the unit's serial line.
-        beside: another line to the same unit, which serves either; None where there is none.
+        host: address to listen at; by default this machine only.
+        port: to listen at; 0 for any free port.
+        paced: whether bytes take their time on the unit's serial line.
+        beside: another line to the same unit, which serves only one of the two at a time; None if there is none.
 
     Raises:
-        DeviceError: the address cannot be listened at.
+        DeviceError: the address is invalid or in use.
     """
 
     def __init__(
@@ -413,14 +414,14 @@ class TcpLine(_Line):
 
     @property
     def url(self) -> str:
-        """How pyserial and a rig's config name it."""
+        """URL of the port for pyserial and rig.toml."""
         return f"socket://{self.host}:{self.port}"
 
     def _is_plugged_in(self) -> bool:
         return self._listener is not None
 
     def _plug_in(self) -> None:
-        """Listen at the same port; if another has taken it meanwhile, wait for it."""
+        """Listen at the same port; if another program has it meanwhile, wait a tick."""
         try:
             self._listener = socket.create_server((self.host, self.port), backlog=1)
         except OSError:
@@ -441,7 +442,7 @@ class TcpLine(_Line):
         self._wire.clear()
 
     def _exchange(self) -> None:
-        """Also waits for a client."""
+        """Pass on the bytes that are due, and wait for more, or for a client."""
         assert self._listener is not None
         arrived = self._wire.step(time.monotonic())
         listener, client, room = self._listener, self._client, self._wire.room

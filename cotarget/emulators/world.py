@@ -1,9 +1,8 @@
-"""The simulated rig in real time: one thread owns the world and its OpenGL, exposes both cameras, and publishes.
+"""The simulated rig in real time, for the emulated devices.
 
-Pictures leave through `Feed`s when their latency is over, by a thread that does nothing else, so that a slow render
-does not make the other camera late. Axes and lens are commanded from the servers' threads.
-
-The simulated rig's axes and lens in real time, as the emulated devices command them; and the clock they go by.
+`LiveWorld` runs the simulation: one thread owns the world and its OpenGL context and exposes both cameras. A second
+thread only publishes images, through `Feed`s once their latency is over, so that a slow render does not delay the other
+camera. The servers' threads command axes and lens (`EmulatedAxis`, `EmulatedLens`).
 """
 
 import contextlib
@@ -26,25 +25,25 @@ from cotarget.sim.motion import Axis, LensDrive
 from cotarget.sim.truth import CameraName
 from cotarget.sim.world import SimWorld
 
-REMEMBERED = 5.0  # how far back axes and lens are asked for exposures [s]
+REMEMBERED = 5.0  # age of the oldest exposure for which axes and lens keep their motion [s]
 
 
 class WallClock:
-    """The machine's monotonic clock from a start."""
+    """The machine's monotonic clock, from its construction."""
 
     def __init__(self) -> None:
         self._start = time.monotonic()
 
     def now(self) -> float:
-        """Seconds since it was made."""
+        """Return the seconds since the construction."""
         return time.monotonic() - self._start
 
     def sleep_until(self, t: float) -> None:
-        """Return when the clock shows ``t`` [s]."""
+        """Sleep until the clock shows ``t`` [s]."""
         time.sleep(max(t - self.now(), 0.0))
 
     def monotonic(self, t: float) -> float:
-        """The machine's monotonic time when this clock shows ``t`` [s]."""
+        """Convert a time of this clock [s] to the machine's monotonic time [s]."""
         return self._start + t
 
 
@@ -54,8 +53,8 @@ class EmulatedAxis:
     Args:
         axis: of the simulation, in radians.
         clock: the world's.
-        step: of the unit, negative where it counts the other way [rad].
-        delay: from a command to motion [s].
+        step: size of the unit's step, negative if the unit counts the other way [rad].
+        delay: from a command to the start of motion [s].
     """
 
     def __init__(self, axis: Axis, clock: WallClock, step: float, delay: float) -> None:
@@ -64,30 +63,30 @@ class EmulatedAxis:
         self._lock = threading.Lock()
 
     def command(self, goal: int, speed: float, acceleration: float) -> None:
-        """Go there from now on: steps, steps/s, steps/s^2."""
+        """Start a move to a goal [steps], at a speed [steps/s] and an acceleration [steps/s^2]."""
         with self._lock:
             t = self._begin(acceleration)
             self._rests = self._axis.command(t, goal * self._step, speed * abs(self._step))
 
     def halt(self, acceleration: float) -> None:
-        """Brake from now on."""
+        """Start braking at an acceleration [steps/s^2]."""
         with self._lock:
             self._rests = self._axis.halt(self._begin(acceleration))
 
     def position(self) -> int:
-        """Where it is now [steps]."""
+        """Return the present position [steps]."""
         return round(self._axis.motor(self._clock.now())[0] / self._step)
 
     def speed(self) -> float:
-        """How fast it turns now [steps/s]."""
+        """Return the present speed, signed [steps/s]."""
         return self._axis.motor(self._clock.now())[1] / self._step
 
     def moving(self) -> bool:
-        """Whether it turns, or is about to."""
+        """Return whether the axis moves, or is about to."""
         return self._clock.now() < self._rests
 
     def _begin(self, acceleration: float) -> float:
-        """When a command given now takes effect; what nobody asks for any more is forgotten."""
+        """Return when a command given now takes effect [s]; drop motion older than `REMEMBERED`."""
         now = self._clock.now()
         self._axis.forget(now - REMEMBERED)
         if math.isfinite(self._axis.acceleration):
@@ -105,44 +104,46 @@ class EmulatedLens:
 
     @property
     def last(self) -> int:
-        """The number of its last position."""
+        """Number of the last position, counted from 0."""
         return self._drive.last
 
     def command(self, position: int) -> None:
-        """Go there from now on."""
+        """Start a move to a position."""
         with self._lock:
             now = self._clock.now()
             self._drive.axis.forget(now - REMEMBERED)
             self._rests = self._drive.axis.command(now + self._delay, float(min(max(position, 0), self.last)))
 
     def position(self) -> int:
-        """Where it is now."""
+        """Return the present position."""
         return round(self._drive.axis.motor(self._clock.now())[0])
 
     def moving(self) -> bool:
-        """Whether it moves, or is about to."""
+        """Return whether the lens moves, or is about to."""
         return self._clock.now() < self._rests
 
 
+# The world
+
 log = logging.getLogger(__name__)
-FIXED_HZ, ZOOM_HZ = 15.0, 10.0  # what one core renders beside a client on another
-OLDEST = REMEMBERED - 1.0  # exposures are left out where the machine, or this program, stood still for longer [s]
+FIXED_HZ, ZOOM_HZ = 15.0, 10.0  # frame rates that one core renders, with a client on another core
+OLDEST = REMEMBERED - 1.0  # age of the oldest exposure that is rendered, after the program was suspended [s]
 STILL_TIMEOUT = 5.0  # [s]
-START_TIMEOUT = 60.0  # to compile the world and open OpenGL on a slow machine [s]
-STILL_INDEX = 1_000_000_000  # stills draw their noise from numbers that no stream reaches
-UNTIL_NEXT_LOOK = 0.25  # at most, so that an end is noticed [s]
+START_TIMEOUT = 60.0  # time limit to compile the world and open OpenGL on a slow machine [s]
+STILL_INDEX = 1_000_000_000  # first frame index of stills, whose noise must differ from the stream's
+UNTIL_NEXT_LOOK = 0.25  # longest wait without checking for the end [s]
 
 
 @dataclass(frozen=True, eq=False)
 class _Still:
-    """A still that was asked for, and where it goes."""
+    """A request for a still: time of its exposure [s], and queue for the image."""
 
     t: float
     answer: "queue.SimpleQueue[Image]"
 
 
 def paced(config: RigConfig) -> RigConfig:
-    """A configuration for real time: fewer frames a second, no shadows, no multisampling, and JPEG by the servers."""
+    """Adapt a configuration to real time: lower frame rates, no shadows, no multisampling, and JPEG by the servers."""
     sim = config.sim
     effects = replace(sim.effects, shadows=False, multisampling=False, jpeg=False)
     fixed = replace(sim.fixed, rate_hz=min(sim.fixed.rate_hz, FIXED_HZ))
@@ -151,15 +152,15 @@ def paced(config: RigConfig) -> RigConfig:
 
 
 class LiveWorld:
-    """The simulated world in real time. A context manager.
+    """The simulated world in real time; a context manager.
 
     Args:
-        config: of the rig, as it shall run; see `paced`.
-        pan_sign: -1 where the unit counts pan to the left.
+        config: of the rig in real time; see `paced`.
+        pan_sign: -1 if the unit counts pan to the left.
 
     Raises:
         ConfigError: an unknown scene or target.
-        DeviceError: the machine cannot render, or the world failed at its first pictures.
+        DeviceError: the machine cannot render, or the world failed at its first images.
     """
 
     def __init__(self, config: RigConfig, *, pan_sign: int = 1) -> None:
@@ -193,19 +194,19 @@ class LiveWorld:
         self.lens = EmulatedLens(world.lens_drive, self.clock, delay)
 
     def check(self) -> None:
-        """Look whether the world lives; one that has failed shows nothing any more.
+        """Raise if the world has failed; its feeds then publish nothing more.
 
         Raises:
-            DeviceError: it has failed, and why.
+            DeviceError: the world has failed; the message says why.
         """
         if self._failure:
             raise DeviceError(self._failure)
 
     def still(self) -> Image:
-        """Take a picture with the zoom camera now, (H, W, 3) BGR.
+        """Take an image with the zoom camera now, (H, W, 3) BGR.
 
         Raises:
-            DeviceError: the world has ended or failed, or is far too slow.
+            DeviceError: the world has ended, failed, or took no image within `STILL_TIMEOUT`.
         """
         self.check()
         answer: queue.SimpleQueue[Image] = queue.SimpleQueue()
@@ -216,19 +217,19 @@ class LiveWorld:
             raise DeviceError(f"the simulated world took no still within {STILL_TIMEOUT:g} s") from None
 
     def present(self, T_fixed_board: RigidTransform | None) -> None:
-        """Put the board there; None takes it away."""
+        """Put the board at a pose; None removes it."""
         self._world.rig.board.present(T_fixed_board)
 
     def swing(self, T_fixed_board: RigidTransform) -> None:
-        """Swing the board about that pose."""
+        """Swing the board about a pose."""
         self._world.rig.board.swing(T_fixed_board)
 
     def head_truth(self) -> tuple[float, float]:
-        """Pan and tilt of the platform now [rad], whatever the unit says."""
+        """Return the true pan and tilt of the platform now [rad], independent of the unit's count."""
         return self._world.head_drive.angles_at(self.clock.now())
 
     def close(self) -> None:
-        """End the threads and release the renderer; more than once does no harm."""
+        """End the threads and release the renderer; may be called again."""
         self._ended.set()
         self._due.put(None)
         for thread in self._threads:
@@ -236,15 +237,15 @@ class LiveWorld:
                 thread.join()
 
     def __enter__(self) -> "LiveWorld":
-        """Give the world itself."""
+        """Return the world itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
+        """Close the world."""
         self.close()
 
     def _guarded(self, run: Callable[[], None]) -> None:
-        """Do what a thread does; what fails is told to who waits for the world, and to who asks for it later."""
+        """Run a thread; its failure is passed to the constructor and to later calls of `check`."""
         try:
             run()
         except Exception as error:
@@ -254,17 +255,17 @@ class LiveWorld:
             self._started.put(error if isinstance(error, CotargetError) else DeviceError(self._failure))
 
     def _render(self) -> None:
-        """Make the world and show it until the end."""
+        """Make the world and render it until the end."""
         with contextlib.closing(SimWorld(self.config, self.clock)) as world:
             sim = self.config.sim
             cameras: dict[CameraName, SimCamera] = {"fixed": sim.fixed, "zoom": sim.zoom}
             for name in cameras:
-                world.expose(name, 0, 0.0)  # the first render of each takes seconds where shaders are compiled
+                world.expose(name, 0, 0.0)  # each camera's first render compiles shaders, which takes seconds
             self._started.put(world)
             self._show(world, cameras)
 
     def _show(self, world: SimWorld, cameras: Mapping[CameraName, SimCamera]) -> None:
-        """Expose both cameras at their rates, and stills on demand."""
+        """Expose both cameras at their rates, and stills on request."""
         latency = self.config.sim.effects.latency
         next_index = {name: math.ceil(self.clock.now() * camera.rate_hz) for name, camera in cameras.items()}
         numbers = itertools.count(STILL_INDEX)
@@ -289,11 +290,11 @@ class LiveWorld:
             if image is not None:
                 due = t + (cameras[name].latency_s if latency else 0.0)
                 self._due.put((due, name, Picture(image, index, self.clock.monotonic(t))))
-            # A world that cannot keep up leaves frames out, but tells the truth of those it shows.
+            # A world that cannot keep up drops frames; those that it publishes have their true times.
             next_index[name] = max(index + 1, math.ceil(self.clock.now() * rate - 1))
 
     def _expose(self, world: SimWorld, name: CameraName, index: int, t: float) -> Image | None:
-        """A camera's picture of then; None where nobody remembers any more how everything stood."""
+        """Render a camera's image at a time [s]; None if the motion at that time is not stored any more."""
         try:
             return None if self._is_forgotten(t) else world.expose(name, index, t)
         except Exception:
@@ -305,7 +306,7 @@ class LiveWorld:
         return self.clock.now() - t > OLDEST
 
     def _publish(self) -> None:
-        """Let pictures out when they are due."""
+        """Publish images when they are due."""
         waiting: list[tuple[float, int, CameraName, Picture]] = []
         while not self._ended.is_set():
             wait = waiting[0][0] - self.clock.now() if waiting else None

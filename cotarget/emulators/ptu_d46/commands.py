@@ -1,6 +1,6 @@
-"""The D46's commands: what each is called, since which firmware it exists, and what those of the whole unit do.
+"""The commands of the PTU-D46: syntax, first firmware version, and effect on a `Unit`.
 
-The D46's commands that name one axis: P... and T..., and the step mode W.
+A handler returns the answer, or a task that ends with it. Most commands that take a value are queries without it.
 """
 
 import re
@@ -15,12 +15,12 @@ MOVE_POWER = {"R": "REGULAR", "L": "LOW", "H": "HIGH"}
 
 
 def _parts(unit: Unit, command: re.Match[str]) -> tuple[UnitAxis, int | None]:
-    """The axis that a command names, and its number, if it has one."""
+    """Return the axis that a command names, and its number or None."""
     return unit.axis(command[1]), None if command[2] is None else int(command[2])
 
 
 def position(unit: Unit, command: re.Match[str]) -> str:
-    """PP, TP: go there; where it is."""
+    """PP, TP: move to a position; query the present position."""
     axis, n = _parts(unit, command)
     if n is None:
         return unit.say("Current {axis} position is {n}", axis, axis.position)
@@ -28,7 +28,7 @@ def position(unit: Unit, command: re.Match[str]) -> str:
 
 
 def offset(unit: Unit, command: re.Match[str]) -> str:
-    """PO, TO: go so far from where it is; where it is to go."""
+    """PO, TO: move by an offset from the present position; query the desired position."""
     axis, n = _parts(unit, command)
     if n is None:
         return unit.say(unit.profile.wording.offset, axis, axis.desired)
@@ -36,7 +36,7 @@ def offset(unit: Unit, command: re.Match[str]) -> str:
 
 
 def speed(unit: Unit, command: re.Match[str]) -> str:
-    """PS, TS: the desired speed."""
+    """PS, TS: set or query the desired speed."""
     axis, n = _parts(unit, command)
     if n is None:
         return unit.say(unit.profile.wording.speed, axis, axis.velocity if unit.velocity_mode else axis.settings.speed)
@@ -44,7 +44,7 @@ def speed(unit: Unit, command: re.Match[str]) -> str:
 
 
 def speed_offset(unit: Unit, command: re.Match[str]) -> str:
-    """PD, TD: the desired speed, from the present one; the present one."""
+    """PD, TD: set the desired speed as an offset from the present speed; query the present speed."""
     axis, n = _parts(unit, command)
     present = round(axis.speed if unit.velocity_mode else abs(axis.speed))
     if n is None:
@@ -53,7 +53,7 @@ def speed_offset(unit: Unit, command: re.Match[str]) -> str:
 
 
 def acceleration(unit: Unit, command: re.Match[str]) -> str | Task:
-    """PA, TA: the acceleration, once the axis stands."""
+    """PA, TA: set the acceleration, once the axis stands; query it."""
     axis, n = _parts(unit, command)
     if n is None:
         return unit.say(unit.profile.wording.acceleration, axis, axis.settings.acceleration)
@@ -61,7 +61,7 @@ def acceleration(unit: Unit, command: re.Match[str]) -> str | Task:
 
 
 def base_speed(unit: Unit, command: re.Match[str]) -> str | Task:
-    """PB, TB: the base speed, once the axis stands."""
+    """PB, TB: set the base speed, once the axis stands; query it."""
     axis, n = _parts(unit, command)
     if n is None:
         return unit.say("Current {axis} base speed is {n} positions/sec", axis, axis.settings.base)
@@ -69,7 +69,7 @@ def base_speed(unit: Unit, command: re.Match[str]) -> str | Task:
 
 
 def upper_speed(unit: Unit, command: re.Match[str]) -> str | Task:
-    """PU, TU: the upper bound of speeds, once the axis stands."""
+    """PU, TU: set the upper bound of speeds, once the axis stands; query it."""
     axis, n = _parts(unit, command)
     if n is None:
         return unit.say("Maximum {axis} speed is {n} positions/sec", axis, axis.settings.upper)
@@ -77,7 +77,7 @@ def upper_speed(unit: Unit, command: re.Match[str]) -> str | Task:
 
 
 def lower_speed(unit: Unit, command: re.Match[str]) -> str | Task:
-    """PL, TL: the lower bound of speeds."""
+    """PL, TL: set the lower bound of speeds, once the axis stands; query it."""
     axis, n = _parts(unit, command)
     if n is None:
         return unit.say("Minimum {axis} speed is {n} positions/sec", axis, axis.settings.lower)
@@ -85,7 +85,7 @@ def lower_speed(unit: Unit, command: re.Match[str]) -> str | Task:
 
 
 def _change(unit: Unit, axis: UnitAxis, name: str, value: int, sensible: bool) -> Task:
-    """Set a bound or the acceleration; the desired speed is kept within the bounds."""
+    """Set a bound or the acceleration; the desired speed is clipped to the bounds."""
     if not sensible:
         raise RefusalError(unit.profile.wording.out_of_range)
 
@@ -98,14 +98,14 @@ def _change(unit: Unit, axis: UnitAxis, name: str, value: int, sensible: bool) -
 
 
 def limit(unit: Unit, command: re.Match[str]) -> str:
-    """PN, PX, TN, TX: the limits that the reset found."""
+    """PN, PX, TN, TX: query the limits that the reset found."""
     axis, upper = unit.axis(command[1]), command[2] == "X"
     word = "Maximum" if upper else "Minimum"
     return unit.say(f"{word} {{axis}} position is {{n}}", axis, axis.factory_limits[upper])
 
 
 def user_limit(unit: Unit, command: re.Match[str]) -> str:
-    """PNU, PXU, TNU, TXU: the user's limits, in force by LU."""
+    """PNU, PXU, TNU, TXU: set or query the user's limits, in force after LU."""
     axis, upper = unit.axis(command[1]), command[2] == "X"
     lowest, highest = axis.factory_limits
     if command[3] is None:
@@ -121,14 +121,14 @@ def user_limit(unit: Unit, command: re.Match[str]) -> str:
 
 
 def resolution(unit: Unit, command: re.Match[str]) -> str:
-    """PR, TR: seconds of arc a position."""
+    """PR, TR: query the resolution [seconds of arc]."""
     axis = unit.axis(command[1])
     number = f"{axis.resolution:.{unit.profile.resolution_digits}f}"
     return unit.profile.wording.resolution.format(axis=axis.name, n=number) if unit.settings.verbose else number
 
 
 def power(unit: Unit, command: re.Match[str]) -> str:
-    """PH, PM, TH, TM: the power of the motor at rest and in motion."""
+    """PH, PM, TH, TM: set or query the power of the motor at rest and in motion."""
     axis, moving, letter = unit.axis(command[1]), command[2] == "M", command[3]
     words = MOVE_POWER if moving else HOLD_POWER
     if letter is None:
@@ -143,7 +143,7 @@ def power(unit: Unit, command: re.Match[str]) -> str:
 
 
 def step_mode(unit: Unit, command: re.Match[str]) -> str | Task:
-    """WP, WT: into how many parts a full step is divided; a change resets the axis."""
+    """WP, WT: set or query the division of a full step; setting it resets the axis."""
     axis, mode = unit.axis(command[1]), command[2]
     if mode is None:
         word = axis.settings.step_mode
@@ -161,13 +161,15 @@ def _change_step_mode(axis: UnitAxis, mode: str) -> Task:
     return ""
 
 
+# Commands of the whole unit
+
 Version = tuple[int, int, int]
 Answer = str | Task
 Handler = Callable[[Unit, re.Match[str]], Answer]
-# Bauds that `@` takes; the E-series knows more, and one D46 was seen at 38400.
+# Baud rates of `@`; the E-series has more, and one D46 was seen at 38400.
 BAUDS = (600, 1200, 2400, 4800, 9600, 19200, 38400)
 E_BAUDS = (*BAUDS, 57600, 115200)
-BYTE_DELAY_MS = (10, 1000)  # or 0
+BYTE_DELAY_MS = (10, 1000)  # 0 is valid too
 PRESETS = 33  # numbers 0 to 32
 E_VERSION = (3, 0, 0)
 MENU = (
@@ -178,7 +180,7 @@ MENU = (
 
 
 def echo(unit: Unit, command: re.Match[str]) -> str:
-    """EE, ED, E."""
+    """EE, ED, E: switch the echo on or off; query it."""
     if command[1]:
         unit.settings.echo = command[1] == "E"
         return ""
@@ -186,7 +188,7 @@ def echo(unit: Unit, command: re.Match[str]) -> str:
 
 
 def feedback(unit: Unit, command: re.Match[str]) -> str:
-    """FV, FT, F."""
+    """FV, FT, F: switch verbose or terse replies on; query which."""
     if command[1]:
         unit.settings.verbose = command[1] == "V"
         return ""
@@ -194,7 +196,7 @@ def feedback(unit: Unit, command: re.Match[str]) -> str:
 
 
 def limits(unit: Unit, command: re.Match[str]) -> str:
-    """LE, LD, LU, L."""
+    """LE, LD, LU, L: enable the factory's limits, none or the user's; query which."""
     if command[1] == "U" and unit.profile.version < (2, 13, 1):
         raise RefusalError(unit.profile.wording.illegal)
     if command[1]:
@@ -208,7 +210,7 @@ def limits(unit: Unit, command: re.Match[str]) -> str:
 
 
 def execution(unit: Unit, command: re.Match[str]) -> str:
-    """I and S: positions at once, or on A or I."""
+    """I, S: execute positions at once, or on A or I."""
     unit.settings.immediate = command[0] == "I"
     if unit.settings.immediate:
         unit.release_pending()
@@ -216,13 +218,13 @@ def execution(unit: Unit, command: re.Match[str]) -> str:
 
 
 def await_arrival(unit: Unit, command: re.Match[str]) -> Task:
-    """A: answers when both axes have arrived."""
+    """A: answer when both axes have arrived."""
     unit.release_pending()
     return unit.standing(unit.axes)
 
 
 def halt(unit: Unit, command: re.Match[str]) -> Answer:
-    """H, HP, HT."""
+    """H, HP, HT: halt both axes or one."""
     halted = [axis for axis in unit.axes if command[1] in ("", axis.letter)]
     for axis in halted:
         axis.velocity = 0
@@ -231,7 +233,7 @@ def halt(unit: Unit, command: re.Match[str]) -> Answer:
 
 
 def control(unit: Unit, command: re.Match[str]) -> str:
-    """CI, CV, C."""
+    """CI, CV, C: set independent or pure velocity mode; query which."""
     if command[1]:
         unit.set_velocity_mode(command[1] == "V")
         return ""
@@ -240,7 +242,7 @@ def control(unit: Unit, command: re.Match[str]) -> str:
 
 
 def reset(unit: Unit, command: re.Match[str]) -> Answer:
-    """R resets; RE, RP, RT, RD say which axes R and power-up reset, or reset at once on the E-series."""
+    """R: reset. RE, RP, RT, RD: set which axes R and power-up reset; on the E-series RE, RP, RT reset at once."""
     letter = command[1]
     if not letter:
         return unit.reset(unit.settings.reset)
@@ -252,7 +254,7 @@ def reset(unit: Unit, command: re.Match[str]) -> Answer:
 
 
 def scan(unit: Unit, command: re.Match[str]) -> str:
-    """M: scan between the limits or between positions; ME, MD, MQ: whether it does so at power-up."""
+    """M: scan between the limits or between positions. ME, MD, MQ: set or query whether power-up begins a scan."""
     match command[1]:
         case "E" | "D":
             unit.settings.scan_at_power_up = command[1] == "E"
@@ -272,7 +274,7 @@ def scan(unit: Unit, command: re.Match[str]) -> str:
 
 
 def preset(unit: Unit, command: re.Match[str]) -> str:
-    """XS, XG, XC: keep where it is under a number, go there, forget it."""
+    """XS, XG, XC: store the present position under a number, move to it, delete it."""
     number = int(command[2] or 0)
     if number >= PRESETS or (command[1] == "G" and number not in unit.presets):
         raise RefusalError(unit.profile.wording.out_of_range)
@@ -288,7 +290,7 @@ def preset(unit: Unit, command: re.Match[str]) -> str:
 
 
 def defaults(unit: Unit, command: re.Match[str]) -> str:
-    """DS, DR, DF."""
+    """DS, DR, DF: save the settings, restore the saved or the factory's."""
     if command[1] == "S":
         unit.save()
     else:
@@ -297,7 +299,7 @@ def defaults(unit: Unit, command: re.Match[str]) -> str:
 
 
 def network(unit: Unit, command: re.Match[str]) -> str:
-    """U: number on a shared line; 0 has the line for itself."""
+    """U: set or query the number on a shared line; 0 for a unit that is alone on its line."""
     if command[1] is None:
         return f"Unit ID is {unit.settings.network_id}" if unit.settings.verbose else str(unit.settings.network_id)
     unit.settings.network_id = int(command[1])
@@ -305,13 +307,13 @@ def network(unit: Unit, command: re.Match[str]) -> str:
 
 
 def select(unit: Unit, command: re.Match[str]) -> str:
-    """_: speak to the unit of that number, 0 to all."""
+    """_: address the unit of this number, 0 for all."""
     unit.selected = int(command[1]) in (0, unit.settings.network_id) or unit.settings.network_id == 0
     return ""
 
 
 def serial_line(unit: Unit, command: re.Match[str]) -> str:
-    """@(baud,delay,T|F): the line from the reply on; T at power-up too."""
+    """@(baud,delay,T|F): set the line from the reply on; with T at power-up too."""
     baud, delay = int(command[1]), int(command[2])
     known = E_BAUDS if unit.profile.version >= E_VERSION else BAUDS
     if unit.settings.network_id != 0 or baud not in known or not (delay == 0 or _within(delay, BYTE_DELAY_MS)):
@@ -327,7 +329,7 @@ def _within(n: int, bounds: tuple[int, int]) -> bool:
 
 
 def route(unit: Unit, command: re.Match[str]) -> str:
-    """@A, @B: the line goes on to an expansion port; @: back."""
+    """@A, @B: connect the line to an expansion port; @: back to the unit."""
     if command[1] and not unit.profile.expansion:
         raise RefusalError(unit.profile.wording.illegal)
     unit.routed = bool(command[1])
@@ -335,7 +337,7 @@ def route(unit: Unit, command: re.Match[str]) -> str:
 
 
 def continuous(unit: Unit, command: re.Match[str]) -> str:
-    """%%1CPT, %%1CPF: pan without end, where there is a slip ring."""
+    """%%1CPT, %%1CPF: switch endless pan on or off, on units with a slip ring."""
     if not unit.profile.slip_ring:
         raise RefusalError(unit.profile.wording.illegal)
     unit.pan.endless = command[1] == "T"
@@ -343,7 +345,7 @@ def continuous(unit: Unit, command: re.Match[str]) -> str:
 
 
 def both(unit: Unit, command: re.Match[str]) -> str:
-    """B pan,tilt,pan speed,tilt speed: all at once (E-series)."""
+    """B pan,tilt,pan speed,tilt speed: command both axes at once (E-series)."""
     numbers = [int(n) for n in command[1].split(",")]
     for axis, goal, speed in zip(unit.axes, numbers[:2], numbers[2:], strict=True):
         unit.set_speed(axis, speed)
@@ -353,7 +355,7 @@ def both(unit: Unit, command: re.Match[str]) -> str:
 
 @dataclass(frozen=True)
 class Command:
-    """A form of command, what it does, and the first firmware that has it."""
+    """Syntax of a command, its handler, and the first firmware version that has it."""
 
     form: re.Pattern[str]
     handler: Handler
@@ -406,10 +408,10 @@ def execute(unit: Unit, text: str) -> Answer:
     """Carry out one command, in capital letters.
 
     Returns:
-        What follows the star, or a task that ends with it.
+        The text after the star, or a task that ends with it.
 
     Raises:
-        RefusalError: with what follows the exclamation mark.
+        RefusalError: the command is refused; its message is the text after the exclamation mark.
     """
     for command in COMMANDS:
         match = command.form.fullmatch(text)

@@ -1,14 +1,12 @@
-"""The firmware of a PTU-D46 as a pure state machine: bytes in, bytes out, on a clock that is given to it.
+"""Firmware of the emulated PTU-D46: a state machine from bytes to bytes, on a given clock.
 
 It implements the ASCII command language of the Command Reference Manual v3.00D and of the PTU-D46 manual v2.14.0, and
-the ways in which units in the field differ from them (`cotarget.emulators.ptu_d46.unit`). The binary language is left
-out. Three things that no source tells are choices: while A, R or the computing of tables goes on, characters wait; a
-position is refused in pure velocity mode; and what is not set on the fly waits until its axis stands.
+the deviations of units in the field (`cotarget.emulators.ptu_d46.unit`), without the binary language. Choices where no
+source says what happens: docs/design-notes.md.
 
-One pan-tilt unit at two lines: a firmware for each, in front of the same axes.
-
-A line serves one firmware. What is wrong is wrong with both of them; but what happens once, a gap in the power or a
-blow against a limit, happens to the one that somebody speaks to, or nobody would be told.
+`make_twins` makes two firmwares in front of the same axes, because a unit has two lines and a line serves one firmware.
+A fault holds for both. A fault that happens once (`ONCE`) happens to the firmware that received bytes last, so that its
+client sees the banner or the event.
 """
 
 import random
@@ -22,16 +20,16 @@ from cotarget.emulators.ptu_d46.unit import RefusalError, Task, Unit, UnitProfil
 
 SPACE, CR, LF, AT = 0x20, 0x0D, 0x0A, 0x40
 NEWLINE = "\r\n"
-# A command longer than this is none; and what comes in while the unit is busy is kept up to here [bytes]. Unselected
-# units were seen to keep about 100.
+# Longest command, and size of the input buffer while the unit is busy [bytes]. Unselected units were seen to keep
+# about 100 bytes.
 LONGEST_COMMAND = 100
 INPUT_BUFFER = 256
-# How much later a reply is with the fault late-replies [s]: more than drivers wait for ordinary commands.
+# Delay of replies with the fault late-replies [s]: longer than drivers wait for ordinary commands.
 LATE_S = 1.5
-# silence: obeys, but nothing comes back. garbage: noise in place of what it sends. half-replies: replies end halfway.
-# late-replies: LATE_S. unplugged: nothing in, nothing out. power-cycle (once): forgets settings and position, prints
-# its banner, and is uncalibrated until R. limit-hit (once, as soon as an axis turns): it stands, with !P or !T, and has
-# lost steps. error-replies: every command but a halt is refused.
+# silence: the unit obeys but sends nothing. garbage: it sends noise. half-replies: replies end halfway. late-replies:
+# replies are LATE_S late. unplugged: no input, no output. power-cycle (once): it loses settings and position, prints
+# its banner, and is uncalibrated until R. limit-hit (once, as soon as an axis turns): the axis stops with !P or !T and
+# has lost steps. error-replies: every command but a halt is refused.
 D46_FAULTS = (
     "silence",
     "garbage",
@@ -45,16 +43,16 @@ D46_FAULTS = (
 
 
 class D46:
-    """A PTU-D46 that has been on for a while: calibrated, echoing, verbose, standing.
+    """A PTU-D46 some time after power-up: calibrated, echoing, verbose, standing.
 
-    Not safe for use by several threads: a line serves it (`cotarget.emulators.serve`).
+    For one thread at a time: the line that serves it (`cotarget.emulators.serve`).
 
     Args:
         pan: mechanics of pan, in half steps of the unit.
-        tilt: mechanics of tilt.
-        unit: the model.
+        tilt: mechanics of tilt, in half steps of the unit.
+        unit: profile of the unit.
         faults: must know `D46_FAULTS`.
-        now: clock [s], which never goes back.
+        now: returns the time [s], which never decreases.
     """
 
     def __init__(
@@ -65,14 +63,14 @@ class D46:
         self._now = now
         self._input: deque[int] = deque()
         self._command = bytearray()
-        self._previous = 0  # the character before
-        self._task: Task | None = None  # what keeps it busy
-        self._output: deque[tuple[float, bytes]] = deque()  # when it is to be sent [s], and what
+        self._previous = 0  # the last character
+        self._task: Task | None = None  # the command that takes time
+        self._output: deque[tuple[float, bytes]] = deque()  # (time to send [s], bytes)
         self._noise = random.Random(0)
 
     @property
     def baud(self) -> int:
-        """Of the serial line, from the byte after the last output on."""
+        """Baud rate of the serial line, from the byte after the last output on."""
         return self._unit.baud
 
     @property
@@ -81,11 +79,11 @@ class D46:
         return self._unit.byte_delay_s
 
     def set_baud(self, baud: int) -> None:
-        """Set the serial line, as somebody may have done who saved it."""
+        """Set the baud rate of the serial line, for power-up too."""
         self._unit.baud = self._unit.baud_at_power_up = baud
 
     def receive(self, data: bytes) -> None:
-        """Take what comes in on the line now."""
+        """Process bytes that arrive on the line now."""
         self._advance()
         if "unplugged" in self.faults:
             return
@@ -95,7 +93,7 @@ class D46:
             self._work()
 
     def output(self) -> bytes:
-        """What is to be sent by now, and was not given out yet; to be asked for often."""
+        """Take the bytes that are to be sent by now; must be called often."""
         self._advance()
         now, due = self._now(), bytearray()
         while self._output and self._output[0][0] <= now:
@@ -103,11 +101,11 @@ class D46:
         return bytes(due)
 
     def connected(self) -> None:
-        """Tell that a client has connected by TCP; E-series units greet it."""
+        """Handle a new TCP client; E-series units greet it."""
         self._send(self._unit.profile.greeting)
 
     def power_on(self, calibrate: bool = True) -> None:
-        """Interrupt the power: banner, then a star when ready; with or without the reset that power-up does."""
+        """Interrupt the power: banner, then with ``calibrate`` the power-up reset, then a star."""
         self._input.clear()
         self._command.clear()
         self._output.clear()
@@ -126,7 +124,7 @@ class D46:
         return ""
 
     def _advance(self) -> None:
-        """Do what is due by now: faults, stops met, tasks, and the characters that waited for them."""
+        """Do what is due by now: faults, stops hit, tasks, and characters that waited for a task."""
         if self.faults.take("power-cycle"):
             self.power_on(calibrate=False)
         for axis in self._unit.axes:
@@ -140,7 +138,7 @@ class D46:
         self._work()
 
     def _hit(self) -> None:
-        """Let the axes that turn run into something."""
+        """Let the axes that turn hit an obstacle."""
         for axis in self._unit.axes:
             if axis.speed != 0 and self.faults.take("limit-hit"):
                 axis.lose_steps(1 if axis.speed > 0 else -1)
@@ -148,7 +146,7 @@ class D46:
                 self._send(f"!{axis.letter}")
 
     def _run_task(self) -> None:
-        """Go on with what keeps the unit busy; its end is the reply."""
+        """Continue the command that takes time; its end is the reply."""
         while self._task is not None:
             try:
                 printed = next(self._task)
@@ -161,12 +159,12 @@ class D46:
                 self._send(printed)
 
     def _work(self) -> None:
-        """Take the characters that wait, unless busy."""
+        """Process the characters in the buffer, unless the unit is busy."""
         while self._input and self._task is None:
             self._character(self._input.popleft())
 
     def _character(self, character: int) -> None:
-        """Take one character: echo it, and at a delimiter carry out what stands before it."""
+        """Process one character: echo it, and at a delimiter carry out the command before it."""
         unit, previous = self._unit, self._previous
         self._previous = character
         if unit.routed and character != AT:
@@ -188,7 +186,7 @@ class D46:
             self._carry_out(text, character)
 
     def _carry_out(self, text: str, delimiter: int) -> None:
-        """Answer one command, now or by a task."""
+        """Carry out one command; reply now or by a task."""
         if delimiter == CR and self._unit.profile.leading_lf:
             self._send("\n")
         try:
@@ -206,13 +204,13 @@ class D46:
             self._run_task()
 
     def _reply(self, mark: str, text: str) -> None:
-        """End a command by its reply."""
+        """Send the reply that ends a command."""
         line = f"{mark} {text}" if text else mark
         line += NEWLINE
         self._send(line[: len(line) // 2] if "half-replies" in self.faults else line)
 
     def _send(self, text: str) -> None:
-        """Let characters out, as far as the faults let them."""
+        """Queue text to send, as the faults allow."""
         if not text or "silence" in self.faults or "unplugged" in self.faults:
             return
         data = text.encode("latin-1")
@@ -224,7 +222,7 @@ class D46:
         self._output.append((when, data))
 
 
-# --- d46_twins ---
+# Two firmwares in front of the same axes
 
 ONCE = ("power-cycle", "limit-hit")
 
@@ -232,20 +230,20 @@ ONCE = ("power-cycle", "limit-hit")
 def make_twins(
     pan: AxisPlant, tilt: AxisPlant, unit: UnitProfile, faults: Faults, now: Callable[[], float]
 ) -> tuple[D46, D46]:
-    """Make both firmwares; the arguments are a `D46`'s."""
+    """Make two firmwares for the two lines of one unit; the arguments are those of `D46`."""
     last = _Last()
     first, second = (_Twin(pan, tilt, unit, _TwinFaults(faults, number, last), now) for number in range(2))
     return first, second
 
 
 class _Last:
-    """Which of the two was spoken to last; None before anybody has spoken."""
+    """Number of the firmware that received bytes last; None before the first bytes."""
 
     number: int | None = None
 
 
 class _TwinFaults(Faults):
-    """The faults as one of the two has them."""
+    """The unit's faults as one of the two firmwares has them."""
 
     def __init__(self, both: Faults, number: int, last: _Last) -> None:
         super().__init__(both.known)
@@ -271,7 +269,7 @@ class _TwinFaults(Faults):
 
 
 class _Twin(D46):
-    """One of the two."""
+    """One of the two firmwares; records that it received bytes."""
 
     def __init__(
         self, pan: AxisPlant, tilt: AxisPlant, unit: UnitProfile, faults: _TwinFaults, now: Callable[[], float]
