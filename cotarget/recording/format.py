@@ -1,16 +1,14 @@
-"""The folder of a recorded run: who wrote what, and one line for every answer that the rig gave.
+"""The folder of a recorded run: format, writing and reading of events.
 
-    recording.json         schema, versions, when, target, whom, config; written last of what comes before
-    calibration.json       the very bytes that the run was started with
-    template.*             the target's picture, where it is found by one
-    log.jsonl              one JSON object a line, appended and flushed: what the rig is, then calls with their
-                           arguments, results and times
-    fixed/ and zoom/       the frames as PNG, by number; a line that names one is written after the image is complete
+    recording.json         schema, versions, when, target, whom, config; written after the next two, before the log
+    calibration.json       byte-for-byte copy of the run's calibration
+    template.*             image of a target that is detected by a template
+    log.jsonl              one JSON object a line, appended and flushed: the facts of the rig, then each call with its
+        arguments, result and time
+    fixed/ and zoom/       frames as PNG, numbered; the line that names an image is written after the image is complete
 
-So whatever moment the program dies at, the log up to there is whole but for its last line, and every image that it
-names is on disk. The last line of a run that was ended, and did not just stop, is an `end`.
-
-Opens the folder of a recorded run and reads as much of it as is whole.
+If the program dies at any moment, the log is whole except for its last line, and every image that it names is on disk.
+The last line of a run that ended in order, or by an error, is an `end`. `open_recording` reads as much as is whole.
 """
 
 import dataclasses
@@ -30,9 +28,9 @@ from cotarget.rig import PanTiltLimits, Speed
 SCHEMA = 1
 META, LOG, CALIBRATION, TEMPLATE = "recording.json", "log.jsonl", "calibration.json", "template"
 FIXED, ZOOM = "fixed", "zoom"  # the frames' folders
-COMPLETE = "complete"  # what the `end` says of a run that nothing interrupted
+COMPLETE = "complete"  # value of `end` for a run that nothing interrupted
 Number = float | bool | None
-# The calls on a rig: how many arguments and how many numbers of a result each has. A frame's result is its time.
+# Calls on a rig: valid numbers of arguments, and number of values in the result. A frame's result is its time.
 CALLS: Mapping[str, tuple[tuple[int, ...], int]] = {
     "fixed.read": ((2,), 1),  # newer_than, timeout -> t
     "zoom.read": ((2,), 1),
@@ -52,16 +50,16 @@ FRAMES = frozenset({"fixed.read", "zoom.read", "zoom.capture"})
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One call on the rig and what came of it.
+    """One call on the rig, with its result or error.
 
     Attributes:
-        call: which, one of `CALLS`.
-        at: the rig's clock when it returned [s].
-        args: as they were given.
-        result: numbers of the answer; none where it failed.
-        image: file of a frame's image; None where it could not be kept.
-        size_bytes: of that file.
-        error: the exception's name and message, where it failed.
+        call: name of the call, one of `CALLS`.
+        at: time of its return on the rig's clock [s].
+        args: the arguments.
+        result: values of the result; empty if the call failed.
+        image: file of a frame's image; None if the image was not stored.
+        size_bytes: size of that file [bytes].
+        error: the exception's name and message if the call failed.
         aside: whether another thread than the run's own called, such as a watchdog.
     """
 
@@ -77,15 +75,15 @@ class Event:
 
 @dataclass(frozen=True)
 class RigFacts:
-    """What a rig says of itself once and for all.
+    """Constant properties of a rig.
 
     Attributes:
         fixed_size: (width, height) of the fixed camera's frames [px].
-        zoom_size: the same of the zoom camera's.
-        still_size: the same of its stills.
+        zoom_size: (width, height) of the zoom camera's frames [px].
+        still_size: (width, height) of the zoom camera's stills [px].
         focal_range: shortest and longest nominal focal length [px].
-        limits: what the head can do.
-        real_time: whether its time passes by itself, which the safety layer wants to know.
+        limits: of the head.
+        real_time: whether time passes without calls; the safety layer needs to know.
     """
 
     fixed_size: tuple[int, int]
@@ -97,12 +95,12 @@ class RigFacts:
 
 
 def move_args(pan: float, tilt: float, speed: Speed | None, wait: bool) -> tuple[Number, ...]:
-    """The arguments of `head.move` as an event has them."""
+    """Flatten the arguments of `head.move` as an event has them."""
     return (pan, tilt, *(speed if isinstance(speed, tuple) else (speed,)), wait)
 
 
 def event_line(event: Event) -> str:
-    """Write an event as a line of the log, without its end; floats keep every bit."""
+    """Write an event as a line of the log, without newline; floats keep every bit."""
     row: dict[str, Any] = {"call": event.call, "at": event.at}
     if event.args:
         row["args"] = [_plain(value) for value in event.args]
@@ -118,10 +116,10 @@ def event_line(event: Event) -> str:
 
 
 def parse_event(row: Mapping[str, Any]) -> Event:
-    """Read an event.
+    """Parse an event of the log.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the row is no valid event.
     """
     call = row.get("call")
     if not isinstance(call, str) or call not in CALLS:
@@ -146,7 +144,7 @@ def parse_event(row: Mapping[str, Any]) -> Event:
 
 
 def facts_table(facts: RigFacts) -> dict[str, Any]:
-    """Write what a rig says of itself."""
+    """Write the facts of a rig as a JSON object."""
     limits = facts.limits
     return {
         "fixed_size": list(facts.fixed_size),
@@ -163,11 +161,11 @@ def facts_table(facts: RigFacts) -> dict[str, Any]:
 
 
 def parse_facts(table: Mapping[str, Any]) -> RigFacts:
-    """Read what a rig said of itself.
+    """Parse the facts of a rig.
 
     Raises:
-        KeyError: something is missing.
-        TypeError, ValueError: something is of another kind.
+        KeyError: a key is missing.
+        TypeError, ValueError: a value has the wrong type.
     """
 
     def pair(key: str) -> tuple[float, float]:
@@ -196,7 +194,7 @@ def read_json(path: Path) -> Mapping[str, Any]:
     """Read recording.json and check its schema.
 
     Raises:
-        ConfigError: it is missing, is none, or is another version's.
+        ConfigError: the file is missing, is not valid, or has another schema.
     """
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
@@ -222,7 +220,7 @@ def read_json(path: Path) -> Mapping[str, Any]:
 
 
 def _plain(value: Number) -> Any:
-    """A number as JSON can say it: infinity, which unlimited heads have, becomes a text that `float` reads."""
+    """Convert a number for JSON: infinity, which unlimited heads have, becomes a text that `float` reads."""
     if value is None or isinstance(value, bool):
         return value
     return float(value) if math.isfinite(value) else str(float(value))
@@ -237,11 +235,11 @@ def _number(value: Any) -> Number:
 
 
 def _is_inside(name: str) -> bool:
-    """Whether a file's name stays inside the recording's folder."""
+    """Return whether a file's name stays inside the recording's folder."""
     return not Path(name).is_absolute() and ".." not in Path(name).parts
 
 
-# --- recordreader ---
+# Reading
 
 
 @dataclass(frozen=True)
@@ -249,16 +247,16 @@ class Recording:
     """A recorded run.
 
     Attributes:
-        directory: its folder.
-        config: of the rig that was recorded; its backend is that rig's.
-        calibration: the run's calibration.json.
+        directory: folder of the recording.
+        config: of the recorded rig, with that rig's backend.
+        calibration: path of the run's calibration.json.
         target: name of the target that was followed.
-        target_choice: which one, where there were several; nothing is said where an older version recorded it.
-        facts: what the rig said of itself.
+        target_choice: which of several targets; the default in recordings of older versions.
+        facts: constant properties of the rig.
         events: every call on the rig, in order.
-        ending: "complete"; or the error that ended the run; or, where it just stops, what it stops with.
-        truncated: whether it just stops; then the last step, which may be half a one, is left out.
-        notes: one line each for what a user should know.
+        ending: "complete", the error that ended the run, or where a truncated log breaks off.
+        truncated: whether the log has no end; then the last step, which may be incomplete, is left out.
+        notes: one line each for the user.
     """
 
     directory: Path
@@ -274,26 +272,26 @@ class Recording:
 
     @property
     def steps(self) -> int:
-        """How many frames of the fixed camera the run looked at."""
+        """Number of the fixed camera's frames in the run."""
         return sum(event.call == "fixed.read" and event.image is not None for event in self.events)
 
     @property
     def pictures(self) -> dict[float, int]:
-        """The numbers of the fixed camera's pictures, from 0, by when they were exposed [s]."""
+        """Numbers of the fixed camera's images, from 0, by their exposure time [s]."""
         frames = [event for event in self.events if event.call == "fixed.read"]
         return {float(e.result[0] or 0.0): int(Path(e.image).stem) for e in frames if e.image is not None}
 
     @property
     def seconds(self) -> float:
-        """From the first call to the last, on the rig's clock [s]."""
+        """Time from the first call to the last, on the rig's clock [s]."""
         return self.events[-1].at - self.events[0].at if self.events else 0.0
 
 
 def open_recording(directory: Path) -> Recording:
-    """Read a recording, up to where it is whole; its images are looked for, but not read.
+    """Read a recording up to where it is whole; images must exist, but are not read.
 
     Raises:
-        ConfigError: it is none, is another version's, or holds nothing that can be replayed.
+        ConfigError: the folder is no recording, has another schema, or holds nothing that can be replayed.
     """
     if not directory.exists():
         raise ConfigError(f"{directory}: no such folder; give the folder of a recording")
@@ -342,11 +340,11 @@ def open_recording(directory: Path) -> Recording:
 
 
 class _DamageError(Exception):
-    """Where a log stops being whole."""
+    """The log is not whole from here on."""
 
 
 def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, TargetChoice, RigConfig]:
-    """The target's name, which one, and the configuration, whose picture of the target lies in the recording."""
+    """Parse target name, target choice and configuration; the target's template is the recording's copy."""
     path = directory / META
     name, table = meta["target"], meta["config"]
     try:
@@ -369,7 +367,7 @@ def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, TargetCh
 
 
 def _rows(path: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:
-    """The log's lines as objects, with their numbers from 1."""
+    """Yield the log's lines as objects, with their numbers from 1."""
     try:
         file = path.open("rb")
     except FileNotFoundError:
@@ -408,7 +406,7 @@ def _words(error: Exception) -> str:
 
 
 def _whole(directory: Path, event: Event) -> Event:
-    """An event whose image is on disk; a frame of the zoom camera can do without."""
+    """Check that an event's image is on disk; a frame of the zoom camera may lack it."""
     if event.image is None:
         if event.call == "fixed.read" and event.error is None:
             raise _DamageError("a frame of the fixed camera has no image")
@@ -429,6 +427,6 @@ def _imageless(event: Event) -> bool:
 
 
 def _without_last_step(events: list[Event]) -> list[Event]:
-    """What comes before the last frame of the fixed camera."""
+    """Return the events before the last frame of the fixed camera."""
     looks = [i for i, event in enumerate(events) if event.call == "fixed.read" and not event.aside]
     return events[: looks[-1]] if looks else []

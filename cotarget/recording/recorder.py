@@ -1,8 +1,8 @@
-"""Writes what a run did: a table of its Steps, and a recording of all that its rig saw and was told.
+"""Record a run: a table of its Steps, and every call on its rig with the result.
 
-A rig that notes every call on it and every answer, in order; it changes neither.
-
-Writes the log and the images of a recording on a thread of its own, so that the run is not held up.
+`StepTable` writes the CSV. `Recorder` makes the folder of a recording and wraps the rig in a `RecordingRig`, which logs
+calls and results in order and changes neither. `RecordWriter` writes log and images on a thread of its own, so that the
+run does not wait for the disk.
 """
 
 import collections
@@ -62,20 +62,22 @@ from cotarget.rig import (
 )
 
 log = logging.getLogger(__name__)
-# Images that may wait for the disk [bytes]; 640x480 takes 0.92 MB. Frames of the zoom camera, from which nothing is
-# decided, go without their image when there is no more room; the fixed camera's never do: the run waits instead.
+# The log and its images
+
+# Images that may wait for the disk [bytes]; one of 640x480 takes 0.92 MB. Beyond this, frames of the zoom camera are
+# logged without their image. The fixed camera's images are always kept: a replay needs them, so the run waits.
 ZOOM_ROOM = 64_000_000
 ROOM = 128_000_000
-# Without search for repetitions, which noise has none of, and with the one filter that pays: a noisy 640x480 image
-# takes 6 ms and 375 kB where zlib's level 1 with every filter takes 13 ms and 370 kB, and raw 922 kB.
+# Huffman coding alone, because noise has no repetitions, and the one useful filter: a noisy 640x480 image takes 6 ms
+# and 375 kB. Measurements: docs/design-notes.md.
 PNG_OPTIONS = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
-if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # older versions of OpenCV use that filter anyway
+if hasattr(cv2, "IMWRITE_PNG_FILTER"):  # older versions of OpenCV always use that filter
     PNG_OPTIONS += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
 
 
 @dataclass(eq=False)
 class _Picture:
-    """An image on its way to the disk; ``image`` is None once it is there, or if it will never be."""
+    """An image on its way to the disk; ``image`` is None once it is written, or if it is dropped."""
 
     name: str
     image: Image | None
@@ -84,25 +86,25 @@ class _Picture:
 
 
 class RecordWriter:
-    """Takes events in order and writes them in that order, each image before the line that names it.
+    """Write events in order, each image before the line that names it.
 
     Attributes:
-        dropped: images of the zoom camera that were not kept, because the disk was too slow.
-        failure: why nothing is written any more; empty as long as all is well.
+        dropped: number of the zoom camera's images that were dropped because the disk was too slow.
+        failure: why writing has ended; empty while it works.
     """
 
     def __init__(self, directory: Path) -> None:
         """Begin the log in a folder.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the folder cannot be written.
         """
         self.dropped = 0
         self.failure = ""
         self._directory = directory
         for name in (FIXED, ZOOM):
             (directory / name).mkdir()
-        self._log = (directory / LOG).open("xb", buffering=0)  # a line is with the system as soon as it is written
+        self._log = (directory / LOG).open("xb", buffering=0)  # unbuffered: a written line survives the program's death
         self._queue: collections.deque[tuple[Event | dict[str, Any], _Picture | None]] = collections.deque()
         self._changed = threading.Condition()
         self._waiting = 0
@@ -113,29 +115,29 @@ class RecordWriter:
         self._thread.start()
 
     def put(self, event: Event | dict[str, Any], camera: str = "", image: Image | None = None) -> None:
-        """Take an event, or another object for a line; with an image, that of a frame exposed at its result.
+        """Queue a line of the log: an event or another object; an image is that of the event's frame.
 
         Args:
-            event: what to log.
-            camera: the image's folder.
-            image: (H, W, 3) BGR, which nobody may change any more.
+            event: the line.
+            camera: folder of the image.
+            image: (H, W, 3) BGR; it must not change any more.
         """
         with self._changed:
             picture = None
             if image is not None and not self.failure:
                 assert isinstance(event, Event)
                 picture = self._picture(camera, image, float(event.result[0] or 0.0))
-            if not self.failure:  # which may have come about while there was no room
+            if not self.failure:  # checked again: it may have failed during the wait for room
                 self._queue.append((event, picture))
                 self._changed.notify_all()
 
     @property
     def waiting(self) -> int:
-        """How many events are still on their way to the disk."""
+        """Number of events that are not on disk yet."""
         return len(self._queue)
 
     def close(self) -> None:
-        """Write what still waits, and end."""
+        """Write the events in the queue, then end the thread."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -143,7 +145,7 @@ class RecordWriter:
         self._log.close()
 
     def _picture(self, camera: str, image: Image, t: float) -> _Picture:
-        """The image's place on disk: that of the last one, if it is the same frame again."""
+        """Make the image's file name, or return that of the last image if the frame is the same."""
         if camera in self._last:
             last_t, last_image, last = self._last[camera]
             if last_t == t and (last_image is image or np.array_equal(last_image, image)):
@@ -170,13 +172,13 @@ class RecordWriter:
                         return
                     event, picture = self._queue[0]
                 self._write(event, picture)
-                self._queue.popleft()  # only now, so that the queue holds whatever is not written yet
+                self._queue.popleft()  # only now, so that the queue holds all that is not written yet
         except (OSError, cv2.error) as error:
             reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error).strip()
             log.warning("the recording ends here; it cannot be written: %s", reason)
             self._fail(reason)
         except BaseException as error:
-            self._fail(f"{type(error).__name__}: {error}")  # nobody may wait for a thread that is gone
+            self._fail(f"{type(error).__name__}: {error}")  # releases a caller that waits for this thread
             raise
 
     def _fail(self, reason: str) -> None:
@@ -200,7 +202,7 @@ class RecordWriter:
         self._log.write(text.encode() + b"\n")
 
     def _write_image(self, name: str, image: Image) -> int:
-        """Write an image under its name only when it is complete; its size on disk [bytes]."""
+        """Write an image, which appears under its name when complete; return its size on disk [bytes]."""
         data = cv2.imencode(".png", image, PNG_OPTIONS)[1].tobytes()
         path = self._directory / name
         part = path.with_suffix(".part")
@@ -209,13 +211,13 @@ class RecordWriter:
         return len(data)
 
 
-# --- recordingrig ---
+# The recorded rig
 
 T = TypeVar("T")
 
 
 class _Notebook:
-    """Where all of a rig's devices note their calls; the thread that opens it is the run's own."""
+    """Log of the calls on all devices of a rig; the thread that makes it is the run's own."""
 
     def __init__(self, clock: Clock, writer: RecordWriter) -> None:
         self._clock, self._writer, self._thread = clock, writer, threading.get_ident()
@@ -223,11 +225,11 @@ class _Notebook:
     def ask(
         self, call: str, args: tuple[Number, ...], answer: Callable[[], T], numbers: Callable[[T], tuple[Number, ...]]
     ) -> T:
-        """Call and note what came of it."""
+        """Call a device, and log the result or the error."""
         return self._ask(call, args, answer, lambda given: (numbers(given), "", None))
 
     def look(self, call: str, camera: str, args: tuple[Number, ...], answer: Callable[[], Frame]) -> Frame:
-        """Ask for a frame and note it with its image."""
+        """Read a frame, and log it with its image."""
         return self._ask(call, args, answer, lambda frame: ((frame.t,), camera, frame))
 
     def _ask(
@@ -238,7 +240,7 @@ class _Notebook:
         parts: Callable[[T], tuple[tuple[Number, ...], str, Frame | None]],
     ) -> T:
         aside = threading.get_ident() != self._thread
-        if aside and call == "clock.now":  # a watchdog asks for it all the time
+        if aside and call == "clock.now":  # a watchdog reads the clock all the time
             return answer()
         try:
             given = answer()
@@ -345,9 +347,9 @@ def _numbers(T: RigidTransform) -> tuple[float, ...]:
 
 
 class RecordingRig:
-    """Any rig, with everything noted that is asked of its devices and what they answer.
+    """A rig that logs every call on its devices and their results.
 
-    It belongs below the safety layer, next to the devices, so that what is noted is what they really did.
+    It belongs below the safety layer, next to the devices, so that the log holds the commands that they received.
     """
 
     def __init__(self, rig: Rig, writer: RecordWriter) -> None:
@@ -375,7 +377,7 @@ class RecordingRig:
         self._rig.close()
 
     def __enter__(self) -> "RecordingRig":
-        """Give the rig itself."""
+        """Return the rig itself."""
         return self
 
     def __exit__(
@@ -385,6 +387,8 @@ class RecordingRig:
         self.close()
 
 
+# Steps and the recording's folder
+
 COLUMNS = (
     "index", "t_s", "t_fixed_s", "t_zoom_s", "state", "reason", "track", "u_px", "v_px", "width_px", "height_px",
     "depth_m", "range_m", "pan_commanded_deg", "tilt_commanded_deg", "focal_commanded_px", "pan_deg", "tilt_deg",
@@ -393,14 +397,14 @@ COLUMNS = (
 
 
 class StepTable:
-    """A table of Steps, one line each; appears under its name only when complete. A context manager."""
+    """CSV table of Steps, one line each, which appears under its name when complete; a context manager."""
 
     def __init__(self, path: Path | None, *, keep: bool = False) -> None:
-        """Prepare to write to ``path``, or nowhere.
+        """Prepare to write to ``path``, or nowhere if it is None.
 
         Args:
-            path: the file.
-            keep: whether the Steps so far are kept where the block ends in an error.
+            path: of the file.
+            keep: whether to keep the lines so far if the block ends in an error.
 
         Raises:
             ConfigError: the file cannot be written.
@@ -408,7 +412,7 @@ class StepTable:
         self._file = None if path is None else CsvFile(path, COLUMNS, keep=keep)
 
     def write(self, step: Step) -> None:
-        """Append a line.
+        """Append a Step.
 
         Raises:
             ConfigError: the disk is full.
@@ -426,13 +430,13 @@ class StepTable:
         self._file.write(cell + 0.0 if isinstance(cell, float) else cell for cell in row)  # no -0.0
 
     def __enter__(self) -> "StepTable":
-        """Give the table itself."""
+        """Return the table itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Complete the file and give it its name; after an error, remove it or keep what there is.
+        """Complete the file and give it its name; after an error remove it, or keep its lines.
 
         Raises:
             ConfigError: the file could not be completed, as on a full disk.
@@ -442,13 +446,12 @@ class StepTable:
 
 
 class Recorder:
-    """Records a run into a folder, so that `cotarget.recording.replay` can open it as a rig. A context manager.
+    """Record a run into a folder that `cotarget.recording.replay` can open as a rig; a context manager.
 
-    Wrap the rig below the safety layer and close it before the recorder:
+    Wrap the rig below the safety layer, and close it before the recorder:
 
-        with Recorder(folder, config, calibration, target) as recorder:
-            with SafeRig(recorder.wrap(open_devices(config)), config.safety) as rig:
-                ...
+        with Recorder(folder, config, calibration, target) as recorder: with
+            SafeRig(recorder.wrap(open_devices(config)), config.safety) as rig: ...
     """
 
     def __init__(
@@ -459,17 +462,17 @@ class Recorder:
         target: str,
         target_choice: TargetChoice = ANY_TARGET,
     ) -> None:
-        """Make the folder and write down what the run begins with.
+        """Make the folder, and store configuration, calibration and target.
 
         Args:
-            directory: the recording's; it must not exist yet, or be empty.
-            config: of the rig; passwords in it are not recorded.
-            calibration: calibration.json, of which the recording gets a copy.
+            directory: folder of the recording; it must not exist yet, or be empty.
+            config: of the rig; its passwords are not recorded.
+            calibration: path of calibration.json, which is copied.
             target: name of the target that will be followed.
-            target_choice: which one, where there are several.
+            target_choice: which of several targets to follow.
 
         Raises:
-            ConfigError: the folder is not empty, something cannot be read or written, or there is no such target.
+            ConfigError: the folder is not empty, a file cannot be read or written, or there is no such target.
         """
         self._directory = directory
         self._wrapped = False
@@ -491,31 +494,31 @@ class Recorder:
 
     @property
     def dropped(self) -> int:
-        """Images of the zoom camera that were left out so far, because the disk was too slow."""
+        """Number of the zoom camera's images dropped so far, because the disk was too slow."""
         return self._writer.dropped
 
     @property
     def waiting(self) -> int:
-        """Answers of the rig that are still on their way to the disk; a crash would lose these and no others."""
+        """Number of calls that are not on disk yet; a crash loses only these."""
         return self._writer.waiting
 
     def wrap(self, rig: Rig) -> Rig:
-        """Give a rig that records; one a recording. The rig is closed with it, and at once if this fails."""
+        """Wrap the one rig of this recording; closing it closes the rig, as does a failure here."""
         assert not self._wrapped, "a recording is of one rig"
         self._wrapped = True
         return RecordingRig(rig, self._writer)
 
     def __enter__(self) -> "Recorder":
-        """Give the recorder itself."""
+        """Return the recorder itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Write what still waits and how the run ended; remove a recording of a rig that was never opened.
+        """Write the rest of the queue and how the run ended; remove the recording if no rig was wrapped.
 
         Raises:
-            CotargetError: the recording is not complete, as on a full disk.
+            CotargetError: the recording is incomplete, as on a full disk.
         """
         ending = COMPLETE if kind is None else f"{kind.__name__}: {error}".removesuffix(": ")
         self._writer.put({"end": ending, "dropped": self._writer.dropped})
@@ -531,7 +534,7 @@ class Recorder:
             copy = TEMPLATE + chosen.template.suffix
             (self._directory / copy).write_bytes(chosen.template.read_bytes())
             chosen = dataclasses.replace(chosen, template=Path(copy))
-        # By hand: where the disk is full shutil's copy blames the file that it reads.
+        # Not shutil.copy: on a full disk its error names the file that it reads.
         (self._directory / CALIBRATION).write_bytes(calibration.read_bytes())
         table = {
             "schema": SCHEMA,
@@ -550,7 +553,7 @@ class Recorder:
         part.replace(self._directory / META)
 
     def _remove(self) -> None:
-        """Take away what was made: nothing in it can be replayed, and it would be in the way of the next try."""
+        """Remove all files of this recording: they cannot be replayed, and would block the next attempt."""
         for folder in (FIXED, ZOOM):
             with contextlib.suppress(OSError):
                 (self._directory / folder).rmdir()

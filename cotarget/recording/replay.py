@@ -1,12 +1,10 @@
-"""Opens a recording as a rig: the same cameras, lens, head and clock again, without the devices.
+"""Replay a recording as a rig: the same cameras, lens, head and clock, without the devices.
 
-What is commanded moves nothing: it is compared with what was commanded then, and the head goes where it went.
+A run that makes the recorded calls in the recorded order gets exactly the recorded results, and so behaves the same to
+the last bit. A run that differs still gets the fixed camera's frames in order; every other call is matched with the
+recorded calls between the same two frames, and a call without a match is answered by the time on the recording's clock.
 
-What was recorded, dealt out again: call by call as long as the run asks the same, by time where it does not.
-
-A run that is what it was when it was recorded asks the same calls in the same order and gets the very same answers, so
-it does the same to the last bit. Where it has changed, the frames of the fixed camera still come one after the other,
-each with what was asked between it and the next; whatever else is asked gets what was so at that time.
+Commands move nothing: they are compared with the recorded ones (`Differences`), and the head moves as recorded.
 """
 
 import math
@@ -44,26 +42,26 @@ COMMANDS = ("head.move", "zoom.zoom", "head.halt")
 
 
 class RecordingEndedError(CotargetError):
-    """The recording holds nothing beyond this; every replay ends with it."""
+    """The recording ends here; every replay ends with this error."""
 
 
 @dataclass(frozen=True)
 class Differences:
-    """How a replay's commands differ from those that were recorded.
+    """Comparison of a replay's commands with the recorded ones.
 
     Attributes:
-        moves: of the head, that were compared.
-        moves_differing: of them.
-        largest_deg: difference of pan or tilt between them [degrees].
-        zooms: of the lens, that were compared.
-        zooms_differing: of them.
-        largest_px: difference of focal length between them [px].
-        missing: commands that were given then and not now, between the same two frames.
-        extra: moves of head and lens that were given now and not then.
-        frames: of the fixed camera, up to the newest.
-        frames_differing: of them, after which another command was given, or one more, or one less.
-        first_frame: the picture's number of the first of those; None where there is none.
-        first_s: when it came, from the beginning of the recording [s].
+        moves: number of compared moves of the head.
+        moves_differing: number of them that differ.
+        largest_deg: largest difference of pan or tilt [degrees].
+        zooms: number of compared commands to the lens.
+        zooms_differing: number of them that differ.
+        largest_px: largest difference of focal length [px].
+        missing: recorded commands without a match between the same two frames.
+        extra: moves of head and lens without a recorded match.
+        frames: number of the fixed camera's frames, up to the newest.
+        frames_differing: number of them that are followed by another, a missing or an extra command.
+        first_frame: image number of the first such frame; None if there is none.
+        first_s: its time since the beginning of the recording [s].
     """
 
     moves: int = 0
@@ -81,11 +79,11 @@ class Differences:
 
     @property
     def same(self) -> bool:
-        """Whether the replay commanded exactly what was commanded then."""
+        """Whether the replay's commands are exactly the recorded ones."""
         return not (self.moves_differing or self.zooms_differing or self.missing or self.extra)
 
     def __str__(self) -> str:
-        """Say it in one line."""
+        """Describe the comparison in one line."""
         if self.same:
             return f"all {self.moves + self.zooms} commands as recorded"
         since = "" if self.first_frame is None else f", from frame {self.first_frame} ({self.first_s:.2f} s) on"
@@ -98,16 +96,16 @@ class Differences:
 
 
 class _Span:
-    """What was asked from one frame of the fixed camera to the next, each kind of call in its order.
+    """Recorded calls from one frame of the fixed camera to the next, in a queue for each kind of call.
 
-    A look at the clock was between two other calls; it is given again only there. So a run that looks more often or
-    less often than the recorded one has the right time again as soon as it asks for something else.
+    A reading of the clock keeps its place between two other calls and is replayed only there. A run that reads the
+    clock more or less often than the recorded one therefore has the right time again at its next other call.
     """
 
     def __init__(self) -> None:
         self._waiting: dict[str, deque[tuple[int, Event]]] = defaultdict(deque)
         self._size = 0
-        self._progress = 0  # behind the furthest of the other calls that was given again
+        self._progress = 0  # place after the furthest other call that was replayed
 
     def add(self, event: Event) -> None:
         """Append a call."""
@@ -115,7 +113,7 @@ class _Span:
         self._size += event.call != "clock.now"
 
     def take(self, call: str) -> Event | None:
-        """The next event of a call, if there is one and it is its turn."""
+        """Take the next event of a call; None if there is none, or a clock reading is not due yet."""
         waiting, looks = self._waiting[call], self._waiting["clock.now"]
         if not waiting or (call == "clock.now" and waiting[0][0] > self._progress):
             return None
@@ -127,27 +125,27 @@ class _Span:
         return event
 
     def left(self, call: str) -> int:
-        """How many events of a call were not taken."""
+        """Return how many events of a call were not taken."""
         return len(self._waiting[call])
 
     def forget(self, call: str) -> None:
-        """Take all events of a call."""
+        """Drop all events of a call."""
         self._waiting[call].clear()
 
 
 class Tape:
-    """A recording that runs.
+    """A recording during its replay.
 
     Attributes:
         now: the replay's clock [s].
-        differences: between the commands so far and those recorded; those recorded after the newest frame are not
-            missed yet.
+        differences: between the commands so far and the recorded ones; recorded commands after the newest frame do not
+            count as missing yet.
     """
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._spans, self._frames = _cut(recording.events)
-        self._differing: set[int] = set()  # places of those frames,
+        self._differing: set[int] = set()  # places of the frames whose commands differ,
         self._first: int | None = None  # and the first of them
         self._broke_off = not recording.truncated and recording.ending != COMPLETE
         self._index = 0
@@ -158,19 +156,19 @@ class Tape:
 
     @property
     def is_aside(self) -> bool:
-        """Whether another thread than the run's own asks, such as a watchdog; it has what is so at this time."""
+        """Whether another thread than the run's own calls, such as a watchdog; it is answered by time."""
         return threading.get_ident() != self._thread
 
     @property
     def _breaks_off(self) -> bool:
-        """Whether the run was ended by an error after the newest frame, so that nothing is known of what followed."""
+        """Whether an error ended the run after the newest frame, so that later calls are unknown."""
         return self._broke_off and self._index == len(self._spans) - 1
 
     def take(self, call: str) -> Event | None:
-        """The recorded event of a call that the run asked then too, between the same two frames; else None.
+        """Take the recorded event of a call between the same two frames; None if there is none.
 
         Raises:
-            RecordingEndedError: the run broke off before it.
+            RecordingEndedError: the run was ended by an error before such a call.
         """
         if self.is_aside:
             return None
@@ -181,7 +179,7 @@ class Tape:
         return event
 
     def play(self, event: Event) -> Event:
-        """Let the time of an event come, and its error.
+        """Advance the clock to an event, and raise its error if it has one.
 
         Raises:
             CotargetError: as recorded.
@@ -192,20 +190,20 @@ class Tape:
         return event
 
     def answer(self, call: str) -> Event | None:
-        """Take an event and play it, where there is one."""
+        """Take an event and play it; None if there is none."""
         event = self.take(call)
         return None if event is None else self.play(event)
 
     def next_frame(self, newer_than: float | None, timeout: float) -> Event:
-        """The next frame of the fixed camera; the newest at this time, where the replay has fallen behind.
+        """Return the next frame of the fixed camera; the newest at this time if the replay has fallen behind.
 
         Args:
             newer_than: exposed after this time [s].
             timeout: how long to wait [s].
 
         Raises:
-            RecordingEndedError: there are no more.
-            DeviceError: no such frame came within ``timeout``.
+            RecordingEndedError: there are no more frames.
+            StaleFrameError: no such frame came within ``timeout``.
             CotargetError: as recorded.
         """
         for index in range(self._index + 1, len(self._spans)):
@@ -226,7 +224,7 @@ class Tape:
         return self.play(frame)
 
     def compare(self, call: str, recorded: Event | None, args: Sequence[float | bool | None]) -> None:
-        """Count a command, and by how much it differs from the one recorded."""
+        """Count a command and its difference from the recorded one."""
         if self.is_aside:
             return
         counts = self.differences
@@ -257,11 +255,11 @@ class Tape:
             self._note(self._index)
 
     def pass_to(self, t: float) -> None:
-        """Let the clock show at least ``t`` [s]."""
+        """Advance the clock to ``t`` [s], unless it is later already."""
         self.now = max(self.now, t)
 
     def _miss(self, over: range) -> None:
-        """Count the commands of spans that are over; the last one's halts are not due before the rig is closed."""
+        """Count untaken commands of past spans as missing; halts of the last span come only when the rig closes."""
         for index in over:
             span = self._spans[index]
             due = COMMANDS[:-1] if span is self._spans[-1] else COMMANDS
@@ -273,7 +271,7 @@ class Tape:
                 self._note(index)
 
     def _note(self, index: int) -> None:
-        """Count the frame that a span begins with; what is asked before the first frame is counted to it."""
+        """Count the frame at the start of a span as differing; calls before the first frame count for the first."""
         place = max(index - 1, 0)
         self._differing.add(place)
         found = replace(self.differences, frames_differing=len(self._differing))
@@ -291,12 +289,15 @@ class Tape:
 
 
 def time_of(frame: Event) -> float:
-    """When a frame was exposed [s]."""
+    """Return the exposure time of a frame [s]."""
     return float(frame.result[0] or 0.0)
 
 
 def _cut(events: Sequence[Event]) -> tuple[list[_Span], list[Event]]:
-    """Spans from frame to frame, the first before any, and the frames; other threads' calls are left out."""
+    """Cut events into spans between frames; return spans and frames.
+
+    The first span comes before any frame. Calls of other threads are left out.
+    """
     spans, frames = [_Span()], []
     for event in events:
         if event.aside:
@@ -310,7 +311,7 @@ def _cut(events: Sequence[Event]) -> tuple[list[_Span], list[Event]]:
 
 
 def _recorded_error(name: str, message: str) -> CotargetError:
-    """The exception that was raised then; one that is not cotarget's own is a device's failure."""
+    """Make the recorded exception; one of another package becomes a DeviceError."""
     kind = getattr(cotarget.errors, name, None)
     if isinstance(kind, type) and issubclass(kind, CotargetError):
         return kind(message)
@@ -321,13 +322,13 @@ T = TypeVar("T")
 
 
 def until_end(steps: Iterable[T]) -> Iterator[T]:
-    """Pass on what a run on a `ReplayRig` yields, until the recording ends."""
+    """Yield the steps of a run on a `ReplayRig`, until the recording ends."""
     with suppress(RecordingEndedError):
         yield from steps
 
 
 class _Camera:
-    """What both cameras share: frames from files, the same object for the same frame."""
+    """Common part of both cameras: frames from files, with the same image object for the same file."""
 
     def __init__(self, tape: Tape, directory: Path, size: tuple[int, int]) -> None:
         self._tape, self._directory, self._size = tape, directory, size
@@ -405,7 +406,7 @@ class _ZoomCamera(_Camera):
         return ZoomState(float(then[0] or 0.0), bool(then[1]), float(then[2] or 0.0))
 
     def _by_time(self, newer_than: float | None, timeout: float) -> Event:
-        """The newest frame that had been read by now, or the first that was within ``timeout``."""
+        """Return the newest frame read by now, or the first one within ``timeout``."""
         fresh = [e for e in self._frames if newer_than is None or time_of(e) > newer_than]
         if before := [e for e in fresh if e.at <= self._tape.now]:
             return before[-1]
@@ -416,7 +417,7 @@ class _ZoomCamera(_Camera):
         raise StaleFrameError(f"no frame of the zoom camera within {timeout:g} s")
 
     def _stand_in(self, event: Event) -> str | None:
-        """The image of the last frame before that has one."""
+        """Return the image of the last earlier frame that has one."""
         before = [e.image for e in self._kept if e.at <= event.at]
         return before[-1] if before else None
 
@@ -478,21 +479,21 @@ class _Board:
     patience = 0.0
 
     def present(self, T_fixed_board: RigidTransform | None) -> None:
-        """Nothing to do: whatever was wished for is in the pictures."""
+        """Do nothing: the board is in the recorded images."""
 
     def swing(self, T_fixed_board: RigidTransform) -> None:
-        """Nothing to do."""
+        """Do nothing: the board is in the recorded images."""
 
 
 class _Track:
-    """States of a device over time: numbers, whether it moved, and the time, as they were recorded."""
+    """Recorded states of a device: numbers, whether it moved, and the time."""
 
     def __init__(self, events: Sequence[Event]) -> None:
         rows = np.array([[float(value or 0.0) for value in e.result] for e in events], dtype=float)
         self._rows = rows[np.argsort(rows[:, -1], kind="stable")] if len(rows) else rows
 
     def at(self, t: float, device: str) -> tuple[list[float], bool]:
-        """The numbers at a time [s], between two states on the straight line, and whether it moved."""
+        """Interpolate the numbers linearly at a time [s]; return them and whether the device moved."""
         if not len(self._rows):
             raise DeviceError(f"the recording holds no state of the {device}")
         times = self._rows[:, -1]
@@ -502,7 +503,7 @@ class _Track:
 
 
 class ReplayRig:
-    """A recording as a rig; wrap it as the recorded rig was wrapped. This module's docstring says what it answers."""
+    """A recording as a rig, see the module's docstring; wrap it in the layers that the recorded rig had."""
 
     def __init__(self, recording: Recording) -> None:
         self._tape = Tape(recording)
@@ -516,18 +517,18 @@ class ReplayRig:
 
     @property
     def differences(self) -> Differences:
-        """Between the commands so far and those recorded."""
+        """Comparison of the commands so far with the recorded ones."""
         return self._tape.differences
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing; there is nothing to release."""
 
     def __enter__(self) -> "ReplayRig":
-        """Give the rig itself."""
+        """Return the rig itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close."""
+        """Close the rig."""
         self.close()
