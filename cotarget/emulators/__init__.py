@@ -1,1 +1,1 @@
-"""The devices' wire protocols in front of the simulated rig; shares nothing with the drivers but bytes."""
+"""Emulators: the devices' wire protocols in front of the simulated rig; they share only bytes with the drivers."""
