@@ -182,7 +182,7 @@ class JpegDecoder:
         if count > units + 1:
             enough = self._decodes(jpeg)
         else:
-            # FFmpeg reads zeros beyond the end. If zeros are no valid unit, the check above says nothing.
+            # FFmpeg reads zeros beyond the end. Where these are no valid unit, whole data fail the first check too.
             enough = self._decodes(header + data + END_OF_IMAGE) or (
                 self._decodes(jpeg) and not self._decodes(header + data + ZEROS + END_OF_IMAGE)
             )
