@@ -43,7 +43,7 @@ SHARED = "shared.json"
 # Modules of the experiments on which no row depends: they choose what is done, record it and tell it.
 NO_ROWS = (
     "__main__",
-    "paper/gallery",
+    *("paper/gallery", "paper/teaser"),
     *("engine/arguments", "engine/bounds", "engine/cases", "engine/command", "engine/outcome", "engine/report"),
     *("engine/runner", "engine/sessions"),
 )

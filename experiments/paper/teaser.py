@@ -1,0 +1,93 @@
+"""Render the animated picture of the README: a bird in the fixed camera's image beside its close-up.
+
+python -m experiments.paper.teaser [--out docs/pictures/teaser.webp]
+"""
+
+import io
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+
+import cotarget as ct
+from cotarget.cli.main import Parser
+from cotarget.drawing import write_text
+from cotarget.errors import CotargetError
+from cotarget.files import write_whole
+from cotarget.rig import Image
+from experiments.engine.arguments import check_folder
+from experiments.paper.gallery import PICTURES
+
+PROGRAM = "python -m experiments.paper.teaser"
+TEASER = PICTURES / "teaser.webp"
+FROM_S, TO_S = 2.2, 8.6  # of the run: the bird comes in at 2.4 s and flies through the whole image
+WIDTH_PX = 400  # of each camera's image; a page of GitHub shows both beside each other
+BOX_MARGIN_PX, BOX_COLOR = 5, (0, 140, 255)
+ENCODER = {"quality": "60", "compression_level": "6"}  # of libwebp
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status."""
+    parser = Parser(prog=PROGRAM, description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=TEASER, metavar="FILE", help="the picture, a .webp")
+    out: Path = parser.parse_args(arguments).out
+    try:
+        check_folder(out.parent)
+        config = ct.RigConfig(sim=ct.SimConfig(scene="outdoor", targets=("bird",)))
+        write_whole(out, animated_webp(pictures(config), config.rate_hz))
+    except CotargetError as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return 1
+    print(f"{out}  {out.stat().st_size // 1024} kB")
+    return 0
+
+
+def pictures(config: ct.RigConfig) -> Iterator[Image]:
+    """Calibrate a rig, follow a bird, and give both cameras' images side by side."""
+    with ct.open_rig(config) as rig:
+        calibration = ct.calibrate(rig)
+    with ct.open_rig(config) as rig:  # from the start, while the bird is still outside
+        for step in ct.follow(rig, calibration, "bird", seconds=TO_S):
+            if step.index >= FROM_S * config.rate_hz:
+                yield side_by_side(step)
+
+
+def side_by_side(step: ct.Step) -> Image:
+    """Draw the detection's box into the fixed camera's image, and put the zoom camera's beside it."""
+    fixed, zoom = small(step.fixed.image), small(step.zoom.image)
+    if step.target is not None:
+        scale = WIDTH_PX / step.fixed.image.shape[1]
+        box = step.target.box
+        center, half = (box.center_px + 0.5) * scale - 0.5, box.size_px * scale / 2 + BOX_MARGIN_PX
+        corners = (np.round(corner).astype(int).tolist() for corner in (center - half, center + half))
+        cv2.rectangle(fixed, *corners, BOX_COLOR, 2)
+    write_text(fixed, "fixed camera", (10, 20), 0.5)
+    write_text(zoom, "zoom camera", (10, 20), 0.5)
+    return np.hstack([fixed, zoom])
+
+
+def small(image: Image) -> Image:
+    """Reduce an image to the width shown."""
+    size = (WIDTH_PX, round(image.shape[0] * WIDTH_PX / image.shape[1]))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def animated_webp(images: Iterable[Image], rate_hz: float) -> bytes:
+    """Encode images as an animated WebP that repeats for ever."""
+    data = io.BytesIO()
+    with av.open(data, "w", format="webp", options={"loop": "0"}) as file:
+        stream = file.add_stream("libwebp_anim", rate=Fraction(rate_hz), options=ENCODER)
+        stream.pix_fmt = "yuv420p"
+        for image in images:
+            stream.height, stream.width = image.shape[:2]
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+        file.mux(stream.encode(None))
+    return data.getvalue()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,65 @@
+"""The Python and shell blocks of README and tutorials run as they are written.
+
+The blocks of a page run in order, in one temporary folder and one Python namespace. In an HTML comment on the line
+before a block, `file: NAME` makes it a file that is there from the beginning, and `no-run: REASON` leaves it out.
+"""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs" / "tutorials").glob("*.md")), ROOT / "docs/targets-and-scenes.md")
+BLOCK = re.compile(r"^(?:<!-- ([^\n]*?) -->\n)?```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+RUN_ELSEWHERE = ("demo", "test")  # the marks of README's two commands, which the gate runs by themselves
+SECONDS = 240  # for one shell block
+
+
+def blocks_of(page):
+    """(mark, language, text) of each fenced block."""
+    return [(found[1] or "", found[2], found[3]) for found in BLOCK.finditer(page.read_text(encoding="utf-8"))]
+
+
+def run_shell(text, folder):
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    environment = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
+    # The checkout is where `python -m experiments` is run from.
+    command = ["bash", "-euo", "pipefail", "-c", text]
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=SECONDS, check=False
+    )
+    assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
+
+
+def test_there_are_blocks_to_run():
+    runnable = [block for page in PAGES for block in blocks_of(page) if block[1] in ("python", "sh") and not block[0]]
+    assert len(runnable) >= 8
+
+
+def test_every_block_left_out_has_a_reason():
+    marks = [mark for page in PAGES for mark, language, _ in blocks_of(page) if mark and language in ("python", "sh")]
+    assert all(mark in RUN_ELSEWHERE or re.fullmatch(r"(no-run|file): .+", mark) for mark in marks), marks
+
+
+@pytest.mark.docs
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_blocks_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    names = {"__name__": "__main__"}
+    blocks = blocks_of(page)
+    for mark, _, text in blocks:
+        if mark.startswith("file: "):
+            (tmp_path / mark.removeprefix("file: ")).write_text(text, encoding="utf-8")
+    for mark, language, text in blocks:
+        if mark:
+            continue
+        if language == "python":
+            exec(compile(text, f"{page.name}: a block of Python", "exec"), names)
+        elif language == "sh":
+            run_shell(text, tmp_path)
