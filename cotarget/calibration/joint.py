@@ -325,7 +325,7 @@ FEWEST_STOP_VIEWS, FEWEST_STOP_PLACEMENTS = 3, 2  # fewest views and placements 
 # Prior of the board's warp over its length: a board of one metre, glued to a sheet, is flat to some millimetres.
 WARP_SHARE = 0.004
 # k3 of the fixed camera is freed where it is this many standard deviations from 0, which chance does for one lens in
-# sixteen thousand; below that it is considered (`with_consider_covariance`). Until then its prior is as wide as K3_WIDE.
+# sixteen thousand; below that it is considered (`with_consider_covariance`). K3_WIDE is its prior's sigma until then.
 K3_SIGMAS, K3_WIDE = 4.0, 1.0
 # A lens that asks for k3 does not follow this model, and departs from it more where no board was seen. This factor on
 # the standard deviations covers rational and fisheye lenses whose nearest fit is 0.2 px off
