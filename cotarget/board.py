@@ -1,9 +1,8 @@
-"""What is printed on a calibration board: one pattern for paper, pictures, finders and the simulation.
+"""Pattern and geometry of the calibration board: chessboard or ChArUco.
 
-A chessboard's squares are black and white in turn, the first one, diagonally outside the first inner corner, black.
-A ChArUco board is the same chessboard with a marker in each white square, the numbers counting along the rows.
-
-A board to print, to scale.
+The corner finders, the printed board and the simulation use this one definition. The squares of a chessboard alternate,
+and the first one, diagonally outside the first inner corner, is black. A ChArUco board is the same chessboard with a
+marker in each white square, numbered along the rows.
 """
 
 import io
@@ -24,25 +23,27 @@ from cotarget.geometry import Array
 from cotarget.rig import Image
 
 METRES_PER_INCH = 0.0254
-MARGIN = 1.0  # white border, in squares; the corner finder needs about half of one
+MARGIN = 1.0  # width of the white border, in squares; the corner finder needs about half a square
 DOTS_PER_INCH = 300
 SUFFIXES = (".pdf", ".png", ".svg")
-# A page beyond this is a mistake of units, and a PNG of it would not fit into memory [m].
+# Largest side of a page [m]. A larger one is a mistake of units, and its PNG would not fit into memory.
 LARGEST = 5.0
 
 
 def print_board(path: Path, board: BoardConfig) -> tuple[float, float]:
-    """Write a board to scale, as PDF, SVG, or a PNG of 300 dots an inch that carries its size.
+    """Write a board to scale for printing, as PDF, SVG, or PNG with 300 dots per inch.
+
+    The PNG carries its resolution.
 
     Args:
-        path: where to; the suffix chooses the format.
-        board: its inner corners and the side of a square.
+        path: file to write; its suffix chooses the format.
+        board: the board's kind, inner corners and side of a square.
 
     Returns:
         Width and height of the page, white border included [m].
 
     Raises:
-        ConfigError: an unknown suffix, a board that `check_board` refuses, or one larger than 5 m.
+        ConfigError: the suffix is unknown, `check_board` refuses the board, or the page is larger than 5 m.
         CalibrationError: the file cannot be written.
     """
     if path.suffix.lower() not in SUFFIXES:
@@ -68,17 +69,17 @@ def print_board(path: Path, board: BoardConfig) -> tuple[float, float]:
         "print at 100 %"
     )
     ax.text(columns / 2, rows + MARGIN / 2, told, ha="center", va="center", fontsize=board.square * 300)
-    page = io.BytesIO()  # matplotlib ends a PDF that a full disk cuts short in errors of its own
+    page = io.BytesIO()  # on a full disk matplotlib fails to close a PDF with errors of its own
     figure.savefig(page, format=path.suffix.lower().removeprefix("."), dpi=DOTS_PER_INCH)
     write_atomically(path, page.getvalue())
     return width, height
 
 
 def check_board(board: BoardConfig) -> None:
-    """Refuse a board that looks the same upside down, or has more squares than there are markers.
+    """Refuse a board that looks the same upside down, or that needs more markers than the dictionary holds.
 
     Raises:
-        ConfigError: there are too few or too many corners; or, of a chessboard, both counts are even or both odd.
+        ConfigError: there are too few or too many corners, or a chessboard's counts are both even or both odd.
     """
     check_corners(board)
     if board.kind == "charuco":
@@ -86,34 +87,35 @@ def check_board(board: BoardConfig) -> None:
 
 
 def board_points(board: BoardConfig) -> Array:
-    """The inner corners in the board's frame [m], row by row, (columns * rows, 3)."""
+    """Compute the inner corners in the board's frame [m], row by row, (columns * rows, 3)."""
     columns, rows = board.corners
     v, u = np.mgrid[:rows, :columns]
     return np.stack([u, v, np.zeros_like(u)], axis=-1).reshape(-1, 3) * board.square
 
 
 def board_outline(board: BoardConfig, squares: float = 1.0) -> Array:
-    """The four outer corners of the board [m], (4, 3), ``squares`` squares outside the inner corners."""
+    """Compute the four corners of a rectangle ``squares`` squares outside the inner corners [m], (4, 3)."""
     columns, rows = board.corners
     low, right, bottom = -squares, columns - 1 + squares, rows - 1 + squares
     return np.array([[low, low, 0], [right, low, 0], [right, bottom, 0], [low, bottom, 0]]) * board.square
 
 
 def draw_board(board: BoardConfig, square_px: int, margin_px: int | None = None) -> Image:
-    """Draw the board to be printed or to be used as a texture.
+    """Draw the board as an image, for printing or as a texture.
 
     Args:
-        board: (columns + 1) x (rows + 1) squares are drawn.
+        board: a board of (columns + 1) x (rows + 1) squares.
         square_px: side of a square [px].
-        margin_px: white margin [px], which finders need; a square's side where it is not given.
+        margin_px: white margin [px], which corner finders need; None for the side of a square.
 
     Returns:
-        A BGR image, (H, W, 3), black or white.
+        A black and white BGR image, (H, W, 3).
     """
     check_board(board)
     dark = cells(board)
     width, height = (square_px * (n + 1) for n in board.corners)
-    # From the middle of each pixel, so that an edge is off by half a pixel at most where cells are not whole pixels.
+    # Sampled at the middle of each pixel: where a cell is not a whole number of pixels, edges are at most half a pixel
+    # off.
     rows, columns = (
         ((np.arange(size) + 0.5) * count / size).astype(int)
         for size, count in ((height, dark.shape[0]), (width, dark.shape[1]))
@@ -123,17 +125,17 @@ def draw_board(board: BoardConfig, square_px: int, margin_px: int | None = None)
     return np.repeat(picture[:, :, None], 3, axis=2)
 
 
-# Another dictionary than that of the targets' markers (4x4, 50), so that neither is ever taken for the other.
+# The targets' markers use another dictionary (4x4, 50), so that neither kind is mistaken for the other.
 DICTIONARY = cv2.aruco.DICT_5X5_250
-MARKER_CELLS = 7  # of a side: five of code, and a black one to each side
-MARKER_SHARE = 0.7  # of a square's side; the rest is white around it
-CELLS_PER_SQUARE = 20  # so that both the markers' cells and the white around them are whole: 2 and 3
+MARKER_CELLS = 7  # cells along a marker's side: five of code, and a black one at each end
+MARKER_SHARE = 0.7  # side of a marker over the side of a square; the rest is white
+CELLS_PER_SQUARE = 20  # with 20, a marker's cell is 2 and the white around the marker 3 cells wide
 Cells = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Tile:
-    """A rectangle of one colour, from (x0, y0) to (x1, y1), in squares from the board's first outer corner."""
+    """Rectangle of one colour from (x0, y0) to (x1, y1), in squares from the board's first outer corner."""
 
     x0: float
     y0: float
@@ -143,15 +145,15 @@ class Tile:
 
 
 def marker_dictionary() -> "cv2.aruco.Dictionary":
-    """The markers of a ChArUco board."""
+    """Return the ArUco dictionary of the ChArUco board's markers."""
     return cv2.aruco.getPredefinedDictionary(DICTIONARY)
 
 
 def check_markers(board: BoardConfig) -> None:
-    """Refuse a ChArUco board of more squares than there are markers.
+    """Refuse a ChArUco board that needs more markers than the dictionary holds.
 
     Raises:
-        ConfigError: it has too many.
+        ConfigError: the board has too many squares.
     """
     (columns, rows), most = board.corners, len(marker_dictionary().bytesList)
     if (columns + 1) * (rows + 1) // 2 > most:
@@ -159,10 +161,12 @@ def check_markers(board: BoardConfig) -> None:
 
 
 def cells(board: BoardConfig) -> Cells:
-    """Which cells are dark, row by row: a chessboard's squares, or 20 x 20 in each square of a ChArUco board.
+    """Compute which cells of a board are dark, row by row.
+
+    A cell is a square of a chessboard; each square of a ChArUco board has 20 x 20 cells.
 
     Raises:
-        ConfigError: a ChArUco board has more squares than there are markers.
+        ConfigError: a ChArUco board needs more markers than the dictionary holds.
     """
     columns, rows = (n + 1 for n in board.corners)
     v, u = np.mgrid[:rows, :columns]
@@ -182,7 +186,7 @@ def cells(board: BoardConfig) -> Cells:
 
 
 def tiles(board: BoardConfig) -> list[Tile]:
-    """Cover the board with rectangles of one colour each, none over another, and few of them."""
+    """Cover the board with few rectangles of one colour each that do not overlap."""
     dark = cells(board)
     per_square = dark.shape[0] // (board.corners[1] + 1)
     left = np.ones(dark.shape, dtype=bool)
@@ -200,5 +204,5 @@ def tiles(board: BoardConfig) -> list[Tile]:
 
 
 def _run(same: Cells) -> int:
-    """How many of the first are True."""
+    """Count the leading True values."""
     return len(same) if same.all() else int(np.argmin(same))

@@ -1,12 +1,6 @@
-"""Pinhole and Brown-Conrady intrinsics: project, the ray through a pixel, depth from a known size.
+"""Camera models: intrinsics with distortion, depth from a known size, and the zoom lens over its range.
 
-Pixels are (u, v), u right and v down, and (0, 0) is the centre of the top-left pixel.
-
-The cameras' inner geometry: intrinsics, range from a known size, and the zoom lens.
-
-Pixels are (u, v), u right and v down, and (0, 0) is the centre of the top-left pixel.
-
-The zoom camera's optics over its range: intrinsics and entrance pupil at every focal length.
+Pixels are (u, v), u right and v down, and (0, 0) is the centre of the top-left pixel. Focal lengths are in pixels.
 """
 
 import bisect
@@ -22,18 +16,18 @@ from scipy.interpolate import CubicSpline
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array, RigidTransform
 
-# Newton's iteration for the inverse distortion: quadratic, so 20 steps are ample wherever an inverse exists.
+# Newton's method for the inverse distortion converges quadratically: 20 steps are ample wherever an inverse exists.
 UNDISTORT_STEPS = 20
-# A pixel counts as explained when its ray projects back to within this normalised distance (about 1e-9 px).
+# A ray is accepted when it projects back to the pixel within this normalised distance (about 1e-9 px).
 UNDISTORT_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A camera's inner geometry: pinhole with Brown-Conrady distortion (OpenCV's first five coefficients).
+    """Intrinsics of a camera: pinhole with Brown-Conrady distortion (OpenCV's first five coefficients).
 
     Attributes:
-        size: (width, height) [px].
+        size: image size (width, height) [px].
         focal_px: (fx, fy) [px].
         center_px: principal point (cx, cy) [px].
         distortion: (k1, k2, p1, p2, k3), without unit.
@@ -46,13 +40,13 @@ class Intrinsics:
 
     @property
     def matrix(self) -> Array:
-        """The 3x3 camera matrix K."""
+        """Camera matrix K, (3, 3)."""
         (fx, fy), (cx, cy) = self.focal_px, self.center_px
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     @property
     def image_center_px(self) -> Array:
-        """The middle of the image, (2,), where a target is wanted by default."""
+        """Centre of the image [px], (2,): the default wanted pixel of a target."""
         return (np.array(self.size, dtype=float) - 1.0) / 2.0
 
     def project(self, x_camera: Array) -> Array:
@@ -62,8 +56,8 @@ class Intrinsics:
             x_camera: points in the camera's frame [m], (..., 3).
 
         Returns:
-            Pixels (..., 2); nan for points that are not in front of the camera, or so far off the axis that
-            the distortion polynomial has folded back.
+            Pixels (..., 2); nan for points behind the camera, and for points beyond the radius where the distortion
+            polynomial folds back.
         """
         x_camera = np.asarray(x_camera, dtype=float)
         depth = x_camera[..., 2]
@@ -76,7 +70,9 @@ class Intrinsics:
         return np.where(valid[..., None], pixels, np.nan)
 
     def ray(self, pixel: Array) -> Array:
-        """Give the ray through a pixel, scaled so that its z is 1 (depth times ray is the point).
+        """Compute the ray through a pixel, scaled to z = 1, so that depth times ray is the point.
+
+        The distortion is inverted by Newton's method.
 
         Args:
             pixel: (u, v) [px], (..., 2).
@@ -106,7 +102,9 @@ class Intrinsics:
         return np.where(ok[..., None], ray, np.nan)
 
     def tangents(self, pixel: Array) -> tuple[Array, Array] | None:
-        """Undistort one pixel; in floats, which takes less than a tenth of the time of `ray` for arrays.
+        """Undistort one pixel and differentiate the result.
+
+        Written in floats, which takes less than a tenth of the time that `ray` takes with arrays.
 
         Args:
             pixel: (u, v) [px], (2,).
@@ -142,15 +140,15 @@ class Intrinsics:
         return None
 
     def scaled(self, focal_factor: float) -> "Intrinsics":
-        """The same camera with its focal lengths multiplied by ``focal_factor``."""
+        """Return these intrinsics with the focal lengths multiplied by ``focal_factor``."""
         fx, fy = self.focal_px
         return replace(self, focal_px=(fx * focal_factor, fy * focal_factor))
 
     def resized(self, size: tuple[int, int]) -> "Intrinsics":
-        """The same camera when its stream is scaled to another size (width, height) [px].
+        """Return the intrinsics of the same camera for a stream scaled to another size (width, height) [px].
 
         Raises:
-            ConfigError: the aspect ratio is another one, so that this cannot be the whole image scaled.
+            ConfigError: the aspect ratio differs, so that the stream cannot be the whole image scaled.
         """
         if size == self.size:
             return self
@@ -179,7 +177,7 @@ class Intrinsics:
         )
 
     def _distort_jacobian(self, xy: Array) -> Array:
-        """Derivative of the distorted by the undistorted coordinates, (..., 2, 2)."""
+        """Compute the derivative of distorted by undistorted coordinates, (..., 2, 2)."""
         k1, k2, p1, p2, k3 = self.distortion
         x, y = xy[..., 0], xy[..., 1]
         r2 = x * x + y * y
@@ -191,47 +189,46 @@ class Intrinsics:
         return np.stack([np.stack([xx, xy_], axis=-1), np.stack([xy_, yy], axis=-1)], axis=-2)
 
     def _before_fold(self, xy: Array) -> Array:
-        """Whether points lie inside the radius at which the radial polynomial stops growing."""
+        """Check whether points lie inside the radius at which the radial polynomial stops growing."""
         k1, k2, _, _, k3 = self.distortion
 
         def growth(r2: Any) -> Any:
-            """The derivative of r radial by r."""
+            """Compute the derivative of r (1 + k1 r^2 + k2 r^4 + k3 r^6) by r, given r^2."""
             return 1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3))
 
         r2 = xy[..., 0] * xy[..., 0] + xy[..., 1] * xy[..., 1]
         before = growth(r2) > 0
-        for lowest in _roots(21 * k3, 10 * k2, 3 * k1):  # between here and the middle it may have been negative too
+        for lowest in _roots(21 * k3, 10 * k2, 3 * k1):  # extrema: one that is not positive has the fold before it
             if lowest > 0 and growth(lowest) <= 0:
                 before = before & (r2 < lowest)
         return np.asarray(before)
 
 
 def _roots(a: float, b: float, c: float) -> list[float]:
-    """Real roots of a x^2 + b x + c."""
+    """Find the real roots of a x^2 + b x + c."""
     if a == 0:
         return [] if b == 0 else [-c / b]
     inside = b * b - 4 * a * c
     if inside < 0:
         return []
-    q = -(b + math.copysign(math.sqrt(inside), b)) / 2  # no difference of nearly equal numbers
+    q = -(b + math.copysign(math.sqrt(inside), b)) / 2  # avoids the difference of nearly equal numbers
     return [q / a] if q == 0 else [q / a, c / q]
 
 
 def depth_from_size(intrinsics: Intrinsics, size: float, size_px: float, center_px: Array, *, vertical: bool) -> float:
     """Estimate a target's depth from its known size: z = f x_size / u_measured.
 
-    The measured size is taken between the rays through its two ends, because distortion makes a pixel worth more
-    away from the middle of the image.
+    The size is measured between the rays through the target's two ends, so that distortion does not change the depth.
 
     Args:
-        intrinsics: the fixed camera.
-        size: the target's true size [m].
-        size_px: its measured size in the image [px].
-        center_px: where its middle is in the image (u, v) [px], (2,).
-        vertical: whether the size is measured along v (a height) and not along u.
+        intrinsics: intrinsics of the fixed camera.
+        size: true size of the target [m].
+        size_px: measured size in the image [px].
+        center_px: centre of the target in the image (u, v) [px], (2,).
+        vertical: True for a size along v (a height), False for one along u.
 
     Returns:
-        Depth along the camera's axis [m]; nan for a size that is not positive or reaches beyond the lens's view.
+        Depth along the camera's axis [m]; nan where size_px is not positive, or where no ray reaches an end.
     """
     axis = 1 if vertical else 0
     half = np.zeros(2)
@@ -242,34 +239,34 @@ def depth_from_size(intrinsics: Intrinsics, size: float, size_px: float, center_
 
 
 def focal_for_size(size: float, wanted_px: float, depth: float) -> float:
-    """The focal length [px] at which ``size`` [m] at ``depth`` [m] appears ``wanted_px`` large (Eq. 17)."""
+    """Compute the focal length [px] at which ``size`` [m] at ``depth`` [m] appears ``wanted_px`` large (Eq. 17)."""
     return wanted_px * depth / size
 
 
-# --- zoomlens ---
+# Zoom lens
 
-# By how much a zoom lens's optical axis wanders for every doubling of its focal length, as a share of the image's
-# width: that of consumer cameras comes to some 10 to 30 px of 640 over a tenfold range.
+# Shift of a zoom lens's optical axis for every doubling of the focal length, as a share of the image's width. For
+# consumer cameras it comes to some 10 to 30 px of 640 over a tenfold range.
 WANDER = 5.0 / 640.0
-FEW_STOPS = 4  # from here on a spline through them is smooth enough to judge itself by
-CENTER = slice(2, 4)  # of what a lens interpolates
-NOMINAL_STEPS = 20  # the ratio of true to nominal focal length changes so little that four or five do
+FEW_STOPS = 4  # from this number of zoom samples on, two splines through them show how well they fix the curve
+CENTER = slice(2, 4)  # columns of the principal point in `ZoomLens._values`
+NOMINAL_STEPS = 20  # the ratio of true to nominal focal length changes slowly: four or five steps suffice
 
 
 @dataclass(frozen=True)
 class ZoomLens:
-    """The zoom camera's optics over its whole range.
+    """Optics of the zoom camera over its focal range, interpolated between calibrated zoom samples.
 
-    The device tells its focal length in nominal pixels; calibration says what that means at some stops. Between them
-    a cubic spline over the logarithm of the nominal focal length passes through what was calibrated: ratios of true to
-    nominal focal length, principal point, distortion as it appears in the image, and entrance pupil. Beyond them the
-    last stop's values hold. A lens with one stop is magnified without any other change.
+    The lens device reports a nominal focal length. A zoom sample holds the calibrated intrinsics at one of them.
+    Between the samples a cubic spline over the logarithm of the nominal focal length interpolates the ratio of true to
+    nominal focal length, the principal point, the distortion as it appears in the image, and the entrance pupil. Beyond
+    them the last sample's values hold. With one sample only the focal length changes.
 
     Attributes:
-        nominal_px: the device's own focal length at each stop [px], increasing, (n,).
-        stops: the calibrated intrinsics at each stop, n of them.
-        pupil: how far the entrance pupil has moved forward along the optical axis since the first stop [m], n of
-            them, the first one 0; where it is left out, it does not move.
+        nominal_px: nominal focal length of each zoom sample [px], increasing, (n,).
+        stops: calibrated intrinsics of each zoom sample, (n,).
+        pupil: shift of the entrance pupil forward along the optical axis since the first zoom sample [m], (n,), the
+            first one 0; empty for a pupil that does not move.
     """
 
     nominal_px: tuple[float, ...]
@@ -288,11 +285,11 @@ class ZoomLens:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) [px]."""
+        """Image size (width, height) [px]."""
         return self.stops[0].size
 
     def at(self, nominal_px: float) -> Intrinsics:
-        """The intrinsics when the device says its focal length is ``nominal_px``."""
+        """Interpolate the intrinsics at a nominal focal length [px]."""
         if len(self.stops) == 1:
             return self.stops[0].scaled(nominal_px / self.nominal_px[0])
         values = self._values(nominal_px)
@@ -306,18 +303,18 @@ class ZoomLens:
         )
 
     def to_pupil(self, nominal_px: float) -> RigidTransform:
-        """The camera's frame at a focal length, seen from that at the first stop: moved forward by `pupil_at`."""
+        """Compute the transform from the zoom frame at a nominal focal length [px] to that at the first zoom sample."""
         return RigidTransform.from_translation([0.0, 0.0, self.pupil_at(nominal_px)])
 
     def pupil_at(self, nominal_px: float) -> float:
-        """How far the entrance pupil has moved forward since the first stop [m]."""
+        """Interpolate the entrance pupil's shift forward since the first zoom sample [m]."""
         return 0.0 if len(self.stops) == 1 else float(self._values(nominal_px)[-1])
 
     def center_doubt_px(self, nominal_px: float) -> Array:
-        """How far off the principal point may be for want of stops, one standard deviation, (2,) [px].
+        """Estimate the interpolation error of the principal point, one standard deviation [px], (2,).
 
-        Between stops, what two interpolants differ by: the spline used, and the one with straight ends. Beyond them,
-        and between a few, as much as a usual zoom lens's axis wanders on the way from the stops.
+        Between the samples, where there are at least `FEW_STOPS`, it is the difference of two interpolants: the spline
+        in use, and the natural spline. Between fewer, and beyond the samples, it grows by `WANDER` with the distance.
         """
         away = np.abs(np.log2(nominal_px / np.array(self.nominal_px)))
         inside = self.nominal_px[0] <= nominal_px <= self.nominal_px[-1]
@@ -331,11 +328,11 @@ class ZoomLens:
         return np.abs(straight(x) - self._curve(x))[CENTER]
 
     def nominal_for(self, focal_px: float) -> float:
-        """What to tell the device so that the true horizontal focal length is ``focal_px`` [px]."""
+        """Convert a true horizontal focal length [px] to the nominal one that is sent to the lens."""
         if len(self.stops) == 1:
             return focal_px * self.nominal_px[0] / self.stops[0].focal_px[0]
         nominal, best = focal_px, math.inf
-        for _ in range(NOMINAL_STEPS):  # Newton's, in the logarithm
+        for _ in range(NOMINAL_STEPS):  # Newton's method in the logarithm
             i, x = self._piece(nominal)
             a, b, c, d = self._ratios[i]
             off = ((a * x + b) * x + c) * x + d + math.log(nominal / focal_px)
@@ -346,35 +343,35 @@ class ZoomLens:
         return nominal
 
     def resized(self, size: tuple[int, int]) -> "ZoomLens":
-        """The same lens when its stream is scaled to another size; its nominal focal lengths are scaled with it.
+        """Return the same lens for a stream scaled to another size; its nominal focal lengths scale with it.
 
         Raises:
-            ConfigError: the aspect ratio is another one.
+            ConfigError: the aspect ratio differs.
         """
         factor = size[0] / self.size[0]
         nominal, stops = tuple(n * factor for n in self.nominal_px), tuple(s.resized(size) for s in self.stops)
         return ZoomLens(nominal, stops, self.pupil)
 
     def _values(self, nominal_px: float) -> Array:
-        """Log ratios (2), centre (2), the image's distortion (5) and pupil (1) at a nominal focal length."""
+        """Interpolate log ratios (2), principal point (2), image distortion (5) and pupil (1) at a focal length."""
         i, x = self._piece(nominal_px)
         a, b, c, d = self._pieces[i]
         return np.asarray(((a * x + b) * x + c) * x + d)
 
     def _piece(self, nominal_px: float) -> tuple[int, float]:
-        """Between which stops a nominal focal length is, and the logarithm of what it is over the shorter one's."""
+        """Find the spline's piece at a nominal focal length, and the logarithm of its ratio to the piece's start."""
         inside = min(max(nominal_px, self.nominal_px[0]), self.nominal_px[-1])
         i = max(bisect.bisect_left(self.nominal_px, inside) - 1, 0)
         return i, math.log(inside / self.nominal_px[i])
 
     @cached_property
     def _pieces(self) -> Array:
-        """The spline's polynomials from stop to stop, highest power first, (n - 1, 4, 10); scipy's call is slow."""
+        """Polynomials of the spline, highest power first, (n - 1, 4, 10); scipy's call is slow."""
         return np.ascontiguousarray(np.moveaxis(self._curve.c, 1, 0))
 
     @cached_property
     def _ratios(self) -> list[list[float]]:
-        """Of these, those of the logarithm of true over nominal horizontal focal length."""
+        """Polynomials of the logarithm of true over nominal horizontal focal length, (n - 1, 4)."""
         return self._pieces[:, :, 0].tolist()
 
     @cached_property
@@ -394,5 +391,5 @@ class ZoomLens:
 
 
 def distortion_growth(magnified: float) -> Array:
-    """By what (k1, k2, p1, p2, k3) grow with the focal length for the image to be bent the same, (5,)."""
+    """Compute the factors of (k1, k2, p1, p2, k3) that keep the image's distortion as the focal length grows, (5,)."""
     return np.array([magnified**2, magnified**4, magnified, magnified, magnified**6])

@@ -1,12 +1,17 @@
-"""Frames, transforms and the rotation conventions everything else relies on.
+"""Coordinate frames, rigid transforms and rotation conventions.
 
-Frames (names as in code, the paper's in braces): ``fixed`` {L} the stationary wide camera; ``zoom0`` {R0} the
-zoom camera at pan = tilt = 0; ``zoom`` {R} the zoom camera now; ``base`` {O} the pan-tilt unit, not moving;
-``head`` {P} its moving platform; ``world`` in the simulation only.
+Frames (names as in code, the paper's in braces):
+
+- ``fixed`` {L}: the fixed camera
+- ``zoom0`` {R0}: the zoom camera at pan = tilt = 0
+- ``zoom`` {R}: the zoom camera at the present pan and tilt
+- ``base`` {O}: the part of the pan-tilt head that does not move
+- ``head`` {P}: the moving platform of the head
+- ``world``: the scene, in the simulation only
 
 ``T_a_b`` maps coordinates in b to coordinates in a, so that names chain: ``x_a = T_a_b T_b_c x_c``. Cameras look
-along +z with x right and y down. Lengths are metres and angles radians. scipy's ``RigidTransform`` is the only
-type of transform.
+along +z, with x right and y down. Lengths are in metres and angles in radians. Every transform is a
+``scipy.spatial.transform.RigidTransform``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +24,7 @@ Array = npt.NDArray[np.float64]
 
 __all__ = ["FARTHEST_M", "Array", "RigidTransform", "Rotation", "angle_between", "pose", "pose_dict", "rot_x", "rot_y"]
 
-FARTHEST_M, WHOLE_TURN_DEG = 1e6, 360.0  # whoever tells of a place that is farther or turned further is mistaken
+FARTHEST_M, WHOLE_TURN_DEG = 1e6, 360.0  # a configured pose beyond these is a mistake, such as a wrong unit
 
 
 def rot_x(angle: float) -> Rotation:
@@ -36,7 +41,7 @@ def pose(translation: Sequence[float] | Array, rotvec_deg: Sequence[float] | Arr
     """Make a transform from a translation [m], (3,), and a rotation vector [degrees], (3,).
 
     Raises:
-        ValueError: it is farther than anything between two cameras, or turned by more than a whole turn.
+        ValueError: a component of the translation exceeds `FARTHEST_M`, or one of the rotation vector a whole turn.
     """
     if np.abs(translation).max() > FARTHEST_M:
         raise ValueError(f"translation: {list(translation)} is farther than {FARTHEST_M:g} m")
@@ -48,7 +53,7 @@ def pose(translation: Sequence[float] | Array, rotvec_deg: Sequence[float] | Arr
 
 
 def pose_dict(T: RigidTransform) -> Mapping[str, list[float]]:
-    """Write a transform as people edit it: translation [m] and rotation vector [degrees]; inverse of `pose`."""
+    """Convert a transform to a table of translation [m] and rotation vector [degrees], the inverse of `pose`."""
     return {
         "translation": [float(v) for v in T.translation],
         "rotvec_deg": [float(v) for v in T.rotation.as_rotvec(degrees=True)],
@@ -56,7 +61,7 @@ def pose_dict(T: RigidTransform) -> Mapping[str, list[float]]:
 
 
 def angle_between(a: Array, b: Array) -> Array:
-    """Angle between directions [rad], exact for tiny and for near-opposite angles.
+    """Compute the angle between directions [rad], exact for tiny and for near-opposite angles.
 
     Args:
         a: directions of any length, (..., 3).

@@ -1,18 +1,19 @@
-"""The exact inverse: pan, tilt and range that bring a target onto a ray of the zoom camera, for one or for many.
+"""Pan-tilt kinematics: forward kinematics, the exact inverse for any ray, and the paper's shortcut.
 
-The formulas are written once, by coordinates, for floats and for arrays: a target that is followed comes alone, and an
-array of one costs twenty times as much as floats.
+The head turns by
 
-Pan-tilt kinematics: forward, the exact inverse for any wanted pixel, and the paper's shortcut beside it.
+    T_base_head(pan, tilt) = Rot(Y, pan) Trans(0, 0, dz) Rot(n, tilt) Trans(0, 0, -dz),   n = (cos eps, sin eps, 0)
 
-The head turns as T_base_head = Rot(Y, pan) Trans(0, 0, dz) Rot(cos(eps) X + sin(eps) Y, tilt) Trans(0, 0, -dz); an
-ideal head has dz = eps = 0. A target x_base is on the ray d of the zoom camera when some range r makes
+For an ideal head, dz = eps = 0, this is the paper's P (Eq. 8). A target x_base lies on the ray d of the zoom camera, at
+range r, where
 
-    T_base_head(pan, tilt) T_head_zoom (r d) = x_base                                                  (Eqs. 2, 6)
+    T_base_head(pan, tilt) x_head = x_base,   x_head = T_head_zoom (r d)                               (Eqs. 5, 6)
 
-A head's own geometry, and where it brings its camera: forward kinematics.
+`solve` solves this for pan, tilt and r. Its closed form is exact for any eps where dz = 0. For dz != 0 the range
+depends on the tilt: a few rounds of the closed form come close, and Newton's method removes the rest.
 
-The paper's own solution of pan and tilt, which takes a depth for the range; kept to be compared with.
+The inverse is written by coordinates, once for floats and arrays, because an array of one target takes twenty times as
+long as floats.
 """
 
 import math
@@ -27,15 +28,15 @@ from cotarget.geometry import Array, RigidTransform, Rotation, angle_between, ro
 
 @dataclass(frozen=True)
 class HeadGeometry:
-    """How a real head departs from two axes that cross at a right angle and encoders that count truly.
+    """Deviations of a real head from crossing, perpendicular axes and exact encoders.
 
     Attributes:
         axis_offset: dz, from the pan axis to the tilt axis along the base's z at pan = 0 [m].
-        squareness: eps, how far the tilt axis leans from X towards Y [rad].
-        pan_scale: true turn over the turn that the head reports.
-        tilt_scale: likewise.
+        squareness: eps, angle by which the tilt axis leans from X towards Y [rad].
+        pan_scale: true pan angle turned, over the reported one.
+        tilt_scale: true tilt angle turned, over the reported one.
         pan_zero: true pan where the head reports 0 [rad].
-        tilt_zero: likewise.
+        tilt_zero: true tilt where the head reports 0 [rad].
     """
 
     axis_offset: float = 0.0
@@ -47,18 +48,18 @@ class HeadGeometry:
 
     @property
     def tilt_axis(self) -> Array:
-        """The tilt axis at pan = 0: cos(eps) X + sin(eps) Y, (3,)."""
+        """Direction of the tilt axis at pan = 0, the unit vector (cos eps, sin eps, 0), (3,)."""
         return np.array([np.cos(self.squareness), np.sin(self.squareness), 0.0])
 
     def true_angles(self, pan: Array | float, tilt: Array | float) -> tuple[Array, Array]:
-        """The axes' true angles [rad] where the head reports these."""
+        """Convert reported pan and tilt to the axes' true angles [rad]."""
         return (
             self.pan_scale * np.asarray(pan, float) + self.pan_zero,
             self.tilt_scale * np.asarray(tilt, float) + self.tilt_zero,
         )
 
     def reported_angles(self, pan: Array, tilt: Array) -> tuple[Array, Array]:
-        """What the head reports at true angles [rad]."""
+        """Convert true pan and tilt to the angles that the head reports [rad]."""
         return (pan - self.pan_zero) / self.pan_scale, (tilt - self.tilt_zero) / self.tilt_scale
 
 
@@ -66,12 +67,14 @@ IDEAL_HEAD = HeadGeometry()
 
 
 def base_head(pan: float, tilt: float, head: HeadGeometry = IDEAL_HEAD) -> RigidTransform:
-    """Forward kinematics T_base_head, the paper's P (Eq. 8); the identity at true pan = tilt = 0.
+    """Compute the forward kinematics T_base_head, the paper's P (Eq. 8 with dz and eps).
+
+    T_base_head is the identity at true pan = tilt = 0.
 
     Args:
-        pan: as the head reports it, positive turns the camera right [rad].
-        tilt: likewise, positive turns the camera up [rad].
-        head: the unit's own geometry.
+        pan: reported pan, positive turns the camera right [rad].
+        tilt: reported tilt, positive turns the camera up [rad].
+        head: geometry of the head.
     """
     true_pan, true_tilt = (float(angle) for angle in head.true_angles(pan, tilt))
     offset = RigidTransform.from_translation([0.0, 0.0, head.axis_offset])
@@ -80,10 +83,12 @@ def base_head(pan: float, tilt: float, head: HeadGeometry = IDEAL_HEAD) -> Rigid
 
 
 def towards(x_base: Array) -> tuple[float, float]:
-    """Pan and tilt of an ideal head whose own z then points at a target; where a camera is on it does not count.
+    """Compute the pan and tilt [rad] that point the z axis of an ideal head's platform at a target.
+
+    This ignores T_head_zoom, the pose of the camera on the head.
 
     Args:
-        x_base: the target in the base's frame [m], (3,).
+        x_base: target in the base's frame [m], (3,).
     """
     x, y, z = x_base
     return math.atan2(x, z), math.atan2(-y, math.hypot(x, z))
@@ -96,14 +101,14 @@ def zoom_fixed(
     T_zoom0_fixed: RigidTransform,
     head: HeadGeometry = IDEAL_HEAD,
 ) -> RigidTransform:
-    """Where the fixed camera is seen from the moved zoom camera: T_zoom_fixed (Eq. 2).
+    """Compute T_zoom_fixed, from the fixed camera to the moved zoom camera (Eq. 2).
 
     Args:
-        pan: the pan axis's angle [rad].
-        tilt: the tilt axis's [rad].
+        pan: reported pan [rad].
+        tilt: reported tilt [rad].
         T_head_zoom: the paper's T.
         T_zoom0_fixed: the paper's Gamma.
-        head: the unit's own geometry.
+        head: geometry of the head.
     """
     return T_head_zoom.inv() * base_head(pan, tilt, head).inv() * T_head_zoom * T_zoom0_fixed
 
@@ -116,15 +121,17 @@ def miss(
     head: HeadGeometry = IDEAL_HEAD,
     ray: Array | tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Array:
-    """Angle between the zoom camera's ray and the target, as seen from the moved camera [rad].
+    """Compute the pointing error: the angle between the zoom camera's ray and the target [rad].
+
+    It shares no code with `solve`, so that it can check it.
 
     Args:
-        pan: [rad], (...).
-        tilt: [rad], (...).
+        pan: reported pan [rad], (...).
+        tilt: reported tilt [rad], (...).
         x_base: targets in the base's frame [m], (..., 3).
-        T_head_zoom: the zoom camera's place on the head.
-        head: the unit's own geometry.
-        ray: the ray, (3,) or (..., 3).
+        T_head_zoom: pose of the zoom camera on the head, the paper's T.
+        head: geometry of the head.
+        ray: ray in the zoom camera's frame, (3,) or (..., 3).
     """
     pan, tilt = head.true_angles(pan, tilt)
     shape = np.broadcast_shapes(np.shape(pan), np.shape(tilt), np.shape(x_base)[:-1])
@@ -137,17 +144,18 @@ def miss(
     return angle_between(x_zoom, np.broadcast_to(np.asarray(ray, float), x_zoom.shape))
 
 
-# Rounds by which the closed form meets an axis offset; a real one shrinks the error a thousandfold each round.
+# Rounds of the closed form for dz != 0. Each shrinks the error by dz / range, a thousandfold for a usual head.
 CLOSED_FORM_ROUNDS = 4
-# Newton's iteration from the closed form converges quadratically; only where the branches meet does it need many.
+# Newton's method converges quadratically from the closed form; only near the pan axis, where the branches meet, does it
+# need many steps.
 NEWTON_STEPS = 40
-# It has converged when it misses by no more than its own rounding, some units in the last place.
+# Newton's method has converged when the residual over the distance is a few units in the last place.
 ROUNDING = 4 * np.finfo(float).eps
 # A solution is accepted when it misses by less than this angle [rad], 6e-10 degrees; rounding stays far below.
 ACCEPTED_MISS = 1e-11
-# A Newton step turns an axis by at most this [rad]: where the branches meet, a full step would leave its branch.
+# Longest Newton step of an axis [rad]: where the branches meet, a full step would leave its branch.
 LONGEST_STEP = 0.2
-# A derivative with a smaller determinant has no inverse.
+# A Jacobian with a smaller determinant has no inverse.
 SINGULAR = np.finfo(float).tiny
 TURN = 2.0 * np.pi
 NOWHERE = (math.nan, math.nan, math.nan)
@@ -157,12 +165,14 @@ Triple = tuple[V, V, V]
 
 @dataclass(frozen=True)
 class Pointing:
-    """Ways to bring a target onto a ray of the zoom camera.
+    """Pan, tilt and range that bring a target onto a ray of the zoom camera.
+
+    Each is a float, or an array (..., 2) with one value per branch.
 
     Attributes:
-        pan: [rad], a float or (..., 2), one for each branch.
-        tilt: [rad], likewise.
-        range: distance from the zoom camera to the target along that ray [m], likewise.
+        pan: reported pan [rad].
+        tilt: reported tilt [rad].
+        range: distance from the zoom camera to the target along the ray [m].
     """
 
     pan: Array
@@ -178,23 +188,21 @@ def solve(
     *,
     pupil: float = 0.0,
 ) -> Pointing:
-    """Solve pan, tilt and range exactly, in both branches (Eqs. 6, 13, 16 and the norm's quadratic for the range).
+    """Solve pan, tilt and range exactly, in both branches (Eqs. 6, 13, 14, 16; the range from |x_head| = |x_base|).
 
-    The closed form holds for an ideal head; Newton's steps carry it to a head with an axis offset and axes that
-    are not square, and take the closed form's own rounding away.
+    The closed form is exact for dz = 0 and any eps. Newton's method carries it to dz != 0 and removes its rounding.
 
     Args:
         x_base: targets in the base's frame [m], (..., 3).
-        T_head_zoom: the zoom camera's place on the head.
-        head: the unit's own geometry.
-        ray: the zoom camera's ray that shall meet the target, of any length, (3,) or (..., 3).
-        pupil: how far the camera's entrance pupil has moved forward from there [m].
+        T_head_zoom: pose of the zoom camera on the head, the paper's T.
+        head: geometry of the head.
+        ray: ray in the zoom camera's frame on which the target shall lie, of any length, (3,) or (..., 3).
+        pupil: shift of the entrance pupil along the optical axis, forward from T_head_zoom [m].
 
     Returns:
-        Pan and tilt as the head reports them, their true angles within -pi..pi, and range, each (..., 2); the first
-        branch is the one that faces forward. All three are nan in a branch that does not exist, as for a target
-        nearer than the lever arm. Within half a degree of the pan axis, where the branches meet, both may be the same
-        solution.
+        Reported pan and tilt, their true angles within -pi..pi, and range, each (..., 2); the first branch faces
+        forward. All three are nan in a branch that does not exist, such as for a target nearer than the lever arm.
+        Within half a degree of the pan axis, where the branches meet, both may be the same solution.
     """
     x_base, ray = np.asarray(x_base, float), np.asarray(ray, float)
     T = T_head_zoom.as_matrix()
@@ -218,14 +226,16 @@ def nearest(
     now: tuple[float, float] = (0.0, 0.0),
     head: HeadGeometry = IDEAL_HEAD,
 ) -> Pointing:
-    """Choose from both branches, whole turns included, the solution within the limits that is nearest to now.
+    """Choose the solution within the limits that is nearest to the head's present pan and tilt.
+
+    The candidates are both branches, each with whole turns added. The distance is the larger of the two axes' travels.
 
     Args:
-        pointing: one target's two branches, as `solve` gives them.
-        pan_limits: lowest and highest pan [rad].
-        tilt_limits: lowest and highest tilt [rad].
-        now: where the head is, (pan, tilt) [rad]. Near is what the slower axis has to travel.
-        head: the unit's own geometry, for what it reports after a whole turn.
+        pointing: both branches of one target, as `solve` returns them.
+        pan_limits: lowest and highest reported pan [rad].
+        tilt_limits: lowest and highest reported tilt [rad].
+        now: present reported (pan, tilt) of the head [rad].
+        head: geometry of the head; its scales convert a whole turn to reported angles.
 
     Raises:
         UnreachableError: there is no solution, or none within the limits.
@@ -260,7 +270,7 @@ def nearest(
 
 
 def _reported(pan: Any, tilt: Any, reach: Any, head: HeadGeometry) -> Triple[Any]:
-    """What the head reports at true angles, which are taken within -pi..pi, and the range, of floats or arrays."""
+    """Wrap true angles to -pi..pi and convert them to reported ones; the range stays. For floats or arrays."""
     pan, tilt = head.reported_angles((pan + math.pi) % TURN - math.pi, (tilt + math.pi) % TURN - math.pi)
     return pan, tilt, reach
 
@@ -271,13 +281,13 @@ def _floats(v: Array) -> Triple[float]:
 
 
 def _solve_one(target: Triple[float], d: Triple[float], t: Triple[float], head: HeadGeometry) -> list[Triple[float]]:
-    """True pan, true tilt and range of one target in both branches, nan where there is none."""
+    """Solve true pan, true tilt and range of one target in both branches; nan where a branch has no solution."""
     distance = math.hypot(*target)
     found = []
     for sign in (1.0, -1.0):
         try:
             pan, tilt, reach = _closed_form(target, d, t, sign, head, math)
-        except ValueError:  # the root of a negative number
+        except ValueError:  # math.sqrt of a negative number: the target is nearer than the lever arm
             found.append(NOWHERE)
             continue
         error = math.inf
@@ -295,7 +305,10 @@ def _solve_one(target: Triple[float], d: Triple[float], t: Triple[float], head: 
 
 
 def _solve_many(x_base: Array, d: Array, t: Array, head: HeadGeometry) -> Triple[Array]:
-    """As `_solve_one`, for targets (..., 3) and rays d (..., 3); true pan, true tilt and range, each (..., 2)."""
+    """Solve true pan, true tilt and range of many targets (..., 3) on rays d (..., 3), each (..., 2).
+
+    The method is that of `_solve_one`.
+    """
     target, d = (
         np.array(np.broadcast_to(v[..., None, :], (*v.shape[:-1], 2, 3))).reshape(-1, 3).T for v in (x_base, d)
     )
@@ -310,7 +323,7 @@ def _solve_many(x_base: Array, d: Array, t: Array, head: HeadGeometry) -> Triple
         turns = np.cos(pan), np.sin(pan), np.cos(tilt), np.sin(tilt)
         residual, det, steps = _newton_step(*turns, reach, tuple(target[:, active]), tuple(d[:, active]), t, head)
         error[active] = np.linalg.norm(residual, axis=0)
-        # A singular J (a target on the pan axis) can go no further and is left to the final check.
+        # Where the Jacobian is singular (a target on the pan axis), the iteration ends and the last check decides.
         going_on = (error[active] > ROUNDING * distance[active]) & (np.abs(det) > SINGULAR)
         active = active[going_on]
         if not len(active):
@@ -324,24 +337,24 @@ def _solve_many(x_base: Array, d: Array, t: Array, head: HeadGeometry) -> Triple
 
 
 def _closed_form(target: Triple[Any], d: Triple[Any], t: Triple[Any], sign: Any, head: HeadGeometry, lib: Any) -> Any:
-    """Pan, tilt and range in the atan2 forms of (13) and (16), of floats or arrays alike.
+    """Compute true pan, true tilt and range in closed form: (13) and (16) with atan2, for floats or arrays.
 
-    Exact for dz = 0. With an axis offset the range depends on the tilt, and a few rounds bring both together; each
-    takes off a factor of dz / range.
+    Exact for dz = 0 and any eps. For dz != 0 the range depends on the tilt and both are iterated; each round shrinks
+    the error by a factor of dz / range.
 
     Args:
         target: x, y and z of the target in the base's frame [m].
-        d: of the ray in the head's frame, of length 1.
-        t: of the zoom camera in the head's frame, from the tilt axis [m].
+        d: x, y and z of the ray in the head's frame, of length 1.
+        t: x, y and z of the zoom camera in the head's frame, from the tilt axis [m].
         sign: 1 for the branch that faces forward, -1 for the other.
-        head: the unit's own geometry.
+        head: geometry of the head.
         lib: `math` or `numpy`, for its functions.
     """
     (a, b, c), dz = target, head.axis_offset
     sin_eps, cos_eps = math.sin(head.squareness), math.cos(head.squareness)
     along = d[0] * t[0] + d[1] * t[1] + d[2] * t[2]
     free = a * a + b * b + c * c - dz * dz - (t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
-    ahead = 0.0  # the z of q after tilting
+    ahead = 0.0  # z of q after tilting
     for _ in range(1 if dz == 0 else CLOSED_FORM_ROUNDS):
         # |x_base|^2 = dz^2 + 2 dz z_tilted + |q|^2 with q = r d + t: a quadratic in the range r
         reach = lib.sqrt(along * along + free - 2 * dz * ahead) - along
@@ -359,10 +372,11 @@ def _newton_step(
     cos_pan: Any, sin_pan: Any, cos_tilt: Any, sin_tilt: Any, reach: Any,
     target: Triple[Any], d: Triple[Any], t: Triple[Any] | Array, head: HeadGeometry,
 ) -> tuple[Triple[Any], Any, Triple[Any]]:  # fmt: skip
-    """What base_head(pan, tilt) (range d + t) misses the target by, and Newton's step by Cramer's rule.
+    """Compute the residual of Eq. 5 at (pan, tilt, range), and Newton's step by Cramer's rule.
 
     Returns:
-        The residual [m]; the determinant of its derivative by (pan, tilt, range); and the step times that.
+        The residual, reached point minus target [m]; the determinant of its Jacobian by (pan, tilt, range); and the
+        step times that determinant.
     """
     q = _tilt((reach * d[0] + t[0], reach * d[1] + t[1], reach * d[2] + t[2]), cos_tilt, sin_tilt, head)
     reached = _pan((q[0], q[1], q[2] + head.axis_offset), cos_pan, sin_pan)
@@ -376,12 +390,12 @@ def _newton_step(
 
 
 def _pan(v: Triple[Any], cos: Any, sin: Any) -> Triple[Any]:
-    """Rotation about Y."""
+    """Rotate a vector about Y, given the cosine and sine of pan."""
     return cos * v[0] + sin * v[2], v[1], cos * v[2] - sin * v[0]
 
 
 def _tilt(v: Triple[Any], cos: Any, sin: Any, head: HeadGeometry) -> Triple[Any]:
-    """Rodrigues' rotation about the tilt axis."""
+    """Rotate a vector about the tilt axis (Rodrigues), given the cosine and sine of tilt."""
     x_axis, y_axis = math.cos(head.squareness), math.sin(head.squareness)
     x, y, z = _about_tilt_axis(v, head)
     along = (1 - cos) * (v[0] * x_axis + v[1] * y_axis)
@@ -389,7 +403,7 @@ def _tilt(v: Triple[Any], cos: Any, sin: Any, head: HeadGeometry) -> Triple[Any]
 
 
 def _about_tilt_axis(v: Triple[Any], head: HeadGeometry) -> Triple[Any]:
-    """Cross product of the tilt axis with a vector."""
+    """Compute the cross product of the tilt axis with a vector."""
     x_axis, y_axis = math.cos(head.squareness), math.sin(head.squareness)
     return y_axis * v[2], -x_axis * v[2], x_axis * v[1] - y_axis * v[0]
 
@@ -402,25 +416,22 @@ def _dot(a: Triple[Any], b: Triple[Any]) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-# --- shortcut ---
-
-
 def shortcut(
     x_fixed: Array,
     T_zoom0_fixed: RigidTransform,
     T_head_zoom: RigidTransform,
     reading: Literal["table", "example"],
 ) -> Pointing:
-    """The paper's own solution, which takes a depth for the range; kept to be compared with.
+    """Solve pan and tilt as the paper does, with a depth in place of the range; kept for comparison.
 
-    P is a rotation, so |x_head| must equal |x_base|; a depth in place of the range does not satisfy that, and the
-    rows of (7) contradict each other: (13) and (16) use the first two and the third only chooses the sign.
+    P is a rotation, so |x_head| must equal |x_base|. With a depth in place of the range it does not, and the rows of
+    (7) contradict each other: (13) and (16) use the first two, and the third only chooses the sign.
 
     Args:
         x_fixed: targets in the fixed camera's frame [m], (..., 3).
-        T_zoom0_fixed: Gamma.
-        T_head_zoom: T.
-        reading: which depth is z: "table" (Table 1) that in x_fixed, "example" (Section 4.2) that in x_zoom0.
+        T_zoom0_fixed: the paper's Gamma.
+        T_head_zoom: the paper's T.
+        reading: depth that serves as z: "table" (Table 1) that of x_fixed, "example" (Section 4.2) that of x_zoom0.
 
     Returns:
         Pan, tilt and that depth, (...); nan where |b| > r1 or |a| > r2.

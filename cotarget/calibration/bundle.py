@@ -1,32 +1,19 @@
-"""The parameters that explain the corners best: one least-squares problem that serves every step.
+"""Bundle adjustment: fit a rig's parameters and the boards' poses to the corners of all views.
 
-The steps of a calibration differ in which blocks are free. The solver is Levenberg and Marquardt's and not scipy's
-least_squares, because of the structure that `cotarget.calibration.bundle` makes use of.
-
-The normal equations of all corners: views added up block by block, boards and head turns eliminated.
-
-A view depends on its own board's pose and on no other: eliminating the poses first (Schur's complement) makes a step of
-150 views take a twentieth of a second, where a dense factorisation takes one or two, and leaves the shared parameters'
-normal matrix. Where a head does not stand quite where it says, all corners of a view are off together. Such a jitter is
-two more unknowns a view, its true pan and tilt, which are eliminated likewise, held near the reported ones by their own
-standard deviation.
-
-A rig's model and its parameters: their names and order, and how a step changes them.
-
-Poses are stepped as R <- exp(w) R, t <- t + d.
-
-Where a rig's model puts the corners of every view, and how that changes with its parameters.
-
-Boards are placed in the fixed camera's frame, so that a corner X of placement b is seen
+Every step of a calibration is one `fit`; the steps differ in which parameter blocks are free. With X a corner in the
+board's frame, it is seen
 
     by the fixed camera at      x_fixed = T_fixed_board X
     by the zoom camera at       x_zoom = T_head_zoom^-1 T_base_head^-1 T_head_zoom T_zoom0_fixed x_fixed       (Eq. 2)
 
-less the way that its entrance pupil has moved forward at the focal length in use. A board that is not flat bulges
-towards its z by a parabola along each side. Poses are stepped as R <- exp(w) R, t <- t + d. The derivatives are
-analytic; OpenCV's cv2.projectPoints gives those of the lens.
+less the entrance pupil's shift along z at the focal length in use. A bent board bulges towards its z by a parabola
+along each side. Poses step by R <- exp(w) R, t <- t + d. Derivatives are analytic; those of the lens are OpenCV's.
 
-Robust statistics of corners: some are found wrongly, and must neither draw a fit nor swell its uncertainty.
+The solver is Levenberg-Marquardt with Huber's loss, because some corners are found wrongly. Each view depends on one
+board's pose, so the boards' poses are eliminated (Schur complement), which leaves the normal matrix of the shared
+parameters. A head that does not stand quite where it reports shifts all corners of a view together: this jitter is two
+more unknowns per view, its true pan and tilt, with a prior at the reported ones, and they are eliminated too.
+Measurements: docs/design-notes.md.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -44,13 +31,12 @@ from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import HeadGeometry
 
 Block = Literal["fixed", "zoom", "pupil", "gamma", "hand", "head", "warp", "k3", "scale", "zero"]
-# What a calibration finds by default, in the order of the parameters; "k3" is the fixed camera's, "scale" and "zero"
-# are the encoders'.
+# Blocks that a calibration fits by default, in the order of the parameters. "k3" is the fixed camera's; "scale" and
+# "zero" are the encoders'.
 ALL_BLOCKS: tuple[Block, ...] = ("fixed", "zoom", "pupil", "gamma", "hand", "head", "warp")
 EVERY_BLOCK: tuple[Block, ...] = (*ALL_BLOCKS, "k3", "scale", "zero")
-# fx fy cx cy k1 k2 p1 p2, the order of OpenCV's Jacobian after the pose; k3, the next, is a block by itself, for lenses
-# that ask for it: elsewhere it hardly changes the residuals (0.0002 px on real photos) but bends the image where no
-# board was seen.
+# The order of OpenCV's Jacobian after the pose. k3, the next, is a block by itself: most lenses do not need it, and it
+# would bend the image where no board was seen.
 LENS_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 LENS_PARAMETERS = len(LENS_NAMES)
 POSE_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -64,7 +50,7 @@ WARP_NAMES = ("warp_x", "warp_y")
 
 
 def columns_of(free: Collection[Block], stops: int) -> dict[str, slice]:
-    """Where each free block stands among the shared parameters, for a zoom lens of so many stops."""
+    """Map each free block to its slice of the shared parameters, for a lens of ``stops`` zoom samples."""
     columns: dict[str, slice] = {}
     width = 0
     for name in EVERY_BLOCK:
@@ -76,7 +62,7 @@ def columns_of(free: Collection[Block], stops: int) -> dict[str, slice]:
 
 
 def parameter_names(free: Collection[Block], stops: int = 1) -> tuple[str, ...]:
-    """Name the free blocks' parameters, in their order among the shared ones; see `Covariance` for their units."""
+    """Name the parameters of the free blocks in their order; see `Covariance` for units."""
     return tuple(name for block in columns_of(free, stops) for name in _names(block, stops))
 
 
@@ -101,7 +87,7 @@ def _names(block: str, stops: int) -> list[str]:
 
 
 def stepped(model: RigModel, shared: Array, boards: Array, free: Collection[Block]) -> RigModel:
-    """Add a step to the shared parameters (n,) and to the boards' poses (B, 6)."""
+    """Apply a step of the shared parameters (n,) and of the boards' poses (B, 6) to a model."""
     steps = {name: shared[columns] for name, columns in columns_of(free, model.stops).items()}
     head = model.head
     for block, names in HEAD_NAMES.items():
@@ -134,7 +120,7 @@ def stepped(model: RigModel, shared: Array, boards: Array, free: Collection[Bloc
 
 
 def difference(model: RigModel, reference: RigModel, free: Collection[Block]) -> Array:
-    """The step of the shared parameters that leads from the reference to the model, (n,): the inverse of `stepped`."""
+    """Compute the step of the shared parameters from the reference to the model, (n,), the inverse of `stepped`."""
     parts: list[Array] = []
     for block in columns_of(free, model.stops):
         match block:
@@ -166,7 +152,7 @@ def difference(model: RigModel, reference: RigModel, free: Collection[Block]) ->
 
 
 def _all_moved(boards: Mapping[int, RigidTransform], steps: Array) -> dict[int, RigidTransform]:
-    """`_moved` for many at once: scipy takes as long for one transform as for a hundred."""
+    """Apply pose steps (B, 6) to all boards at once: scipy takes as long for one transform as for a hundred."""
     if not boards:
         return {}
     M = np.stack([T.as_matrix() for T in boards.values()])
@@ -196,7 +182,7 @@ def _pair(values: Array) -> tuple[float, float]:
     return float(first), float(second)
 
 
-# --- reprojection ---
+# Reprojection of the corners
 
 E3 = np.array([0.0, 0.0, 1.0])
 
@@ -206,13 +192,13 @@ class Batch:
     """Views through one lens, as arrays.
 
     Attributes:
-        rows: which of all views these v are, (v,).
-        stop: of the zoom lens; None for the fixed camera.
-        pan: as the head reported it [rad], (v,).
-        tilt: likewise.
-        owners: index of each view's board among the model's, (v,).
-        observed: corners [px], (v, N, 2); 0 where they are not seen.
-        seen: which are, (v, N).
+        rows: indices of these v views among all, (v,).
+        stop: index of the zoom sample; None for the fixed camera.
+        pan: reported pan [rad], (v,).
+        tilt: reported tilt [rad], (v,).
+        owners: index of each view's board among the model's boards, (v,).
+        observed: corners [px], (v, N, 2); 0 for corners that are not seen.
+        seen: True for corners that are seen, (v, N).
     """
 
     rows: npt.NDArray[np.intp]
@@ -226,13 +212,13 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a model says of a batch.
+    """Corners of a batch as a model predicts them, with derivatives.
 
     Attributes:
-        pixels: of all corners, (v, N, 2) [px].
-        by_shared: derivatives by the free parameters that matter to it, (v, N, 2, k).
-        columns: where these stand among all free parameters, (k,).
-        by_board: derivatives by the pose of each view's own board, (v, N, 2, 6).
+        pixels: all corners, (v, N, 2) [px].
+        by_shared: derivatives by the free shared parameters on which the batch depends, (v, N, 2, k).
+        columns: indices of these among all free shared parameters, (k,).
+        by_board: derivatives by the pose of each view's board, (v, N, 2, 6).
         by_turn: derivatives by the true pan and tilt of each view, (v, N, 2, 2); None for the fixed camera.
     """
 
@@ -244,7 +230,7 @@ class Prediction:
 
 
 def batches_of(model: RigModel, views: Sequence[View]) -> list[Batch]:
-    """Sort views by lens; their placements must be among the model's boards.
+    """Group views by lens; their placements must be among the model's boards.
 
     Raises:
         CalibrationError: there are views of a camera without a model.
@@ -275,7 +261,7 @@ def batches_of(model: RigModel, views: Sequence[View]) -> list[Batch]:
 
 
 def predict(model: RigModel, batch: Batch, points: Array, free: Collection[Block]) -> Prediction:
-    """Predict every corner of a batch, and its derivatives; nan behind a camera."""
+    """Predict every corner of a batch with its derivatives; nan behind a camera."""
     if batch.stop is None:
         assert model.fixed is not None
         lens, own = model.fixed, "fixed"
@@ -355,22 +341,22 @@ def _points_in_camera(model: RigModel, batch: Batch, points: Array) -> tuple[Arr
 
 
 def _bulge(points: Array) -> Array:
-    """How far each corner of a board stands out for a unit of warp along x and along y, (N, 2): 1 in the middle."""
+    """Compute how far each corner stands out for a unit of warp along x and along y, (N, 2): 1 in the middle."""
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     half = np.maximum((high - low) / 2, np.finfo(float).tiny)
     return np.asarray(1 - ((points[:, :2] - (low + high) / 2) / half) ** 2)
 
 
 def base_heads(head: HeadGeometry, pan: Array, tilt: Array) -> tuple[Array, Array, Array]:
-    """T_base_head of many poses at once (Eq. 8 with dz and eps).
+    """Compute T_base_head of many head poses at once (Eq. 8 with dz and eps).
 
     Args:
-        head: the unit's geometry.
-        pan: as the head reports it [rad], (v,).
-        tilt: likewise.
+        head: geometry of the head.
+        pan: reported pan [rad], (v,).
+        tilt: reported tilt [rad], (v,).
 
     Returns:
-        Rotations (v, 3, 3), translations (v, 3), and the tilts' own rotations (v, 3, 3).
+        Rotations (v, 3, 3) and translations (v, 3) of T_base_head, and the rotations of tilt alone (v, 3, 3).
     """
     pan, tilt = head.true_angles(pan, tilt)
     turns = Rotation.from_rotvec(pan[:, None] * np.array([0.0, 1.0, 0.0])).as_matrix()
@@ -380,9 +366,9 @@ def base_heads(head: HeadGeometry, pan: Array, tilt: Array) -> tuple[Array, Arra
 
 
 def _by_head(head: HeadGeometry, A: Array, x_head: Array) -> Array:
-    """How x_head changes with dz and with eps, (v, N, 3, 2).
+    """Compute the derivatives of x_head by dz and by eps, (v, N, 3, 2).
 
-    With A the tilt's rotation, x_head = A^T (q - dz e3) + dz e3 where q = Rot(Y, -pan) x_base.
+    With A the rotation of tilt, x_head = A^T (q - dz e3) + dz e3 where q = Rot(Y, -pan) x_base.
     """
     by_dz = np.broadcast_to((E3 - A[:, 2])[:, None], x_head.shape)  # A^T e3 is A's third row
     # A = Rot(Z, eps) Rot(X, tilt) Rot(Z, -eps), so dA^T/deps = [e3]x A^T - A^T [e3]x
@@ -393,7 +379,7 @@ def _by_head(head: HeadGeometry, A: Array, x_head: Array) -> Array:
 
 
 def _by_turn(head: HeadGeometry, A: Array, x_head: Array) -> Array:
-    """How x_head changes with true pan and tilt, (v, N, 3, 2), in the terms of `_by_head`."""
+    """Compute the derivatives of x_head by true pan and true tilt, (v, N, 3, 2), with A and q as in `_by_head`."""
     a = x_head - head.axis_offset * E3
     q = a @ A.swapaxes(1, 2) + head.axis_offset * E3
     by_pan = -np.cross(np.array([0.0, 1.0, 0.0]), q) @ A  # dq/dpan = -e2 x q, then A^T
@@ -402,7 +388,7 @@ def _by_turn(head: HeadGeometry, A: Array, x_head: Array) -> Array:
 
 
 def _pose_derivative(turned: Array) -> Array:
-    """Derivative of R x + t by a step (w, d), given R x: [-[R x]x, I], (..., 3, 6)."""
+    """Compute the derivative of R x + t by a step (w, d), given R x: [-[R x]x, I], (..., 3, 6)."""
     x, y, z = np.moveaxis(turned, -1, 0)
     o, i = np.zeros_like(x), np.ones_like(x)
     rows = [[o, z, -y, i, o, o], [-z, o, x, o, i, o], [y, -x, o, o, o, i]]
@@ -417,11 +403,11 @@ def _project(lens: Intrinsics, x_camera: Array) -> tuple[Array, Array, Array, Ar
     px, J = cv2.projectPoints(x, np.zeros(3), np.zeros(3), lens.matrix, np.array(lens.distortion))
     J = np.asarray(J).reshape(v, n, 2, -1)
     last = POSE_PARAMETERS + LENS_PARAMETERS
-    by_point = J[..., 3:POSE_PARAMETERS]  # by t, which is the same
+    by_point = J[..., 3:POSE_PARAMETERS]  # the derivative by t equals that by the point
     return np.asarray(px).reshape(v, n, 2), by_point, J[..., POSE_PARAMETERS:last], J[..., last : last + 1]
 
 
-# --- normal ---
+# Normal equations
 
 SMALLEST_DAMPING = 1e-12
 TURNS = 2  # pan and tilt
@@ -429,19 +415,33 @@ TURNS = 2  # pan and tilt
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known before the corners speak: parameters near a reference's, with standard deviations by name."""
+    """Gaussian prior of the shared parameters.
+
+    Attributes:
+        reference: model with the means.
+        sigmas: standard deviations by parameter name; a parameter without one has no prior.
+    """
 
     reference: RigModel
     sigmas: Mapping[str, float]
 
 
-# Which parameters a batch speaks of (k,), and J^T W J for each of its views (v, m, m).
+# Indices of the shared parameters on which a batch depends (k,), and J^T W J of each of its views (v, m, m).
 Gram = tuple[npt.NDArray[np.intp], Array]
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Normal equations in blocks: shared (n, n), shared by board (B, n, 6), board (B, 6, 6), gradients, squares."""
+    """Normal equations in blocks.
+
+    Attributes:
+        shared: shared parameters, (n, n).
+        mixed: shared parameters by each board's pose, (B, n, 6).
+        boards: pose of each board, (B, 6, 6).
+        shared_gradient: gradient by the shared parameters, (n,).
+        board_gradient: gradient by each board's pose, (B, 6).
+        squares: weighted sum of squared residuals [px^2].
+    """
 
     shared: Array
     mixed: Array
@@ -453,20 +453,38 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """A model's residuals, batch by batch, and those left when every view's pan and tilt gave way (v, N, 2)."""
+    """A model's residuals, batch by batch.
+
+    Attributes:
+        model: the model.
+        predictions: predicted corners of each batch.
+        residuals: predicted minus observed, (v, N, 2) [px]; 0 for corners that are not seen.
+        after: residuals after each view's pan and tilt are fitted within the jitter, (v, N, 2) [px].
+        given: sum of the squared changes of pan and tilt [rad^2].
+        finite: False where a board is behind a camera.
+        sigma: robust standard deviation of a coordinate of ``after`` [px].
+    """
 
     model: RigModel
     predictions: list[Prediction]
     residuals: list[Array]
     after: list[Array]
-    given: float  # sum of the squares of how far pan and tilt gave way [rad^2]
+    given: float
     finite: bool
     sigma: float
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What does not change during a fit: the views, sorted by lens, what is free, what is known, and the jitter."""
+    """Least-squares problem of one fit.
+
+    Attributes:
+        batches: views, grouped by lens.
+        points: the board's corners in its frame [m], (N, 3).
+        free: blocks that are free.
+        prior: prior of the shared parameters, or None.
+        jitter: standard deviation of the head's true angles about the reported ones [rad].
+    """
 
     batches: list[Batch]
     points: Array
@@ -475,7 +493,7 @@ class Problem:
     jitter: float
 
     def at(self, model: RigModel) -> Evaluation:
-        """Predict every view."""
+        """Evaluate a model: predict every view and compute the residuals."""
         predictions = [predict(model, batch, self.points, self.free) for batch in self.batches]
         residuals = [
             np.where(batch.seen[..., None], p.pixels - batch.observed, 0.0)
@@ -500,7 +518,7 @@ class Problem:
         return Evaluation(model, predictions, residuals, after, given, finite, sigma)
 
     def cost(self, here: Evaluation, scale: float) -> float:
-        """Huber's cost, of the residuals and of what is known before."""
+        """Compute Huber's cost of the residuals plus the cost of jitter and prior [px^2]."""
         if not here.finite:
             return np.inf
         cost = sum(huber_cost(r, scale) for r in here.after)
@@ -513,7 +531,7 @@ class Problem:
         return cost
 
     def variance(self, here: Evaluation) -> float | None:
-        """See `Fit.variance`."""
+        """Estimate the variance of a corner coordinate [px^2]; see `coordinate_variance`."""
         n = len(parameter_names(self.free, here.model.stops))
         parameters = float(n + POSE_PARAMETERS * len(here.model.boards))
         if self.jitter:
@@ -528,14 +546,14 @@ class Problem:
         return coordinate_variance(self._seen(here.after), parameters)
 
     def equations(self, here: Evaluation, scale: float | None) -> Equations:
-        """Normal equations with Huber's weights; without a scale, of plain squares."""
+        """Form the normal equations with Huber's weights; with ``scale`` None, those of plain least squares."""
         sigma = here.sigma
         return self.assembled(
             here, self.grams(here, scale), (sigma / self.jitter) ** 2 if self.jitter else np.inf, sigma**2
         )
 
     def grams(self, here: Evaluation, scale: float | None) -> list[Gram]:
-        """Every batch's columns, and J^T W J of J = (shared, board, turn, residual) for each of its views."""
+        """Compute J^T W J with J = (shared, board, turn, residual) for each view, batch by batch."""
         found = []
         for batch, p, r, after in zip(self.batches, here.predictions, here.residuals, here.after, strict=True):
             turn = [p.by_turn] if p.by_turn is not None else []
@@ -550,13 +568,13 @@ class Problem:
     def assembled(
         self, here: Evaluation, grams: list[Gram], penalty: float, variance: float | None = None
     ) -> Equations:
-        """Add up all views, their turns eliminated, and what is known before.
+        """Add up all views and the prior, with each view's own pan and tilt eliminated.
 
         Args:
-            here: where the views were predicted.
-            grams: of every batch.
-            penalty: variance of a coordinate over that of a turn; infinite where the head is exact.
-            variance: of a coordinate, to weigh the prior [px^2]; the evaluation's own where it is not given.
+            here: evaluation of the model.
+            grams: J^T W J of every batch, see `grams`.
+            penalty: variance of a coordinate over the squared jitter [px^2/rad^2]; infinite for an exact head.
+            variance: variance of a coordinate, which weighs the prior [px^2]; None for that of the evaluation.
         """
         boards = len(here.model.boards)
         n = len(parameter_names(self.free, here.model.stops))
@@ -584,24 +602,24 @@ class Problem:
         return Equations(shared, mixed, board, shared_gradient, board_gradient, squares)
 
     def _known(self, model: RigModel, variance: float) -> tuple[Array, Array]:
-        """How far the free parameters are from the prior's, and its weight in px^2 against a coordinate's, (n,)."""
+        """Compute the free parameters' deviations from the prior's means, (n,), and their weights [px^2], (n,)."""
         assert self.prior is not None
         names = parameter_names(self.free, model.stops)
         sigmas = np.array([self.prior.sigmas.get(name, np.inf) for name in names])
         return difference(model, self.prior.reference, self.free), variance / sigmas**2
 
     def _seen(self, residuals: list[Array]) -> Array:
-        """The residuals of the corners that are seen, (n, 2)."""
+        """Select the residuals of the corners that are seen, (n, 2)."""
         return np.concatenate([r[batch.seen] for batch, r in zip(self.batches, residuals, strict=True)])
 
 
 def masked(J: Array, batch: Batch) -> Array:
-    """Derivatives (v, N, 2, k) with those of unseen corners cleared."""
+    """Set the derivatives (v, N, 2, k) of corners that are not seen to 0."""
     return np.where(batch.seen[..., None, None], J, 0.0)
 
 
 def without_turns(gram: Array, penalty: float) -> Array:
-    """Eliminate each view's own pan and tilt, the two columns before the last."""
+    """Eliminate each view's own pan and tilt, the two columns before the last (Schur complement)."""
     k = gram.shape[-1] - 1 - TURNS
     kept = [*range(k), gram.shape[-1] - 1]
     rest = gram[:, kept][:, :, kept]
@@ -613,7 +631,11 @@ def without_turns(gram: Array, penalty: float) -> Array:
 
 
 def reduced(equations: Equations, damping: float) -> tuple[Array, Array, Array]:
-    """Eliminate the boards: reduced matrix (n, n) and gradient (n,), and the boards' inverses (B, 6, 6)."""
+    """Eliminate the boards' poses (Schur complement).
+
+    Returns:
+        Normal matrix (n, n) and gradient (n,) of the shared parameters; inverses of the boards' blocks (B, 6, 6).
+    """
     e = equations
     inverse = np.asarray(np.linalg.inv(e.boards + damped(e.boards, damping)), dtype=float)
     through = e.mixed @ inverse
@@ -622,7 +644,7 @@ def reduced(equations: Equations, damping: float) -> tuple[Array, Array, Array]:
 
 
 def solved_step(equations: Equations, damping: float) -> tuple[Array, Array]:
-    """A damped step of the shared parameters (n,) and of the boards (B, 6)."""
+    """Solve a damped step of the shared parameters (n,) and of the boards' poses (B, 6)."""
     matrix, gradient, inverse = reduced(equations, damping)
     shared = np.asarray(np.linalg.solve(matrix, -gradient), dtype=float)
     right = equations.board_gradient + np.einsum("bij,i->bj", equations.mixed, shared)
@@ -630,48 +652,49 @@ def solved_step(equations: Equations, damping: float) -> tuple[Array, Array]:
 
 
 def damped(blocks: Array, damping: float) -> Array:
-    """The diagonal to add to one or many square blocks; never quite zero, so that a free direction stands still."""
+    """Compute the damping diagonal of square blocks; it is never zero, so that undetermined directions do not move."""
     diagonal = np.diagonal(blocks, axis1=-2, axis2=-1)
     return np.eye(blocks.shape[-1]) * (diagonal * damping + SMALLEST_DAMPING)[..., None]
 
 
 def robust_scale(here: Evaluation) -> float:
-    """Beyond which a corner's residual counts linearly [px]."""
+    """Compute the residual beyond which a corner counts linearly in Huber's loss [px]."""
     return HUBER_SIGMAS * here.sigma
 
 
-# --- robust ---
+# Robust statistics of the residuals
 
-# A point further off than this many standard deviations (from the median) counts linearly, not squared (Huber).
+# A point farther off than this many standard deviations counts linearly and not squared (Huber).
 HUBER_SIGMAS = 3.0
-MEDIAN_TO_SIGMA = 1 / 1.1774  # of the length of a 2D Gaussian vector: its median is sigma sqrt(2 ln 2)
-SMALLEST_SIGMA_PX = 1e-4  # corners are rounded to this, so that exact data have no smaller scale
+MEDIAN_TO_SIGMA = 1 / 1.1774  # the median length of a 2D Gaussian vector is sigma sqrt(2 ln 2)
+SMALLEST_SIGMA_PX = 1e-4  # rounding of corners, and so the smallest scale of exact data
 
 
 def rms(residuals: Array) -> float:
-    """OpenCV's rms: root of the mean squared distance per point of residuals (..., 2) [px]; nan points do not count."""
+    """Compute OpenCV's rms, the root mean square distance per point of residuals (..., 2) [px]; nan does not count."""
     squared = np.sum(residuals**2, axis=-1)
     seen = np.isfinite(squared)
     return float(np.sqrt(squared[seen].mean())) if seen.any() else 0.0
 
 
 def robust_sigma(residuals: Array) -> float:
-    """Standard deviation of a coordinate of residuals (n, 2), told by the median length [px]."""
+    """Estimate the standard deviation of a coordinate of residuals (n, 2) from their median length [px]."""
     return max(float(np.median(np.linalg.norm(residuals, axis=-1))) * MEDIAN_TO_SIGMA, SMALLEST_SIGMA_PX)
 
 
 def coordinate_variance(residuals: Array, parameters: float) -> float | None:
-    """Estimate what variance of one coordinate, times the inverse normal matrix, gives the parameters' covariance.
+    """Estimate the variance of one corner coordinate, robust against wrong corners.
 
-    It is that of Huber's estimate (Huber 1981, Eq. 7.6.10): mean |psi|^2 / 2 over the squared mean slope of psi, where
-    psi is a residual cut to the robust scale; for Gaussian noise 1 % more than the noise's own variance.
+    Times the inverse normal matrix, it gives the parameters' covariance. It is that of Huber's estimate (Huber 1981,
+    Eq. 7.6.10): mean |psi|^2 / 2 over the squared mean slope of psi, with psi a residual cut to the robust scale. For
+    Gaussian noise it is 1 % above the noise's variance.
 
     Args:
-        residuals: of the optimum, (n, 2) [px].
-        parameters: how many were fitted, the boards' poses included; they take up as many coordinates.
+        residuals: residuals at the optimum, (n, 2) [px].
+        parameters: number of fitted parameters, the boards' poses included.
 
     Returns:
-        [px^2]; None where there are not more coordinates than parameters.
+        Variance [px^2]; None where there are not more coordinates than parameters.
     """
     freedom = residuals.size - parameters
     if freedom <= 0:
@@ -679,41 +702,43 @@ def coordinate_variance(residuals: Array, parameters: float) -> float | None:
     scale = HUBER_SIGMAS * robust_sigma(residuals)
     weights = huber_weights(residuals, scale)
     psi2 = np.sum((weights[..., None] * residuals) ** 2, axis=-1)
-    slope = np.where(weights < 1, weights / 2, 1.0)  # beyond the scale psi only turns: one direction of the two
+    slope = np.where(weights < 1, weights / 2, 1.0)  # beyond the scale, psi changes in one of its two directions only
     return float(np.mean(psi2) / 2 / np.mean(slope) ** 2 * residuals.size / freedom)
 
 
 def huber_weights(residuals: Array, scale: float) -> Array:
-    """Huber's weight of every point."""
+    """Compute Huber's weight of every point, (...), from residuals (..., 2) and the scale [px]."""
     return scale / np.maximum(np.linalg.norm(residuals, axis=-1), scale)
 
 
 def huber_cost(residuals: Array, scale: float) -> float:
-    """Huber's cost."""
+    """Compute Huber's cost of residuals (..., 2), summed over the points [px^2]."""
     lengths = np.linalg.norm(residuals, axis=-1)
     return float(np.sum(np.where(lengths <= scale, lengths**2, scale * (2 * lengths - scale))))
 
 
+# The fit
+
 STEPS = 60
-CONVERGED = 1e-10  # relative fall of the cost at which the solver stops
-DAMPING = 1e-4  # first, relative to the diagonal of the normal equations
+CONVERGED = 1e-10  # relative decrease of the cost at which the solver stops
+DAMPING = 1e-4  # of the first step, relative to the diagonal of the normal equations
 DAMPING_LIMIT = 1e10
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The outcome of a fit.
+    """Result of a fit.
 
     Attributes:
-        model: the best parameters.
-        free: the blocks that were free.
-        residuals: predicted minus observed, of each view's points (V, N, 2) [px]; nan where a corner is not seen.
-        left: the same when every view's pan and tilt has given way to the jitter assumed.
-        normal: normal matrix of the free blocks, the boards' poses and any jitter eliminated; its inverse times the
-            variance of a coordinate is the parameters' covariance.
-        variance: of a coordinate [px^2]; None where there are not more coordinates than parameters.
-        jitter: the standard deviation of the head's angles that was assumed [rad].
-        views: what was fitted.
+        model: the fitted model.
+        free: blocks that were free.
+        residuals: predicted minus observed corners, (V, N, 2) [px]; nan for corners that are not seen.
+        left: residuals after each view's pan and tilt are fitted within the jitter, (V, N, 2) [px].
+        normal: normal matrix of the free blocks, with the boards' poses and any jitter eliminated; its inverse times
+            ``variance`` is the parameters' covariance.
+        variance: variance of a coordinate [px^2]; None where there are not more coordinates than parameters.
+        jitter: standard deviation of the head's angles that the fit assumed [rad].
+        views: views that were fitted.
     """
 
     model: RigModel
@@ -727,7 +752,7 @@ class Fit:
 
     @property
     def rms_px(self) -> float:
-        """Root mean square distance per point."""
+        """Root mean square distance per point [px]."""
         return rms(self.residuals)
 
 
@@ -740,18 +765,18 @@ def fit(
     prior: Prior | None = None,
     jitter: float = 0.0,
 ) -> Fit:
-    """Find the most likely parameters; the boards' poses are always free.
+    """Fit the free blocks and the boards' poses to the corners of all views (Levenberg-Marquardt).
 
     Args:
-        model: where to start.
-        views: with the corners of all points each, nan where not seen.
+        model: start of the iteration, with a pose for every board.
+        views: views to fit.
         points: the board's corners in its frame [m], (N, 3).
-        free: which blocks may change besides the boards' poses.
-        prior: what is known of the parameters before.
-        jitter: standard deviation of the head's true angles about the reported ones, of every view anew [rad].
+        free: blocks that are free besides the boards' poses.
+        prior: prior of the shared parameters.
+        jitter: standard deviation of the head's true angles about the reported ones, independent for each view [rad].
 
     Raises:
-        CalibrationError: there is nothing to fit, or the corners cannot be explained at all.
+        CalibrationError: there are no views, or a board ends behind a camera.
     """
     if not views:
         raise CalibrationError("no views of the board to fit")
@@ -786,16 +811,16 @@ def fit(
 
 
 def information(model: RigModel, views: Sequence[View], points: Array, free: Collection[Block]) -> Array:
-    """What views would tell of the free parameters, whatever their corners: the normal matrix without the boards.
+    """Compute the normal matrix that views would add, with the boards' poses eliminated.
 
     Args:
-        model: with the boards of the views.
-        views: planned or taken; only which corners are seen matters.
+        model: model with the boards of the views.
+        views: planned or taken views; only which corners are seen matters.
         points: the board's corners in its frame [m], (N, 3).
-        free: the blocks.
+        free: blocks that are free.
 
     Returns:
-        (n, n), in the order of `parameter_names` [1/px^2].
+        Normal matrix (n, n) in the order of `parameter_names` [1/px^2].
     """
     model = replace(model, boards={number: model.boards[number] for number in sorted({v.board for v in views})})
     problem = Problem(batches_of(model, views), points, tuple(free), None, 0.0)

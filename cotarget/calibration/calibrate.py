@@ -1,9 +1,8 @@
-"""From views, saved captures or plain photos to a `Calibration`, by a method that is named.
+"""Calibrate a rig: from a rig, from saved captures, from plain photos, or from views, to a `Calibration`.
 
-From images on disk to views: whole boards first, then the parts of boards that long focal lengths show.
-
-Parts of a plain chessboard are told apart by where they should be, so that the images at longer focal lengths wait
-until those at the shortest have told the rig, and each zoom stop until the one before it is known; see `stops`.
+Images on disk are searched for whole boards at the shortest focal length first. At longer focal lengths the zoom camera
+sees a part of a board, whose corners are numbered by a prediction. So these images wait until the rig is calibrated at
+the shortest focal length, and those of each zoom sample until the one before is fitted.
 """
 
 import dataclasses
@@ -53,14 +52,20 @@ from cotarget.rig import Rig, opened_from
 
 NO_BOARD = "no whole board of {}x{} corners is seen"
 TWO_BOARDS = "two boards are in this picture; show one"
-GUESSES = 10  # pictures in which another board is looked for when the one configured is in none
+GUESSES = 10  # images searched for another size of board when none shows the configured one
 NOT_EXPECTED = "no part of the board is seen where it should be"
-TEACHING_VIEWS = 4  # of a stop, after each of which it is fitted again
+TEACHING_VIEWS = 4  # first views of a zoom sample, after each of which it is fitted again
 
 
 @dataclass(frozen=True, eq=False)
 class FoundViews:
-    """What images gave: views, what was left out, and the images' sizes (width, height) [px]."""
+    """Views found in images.
+
+    Attributes:
+        views: views found.
+        rejected: images without a usable board.
+        sizes: image size (width, height) of each camera [px].
+    """
 
     views: tuple[View, ...]
     rejected: tuple[Rejected, ...]
@@ -74,20 +79,20 @@ def find_view(capture: Capture, board: BoardConfig) -> View | None:
 
 
 def beyond_shortest(name: str, focal_px: float, shortest_px: float) -> Rejected:
-    """What is not used of the zoom camera where only its shortest nominal focal length is."""
+    """Reject an image or view beyond the shortest nominal focal length, for a method that uses only that."""
     return Rejected(name, f"taken at {focal_px:.0f} px, not at the shortest focal length, {shortest_px:.0f} px")
 
 
 def find_views(
     directory: Path, index: CaptureIndex, progress: Progress | None = None, *, options: Options = DEFAULT_OPTIONS
 ) -> FoundViews:
-    """Find the boards in all images of an index; the sequential method's only at the shortest focal length.
+    """Find the boards in all images of an index; for the sequential method, only at the shortest focal length.
 
     Args:
-        directory: where the images lie.
-        index: what they are.
-        progress: called with what is done, of how much, and in words.
-        options: how the views will be calibrated.
+        directory: folder of the images.
+        index: index of the images.
+        progress: called with the number done, the total, and a text.
+        options: options with which the views will be calibrated.
 
     Raises:
         CalibrationError: an image is missing or malformed, none shows a board, or those at the shortest focal length
@@ -113,7 +118,7 @@ def find_views(
         if view is None:
             rejected.append(Rejected(str(capture.source), NO_BOARD.format(*index.board.corners)))
             if not views and len(rejected) == GUESSES and (other := _another_kind(capture, index.board)):
-                raise CalibrationError(f"{directory}: {other}")  # long before all pictures were searched in vain
+                raise CalibrationError(f"{directory}: {other}")  # early, before all images are searched in vain
         elif another_board(capture.image, index.board, view.corners_px):
             rejected.append(Rejected(str(capture.source), TWO_BOARDS))
         else:
@@ -130,7 +135,7 @@ def find_views(
 
 
 def _why_none(directory: Path, index: CaptureIndex, rejected: Sequence[Rejected]) -> str:
-    """Why no picture has given a view, as far as a look at some of them tells."""
+    """Explain why no image gave a view, from a second search of some of them."""
     board = index.board
     name = f"{board.kind} of {board.corners[0]}x{board.corners[1]} inner corners"
     if two := [one.name for one in rejected if one.reason == TWO_BOARDS]:
@@ -143,7 +148,7 @@ def _why_none(directory: Path, index: CaptureIndex, rejected: Sequence[Rejected]
 
 
 def _another_kind(capture: Capture, board: BoardConfig) -> str:
-    """That a picture shows a chessboard of another size than the one configured; empty where it does not."""
+    """Describe a chessboard of another size than the configured one in an image; empty where there is none."""
     seen = guess_corners(capture.image) if board.kind == "chessboard" else None
     if seen is None or seen == board.corners:
         return ""
@@ -160,7 +165,7 @@ def _find_parts(
     sizes: Mapping[CameraName, tuple[int, int]],
     options: Options,
 ) -> tuple[list[View], list[Rejected]]:
-    """Find whole or partly seen boards in images at the stops beyond the first, one stop after the other."""
+    """Find whole or partly seen boards in images at the zoom samples beyond the first, one sample after the other."""
     points = board_points(board)
     solution = joint(views, points, sizes, stops_of(views), options)
     model, known = solution.model, list(solution.views)
@@ -172,7 +177,7 @@ def _find_parts(
         model = replace(model, zoom=with_stop(model.zoom, nominal))
         here: list[View] = []
         waiting = [(image, view) for image, view in blank if same_focal(view, nominal) and view.board in model.boards]
-        for learning in (True, False):  # what is seen teaches the stop; what was missed before may be seen then
+        for learning in (True, False):  # images missed in the first round may be found once the sample is fitted
             missed = []
             for image, view in waiting:
                 corners = find_expected(image, board, expected_corners(model, view, points))
@@ -191,19 +196,21 @@ def _find_parts(
 
 
 def _taught(model: RigModel, known: Sequence[View], here: Sequence[View], points: Array) -> RigModel:
-    """The model with its last stop fitted to the views at it."""
+    """Fit the last zoom sample of a model to the views at it."""
     numbers = {view.board for view in here}
     fixed = [view for view in known if view.camera == "fixed" and view.board in numbers]
     return fit_stop(model, model.stops - 1, [*fixed, *here], points)
 
 
+# Calibration from views, captures, photos and rigs
+
 # Thirty placements point to a few thousandths of a degree; a session of them takes about 15 s on two cores.
 PLACEMENTS = 30
-# Eight stops follow a twelvefold zoom to some hundredths of a percent; six placements see each twelve times.
+# Eight zoom samples follow a twelvefold zoom to some hundredths of a percent; six placements see each twelve times.
 STOPS, FAR_PLACEMENTS = 8, 6
 METHODS = ("joint", "sequential")
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
-# Corners that depart from a line by less are on it: the board's by rounding [m], the image's as corners are rounded.
+# Points this near to a line are on it: on the board by rounding [m], in the image because corners are rounded [px].
 LINE_M, LINE_PX = 1e-9, 1e-3
 
 
@@ -217,17 +224,17 @@ def calibrate_views(
     rejected: Sequence[Rejected] = (),
     provenance: Mapping[str, Any] | None = None,
 ) -> Calibration:
-    """Calibrate from corners. The order of the views does not matter.
+    """Calibrate a rig from views, in any order.
 
     Args:
-        views: of both cameras. The sequential method leaves out those of the zoom camera that are not at its shortest
-            focal length.
-        board: what the corners are of.
-        sizes: (width, height) of the images of "fixed" and "zoom" [px].
-        pitch_mm: size of a pixel of the zoom camera [mm], where it is known.
-        options: how to calibrate.
-        rejected: images already left out, and why, for the report.
-        provenance: where the views come from; versions and method are added.
+        views: views of both cameras. The sequential method leaves out zoom views that are not at the shortest focal
+            length.
+        board: the board of the views.
+        sizes: image sizes (width, height) of "fixed" and "zoom" [px].
+        pitch_mm: pixel size of the zoom camera [mm]; None if unknown.
+        options: options of the calibration.
+        rejected: images left out before, for the report.
+        provenance: origin of the views; versions and options are added.
 
     Raises:
         CalibrationError: the views do not determine the rig.
@@ -281,7 +288,7 @@ def _options_table(options: Options) -> dict[str, Any]:
 
 
 def _check_views(views: Sequence[View], board: BoardConfig) -> None:
-    """Refuse corners that are not of this board, or do not tell its pose."""
+    """Refuse views whose corners do not belong to this board, or do not determine its pose."""
     columns, rows = board.corners
     points = board_points(board)
     for view in views:
@@ -298,10 +305,10 @@ def _check_views(views: Sequence[View], board: BoardConfig) -> None:
 
 
 def tells_pose(view: View, points: Array) -> bool:
-    """Whether the corners seen are enough for the board's pose, and not all on one line.
+    """Check whether the corners seen determine the board's pose: enough of them, and not all on one line.
 
     Args:
-        view: of a board.
+        view: view of a board.
         points: the board's corners in its frame [m], (N, 3).
     """
     seen = view.seen
@@ -312,7 +319,7 @@ def tells_pose(view: View, points: Array) -> bool:
 
 
 def _in_canonical_order(views: Sequence[View]) -> list[View]:
-    """The same views in an order that does not depend on the one given, so that sums round alike."""
+    """Sort views, so that the rounding of sums does not depend on the order given."""
 
     def key(view: View) -> tuple[Any, ...]:
         return view.camera, view.board, view.focal_px or 0.0, view.pan, view.tilt, view.corners_px.tobytes()
@@ -321,7 +328,7 @@ def _in_canonical_order(views: Sequence[View]) -> list[View]:
 
 
 def _at_shortest(views: Sequence[View], nominal: Sequence[float]) -> tuple[list[View], list[Rejected]]:
-    """Keep the zoom camera's views at its shortest nominal focal length."""
+    """Keep the views of the fixed camera, and those of the zoom camera at its shortest nominal focal length."""
 
     def keep(view: View) -> bool:
         return view.camera == "fixed" or view.focal_px is None or view.focal_px <= nominal[0] * (1 + SAME_FOCAL)
@@ -337,12 +344,12 @@ def _at_shortest(views: Sequence[View], nominal: Sequence[float]) -> tuple[list[
 def calibrate_captures(
     directory: Path, *, options: Options = DEFAULT_OPTIONS, progress: Progress | None = None
 ) -> Calibration:
-    """Calibrate from captures that `calibrate` or somebody else saved; no rig is needed.
+    """Calibrate from saved captures, by `calibrate` or by another program; no rig is needed.
 
     Args:
         directory: folder with index.json and its images.
-        options: how to calibrate.
-        progress: called with what is done, of how much, and in words.
+        options: options of the calibration.
+        progress: called with the number done, the total, and a text.
 
     Raises:
         CalibrationError: a file is missing or malformed, or the views do not determine the rig.
@@ -365,10 +372,10 @@ def calibrate_photos(
     Args:
         directory: folder of the photos.
         fixed_glob: pattern of the fixed camera's files, like 'left*.jpg'.
-        zoom_glob: pattern of the zoom camera's, taken at pan = tilt = 0 or without any head.
-        board: what the photos show.
-        options: how to calibrate.
-        progress: called with what is done, of how much, and in words.
+        zoom_glob: pattern of the zoom camera's files, taken at pan = tilt = 0 or without a head.
+        board: the board in the photos.
+        options: options of the calibration.
+        progress: called with the number done, the total, and a text.
 
     Raises:
         CalibrationError: there are no pairs, or they do not determine the cameras.
@@ -423,21 +430,21 @@ def calibrate(
     config: RigConfig | None = None,
     options: Options = DEFAULT_OPTIONS,
 ) -> Calibration:
-    """Drive a rig through a capture session, then calibrate it.
+    """Drive a rig through a capture session, and calibrate it from the views.
 
     Args:
-        rig: of which nothing needs to be known.
-        board: the board that its holder holds; that of the rig's configuration by default, and its `pitch_mm` too.
-        captures_dir: where to keep the images; None to keep none.
-        progress: called with what is done, of how much, and in words.
-        placements: how many placements of the board, at the shortest focal length.
-        stops: how many stops of the zoom lens, evenly spread over its range; 1 for the shortest alone.
-        far_placements: how many more placements, far away, for the stops beyond the first.
-        seed: of the choice among possible placements.
-        pitch_mm: size of a pixel of the zoom camera [mm], where it is known.
-        settle: how long after a stop of head or board an image is still taken for one of before [s].
-        config: of the rig, to be kept beside the captures.
-        options: how to calibrate.
+        rig: rig to calibrate; no earlier calibration is needed.
+        board: the board in use; None for the board and `pitch_mm` of the rig's configuration.
+        captures_dir: folder for the images; None to keep none.
+        progress: called with the number done, the total, and a text.
+        placements: number of placements of the board at the shortest focal length.
+        stops: number of zoom samples, evenly spread over the logarithm of the lens's range; 1 for the shortest alone.
+        far_placements: number of further placements, far away, for the zoom samples beyond the first.
+        seed: seed of the choice among possible placements.
+        pitch_mm: pixel size of the zoom camera [mm]; None if unknown.
+        settle: time after head and board stand until an image counts [s].
+        config: configuration of the rig, stored beside the captures.
+        options: options of the calibration.
 
     Raises:
         CalibrationError: a camera never sees the board, there is no common view, or the head fails.

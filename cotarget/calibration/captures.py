@@ -1,15 +1,12 @@
-"""Captures on disk: PNG images and one index.json that says how each was taken; and folders of plain photos.
+"""Captures on disk: images, their index, and the log of the session; and folders of plain photos.
 
-index.json: schema; board; pitch_mm (or null); captures, one object an image with file, camera, board (the number of
-the placement), pan and tilt [rad], focal_px (null for the fixed camera), t [s]. The index is replaced in one step
-after every image, so that a session that is cut short, however, can still be used up to there.
-
-What a capture session leaves beside its images: what rig it was, by which versions, and what it was told to do.
-
-session.json: schema; versions; config, the rig's whole configuration without passwords (null where none was given).
-commands.jsonl: an object a line and a command, written before the next is given: t [s], when it was given; do; asked;
-got. "turn" asks for pan and tilt [rad] and gets those that the head goes to; "zoom" asks for a focal length [px] and
-gets the one that the lens goes to; "present" asks for the board at a pose, T_fixed_board, and gets null.
+- index.json: schema; board; pitch_mm (or null); captures, one object per image with file, camera, board (number of the
+  placement), pan and tilt [rad], focal_px (null for the fixed camera), t [s]. It is replaced atomically after every
+  image, so that an interrupted session can be used up to there.
+- session.json: schema; versions; config, the rig's whole configuration without passwords (null where none was given).
+- commands.jsonl: one object per line and command, written before the next command: t [s], the time of the command; do;
+  asked; got. "turn" asks for pan and tilt [rad] and gets those that the head goes to; "zoom" asks for a focal length
+  [px] and gets the one that the lens goes to; "present" asks for T_fixed_board and gets null.
 """
 
 import importlib.metadata
@@ -36,11 +33,11 @@ from cotarget.rig import Image
 
 SCHEMA = 1
 SESSION, COMMANDS = "session.json", "commands.jsonl"
-VERSIONS = ("numpy", "scipy", "opencv-python-headless")  # of what found the corners and fits
+VERSIONS = ("numpy", "scipy", "opencv-python-headless")  # packages on which corners and fits depend
 
 
 def write_session(directory: Path, config: RigConfig | None) -> None:
-    """Write session.json, and begin commands.jsonl.
+    """Write session.json and an empty commands.jsonl.
 
     Raises:
         CalibrationError: a file cannot be written.
@@ -72,19 +69,25 @@ def write_command(directory: Path, t: float, do: str, asked: Any, got: Any = Non
 def _version(package: str) -> str | None:
     try:
         return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:  # another build of it
+    except importlib.metadata.PackageNotFoundError:  # such as another build of OpenCV
         return None
 
 
 INDEX = "index.json"
-# zlib's fastest level: noise hardly compresses, and the session's time is better spent on looking for corners.
+# zlib's fastest level: noise hardly compresses, and the time is better spent on the search for corners.
 PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)
-LARGEST_ANGLE = 2 * math.pi  # of a head that stays within one turn to each side [rad]
+LARGEST_ANGLE = 2 * math.pi  # a head stays within one turn to each side [rad]; a larger angle is in degrees
 
 
 @dataclass(frozen=True)
 class CaptureIndex:
-    """What index.json says, without the images: ``captures`` hold file names as their source and empty images."""
+    """Content of index.json.
+
+    Attributes:
+        board: the board in the images.
+        pitch_mm: pixel size of the zoom camera [mm], or None.
+        captures: captures with the file's name as their source and an empty image.
+    """
 
     board: BoardConfig
     pitch_mm: float | None
@@ -95,12 +98,12 @@ NO_IMAGE: Image = np.zeros((0, 0, 3), np.uint8)
 
 
 def file_name(capture: Capture, number: int) -> str:
-    """Name a capture's image: its number in the session, its camera, its placement."""
+    """Make the name of a capture's image from its number in the session, its camera and its placement."""
     return f"{number:04d}_{capture.camera}_board{capture.board:02d}.png"
 
 
 def write_image(path: Path, image: Image) -> None:
-    """Write a PNG in one step.
+    """Write a PNG atomically.
 
     Raises:
         CalibrationError: the file cannot be written.
@@ -112,7 +115,7 @@ def write_image(path: Path, image: Image) -> None:
 
 
 def write_index(directory: Path, index: CaptureIndex) -> None:
-    """Write index.json in one step.
+    """Write index.json atomically.
 
     Raises:
         CalibrationError: the file cannot be written.
@@ -143,8 +146,8 @@ def read_index(directory: Path) -> CaptureIndex:
     """Read index.json.
 
     Raises:
-        CalibrationError: it is missing or malformed, or lists an image twice or one that is not there; the message
-            names the file and the key.
+        CalibrationError: the file is missing or malformed, or lists an image twice or one that does not exist; the
+            message names the file and the key.
     """
     path = directory / INDEX
     if not directory.is_dir():
@@ -169,10 +172,10 @@ def read_index(directory: Path) -> CaptureIndex:
 
 
 def read_images(directory: Path, captures: Sequence[Capture]) -> Iterator[Capture]:
-    """Read the images one by one; each camera's must be of one size.
+    """Read the images of captures one by one; all images of a camera must have one size.
 
     Raises:
-        CalibrationError: an image is missing, unreadable, or of another size than its camera's others.
+        CalibrationError: an image is missing, unreadable, or differs in size from others of its camera.
     """
     sizes: dict[CameraName, tuple[str, tuple[int, int]]] = {}
     for capture in captures:
@@ -210,15 +213,15 @@ def pair_photos(directory: Path, fixed_glob: str, zoom_glob: str) -> tuple[list[
     """Pair plain photos of two cameras by the last number in their names.
 
     Args:
-        directory: where they lie.
+        directory: folder of the photos.
         fixed_glob: pattern of the fixed camera's files, like 'left*.jpg'.
-        zoom_glob: pattern of the zoom camera's.
+        zoom_glob: pattern of the zoom camera's files.
 
     Returns:
-        Captures with empty images, the number as the placement; and the names of files without a partner.
+        Captures with empty images and the number as the placement; and the names of files without a partner.
 
     Raises:
-        CalibrationError: no folder, no files, a file without a number, or two files with one number.
+        CalibrationError: there is no folder, no file, a file without a number, or two files with the same number.
     """
     if not directory.is_dir():
         raise CalibrationError(f"{directory}: no such folder; give a folder of photos")
@@ -239,10 +242,10 @@ def pair_photos(directory: Path, fixed_glob: str, zoom_glob: str) -> tuple[list[
 
 
 def matching(directory: Path, pattern: str) -> list[Path]:
-    """Find the files that a pattern means, sorted; not hidden ones, as what is left of a file that was being written.
+    """List the files that match a pattern, sorted, without hidden ones, such as the rest of an interrupted write.
 
     Raises:
-        CalibrationError: it is no pattern.
+        CalibrationError: the pattern is invalid.
     """
     try:
         return sorted(path for path in directory.glob(pattern) if path.is_file() and not path.name.startswith("."))
@@ -251,7 +254,7 @@ def matching(directory: Path, pattern: str) -> list[Path]:
 
 
 def _numbered(directory: Path, pattern: str) -> dict[int, str]:
-    """Files by the last number in their names."""
+    """Map the last number in each file's name to the name."""
     paths = matching(directory, pattern)
     if not paths:
         raise CalibrationError(f"{directory}: no file matches '{pattern}'")
@@ -293,7 +296,7 @@ def _parse_capture(value: object, where: str) -> Capture:
 
 
 def _parse_angle(row: Table, key: str, where: str, camera: CameraName) -> float:
-    """The head's angle [rad]; null is none, which does for the fixed camera."""
+    """Parse an angle of the head [rad]; the fixed camera may have null, which is 0."""
     value = get(row, key, where) if camera == "fixed" else row.get(key)
     if value is None:
         if camera == "fixed":
@@ -306,7 +309,7 @@ def _parse_angle(row: Table, key: str, where: str, camera: CameraName) -> float:
 
 
 def _check_files(directory: Path, captures: Sequence[Capture]) -> None:
-    """Refuse an index that does not agree with the folder."""
+    """Refuse an index that lists a file twice, or one that is not in the folder."""
     first: dict[str, int] = {}
     for i, capture in enumerate(captures):
         assert capture.source is not None

@@ -1,18 +1,15 @@
-"""The board: its points, its picture, and its corners in an image, numbered the same way from every side.
+"""Corner detection: find a board's inner corners in an image to subpixel accuracy, and number them.
 
-The board's frame: origin at the first inner corner, x along the columns, y along the rows, z into the board, away
-from the viewer. The square diagonally outside the first corner is black. With one odd and one even count of corners
-the opposite square is white, so that the colours alone tell a board from the same board upside down; a ChArUco board is
-told by its markers, whatever the counts.
+The board's frame has its origin at the first inner corner, x along the columns, y along the rows, and z into the board,
+away from the viewer. The square diagonally outside the first corner is black.
 
-A ChArUco board's corners: its markers say which part of it is seen, so that it may reach beyond the image.
+- `find_corners` finds a whole chessboard. With one odd and one even count of corners, the colours alone show which way
+  up it is.
+- `find_charuco` finds a ChArUco board, whole or in part. Its markers number the corners.
+- `find_near` finds a part of a chessboard, as the zoom camera sees it at long focal lengths. The colours alone do not
+  show which part, so the corners are numbered by a prediction that is good to a fraction of a square.
 
-Corners of a grid of squares, looked for near where they should be, and told from everything else.
-
-A chessboard of which the image shows only a part, its corners told apart by a prediction.
-
-At long focal lengths the zoom camera sees a part of any board that the fixed camera can read. The squares' colours
-alone do not say which part; but where every corner should be is known to a fraction of a square by then.
+Measurements: docs/design-notes.md.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,42 +24,45 @@ from cotarget.config import BoardConfig
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
+# Search of a grid's corners near their predictions
+
 Mask = npt.NDArray[np.bool_]
-# cornerSubPix looks this share of the smallest corner spacing to each side. The customary 11 px reach into the next
-# corners on small boards and more than double the residuals on real photos.
+# Half window of cornerSubPix over the smallest corner spacing. The customary 11 px reach into the next corners of small
+# boards and more than double the residuals on real photos.
 WINDOW_SHARE = 0.35
-SMALLEST_WINDOW_PX = 2  # below it, cornerSubPix has too few pixels to fit
-# Stop when corners move less than a thousandth of a pixel, ten times below the noise of the best corners.
+SMALLEST_WINDOW_PX = 2  # with a smaller half window, cornerSubPix has too few pixels to fit
+# Stop when corners move by less than a thousandth of a pixel, ten times below the noise of the best corners.
 SUBPIX_CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001)
-# Corners are kept to a ten-thousandth of a pixel: a hundred times below their noise, and short in a file.
+# Corners are rounded to a ten-thousandth of a pixel, a hundred times below their noise, to keep files short.
 CORNER_DECIMALS = 4
-# Even and odd squares must differ by this many grey levels, or what was found is no chessboard.
+# Even and odd squares of a chessboard differ by at least this many grey levels.
 SMALLEST_CONTRAST = 8.0
-BEYOND_SHARE = 0.4  # of the board's usual contrast, which a corner beyond its edge has too, and a background has not
+BEYOND_SHARE = 0.4  # contrast over the board's usual one from which a point beyond its edge is another corner
 FEWEST_CORNERS = 6
-FEWEST_AFFINE = 4  # at the first look, whose larger window leaves out those near the image's edge
+FEWEST_AFFINE = 4  # in the first round, whose larger window leaves out corners near the image's edge
 SMALLEST_SPACING_PX = 10.0  # below, the four squares around a corner blur into each other
-# Once corners are nearly known, a larger window adds no accuracy but loses corners near the image's edge [px].
+# Largest half window once corners are nearly known [px]. A larger one adds no accuracy and loses corners near the
+# image's edge.
 LARGEST_WINDOW_PX = 10
-ROUNDS = 4  # of predicting and looking again; two or three are usual
-CAPTURE_SHARE = 0.06  # of a square, within which corners agree with an affine map at the first look
-# A corner farther from a smooth map than this is another thing: [px], and of a square; the larger holds. Where few
-# corners leave the map affine, it is what perspective and the lens may bend over them.
+ROUNDS = 4  # rounds of prediction and search; two or three are usual
+CAPTURE_SHARE = 0.06  # distance from an affine map in the first round, in squares, within which corners agree
+# Distance from a smooth map beyond which a point is no corner: in pixels and in squares, whichever is larger. Where few
+# corners leave the map affine, this allows for what perspective and the lens bend.
 OFF_MAP_PX, OFF_MAP_SHARE = 1.0, 0.01
-CURVED_CORNERS = 16  # from so many corners on, the map is curved as by perspective and a lens of unknown distortion
-TRIMMINGS = 10  # of the worst corners, one share after the other
-PIXEL_SCALE = 1000.0  # pixels are divided by it where their squares are fitted, so that no column is much larger
+CURVED_CORNERS = 16  # number of corners from which the map includes perspective and radial distortion
+TRIMMINGS = 10  # rounds of leaving out the worst corners
+PIXEL_SCALE = 1000.0  # divisor of pixels in the map's fit, so that the columns are of similar size
 
 
 @dataclass(frozen=True)
 class Look:
-    """How closely corners are looked at, in shares of a square.
+    """Distances at which corners are examined, in squares.
 
     Attributes:
-        window: reach of cornerSubPix to each side.
-        inside: where the colours of the four squares are compared, from the corner along both axes.
-        near: where they are compared again.
-        sharpness: of the contrast at ``inside``, what must be left at ``near``, or the image is too blurred.
+        window: half window of cornerSubPix.
+        inside: distance from the corner along both axes at which the colours of the four squares are compared.
+        near: smaller distance at which they are compared again.
+        sharpness: smallest contrast at ``near`` over that at ``inside``; below it the image is too blurred.
     """
 
     window: float
@@ -71,21 +71,21 @@ class Look:
     sharpness: float
 
 
-# Blurred by 7 px (one standard deviation) where squares are 70 px large is too much.
+# Refuses a blur of 7 px (one standard deviation) with squares of 70 px.
 PLAIN = Look(window=WINDOW_SHARE, inside=0.3, near=0.1, sharpness=0.4)
-# Squares of a whole board may be as small as 7 px, and then little is left of the contrast near the corners.
+# Squares of a whole board may be as small as 7 px, with little contrast left near the corners.
 SMALL = Look(window=WINDOW_SHARE, inside=0.3, near=0.3, sharpness=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class FoundCorners:
-    """What a search came to.
+    """Result of a search for corners.
 
     Attributes:
-        corners_px: (N, 2), nan where nothing was found.
-        seen: which of them are the grid's corners.
-        expected: which of them were well inside the image and should have been seen.
-        spacing: smallest distance of neighbours in the image [px].
+        corners_px: points found, (N, 2) [px]; nan where nothing was found.
+        seen: True for points that are corners of the grid, (N,).
+        expected: True for corners that were well inside the image and should have been seen, (N,).
+        spacing: smallest distance of neighbouring corners in the image [px].
     """
 
     corners_px: Array
@@ -94,21 +94,21 @@ class FoundCorners:
     spacing: float
 
     def rounded(self) -> Array:
-        """The corners seen, (N, 2) [px]; the others are nan."""
+        """Return the corners that are seen, rounded, (N, 2) [px]; nan for the others."""
         return np.where(self.seen[:, None], np.round(self.corners_px, CORNER_DECIMALS), np.nan)
 
 
 def search(grey: Image, grid: Array, predicted: Array, look: Look) -> FoundCorners | None:
-    """Look for corners near their predictions, learn how far these are off, and look again until nothing changes.
+    """Search for corners near their predictions, correct the predictions by what is found, and repeat.
 
     Args:
-        grey: (H, W).
+        grey: grey image, (H, W).
         grid: column and row of every corner, (N, 2).
-        predicted: where they should be, (N, 2) [px]; nan where nobody knows.
-        look: how closely to look.
+        predicted: predicted corners, (N, 2) [px]; nan for corners without a prediction.
+        look: distances at which corners are examined.
 
     Returns:
-        What was found; None where it is fewer than six corners, or they are too close together.
+        Corners found; None where they are fewer than six, or too close together.
     """
     H = homography(grid, predicted)
     if H is None:
@@ -127,27 +127,27 @@ def search(grey: Image, grid: Array, predicted: Array, look: Look) -> FoundCorne
             return None
         if number and np.array_equal(seen, before):
             break
-        # Affine is enough to find the next ones by, and reaches safely beyond what is seen.
+        # An affine map predicts well enough for the next search, and extrapolates safely.
         start, half = mapped(predicted, found, seen, curved=False), min(half, LARGEST_WINDOW_PX)
     return FoundCorners(found, seen, expected, spacing)
 
 
 def grid_of(board: BoardConfig) -> Array:
-    """Column and row of every corner, (N, 2)."""
+    """List the column and row of every corner, row by row, (N, 2)."""
     columns, rows = board.corners
     v, u = np.mgrid[:rows, :columns].astype(float)
     return np.stack([u, v], axis=-1).reshape(-1, 2)
 
 
 def homography(grid: Array, pixels: Array) -> Array | None:
-    """From squares to pixels by least squares over what is finite.
+    """Fit the homography from squares to pixels by least squares over the finite pixels.
 
     Args:
-        grid: where corners are on the board [squares], (n, 2).
-        pixels: where they are in the image, (n, 2) [px]; nan where one is not known.
+        grid: corners on the board [squares], (n, 2).
+        pixels: corners in the image, (n, 2) [px]; nan for unknown ones.
 
     Returns:
-        (3, 3); None where too few are known.
+        Homography (3, 3); None where fewer than six corners are known.
     """
     finite = np.isfinite(pixels).all(axis=1)
     if np.count_nonzero(finite) < FEWEST_CORNERS:
@@ -157,14 +157,14 @@ def homography(grid: Array, pixels: Array) -> Array | None:
 
 
 def through(H: Array, grid: Array) -> Array:
-    """Where squares' places (..., 2) are in the image [px]."""
+    """Map points on the board (..., 2) [squares] to pixels by a homography."""
     x = grid @ H[:, :2].T + H[:, 2]
     with np.errstate(all="ignore"):
         return np.where(x[..., 2:] > 0, x[..., :2] / x[..., 2:], np.nan)
 
 
 def spacing_px(grey: Image, grid: Array, H: Array) -> float:
-    """The smallest distance of neighbouring corners within the image [px]; nan where there are none."""
+    """Compute the smallest distance of neighbouring corners within the image [px]; nan where there are none."""
     places = through(H, grid)
     here = inside(grey, places, 0)
     if not here.any():
@@ -174,15 +174,15 @@ def spacing_px(grey: Image, grid: Array, H: Array) -> float:
 
 
 def inside(grey: Image, pixels: Array, margin: float) -> Mask:
-    """Which pixels (N, 2) are inside the image by a margin [px]; not the nan ones."""
+    """Check which pixels (N, 2) are inside the image by a margin [px], (N,); False for nan."""
     limit = np.array(grey.shape[::-1]) - 1 - margin
     return np.asarray(((pixels >= margin) & (pixels <= limit)).all(axis=-1))
 
 
 def refined(grey: Image, start: Array, which: Mask, half: int) -> Array:
-    """Move corners to the saddle points in the window around them; nan for the others.
+    """Move the selected corners to the saddle points in their windows, (N, 2) [px]; nan for the others.
 
-    One that runs out of its window stays where it was, which `are_corners` tells from a corner.
+    A point that leaves its window stays where it was; `are_corners` rejects it.
     """
     found = np.full(start.shape, np.nan)
     if which.any():
@@ -192,24 +192,24 @@ def refined(grey: Image, start: Array, which: Mask, half: int) -> Array:
 
 
 def are_corners(grey: Image, pixels: Array, grid: Array, H: Array, look: Look) -> Mask:
-    """Whether the image shows corners of the board's there, and sharp ones; see `contrast`."""
+    """Check which pixels (N, 2) show sharp corners of the board, by `contrast`, (N,)."""
     well_inside, near = (contrast(grey, pixels, grid, H, share) for share in (look.inside, look.near))
     with np.errstate(invalid="ignore"):
         return np.asarray((well_inside > SMALLEST_CONTRAST) & (near > look.sharpness * well_inside))
 
 
 def contrast(grey: Image, pixels: Array, grid: Array, H: Array, share: float) -> Array:
-    """By how much the two squares across that should be bright are brighter than the two that should be dark.
+    """Compute the contrast between the two bright and the two dark squares around each corner.
 
     Args:
-        grey: the image.
-        pixels: where corners may be, (N, 2).
-        grid: column and row of the corners that should be there, (N, 2).
-        H: from squares to pixels, roughly, for the size and the slant of the squares.
-        share: how far from the corner it is looked, along both axes, in squares.
+        grey: grey image, (H, W).
+        pixels: candidate corners, (N, 2).
+        grid: column and row of the expected corners, (N, 2).
+        H: approximate homography from squares to pixels, for the size and slant of the squares.
+        share: distance from the corner along both axes at which the squares are sampled [squares].
 
     Returns:
-        (N,) [grey levels], from the darker bright square to the brighter dark one; nan where the pixel is.
+        Level of the darker bright square less that of the brighter dark one, (N,) [grey levels]; nan for nan pixels.
     """
     diagonals = np.array([[-1, -1], [1, 1], [1, -1], [-1, 1]])  # dark, dark, bright, bright around the first corner
     arms = through(H, grid[:, None] + share * diagonals) - through(H, grid)[:, None]
@@ -221,13 +221,15 @@ def contrast(grey: Image, pixels: Array, grid: Array, H: Array, share: float) ->
 
 
 def goes_on(grey: Image, grid: Array, seen: Mask, H: Array) -> bool:
-    """Whether there are corners beyond an edge of the board: then this is another part of it, or of a larger one.
+    """Check whether corners continue beyond an edge of the board.
+
+    If so, what is seen is another part of the board, or a part of a larger one.
 
     Args:
-        grey: the image.
+        grey: grey image, (H, W).
         grid: column and row of the board's corners, (N, 2).
-        seen: those whose contrast is taken for the board's.
-        H: from squares to pixels.
+        seen: corners that give the board's usual contrast, (N,).
+        H: homography from squares to pixels.
     """
     usual = np.median(contrast(grey, through(H, grid[seen]), grid[seen], H, PLAIN.inside))
     last_column, last_row = grid.max(axis=0)
@@ -246,7 +248,7 @@ def goes_on(grey: Image, grid: Array, seen: Mask, H: Array) -> bool:
 
 
 def _agreeing(predicted: Array, found: Array, corners: Mask, spacing: float, *, rough: bool) -> Mask:
-    """Which corners moved from their prediction as a smooth map does; none where there is no such map."""
+    """Check which corners are off their predictions by one smooth map, (N,); none where there is no such map."""
     which = np.flatnonzero(corners)
     kept: Mask = np.zeros(len(found), dtype=bool)
     if rough:
@@ -271,7 +273,7 @@ def _agreeing(predicted: Array, found: Array, corners: Mask, spacing: float, *, 
 
 
 def mapped(predicted: Array, found: Array, kept: Mask, *, curved: bool) -> Array:
-    """Where a map, fitted to the corners kept, takes all predictions, (N, 2) [px]."""
+    """Fit a smooth map from predicted to found corners over those kept, and map all predictions, (N, 2) [px]."""
     middle = predicted[kept].mean(axis=0)
     columns = design(predicted - middle, curved=curved)
     coefficients = np.linalg.lstsq(columns[kept], found[kept] - predicted[kept], rcond=None)[0]
@@ -279,36 +281,36 @@ def mapped(predicted: Array, found: Array, kept: Mask, *, curved: bool) -> Array
 
 
 def design(pixels: Array, *, curved: bool) -> Array:
-    """Columns of an affine map, or of one that is curved by perspective and by radial distortion."""
+    """Make the design matrix of an affine map, or of one with perspective and radial distortion."""
     u, v = pixels.T / PIXEL_SCALE
     r2 = u * u + v * v
     columns = [np.ones_like(u), u, v] + ([u * u, u * v, v * v, u * r2, v * r2] if curved else [])
     return np.stack(columns, axis=1)
 
 
-# --- charuco ---
+# ChArUco boards
 
 GAP = (1 - MARKER_SHARE) / 2  # white between a corner and the marker, in squares
-# Nothing may reach into the markers: with a window of 0.35 corners are off by 0.15 to 0.23 px, with this by 0.1.
+# The window ends at the markers: with 0.35 squares corners are off by 0.15 to 0.23 px, with this by 0.1 px.
 BETWEEN_MARKERS = Look(window=GAP, inside=0.8 * GAP, near=0.8 * GAP, sharpness=0.0)
-# Small markers are read twice as far away in an image that is enlarged by 2, but in four times the time.
+# Enlarged by 2, small markers are read twice as far away, in four times the time.
 ENLARGED = (1, 2)
-ENOUGH = 0.5  # of the board's corners, from which on a larger image is not tried
-# Markers' cells are mostly edges when small: leave out more of them than the usual 0.13, and trust the code, which
-# corrects two bits, to do so.
+ENOUGH = 0.5  # share of the board's corners from which the enlarged image is not tried
+# Cells of small markers are mostly edges, so more of their margin is ignored than the usual 0.13; the code corrects two
+# bits.
 IGNORED_MARGIN, CORRECTION = 0.3, 1.0
 
 
 def find_charuco(grey: Image, board: BoardConfig, *, thorough: bool = True) -> Array | None:
-    """Find the corners of a ChArUco board that may be seen in part.
+    """Find the corners of a ChArUco board, whole or in part.
 
     Args:
-        grey: (H, W).
+        grey: grey image, (H, W).
         board: a ChArUco board.
-        thorough: whether to look for small markers even where no large ones are seen.
+        thorough: True to search the enlarged image even where the plain one shows no markers.
 
     Returns:
-        Corners row by row, (columns * rows, 2) [px], nan where none is seen; None where fewer than six are, or all are
+        Corners row by row, (columns * rows, 2) [px], nan for those not seen; None where fewer than six are seen, or all
         in one row or column.
     """
     grid = grid_of(board)
@@ -319,7 +321,7 @@ def find_charuco(grey: Image, board: BoardConfig, *, thorough: bool = True) -> A
     H = homography(grid, rough)
     if H is None:
         return None
-    # Corners without two readable markers beside them are looked for where the others say that they are.
+    # Corners without two readable markers beside them are searched where the others predict them.
     straight = through(H, grid)
     elsewhere = mapped(straight, rough, read, curved=bool(np.count_nonzero(read) >= CURVED_CORNERS))
     found = search(grey, grid, np.where(read[:, None], rough, elsewhere), BETWEEN_MARKERS)
@@ -329,7 +331,7 @@ def find_charuco(grey: Image, board: BoardConfig, *, thorough: bool = True) -> A
 
 
 def _by_markers(grey: Image, board: BoardConfig, thorough: bool) -> Array:
-    """Corners beside two markers that are read, roughly, (N, 2) [px]; nan for the others."""
+    """Find rough corners beside two markers that are read, (N, 2) [px]; nan for the others."""
     columns, rows = board.corners
     parameters = cv2.aruco.DetectorParameters()
     parameters.perspectiveRemoveIgnoredMarginPerCell = IGNORED_MARGIN
@@ -349,31 +351,31 @@ def _by_markers(grey: Image, board: BoardConfig, thorough: bool) -> Array:
     return most
 
 
-# --- partial ---
+# Chessboards seen in part
 
-# A mean offset beyond this share of a square is refused, long before it could be that of the next square; so is a
-# scale, shear or turn beyond this, as the largest element of a matrix less 1 (predictions are up to 3 % off).
+# Largest mean offset from the prediction, in squares, far below the distance of the next square; and largest scale,
+# shear or turn, as an element of the affine map less 1. Predictions are up to 3 % off.
 FARTHEST_SHARE = 0.35
 LARGEST_STRETCH = 0.1
-# Of the corners that must be in the image, so many are found on a board that is numbered as predicted.
+# Smallest share of the expected corners that are found on a board numbered as predicted.
 SMALLEST_SHARE = 0.85
 
 
 def find_near(image: Image, board: BoardConfig, predicted_px: Array) -> Array | None:
-    """Find the corners of a chessboard that may be seen in part, near where they are predicted.
+    """Find the corners of a board seen in part, near their predictions.
 
     Args:
-        image: (H, W, 3) BGR, or grey (H, W).
-        board: a chessboard.
-        predicted_px: where each corner should be, row by row, (columns * rows, 2) [px]: off by less than a third of a
-            square, by nearly the same at all corners. May be nan, or outside the image.
+        image: image, (H, W, 3) BGR, or grey (H, W).
+        board: the board.
+        predicted_px: predicted corners row by row, (columns * rows, 2) [px], off by less than a third of a square and
+            by nearly the same at all corners. They may be nan, or outside the image.
 
     Returns:
-        Corners row by row, (columns * rows, 2) [px], nan where none is seen; None where fewer than six are, or where
-        what is seen is not surely the board as it was predicted.
+        Corners row by row, (columns * rows, 2) [px], nan for those not seen; None where fewer than six are seen, or
+        where they are not surely numbered as predicted.
     """
     grey = np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
-    if board.kind == "charuco":  # its markers number it better than any prediction
+    if board.kind == "charuco":  # the markers number the corners better than any prediction
         return find_charuco(grey, board)
     grid, predicted = grid_of(board), np.asarray(predicted_px, dtype=float).reshape(-1, 2)
     found = search(grey, grid, predicted, PLAIN)
@@ -383,10 +385,10 @@ def find_near(image: Image, board: BoardConfig, predicted_px: Array) -> Array | 
 
 
 def _as_predicted(grey: Image, grid: Array, predicted: Array, found: FoundCorners) -> bool:
-    """Whether the corners seen are surely numbered as predicted.
+    """Check whether the corners seen are surely numbered as predicted.
 
-    Two squares or one diagonal off, the colours are the same. But where one of the board's edges is in view, either a
-    row or column is then missing, sought beyond the edge, or there is one more than there should be.
+    A shift by two squares or one diagonal has the same colours. But where an edge of the board is in the image, a
+    shifted numbering either misses a whole row or column, or leaves one beyond the edge.
     """
     seen, expected = found.seen, found.expected
     lines = [np.unique(grid[seen, axis]) for axis in (0, 1)]
@@ -404,23 +406,25 @@ def _as_predicted(grey: Image, grid: Array, predicted: Array, found: FoundCorner
     return H is not None and not goes_on(grey, grid, seen, H)
 
 
-FILLABLE_PX = (-10000.0, 10000.0)  # OpenCV paints no polygons whose corners are much farther out
-LARGEST_BEND = 0.4  # of a square, of the corners from a plane's picture; a lens bends real ones by 0.3
-SMALLEST_RIGHT = 0.7  # of the corners of any row or column, whose squares have the colours that they should
+# Whole boards
+
+FILLABLE_PX = (-10000.0, 10000.0)  # OpenCV fills no polygons with corners much farther out
+LARGEST_BEND = 0.4  # largest distance of a corner from the image of a plane, in squares; a lens bends real ones by 0.3
+SMALLEST_RIGHT = 0.7  # smallest share of corners with the right colours around, in any row or column
 
 
 def find_corners(image: Image, board: BoardConfig, *, thorough: bool = True) -> Array | None:
-    """Find the inner corners of the board: all of a chessboard, or those that are seen of a ChArUco board.
+    """Find the inner corners of a board: all of a chessboard, or those of a ChArUco board that are seen.
 
     Args:
-        image: (H, W, 3) BGR, or grey (H, W).
-        board: a chessboard must have one odd and one even count of corners.
-        thorough: whether to try every finder; the first alone finds nearly all boards, in a tenth of the time that
-            it takes to be sure that there is none.
+        image: image, (H, W, 3) BGR, or grey (H, W).
+        board: the board; a chessboard must have one odd and one even count of corners.
+        thorough: True to try every finder. The first alone finds nearly all boards; to try all where there is no board
+            takes ten times as long.
 
     Returns:
         Corners from the board's first, row by row, (columns * rows, 2) [px]; None where no whole chessboard is seen.
-        Corners of a ChArUco board that are not seen are nan; None where fewer than six are, or all in one line.
+        Corners of a ChArUco board that are not seen are nan; None where fewer than six are seen, or all in one line.
     """
     grey = np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
     if board.kind == "charuco":
@@ -436,12 +440,12 @@ def find_corners(image: Image, board: BoardConfig, *, thorough: bool = True) -> 
 
 
 def another_board(image: Image, board: BoardConfig, corners_px: Array) -> bool:
-    """Whether a picture shows a second board of the same kind and size, by the fastest finder alone.
+    """Check whether an image shows a second board of the same kind and size, by the fastest finder alone.
 
     Args:
-        image: (H, W, 3) BGR, or grey (H, W).
+        image: image, (H, W, 3) BGR, or grey (H, W).
         board: the board.
-        corners_px: where one was found, (columns * rows, 2) [px], nan for corners that are not seen.
+        corners_px: corners of the first board, (columns * rows, 2) [px], nan for corners that are not seen.
     """
     grey = np.array(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
     H = homography(grid_of(board), corners_px)
@@ -455,13 +459,13 @@ def another_board(image: Image, board: BoardConfig, corners_px: Array) -> bool:
 
 
 def guess_corners(image: Image) -> tuple[int, int] | None:
-    """Guess the inner corners, columns and rows, of whatever chessboard a picture shows, for an error's message.
+    """Guess the counts of inner corners of any chessboard that an image shows, for an error message.
 
     Args:
-        image: (H, W, 3) BGR, or grey (H, W).
+        image: image, (H, W, 3) BGR, or grey (H, W).
 
     Returns:
-        The larger count first; None where no chessboard is surely seen.
+        Columns and rows, the larger count first; None where no chessboard is surely seen.
     """
     grey = np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
     ok, _, layout = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), cv2.CALIB_CB_LARGER)
@@ -475,18 +479,18 @@ def guess_corners(image: Image) -> tuple[int, int] | None:
 
 
 def smallest_spacing(corners_px: Array, corners: Sequence[int]) -> float:
-    """The smallest distance between neighbouring corners that are seen [px]; nan where no neighbours are."""
+    """Compute the smallest distance between neighbouring corners that are seen [px]; nan where no neighbours are."""
     grid = corners_px.reshape(corners[1], corners[0], 2)
     distances = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1) for axis in (0, 1)]
     return float(np.fmin.reduce(np.concatenate(distances, axis=None)))
 
 
 def _number(grey: Image, corners_px: Array, corners: tuple[int, int]) -> Array | None:
-    """Turn the order so that the first corner is the board's, by handedness and then by the squares' colours."""
+    """Reorder corners so that the first is the board's, by handedness and then by the squares' colours."""
     columns, rows = corners
     grid = corners_px.reshape(rows, columns, 2)
     along, down = grid[:, -1].mean(0) - grid[:, 0].mean(0), grid[-1].mean(0) - grid[0].mean(0)
-    if along[0] * down[1] - along[1] * down[0] < 0:  # seen from its front, x turns clockwise into y
+    if along[0] * down[1] - along[1] * down[0] < 0:  # from the front of the board, x turns clockwise into y
         grid = grid[:, ::-1]
     centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     map_u, map_v = (centres[..., i].astype(np.float32) for i in (0, 1))
@@ -502,7 +506,7 @@ def _number(grey: Image, corners_px: Array, corners: tuple[int, int]) -> Array |
 
 
 def _is_whole(grey: Image, corners_px: Array, board: BoardConfig) -> bool:
-    """Whether corners are those of the whole board: finders also report part of a larger one, or a row too many."""
+    """Check whether corners are those of the whole board: finders also report part of a larger one, or one more row."""
     grid = grid_of(board)
     H = homography(grid, corners_px)
     if H is None:
@@ -517,7 +521,7 @@ def _is_whole(grey: Image, corners_px: Array, board: BoardConfig) -> bool:
 
 
 def _refine(grey: Image, corners_px: Array, corners: tuple[int, int]) -> Array:
-    """Move the corners to the saddle points of the image."""
+    """Move the corners to the saddle points of the image, (N, 2) [px]."""
     half = max(SMALLEST_WINDOW_PX, round(WINDOW_SHARE * smallest_spacing(corners_px, corners)))
     start = corners_px.astype(np.float32).reshape(-1, 1, 2)
     refined = cv2.cornerSubPix(grey, start, (half, half), (-1, -1), SUBPIX_CRITERIA)
@@ -539,7 +543,8 @@ def _quadrangles(grey: Image, corners: tuple[int, int]) -> Array | None:
     return np.asarray(found, dtype=float).reshape(-1, 2) if ok else None
 
 
-# Finders to about a pixel, the fastest first; what one misses, another often sees (20, 25, 100 ms and up at 640x480).
+# Finders accurate to about a pixel, the fastest first (20, 25, 100 ms and up at 640x480). What one misses, another
+# often sees.
 Search = Callable[[Image, tuple[int, int]], Array | None]
 SEARCHES: tuple[Search, ...] = (
     _sector_based(0),

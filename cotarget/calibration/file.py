@@ -1,15 +1,12 @@
-"""calibration.json: readable, replaced atomically, checked when it is read, and with the corners it came from.
+"""Calibration result and its file, calibration.json.
 
-Keys: schema; fixed; zoom (stops over the focal length); T_zoom0_fixed; T_head_zoom (or null); head; pitch_mm (or
-null); residuals; covariance (or null); held_out (or null); board and board_warp [m]; provenance; views, with null for
-a corner that is not seen. Lengths are metres; angles are degrees where people read them, and radians in the views, so
-that a refit starts from the very same numbers.
+The file holds the result, its uncertainty and the corners it comes from, so that it can be checked and refitted. Keys:
+schema; fixed; zoom (zoom samples, as stops); T_zoom0_fixed; T_head_zoom (or null); head; pitch_mm (or null); residuals;
+covariance (or null); held_out (or null); board and board_warp [m]; provenance; views, with null for a corner that is
+not seen. Lengths are metres. Angles are degrees where people read them, and radians in the views, so that a refit
+starts from exactly the same numbers.
 
-Reading JSON that people may have edited: every error names the key and what was expected there.
-
-Messages do not name the file; the caller, who knows it, puts it in front.
-
-Reading the parts of calibration.json: every key is there, and every value makes sense, or the error names it.
+Reading checks every key and value. Errors of `get` and the ``as_`` functions name the key; their callers add the file.
 """
 
 import dataclasses
@@ -39,24 +36,24 @@ Table = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """All that targeting needs to know of a rig, and what it was found from.
+    """Calibration of a rig, with the views it comes from.
 
     Attributes:
-        fixed: the fixed camera.
-        zoom: the zoom camera over its focal lengths.
+        fixed: intrinsics of the fixed camera.
+        zoom: optics of the zoom camera over its focal range.
         T_zoom0_fixed: the paper's Gamma, at the shortest focal length.
-        T_head_zoom: the paper's T, at the shortest focal length; None where there was no head to calibrate.
-        head: the pan-tilt unit's own geometry.
-        pitch_mm: size of a pixel of the zoom camera [mm], where it is known; only for focal lengths in millimetres.
-        residuals: how well the corners are explained, and what was rejected.
-        covariance: None where the method gives none.
-        jitter: standard deviation by which each axis of the head misses what it reports, at every pose anew [rad];
-            beyond the head itself it stands for whatever of the rig the model leaves out.
-        held_out: what captures kept out of the fit say; None where there were too few, or the method tells none.
-        board_warp: by how much the board's middle stands out towards its z, along its x and along its y [m].
-        board: the board, None for a calibration that comes from no board.
-        views: the corners themselves, so that the calibration can be checked and refitted.
-        provenance: versions, method, when, from which captures; JSON values only.
+        T_head_zoom: the paper's T, at the shortest focal length; None where no head was calibrated.
+        head: geometry of the head.
+        pitch_mm: pixel size of the zoom camera [mm], for focal lengths in millimetres; None if unknown.
+        residuals: residuals of the fit, and what was rejected.
+        covariance: covariance of the parameters; None where the method gives none.
+        jitter: standard deviation of each axis's true angle about the reported one, independent at every pose [rad]. It
+            also stands for errors that the model leaves out.
+        held_out: result of the held-out check; None where there were too few captures, or the method has no check.
+        board_warp: height of the board's middle above its edges, towards its z, by the bend along x and along y [m].
+        board: the board; None for a calibration without one.
+        views: views of the calibration, for checks and refits.
+        provenance: versions, options, time and origin of the captures; JSON values only.
     """
 
     fixed: Intrinsics
@@ -75,14 +72,13 @@ class Calibration:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def hand_eye(self, nominal_px: float | None = None) -> RigidTransform:
-        """T_head_zoom, for those who cannot do without.
+        """Return T_head_zoom at a focal length, and refuse a calibration without it.
 
         Args:
-            nominal_px: focal length by the device's own account [px], whose entrance pupil is meant; the shortest
-                calibrated one by default.
+            nominal_px: nominal focal length whose entrance pupil is the origin [px]; None for the shortest one.
 
         Raises:
-            CalibrationError: there was no head to calibrate.
+            CalibrationError: no head was calibrated.
         """
         if self.T_head_zoom is None:
             raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
@@ -92,32 +88,34 @@ class Calibration:
 
     @cached_property
     def T_base_fixed(self) -> RigidTransform:
-        """Where the fixed camera is seen from the base (6).
+        """Transform from the fixed camera to the base, T_head_zoom T_zoom0_fixed (Eq. 6).
 
         Raises:
-            CalibrationError: there was no head to calibrate.
+            CalibrationError: no head was calibrated.
         """
         return self.hand_eye() * self.T_zoom0_fixed
 
     @cached_property
     def _base_fixed(self) -> Array:
-        """Rotation and translation of that side by side, (3, 4)."""
+        """Rotation and translation of T_base_fixed side by side, (3, 4)."""
         return self.T_base_fixed.as_matrix()[:3]
 
     def in_base(self, x_fixed: Array) -> Array:
-        """Where a point of the fixed camera's frame is in the base's (6), (3,) [m]; in a third of scipy's time.
+        """Map a point from the fixed camera's frame to the base's, (3,) [m] (Eq. 6).
+
+        It takes a third of the time of scipy's transform.
 
         Raises:
-            CalibrationError: there was no head to calibrate.
+            CalibrationError: no head was calibrated.
         """
         x, y, z = x_fixed
         return np.asarray(self._base_fixed @ np.array((x, y, z, 1.0)))
 
     def for_streams(self, fixed_size: tuple[int, int], zoom_size: tuple[int, int]) -> "Calibration":
-        """The same calibration for streams (width, height) [px] that are scaled.
+        """Return the calibration for streams scaled to other sizes (width, height) [px].
 
         Raises:
-            ConfigError: a stream has another aspect ratio than was calibrated.
+            ConfigError: the aspect ratio of a stream differs from that calibrated.
         """
         covariance = self.covariance
         if covariance is not None:
@@ -146,7 +144,7 @@ class Calibration:
         return load_calibration(Path(path))
 
     def save(self, path: Path | str) -> None:
-        """Write a calibration.json, whole or not at all.
+        """Write a calibration.json atomically.
 
         Raises:
             CalibrationError: the file cannot be written.
@@ -158,11 +156,11 @@ def read_json(path: Path, wanted: str) -> Table:
     """Read a JSON object from a file.
 
     Args:
-        path: of the file.
-        wanted: what to give instead, where it holds something else.
+        path: file to read.
+        wanted: advice for the message, where the file holds something else.
 
     Raises:
-        CalibrationError: the file is missing, or is not JSON; the message says what it is, if that can be told.
+        CalibrationError: the file is missing, or is not a JSON object; the message says what it is where possible.
     """
 
     def refuse(constant: str) -> None:
@@ -192,10 +190,10 @@ def _is_toml(text: str) -> bool:
 
 
 def check_schema(path: Path, table: Table, schema: int) -> None:
-    """Refuse a file of another version.
+    """Refuse a file of another schema version.
 
     Raises:
-        CalibrationError: it has another schema number, or none.
+        CalibrationError: the file has another schema number, or none.
     """
     if "schema" not in table:
         raise CalibrationError(f"{path}: missing key 'schema'; this version reads schema {schema}")
@@ -204,14 +202,14 @@ def check_schema(path: Path, table: Table, schema: int) -> None:
 
 
 def get(table: Table, key: str, where: str = "") -> Any:
-    """Look a key up, or say that it is missing."""
+    """Look a key up, and refuse a table without it."""
     if key not in table:
         raise CalibrationError(f"missing key '{join(where, key)}'; found here: {choices(table)}")
     return table[key]
 
 
 def join(where: str, key: str) -> str:
-    """Name a key inside a table."""
+    """Join a table's name and a key with a dot."""
     return f"{where}.{key}" if where else key
 
 
@@ -223,7 +221,7 @@ def as_table(value: Any, where: str) -> Table:
 
 
 def as_list(value: Any, where: str, length: int | None = None) -> Sequence[Any]:
-    """Expect a JSON list, of a certain length where one is given."""
+    """Expect a JSON list, of the given length unless that is None."""
     if not isinstance(value, list):
         raise CalibrationError(f"{where}: {short(value)} is not a list")
     if length is not None and len(value) != length:
@@ -232,7 +230,7 @@ def as_list(value: Any, where: str, length: int | None = None) -> Sequence[Any]:
 
 
 def as_number(value: Any, where: str, *, positive: bool = False) -> float:
-    """Expect a finite number."""
+    """Expect a finite number, greater than zero if ``positive``."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise CalibrationError(f"{where}: {short(value)} is not a finite number")
     if positive and value <= 0:
@@ -241,32 +239,32 @@ def as_number(value: Any, where: str, *, positive: bool = False) -> float:
 
 
 def as_whole(value: Any, where: str, *, lowest: int = 0) -> int:
-    """Expect a whole number."""
+    """Expect a whole number not below ``lowest``."""
     if isinstance(value, bool) or not isinstance(value, int) or value < lowest:
         raise CalibrationError(f"{where}: {short(value)} is not a whole number from {lowest} up")
     return value
 
 
 def as_text(value: Any, where: str) -> str:
-    """Expect a text."""
+    """Expect a string."""
     if not isinstance(value, str):
         raise CalibrationError(f"{where}: {short(value)} is not a text")
     return value
 
 
 def as_numbers(value: Any, where: str, length: int) -> tuple[float, ...]:
-    """Expect a list of finite numbers."""
+    """Expect a list of finite numbers of the given length."""
     return tuple(as_number(item, f"{where}[{i}]") for i, item in enumerate(as_list(value, where, length)))
 
 
 def as_size(value: Any, where: str) -> tuple[int, int]:
-    """Expect (width, height) or (columns, rows)."""
+    """Expect a pair of positive whole numbers: (width, height) or (columns, rows)."""
     first, second = as_list(value, where, 2)
     return as_whole(first, f"{where}[0]", lowest=1), as_whole(second, f"{where}[1]", lowest=1)
 
 
 def as_pose(value: Any, where: str) -> RigidTransform:
-    """Expect a translation [m] and a rotation vector [degrees]."""
+    """Expect a table of translation [m] and rotation vector [degrees]."""
     table = as_table(value, where)
     translation = as_numbers(get(table, "translation", where), join(where, "translation"), 3)
     rotvec_deg = as_numbers(get(table, "rotvec_deg", where), join(where, "rotvec_deg"), 3)
@@ -277,18 +275,18 @@ def as_pose(value: Any, where: str) -> RigidTransform:
 
 
 def short(value: Any) -> str:
-    """Quote a value in an error message without filling the screen."""
+    """Quote a value for an error message, cut to 40 characters."""
     text = repr(value)
     return text if len(text) <= 40 else text[:37] + "..."
 
 
-# --- reading ---
+# Parsing the parts of calibration.json
 
-# Rounding leaves a covariance, scaled to a unit diagonal, no less symmetric and its smallest eigenvalue no further
-# below zero than this, for every parameter.
+# Largest asymmetry and negative eigenvalue that rounding leaves per parameter, in a covariance scaled to a unit
+# diagonal.
 ROUNDING = 1e-9
-# Beyond these a number was mistyped: an encoder's scale is within percents of 1, and no lens is longer than a
-# telescope's 1e7 px, has its axis more than ten images off the middle, or needs coefficients that large.
+# Values beyond these are mistyped: an encoder's scale is within percents of 1, and no lens is longer than a telescope's
+# 1e7 px, has its axis more than ten images off the middle, or needs coefficients that large.
 SCALES, FOCALS_PX, IMAGES_OFF, LARGEST_COEFFICIENT = (0.5, 2.0), (1.0, 1e7), 10.0, 1e6
 RESIDUAL_KEYS = (
     "fixed_rms_px",
@@ -303,10 +301,10 @@ RESIDUAL_KEYS = (
 
 
 def parse_calibration(table: Table) -> Calibration:
-    """Read a calibration from the object that calibration.json holds.
+    """Parse a calibration from the JSON object of calibration.json.
 
     Raises:
-        CalibrationError: with the key that is missing, or whose value makes no sense.
+        CalibrationError: a key is missing or its value is invalid; the message names the key.
     """
     T_head_zoom = get(table, "T_head_zoom")
     head = as_table(get(table, "head"), "head")
@@ -348,14 +346,14 @@ def parse_calibration(table: Table) -> Calibration:
 
 
 def check_covariance(covariance: Covariance, stops: int) -> None:
-    """Refuse a covariance that is none, or of other parameters than a rig has.
+    """Refuse a matrix that is no covariance, and parameters that the rig does not have.
 
     Args:
-        covariance: of a calibration.
-        stops: how many its zoom lens has.
+        covariance: covariance of a calibration.
+        stops: number of zoom samples of its lens.
 
     Raises:
-        CalibrationError: with the key in the file.
+        CalibrationError: the covariance is invalid; the message names the key in the file.
     """
     names, C = covariance.parameters, covariance.matrix
     known = parameter_names(EVERY_BLOCK, stops)
@@ -379,7 +377,7 @@ def check_covariance(covariance: Covariance, stops: int) -> None:
 
 
 def parse_board(value: Any, where: str) -> BoardConfig:
-    """Read a board from a JSON object."""
+    """Parse a board from a JSON object."""
     table = as_table(value, where)
     kind = get(table, "kind", where)
     if kind not in ("chessboard", "charuco"):
@@ -456,7 +454,7 @@ def _parse_held_out(value: Any) -> HeldOut | None:
 
 
 def _within(bounds: tuple[float, float], value: Any, where: str) -> float:
-    """Expect a number that can be; one that is to be above zero is told that first."""
+    """Expect a number within bounds; for a positive lower bound, refuse zero and less with a message of its own."""
     low, high = bounds
     number = as_number(value, where, positive=low > 0)
     if not low <= number <= high:
@@ -465,7 +463,7 @@ def _within(bounds: tuple[float, float], value: Any, where: str) -> float:
 
 
 def _at_least(lowest: int, value: Any, where: str) -> float:
-    """Expect a number that is not below some lowest one."""
+    """Expect a number not below ``lowest``."""
     number = as_number(value, where)
     if number < lowest:
         raise CalibrationError(f"{where}: {number:g} is less than {lowest}")
@@ -514,8 +512,10 @@ def _parse_view(value: Any, where: str, board: BoardConfig) -> View:
     )
 
 
+# Reading and writing calibration.json
+
 SCHEMA = 2
-OWN_KEYS = {"fixed", "zoom", "T_zoom0_fixed"}  # of which a calibration of any version has one
+OWN_KEYS = {"fixed", "zoom", "T_zoom0_fixed"}  # a calibration of any version has at least one of these
 WANTED = "give a calibration.json, as cotarget calibrate writes it"
 OTHERS = (
     ({"captures", "board"}, "the index of captures: cotarget calibrate --from its folder makes one of them"),
@@ -524,7 +524,7 @@ OTHERS = (
 
 
 def save_calibration(path: Path, calibration: Calibration) -> None:
-    """Write calibration.json; the file is replaced in one step.
+    """Write calibration.json atomically.
 
     Raises:
         CalibrationError: the file cannot be written, or the calibration holds a number that is not finite.
@@ -540,7 +540,7 @@ def load_calibration(path: Path) -> Calibration:
     """Read calibration.json.
 
     Raises:
-        CalibrationError: the file is missing, malformed or something else; the message names the file and the key.
+        CalibrationError: the file is missing, malformed or no calibration; the message names the file and the key.
     """
     table = read_json(path, WANTED)
     if not (table.keys() & OWN_KEYS):
@@ -555,7 +555,7 @@ def load_calibration(path: Path) -> Calibration:
 
 
 def _table(calibration: Calibration) -> dict[str, Any]:
-    """What the file holds."""
+    """Make the JSON object of a calibration."""
     T_head_zoom = calibration.T_head_zoom
     covariance = calibration.covariance
     return {
@@ -593,20 +593,20 @@ def _table(calibration: Calibration) -> dict[str, Any]:
 
 
 def _what(table: Table) -> str:
-    """What a file is that is no calibration, where that can be told."""
+    """Describe a file that is no calibration, by its keys; empty where it is not recognised."""
     return next((f", but {what}" for keys, what in OTHERS if table.keys() >= keys), "")
 
 
 def _refuse_unknown(read: Any, written: Any, where: str = "") -> None:
-    """Refuse a key that nothing is read from, which somebody may have meant to change something by.
+    """Refuse unknown keys, which would otherwise be ignored without notice.
 
     Args:
-        read: from the file.
-        written: what the same calibration would be written as.
-        where: the key of both.
+        read: value from the file.
+        written: the same value as this version writes it.
+        where: key of both.
 
     Raises:
-        CalibrationError: with the keys that are known there.
+        CalibrationError: a key is unknown; the message lists the valid ones.
     """
     if isinstance(read, dict) and isinstance(written, dict):
         for key, value in read.items():
@@ -619,12 +619,12 @@ def _refuse_unknown(read: Any, written: Any, where: str = "") -> None:
 
 
 def write_board(board: BoardConfig) -> dict[str, Any]:
-    """Write the board as a JSON object."""
+    """Make the JSON object of a board."""
     return {"kind": board.kind, "corners": list(board.corners), "square": board.square}
 
 
 def _readable(table: dict[str, Any]) -> str:
-    """Write one line a short value and one line a view, not one line a number."""
+    """Format the JSON with one line per value and one line per view, and not one line per number."""
     lines = []
     for key, value in table.items():
         if isinstance(value, list) and value:

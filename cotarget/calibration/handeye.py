@@ -1,18 +1,17 @@
-"""Hand-eye: X = T_hand_camera from motions of the hand and of the camera, A_i X = X B_i (Eqs. 3, 4).
+"""Hand-eye calibration: X = T_hand_camera from motions of the hand and of the camera, A_i X = X B_i (Eqs. 3, 4).
 
-`park_martin` gives it in closed form. `solve_hand_eye_from_motions` and `solve_hand_eye` go on from there to the most
-likely X, with its covariance and with a verdict on what the motions determine; they serve a robot's arm as well as a
-pan-tilt head, whose hand turns without shifting.
+`park_martin` solves X in closed form. `solve_hand_eye_from_motions` and `solve_hand_eye` start there and find the
+maximum-likelihood X, with its covariance and a verdict on what the motions determine. They serve a robot arm as well as
+a pan-tilt head, whose hand turns without shifting and whose X is the paper's T.
+
+These two are weighted least squares on SE(3) with estimated weights. The six residuals of a motion or pose fall into
+groups (rotation and translation, or finer), each with its own standard deviation. It is estimated from the group's
+residuals and its degrees of freedom less those that the parameters take (restricted maximum likelihood of a
+variance-component model; Helmert 1907). A first fit with Huber's weights and medians finds gross errors; the second is
+plain least squares without them.
 
 F. C. Park and B. J. Martin, "Robot sensor calibration: solving AX = XB on the Euclidean group", IEEE Transactions on
-Robotics and Automation 10(5), 1994.
-
-Transforms that explain measured poses or motions best: weighted least squares on SE(3), the weights found as well.
-
-The six residuals of a pose or motion fall into groups (rotation and translation, or finer) that each have a standard
-deviation of their own. It is estimated from the residuals, every group's degrees of freedom less those that the
-parameters take up (the restricted maximum likelihood of a variance-component model; Helmert 1907). First with Huber's
-weights and medians, by which gross errors are found; then without these, by least squares.
+Robotics and Automation 10(5), 1994. Measurements: docs/design-notes.md.
 """
 
 import itertools
@@ -33,31 +32,31 @@ from cotarget.calibration.observability import (
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
 
-# Standard deviations before there are enough residuals to estimate them: what they are to each other counts.
+# Assumed standard deviations while there are too few residuals to estimate them; only their ratio counts.
 NOMINAL_ROTATION = 1e-3  # [rad]
 NOMINAL_POSITION = 1e-3  # [m]
 NOMINAL = np.repeat([NOMINAL_ROTATION, NOMINAL_POSITION], 3)
-ENOUGH = 7  # so many independent motions tell the groups' standard deviations apart, and gross errors from others
-FEW = 4  # so many tell rotation's from translation's
+ENOUGH = 7  # independent motions from which each group's standard deviation is estimated and gross errors are searched
+FEW = 4  # independent motions from which the standard deviations of rotation and translation are estimated
 SMALLEST_SIGMA = 1e-9  # [rad] and [m]; exact data are rounded to less
-SMALLEST_RATIO = 1e-3  # of a group's standard deviation to all groups', so that none can take all the weight
-MEDIAN_TO_SIGMA = 1.4826  # of the absolute value of a Gaussian variable
-HUBER_SIGMAS = 4.0  # of the length of six residuals; 1 % of Gaussian ones are longer
-# Beyond so many it is a gross error. Medians of a few poses may be half the true deviation, and Gaussian lengths of six
-# exceed 4.5 once in a thousand times.
+SMALLEST_RATIO = 1e-3  # smallest standard deviation of a group over that of all, so that no group takes all the weight
+MEDIAN_TO_SIGMA = 1.4826  # standard deviation over the median absolute value of a Gaussian variable
+HUBER_SIGMAS = 4.0  # length of six whitened residuals from which Huber's weight falls; 1 % of Gaussian ones are longer
+# Length of six whitened residuals beyond which a motion or pose is a gross error. Medians of a few poses may be half
+# the true deviation, and Gaussian lengths exceed 4.5 once in a thousand times.
 GROSS_SIGMAS = 9.0
 ROUNDS = 200
 CONVERGED = 1e-5  # length of the last step, in standard deviations
-ROUGHLY = 0.03  # likewise, while looking for gross errors
-LONGEST_TURN = 0.5  # of one step [rad]: linearising holds no further
-# Directions so much worse known than is of use (see `spectrum`) are left alone while looking for the optimum.
+ROUGHLY = 0.03  # length of the last step while gross errors are searched, in standard deviations
+LONGEST_TURN = 0.5  # largest turn in one step [rad], as far as linearising holds
+# Directions with a smaller eigenvalue of `spectrum` are known far too badly and do not move during the search.
 HOPELESS = 0.03
 ROTATION_AND_TRANSLATION = (0, 0, 0, 1, 1, 1)
 E3 = np.array([0.0, 0.0, 1.0])
-# With k degrees of freedom left, a variance that was itself estimated widens the parameters' distribution to Student's,
-# whose variance is larger by k / (k - 2).
+# With k degrees of freedom left, an estimated variance widens the parameters' distribution to Student's, whose variance
+# is larger by k / (k - 2).
 STUDENT = 2.0
-# Without knowledge of a direction, `regularize` takes it as zero give or take this.
+# Standard deviations of the prior, with mean zero, that `regularize` gives to undetermined directions.
 REGULARIZED_ROTATION = 1.0  # [rad]
 REGULARIZED_POSITION = 1.0  # [m]
 PRIOR = 1 / np.repeat([REGULARIZED_ROTATION, REGULARIZED_POSITION], 3) ** 2
@@ -65,16 +64,16 @@ PRIOR = 1 / np.repeat([REGULARIZED_ROTATION, REGULARIZED_POSITION], 3) ** 2
 
 @dataclass(frozen=True, eq=False)
 class HandEyeProblem:
-    """Residuals of n motions or poses as functions of stacked transforms, X being the first.
+    """Residuals of n motions or poses as functions of stacked transforms, of which X is the first.
 
     Attributes:
-        residuals: gives residuals (n, 6), rotation [rad] before translation [m], and derivatives by a step (w, d) of
-            every transform, (n, 6, 6 * transforms).
-        groups: for each of the six residuals the number of its group, from 0.
-        noise: from the transforms, the six residuals' standard deviations and how many motions or poses are used,
-            what N of X noise alone would show; see `spectrum`.
-        independent: how many independent motions there are.
-        share: of the motions (poses) that are, where they are not independent; information counts that much.
+        residuals: function of the transforms; returns residuals (n, 6), rotation [rad] before translation [m], and
+            derivatives by a step (w, d) of every transform, (n, 6, 6 * transforms).
+        groups: number of the group of each of the six residuals, from 0.
+        noise: function of the transforms, the residuals' standard deviations (6,) and the number of motions or poses
+            used; returns the diagonal of the normal matrix of X that noise alone would show, (6,), see `spectrum`.
+        independent: number of independent motions.
+        share: independent motions over all motions; the weight of each.
     """
 
     residuals: Callable[[RigidTransform], tuple[Array, Array]]
@@ -86,15 +85,15 @@ class HandEyeProblem:
 
 @dataclass(frozen=True, eq=False)
 class MotionFit:
-    """The optimum.
+    """Optimum of a hand-eye problem.
 
     Attributes:
-        transforms: stacked, X first.
-        residuals: (n, 6).
-        normal: of X, the other transforms eliminated, in inverse variances; (6, 6).
-        noise: what of it noise alone would show, its diagonal, (6,).
-        used: which motions or poses are no gross errors, (n,).
-        covariance: of X, (6, 6); with insisted directions in it, where there are.
+        transforms: stacked transforms, X first.
+        residuals: residuals at the optimum, (n, 6) [rad and m].
+        normal: normal matrix of X with the other transforms eliminated, in inverse variances, (6, 6).
+        noise: diagonal of the part of it that noise alone would show, (6,).
+        used: False for gross errors, (n,).
+        covariance: covariance of X, (6, 6), with the prior of the free directions where X is regularized.
     """
 
     transforms: RigidTransform
@@ -106,12 +105,12 @@ class MotionFit:
 
 
 def motion_problem(A: RigidTransform, B: RigidTransform, independent: int) -> HandEyeProblem:
-    """A X = X B: rotation and translation are a group each.
+    """Pose the problem A X = X B, with rotation and translation as one group each.
 
     Args:
         A: motions of the hand, stacked.
         B: motions of the camera, stacked.
-        independent: how many of them are.
+        independent: number of independent motions among them.
     """
     R_A, one = A.rotation.as_matrix(), np.eye(3)
     share = independent / len(A)
@@ -134,8 +133,8 @@ def motion_problem(A: RigidTransform, B: RigidTransform, independent: int) -> Ha
         return r, J
 
     def noise(transforms: RigidTransform, sigma: Array, count: int) -> Array:
-        # An error e of R_A adds [e]x to all blocks, one of t_B adds [R e]x below; both are weighted with their inverse
-        # variances, so that each gives 2.
+        # An error e of R_A adds [e]x to all blocks, and one of t_B adds [R e]x to the lower left one. Weighted with the
+        # inverse variances, each adds 2 to the diagonal.
         return count * np.repeat([4.0, 2.0 * (sigma[0] / sigma[3]) ** 2], 3)
 
     return HandEyeProblem(residuals, ROTATION_AND_TRANSLATION, noise, independent, share)
@@ -144,12 +143,14 @@ def motion_problem(A: RigidTransform, B: RigidTransform, independent: int) -> Ha
 def pose_problem(
     T_base_hand: RigidTransform, T_camera_board: RigidTransform, owners: npt.NDArray[np.intp]
 ) -> HandEyeProblem:
-    """T_camera_board = X^-1 T_base_hand^-1 Z, in the camera's frame turned so that z is the line of sight.
+    """Pose the problem T_camera_board = X^-1 T_base_hand^-1 Z, with Z = T_base_board of each placement.
+
+    Residuals are in the camera's frame, turned so that z is the line of sight to the board.
 
     Args:
-        T_base_hand: stacked.
-        T_camera_board: stacked.
-        owners: which of the boards' places Z is meant, (n,), from 0.
+        T_base_hand: poses of the hand, stacked.
+        T_camera_board: poses of the board, stacked.
+        owners: index of each pose's placement, (n,), from 0.
     """
     look = _turn_to_z(T_camera_board.translation)
     hand_inv = T_base_hand.inv()
@@ -178,8 +179,8 @@ def pose_problem(
 
     def noise(transforms: RigidTransform, sigma: Array, count: int) -> Array:
         # An error e of the hand's rotation adds [e]x to the blocks of rotation by w and of translation by d, and
-        # [e x q]x to that of translation by w, q being the board in the hand's axes. It is no larger than residuals
-        # across the line of sight show it, with |q| as a lever.
+        # [e x q]x to the block of translation by w, with q the vector from hand to board. The residuals across the line
+        # of sight, with |q| as a lever, bound e.
         q = transforms[1 + owners].translation - T_base_hand.translation
         lever = float(np.sqrt(np.mean(np.sum(q**2, axis=1))))
         rotation, translation = min(sigma[:3]), min(sigma[3:])
@@ -191,7 +192,7 @@ def pose_problem(
 
 
 def _turn_to_z(directions: Array) -> Rotation:
-    """The smallest rotations that lay vectors (n, 3) along z, either way round."""
+    """Compute the smallest rotations that bring vectors (n, 3) onto +z or -z."""
     sign = np.where(directions[:, 2:] < 0, -1.0, 1.0)
     half = directions * sign / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), SMALLEST_SIGMA) + E3
     half /= np.linalg.norm(half, axis=1, keepdims=True)
@@ -201,14 +202,14 @@ def _turn_to_z(directions: Array) -> Rotation:
 
 
 def _cross(v: Array) -> Array:
-    """[v]x for vectors (n, 3): (n, 3, 3)."""
+    """Make the cross product matrices [v]x of vectors (n, 3): (n, 3, 3)."""
     x, y, z = v.T
     o = np.zeros_like(x)
     return np.stack([np.stack(row, axis=-1) for row in ([o, -z, y], [z, o, -x], [-y, x, o])], axis=-2)
 
 
 def fit_motions(problem: HandEyeProblem, start: RigidTransform) -> MotionFit:
-    """Find the most likely transforms, gross errors left out; free directions stay where the search left them."""
+    """Find the most likely transforms without gross errors; undetermined directions keep the search's last value."""
     used = np.ones(len(problem.residuals(start)[0]), dtype=bool)
     state = start
     if problem.independent >= ENOUGH:
@@ -219,14 +220,14 @@ def fit_motions(problem: HandEyeProblem, start: RigidTransform) -> MotionFit:
 
 
 def regularized(problem: HandEyeProblem, found: MotionFit) -> MotionFit:
-    """Put the free directions of X where its rotation and translation are smallest; see `PRIOR`."""
+    """Fit again, with the undetermined directions of X where its rotation and translation are smallest; see `PRIOR`."""
     free = int(np.sum(spectrum(found.normal, found.noise)[0] < 1))
     state, _, taken = _descend(problem, found.transforms, found.used, free=free)
     return _result(problem, state, taken, found.used, free)
 
 
 def stepped(transforms: RigidTransform, step: Array) -> RigidTransform:
-    """R <- exp(w) R, t <- t + d for every transform; step (6 * transforms,)."""
+    """Apply a step (6 * transforms,) to every transform: R <- exp(w) R, t <- t + d."""
     step = step.reshape(-1, 6)
     return RigidTransform.from_components(
         transforms.translation + step[:, 3:], Rotation.from_rotvec(step[:, :3]) * transforms.rotation
@@ -236,7 +237,12 @@ def stepped(transforms: RigidTransform, step: Array) -> RigidTransform:
 def _descend(
     problem: HandEyeProblem, state: RigidTransform, used: npt.NDArray[np.bool_], *, robust: bool = False, free: int = 0
 ) -> tuple[RigidTransform, Array, Array]:
-    """Iterate Gauss and Newton's step; also gives the six residuals' standard deviations and their lost freedom."""
+    """Iterate Gauss-Newton steps to the optimum.
+
+    Returns:
+        Transforms; standard deviations of the six residuals, (6,); degrees of freedom that the parameters take from
+        each, (6,).
+    """
     freedom = np.full(6, float(len(state)))  # taken from each of the six residuals
     for _ in range(ROUNDS):
         r, J = problem.residuals(state)
@@ -260,7 +266,11 @@ def _descend(
 
 
 def _eliminated(N: Array, g: Array) -> tuple[Array, Array, Array]:
-    """Eliminate all transforms but X: its normal matrix and gradient; and Nzz^-1 (Nzx, gz), (p - 6, 7)."""
+    """Eliminate all transforms but X.
+
+    Returns:
+        Normal matrix (6, 6) and gradient (6,) of X; and Nzz^-1 (Nzx, gz), (p - 6, 7).
+    """
     if len(N) == 6:
         return N, g, np.empty((0, 7))
     through = np.asarray(np.linalg.solve(N[6:, 6:], np.column_stack([N[6:, :6], g[6:]])), dtype=float)
@@ -270,18 +280,22 @@ def _eliminated(N: Array, g: Array) -> tuple[Array, Array, Array]:
 def _inverse(
     problem: HandEyeProblem, state: RigidTransform, Nx: Array, sigma: Array, count: int, free: int
 ) -> tuple[Array, Array]:
-    """The covariance of X, and the step towards the smallest X that the prior asks for."""
+    """Invert the normal matrix of X in the directions that are known, and compute the prior's step in the free ones.
+
+    Returns:
+        Covariance of X (6, 6), and the step (6,) towards the smallest rotation and translation.
+    """
     values, V = spectrum(Nx, problem.share * problem.noise(state, sigma, count))
     known = np.arange(6) >= free if free else values > HOPELESS
     inverse = (V[:, known] / np.maximum(values[known], HOPELESS)) @ V[:, known].T
-    # Only along the free directions is X drawn, so that the others keep what the motions say.
+    # The prior moves X along the free directions only, so that the motions alone determine the others.
     F, P, X = V[:, :free], np.diag(PRIOR), state[0]
     small = np.concatenate([X.rotation.as_rotvec(), X.translation])
     return inverse, -F @ np.linalg.solve(F.T @ P @ F, F.T @ P @ small)
 
 
 def _taken(WJ: Array, J: Array, inverse: Array, through: Array, N: Array) -> Array:
-    """How many degrees of freedom the parameters take from each of the six residuals: the hat matrix's trace, (6,)."""
+    """Count the degrees of freedom that the parameters take from each of the six residuals: trace of the hat matrix."""
     reduced = J[..., :6] - J[..., 6:] @ through
     W_reduced = WJ[..., :6] - WJ[..., 6:] @ through
     taken = np.einsum("nij,jk,nik->i", W_reduced, inverse, reduced)
@@ -291,7 +305,7 @@ def _taken(WJ: Array, J: Array, inverse: Array, through: Array, N: Array) -> Arr
 
 
 def _sigmas(problem: HandEyeProblem, r: Array, taken: Array, *, robust: bool, lost: float = 0.0) -> Array:
-    """Standard deviation of each of the six residuals, one for each group; see the module's text."""
+    """Estimate the standard deviation of each of the six residuals, the same within a group, (6,)."""
     in_nominal = r / NOMINAL
     left = 6 * len(r) - taken.sum() - lost
     if robust:
@@ -326,7 +340,7 @@ def _result(
 
 
 def _covariance(Nx: Array, noise: Array, free: int) -> Array:
-    """Invert X's normal matrix, the prior's information in place of that of the free directions, which is noise."""
+    """Invert the normal matrix of X, with the prior's information in the free directions in place of noise."""
     values, V = spectrum(Nx, noise)
     inner = np.diag(np.where(np.arange(6) < free, 0.0, np.maximum(values, 0.0)))  # V^T Nx V
     if free:
@@ -337,34 +351,36 @@ def _covariance(Nx: Array, noise: Array, free: int) -> Array:
     return (covariance + covariance.T) / 2
 
 
-# A motion's angle is the same seen by the head and by the camera. Corners of 0.2 px on a board 3 m away turn it by
-# 0.1 to 0.3 degrees; several times that, and a share of the angle, is another cause.
+# The solvers
+
+# A motion turns hand and camera by the same angle. Noise of 0.2 px in the corners of a board 3 m away changes it by 0.1
+# to 0.3 degrees; a difference above this tolerance and share of the angle has another cause.
 ANGLE_TOLERANCE = np.radians(2.0)
 ANGLE_SHARE = 0.1
-# The least determined direction may come out mirrored by noise alone while its singular value is below this share.
+# Below this share of the largest singular value, noise alone may mirror the least determined direction.
 WEAK_SHARE = 0.01
-# While the search only needs a start, a second axis counts that is seen at a hundredth of the first (squared).
+# For a start, a second axis counts from a hundredth of the first one's singular value (the share is squared).
 START_SHARE = 1e-4
 START_ROUNDS = 4
 START_MEDIANS = 3.0  # one Gaussian motion in eighty is further off
-UNTURNED = 1e-6  # [rad]; less than this is no rotation but rounding
-# Cosine and sine of a turn that the translations tell come out of linear equations with length 1; with length 0 where
-# they do not tell it.
+UNTURNED = 1e-6  # [rad]; a smaller rotation is rounding
+# In `_turned_by_shifts` the cosine and sine of a turn come out of linear equations, with length 1 where translations
+# determine the turn, and 0 where they do not.
 HALF = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """X, how well it is known, and how well it explains the motions.
+    """Result of a hand-eye calibration.
 
     Attributes:
         X: T_hand_camera.
-        covariance: of an error (w, d) of X, exp(w) R and t + d, [rad] and [m], (6, 6); as in `Covariance`.
-        rotation_rms: root mean square angle that remains of a motion (of a pose, where poses were given) [rad].
-        translation_rms: root mean square distance that remains [m].
+        covariance: covariance of the error (w, d) of X, exp(w) R and t + d, (6, 6) [rad and m]; as in `Covariance`.
+        rotation_rms: root mean square of the residual angle, per motion or per pose [rad].
+        translation_rms: root mean square of the residual distance, per motion or per pose [m].
         verdict: what the motions determine.
-        rejected: numbers of the motions (poses) that were left out as gross errors.
-        boards: T_base_board of each placement, in the order of their numbers; empty where only motions were given.
+        rejected: indices of the motions or poses that were left out as gross errors.
+        boards: T_base_board of each placement, in the order of their numbers; empty for motions.
     """
 
     X: RigidTransform
@@ -379,7 +395,7 @@ class HandEye:
 def motions(
     poses_base_head: Sequence[RigidTransform], poses_zoom_board: Sequence[RigidTransform]
 ) -> tuple[list[RigidTransform], list[RigidTransform]]:
-    """All motions between poses of the head with one board standing still.
+    """Make the motions of head and camera between all pairs of views of one placement (Eq. 3).
 
     Args:
         poses_base_head: T_base_head of each view.
@@ -396,17 +412,17 @@ def motions(
 
 
 def park_martin(head_motions: Sequence[RigidTransform], camera_motions: Sequence[RigidTransform]) -> RigidTransform:
-    """Solve A_i T = T B_i in closed form.
+    """Solve A_i T = T B_i in closed form (Eqs. 3, 4).
 
-    The sign of pan or of tilt cannot be wrong: a head that counts the other way is the same head with its frame
-    turned by half a turn, which T absorbs, so that such a calibration points as well as any.
+    A head that counts pan or tilt the other way needs no treatment: it is the same head with its frame turned by half a
+    turn. T absorbs that, and the calibration points equally well.
 
     Args:
-        head_motions: A_i.
-        camera_motions: B_i.
+        head_motions: motions A_i of the head.
+        camera_motions: motions B_i of the camera.
 
     Returns:
-        T_head_zoom.
+        T_head_zoom, the paper's T.
 
     Raises:
         CalibrationError: the motions are too few, all about one axis, or contradict each other.
@@ -430,22 +446,24 @@ def solve_hand_eye_from_motions(
 ) -> HandEye:
     """Find the most likely X of A_i X = X B_i, with its covariance.
 
-    From Park and Martin's X, by least squares on what remains of A_i^-1 X B_i X^-1 in rotation and of A_i X and X B_i
-    in translation, both weighted by their own standard deviations; seven motions and more have these estimated, and
-    gross errors left out. The covariance takes the motions as independent. Motions that share poses are not: all pairs
-    of n poses tell no more than n - 1 of them, and `independent` says so. With poses at hand,
-    `solve_hand_eye` is more exact.
+    Least squares, from Park and Martin's X, on the rotation of A_i^-1 X B_i X^-1 and on the difference of translation
+    between A_i X and X B_i, each weighted by its standard deviation. From four independent motions on, these standard
+    deviations are estimated separately. From seven on, gross errors are left out.
+
+    The covariance assumes independent motions. Motions that share poses are not independent: all pairs of n poses hold
+    the information of n - 1 motions, so pass ``independent=n - 1``. If the poses are known, `solve_hand_eye` is more
+    accurate.
 
     Args:
         A: motions of the hand, T_hand_hand', two or more; see `motions`.
-        B: motions of the camera, T_camera_camera', likewise.
-        independent: how many of the motions are independent; all, by default.
-        regularize: to be given an X also where the motions leave some of it free. Its rotation and translation are then
-            the smallest that explain the motions, and its free directions have standard deviations of
+        B: motions of the camera, T_camera_camera', as many.
+        independent: number of independent motions; None for all.
+        regularize: True to get an X even where the motions leave some of it undetermined. Its rotation and translation
+            are then the smallest that explain the motions, and its undetermined directions have standard deviations of
             `REGULARIZED_ROTATION` and `REGULARIZED_POSITION`.
 
     Raises:
-        CalibrationError: the motions contradict each other, or leave X undetermined; in words, with what to add.
+        CalibrationError: the motions contradict each other, or leave X undetermined; the message says what to add.
     """
     if len(A) < 2 or len(A) != len(B):
         raise CalibrationError(f"hand-eye: {len(A)} and {len(B)} motions; it takes two or more, as many of each")
@@ -463,26 +481,27 @@ def solve_hand_eye(
     middle: Sequence[float] | Array = (0.0, 0.0, 0.0),
     regularize: bool = False,
 ) -> HandEye:
-    """Find the most likely X and places of the board from poses: T_base_hand X T_camera_board = T_base_board.
+    """Find the most likely X and board poses from T_base_hand X T_camera_board = T_base_board, with their covariance.
 
-    What remains is looked at in the camera's frame, along the line of sight and across it apart: a camera sees across
-    ten times better than along. From eight poses on, the standard deviations of all four (rotation about the line of
-    sight and about axes across it, shift along and across) are estimated. The poses' errors are independent, so that
-    the covariance is honest, as long as noise is the camera's. Noise of the hand's rotation moves board and view
-    together, which these four know nothing of: where it dominates, 90 % ellipsoids hold X in some 70 % of cases.
+    Residuals are taken in the camera's frame, separately along the line of sight and across it, because a camera
+    measures ten times better across than along. From eight poses of one placement on, four standard deviations are
+    estimated: of rotation about the line of sight and about axes across it, and of shift along and across.
 
-    For a camera that stands still and a board in the hand, give the inverse of T_base_hand: X is T_base_camera then.
+    The covariance is consistent while the camera's noise dominates. Noise of the hand's rotation moves board and view
+    together, which the four groups do not model: where it dominates, 90 % ellipsoids hold X in some 70 % of cases.
+
+    For a camera that stands still and a board in the hand, pass the inverse of T_base_hand; X is then T_base_camera.
 
     Args:
-        T_base_hand: of each view, a list of three scipy RigidTransforms or more [m].
-        T_camera_board: of each view: where the board is in the camera's frame, not the other way round.
-        placements: where the board stood during each view, by number; in one place throughout, by default.
-        middle: of the board's points, in its frame [m], (3,): that is the point which the camera sees best. With a
-            board whose origin is a corner it makes a difference.
+        T_base_hand: pose of the hand for each view, a list of three or more scipy RigidTransforms [m].
+        T_camera_board: pose of the board in the camera's frame for each view (not its inverse).
+        placements: number of the board's placement for each view; None for one placement.
+        middle: middle of the board's points in its frame [m], (3,), which the camera measures best. It matters for a
+            board whose origin is a corner.
         regularize: see `solve_hand_eye_from_motions`.
 
     Raises:
-        CalibrationError: the poses contradict each other, or leave X undetermined; in words, with what to add.
+        CalibrationError: the poses contradict each other, or leave X undetermined; the message says what to add.
     """
     where = np.zeros(len(T_base_hand), dtype=int) if placements is None else np.asarray(placements)
     if not len(T_base_hand) == len(T_camera_board) == len(where):
@@ -506,10 +525,10 @@ def solve_hand_eye(
 
 
 def _together(transforms: Sequence[RigidTransform]) -> RigidTransform:
-    """Many transforms as one object of scipy's.
+    """Stack transforms into one scipy RigidTransform.
 
     Raises:
-        CalibrationError: they are something else.
+        CalibrationError: an item is not a RigidTransform.
     """
     try:
         return RigidTransform.concatenate(list(transforms))
@@ -521,7 +540,11 @@ def _together(transforms: Sequence[RigidTransform]) -> RigidTransform:
 
 
 def _solved(problem: HandEyeProblem, start: RigidTransform, moved: HandMotions, regularize: bool) -> HandEye:
-    """Fit, judge, and refuse or insist."""
+    """Fit a problem, judge what is determined, and refuse or regularize what is not.
+
+    Raises:
+        CalibrationError: X is undetermined and ``regularize`` is False.
+    """
     found = fit_motions(problem, start)
     verdict = judge_motions(found.normal, found.noise, moved)
     if not verdict.determined:
@@ -542,7 +565,7 @@ def _solved(problem: HandEyeProblem, start: RigidTransform, moved: HandMotions, 
 
 
 def _start(A: RigidTransform, B: RigidTransform) -> RigidTransform:
-    """Find an X in closed form, also where the motions leave some of it free.
+    """Find a first X in closed form, even where the motions leave some of it undetermined.
 
     Raises:
         CalibrationError: the motions contradict each other.
@@ -551,11 +574,11 @@ def _start(A: RigidTransform, B: RigidTransform) -> RigidTransform:
     _check_angles(alpha, beta)
     good = _angles_off(alpha, beta) <= ANGLE_TOLERANCE
     A, B, alpha, beta = A[good], B[good], alpha[good], beta[good]
-    if np.linalg.norm(alpha, axis=1).max() < UNTURNED:  # then t_A = R t_B, or nothing moved
+    if np.linalg.norm(alpha, axis=1).max() < UNTURNED:  # pure shifts, t_A = R t_B, or no motion at all
         R = _rotation_between(A.translation, B.translation)
     else:
         R = _rotation_between(alpha, beta)
-        for _ in range(START_ROUNDS):  # a few gross errors shall not draw it away
+        for _ in range(START_ROUNDS):  # without motions far off, so that gross errors do not bias R
             off = np.linalg.norm(alpha - beta @ R.T, axis=1)
             near = off <= START_MEDIANS * np.median(off) + UNTURNED
             R = _rotation_between(alpha[near], beta[near])
@@ -567,7 +590,7 @@ def _start(A: RigidTransform, B: RigidTransform) -> RigidTransform:
 
 
 def _rotation_between(a: Array, b: Array) -> Array:
-    """R with a_i = R b_i, (3, 3); the smallest where the vectors have one direction or none."""
+    """Find R with a_i = R b_i, (3, 3); the smallest R where the vectors have only one direction, or none."""
     U, s, Vt = np.linalg.svd(b.T @ a)
     if s[0] == 0:
         return np.eye(3)
@@ -577,7 +600,7 @@ def _rotation_between(a: Array, b: Array) -> Array:
 
 
 def _turned_by_shifts(axis: Array, R: Array, A: RigidTransform, B: RigidTransform) -> Array:
-    """Turn R about the only axis of all rotations as the translations tell, or not at all where they do not.
+    """Find the turn of R about the only axis of all rotations from the translations; R itself where they leave it open.
 
     With v = R t_B, (R_A - I) t + t_A = Rot(axis, phi) v = cos(phi) v_across + sin(phi) axis x v + v_along.
     """
@@ -593,7 +616,7 @@ def _turned_by_shifts(axis: Array, R: Array, A: RigidTransform, B: RigidTransfor
 
 
 def _translation(R: Array, A: RigidTransform, B: RigidTransform) -> Array:
-    """Solve (R_A - I) t = R t_B - t_A, all motions at once; the shortest t where they leave some of it free."""
+    """Solve (R_A - I) t = R t_B - t_A over all motions; the shortest t where some of it is undetermined."""
     left = A.rotation.as_matrix() - np.eye(3)
     right = B.translation @ R.T - A.translation
     return np.asarray(np.linalg.lstsq(left.reshape(-1, 3), right.ravel(), rcond=None)[0], dtype=float)
@@ -604,8 +627,8 @@ def _rotvecs(motions: Sequence[RigidTransform]) -> Array:
 
 
 def _park_martin_rotation(alpha: Array, beta: Array) -> Array:
-    """R with alpha_i = R beta_i in the least squares' sense, (3, 3)."""
-    # R = (M^T M)^(-1/2) M^T with M = sum_i beta_i alpha_i^T; with M = U S V^T that is V U^T.
+    """Find R with alpha_i = R beta_i by least squares, (3, 3) (Park and Martin 1994)."""
+    # R = (M^T M)^(-1/2) M^T with M = sum_i beta_i alpha_i^T, which is V U^T for M = U S V^T.
     U, s, Vt = np.linalg.svd(beta.T @ alpha)
     R = Vt.T @ U.T
     if np.linalg.det(R) < 0:
@@ -614,13 +637,13 @@ def _park_martin_rotation(alpha: Array, beta: Array) -> Array:
                 "hand-eye: the answer is a reflection (determinant -1): the head's angles and the camera's motions "
                 "contradict each other; check that pan and tilt are not exchanged"
             )
-        Vt[2] = -Vt[2]  # two axes determine a rotation; the third direction is the one that noise has turned round
+        Vt[2] = -Vt[2]  # two axes determine a rotation; noise has mirrored the third direction
         R = Vt.T @ U.T
     return R
 
 
 def _check_axes(alpha: Array) -> None:
-    """Refuse motions that leave T undetermined, and say which axis is missing."""
+    """Refuse motions about fewer than two axes, and name the missing one."""
     if not len(alpha) or np.linalg.norm(alpha, axis=1).max() < SMALLEST_TURN:
         raise CalibrationError("hand-eye: the head did not move between the views; both pan and tilt must")
     _, s, Vt = np.linalg.svd(alpha, full_matrices=False)
@@ -634,7 +657,7 @@ def _check_axes(alpha: Array) -> None:
 
 
 def _check_angles(alpha: Array, beta: Array) -> None:
-    """A_i and B_i are the same motion in two frames, so they turn by the same angle."""
+    """Refuse motions whose angles differ: A_i and B_i are the same motion in two frames and turn by the same angle."""
     head, camera = np.linalg.norm(alpha, axis=1), np.linalg.norm(beta, axis=1)
     off = np.abs(head - camera)
     if np.median(_angles_off(alpha, beta)) > ANGLE_TOLERANCE:
@@ -646,13 +669,13 @@ def _check_angles(alpha: Array, beta: Array) -> None:
 
 
 def _angles_off(alpha: Array, beta: Array) -> Array:
-    """By how much the angles differ, beyond the share that is tolerated [rad], (n,)."""
+    """Compute the difference of the angles of head and camera beyond the tolerated share [rad], (n,)."""
     head, camera = np.linalg.norm(alpha, axis=1), np.linalg.norm(beta, axis=1)
     return np.abs(head - camera) - ANGLE_SHARE * head
 
 
 def _check_axes_agree(alpha: Array, beta_in_head: Array) -> None:
-    """After the fit the axes agree as well, or no T explains the motions."""
+    """Refuse motions whose axes still differ once the camera's are turned into the head's frame."""
     off = np.linalg.norm(alpha - beta_in_head, axis=1)
     if np.median(off - ANGLE_SHARE * np.linalg.norm(alpha, axis=1)) > ANGLE_TOLERANCE:
         raise CalibrationError(

@@ -1,14 +1,12 @@
-"""Where a fit starts: each camera by itself, T from motions, Gamma from every placement that both cameras see.
+"""Initial estimates for the fits: intrinsics of each camera, board poses, Gamma and T.
 
-Whatever of a head's geometry, of the order of the views and of the cameras' places is known or not, these starts need
-none of it.
+- `calibrate_camera`: intrinsics of one camera (Zhang 2000, by OpenCV).
+- `place_boards`: pose of every placement. One view of a flat board has two poses that explain it about equally,
+  mirrored at the line of sight; a view by the other camera or from another head pose decides.
+- `rough_gamma`, `stereo`: Gamma from placements that both cameras see.
+- `rough_hand`: T from the motions of head and camera.
 
-One camera's intrinsics from views of the board, and the board's pose in one view (Zhang 2000, by OpenCV).
-
-Where each placement's board is, told by all of its views together.
-
-One view of a flat board has two poses that explain it about equally, mirrored at the line of sight. Another view, by
-the other camera or from another pose of the head, tells them apart.
+Nothing is assumed of the head's geometry, the order of the views or the cameras' mounting.
 """
 
 from collections import defaultdict
@@ -26,11 +24,13 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import base_head, zoom_fixed
 
+# Intrinsics and board pose of one camera
+
 FEWEST_VIEWS = 3  # Zhang's method: two views determine a pinhole, a third the distortion
 FEWEST_CORNERS = 4  # of a plane, for its pose
-# OpenCV starts the fit from this many views, evenly picked: its time grows with their square.
+# Views, evenly picked, from which OpenCV computes the start; its time grows with their square.
 STARTING_VIEWS = 20
-# A start only: no tangential distortion nor k2, k3, which a few views near the middle do not determine.
+# The start has no tangential distortion, k2 and k3, which a few views near the middle do not determine.
 START_FLAGS = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
 
 
@@ -40,11 +40,14 @@ def calibrate_camera(
     """Fit one camera's intrinsics: focal lengths, principal point, k1, k2, p1, p2; every view's pose is free.
 
     Args:
-        camera: which one.
+        camera: name of the camera.
         views: its views, all at one focal length.
         points: the board's corners in its frame [m], (N, 3).
-        size: (width, height) [px].
-        start: where to start, if that is known.
+        size: image size (width, height) [px].
+        start: start of the fit; None for `rough_intrinsics`.
+
+    Returns:
+        Intrinsics, and the fit.
 
     Raises:
         CalibrationError: too few views, or OpenCV finds no camera that explains them.
@@ -62,10 +65,10 @@ def calibrate_camera(
 
 
 def rough_intrinsics(camera: CameraName, views: Sequence[View], points: Array, size: tuple[int, int]) -> Intrinsics:
-    """A camera with equal focal lengths and k1 alone, from nothing but a few views.
+    """Estimate intrinsics with equal focal lengths and k1 alone from a few views.
 
     Raises:
-        CalibrationError: OpenCV finds no camera that explains them.
+        CalibrationError: OpenCV finds no camera that explains the views.
     """
     picked = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, STARTING_VIEWS).round().astype(int))]
     try:
@@ -93,7 +96,7 @@ def rough_intrinsics(camera: CameraName, views: Sequence[View], points: Array, s
 
 
 def board_pose(lens: Intrinsics, corners_px: Array, points: Array) -> RigidTransform:
-    """The board's pose in a camera's frame, T_camera_board, from one view.
+    """Estimate the board's pose in a camera's frame, T_camera_board, from one view.
 
     Raises:
         CalibrationError: no pose explains the corners.
@@ -111,7 +114,7 @@ def board_pose(lens: Intrinsics, corners_px: Array, points: Array) -> RigidTrans
 
 
 def pose_candidates(lens: Intrinsics, corners_px: Array, points: Array) -> list[RigidTransform]:
-    """The one or two poses of a flat board that explain its corners about equally, the better one first.
+    """Find the one or two poses T_camera_board that explain a flat board's corners about equally, the better first.
 
     Raises:
         CalibrationError: no pose explains the corners.
@@ -131,7 +134,7 @@ def pose_candidates(lens: Intrinsics, corners_px: Array, points: Array) -> list[
 
 
 def _seen(points: Array, corners_px: Array) -> tuple[Array, Array]:
-    """The points that are seen, and where.
+    """Select the points that are seen, and their corners.
 
     Raises:
         CalibrationError: they are too few for a pose.
@@ -142,28 +145,28 @@ def _seen(points: Array, corners_px: Array) -> tuple[Array, Array]:
     return points[seen], corners_px[seen]
 
 
-# --- placing ---
+# Pose of every placement
 
-ASKED_VIEWS = 2  # of a placement, whose candidates are tried on all of its views
+ASKED_VIEWS = 2  # views of a placement whose candidate poses are tried on all of its views
 
 
 def place_boards(model: RigModel, views: Sequence[View], points: Array) -> RigModel:
-    """Give every placement the pose, of those that its views suggest, at which all of its views fit best.
+    """Choose the pose of every placement: of the candidates from its views, the one that fits all its views best.
 
     Args:
-        model: with the intrinsics of the cameras that took the views, Gamma and T, at least roughly.
-        views: of any placements.
+        model: model with at least rough intrinsics, Gamma and T.
+        views: views of any placements.
         points: the board's corners in its frame [m], (N, 3).
 
     Returns:
-        The model with these placements' boards and no others.
+        The model with the boards of these placements and no others.
     """
     placements: dict[int, list[View]] = defaultdict(list)
     for view in views:
         placements[view.board].append(view)
     boards = {}
     for number, same in placements.items():
-        # One view of each camera, where there are two cameras: their candidates differ. The one that shows most.
+        # The view of each camera that shows most corners; the candidates of the two cameras differ.
         by_camera = {view.camera: view for view in sorted(same, key=lambda view: int(view.seen.sum()))}
         candidates = [T for view in list(by_camera.values())[:ASKED_VIEWS] for T in _suggested(model, view, points)]
         errors = [_misfit(model, number, T, same, points) for T in candidates]
@@ -172,7 +175,7 @@ def place_boards(model: RigModel, views: Sequence[View], points: Array) -> RigMo
 
 
 def _suggested(model: RigModel, view: View, points: Array) -> list[RigidTransform]:
-    """T_fixed_board as one view may mean it."""
+    """Find the candidates of T_fixed_board from one view."""
     poses = pose_candidates(model.lens_of(view), view.corners_px, points)
     if view.camera == "fixed":
         return poses
@@ -183,7 +186,7 @@ def _suggested(model: RigModel, view: View, points: Array) -> list[RigidTransfor
 
 
 def _misfit(model: RigModel, number: int, T: RigidTransform, views: Sequence[View], points: Array) -> float:
-    """Mean distance between predicted and seen corners [px]; infinite behind a camera."""
+    """Compute the mean distance between predicted and seen corners [px]; infinite behind a camera."""
     pixels = predict_pixels(replace(model, boards={number: T}), views, points)
     off = np.concatenate([
         np.linalg.norm(predicted[view.seen] - view.corners_px[view.seen], axis=-1)
@@ -192,9 +195,20 @@ def _misfit(model: RigModel, number: int, T: RigidTransform, views: Sequence[Vie
     return float(np.mean(off)) if np.isfinite(off).all() else np.inf
 
 
+# Both cameras, Gamma and T
+
+
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """What the steps before a joint fit found, and their residuals."""
+    """Result of calibrating each camera by itself.
+
+    Attributes:
+        model: model with both cameras' intrinsics.
+        fixed_fit: fit of the fixed camera.
+        zoom_fit: fit of the zoom camera.
+        views: views used.
+        rejected: views left out.
+    """
 
     model: RigModel
     fixed_fit: Fit
@@ -204,14 +218,14 @@ class Steps:
 
     @property
     def has_head(self) -> bool:
-        """Whether the head ever left home."""
+        """True if the head ever left home."""
         return any(view.camera == "zoom" and not at_home(view) for view in self.views)
 
 
 def both_cameras(
     views: Sequence[View], points: Array, sizes: Mapping[CameraName, tuple[int, int]], nominal_px: float | None
 ) -> Steps:
-    """Step 1: each camera by itself, from views of one focal length."""
+    """Calibrate each camera by itself, from views at one focal length (step 1 of the sequential method)."""
     fixed, fixed_fit, fixed_views, fixed_rejected = one_camera("fixed", views, points, sizes["fixed"])
     zoom, zoom_fit, zoom_views, zoom_rejected = one_camera("zoom", views, points, sizes["zoom"])
     model = RigModel({}, fixed, ZoomLens((nominal_px or zoom.focal_px[0],), (zoom,)))
@@ -220,20 +234,20 @@ def both_cameras(
 
 
 def stereo(model: RigModel, pairs: Sequence[View], points: Array) -> Fit:
-    """Step 2: Gamma with the intrinsics as they are, from pairs at home."""
+    """Fit Gamma to pairs at home with the intrinsics held (step 2 of the sequential method)."""
     start = replace(model, gamma=rough_gamma(model, pairs, points))
     return fit(place_boards(start, pairs, points), pairs, points, {"gamma"})
 
 
 def check_pairs(steps: Steps, together_px: float) -> None:
-    """Refuse pictures of two cameras without a head that contradict each other: alone each explains its own far better.
+    """Refuse images of two cameras without a head that fit far worse together than each camera's alone.
 
     Args:
-        steps: each camera by itself.
-        together_px: rms of both with one offset between them [px].
+        steps: calibration of each camera by itself.
+        together_px: rms of both cameras with one Gamma [px].
 
     Raises:
-        CalibrationError: they do.
+        CalibrationError: the cameras contradict each other.
     """
     alone_px = max(steps.fixed_fit.rms_px, steps.zoom_fit.rms_px)
     if not steps.has_head and together_px > max(CONTRADICTION * alone_px, CONTRADICTION_FLOOR_PX):
@@ -244,27 +258,30 @@ def check_pairs(steps: Steps, together_px: float) -> None:
         )
 
 
-# Pictures of two cameras that did not stand still are explained so many times worse together than each camera's alone;
-# lenses and boards that are not as modelled cost less than twice.
+# Ratio of the rms together to the rms alone, and rms, beyond which two cameras contradict each other, because they did
+# not stand still. Lenses and boards that differ from the model cost less than twice.
 CONTRADICTION, CONTRADICTION_FLOOR_PX = 3.0, 1.0
 
 
-# A view whose typical corner is off by this many times what is usual for its camera, and above the floor, is left out;
-# single wrong corners are left to the last fit.
+# A view whose typical residual exceeds the floor and this many times its camera's usual one is left out; single wrong
+# corners are left to the last fit.
 OUTLIER_FACTOR = 4.0
 OUTLIER_FLOOR_PX = 0.5
-HOME_TOLERANCE = np.radians(0.01)  # the head is at home within a fifth of the smallest usual step
+HOME_TOLERANCE = np.radians(0.01)  # a fifth of the smallest usual step of a head
 
 
 def at_home(view: View) -> bool:
-    """Whether the head was at pan = tilt = 0."""
+    """Check whether the head was at pan = tilt = 0."""
     return max(abs(view.pan), abs(view.tilt)) <= HOME_TOLERANCE
 
 
 def one_camera(
     camera: CameraName, views: Sequence[View], points: Array, size: tuple[int, int]
 ) -> tuple[Intrinsics, Fit, tuple[View, ...], list[Rejected]]:
-    """One camera's intrinsics from its views alone, without those that do not fit with the others.
+    """Calibrate one camera from its views alone, without views that do not fit the others.
+
+    Returns:
+        Intrinsics, the fit, the views used, and the views left out.
 
     Raises:
         CalibrationError: too few views, or no camera explains them.
@@ -286,22 +303,22 @@ def one_camera(
 
 
 def pairs_at_home(views: Sequence[View]) -> tuple[View, ...]:
-    """The views of those placements that both cameras see with the head at home."""
+    """Select the views of placements that both cameras see with the head at home."""
     return of_both([view for view in views if view.camera == "fixed" or at_home(view)])
 
 
 def of_both(views: Sequence[View]) -> tuple[View, ...]:
-    """The views of those placements that both cameras see."""
+    """Select the views of placements that both cameras see."""
     seen = [{view.board for view in views if view.camera == camera} for camera in ("fixed", "zoom")]
     return tuple(view for view in views if view.board in seen[0] & seen[1])
 
 
 def rough_gamma(model: RigModel, views: Sequence[View], points: Array) -> RigidTransform:
-    """Gamma from placements that both cameras see, whatever the head's pose: the candidate nearest to all others.
+    """Estimate Gamma from placements that both cameras see at any head pose: the candidate nearest to all others.
 
     Args:
-        model: both cameras, and the hand where the head has moved.
-        views: of such placements.
+        model: model with both cameras, and with T where the head has moved.
+        views: views of such placements.
         points: the board's corners in its frame [m], (N, 3).
     """
     assert model.fixed is not None
@@ -322,7 +339,7 @@ def rough_gamma(model: RigModel, views: Sequence[View], points: Array) -> RigidT
 
 
 def _most_central(candidates: Sequence[RigidTransform], scale: float) -> RigidTransform:
-    """The transform nearest to all others: a board seen in its mirrored pose cannot pull it away."""
+    """Find the transform nearest to all others by medians, so that a board in its mirrored pose has no influence."""
     t = np.array([T.translation for T in candidates])
     q = Rotation.concatenate([T.rotation for T in candidates])
     far = np.linalg.norm(t[:, None] - t[None], axis=-1) / scale
@@ -331,16 +348,16 @@ def _most_central(candidates: Sequence[RigidTransform], scale: float) -> RigidTr
 
 
 def rough_hand(model: RigModel, views: Sequence[View], points: Array, *, regularize: bool = False) -> RigidTransform:
-    """T by Park and Martin's method from all motions within each placement.
+    """Estimate T from all motions within each placement, by Park and Martin's method.
 
     Args:
-        model: with the zoom camera.
-        views: of any placements.
+        model: model with the zoom camera.
+        views: views of any placements.
         points: the board's corners in its frame [m], (N, 3).
-        regularize: whether to take the smallest turn and shift of what the motions leave free.
+        regularize: True to take the smallest turn and shift where the motions leave T undetermined.
 
     Raises:
-        CalibrationError: the motions do not determine it, or contradict each other.
+        CalibrationError: the motions do not determine T, or contradict each other.
     """
     A, B = head_motions(model, views, points)
     return solve_hand_eye_from_motions(A, B, regularize=True).X if regularize else park_martin(A, B)
@@ -349,7 +366,11 @@ def rough_hand(model: RigModel, views: Sequence[View], points: Array, *, regular
 def head_motions(
     model: RigModel, views: Sequence[View], points: Array
 ) -> tuple[list[RigidTransform], list[RigidTransform]]:
-    """All motions of the head and of the camera within each placement, A and B of A T = T B."""
+    """Make the motions A of the head and B of the camera between all zoom views of each placement (Eq. 3).
+
+    Raises:
+        CalibrationError: no placement is seen from two head poses.
+    """
     assert model.zoom is not None
     placements: dict[int, list[View]] = defaultdict(list)
     for view in views:

@@ -1,21 +1,17 @@
-"""The joint method: one fit of everything over the corners of all images.
+"""Joint calibration: one fit of all parameters over the corners of all images.
 
-1. A start that assumes nothing of how the cameras are mounted: each camera by itself at the shortest focal length, T
-   from the motions of head and camera, Gamma from every placement that both cameras see, whatever the head's pose.
-2. One fit of both cameras, Gamma, T and the head's geometry from all views at the shortest focal length.
-3. The zoom lens's stops one after the other, each beginning where the one before ended; then everything together.
-4. Views for which the head stood elsewhere than it says, and single corners that are wrong, are left out; the head's
-   jitter is estimated; and the fixed camera's k3, where the corners ask for it.
-5. The uncertainty counts what is held and may be wrong all the same, k3 and the encoders' scales; what captures kept
-   out of the fit say widens it where they disagree with it.
+1. Start: each camera by itself at the shortest focal length, T from the motions of head and camera, Gamma from every
+   placement that both cameras see at any head pose. Nothing is assumed of how the cameras are mounted.
+2. One fit of both cameras, Gamma, T and the head's geometry to all views at the shortest focal length.
+3. The zoom samples one after the other, each predicted from the one before; then one fit of everything.
+4. Views for which the head stood elsewhere than it reported, and single wrong corners, are left out. The head's jitter
+   is estimated, and the fixed camera's k3 where the corners ask for it.
+5. Covariance: parameters held in the fit (k3, encoder scales) are considered; captures kept out of the fit widen it
+   where they are missed by more than predicted.
 
-How far the head stands from where it says: every view by itself, and the scatter of all.
-
-The zoom lens's stops: from the shortest focal length on, each is looked for where the one before lets expect it.
-
-At long focal lengths the zoom camera sees a part of a board that stands far enough for the fixed camera to see it
-whole. Where its corners should be follows from the fixed camera's view, the head and a guess of the lens, so that they
-can be told apart; and each stop, once seen, makes a good guess of the next.
+At long focal lengths the zoom image shows only a part of a board that stands far enough for the fixed camera to see it
+whole. The corners are numbered by a prediction from the fixed camera's view, the head's pose and the lens.
+Measurements: docs/design-notes.md.
 """
 
 import itertools
@@ -80,27 +76,29 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
-# Jitter is looked for between these [rad], and believed when its likelihood is this many times that of none:
-# exp(2.71 / 2), which chance exceeds once in twenty times (a half chi-square at its border).
+# The head's jitter
+
+# Range of the search [rad], and twice the log-likelihood ratio from which jitter is believed: chance exceeds it once in
+# twenty times (a half chi-square at its border).
 JITTER_RANGE = (1e-7, 0.1)
 JITTER_EVIDENCE = 2.71
 TURN_ROUNDS = 6
-RELATIVE_ROUNDING = 1e-10  # of a normal matrix whose boards were eliminated by subtraction
+RELATIVE_ROUNDING = 1e-10  # rounding of a normal matrix after the boards' poses are eliminated by subtraction
 
 
 def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> float:
-    """Estimate how far the head's angles scatter about the reported ones, by restricted maximum likelihood.
+    """Estimate the standard deviation of the head's angles about the reported ones, by restricted maximum likelihood.
 
-    With the corners' own variance profiled out, the likelihood of a jitter needs only the normal equations of the fit
-    without one (Patterson and Thompson 1971; Harville 1977).
+    With the variance of the corners profiled out, the likelihood of a jitter needs only the normal equations of the fit
+    without jitter (Patterson and Thompson 1971; Harville 1977).
 
     Args:
-        found: a fit, without jitter or with one found before, by which its corners are then judged.
+        found: a fit with or without jitter; the jitter in it affects only the weights of its corners.
         points: the board's corners in its frame [m], (N, 3).
-        prior: that of the fit.
+        prior: prior of the fit.
 
     Returns:
-        Standard deviation of each axis [rad]; 0 where the corners do not speak for any.
+        Standard deviation of each axis [rad]; 0 where the corners give no evidence of jitter.
     """
     problem = Problem(batches_of(found.model, found.views), points, found.free, prior, found.jitter)
     if found.variance is None or not any(batch.stop is not None for batch in problem.batches):
@@ -111,10 +109,10 @@ def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> fl
     freedom = coordinates - len(found.normal) - POSE_PARAMETERS * len(found.model.boards)
 
     def profiled(ratio: float) -> tuple[float, Array, Array]:
-        """Squares left, and the reduced matrix and the boards' inverses, at jitter^2 = ratio * variance."""
+        """Compute the squares at the optimum, the reduced matrix and the boards' inverses at jitter^2 / variance."""
         equations = problem.assembled(here, grams, 1 / ratio if ratio else np.inf)
         matrix, gradient, inverse = reduced(equations, 0.0)
-        matrix = matrix + damped(matrix, RELATIVE_ROUNDING)  # where a direction is open, it stands still
+        matrix = matrix + damped(matrix, RELATIVE_ROUNDING)  # so that an undetermined direction does not move
         left = equations.squares - gradient @ np.linalg.solve(matrix, gradient)
         left -= np.einsum("bi,bij,bj->", equations.board_gradient, inverse, equations.board_gradient)
         return max(float(left), SMALLEST_SIGMA_PX**2), matrix, inverse
@@ -136,9 +134,9 @@ def estimate_jitter(found: Fit, points: Array, prior: Prior | None = None) -> fl
 
 
 def head_turns(found: Fit, points: Array) -> Array:
-    """By how much every zoom view's own pan and tilt would have to differ for its corners to fit best, (V, 2) [rad].
+    """Estimate by how much each zoom view's true pan and tilt differ from the reported ones, (V, 2) [rad].
 
-    nan for the fixed camera's views; the boards and everything else stay where the fit has put them.
+    The boards and all other parameters stay as fitted. Views of the fixed camera have nan.
     """
     problem = Problem(batches_of(found.model, found.views), points, (), None, 0.0)
     here = problem.at(found.model)
@@ -147,7 +145,7 @@ def head_turns(found: Fit, points: Array) -> Array:
         if p.by_turn is None:
             continue
         Q, after = masked(p.by_turn, batch), r
-        for _ in range(TURN_ROUNDS):  # wrong corners are not to turn a view
+        for _ in range(TURN_ROUNDS):  # reweighted, so that wrong corners do not turn a view
             weighted = Q * huber_weights(after, robust_scale(here))[..., None, None]
             own = np.einsum("vnik,vnil->vkl", weighted, Q)
             turn = -np.linalg.solve(
@@ -158,36 +156,35 @@ def head_turns(found: Fit, points: Array) -> Array:
     return turns
 
 
-# --- stops ---
+# Zoom samples
 
 FINE = 1e-9  # rounding of a logarithm
 SAME_FOCAL = 0.008  # relative; a step of a usual lens changes the focal length by 0.02
-# What is known of a lens before it is seen: its pupil moves by some decimetres over the range; and distortion, measured
-# in the image, stays within several times of what lenses have. Boards all over the image know either far better.
+# Weak prior of a lens: its pupil moves by some decimetres over the range, and its distortion in the image stays within
+# several times the usual. Boards all over the image determine both far better.
 PUPIL_SIGMA = 0.2  # [m]
-BENT_SIGMAS = {"k1": (0.5, 2), "k2": (1.0, 4), "p1": (0.05, 1), "p2": (0.05, 1)}  # and the power of the focal length
+BENT_SIGMAS = {"k1": (0.5, 2), "k2": (1.0, 4), "p1": (0.05, 1), "p2": (0.05, 1)}  # with the power of the focal length
 INSIDE_PX = 2.0  # a corner predicted this far inside the image is expected to be seen
-# A stop is found by where the one before lets expect the board's corners. What that one leaves open, a principal point
-# that is taken for a turn of the camera, grows with the focal length: in three sessions of eight placements, rendered
-# without multisampling, a stop 12 times as far was lost in two, 3.5 times as far in one, 2.3 times in none.
+# Largest ratio of one zoom sample's focal length to that of the one before. The errors of the prediction, such as a
+# principal point mistaken for a turn of the camera, grow with it; at 3.5 one session in three lost the next sample.
 LARGEST_LEAP = 2.5
-FEWEST_CORNERS = 6  # of a board seen in part, that tell how a lens magnifies and where its axis is
+FEWEST_CORNERS = 6  # of a board seen in part: enough for a lens's magnification and axis
 
 
 def spread_stops(shortest_px: float, longest_px: float, count: int) -> list[float]:
-    """Nominal focal lengths evenly spread in their logarithm [px]; the shortest alone for a lens that does not zoom."""
+    """Spread nominal focal lengths evenly in their logarithm [px]; a lens that does not zoom has the shortest alone."""
     if longest_px <= shortest_px * (1 + SAME_FOCAL) or count < 2:
         return [shortest_px]
     return [float(f) for f in np.geomspace(shortest_px, longest_px, count)]
 
 
 def fewest_stops(shortest_px: float, longest_px: float) -> int:
-    """How many stops it takes, evenly spread in their logarithm, to get surely from one to the next."""
+    """Count the zoom samples, evenly spread in the logarithm, whose ratio stays within `LARGEST_LEAP`."""
     return 1 + math.ceil(math.log(longest_px / shortest_px) / math.log(LARGEST_LEAP) - FINE)
 
 
 def stops_of(views: Sequence[View]) -> list[float]:
-    """The nominal focal lengths at which the zoom camera was, increasing [px]; empty where no device told one."""
+    """List the nominal focal lengths of the zoom views, increasing [px]; empty where no view has one."""
     stops: list[float] = []
     for focal in sorted({view.focal_px for view in views if view.camera == "zoom" and view.focal_px is not None}):
         if not stops or focal > stops[-1] * (1 + SAME_FOCAL):
@@ -196,12 +193,16 @@ def stops_of(views: Sequence[View]) -> list[float]:
 
 
 def same_focal(view: View, nominal_px: float) -> bool:
-    """Whether a view was taken at a nominal focal length [px]."""
+    """Check whether a view was taken at a nominal focal length [px], within `SAME_FOCAL`."""
     return view.focal_px is not None and abs(view.focal_px / nominal_px - 1) <= SAME_FOCAL
 
 
 def with_stop(lens: ZoomLens, nominal_px: float) -> ZoomLens:
-    """A lens with one more stop beyond its last, guessed: ratio and centre go on as they went, the rest stays."""
+    """Extrapolate a lens by one zoom sample beyond its last.
+
+    The ratio of true to nominal focal length and the principal point continue their trend; the distortion of the image
+    and the pupil stay.
+    """
     last = lens.stops[-1]
     magnified = nominal_px / lens.nominal_px[-1]
     k1, k2, p1, p2, k3 = (float(k) for k in np.array(last.distortion) * distortion_growth(magnified))
@@ -217,7 +218,7 @@ def with_stop(lens: ZoomLens, nominal_px: float) -> ZoomLens:
         focal = focal * (ratio / earlier) ** onward
         center = center + onward * (center - np.array(before.center_px))
     else:
-        distortion = (0.0,) * 5  # one stop does not tell how the image's distortion goes on
+        distortion = (0.0,) * 5  # one sample does not show how the image's distortion changes with the focal length
     guess = replace(
         last,
         focal_px=(float(focal[0]), float(focal[1])),
@@ -228,7 +229,7 @@ def with_stop(lens: ZoomLens, nominal_px: float) -> ZoomLens:
 
 
 def lens_prior(model: RigModel) -> Prior:
-    """What is known of a zoom lens beyond its first stop before it is seen; see `PUPIL_SIGMA` and `BENT_SIGMAS`."""
+    """Make the prior of the zoom samples beyond the first, from `PUPIL_SIGMA` and `BENT_SIGMAS`."""
     assert model.zoom is not None
     sigmas: dict[str, float] = {}
     stops = []
@@ -243,41 +244,43 @@ def lens_prior(model: RigModel) -> Prior:
 
 
 def fit_stop(model: RigModel, number: int, views: Sequence[View], points: Array) -> RigModel:
-    """Fit one stop alone to views at it, the boards where they are, everything else as it is.
+    """Fit one zoom sample to views at it; every other parameter of the model is held.
+
+    The boards' poses are free during the fit, and are returned as they were.
 
     Args:
-        model: with the boards of the views' placements.
-        number: of the stop.
-        views: of the zoom camera at that stop, and of the fixed camera of the same placements.
+        model: model with the boards of the views' placements and a first guess of the zoom sample.
+        number: index of the zoom sample.
+        views: zoom views at that sample, and fixed views of the same placements.
         points: the board's corners in its frame [m], (N, 3).
     """
     known = lens_prior(model)
-    own = f"zoom[{number}]."  # nothing is to draw the other stops, which have no views here
+    own = f"zoom[{number}]."  # without a prior the other samples, which have no views here, do not move
     prior = Prior(known.reference, {name: sigma for name, sigma in known.sigmas.items() if name.startswith(own)})
     found = fit(model, views, points, ("zoom", "pupil"), prior=prior)
     return replace(found.model, boards=model.boards)
 
 
 def expected_corners(model: RigModel, view: View, points: Array) -> Array:
-    """Where the corners of a view's board should be, (N, 2) [px]; nan behind the camera.
+    """Predict the corners of a view's board, (N, 2) [px]; nan behind the camera.
 
     Args:
-        model: with the board's place, and a stop at the view's focal length.
-        view: its corners do not matter.
+        model: model with the board's pose and a zoom sample at the view's focal length.
+        view: the view; its corners are not used.
         points: the board's corners in its frame [m], (N, 3).
     """
     return predict_pixels(model, [view], points)[0]
 
 
 def expected_inside(expected_px: Array, size: tuple[int, int]) -> Array:
-    """Which corners are expected in the image, (N,)."""
+    """Check which predicted corners lie inside the image, (N,)."""
     with np.errstate(invalid="ignore"):
         low = (expected_px >= INSIDE_PX).all(axis=-1)
         return np.asarray(low & (expected_px <= np.array(size) - 1 - INSIDE_PX).all(axis=-1))
 
 
 def find_expected(image: Image, board: BoardConfig, expected_px: Array) -> Array | None:
-    """Find a board, whole or in part, that is expected at (N, 2) [px]; None where it is not surely there."""
+    """Find a board, whole or in part, whose corners are expected at (N, 2) [px]; None where it is not found surely."""
     inside = expected_inside(expected_px, (image.shape[1], image.shape[0]))
     found = None
     if inside.all():
@@ -293,7 +296,7 @@ def check_stops(model: RigModel) -> None:
     """Refuse a lens whose true focal length does not grow with the nominal one.
 
     Raises:
-        CalibrationError: two stops contradict each other.
+        CalibrationError: two zoom samples contradict each other.
     """
     assert model.zoom is not None
     focal = [stop.focal_px[0] for stop in model.zoom.stops]
@@ -306,29 +309,31 @@ def check_stops(model: RigModel) -> None:
             )
 
 
-# A corner further off than this many standard deviations, and than the floor, is wrong: of Gaussian ones, one in
-# 65 million is.
+# The method
+
+# A corner beyond this many standard deviations and beyond the floor is wrong. Chance makes one Gaussian corner in 65
+# million so.
 WRONG_SIGMAS, WRONG_FLOOR_PX = 6.0, 0.5
-WRONG_SHARE = 0.3  # a view with more wrong corners than this is left out as a whole
+WRONG_SHARE = 0.3  # a view with a larger share of wrong corners is left out as a whole
 NO_PLACE = "its board is seen by neither camera at the shortest focal length, so that nothing tells where it is"
-# A view is left out when the head would have to stand this many times further than usual from where it says, and by
-# more than the floor: backlash and sag of usual heads.
+# A view is left out when the head stands this many times farther from the reported angles than usual, and by more than
+# the floor, which allows for the backlash and sag of usual heads.
 ELSEWHERE_SIGMAS, ELSEWHERE_FLOOR = 6.0, np.radians(0.05)
-JITTER_ROUNDS, SETTLED = 5, 0.03  # the jitter found and the parameters depend on each other
+JITTER_ROUNDS, SETTLED = 5, 0.03  # rounds of jitter and parameters in turn; relative change at which they end
 LARGEST_JITTER = np.radians(1.5)
-FEWEST_STOP_VIEWS, FEWEST_STOP_PLACEMENTS = 3, 2  # of a stop of the zoom lens
-# A board of one metre, glued to a sheet of something, is flat to some millimetres (as a share of its length).
+FEWEST_STOP_VIEWS, FEWEST_STOP_PLACEMENTS = 3, 2  # fewest views and placements of a zoom sample
+# Prior of the board's warp over its length: a board of one metre, glued to a sheet, is flat to some millimetres.
 WARP_SHARE = 0.004
-# The fixed camera's k3 is found too where it is this many standard deviations from 0, by chance of one lens in sixteen
-# thousand; below that it is doubted (`considered`).
+# k3 of the fixed camera is freed where it is this many standard deviations from 0, which chance does for one lens in
+# sixteen thousand; below that it is considered (`with_consider_covariance`). K3_WIDE is its prior's sigma until then.
 K3_SIGMAS, K3_WIDE = 4.0, 1.0
-# A lens that asks for k3 is not of this model, and departs from it further where no board was seen: the uncertainty is
-# widened by this, which covers rational and fisheye lenses whose nearest fit is 0.2 px off
+# A lens that asks for k3 does not follow this model, and departs from it more where no board was seen. This factor on
+# the standard deviations covers rational and fisheye lenses whose nearest fit is 0.2 px off
 # (experiments.calibration.mismatch).
 K3_WIDENED = 1.4
-# Held where they are not found, and doubted where the corners speak against that.
+# Blocks that are held unless they are freed, and considered in the covariance.
 CONSIDERED: tuple[Block, ...] = ("k3", "scale")
-# Encoders, where they are asked for: gears are cut to a thousandth or two, zeros are found to half a degree.
+# Prior of the encoders: gears are cut to a thousandth or two, and zeros are found to half a degree.
 ENCODER_SIGMAS = {
     "head.pan_scale": 0.002,
     "head.tilt_scale": 0.002,
@@ -344,14 +349,14 @@ def joint(
     nominal_px: Sequence[float] = (),
     options: Options = DEFAULT_OPTIONS,
 ) -> Solution:
-    """Calibrate a rig by one fit of everything.
+    """Calibrate a rig by one fit of all parameters.
 
     Args:
-        views: of both cameras, those of the zoom camera at any of its stops.
+        views: views of both cameras, those of the zoom camera at any zoom sample.
         points: the board's corners in its frame [m], (N, 3).
-        sizes: (width, height) of both cameras [px].
-        nominal_px: the stops' focal lengths by the device's own account, increasing; empty where it told none.
-        options: what is asked beyond the defaults.
+        sizes: image sizes (width, height) of both cameras [px].
+        nominal_px: nominal focal lengths of the zoom samples [px], increasing; empty where the lens reports none.
+        options: options of the calibration.
 
     Raises:
         CalibrationError: the views do not determine the rig; the message says what is missing.
@@ -385,7 +390,7 @@ def joint(
     everything = result
     result, wrong, left_out = _cleaned(everything, points, prior)
     with_k3, k3_prior = _with_k3_where_needed(result, points, prior)
-    if "k3" in with_k3.free:  # what such a lens does to corners is not the corners' fault
+    if "k3" in with_k3.free:  # corners that k3 explains are not wrong, so all are judged again
         prior = k3_prior
         again = fit(with_k3.model, everything.views, points, with_k3.free, prior=prior)
         result, wrong, left_out = _cleaned(again, points, prior)
@@ -416,17 +421,17 @@ def joint(
 
 
 def undetermined(found: Fit) -> str:
-    """What a fit leaves undetermined, in words with what to add; empty where nothing is."""
+    """Describe what a fit leaves undetermined and what to add; empty where it determines everything."""
     names = parameter_names(found.free, found.model.stops)
     focal = found.model.focal_px
     return name_directions(names, weak_directions(found.normal, names, found.variance or 0.0, focal), focal)
 
 
 def _known(model: RigModel, start: RigModel, blocks: Sequence[Block], options: Options, warp_sigma: float) -> Prior:
-    """What is known before the corners speak: of the board, the zoom lens, encoders, and what is insisted on.
+    """Make the prior of the board's warp, the zoom lens, the encoders, and of T, Gamma and head if regularized.
 
-    Who insists holds T, Gamma and the head's geometry near the start, as loosely as they are of any use: directions
-    that the corners determine do not notice, and the others get an uncertainty that says so.
+    The prior of T, Gamma and the head's geometry is at the start, with `limits_of_use` as standard deviations. It does
+    not change directions that the corners determine, and it bounds the uncertainty of the others.
     """
     reference, sigmas = replace(start, zoom=model.zoom), dict.fromkeys(("board.warp_x", "board.warp_y"), warp_sigma)
     if model.stops > 1:
@@ -445,7 +450,11 @@ def _known(model: RigModel, start: RigModel, blocks: Sequence[Block], options: O
 def _all_stops(
     found: Fit, views: Sequence[View], points: Array, nominal_px: Sequence[float]
 ) -> tuple[RigModel, list[View], list[Rejected]]:
-    """Add the stops in their order, each fitted by itself; the model then, all views of it, and what is left out."""
+    """Add the zoom samples beyond the first in their order, each fitted by itself.
+
+    Returns:
+        Model with the zoom samples; the views used; what was left out.
+    """
     model, used, rejected = found.model, list(found.views), []
     for number, nominal in enumerate(nominal_px[1:], start=1):
         assert model.zoom is not None
@@ -466,14 +475,18 @@ def _all_stops(
 
 
 def _cleaned(found: Fit, points: Array, prior: Prior) -> tuple[Fit, int, list[Rejected]]:
-    """Leave out what is wrong, and tell the head's jitter; how many single corners went, and which views."""
+    """Leave out views with a wrong head pose and wrong corners, and estimate the head's jitter.
+
+    Returns:
+        The fit of the rest; the number of single corners left out; the views left out.
+    """
     found, elsewhere = _without_heads_elsewhere(found, points, prior)
     found, wrong, spoilt = _without_wrong_corners(found, points, prior)
     return found, wrong, [*elsewhere, *spoilt]
 
 
 def _without_heads_elsewhere(found: Fit, points: Array, prior: Prior) -> tuple[Fit, list[Rejected]]:
-    """Leave out the views for which the head did not stand where it said: far more than for others."""
+    """Leave out views for which the head stood much farther from the reported angles than for others."""
     if "hand" not in found.free:
         return found, []
     off = np.linalg.norm(head_turns(found, points), axis=-1)
@@ -492,7 +505,11 @@ def _without_heads_elsewhere(found: Fit, points: Array, prior: Prior) -> tuple[F
 
 
 def _without_wrong_corners(found: Fit, points: Array, prior: Prior) -> tuple[Fit, int, list[Rejected]]:
-    """Leave out the corners that nothing explains, and tell the head's jitter; the fit then, and how many they were."""
+    """Leave out corners with far too large residuals, and estimate the head's jitter.
+
+    Returns:
+        The fit of the rest; the number of single corners left out; the views left out.
+    """
     found = _with_jitter(found, points, prior)
     lengths = np.linalg.norm(found.left, axis=-1)
     seen = np.isfinite(lengths)
@@ -509,16 +526,16 @@ def _without_wrong_corners(found: Fit, points: Array, prior: Prior) -> tuple[Fit
         count += int(bad.sum())
         views.append(replace(view, corners_px=np.where(bad[:, None], np.nan, view.corners_px)) if bad.any() else view)
     again = fit(found.model, views, points, found.free, prior=prior, jitter=found.jitter)
-    if found.jitter:  # views and corners that were off look like jitter
+    if found.jitter:  # the corners now left out looked like jitter before
         again = _with_jitter(again, points, prior)
     return again, count, rejected
 
 
 def _with_jitter(found: Fit, points: Array, prior: Prior) -> Fit:
-    """The fit with the head's jitter, as it and the parameters settle together.
+    """Estimate the head's jitter and fit again with it, in turn until both settle.
 
     Raises:
-        CalibrationError: it is so large that no head has it.
+        CalibrationError: the jitter is larger than any head's.
     """
     if "hand" not in found.free:
         return found
@@ -536,10 +553,13 @@ def _with_jitter(found: Fit, points: Array, prior: Prior) -> Fit:
 
 
 def _with_k3_where_needed(found: Fit, points: Array, prior: Prior) -> tuple[Fit, Prior]:
-    """Free the fixed camera's k3 as well, if the corners speak for it, and by as much as they do.
+    """Free the fixed camera's k3 where its estimate is significant (`K3_SIGMAS`).
 
-    Its prior is what its own estimate lets expect of such a lens (empirical Bayes): k3^2 less its variance. So a k3
-    that noise explains stays 0, a large one is free, and one between is drawn towards 0.
+    The variance of its prior is k3^2 less the estimate's variance (empirical Bayes), so that a smaller k3 is drawn
+    towards 0.
+
+    Returns:
+        The fit and its prior, as they were where k3 stays held.
     """
     free: tuple[Block, ...] = (*found.free, "k3")
 
@@ -556,7 +576,7 @@ def _with_k3_where_needed(found: Fit, points: Array, prior: Prior) -> tuple[Fit,
 
 
 def _residuals(steps: Steps, result: Fit, points: Array, rejected: Sequence[Rejected], wrong: int) -> Residuals:
-    """The figures of each part by itself, as everybody states them, and those of the whole."""
+    """Compute the rms of each part fitted by itself, as is customary, and that of the joint fit."""
     pairs = pairs_at_home(result.views)
     zoom = np.array([view.camera == "zoom" for view in result.views])
     return Residuals(

@@ -1,4 +1,4 @@
-"""What a calibration takes and gives: captures, views (the corners of one image), and the calibration itself."""
+"""Data of a calibration: captures, views, options, the rig's model, residuals and covariance."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,14 +22,14 @@ Progress = Callable[[int, int, str], None]  # done, total, text
 
 @dataclass(frozen=True)
 class Capture:
-    """One image of a calibration board and what the devices said when it was taken.
+    """One image of a calibration board with the state that the devices reported.
 
     Attributes:
-        image: (H, W, 3) BGR.
-        camera: which camera took it.
+        image: image, (H, W, 3) BGR.
+        camera: camera that took it.
         board: number of the board's placement; images with the same number show the board in the same place.
-        pan: the head's pan [rad].
-        tilt: the head's tilt [rad].
+        pan: reported pan [rad].
+        tilt: reported tilt [rad].
         focal_px: nominal focal length of the zoom camera [px]; None for the fixed camera.
         t: middle of the exposure on the rig's clock [s].
         source: name of the image's file, or None.
@@ -47,10 +47,11 @@ class Capture:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The board's corners in one image; see `Capture` for the other attributes.
+    """Corners of the board in one capture; see `Capture` for the other attributes.
 
     Attributes:
-        corners_px: all inner corners, row by row from the board's first, (N, 2) [px]; nan for those not seen.
+        corners_px: all inner corners, row by row from the board's first, (N, 2) [px]; nan for corners that are not
+            seen.
     """
 
     camera: CameraName
@@ -64,23 +65,23 @@ class View:
 
     @property
     def seen(self) -> npt.NDArray[np.bool_]:
-        """Which corners are seen, (N,)."""
+        """True for corners that are seen, (N,)."""
         return np.isfinite(self.corners_px[:, 0])
 
     @property
     def name(self) -> str:
-        """How to speak of this view: its file, or its camera, placement and pose."""
+        """Name of the view in messages: its file, or its camera, placement and time."""
         return self.source or f"{self.camera} view of placement {self.board} at t = {self.t:.2f} s"
 
 
 def unseen(count: int) -> Array:
-    """The corners of a view in which none is seen, (count, 2)."""
+    """Make the corners of a view in which none is seen, (count, 2), all nan."""
     return np.full((count, 2), np.nan)
 
 
 @dataclass(frozen=True)
 class Rejected:
-    """An image, or a view, that was not used, by name, and why."""
+    """Name of an image or view that was not used, with the reason."""
 
     name: str
     reason: str
@@ -88,14 +89,14 @@ class Rejected:
 
 @dataclass(frozen=True)
 class Options:
-    """How to calibrate.
+    """Options of a calibration.
 
     Attributes:
-        method: "joint", one fit of everything; or "sequential", the paper's, to be compared with.
-        encoders: joint only: whether to find the encoders' scales and zeros too, near 1 and 0 by prior knowledge.
-        regularize: joint only: whether to go on where the motions leave something open, with an uncertainty that says
-        so.
-        folds: joint only: into how many parts the placements are split, each kept out once and predicted; 0 for none.
+        method: "joint", one fit of everything; or "sequential", the paper's method, for comparison.
+        encoders: joint only: True to fit the encoders' scales and zeros too, with a prior near 1 and 0.
+        regularize: joint only: True to give undetermined directions a weak prior, so that the calibration goes on with
+            an uncertainty to match; False to refuse them.
+        folds: joint only: number of parts into which the placements are split for the held-out check; 0 for no check.
     """
 
     method: str = "joint"
@@ -109,18 +110,18 @@ DEFAULT_OPTIONS = Options()
 
 @dataclass(frozen=True)
 class Residuals:
-    """How well the corners are explained: root mean square distance per point, all corners of all views used [px].
+    """Residuals of a calibration: root mean square distance per point, over all corners of all views used [px].
 
     Attributes:
-        fixed_rms_px: the fixed camera's views, each board pose free.
-        zoom_rms_px: the zoom camera's views, each board pose free.
-        stereo_rms_px: pairs at home, one board pose a pair, over both cameras' points; None without pairs.
-        handeye_rms_px: every view of the zoom camera through the head; None without a head.
-        outliers: how many single corners were left out of the last fit.
-        fixed_views: how many views of the fixed camera were used.
-        zoom_views: how many views of the zoom camera were used.
-        pairs: how many placements were seen by both cameras at home.
-        rejected: what was not used.
+        fixed_rms_px: rms of the fixed camera's views, each board pose free.
+        zoom_rms_px: rms of the zoom camera's views, each board pose free.
+        stereo_rms_px: rms of pairs at home over both cameras' points, one board pose per pair; None without pairs.
+        handeye_rms_px: rms of all zoom views through the head's kinematics; None without a head.
+        outliers: number of single corners left out of the last fit.
+        fixed_views: number of views of the fixed camera used.
+        zoom_views: number of views of the zoom camera used.
+        pairs: number of placements that both cameras see at home.
+        rejected: images and views that were not used.
     """
 
     fixed_rms_px: float
@@ -136,57 +137,56 @@ class Residuals:
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """What is left uncertain.
-
-    The truth differs from what was found by an error of this covariance. Parameters that were held are left out.
+    """Covariance of a calibration's parameters; parameters held in the fit are left out.
 
         fixed.fx .fy .cx .cy                 [px], of the image size calibrated
         fixed.k1 .k2 .p1 .p2                 without unit; and .k3, where the corners ask for it
-        zoom[i].fx ... zoom[i].p2            the same of the zoom lens's stop i, counted from 0
-        zoom[i].pupil                        [m], of all stops but the first
-        T_zoom0_fixed.rx .ry .rz .tx .ty .tz     [rad] and [m]; T_head_zoom.* likewise
+        zoom[i].fx ... zoom[i].p2            the same for zoom sample i, counted from 0
+        zoom[i].pupil                        [m], for all zoom samples but the first
+        T_zoom0_fixed.rx .ry .rz .tx .ty .tz     [rad] and [m]
+        T_head_zoom.rx .ry .rz .tx .ty .tz       [rad] and [m]
         head.axis_offset .squareness         [m] and [rad]
-        head.pan_scale .tilt_scale           without unit, where they were asked for
-        head.pan_zero .tilt_zero             [rad], where they were asked for
+        head.pan_scale .tilt_scale           without unit, where they are fitted or considered
+        head.pan_zero .tilt_zero             [rad], where they are fitted
         board.warp_x .warp_y                 [m], see `Calibration.board_warp`
 
-    An error (w, d) of a transform (R, t) means exp(w) R and t + d: w turns about the axes of the frame that the
-    transform leads to, and leaves t as it is.
+    An error (w, d) of a transform (R, t) = T_a_b means exp(w) R and t + d: w turns about the axes of frame a, and t
+    changes by d alone.
 
     Attributes:
-        parameters: names, n of them.
-        matrix: (n, n), in products of the units above.
+        parameters: names of the n parameters.
+        matrix: covariance (n, n), in products of the units above.
     """
 
     parameters: tuple[str, ...]
     matrix: Array
 
     def scaled(self, factors: Mapping[str, float]) -> "Covariance":
-        """The same where the parameters named are multiplied by factors."""
+        """Return the covariance after the named parameters are multiplied by factors."""
         by = np.array([factors.get(name, 1.0) for name in self.parameters])
         return Covariance(self.parameters, self.matrix * np.outer(by, by))
 
     def sigma(self, name: str) -> float:
-        """Standard deviation of one parameter."""
+        """Return the standard deviation of one parameter, in its unit."""
         i = self.parameters.index(name)
         return float(np.sqrt(self.matrix[i, i]))
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How well placements that were kept out of the fit are predicted, each of some folds in its turn.
+    """Result of the held-out check: how well placements kept out of the fit are predicted.
 
-    The board's place comes from the fixed camera's view alone; where it then appears to the zoom camera, on average
-    over its corners, is what pointing at a target means.
+    The board's pose comes from the fixed camera's view alone, and the mean of its corners in the zoom image is
+    predicted. That is what pointing at a target does.
 
     Attributes:
-        views: how many views of the zoom camera were predicted.
-        measured_px: rms distance between predicted and seen, at each view's own focal length brought to the shortest.
-        predicted_px: what the covariance, the jitter and the corners' noise let expect of that.
-        corners_rms_px: rms of single corners of all views kept out, with only their board's pose fitted.
-        ratio: rms of every distance over what was expected of it; 1 where the uncertainty is honest.
-        widened: factor by which the standard deviations were widened, because the measured distance was larger than
-            predicted beyond chance; 1 where they agree.
+        views: number of zoom views predicted.
+        measured_px: rms distance between predicted and seen mean, scaled from each view's focal length to the shortest.
+        predicted_px: rms distance that the covariance, the jitter and the corners' noise let expect.
+        corners_rms_px: rms of single corners of the views kept out, with only the boards' poses fitted.
+        ratio: rms of the distances, each over its expected value; 1 for a consistent covariance.
+        widened: factor by which the standard deviations were widened, because the measured distance exceeds the
+            predicted one beyond chance; 1 where they agree.
     """
 
     views: int
@@ -199,16 +199,16 @@ class HeldOut:
 
 @dataclass(frozen=True, eq=False)
 class RigModel:
-    """Everything that determines where corners appear.
+    """Model of a rig and its boards: all that predicts the corners of a view.
 
     Attributes:
-        fixed: the fixed camera, None while only the zoom camera is looked at.
-        zoom: the zoom camera, None while only the fixed camera is looked at.
-        gamma: T_zoom0_fixed, at the first stop.
-        hand: T_head_zoom, at the first stop.
-        head: the pan-tilt unit's geometry.
+        fixed: intrinsics of the fixed camera; None while only the zoom camera is modelled.
+        zoom: optics of the zoom camera; None while only the fixed camera is modelled.
+        gamma: T_zoom0_fixed, at the first zoom sample.
+        hand: T_head_zoom, at the first zoom sample.
+        head: geometry of the head.
         boards: T_fixed_board by the number of the placement.
-        warp: by how much the board's middle stands out towards its z from its edges along x, and along y [m].
+        warp: height of the board's middle above its edges, towards its z, by the bend along x and along y [m].
     """
 
     boards: Mapping[int, RigidTransform]
@@ -221,21 +221,21 @@ class RigModel:
 
     @property
     def stops(self) -> int:
-        """How many stops the zoom lens has here."""
+        """Number of zoom samples."""
         return 0 if self.zoom is None else len(self.zoom.stops)
 
     @property
     def focal_px(self) -> dict[str, float]:
-        """Focal length of every lens [px], by how the names of its parameters begin."""
+        """Focal length of every lens [px], by the prefix of its parameters' names ("fixed", "zoom[0]")."""
         found = {} if self.fixed is None else {"fixed": self.fixed.focal_px[0]}
         stops = () if self.zoom is None else self.zoom.stops
         return found | {f"zoom[{i}]": stop.focal_px[0] for i, stop in enumerate(stops)}
 
     def lens_of(self, view: View) -> Intrinsics:
-        """The intrinsics with which a view was taken.
+        """Select the intrinsics with which a view was taken.
 
         Raises:
-            CalibrationError: there is no model of its camera.
+            CalibrationError: there is no model of the view's camera.
         """
         if view.camera == "fixed" and self.fixed is not None:
             return self.fixed
@@ -246,7 +246,17 @@ class RigModel:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What a method found: the model (every placement's board in it), residuals, and the views it used."""
+    """Result of a calibration method.
+
+    Attributes:
+        model: fitted model, with the board of every placement.
+        residuals: residuals of its parts.
+        views: views that it used.
+        has_head: False if the head never moved, so that T is unknown.
+        covariance: covariance of the parameters, or None.
+        jitter: standard deviation of the head's true angles about the reported ones [rad].
+        held_out: result of the held-out check, or None.
+    """
 
     model: RigModel
     residuals: Residuals
@@ -258,7 +268,7 @@ class Solution:
 
 
 def stop_of(nominal_px: Sequence[float], view: View) -> int:
-    """The stop that is nearest to a view's nominal focal length; the first where none was told."""
+    """Find the zoom sample nearest to a view's nominal focal length; the first where the view has none."""
     if view.focal_px is None or not nominal_px:
         return 0
     return int(np.argmin(np.abs(np.log(np.array(nominal_px) / view.focal_px))))

@@ -1,9 +1,9 @@
-"""What motions or views leave undetermined, and what to add, in words.
+"""Observability: find and name the directions of the parameters that motions or views leave undetermined.
 
-`judge_motions` speaks of hand-eye motions, `weak_directions` and `name_directions` of a rig's joint fit. A normal
-matrix N (the inverse of a covariance) tells how well every direction of the parameters is known. A direction counts as
-undetermined where its standard deviation is beyond use; divided by these limits of use, all parameters have the same
-unit, and that is an eigenvalue of N below 1.
+`judge_motions` is for hand-eye motions; `weak_directions` and `name_directions` are for a rig's joint fit. A direction
+is undetermined where its standard deviation exceeds a limit of use, beyond which an estimate is worthless. With every
+parameter divided by its limit of use, that is an eigenvalue below 1 of the normal matrix N, the inverse covariance. The
+texts say what is undetermined and which motions or views to add. Sources: docs/design-notes.md.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,21 +16,22 @@ from scipy.linalg import eigh
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
 
-# A start that is wrong by so much still leads every later fit to the optimum, and nobody would call it measured.
+# Limits of use of a rotation [rad] and a position [m]. A start that is wrong by that much still leads later fits to the
+# optimum.
 USELESS_ROTATION = np.radians(5.0)
 USELESS_POSITION = 0.5  # [m]
-# A lens parameter is of no use when it is wrong by so much that corners at the image's edge move by 50 px, about as
-# much as 5 degrees do at a focal length of 600 px.
+# Limit of use of a lens parameter: it moves corners at the image's edge by 50 px, about as much as 5 degrees at a focal
+# length of 600 px.
 USELESS_PX = 50.0
 EDGE_PX = 360.0  # from the middle of a usual image to its edge
 USUAL_FOCAL_PX = 600.0
-USELESS_SCALE = 0.1  # of an encoder: of 50 degrees, 5 degrees
+USELESS_SCALE = 0.1  # limit of use of an encoder's scale: 5 of 50 degrees
 NO_FOCAL_PX: Mapping[str, float] = MappingProxyType({})
 TILT_BOARDS = "tilt the boards against the camera by 20 to 40 degrees, in several directions"
 OUTWARD = "show boards out to the image's corners"
 BOTH = "show both cameras the same placements, near and far"
 NEARER = "move both pan and tilt further, with boards nearer"
-# How people call a parameter, and what determines it.
+# Name of each parameter in messages, and the advice that determines it.
 WORDS = {
     **dict.fromkeys(("fx", "fy"), ("focal length", TILT_BOARDS)),
     **dict.fromkeys(("cx", "cy"), ("principal point", TILT_BOARDS)),
@@ -43,32 +44,32 @@ WORDS = {
     "pan_scale": ("scale of pan", "add pan"),
     **dict.fromkeys(("pan_zero", "tilt_zero"), ("zero angles", "hold these or T_zoom0_fixed: they say the same")),
 }
-# Noise of the hand's own pose turns axes about and makes a direction look measured that is not. It has to be seen by
-# this many times as much as by noise alone; below, the estimate would be drawn towards noise by more than a tenth.
+# Noise of the hand's pose perturbs the axes and makes an undetermined direction look measured. A direction must be seen
+# this many times as strongly as by noise alone; below, noise biases the estimate by more than a tenth.
 ABOVE_NOISE = 3.0
-# Eigenvalues below this share of the largest are rounding, where boards' poses were eliminated by subtraction.
+# Eigenvalues below this share of the largest are rounding, because the boards' poses are eliminated by subtraction.
 ROUNDING = 1e-12
-# Axes of rotation are one when the second singular value of all rotation vectors is below this share of the first: a
-# head that only pans or only tilts leaves two of T's six numbers free.
+# All motions turn about one axis when the second singular value of their rotation vectors is below this share of the
+# first. A head that only pans or only tilts leaves two of T's six numbers undetermined.
 PARALLEL_SHARE = 0.05
-SMALLEST_TURN = np.radians(0.5)  # motions below this say more about noise than about axes
-SMALLEST_SHIFT = 1e-3  # [m]; likewise
-# A pan-tilt head's axes nearly cross: it shifts by no more than this for every radian [m].
+SMALLEST_TURN = np.radians(0.5)  # smaller turns show noise rather than axes
+SMALLEST_SHIFT = 1e-3  # smaller shifts show noise rather than motion [m]
+# The axes of a pan-tilt head nearly cross: it shifts by at most this per radian [m/rad].
 LONGEST_OFFSET = 0.05
-ALIGNED = 0.99  # cosine of 8 degrees: directions nearer than that have one name
-# A parameter takes part in free directions where they hold this share of it (the diagonal of the projection on them).
+ALIGNED = 0.99  # cosine of 8 degrees, within which two directions have one name
+# A parameter takes part in the free directions where the diagonal of the projection on them exceeds this.
 TAKES_PART = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Observability:
-    """What motions determine of a transform.
+    """Verdict on what motions determine of a transform.
 
     Attributes:
-        determined: whether nothing is free.
+        determined: True if no direction is undetermined.
         text: the verdict in words, with what to add.
-        free: what is undetermined, in words; empty where all is determined.
-        directions: the free directions (w, d) of the transform [rad] and [m], unit vectors, (k, 6).
+        free: names of what is undetermined; empty where all is determined.
+        directions: undetermined directions (w, d) of the transform [rad] and [m], unit vectors, (k, 6).
     """
 
     determined: bool
@@ -79,12 +80,12 @@ class Observability:
 
 @dataclass(frozen=True, eq=False)
 class HandMotions:
-    """How the hand moved, as far as words about it need.
+    """Motions of the hand, as the verdict describes them.
 
     Attributes:
         turns: rotation vectors in the hand's frame [rad], (n, 3).
         shifts: translations in the hand's frame [m], (n, 3).
-        turns_base: the rotation vectors in the base's frame, (n, 3); None where only motions are known.
+        turns_base: rotation vectors in the base's frame [rad], (n, 3); None where only motions are known.
     """
 
     turns: Array
@@ -93,14 +94,17 @@ class HandMotions:
 
 
 def spectrum(normal: Array, noise: Array) -> tuple[Array, Array]:
-    """Solve N v = u (L^-2 + k^2 N0) v, with L the limits of use, k `ABOVE_NOISE` and N0 what noise alone would show.
+    """Compute how well each direction of a transform is known, against the limits of use and noise.
+
+    This solves N v = u (L^-2 + k^2 N0) v, with L the limits of use, k `ABOVE_NOISE`, and N0 the normal matrix that
+    noise alone would show.
 
     Args:
-        normal: N of a transform's (w, d), (6, 6) [1/rad^2, 1/m^2].
-        noise: the diagonal of N0, (6,).
+        normal: normal matrix N of a transform's (w, d), (6, 6) [1/rad^2, 1/m^2].
+        noise: diagonal of N0, (6,).
 
     Returns:
-        u, ascending, (6,); a direction is undetermined where u < 1. And the directions, (6, 6), one a column.
+        Eigenvalues u, ascending, (6,), where u < 1 is undetermined; and the directions v, one per column, (6, 6).
     """
     bound = 1 / np.repeat([USELESS_ROTATION, USELESS_POSITION], 3) ** 2 + ABOVE_NOISE**2 * noise
     values, vectors = eigh((normal + normal.T) / 2, np.diag(bound))
@@ -108,7 +112,7 @@ def spectrum(normal: Array, noise: Array) -> tuple[Array, Array]:
 
 
 def judge_motions(normal: Array, noise: Array, motions: HandMotions) -> Observability:
-    """Say in words what motions determine of X in A X = X B; see `spectrum` for normal and noise."""
+    """Judge what motions determine of X in A X = X B; see `spectrum` for normal and noise."""
     values, vectors = spectrum(normal, noise)
     basis = vectors[:, values < 1]
     if not basis.shape[1]:
@@ -128,20 +132,20 @@ def judge_motions(normal: Array, noise: Array, motions: HandMotions) -> Observab
 def weak_directions(
     normal: Array, parameters: Sequence[str], variance: float, focal_px: Mapping[str, float] = NO_FOCAL_PX
 ) -> Array:
-    """Find what a normal matrix leaves undetermined, judged in units that matter.
+    """Find the directions that a normal matrix leaves undetermined, measured by the parameters' limits of use.
 
     Args:
-        normal: (n, n), its inverse times the variance being the covariance.
-        parameters: names, n of them, as in `Covariance`.
-        variance: of one coordinate [px^2]; 0 for what is undetermined however exact the corners are.
-        focal_px: of lenses whose focal length is far from 600 px, by the part of the name in front of the point.
+        normal: normal matrix (n, n); its inverse times the variance is the covariance.
+        parameters: names of the n parameters, as in `Covariance`.
+        variance: variance of one coordinate [px^2]; 0 to find what even exact corners leave undetermined.
+        focal_px: focal length of each lens [px], by the prefix of its parameters' names; 600 px for those not given.
 
     Returns:
-        Directions (k, n) in the parameters' units, the least known first. Divided by the parameters' limits of use they
-        are orthonormal; the standard deviation of each is larger than it is long.
+        Directions (k, n) in the parameters' units, the least known first. Divided by the limits of use they are
+        orthonormal; the standard deviation along each is larger than its length.
 
     Raises:
-        CalibrationError: a name is none that is known.
+        CalibrationError: a parameter's name is unknown.
     """
     limits = limits_of_use(parameters, focal_px)
     values, vectors = np.linalg.eigh(normal * np.outer(limits, limits))
@@ -150,22 +154,22 @@ def weak_directions(
 
 
 def name_directions(parameters: Sequence[str], directions: Array, focal_px: Mapping[str, float] = NO_FOCAL_PX) -> str:
-    """Say in words what is undetermined, and what to add.
+    """Describe undetermined directions in words, with what to add.
 
     Args:
-        parameters: names, n of them, as in `Covariance`.
-        directions: in their units, independent of each other, (k, n); as `weak_directions` gives them.
-        focal_px: as there.
+        parameters: names of the n parameters, as in `Covariance`.
+        directions: independent directions in the parameters' units, (k, n), as `weak_directions` returns them.
+        focal_px: focal length of each lens [px], as in `weak_directions`.
 
     Returns:
         One sentence without a full stop; empty where there are no directions.
 
     Raises:
-        CalibrationError: a name is none that is known.
+        CalibrationError: a parameter's name is unknown.
     """
     if not len(directions):
         return ""
-    # The projection on the directions does not depend on which of them span the same space.
+    # The projection depends only on the space that the directions span.
     basis = np.linalg.qr((directions / limits_of_use(parameters, focal_px)).T)[0]
     part = np.sum(basis**2, axis=1)
     reason = ""
@@ -184,14 +188,18 @@ def name_directions(parameters: Sequence[str], directions: Array, focal_px: Mapp
         else:
             word, advice = WORDS[kind]
         what.append(f"{_owner(owner)}'s {word}")
-        if not (reason and owner == "head"):  # then the missing axis is all it takes
+        if not (reason and owner == "head"):  # where an axis did not move, moving it determines the head too
             add.append(advice)
     what, add = list(dict.fromkeys(what)), list(dict.fromkeys(add))
     return f"{reason}{_listed(what)} {'is' if len(what) == 1 else 'are'} free; {_listed(add)}"
 
 
 def limits_of_use(parameters: Sequence[str], focal_px: Mapping[str, float] = NO_FOCAL_PX) -> Array:
-    """By how much each parameter must be wrong to be of no use, in its unit, (n,); see `weak_directions`."""
+    """Look up the limit of use of each parameter, in its unit, (n,); see `weak_directions`.
+
+    Raises:
+        CalibrationError: a parameter's name is unknown.
+    """
     limits = []
     for name in parameters:
         owner, _, kind = name.rpartition(".")
@@ -222,7 +230,7 @@ def limits_of_use(parameters: Sequence[str], focal_px: Mapping[str, float] = NO_
 
 
 def _owner(owner: str) -> str:
-    """How people call a block of parameters."""
+    """Name the owner of parameters for messages."""
     if owner.startswith("zoom["):
         return f"the zoom camera's stop {owner[5:-1]}"
     return {"fixed": "the fixed camera", "zoom": "the zoom camera", "head": "the head", "board": "the board"}.get(
@@ -231,9 +239,10 @@ def _owner(owner: str) -> str:
 
 
 def _still(basis: Array, rows: Sequence[int]) -> Array:
-    """Those of the directions that leave some parameters as they are; all where each of them changes these.
+    """Select the directions that do not change some parameters; all directions where each changes them.
 
-    With tilt alone, an axis offset is nothing but a shift of T_head_zoom: that is not to hide why both are free.
+    With tilt alone, an axis offset equals a shift of T_head_zoom. This selection keeps the verdict on T_head_zoom free
+    of that.
     """
     _, s, Vt = np.linalg.svd(basis[list(rows)])
     rank = int(np.sum(s**2 > TAKES_PART))
@@ -241,7 +250,15 @@ def _still(basis: Array, rows: Sequence[int]) -> Array:
 
 
 def _name_hand(names: Sequence[str], basis: Array) -> tuple[str, list[str], list[str]]:
-    """Why T_head_zoom is free, what of it, and what to add; basis: its rows of all free directions, (m, k)."""
+    """Describe why T_head_zoom is undetermined.
+
+    Args:
+        names: names of its parameters, m of them.
+        basis: rows of the free directions for these, (m, k).
+
+    Returns:
+        Reason, names of what is undetermined, and what to add.
+    """
     spans = []
     for kind in ("r", "t"):
         rows = np.zeros((3, basis.shape[1]))
@@ -261,7 +278,11 @@ def _name_hand(names: Sequence[str], basis: Array) -> tuple[str, list[str], list
 
 
 def _how_it_moved(motions: HandMotions) -> tuple[str, Array | None, str, str]:
-    """What the hand did, its only axis and the name of that (None and nothing where there are more), what to add."""
+    """Describe the hand's motions.
+
+    Returns:
+        Description; the only axis, (3,), or None where there are several; the axis's name; what to add.
+    """
     turns, shifts = motions.turns, motions.shifts
     largest = float(np.linalg.norm(turns, axis=1).max())
     moves = float(np.linalg.norm(shifts, axis=1).max())
@@ -289,7 +310,7 @@ def _how_it_moved(motions: HandMotions) -> tuple[str, Array | None, str, str]:
 
 
 def _free_axes(basis: Array) -> tuple[Array, Array]:
-    """Axes of the free rotations, and directions of the free shifts that need no rotation, (a, 3) and (b, 3)."""
+    """Find the axes of the free rotations, (a, 3), and the directions of free shifts without rotation, (b, 3)."""
     scaled = basis / np.repeat([USELESS_ROTATION, USELESS_POSITION], 3)[:, None]
     scaled = np.linalg.qr(scaled)[0]
     U, s, Vt = np.linalg.svd(scaled[:3])
@@ -299,7 +320,7 @@ def _free_axes(basis: Array) -> tuple[Array, Array]:
 
 
 def _along(what: str, how: str, directions: Array, axis: Array | None, axis_name: str) -> tuple[str, ...]:
-    """Name each direction: as the axis of all motions where it is that, as a vector otherwise."""
+    """Name each direction, by the axis of all motions where it is aligned with it, as a vector otherwise."""
     if len(directions) == 3:
         return (what,)
     return tuple(
@@ -309,11 +330,11 @@ def _along(what: str, how: str, directions: Array, axis: Array | None, axis_name
 
 
 def _listed(items: Sequence[str]) -> str:
-    """Join as people do: a, b and c."""
+    """Join items as a sentence does: a, b and c."""
     return " and ".join(filter(None, (", ".join(items[:-1]), items[-1])))
 
 
 def _vector(v: Array) -> str:
-    """Write an axis with its largest component positive."""
+    """Format an axis with its largest component positive."""
     v = v * np.sign(v[np.argmax(np.abs(v))])
     return "(" + ", ".join(f"{value + 0.0:.2f}" for value in np.round(v, 2)) + ")"

@@ -1,8 +1,8 @@
-"""Where to hold the board next and where to turn the head, so that the corners cover both images, near and far.
+"""Plan a capture session: the next board placement and the head poses, by coverage and predicted accuracy.
 
-Plans need only a rough model of the rig. Whatever is planned is a wish: what counts is what is then seen.
-
-What a capture session knows so far, in the terms that count: the predicted pointing error; and what more buys.
+Plans need only a rough model of the rig. They are requests: the fit uses what is then seen. The predicted accuracy is
+the rms pointing error that the views so far let expect, and by how much planned views would reduce it.
+Measurements: docs/design-notes.md.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,23 +22,25 @@ from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import nearest, solve
 from cotarget.rig import PanTiltLimits
 
-# Pointing is judged for targets on a grid over the wide view at these depths [m], in squares of the board: a board of
-# 0.1 m is for scenes of 4 to 30 m.
+# Predicted accuracy
+
+# The pointing error is predicted for targets on a grid over the fixed image, at these depths in squares of the board:
+# squares of 0.1 m are for scenes of 4 to 30 m.
 DEPTHS_SQUARES = (40.0, 110.0, 300.0)
 ACCURACY_GRID = (5, 4)
-BORDER = 0.02  # of the image, that the grid keeps clear
+BORDER = 0.02  # border that the grid keeps clear, as a share of the image
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedAccuracy:
-    """What is known of the parameters, and how pointing depends on them.
+    """Normal matrix of the parameters so far, and the dependence of the pointing error on them.
 
     Attributes:
-        model: fitted so far.
-        free: its blocks.
-        normal: what is known, (n, n) [1/px^2].
-        variance: of a coordinate [px^2].
-        pointing: mean over targets of J^T J, with J how the miss changes with the parameters, (n, n).
+        model: model fitted so far.
+        free: its free blocks.
+        normal: normal matrix of the parameters, (n, n) [1/px^2].
+        variance: variance of a corner coordinate [px^2].
+        pointing: mean over targets of J^T J, with J the derivative of the pointing error by the parameters, (n, n).
     """
 
     model: RigModel
@@ -48,7 +50,14 @@ class PredictedAccuracy:
     pointing: Array
 
     def error(self, more: Array | float = 0.0) -> float:
-        """Predicted rms pointing error when so much more is known (n, n) [rad]; infinite where something is open."""
+        """Predict the rms pointing error [rad].
+
+        Args:
+            more: normal matrix of further views, (n, n), see `worth`.
+
+        Returns:
+            Error; infinite where a direction is undetermined.
+        """
         total = self.normal + more
         scale = np.sqrt(np.diagonal(total))
         if not (scale > 0).all():
@@ -63,23 +72,23 @@ class PredictedAccuracy:
     def with_views(
         self, views: Sequence[View], boards: dict[int, RigidTransform], points: Array
     ) -> "PredictedAccuracy":
-        """The outlook after views of more placements."""
+        """Return the predicted accuracy after views of further placements."""
         return replace(self, normal=self.normal + self.worth(views, boards, points))
 
     def worth(self, views: Sequence[View], boards: dict[int, RigidTransform], points: Array) -> Array:
-        """What views of placements would add to what is known, (n, n)."""
+        """Compute the normal matrix that views of placements would add, (n, n)."""
         return information(replace(self.model, boards=boards), views, points, self.free)
 
 
 def predict_accuracy(found: Fit, square: float) -> PredictedAccuracy | None:
-    """The outlook after a fit of everything at the shortest focal length.
+    """Predict the accuracy of pointing after a fit at the shortest focal length.
 
     Args:
-        found: with Gamma, T and both cameras free.
-        square: of the board [m], which tells how far targets are.
+        found: fit with Gamma, T and both cameras free.
+        square: side of a square of the board [m], which scales the targets' depths.
 
     Returns:
-        None where there are too few corners for it, or targets cannot be reached.
+        The prediction; None where there are too few corners, or no target is within reach.
     """
     model = found.model
     if found.variance is None or model.fixed is None or model.zoom is None:
@@ -98,37 +107,39 @@ def predict_accuracy(found: Fit, square: float) -> PredictedAccuracy | None:
 
 
 def planned_views(board: int, turns: Sequence[tuple[float, float]], corners: int) -> list[View]:
-    """The views that a placement seen by the fixed camera and from head poses will be, all corners seen."""
+    """Make the views that a placement will give, from the fixed camera and from head poses, all corners seen."""
     seen = np.zeros_like(unseen(corners))
     return [View("fixed", seen, board), *(View("zoom", seen, board, pan, tilt) for pan, tilt in turns)]
 
 
-# Distances for squares of 0.1 m and a focal length of 1.07 image widths: nearer, the board fills the image and moves
-# out of it at every turn; farther, squares of 8 px and less are no longer found.
-# Markers are read to half that distance, and a board that is seen in part counts.
+# Placements and head poses
+
+# Distances [m] for squares of 0.1 m and a focal length of 1.07 image widths. Nearer, the board fills the image and
+# moves out of it at every turn; farther, squares of 8 px and less are not found. Markers are read to half that
+# distance, and a ChArUco board that is seen in part counts.
 NEAR_FAR = {"chessboard": (2.5, 8.0), "charuco": (1.7, 4.0)}
 REFERENCE_SQUARE = 0.1  # [m]
 REFERENCE_FOCAL = 1.07  # in image widths
 MOST_TILTED, LEAST_TILTED = np.radians(40.0), np.radians(8.0)  # from facing the camera; beyond, squares get too thin
 MOST_ROLLED = np.radians(25.0)
-GOLDEN = 0.6180339887  # its multiples spread evenly over 0..1 however many there are
+GOLDEN = 0.6180339887  # golden ratio: any number of its multiples, modulo 1, is spread evenly over 0..1
 GRID = (10, 8)  # cells across and down an image in which corners are counted
-HIDDEN_REACH = 0.12  # of the image's width: so near to a board that was not seen, others are not expected either
-SAME_DEPTH = 0.9  # boards this much nearer are
-CANDIDATES = 150  # placements tried before one is chosen; the choice hardly improves with more
-POSES = 120  # head poses tried for a placement
-SMALLEST_SPACING_PX = {"chessboard": 7.0, "charuco": 14.0}  # on average over the board, of the thinner direction
+HIDDEN_REACH = 0.12  # distance from a missed board within which others are not expected, over the image's width
+SAME_DEPTH = 0.9  # depth over that of a missed board below which a board is expected all the same
+CANDIDATES = 150  # candidate placements; the choice hardly improves with more
+POSES = 120  # candidate head poses for a placement
+SMALLEST_SPACING_PX = {"chessboard": 7.0, "charuco": 14.0}  # mean over the board, along its thinner direction
 
 
 @dataclass(eq=False)
 class Coverage:
-    """How many corners each cell of one camera's image has seen, and where boards were held that it did not see.
+    """Corners seen in each cell of one camera's image, and boards that the camera did not see.
 
     Attributes:
-        size: of the image [px].
-        counts: of every cell.
-        misses: middle in the image [px], (2,), and depth [m] of boards that were not seen: behind a wall or below a
-            floor, where others at that depth or farther will not be seen either.
+        size: image size (width, height) [px].
+        counts: number of corners in every cell, `GRID`.
+        misses: middle in the image [px], (2,), and depth [m] of each board that was not seen, such as one behind a wall
+            or below a floor; boards there at that depth or farther will not be seen either.
     """
 
     size: tuple[int, int]
@@ -140,13 +151,13 @@ class Coverage:
         np.add.at(self.counts, self._cells(corners_px), 1)
 
     def gain(self, corners_px: Array) -> float:
-        """How much corners (N, 2) [px] would add: a corner in a cell with n others is worth 1 / (1 + n)."""
+        """Compute the gain of further corners (N, 2) [px]; one in a cell with n others counts about 1 / (1 + n)."""
         new = np.zeros(GRID)
         np.add.at(new, self._cells(corners_px), 1)
         return float(np.sum(np.log1p(self.counts + new) - np.log1p(self.counts)))
 
     def hidden(self, middles_px: Array, depth: float) -> npt.NDArray[np.bool_]:
-        """Which boards with their middles there (K, 2) [px], at a depth [m], are likely not to be seen, (K,)."""
+        """Check which boards with their middles at pixels (K, 2), at a depth [m], are likely hidden, (K,)."""
         near = np.zeros(len(middles_px), dtype=bool)
         for middle, missed in self.misses:
             if depth >= SAME_DEPTH * missed:
@@ -159,23 +170,23 @@ class Coverage:
 
 
 def board_body(board: BoardConfig) -> Array:
-    """The board's outer corners, then its inner ones [m], (4 + N, 3)."""
+    """List the board's four outer corners, then its inner ones [m], (4 + N, 3)."""
     return np.concatenate([board_outline(board), board_points(board)])
 
 
 def visible(
     lens: Intrinsics, x_camera: Array, board: BoardConfig, margin_px: float
 ) -> tuple[npt.NDArray[np.bool_], Array]:
-    """Which of many boards are well visible, with all their outer squares.
+    """Check which of many board poses show the whole board, facing the camera and large enough for the finders.
 
     Args:
-        lens: the camera.
-        x_camera: `board_body` in the camera's frame [m], (K, 4 + N, 3).
+        lens: intrinsics of the camera.
+        x_camera: `board_body` in the camera's frame for each pose [m], (K, 4 + N, 3).
         board: the board.
-        margin_px: how far inside the image it must be.
+        margin_px: border of the image that the board must keep clear [px].
 
     Returns:
-        Whether each is visible, (K,), and its inner corners (K, N, 2) [px].
+        True for visible boards, (K,), and the inner corners (K, N, 2) [px].
     """
     columns, rows = board.corners
     px = lens.project(x_camera)
@@ -191,13 +202,13 @@ def visible(
 
 
 def facing_board(board: BoardConfig, x_fixed: Array, turn: Rotation) -> RigidTransform:
-    """T_fixed_board with the board's middle at ``x_fixed`` [m], (3,), turned from facing the camera's axis."""
+    """Make T_fixed_board with the board's middle at ``x_fixed`` [m], (3,), turned from facing the camera."""
     middle = board_points(board).mean(axis=0)
     return RigidTransform.from_components(x_fixed - turn.apply(middle), turn)
 
 
 def distance(board: BoardConfig, lens: Intrinsics, share: float) -> float:
-    """A distance [m] from the nearest (share 0) to the farthest (share 1) for this board and camera."""
+    """Compute a board's distance [m], from the nearest (share 0) to the farthest (share 1) for board and camera."""
     scale = board.square / REFERENCE_SQUARE * (lens.focal_px[0] / lens.size[0]) / REFERENCE_FOCAL
     near, far = NEAR_FAR[board.kind]
     return float(scale * near * (far / near) ** share)
@@ -214,17 +225,17 @@ def plan_placements(
     margin_px: float,
     accept: Callable[[RigidTransform], bool] | None = None,
 ) -> list[RigidTransform]:
-    """Choose where the board may be held: for each distance, the place that covers most of what was not yet covered.
+    """Choose a board placement for each distance: of random candidates, the one that adds most to the coverage.
 
     Args:
-        model: rough model of the rig; while its ``zoom`` is None, only the fixed camera is looked at.
+        model: rough model of the rig; while its ``zoom`` is None, only the fixed camera counts.
         board: the board.
-        coverage: of "fixed" and "zoom".
+        coverage: coverage of the images "fixed" and "zoom".
         shares: distances, as shares of the way from near to far.
         rng: random numbers.
-        shared: whether the zoom camera must see it too, at pan = tilt = 0.
-        margin_px: how far inside the images the board must stay.
-        accept: whether a place will do in other respects.
+        shared: True if the zoom camera must see the board too, at pan = tilt = 0.
+        margin_px: border of the images that the board must keep clear [px].
+        accept: further condition on T_fixed_board.
 
     Returns:
         T_fixed_board, one for each distance at which a candidate is visible.
@@ -262,18 +273,21 @@ def plan_placements(
 
 
 def where_in(lens: Intrinsics, board: BoardConfig, T_fixed_board: RigidTransform) -> tuple[Array, float]:
-    """Where a board's middle is in the fixed camera's image, (2,) [px], and its depth [m]."""
+    """Project a board's middle into the fixed image, (2,) [px], and compute its depth [m]."""
     x = T_fixed_board.apply(board_points(board).mean(axis=0))
     return lens.project(x), float(x[2])
 
 
 def preferred_share(number: int) -> float:
-    """Of the way from near to far: successive placements are spread evenly."""
+    """Compute a placement's share of the way from near to far; successive numbers are spread evenly."""
     return (number * GOLDEN) % 1.0
 
 
 def _between(x_fixed: Array, center_fixed: Array) -> Rotation:
-    """Half the turn from the fixed camera's line of sight to the other camera's, for points (n, 3): both see alike."""
+    """Compute half the turn from the fixed camera's line of sight to the zoom camera's, for points (n, 3).
+
+    A board turned so faces both cameras equally.
+    """
     here = x_fixed / np.linalg.norm(x_fixed, axis=-1, keepdims=True)
     there = x_fixed - center_fixed
     there = there / np.linalg.norm(there, axis=-1, keepdims=True)
@@ -294,7 +308,17 @@ def plan_poses(
     rng: np.random.Generator,
     margin_px: float,
 ) -> list[tuple[float, float]]:
-    """Choose head poses that move a board over the zoom image, to where few corners were yet.
+    """Choose head poses that bring a board to parts of the zoom image with few corners so far.
+
+    Args:
+        model: rough model of the rig.
+        T_fixed_board: pose of the board.
+        board: the board.
+        coverage: coverage of the zoom image.
+        limits: limits of the head.
+        count: largest number of poses.
+        rng: random numbers.
+        margin_px: border of the image that the board must keep clear [px].
 
     Returns:
         Up to ``count`` pairs (pan, tilt) [rad], within the limits.
@@ -329,14 +353,14 @@ def plan_poses(
 
 
 def seen_at_home(model: RigModel, T_fixed_board: RigidTransform, board: BoardConfig) -> bool:
-    """Whether the zoom camera should see a board at pan = tilt = 0."""
+    """Check whether the zoom camera should see a board at pan = tilt = 0."""
     assert model.zoom is not None
     x_zoom = (model.gamma * T_fixed_board).apply(board_body(board))
     return bool(visible(model.zoom.stops[0], x_zoom[None], board, 0.0)[0][0])
 
 
 def random_turns(count: int, rng: np.random.Generator) -> Rotation:
-    """Turn boards from facing the camera: tilted in any direction, and a little rolled."""
+    """Draw random turns of boards from facing the camera: tilted in any direction, and a little rolled."""
     direction = rng.uniform(-np.pi, np.pi, count)
     tilted = rng.uniform(LEAST_TILTED, MOST_TILTED, count)
     rolled = rng.uniform(-MOST_ROLLED, MOST_ROLLED, count)

@@ -1,12 +1,12 @@
-"""The sequential method, step by step as in the paper's Table 1; kept to be compared with.
+"""Sequential calibration, step by step as in the paper's Table 1; kept for comparison.
 
 1. Intrinsics of each camera by itself, the zoom camera at its shortest focal length.
 2. Gamma = T_zoom0_fixed from the placements that both cameras see at pan = tilt = 0.
-3. T = T_head_zoom from the motions of head and camera, A T = T B (Eqs. 3, 4); then T, the axis offset dz and the
-   non-squareness eps refined on the corners themselves.
+3. T = T_head_zoom from the motions of head and camera, A T = T B (Eqs. 3, 4); then a fit of T, the axis offset dz and
+   the squareness eps to the corners.
 
-Each step holds fixed what earlier ones found, so that errors add up, and the steps' own normal matrices know nothing of
-most of what is uncertain: the method gives no covariance.
+Each step holds the results of earlier ones, so errors add up, and the normal matrices of the steps miss most of the
+uncertainty. The method therefore gives no covariance.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,10 +36,10 @@ def sequential(
     """Calibrate a rig step by step.
 
     Args:
-        views: of both cameras, those of the zoom camera at one focal length.
+        views: views of both cameras, those of the zoom camera at one focal length.
         points: the board's corners in its frame [m], (N, 3).
-        sizes: (width, height) of both cameras [px].
-        nominal_px: that focal length by the device's own account; None where it told none.
+        sizes: image sizes (width, height) of both cameras [px].
+        nominal_px: nominal focal length of the zoom views [px]; None where the lens reports none.
 
     Raises:
         CalibrationError: the views do not determine the rig; the message says what is missing.

@@ -1,26 +1,16 @@
-"""A capture session: from a rig of which nothing is known to the views that calibrate it.
+"""Capture session: drive an uncalibrated rig through board placements and head poses to views that calibrate it.
 
-Known are the board, the images' sizes, the head's limits and the zoom's nominal focal length; not the fixed camera's
-focal length, nor Gamma, nor T. So the session learns as it goes: the board straight ahead tells the fixed camera's
-focal length; a scan with the head finds it in the zoom camera; two small turns tell how the camera sits on the head;
-from then on a rough model plans every placement and every head pose, and each refines the model.
+The board, the image sizes, the head's limits and the lens's nominal focal length are known; the fixed camera's focal
+length, Gamma and T are not. The session estimates a rough model as it goes (`learn_fixed`, `learn_zoom`):
 
-The first look through a rig of which nothing is known: from the first board to a rough model.
+1. A board straight ahead gives the fixed camera's focal length, and tilted ones its rough intrinsics.
+2. A scan with the head finds the board in the zoom image. Two small turns give the rotation of T, and with it Gamma, up
+   to the mirror image that a single view of a flat board allows; a second board decides between the two.
+3. The rough model plans every further placement and head pose, and is fitted again as views come in.
+4. For further zoom samples (`see_stops`), boards stand far away, where the fixed camera still sees them whole. At each
+   board the lens goes through all zoom samples, and the head brings parts of the board all over the zoom image.
 
-The board straight ahead tells the fixed camera's focal length, and some tilted ones its rough intrinsics; a scan with
-the head finds it in the zoom camera; two small turns tell how the camera sits on the head, and so Gamma, up to the
-mirror image that any single flat board allows; a second board decides.
-
-Taking captures from a rig: everything stands still first, and every image goes to disk with how it was taken.
-
-Waiting until head and lens of a rig stand where they were sent.
-
-The part of a capture session that sees boards at the zoom lens's other stops.
-
-Boards are held far away, where the fixed camera still sees them whole; at each the lens goes through all stops, and the
-head brings parts of the board all over the zoom image. The first board teaches each stop before the next one is tried.
-
-A rig whose zoom camera looks by full stills: what calibration wants where the stream is a small preview.
+Before each image, board, head and lens stand still. Measurements: docs/design-notes.md.
 """
 
 import contextlib
@@ -95,27 +85,27 @@ from cotarget.rig import (
 )
 
 log = logging.getLogger(__name__)
-# Wishes are rounded to 0.1 mm and 0.1 mrad. Nobody holds a board better; and the fits behind a plan sum in an order
-# that varies with the threads: their last digits would otherwise make two runs with the same seed drift apart.
+# Requested poses are rounded to 0.1 mm and 0.1 mrad, finer than a person holds a board. The fits behind a plan sum in
+# an order that varies with the threads; unrounded, their last digits would make two runs with the same seed diverge.
 WISH_DECIMALS = 4
-# After a stop, for vibrations and for an exposure that had begun before [s]; and where nobody has measured yet by how
-# much frames are dated too late.
+# Time after everything stands until an image counts [s], for vibrations and for an exposure that began before. The long
+# one is for a rig whose camera latency is not measured yet, so that frames may be dated too late.
 SETTLE, SETTLE_LONG = 0.05, 0.5
-FRAME_TIMEOUT = 5.0  # a slow network camera's latency, several times [s]
-# A board in somebody's hands counts as held when its corners move less than this between two looks so far apart, and
-# have moved at least so far since the wish (mean over the corners).
+FRAME_TIMEOUT = 5.0  # several times the latency of a slow network camera [s]
+# A board that a person holds is settled when its corners move by less than HELD_PX between two images HELD_FOR seconds
+# apart, and by at least LEFT_PX since the request (mean over the corners).
 HELD_PX, HELD_FOR, LEFT_PX = 0.3, 0.4, 8.0
-# Of a turn, and of an image: on a machine that is busy for a while the watchdog halts the head on its way, and frames
-# are too old when they are read.
+# Tries of a turn, and of an image: on a busy machine the watchdog may halt the head on its way, and frames may be too
+# old when they are read.
 TRIES = 3
-LENS_TOLERANCE = 0.03  # of the focal length; a step of a usual lens is 0.02
-# Finds a board's corners in an image, given the view that it will be but for its corners.
+LENS_TOLERANCE = 0.03  # relative to the focal length; a step of a usual lens is 0.02
+# Finds a board's corners in an image, given the view to be filled, whose corners are still nan.
 Finder = Callable[[Image, View], Array | None]
 Seen = TypeVar("Seen")
 
 
 def view_of(capture: Capture, corners_px: Array) -> View:
-    """The view that a capture becomes."""
+    """Make the view of a capture from the corners found in it, (N, 2) [px]."""
     return View(
         capture.camera,
         corners_px,
@@ -130,18 +120,18 @@ def view_of(capture: Capture, corners_px: Array) -> View:
 
 @dataclass(eq=False)
 class CaptureRecorder:
-    """A capture session's hands: it moves the head, presents the board, takes images and keeps what was seen.
+    """Move head, lens and board, take images, and keep captures and views.
 
     Attributes:
         rig: the rig.
         board: the board in use.
-        directory: where captures go; None to keep the corners only.
-        pitch_mm: size of a pixel of the zoom camera [mm], for the index.
-        settle: how long after a stop an image is still taken for one of before [s].
-        config: of the rig, to be kept beside the captures; None where a program made the rig otherwise.
-        views: found so far.
-        rejected: images in which a board was expected and not found.
-        number: of the board's placement now.
+        directory: folder for the captures; None to keep the corners only.
+        pitch_mm: pixel size of the zoom camera [mm], for the index.
+        settle: time after everything stands from which an image counts [s].
+        config: configuration of the rig, stored beside the captures; None if the rig was not made from one.
+        views: views found so far.
+        rejected: images in which a board was expected but not found.
+        number: number of the present placement.
     """
 
     rig: Rig
@@ -158,10 +148,10 @@ class CaptureRecorder:
     _wish: tuple[float, float] | None = None
 
     def start(self) -> None:
-        """Make the captures' folder, send the lens to its shortest focal length and the head home.
+        """Make the folder for captures, send the lens to its shortest focal length and the head home.
 
         Raises:
-            CalibrationError: the folder holds captures already, or lens or head do not move.
+            CalibrationError: the folder cannot be made or holds captures already, or lens or head do not arrive.
         """
         if self.directory is not None:
             try:
@@ -175,10 +165,13 @@ class CaptureRecorder:
         self.turn(0.0, 0.0)
 
     def zoom(self, nominal_px: float) -> float:
-        """Send the lens to a focal length and wait until it stands; the one that it reached, by its own account [px].
+        """Send the lens to a nominal focal length and wait until it stands.
+
+        Returns:
+            Nominal focal length that the lens reports [px].
 
         Raises:
-            CalibrationError: the lens goes on moving, or does not reach what it said it would.
+            CalibrationError: the lens goes on moving, or stands elsewhere than commanded.
         """
         lens, clock = self.rig.zoom, self.rig.clock
         begin, wanted = clock.now(), lens.zoom(nominal_px)
@@ -193,7 +186,7 @@ class CaptureRecorder:
         return state.focal_px
 
     def present(self, T_fixed_board: RigidTransform) -> int:
-        """Ask for the board at a pose, as a new placement; its number."""
+        """Request the board at a pose as a new placement, and return the placement's number."""
         wish = RigidTransform.from_components(
             np.round(T_fixed_board.translation, WISH_DECIMALS),
             Rotation.from_rotvec(np.round(T_fixed_board.rotation.as_rotvec(), WISH_DECIMALS)),
@@ -208,16 +201,16 @@ class CaptureRecorder:
         return self.number
 
     def _fixed_corners(self) -> Array | None:
-        """Where the fixed camera sees the board now, in a frame that was exposed after now."""
+        """Find the board's corners in a frame of the fixed camera exposed after now, (N, 2) [px], or None."""
         self._still_since = max(self._still_since, self.rig.clock.now())
         frame = self._look(self._read_fixed)
         return find_corners(frame.image, self.board, thorough=False)
 
     def _wait_until_held(self, before: Array | None) -> None:
-        """Wait until the board has left where it was and stands still, at most for the holder's patience.
+        """Wait until the board has moved and stands still, at most for `Board.patience`.
 
         Args:
-            before: its corners in the fixed view before the wish, (N, 2) [px]; None where it was not seen.
+            before: corners in the fixed image before the request, (N, 2) [px]; None where the board was not seen.
         """
         clock = self.rig.clock
         deadline = clock.now() + self.rig.board.patience
@@ -233,11 +226,11 @@ class CaptureRecorder:
     def turn(self, pan: float, tilt: float) -> None:
         """Turn the head and wait until it stands.
 
-        One that was halted on its way is sent again, a few times; after an emergency stop the head refuses that.
+        A head that is halted on its way is sent again, up to `TRIES` times in all. After an emergency stop it refuses.
 
         Raises:
-            CalibrationError: it does not reach the pose that it said it would.
-            HaltedError: it was halted each time.
+            CalibrationError: the head stands elsewhere than commanded.
+            HaltedError: the head was halted each time.
         """
         wish = self._wish = round(pan, WISH_DECIMALS), round(tilt, WISH_DECIMALS)
         for left in reversed(range(TRIES)):
@@ -268,27 +261,27 @@ class CaptureRecorder:
         return self._keep(Capture(frame.image, "fixed", self.number, t=frame.t), expected)
 
     def update_zoom(self, *, expected: bool = True, find: Finder | None = None) -> View | None:
-        """Take an image with the zoom camera where the head now stands and find the board in it.
+        """Take an image with the zoom camera at the present head pose and find the board in it.
 
         Args:
-            expected: whether the board should be there, so that it is worth looking thoroughly.
-            find: how to look for it: given the image, and the view that it will be but for its corners.
+            expected: True if the board should be in the image: the search is thorough, and an image without it is
+                rejected.
+            find: finder of the corners; None for `find_corners`.
         """
         frame, pose, lens = self._look(self._read_zoom)
         capture = Capture(frame.image, "zoom", self.number, pose.pan, pose.tilt, lens.focal_px, frame.t)
         return self._keep(capture, expected, find)
 
     def _look(self, look: Callable[[float], Seen]) -> Seen:
-        """Look, and look again, a few times, where what is seen comes too late.
+        """Read a frame, and retry where it comes too late.
 
-        Each time the head is sent again to where it should stand; it stays there if nothing happened, and refuses after
-        an emergency stop.
+        Before each retry the head is sent again to its last goal. It refuses after an emergency stop.
 
         Args:
-            look: given the time [s] after which a frame must have been exposed.
+            look: reads a frame exposed after the time that it is given [s].
 
         Raises:
-            StaleFrameError: it came too late each time.
+            StaleFrameError: the frame came too late each time.
             EmergencyStopError: the head was stopped meanwhile.
         """
         for _ in range(TRIES - 1):
@@ -305,7 +298,7 @@ class CaptureRecorder:
         return self.rig.fixed.read(newer_than=newer_than, timeout=FRAME_TIMEOUT)
 
     def _read_zoom(self, newer_than: float) -> tuple[Frame, PanTiltState, ZoomState]:
-        """A frame of the zoom camera, and how head and lens stand."""
+        """Read a frame of the zoom camera, and the states of head and lens, which must stand."""
         frame = self.rig.zoom.read(newer_than=newer_than, timeout=FRAME_TIMEOUT)
         pose, lens = self.rig.head.state(), self.rig.zoom.state()
         if pose.moving or lens.moving:
@@ -313,21 +306,21 @@ class CaptureRecorder:
         return frame, pose, lens
 
     def of_placement(self, number: int) -> Sequence[View]:
-        """The views of one placement."""
+        """Select the views of one placement."""
         return [view for view in self.views if view.board == number]
 
     def save_index(self) -> None:
-        """Bring index.json up to date."""
+        """Write index.json with the captures so far."""
         if self.directory is not None and self._captures:
             write_index(self.directory, CaptureIndex(self.board, self.pitch_mm, tuple(self._captures)))
 
     def _note(self, t: float, do: str, asked: object, got: object = None) -> None:
-        """Note a command, where captures are kept."""
+        """Log a command, where captures are kept."""
         if self.directory is not None:
             write_command(self.directory, t, do, asked, got)
 
     def _keep(self, capture: Capture, expected: bool, find: Finder | None = None) -> View | None:
-        """Find the board; keep the image where it was found, or should have been."""
+        """Find the board in a capture; keep the image if the board was found or expected."""
         if find is None:
             corners = find_corners(capture.image, self.board, thorough=expected)
         else:
@@ -352,21 +345,21 @@ class CaptureRecorder:
 
 
 def _apart(a: Array, b: Array) -> float:
-    """Mean distance between two findings of the same corners [px]."""
+    """Compute the mean distance between two sets of the same corners [px]."""
     return float(np.mean(np.linalg.norm(a - b, axis=-1)))
 
 
-# --- bootstrap ---
+# From the first board to a rough model of the rig
 
-FIRST_FIELD = np.radians(50.0)  # the field of view supposed before anything was seen
+FIRST_FIELD = np.radians(50.0)  # field of view assumed before the first board is seen
 FIRST_SHARES = (0.16, 0.5, -0.2, 0.8)  # of the way from near to far: 3, 4.5, 2, 6.3 m for a usual board
-LEARNING = 4  # tilted placements from which the fixed camera's rough intrinsics come
+LEARNING = 4  # tilted placements for the fixed camera's rough intrinsics
 SCAN_STEP = np.radians(20.0)  # less than half the smaller field of view of a usual camera
-SCAN_PAN, SCAN_TILT = np.radians(160.0), np.radians(60.0)  # how far the scan looks to each side, limits allowing
-# A board seen face-on has two poses that its corners hardly tell apart.
+SCAN_PAN, SCAN_TILT = np.radians(160.0), np.radians(60.0)  # reach of the scan to each side, within the limits
+# The corners of a board seen face-on hardly separate its two possible poses, so boards are tilted.
 CLEARLY_TILTED = Rotation.from_rotvec(np.radians([20.0, 20.0, 0.0]))
-# How the board is shown while the zoom camera looks for it: as far away as this share, turned so [degrees]. A camera
-# far to one side sees it only where it is turned towards that side, and farther away.
+# Placements while the zoom camera searches for the board: share of the way from near to far, and turn [degrees]. A zoom
+# camera far to one side sees the board only when it is turned towards that side and farther away.
 SHOWN = (
     (0.6, (20.0, 20.0)),
     (0.2, (20.0, 20.0)),
@@ -375,18 +368,18 @@ SHOWN = (
     (1.0, (35.0, 10.0)),
     (1.0, (-35.0, 10.0)),
 )
-SMALL_TURN = np.radians(7.0)  # tells the camera's mounting without losing a central board
-ROUGH_MARGIN = 0.04  # of the image's width, that plans keep clear while the model is rough
-ENOUGH_VIEWS = 12  # of the zoom camera, before its intrinsics and T's translation join the rough fit
-ROUGH_RMS_PX = 3.0  # a rough fit worse than this is not believed
-CENTRAL = 0.12  # of the image's width: nearer to the middle a board is central
+SMALL_TURN = np.radians(7.0)  # enough for T's rotation, and keeps a central board in the image
+ROUGH_MARGIN = 0.04  # border that plans keep clear while the model is rough, over the image's width
+ENOUGH_VIEWS = 12  # zoom views from which the zoom intrinsics and T's translation join the rough fit
+ROUGH_RMS_PX = 3.0  # a rough fit with a larger rms starts again
+CENTRAL = 0.12  # a board is central within this distance of the image's centre, over the image's width
 
 
 def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> RigModel:
-    """Rough intrinsics of the fixed camera, from one board straight ahead and a few tilted ones.
+    """Estimate rough intrinsics of the fixed camera, from one board straight ahead and a few tilted ones.
 
     Raises:
-        CalibrationError: it does not see the board.
+        CalibrationError: the fixed camera does not see the board.
     """
     board, points = recorder.board, board_points(recorder.board)
     width, height = size = recorder.rig.fixed.size
@@ -424,7 +417,7 @@ def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> RigModel
 
 
 def learn_zoom(recorder: CaptureRecorder, model: RigModel) -> RigModel:
-    """Rough Gamma and T: find the board with the zoom camera, turn the head a little, and see how it moves."""
+    """Estimate rough Gamma and T: find the board in the zoom image, and turn the head a little."""
     assert model.fixed is not None
     focal = recorder.rig.zoom.state().focal_px
     width, height = size = recorder.rig.zoom.size
@@ -440,7 +433,7 @@ def learn_zoom(recorder: CaptureRecorder, model: RigModel) -> RigModel:
 
 
 def _present_otherwise_tilted(recorder: CaptureRecorder, model: RigModel, view: View) -> None:
-    """Show both cameras another board in the same place: of Gamma's mirror images only the true one fits both."""
+    """Present the board in the same place with another tilt; only the true one of Gamma's mirror images fits both."""
     assert model.fixed is not None
     points = board_points(recorder.board)
     fixed_view = next(v for v in recorder.of_placement(view.board) if v.camera == "fixed")
@@ -452,10 +445,10 @@ def _present_otherwise_tilted(recorder: CaptureRecorder, model: RigModel, view: 
 
 
 def _likeliest(model: RigModel, recorder: CaptureRecorder, seen: Sequence[View]) -> RigModel:
-    """Rough Gamma and T from one placement seen from three head poses.
+    """Choose rough Gamma and T from one placement seen from three head poses.
 
-    Each view has two possible poses of the board; every combination of them makes a model, and all views so far
-    judge between these.
+    Each view has two possible poses of the board. Every combination makes a model, and the one that fits all views so
+    far best is chosen.
     """
     assert model.fixed is not None
     assert model.zoom is not None
@@ -471,7 +464,7 @@ def _likeliest(model: RigModel, recorder: CaptureRecorder, seen: Sequence[View])
     refused = None
     for boards in itertools.product(*(pose_candidates(zoom, view.corners_px, points) for view in seen)):
         try:
-            # Small turns tell the rotation; the translation is a matter of centimetres and has to wait.
+            # Small turns determine the rotation only. The translation, some centimetres, is fitted from more views.
             hand = RigidTransform.from_rotation(park_martin(*motions(heads, boards)).rotation)
             gamma = hand.inv() * heads[0] * hand * boards[0] * T_fixed_board.inv()  # Eq. 2 solved for Gamma
             start = place_boards(replace(model, hand=hand, gamma=gamma), views, points)
@@ -479,7 +472,7 @@ def _likeliest(model: RigModel, recorder: CaptureRecorder, seen: Sequence[View])
         except CalibrationError as error:
             refused = refused or error
             continue
-        # The fit's T is only good for judging: so few views do not yet determine its translation.
+        # The fit's T serves the comparison only: these few views do not determine its translation.
         results.append((result.rms_px, replace(model, hand=hand, gamma=gamma)))
     if not results:
         raise refused or CalibrationError("hand-eye: no motion of the head was seen")
@@ -487,7 +480,11 @@ def _likeliest(model: RigModel, recorder: CaptureRecorder, seen: Sequence[View])
 
 
 def _find_with_zoom(recorder: CaptureRecorder, model: RigModel) -> View:
-    """A zoom view of a placement that the fixed camera sees too, near the middle of the zoom image."""
+    """Scan with the head until the zoom camera sees a placement that the fixed camera sees too.
+
+    Raises:
+        CalibrationError: the zoom camera sees the board nowhere.
+    """
     assert model.fixed is not None
     limits = recorder.rig.head.limits
     steps = [
@@ -518,7 +515,11 @@ def _find_with_zoom(recorder: CaptureRecorder, model: RigModel) -> View:
 
 
 def _turn_a_little(recorder: CaptureRecorder, view: View) -> tuple[View, View]:
-    """See the same board from another pan and from another tilt."""
+    """Take a zoom view of the same board at another pan, and one at another tilt.
+
+    Raises:
+        CalibrationError: the zoom camera loses the board.
+    """
     limits = recorder.rig.head.limits
     seen: list[View] = []
     for name, d_pan, d_tilt in (("pan", SMALL_TURN, 0.0), ("tilt", 0.0, SMALL_TURN)):
@@ -540,9 +541,12 @@ def _turn_a_little(recorder: CaptureRecorder, view: View) -> tuple[View, View]:
 
 
 def _centred(recorder: CaptureRecorder, view: View, by_pan: View, by_tilt: View) -> View:
-    """Bring the board to the middle of the zoom image, where the unknown distortion bends no pose.
+    """Bring the board to the middle of the zoom image, where the unknown distortion does not bias its pose.
 
-    The two turns tell how pan and tilt move the board in the image, whatever the camera's roll.
+    The views after the two turns give the image Jacobian by pan and tilt, for any roll of the camera.
+
+    Returns:
+        View of the centred board; the view given, where the board is central already or is lost on the way.
     """
     common = view.seen & by_pan.seen & by_tilt.seen
     if not common.any():
@@ -562,7 +566,7 @@ def _centred(recorder: CaptureRecorder, view: View, by_pan: View, by_tilt: View)
 
 
 def refitted(model: RigModel, recorder: CaptureRecorder) -> Fit:
-    """Fit the rough model to all views so far: at first Gamma alone, with more views everything."""
+    """Fit the rough model to all views so far: Gamma alone at first, everything with `ENOUGH_VIEWS` zoom views."""
     points: Array = board_points(recorder.board)
     views = recorder.views
     if sum(view.camera == "zoom" for view in views) < ENOUGH_VIEWS:
@@ -572,7 +576,7 @@ def refitted(model: RigModel, recorder: CaptureRecorder) -> Fit:
     result = fit(place_boards(model, views, points), views, points, blocks)
     if result.rms_px <= ROUGH_RMS_PX:
         return result
-    # The first views misled the intrinsics too far: start those afresh from all views.
+    # The intrinsics from the first views are too far off: start again with intrinsics from all views.
     by_camera = {name: [view for view in views if view.camera == name] for name in ("fixed", "zoom")}
     fixed = rough_intrinsics("fixed", by_camera["fixed"], points, recorder.rig.fixed.size)
     zoom = rough_intrinsics("zoom", by_camera["zoom"], points, recorder.rig.zoom.size)
@@ -583,19 +587,19 @@ def refitted(model: RigModel, recorder: CaptureRecorder) -> Fit:
     return min((result, again), key=lambda one: one.rms_px)
 
 
-# --- standing ---
+# Waiting until head and lens stand
 
-POLL = 0.02  # between looks at a state [s]
-HEAD_PATIENCE = 2.0  # beyond what the way takes at the head's own speed and acceleration [s]
-POSE_TOLERANCE = np.radians(0.2)  # between commanded and reached, above the head's own step [rad]
+POLL = 0.02  # time between reads of a state [s]
+HEAD_PATIENCE = 2.0  # timeout beyond what the way takes at the head's speed and acceleration [s]
+POSE_TOLERANCE = np.radians(0.2)  # between commanded and reached angle, beyond one step of the head [rad]
 LENS_TIMEOUT = 15.0  # the slowest zoom lenses take some ten seconds from end to end [s]
 
 
 def wait_for_lens(rig: Rig) -> ZoomState:
-    """Wait until the zoom lens stands; its state then.
+    """Wait until the zoom lens stands, and return its state.
 
     Raises:
-        CalibrationError: it goes on moving.
+        CalibrationError: the lens still moves after `LENS_TIMEOUT`.
     """
     clock = rig.clock
     deadline = clock.now() + LENS_TIMEOUT
@@ -607,15 +611,15 @@ def wait_for_lens(rig: Rig) -> ZoomState:
 
 
 def wait_for_head(rig: Rig, wanted: tuple[float, float], way: float) -> tuple[PanTiltState, bool]:
-    """Wait until the head stands where it is wanted, or should have for long.
+    """Wait until the head stands where it was commanded, or the timeout is over.
 
     Args:
-        rig: whose head it is.
-        wanted: pan and tilt [rad].
-        way: from where it was, the longer of both axes' [rad].
+        rig: rig with the head.
+        wanted: commanded pan and tilt [rad].
+        way: travel from where the head was, the larger of both axes' [rad].
 
     Returns:
-        Its state, and whether it has arrived.
+        State of the head, and True if it has arrived.
     """
     head, clock = rig.head, rig.clock
     limits = head.limits
@@ -629,16 +633,16 @@ def wait_for_head(rig: Rig, wanted: tuple[float, float], way: float) -> tuple[Pa
         clock.sleep_until(clock.now() + POLL)
 
 
-# --- zooming ---
+# Zoom samples beyond the first
 
-# Shares of the way from near to far at which boards are held: far, because the fixed camera must see a board whole that
-# fills the zoom image many times over; not all as far, or the entrance pupil could not be told from the focal length.
+# Boards are far, as shares of the way from near to far, because the fixed camera must see a board whole that fills the
+# zoom image many times over. The distances differ, or the entrance pupil could not be separated from the focal length.
 NEAREST_SHARE, FARTHEST_SHARE = 0.6, 1.0
-VIEWS_A_STOP = 2  # of each placement
-FIRST_VIEWS = 3  # of the first placement, from which a stop is learnt
-ATTEMPTS = 3  # times as many placements are tried, where some are not seen
-CANDIDATES = 60  # ways to bring a part of the board into the image that are tried for each view
-BORDER_PX = 12.0  # a point of the board is brought anywhere but this near to the image's border
+VIEWS_A_STOP = 2  # views of each placement at a zoom sample
+FIRST_VIEWS = 3  # views of the first placement, from which a zoom sample is first fitted
+ATTEMPTS = 3  # placements tried at most, over those wanted
+CANDIDATES = 60  # head poses tried for each view
+BORDER_PX = 12.0  # border of the image to which no point of the board is brought
 
 
 def see_stops(
@@ -649,15 +653,18 @@ def see_stops(
     rng: np.random.Generator,
     tell: Callable[[str], None],
 ) -> RigModel:
-    """Take views at all stops but the first, and learn them; the model with these stops.
+    """Take views at all zoom samples but the first, and add the samples to the model.
 
     Args:
-        recorder: with the views at the shortest focal length.
-        model: fitted to these.
-        stops: nominal focal lengths [px], increasing, the shortest first.
-        placements: how many placements of the board.
+        recorder: recorder that holds the views at the shortest focal length.
+        model: model fitted to these views.
+        stops: nominal focal lengths of the zoom samples [px], increasing, the shortest first.
+        placements: number of placements of the board.
         rng: random numbers.
-        tell: told what is done.
+        tell: called with a text about the progress.
+
+    Returns:
+        The model with the zoom samples that were seen.
     """
     assert model.fixed is not None
     assert model.zoom is not None
@@ -691,19 +698,19 @@ def see_stops(
             tell(f"zoom stop {i} of {len(stops)}, board {done} of {placements}")
             nominal = recorder.zoom(stop)
             number, guessed = _stop_at(model, nominal)
-            if not number:  # a lens with few positions offers the first one again
+            if not number:  # a lens with few positions goes to the first one again
                 continue
             cover = at_stop.setdefault(number, Coverage(size))
             learnt = _see_stop(recorder, guessed, number, fixed_view, cover, rng, points)
             if learnt is None:
-                break  # a guess of the next stop would be one of a guess
+                break  # a sample that was not seen cannot predict the next one
             model = learnt
         recorder.zoom(stops[0])
     return model
 
 
 def _reachable(model: RigModel, limits: PanTiltLimits, points: Array, wish: RigidTransform) -> bool:
-    """Whether the head can look at all of a board held there."""
+    """Check whether the head can point at every corner of a board at a pose T_fixed_board."""
     assert model.zoom is not None
     lens = model.zoom.stops[0]
     corners = (model.hand * model.gamma * wish).apply(points)
@@ -712,7 +719,11 @@ def _reachable(model: RigModel, limits: PanTiltLimits, points: Array, wish: Rigi
 
 
 def _stop_at(model: RigModel, nominal: float) -> tuple[int, RigModel]:
-    """The number of the stop at a focal length, and the model with it: a new one only beyond the last."""
+    """Find the zoom sample at a nominal focal length [px]; beyond the last one, add it to the model.
+
+    Returns:
+        Number of the zoom sample, and the model that contains it.
+    """
     assert model.zoom is not None
     away = np.abs(np.log(np.array(model.zoom.nominal_px) / nominal))
     if nominal <= model.zoom.nominal_px[-1] or away.min() <= SAME_FOCAL:
@@ -729,9 +740,10 @@ def _see_stop(
     rng: np.random.Generator,
     points: Array,
 ) -> RigModel | None:
-    """Take views of the present placement at a stop; the model, which learns the stop when it is first seen.
+    """Take views of the present placement at a zoom sample; fit the sample when it is first seen.
 
-    None where a stop that is not yet known was not seen.
+    Returns:
+        The model with the zoom sample; None where a sample not yet fitted was not seen.
     """
     assert model.zoom is not None
     nominal = model.zoom.nominal_px[number]
@@ -754,7 +766,7 @@ def _see_part(
     rng: np.random.Generator,
     points: Array,
 ) -> View | None:
-    """Turn the head so that the board, or a part of it, fills what was not yet covered, and look."""
+    """Turn the head so that a part of the board covers new parts of the zoom image, and take a view."""
     turn = plan_part(model, recorder.number, nominal, coverage, recorder.rig.head.limits, rng, points)
     if turn is None:
         return None
@@ -776,10 +788,19 @@ def plan_part(
     rng: np.random.Generator,
     points: Array,
 ) -> tuple[float, float] | None:
-    """Choose a head pose that brings some point of a board to some pixel, so that its corners gain most.
+    """Choose the head pose that adds most to the coverage, of random poses that bring a corner to a pixel.
+
+    Args:
+        model: model with the board and the zoom sample.
+        board: number of the placement.
+        nominal: nominal focal length [px].
+        coverage: coverage of the zoom image at this focal length.
+        limits: limits of the head.
+        rng: random numbers.
+        points: the board's corners in its frame [m], (N, 3).
 
     Returns:
-        Pan and tilt [rad]; None where none within the limits shows enough of the board.
+        Pan and tilt [rad]; None where no pose within the limits shows enough of the board.
     """
     assert model.zoom is not None
     lens = model.zoom.at(nominal)
@@ -801,21 +822,21 @@ def plan_part(
 
 
 def _seen(lens: Intrinsics, x_zoom: Array) -> Array:
-    """The pixels of those points (N, 3) that are in the image, (n, 2)."""
+    """Project points (N, 3) and select the pixels inside the image, (n, 2)."""
     pixels = lens.project(x_zoom)
     return pixels[expected_inside(pixels, lens.size)]
 
 
-# --- stills ---
+# Full stills, for a zoom camera whose stream is only a small preview
 
 
 def with_stills(rig: Rig) -> Rig:
-    """The same rig, seen by full stills; itself, where its stills are no larger than its stream."""
+    """Wrap a rig so that its zoom camera takes full stills; return it as it is where stills have the stream's size."""
     return rig if rig.zoom.still_size == rig.zoom.size else _StillsRig(rig)
 
 
 class StillCamera:
-    """A zoom camera whose every frame is a full still; its focal lengths are in the still's pixels."""
+    """Zoom camera whose frames are full stills, with focal lengths in pixels of the still."""
 
     def __init__(self, camera: ZoomCamera, clock: Clock) -> None:
         self._camera, self._clock = camera, clock
@@ -823,25 +844,25 @@ class StillCamera:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) of a still [px]."""
+        """Size of a frame, which is a still, (width, height) [px]."""
         return self._camera.still_size
 
     @property
     def still_size(self) -> tuple[int, int]:
-        """The same."""
+        """Size of a still (width, height) [px]."""
         return self._camera.still_size
 
     @property
     def focal_range(self) -> tuple[float, float]:
-        """Shortest and longest focal length [px]."""
+        """Shortest and longest nominal focal length [px of a still]."""
         shortest, longest = self._camera.focal_range
         return shortest * self._factor, longest * self._factor
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Take a still, after ``newer_than`` [s] if that is still to come, however long the camera needs for it.
+        """Take a still, not before the time ``newer_than`` [s]. The camera may need any time for it.
 
         Raises:
-            StaleFrameError: that is farther away than ``timeout`` [s].
+            StaleFrameError: ``newer_than`` is more than ``timeout`` [s] from now.
         """
         if newer_than is not None:
             if (ahead := newer_than - self._clock.now()) > timeout:
@@ -850,11 +871,11 @@ class StillCamera:
         return self._camera.capture()
 
     def zoom(self, focal_px: float) -> float:
-        """Start the lens moving; the focal length [px] that it will reach."""
+        """Command the lens, and return the focal length that it will reach [px of a still]."""
         return self._camera.zoom(focal_px / self._factor) * self._factor
 
     def state(self) -> ZoomState:
-        """The lens's state now."""
+        """Read the state of the lens, with the focal length in pixels of a still."""
         state = self._camera.state()
         return ZoomState(state.focal_px * self._factor, state.moving, state.t)
 
@@ -864,7 +885,7 @@ class StillCamera:
 
 
 class _StillsRig:
-    """A rig with another zoom camera in front of its own."""
+    """Rig whose zoom camera is replaced by a `StillCamera`."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -880,22 +901,24 @@ class _StillsRig:
         self._rig.close()
 
     def __enter__(self) -> "_StillsRig":
-        """Give the rig itself."""
+        """Return the rig."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close."""
+        """Close the rig."""
         self.close()
 
 
-FINE_MARGIN = 0.008  # of the image's width, that plans keep clear once the model is fine
-MARGIN_GROWTH, WIDEST_MARGIN = 3.0, 0.15  # at every miss, and at most
-MOVED_VIEWS = 3  # zoom views with the head away from home, a placement
-CHOICES = 6  # places among which the next is chosen, half of them seen by both cameras at home where there are such
-REFIT_ALWAYS, REFIT_EVERY = 8, 6  # refit the rough model at each of the first placements, later now and then
-MOST_MISSES = 4  # placements in a row without a view before giving up
+# The session
+
+FINE_MARGIN = 0.008  # border that plans keep clear once the model is fine, over the image's width
+MARGIN_GROWTH, WIDEST_MARGIN = 3.0, 0.15  # factor of the margin at every miss, and its largest value
+MOVED_VIEWS = 3  # zoom views per placement with the head away from home
+CHOICES = 6  # candidates for the next placement, half of them seen by both cameras at home where possible
+REFIT_ALWAYS, REFIT_EVERY = 8, 6  # refit after each of the first 8 placements, then after every 6th
+MOST_MISSES = 4  # placements in a row that the fixed camera may miss before the session fails
 
 
 def capture_session(
@@ -907,16 +930,16 @@ def capture_session(
     stops: int = 1,
     far_placements: int = 0,
 ) -> None:
-    """Fill a recorder with views.
+    """Run a capture session: fill a recorder with views that calibrate its rig.
 
     Args:
-        recorder: of a rig that stands still.
-        placements: how many placements of the board, those included that a first rough model comes from, which no
-            session does without.
-        stops: how many stops of the zoom lens.
-        far_placements: how many more placements of the board, for the stops beyond the first.
-        rng: chooses among possible placements.
-        progress: called with what is done, of how much, and in words.
+        recorder: recorder of a rig that stands still.
+        placements: number of placements of the board. It includes those for the first rough model, which are taken in
+            any case.
+        stops: number of zoom samples.
+        far_placements: number of further placements for the zoom samples beyond the first.
+        rng: random numbers, which choose among possible placements.
+        progress: called with the number done, the total, and a text.
 
     Raises:
         CalibrationError: a camera never sees the board, or the head or the lens fails.
@@ -951,8 +974,8 @@ def capture_session(
 
 
 def _break_off(recorder: CaptureRecorder) -> None:
-    """End a session that failed or was interrupted: the head first of all; what fails now hides no earlier error."""
-    with contextlib.suppress(CotargetError):  # whoever closes the rig halts it again, and tells where that fails
+    """Halt the head and end a session that failed or was interrupted; log errors, so that they hide no earlier one."""
+    with contextlib.suppress(CotargetError):  # closing the rig halts the head again, and reports a failure
         recorder.rig.head.halt()
     for act in (recorder.save_index, lambda: recorder.rig.board.present(None)):
         try:
@@ -962,7 +985,7 @@ def _break_off(recorder: CaptureRecorder) -> None:
 
 
 def _stops_without_views(recorder: CaptureRecorder, stops: Sequence[float]) -> list[Rejected]:
-    """The stops that were asked for and not seen, each by the nearest views [px]."""
+    """List the requested zoom samples (nominal focal lengths [px]) near which no view was taken."""
     half = np.log(stops[1] / stops[0]) / 2
     seen = np.log([view.focal_px for view in recorder.views if view.camera == "zoom" and view.focal_px is not None])
     return [
@@ -979,7 +1002,7 @@ def _cover(
     rng: np.random.Generator,
     tell: Callable[[str], None],
 ) -> RigModel:
-    """Present the board all over both images and turn the head at each placement."""
+    """Take views of placements that cover both images, from several head poses each, and refine the rough model."""
     rig, points = recorder.rig, board_points(recorder.board)
     coverage = {"fixed": Coverage(rig.fixed.size), "zoom": Coverage(rig.zoom.size)}
     for view in recorder.views:
@@ -987,7 +1010,7 @@ def _cover(
     predicted: PredictedAccuracy | None = None
     misses = done = 0
     while recorder.number + 1 < placements:
-        # A miss means that the rough model bends the image wrongly where nothing was seen yet: keep farther inside.
+        # After a miss the rough model's distortion is wrong near the border, so the next placement keeps farther away.
         margin = min((ROUGH_MARGIN if done < REFIT_ALWAYS else FINE_MARGIN) * MARGIN_GROWTH**misses, WIDEST_MARGIN)
         recorder.turn(0.0, 0.0)
         wish = _next_placement(recorder, model, coverage, rng, margin, predicted)
@@ -1023,9 +1046,9 @@ def _next_placement(
     margin: float,
     predicted: PredictedAccuracy | None,
 ) -> RigidTransform:
-    """Where to hold the board next: of several places, near and far, the one that makes the predicted error smallest.
+    """Choose the next placement: of several candidates, near and far, the one with the smallest predicted error.
 
-    While nothing is predicted yet, the one from which most head poses show the board.
+    Before the accuracy can be predicted, it is the one that most head poses show.
     """
     assert model.fixed is not None
     assert model.zoom is not None
@@ -1059,10 +1082,13 @@ def _see_from_everywhere(
     margin: float,
     rng: np.random.Generator,
 ) -> RigidTransform:
-    """Take the zoom views of a placement, home first; where the board really is, T_fixed_board."""
+    """Take the zoom views of a placement, home first, and return the board's pose T_fixed_board.
+
+    The pose comes from the fixed camera's view.
+    """
     assert model.fixed is not None
     rig, board = recorder.rig, recorder.board
-    # In that of its two possible poses which is nearer to the wish.
+    # Of the view's two possible poses, the one nearer to the requested rotation.
     poses = pose_candidates(model.fixed, fixed_view.corners_px, board_points(board))
     T = min(poses, key=lambda pose: float((pose.rotation * wish.rotation.inv()).magnitude()))
     home = seen_at_home(model, T, board)

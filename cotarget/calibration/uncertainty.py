@@ -1,21 +1,13 @@
-"""How uncertain a calibration is: the covariance of its parameters, and what that leaves of error in pointing.
+"""Uncertainty of a calibration: covariance of its parameters, and the pointing error that it leaves.
 
-The covariance speaks of the corners' noise, and of a head that does not stand quite where it says; of parameters that
-are held, by `cotarget.calibration.uncertainty`. What else a model leaves out is noticed by captures kept out of the fit
-(`cotarget.calibration.uncertainty`), which widen it.
+- `covariance_of`: the noise of the corners and the head's jitter.
+- `with_consider_covariance`: parameters held in the fit that may be wrong (Schmidt 1966; Tapley, Schutz and Born,
+  Statistical Orbit Determination, ch. 6).
+- `cross_validate`: what else the model leaves out, by captures kept out of the fit. Each fold of the placements is left
+  out once, and its zoom views are predicted from the fixed camera's view of the same board, as pointing does.
+- `line_of_sight_covariance`, `predicted_pointing`: the pointing error at a pixel and depth.
 
-Parameters that a fit holds, considered all the same: what their being wrong would do to those that it finds.
-
-A fit without a parameter that matters is wrong by more than its covariance says. To free every parameter that might
-matter makes every calibration worse. Between these stands the consider covariance (Schmidt 1966; Tapley, Schutz and
-Born, Statistical Orbit Determination, ch. 6): the parameter stays where it is, and its doubt is carried into the
-others. How large that doubt is, the corners tell: one Gauss-Newton step with the parameter free gives its estimate and
-the standard deviation of that. An estimate that noise explains is no reason for doubt; any other is the doubt itself.
-
-Captures kept out of the fit and predicted: whether a calibration points as well as it says.
-
-The placements are dealt into folds; each fold is left out once, everything else fitted again, and the fold's views of
-the zoom camera are predicted from the fixed camera's view of the same board alone. That is what pointing does.
+Measurements: docs/design-notes.md.
 """
 
 from collections import Counter
@@ -49,26 +41,31 @@ from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
 from cotarget.pantilt import solve
 
-# Held parameters whose estimate is further from where they are held than this many standard deviations are doubted: by
-# chance, one in eight. From 1 on, ellipses of the focal length held the truth in 95 of 100 rigs instead of 90.
+# Consider covariance
+
+# A held parameter is doubted if its estimate is more than this many standard deviations from the held value, which
+# chance does for one in eight.
 DOUBTED_SIGMAS = 1.5
 
 
 def with_consider_covariance(
     covariance: Covariance, found: Fit, points: Array, held: Collection[Block], prior: Prior | None = None
 ) -> Covariance:
-    """Add to a fit's covariance what held parameters leave in doubt.
+    """Add the doubt about held parameters to a fit's covariance (consider covariance, Schmidt).
+
+    One Gauss-Newton step with the held parameters free gives their estimates and standard deviations. An estimate that
+    noise explains adds nothing. Any other is taken as the parameter's error. With S = dp/dq, the sensitivity of the
+    fitted parameters p to an error of a held q, the errors (S, -1) q are added to the covariance.
 
     Args:
-        covariance: of the fit.
+        covariance: covariance of the fit.
         found: the fit.
         points: the board's corners in its frame [m], (N, 3).
-        held: blocks that were not free in it.
-        prior: that of the fit, with what is known of the held ones.
+        held: blocks that were held in the fit.
+        prior: prior of the fit and of the held blocks.
 
     Returns:
-        Of the fit's parameters and of those held ones that are doubted. With S = dp/dq, by what the parameters p come
-        out wrong when a held q is, the errors (S, -1) q are added with q^2 = its estimate squared.
+        Covariance of the fit's parameters and of the held ones that are doubted.
     """
     own = list(covariance.parameters)
     free = (*found.free, *held)
@@ -77,7 +74,7 @@ def with_consider_covariance(
     matrix, gradient, _ = reduced(problem.equations(here, robust_scale(here)), 0.0)
     everything = covariance_of(replace(found, free=free, normal=matrix))
     if everything is None:
-        return covariance  # nothing tells the held ones from the others
+        return covariance  # the corners cannot separate the held parameters from the others
     names = parameter_names(free, found.model.stops)
     estimates = dict(zip(names, np.linalg.solve(matrix, -gradient), strict=True))
     doubted = [
@@ -93,28 +90,28 @@ def with_consider_covariance(
     return Covariance((*own, *doubted), grown)
 
 
-# --- heldout ---
+# Held-out check
 
 # Measured and predicted agree when the mean squared, whitened miss is below 1 + this many standard deviations of it.
 # The misses of a fold share the error of its fit: a placement counts as half an independent miss of two coordinates.
 CHANCE_SIGMAS, SHARE = 2.0, 0.5
-# Where the others predict a board no better than this, they do not determine the rig, and the miss tells nothing [px].
+# With a larger predicted miss [px] the remaining placements do not determine the rig, and the check means nothing.
 DETERMINED_PX = 50.0
-FEWEST_VIEWS = 3  # of a zoom stop that must remain for a fold's views at it to be predicted
+FEWEST_VIEWS = 3  # views of a zoom sample that must remain for a fold's views at it to be predicted
 
 
 def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -> HeldOut | None:
-    """Predict every placement by a fit of the others.
+    """Predict every placement by a fit of the others (held-out check).
 
     Args:
-        found: the fit of everything, from which the others start.
+        found: fit of all views, from which the others start.
         points: the board's corners in its frame [m], (N, 3).
-        prior: that of the fit.
-        folds: into how many parts the placements are split.
+        prior: prior of the fit.
+        folds: number of parts into which the placements are split.
 
     Returns:
-        What came out; None where there are fewer placements seen by both cameras than folds, or too few views to do
-        without any: then the others do not determine the rig.
+        Result of the check; None where both cameras see fewer placements than folds, or where the remaining placements
+        do not determine the rig.
     """
     both = {v.board for v in found.views if v.camera == "fixed"} & {v.board for v in found.views if v.camera == "zoom"}
     numbers = sorted(both)
@@ -164,10 +161,11 @@ def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -
 
 
 def _predicted(found: Fit, covariance: Array, kept: Sequence[View], points: Array) -> tuple[Array, Array]:
-    """Mean miss of each zoom view kept out, (v, 2), and its covariance, (v, 2, 2) [px], of the shortest focal length.
+    """Compute the mean miss of each zoom view kept out, (v, 2) [px], and its covariance, (v, 2, 2) [px^2].
 
-    With the board's pose b told by the fixed camera's corners, db = -B^+ (J dp + noise); the mean over a zoom view's
-    corners then moves by M (J_z - B_z B^+ J) dp, by M B_z B^+ of the fixed view's noise, and by its own.
+    Both are scaled to the shortest focal length. The board's pose b comes from the fixed camera's corners, so that
+    db = -B^+ (J dp + noise). The mean M over a zoom view's corners then moves by M (J_z - B_z B^+ J) dp, by M B_z B^+
+    of the fixed view's noise, and by its own noise.
     """
     model, variance = found.model, found.variance
     assert variance is not None
@@ -206,28 +204,30 @@ def _predicted(found: Fit, covariance: Array, kept: Sequence[View], points: Arra
 
 
 def _mean(values: Array, batch: Batch) -> Array:
-    """Mean over the corners seen of values (v, N, ...), (v, ...)."""
+    """Average values (v, N, ...) over the corners that are seen, (v, ...)."""
     seen = batch.seen.reshape(*batch.seen.shape, *(1,) * (values.ndim - 2))
     return np.asarray(np.sum(np.where(seen, values, 0.0), axis=1) / seen.sum(axis=1))
 
 
-# Central differences err by the square of this times the third derivative, which is of the order of the first [px, m,
-# rad]; rounding stays at 1e-11.
+# Covariance of the parameters and of the line of sight
+
+# Step of central differences [px, m, rad]. Their error is its square times the third derivative, which is of the order
+# of the first; rounding stays at 1e-11.
 STEP = 1e-5
-# Smallest eigenvalue of the normal matrix, scaled to a unit diagonal, that rounding cannot have made.
+# Smaller eigenvalues of the normal matrix, scaled to a unit diagonal, may be rounding.
 SMALLEST_EIGENVALUE = 1e-13
-LENS_BLOCKS = ("zoom", "pupil")  # the zoom lens's: of the targets they change nothing, only where it looks
+LENS_BLOCKS = ("zoom", "pupil")  # blocks that change the zoom camera's line of sight but not the targets
 
 
 def covariance_of(result: Fit) -> Covariance | None:
-    """Give the covariance of a fit's free parameters, the boards' poses left out by marginalising them.
+    """Compute the covariance of a fit's free parameters, with the boards' poses marginalised.
 
     Args:
-        result: of `fit`, at its optimum.
+        result: result of `fit`.
 
     Returns:
-        The inverse of the normal matrix times the variance of a coordinate; None where the views leave a direction of
-        the parameters open, or are no more than the parameters.
+        Inverse of the normal matrix times the variance of a coordinate; None where the views leave a direction
+        undetermined, or hold no more coordinates than parameters.
     """
     scale = np.sqrt(np.diagonal(result.normal))
     if result.variance is None or not (scale > 0).all():
@@ -248,7 +248,7 @@ def predicted_pointing(
     pan_tilt: tuple[Array | float, Array | float] | None = None,
     nominal_px: float | None = None,
 ) -> Array:
-    """Predict the rms angle by which the line of sight misses a target, see `line_of_sight_covariance` [rad], (...)."""
+    """Predict the rms pointing error [rad], (...), the root of the trace of `line_of_sight_covariance`."""
     covariance = line_of_sight_covariance(calibration, pixel, depth, pan_tilt=pan_tilt, nominal_px=nominal_px)
     return np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
 
@@ -261,22 +261,22 @@ def line_of_sight_covariance(
     pan_tilt: tuple[Array | float, Array | float] | None = None,
     nominal_px: float | None = None,
 ) -> Array:
-    """Predict the covariance of the miss between the zoom camera's line of sight and a target.
+    """Predict the covariance of the pointing error: the miss between the zoom camera's line of sight and a target.
 
-    With parameters p, the target is at x(p) = depth ray_fixed(pixel; p), the head at q = (pan, tilt) shows it in the
-    direction a(p, q) of T_zoom_fixed(q; p) x(p) (Eq. 2), and the line of sight, through the middle of the zoom image,
-    is d(p). The head is sent to the q that makes a = d by the parameters found, p0. There it stays, while the true
-    parameters p0 + e put the target at m = E^T (a(p0 + e, q) - d(p0 + e)), E being the two directions across d. To
-    first order m = J e with J = dm/dp at fixed q, so that cov(m) = J cov(e) J^T; how q was solved does not matter.
-    The head's jitter, where there is any, adds what a turn of that size moves, and the zoom lens what its stops leave
-    in doubt between and beyond them.
+    With parameters p, the target is at x(p) = depth ray_fixed(pixel; p). The head at q = (pan, tilt) shows it in the
+    direction a(p, q) of T_zoom_fixed(q; p) x(p) (Eq. 2). The line of sight through the middle of the zoom image is
+    d(p). The head is sent to the q that makes a = d for the calibrated parameters p0. With the true parameters p0 + e
+    the target then appears at m = E^T (a(p0 + e, q) - d(p0 + e)), with E the two directions across d. To first order
+    m = J e with J = dm/dp at fixed q, so that cov(m) = J cov(e) J^T; how q was solved does not matter. The head's
+    jitter adds jitter^2 J_q J_q^T with J_q = dm/dq. The zoom lens adds its doubt about the principal point between and
+    beyond zoom samples (`ZoomLens.center_doubt_px`).
 
     Args:
-        calibration: with a covariance and a T.
-        pixel: of the target in the fixed view, known exactly, (..., 2) [px].
-        depth: along the fixed camera's axis, known exactly [m], (...).
-        pan_tilt: where the head is sent [rad], (...) each; by default the exact solution that faces forward.
-        nominal_px: the zoom camera's nominal focal length [px]; the shortest calibrated one by default.
+        calibration: calibration with a covariance and T.
+        pixel: pixel of the target in the fixed image, taken as exact, (..., 2).
+        depth: depth of the target along the fixed camera's axis, taken as exact [m], (...).
+        pan_tilt: commanded pan and tilt [rad], (...) each; None for the exact solution that faces forward.
+        nominal_px: nominal focal length of the zoom camera [px]; None for the shortest calibrated one.
 
     Returns:
         Covariance along right and down in the zoom image [rad^2], (..., 2, 2); nan where the target cannot be reached.
@@ -316,18 +316,18 @@ def miss_derivatives(
     nominal_px: float,
     pan_tilt: tuple[Array, Array] | None = None,
 ) -> tuple[Array, Array]:
-    """How the miss m of `line_of_sight_covariance` changes with parameters, and with the head's pan and tilt.
+    """Compute the derivatives of the miss m of `line_of_sight_covariance`, by central differences.
 
     Args:
-        model: the rig.
-        parameters: names, k of them.
-        pixels: of targets in the fixed view, (n, 2) [px].
-        depths: of these along the fixed camera's axis [m], (n,).
-        nominal_px: the zoom camera's nominal focal length [px].
-        pan_tilt: where the head is [rad], (n,) each; by default the exact solution that faces forward.
+        model: model of the rig.
+        parameters: names of the k parameters.
+        pixels: pixels of the targets in the fixed image, (n, 2).
+        depths: depths of the targets along the fixed camera's axis [m], (n,).
+        nominal_px: nominal focal length of the zoom camera [px].
+        pan_tilt: pan and tilt of the head [rad], (n,) each; None for the exact solution that faces forward.
 
     Returns:
-        Derivatives (n, 2, k) and (n, 2, 2); nan for targets that cannot be reached.
+        Derivatives by the parameters, (n, 2, k), and by pan and tilt, (n, 2, 2); nan for targets out of reach.
     """
     assert model.fixed is not None
     assert model.zoom is not None
@@ -363,7 +363,7 @@ def miss_derivatives(
 
 
 def model_of(calibration: Calibration) -> RigModel:
-    """A calibration as the fit sees it, without boards; T is the identity where there was no head."""
+    """Make the fit's model from a calibration, without boards; T is the identity where the calibration has none."""
     hand = calibration.T_head_zoom
     return RigModel(
         boards={},
@@ -377,7 +377,7 @@ def model_of(calibration: Calibration) -> RigModel:
 
 
 def _moved_targets(model: RigModel, pixels: Array, depths: Array, pan: Array, tilt: Array) -> Array:
-    """The targets in the moved zoom camera's frame, as it is at the first stop [m], (n, 3) (Eq. 2)."""
+    """Compute the targets in the moved zoom camera's frame at the first zoom sample [m], (n, 3) (Eq. 2)."""
     assert model.fixed is not None
     x_base = (model.hand * model.gamma).apply(model.fixed.ray(pixels) * depths[:, None])
     R, t, _ = base_heads(model.head, pan, tilt)
@@ -385,13 +385,13 @@ def _moved_targets(model: RigModel, pixels: Array, depths: Array, pan: Array, ti
 
 
 def _directions(model: RigModel, x_zoom: Array, nominal_px: float) -> Array:
-    """Unit vectors from the zoom camera's pupil at a nominal focal length to `_moved_targets`, (n, 3)."""
+    """Compute unit vectors from the pupil at a nominal focal length to the targets of `_moved_targets`, (n, 3)."""
     assert model.zoom is not None
     return _unit(x_zoom - np.array([0.0, 0.0, model.zoom.pupil_at(nominal_px)]))
 
 
 def _line_of_sight(model: RigModel, nominal_px: float) -> Array:
-    """Unit vector through the middle of the zoom image at a nominal focal length, (3,)."""
+    """Compute the unit vector through the middle of the zoom image at a nominal focal length, (3,)."""
     assert model.zoom is not None
     lens = model.zoom.at(nominal_px)
     return _unit(lens.ray(lens.image_center_px))
@@ -402,6 +402,6 @@ def _unit(v: Array) -> Array:
 
 
 def _across(d: Array) -> Array:
-    """Right and down across a direction near +z, as columns (3, 2)."""
+    """Compute the unit vectors right and down across a direction near +z, as columns (3, 2)."""
     right = _unit(np.cross([0.0, 1.0, 0.0], d))
     return np.stack([right, np.cross(d, right)], axis=-1)

@@ -1,4 +1,4 @@
-"""The report on a calibration: one page that tells whether to trust it; `cotarget.report.page` writes it."""
+"""Calibration report: an HTML page on how well a calibration points; `cotarget.report.page` writes it."""
 
 from cotarget.report.text import verdict
 

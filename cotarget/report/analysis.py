@@ -1,8 +1,8 @@
-"""What the stored corners say: residuals, where they were seen, how far away the boards were and how they were held.
+"""Analysis of a calibration for its report: lens curves, predicted pointing error, and evidence from the corners.
 
-The zoom lens over its focal lengths, with the standard deviation of every curve.
-
-What a calibration predicts of its own pointing, all over the wide view, and which parameters that comes from.
+- `lens_curves`: the zoom lens over its focal range, with standard deviations.
+- `pointing`, `contributions`: the predicted pointing error over the fixed image, and its parts by group of parameters.
+- `gather`: residuals of the stored corners, coverage, distances and tilts of the boards, and the board's shape.
 """
 
 import itertools
@@ -34,21 +34,23 @@ from cotarget.camera import ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
 
+# The zoom lens over its focal range
+
 POINTS = 61
-# What is drawn: true over nominal focal length, principal point [px], the image's distortion, the pupil [mm].
+# True over nominal focal length along u and v, principal point [px], distortion k1 of the image, pupil [mm].
 CURVES = ("ratio_x", "ratio_y", "cx", "cy", "kappa1", "pupil_mm")
 
 
 @dataclass(frozen=True, eq=False)
 class LensCurves:
-    """Curves over the nominal focal length.
+    """Parameters of the zoom lens as curves over the nominal focal length, by the names of `CURVES`.
 
     Attributes:
-        nominal_px: where they are evaluated, (n,) [px].
-        stops_px: the stops' own nominal focal lengths [px].
-        values: by the names of `CURVES`, (n,) each.
-        sigmas: likewise; empty without a covariance.
-        at_stops: the values at the stops themselves.
+        nominal_px: nominal focal lengths of the curves, (n,) [px].
+        stops_px: nominal focal lengths of the zoom samples [px].
+        values: values of each curve, (n,).
+        sigmas: standard deviations of each curve, (n,); empty without a covariance.
+        at_stops: values at the zoom samples.
     """
 
     nominal_px: Array
@@ -59,9 +61,10 @@ class LensCurves:
 
 
 def lens_curves(calibration: Calibration) -> LensCurves:
-    """Evaluate the zoom lens between its stops.
+    """Evaluate the zoom lens over its focal range.
 
-    Standard deviations are by linear propagation of the covariance, and of what is in doubt between stops.
+    Standard deviations come from linear propagation of the covariance, and from the doubt between zoom samples
+    (`ZoomLens.center_doubt_px`).
     """
     lens = calibration.zoom
     nominal = np.geomspace(lens.nominal_px[0], lens.nominal_px[-1], POINTS)
@@ -75,7 +78,7 @@ def lens_curves(calibration: Calibration) -> LensCurves:
 
 
 def _evaluate(lens: ZoomLens, nominal_px: Array) -> Array:
-    """All curves, (6, n)."""
+    """Evaluate all curves of a lens, (6, n)."""
     rows = []
     for nominal in nominal_px:
         here = lens.at(float(nominal))
@@ -106,15 +109,15 @@ def _sigmas(calibration: Calibration, nominal_px: Array) -> dict[str, Array]:
     return sigmas | {name: np.hypot(sigmas[name], doubt[:, i]) for i, name in enumerate(("cx", "cy"))}
 
 
-# --- pointing ---
+# Predicted pointing error
 
-DEPTHS = (4.0, 30.0)  # where targets are [m]
-POINTING_CELLS = (9, 7)  # across and down the wide view, at whose middles pointing is predicted
+DEPTHS = (4.0, 30.0)  # depths of targets, nearest and farthest [m]
+POINTING_CELLS = (9, 7)  # cells across and down the fixed image, at whose middles pointing is predicted
 DEPTH_STEPS = 5
-FARTHER = 1.1  # times the longest focal length calibrated, up to which a lens may go without a word
-MORE_PLACEMENTS = 10  # of which people are told what they would bring
-BETWEEN_STOPS = 4  # focal lengths to look at between the stops, shared out, but never fewer than one each
-# Groups of parameters in the order of the page: how people call them, and how their names begin.
+FARTHER = 1.1  # longest focal length of the lens over the longest calibrated, above which the report mentions it
+MORE_PLACEMENTS = 10  # further placements whose effect the report states
+BETWEEN_STOPS = 4  # focal lengths between all zoom samples together, at least one in each gap
+# Groups of parameters in the order of the page: name, and prefixes of the parameters' names.
 GROUPS = (
     ("the fixed camera's lens", ("fixed.",)),
     ("the zoom lens's pupil", ("zoom.pupil",)),
@@ -130,12 +133,12 @@ JITTER_GROUP = "the head's jitter"
 
 @dataclass(frozen=True)
 class AtFocal:
-    """Pointing at one stop of the zoom lens, rms over the wide view and the depths.
+    """Predicted pointing error at one focal length, rms over the fixed image and the depths.
 
     Attributes:
-        nominal_px: the stop's nominal focal length [px].
-        focal_px: its true one, the mean of both directions [px].
-        rms: predicted angle [rad].
+        nominal_px: nominal focal length [px].
+        focal_px: true focal length, the mean of both directions [px].
+        rms: predicted pointing error [rad].
     """
 
     nominal_px: float
@@ -144,20 +147,25 @@ class AtFocal:
 
     @property
     def rms_px(self) -> float:
-        """The same in the zoom image, near its middle [px]."""
+        """Predicted pointing error in the zoom image, near its middle [px]."""
         return float(np.tan(self.rms)) * self.focal_px
 
 
 @dataclass(frozen=True)
 class Contribution:
-    """What one group of parameters adds to the error: the rms that would be left if it were known exactly [rad]."""
+    """Contribution of one group of parameters to the pointing error.
+
+    Attributes:
+        group: name of the group.
+        left: rms pointing error if the group were known exactly [rad].
+    """
 
     group: str
     left: float
 
 
 def sample_pixels(calibration: Calibration, cells: tuple[int, int] = POINTING_CELLS) -> Array:
-    """Middles of cells all over the wide view, (n, 2) [px]."""
+    """List the middles of cells all over the fixed image, (n, 2) [px]."""
     across, down = (
         (np.arange(n) + 0.5) / n * side - 0.5 for n, side in zip(cells, calibration.fixed.size, strict=True)
     )
@@ -165,33 +173,33 @@ def sample_pixels(calibration: Calibration, cells: tuple[int, int] = POINTING_CE
 
 
 def sample_depths(count: int = DEPTH_STEPS) -> Array:
-    """Depths from the nearest to the farthest target, evenly over their logarithm [m]."""
+    """List depths from the nearest to the farthest target, evenly over their logarithm [m]."""
     return np.geomspace(*DEPTHS, count)
 
 
 def sigma_of(calibration: Calibration, name: str) -> float | None:
-    """Standard deviation of a parameter; None where the calibration tells none."""
+    """Look up the standard deviation of a parameter; None where the calibration has none."""
     covariance = calibration.covariance
     return covariance.sigma(name) if covariance is not None and name in covariance.parameters else None
 
 
 def uncalibrated_px(calibration: Calibration) -> float | None:
-    """The longest focal length of a lens that was not calibrated so far [px]; None where it was, or is not known."""
+    """Find the longest nominal focal length [px] of a lens that is not calibrated so far; None if it is, or unknown."""
     told = calibration.provenance.get("focal_range_px")
     longest = told[-1] if isinstance(told, list) and told and isinstance(told[-1], int | float) else None
     return longest if longest is not None and longest > calibration.zoom.nominal_px[-1] * FARTHER else None
 
 
 def can_point(calibration: Calibration) -> bool:
-    """Whether pointing can be predicted at all."""
+    """Check whether pointing can be predicted: the calibration has T and a covariance."""
     return calibration.T_head_zoom is not None and calibration.covariance is not None
 
 
 def pointing(calibration: Calibration, nominal_px: Sequence[float] | None = None) -> tuple[AtFocal, ...]:
-    """Predict the pointing at focal lengths, by default at every stop of the zoom lens.
+    """Predict the pointing error at nominal focal lengths [px]; None for those of all zoom samples.
 
     Returns:
-        One each; nan where the head reaches nothing; empty where nothing can be predicted.
+        One result per focal length, nan where the head reaches no target; empty where nothing can be predicted.
     """
     if not can_point(calibration):
         return ()
@@ -203,12 +211,12 @@ def pointing(calibration: Calibration, nominal_px: Sequence[float] | None = None
 
 
 def placements(calibration: Calibration) -> int:
-    """How many placements of the board are stored with a calibration."""
+    """Count the placements of the board that are stored with a calibration."""
     return len({view.board for view in calibration.views})
 
 
 def what_stays(calibration: Calibration, at: AtFocal) -> float:
-    """What placements take nothing from: the head's jitter, and what the zoom lens's stops leave in doubt [rad]."""
+    """Compute the error that more placements do not reduce [rad]: jitter, and the doubt between zoom samples."""
     covariance = calibration.covariance
     assert covariance is not None
     known = replace(covariance, matrix=np.zeros_like(covariance.matrix))
@@ -216,23 +224,23 @@ def what_stays(calibration: Calibration, at: AtFocal) -> float:
 
 
 def with_more_placements(calibration: Calibration, at: AtFocal, more: int = MORE_PLACEMENTS) -> float:
-    """What the error would be with so many more placements of the same kind [rad].
+    """Predict the pointing error after ``more`` placements of the same kind [rad].
 
-    Their part of it, the parameters' covariance, goes with 1 / placements.
+    The part from the parameters' covariance is taken as proportional to 1 / placements.
     """
     here, stays2 = placements(calibration), what_stays(calibration, at) ** 2
     return float(np.sqrt(stays2 + max(at.rms**2 - stays2, 0.0) * here / (here + more)))
 
 
 def between_stops(calibration: Calibration) -> list[float]:
-    """Nominal focal lengths between the stops of the zoom lens, where it is only interpolated [px]."""
+    """List nominal focal lengths between the zoom samples, where the lens is interpolated [px]."""
     stops = calibration.zoom.nominal_px
     each = max(1, BETWEEN_STOPS // max(len(stops) - 1, 1))
     return [float(n) for a, b in itertools.pairwise(stops) for n in np.geomspace(a, b, each + 2)[1:-1]]
 
 
 def _over_the_view(calibration: Calibration, nominal_px: float) -> float:
-    """Rms of the predicted angle over all pixels and depths that can be reached [rad]."""
+    """Compute the rms of the predicted error over all pixels and depths within reach [rad]."""
     pixels, depths = sample_pixels(calibration), sample_depths()
     errors = predicted_pointing(calibration, pixels[None], depths[:, None], nominal_px=nominal_px)
     reached = errors[np.isfinite(errors)]
@@ -240,9 +248,9 @@ def _over_the_view(calibration: Calibration, nominal_px: float) -> float:
 
 
 def corner_errors(calibration: Calibration, nominal_px: float) -> tuple[float, dict[str, float]]:
-    """Predicted angle in the middle of the wide view, and by name in its corners that can be reached [rad].
+    """Predict the pointing error in the middle of the fixed image, and by name in its corners within reach [rad].
 
-    Depths are those of `sample_depths`, rms over them.
+    Each is the rms over `sample_depths`.
     """
     right, bottom = np.array(calibration.fixed.size) - 1.0
     places = {"upper left": (0.0, 0.0), "upper right": (right, 0.0), "lower left": (0.0, bottom)}
@@ -254,17 +262,17 @@ def corner_errors(calibration: Calibration, nominal_px: float) -> tuple[float, d
 
 
 def group_of(parameter: str) -> str:
-    """The group that a parameter belongs to."""
+    """Find the group that a parameter belongs to."""
     owner, _, kind = parameter.rpartition(".")
     plain = f"{owner.partition('[')[0]}.{kind}"
     return next((name for name, begins in GROUPS if plain.startswith(begins)), parameter)
 
 
 def contributions(calibration: Calibration) -> tuple[Contribution, ...]:
-    """What each group adds to the error at the longest focal length, the largest first.
+    """Compute what each group contributes to the error at the longest focal length, the largest first.
 
-    A group is taken as known exactly: what the others then leave, given it, is the conditional covariance. To clear
-    its rows instead would count what it shares with the others twice.
+    Each group in turn is taken as known exactly, which leaves the conditional covariance of the others. Clearing its
+    rows instead would count correlations with the others twice.
     """
     covariance = calibration.covariance
     if not can_point(calibration) or covariance is None:
@@ -297,7 +305,7 @@ def contributions(calibration: Calibration) -> tuple[Contribution, ...]:
 
 
 def given(covariance: Covariance, known: npt.NDArray[np.bool_]) -> Covariance:
-    """The covariance left when some parameters, (n,) booleans, are known exactly."""
+    """Compute the conditional covariance given that some parameters, (n,) booleans, are known exactly."""
     C = covariance.matrix
     scale = np.sqrt(np.maximum(np.diagonal(C), np.finfo(float).tiny))
     R = C / np.outer(scale, scale)
@@ -309,9 +317,9 @@ def given(covariance: Covariance, known: npt.NDArray[np.bool_]) -> Covariance:
 
 
 def undetermined(calibration: Calibration) -> str:
-    """Say what the covariance leaves undetermined, and what to add; empty where all is determined.
+    """Describe what the covariance leaves undetermined, and what to add; empty where all is determined.
 
-    What captures kept out have widened it by is taken out: that tells of a model that is wrong, and no views mend it.
+    The widening by the held-out check is taken out, because it stands for a wrong model, which no views correct.
     """
     covariance, held_out = calibration.covariance, calibration.held_out
     if covariance is None or not covariance.matrix.any():
@@ -322,19 +330,21 @@ def undetermined(calibration: Calibration) -> str:
     return name_directions(covariance.parameters, weak_directions(normal, covariance.parameters, 1.0, focal), focal)
 
 
+# Evidence from the stored corners
+
 TITLES = {"fixed": "fixed camera", "zoom": "zoom camera"}
 
 
 log = logging.getLogger(__name__)
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
-CELLS = (16, 12)  # across and down an image, in which residuals are averaged
-FEWEST_IN_CELL = 5  # corners, below which an average says nothing
-BEYOND_CHANCE = 3.0  # standard deviations of an average of two coordinates, which chance exceeds at one cell in 90
-SHAPE_CHI2 = 16.3  # chi-square of three, which chance exceeds once in a thousand
-WRONG_SHARE = 0.1  # of a board's corners
-POINT_STEP = 1e-5  # [m]; pixels change by their derivatives, to rounding
-COVER = (10, 8)  # cells in which corners are counted, as the capture plan does
-# How the thirds of an image are called.
+CELLS = (16, 12)  # cells across and down an image, in which residuals are averaged
+FEWEST_IN_CELL = 5  # fewest corners of an average
+BEYOND_CHANCE = 3.0  # standard deviations of a cell's average, which chance exceeds in one cell of 90
+SHAPE_CHI2 = 16.3  # 99.9 % of a chi-square with three degrees of freedom
+WRONG_SHARE = 0.1  # share of a board's corners that are off, above which the board is wrong
+POINT_STEP = 1e-5  # step of a corner for derivatives [m]
+COVER = (10, 8)  # cells in which corners are counted, as `planning.GRID`
+# Names of the thirds of an image.
 ROWS, COLUMNS = ("upper", "", "lower"), ("left", "", "right")
 
 
@@ -343,9 +353,9 @@ class Corners:
     """All corners that one camera saw.
 
     Attributes:
-        size: (width, height) of its image [px].
-        seen_px: where they were seen, (n, 2).
-        residuals: predicted minus seen [px], (n, 2); what the head's jitter explains is taken out.
+        size: image size (width, height) [px].
+        seen_px: corners in the image, (n, 2) [px].
+        residuals: predicted minus seen, (n, 2) [px], after each view's pan and tilt are fitted within the jitter.
     """
 
     size: tuple[int, int]
@@ -354,7 +364,7 @@ class Corners:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of a coordinate of the residuals, told by their median [px]."""
+        """Robust standard deviation of a coordinate of the residuals [px]."""
         return robust_sigma(self.residuals) if len(self.residuals) else 0.0
 
 
@@ -363,9 +373,9 @@ class Cells:
     """Residuals averaged over the cells of an image; nan where a cell has too few.
 
     Attributes:
-        middles: of the corners in the cell [px], (cells, 2).
-        means: [px], (cells, 2).
-        beyond_chance: which averages are larger than noise alone makes them, (cells,).
+        middles: mean of the corners in each cell, (cells, 2) [px].
+        means: mean of their residuals, (cells, 2) [px].
+        beyond_chance: True for means larger than noise explains, (cells,).
     """
 
     middles: Array
@@ -375,11 +385,11 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class BoardShape:
-    """How the board departs from what everybody believes, told by the residuals.
+    """Deviation of the board's corners from their nominal positions, estimated from the residuals.
 
     Attributes:
-        offsets: of every corner, right, down and out of the board [m], (N, 3); 0 where it is hardly seen.
-        beyond_chance: which are larger than noise alone makes them, (N,).
+        offsets: offset of every corner along x, y and z of the board [m], (N, 3); 0 for a corner that is hardly seen.
+        beyond_chance: True for offsets larger than noise explains, (N,).
     """
 
     offsets: Array
@@ -387,31 +397,31 @@ class BoardShape:
 
     @property
     def wrong(self) -> bool:
-        """Whether so many corners are off that the board is not what it is believed to be."""
+        """True if more than `WRONG_SHARE` of the corners are off."""
         return bool(self.beyond_chance.mean() > WRONG_SHARE)
 
     @property
     def within(self) -> float:
-        """Rms offset within the board [m]."""
+        """Rms offset within the board's plane [m]."""
         return float(np.sqrt(np.mean(np.sum(self.offsets[:, :2] ** 2, axis=1))))
 
     @property
     def out(self) -> float:
-        """Rms offset out of the board [m]."""
+        """Standard deviation of the offsets out of the board's plane [m]."""
         return float(np.std(self.offsets[:, 2]))
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Everything told by the corners.
+    """Evidence from the stored corners.
 
     Attributes:
-        views: those that were used.
-        corners: of both cameras.
-        distances: of the boards' middles from the fixed camera, one a placement [m].
-        leanings: by which boards were turned from facing the fixed camera [rad].
-        per_stop: how many views each stop of the zoom lens has.
-        shape: of the board.
+        views: views used.
+        corners: corners of both cameras.
+        distances: distance of each placement's middle from the fixed camera [m].
+        leanings: angle of each placement from facing the fixed camera [rad].
+        per_stop: number of views at each zoom sample.
+        shape: deviation of the board's corners.
     """
 
     views: tuple[View, ...]
@@ -423,12 +433,12 @@ class Evidence:
 
 
 def gather(calibration: Calibration) -> Evidence | None:
-    """Fit the boards' poses, and nothing else, to the stored corners; None where a calibration stores none.
+    """Fit the boards' poses alone to the stored corners; None where a calibration stores none.
 
-    Views whose corners do not tell a pose are left out: of those in a fit, too many may have been wrong.
+    Views whose corners do not determine a pose are left out: too many of their corners may have been rejected.
 
     Raises:
-        CalibrationError: the stored corners do not belong to this calibration.
+        CalibrationError: the stored corners do not determine the boards' poses.
     """
     if calibration.board is None:
         return None
@@ -470,10 +480,10 @@ def _corners(calibration: Calibration, found: Fit, name: CameraName) -> Corners:
 
 
 def _shape(found: Fit, points: Array) -> BoardShape:
-    """Fit an offset to every corner of the board, of what the boards' poses left; it is that or less.
+    """Fit an offset of every corner of the board to the residuals, with the boards' poses held.
 
-    With residuals r = predicted - seen and their derivatives J by the corner's place, the offset is -J^+ r, and
-    r^T J J^+ r over the variance is chi-square of three where there is only noise.
+    With residuals r = predicted - seen and their derivatives J by the corner's position, the offset is -J^+ r. With
+    noise alone, r^T J J^+ r over the variance is a chi-square with three degrees of freedom.
     """
     seen = np.isfinite(found.left[..., 0])
     ends = [[predict_pixels(found.model, found.views, points + d) for d in (e, -e)] for e in POINT_STEP * np.eye(3)]
@@ -490,7 +500,7 @@ def _shape(found: Fit, points: Array) -> BoardShape:
 
 
 def averaged(corners: Corners) -> Cells:
-    """Average the residuals over cells: a pattern that remains is what the lens's model leaves out."""
+    """Average the residuals over cells, to show patterns that the lens's model leaves out."""
     owner = _cell(corners, CELLS)
     cells = CELLS[0] * CELLS[1]
     number = np.bincount(owner, minlength=cells)
@@ -506,20 +516,20 @@ def averaged(corners: Corners) -> Cells:
 
 
 def counts(corners: Corners, cells: tuple[int, int] = COVER) -> Array:
-    """How many corners were seen in each cell of the image, (down, across)."""
+    """Count the corners in each cell of the image, (down, across)."""
     found = np.bincount(_cell(corners, cells), minlength=cells[0] * cells[1])
     return found.reshape(cells[1], cells[0]).astype(float)
 
 
 def _cell(corners: Corners, cells: tuple[int, int]) -> npt.NDArray[np.intp]:
-    """Number of the cell that each corner is in, row by row."""
+    """Compute the index of each corner's cell, row by row, (n,)."""
     at = ((corners.seen_px + 0.5) / np.array(corners.size) * np.array(cells)).astype(np.intp)
     across, down = np.clip(at, 0, np.array(cells) - 1).T
     return np.asarray(down * cells[0] + across)
 
 
 def empty_places(corners: Corners) -> list[str]:
-    """Name the corners and edges of the image where no board was seen in any of the outermost cells nearby."""
+    """Name the corners and edges of the image whose outermost cells show no board."""
     seen = counts(corners) > 0
     down, across = np.indices(seen.shape)
     rim = (down == 0) | (down == seen.shape[0] - 1) | (across == 0) | (across == seen.shape[1] - 1)
@@ -534,10 +544,10 @@ def empty_places(corners: Corners) -> list[str]:
 
 
 def share_beyond(residuals: Array, sigma: float, times: float = 3.0) -> float:
-    """Share of coordinates beyond so many standard deviations; of Gaussian ones, 0.27 % are beyond three."""
+    """Compute the share of coordinates beyond ``times`` standard deviations; 0.27 % of Gaussian ones are beyond 3."""
     return float(np.mean(np.abs(residuals) > times * sigma)) if residuals.size else 0.0
 
 
 def head_poses(views: Sequence[View]) -> Array:
-    """Pan and tilt of the zoom camera's views, (n, 2) [rad]."""
+    """List pan and tilt of the zoom views, (n, 2) [rad]."""
     return np.array([(view.pan, view.tilt) for view in views if view.camera == "zoom"]).reshape(-1, 2)

@@ -1,9 +1,4 @@
-"""How the report's pictures look, and the pictures of what the corners say.
-
-All pictures of a report, with what they show in words.
-
-Pictures of the predicted pointing error: over the wide view, over depth and over focal length.
-"""
+"""Figures of the calibration report, with their captions: pointing error, residuals, coverage and the zoom lens."""
 
 import io
 from collections.abc import Callable, Iterator, Sequence
@@ -36,17 +31,19 @@ from cotarget.report.analysis import (
 )
 from cotarget.report.text import count, digits
 
+# Predicted pointing error
+
 MAP_DEPTHS = 3
 GRID = (29, 22)  # samples across and down the map
-CONTOUR_SHARES = (0.15, 0.4, 0.65, 0.9)  # of the view, over all depths, inside each contour
+CONTOUR_SHARES = (0.15, 0.4, 0.65, 0.9)  # share of the image, over all depths, inside each contour
 TICKS = 5
-LOG_RATIO = 8.0  # from where on colours go by the logarithm
-CURVE_REACH = 3.0  # the curve goes so many times nearer and farther than targets are
+LOG_RATIO = 8.0  # ratio of largest to smallest error above which the colour scale is logarithmic
+CURVE_REACH = 3.0  # factor by which the curve over depth extends beyond `DEPTHS` at both ends
 CURVE_POINTS = 60
 
 
 def map_figure(calibration: Calibration, at: AtFocal) -> Figure:
-    """Draw the predicted error over the wide view at three depths, in degrees and in px at the longest focal length."""
+    """Draw the predicted error over the fixed image at three depths, in degrees and in px at one focal length."""
     width, height = calibration.fixed.size
     u, v = np.linspace(0, width - 1, GRID[0]), np.linspace(0, height - 1, GRID[1])
     pixels = np.stack(np.meshgrid(u, v), axis=-1)
@@ -81,17 +78,23 @@ def map_figure(calibration: Calibration, at: AtFocal) -> Figure:
 
 
 def _steps(low: float, high: float, number: int) -> Array:
-    """Values between two others, evenly, or over their logarithm where they are far apart."""
+    """Spread values between two others evenly, or over their logarithm where they are far apart."""
     return (np.geomspace if high > LOG_RATIO * low else np.linspace)(low, high, number)
 
 
 def _pixels(focal_px: float) -> tuple[Any, Any]:
-    """Between degrees and px."""
+    """Make the conversions from degrees to pixels and back at a focal length, for a second axis."""
     return (lambda d: np.radians(d) * focal_px, lambda p: np.degrees(p / focal_px))
 
 
 def depth_figure(calibration: Calibration, at: AtFocal, boards: Array | None) -> Figure:
-    """Draw the predicted error over depth at the wide view's middle and corners; boards are their distances [m]."""
+    """Draw the predicted error over depth, in the middle of the fixed image and in its worst corner.
+
+    Args:
+        calibration: the calibration.
+        at: focal length of the prediction.
+        boards: distances of the calibration's boards to mark [m], (n,); None for no marks.
+    """
     depths = np.geomspace(DEPTHS[0] / CURVE_REACH, DEPTHS[1] * CURVE_REACH, CURVE_POINTS)
     width, height = calibration.fixed.size
     corners = np.array([(0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)], dtype=float)
@@ -121,7 +124,7 @@ def depth_figure(calibration: Calibration, at: AtFocal, boards: Array | None) ->
 
 
 def focal_figure(stops: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Figure:
-    """Draw the predicted error over focal length, rms over the wide view and the depths, in degrees and in px."""
+    """Draw the predicted error over focal length, rms over the fixed image and the depths, in degrees and in px."""
     curve = sorted((*stops, *between), key=lambda at: at.nominal_px)
     with styled(2.7) as figure:
         for ax, unit in zip(figure.subplots(1, 2), ("degrees", "px in the zoom image"), strict=True):
@@ -136,14 +139,14 @@ def focal_figure(stops: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Fi
 
 @dataclass(frozen=True)
 class Plot:
-    """A picture for the page and for the folder beside it.
+    """Rendered figure for the page and for the folder beside it.
 
     Attributes:
-        name: of its file, without ending.
-        png: the picture.
-        svg: the same, where that is what the page shows.
-        alt: what it shows, for those who do not see it.
-        caption: how to read it.
+        name: name of its file without suffix.
+        png: figure as PNG.
+        svg: figure as SVG, which the page then embeds; None if it embeds the PNG.
+        alt: text alternative.
+        caption: caption.
     """
 
     name: str
@@ -176,7 +179,7 @@ STYLE = {
     "legend.frameon": False,
     "svg.hashsalt": "cotarget",
 }
-# A typical arrow is drawn so long, as a share of the image's width.
+# Length of a typical arrow over the image's width.
 ARROW_SHARE = 0.02
 NICE = (1, 2, 5)
 HISTOGRAM_SIGMAS = 5.0
@@ -185,7 +188,7 @@ BINS = 60
 
 @contextmanager
 def styled(height: float, width: float = WIDTH) -> Iterator[Figure]:
-    """Give an empty figure [inches]; everything drawn in the context has the report's style."""
+    """Make an empty figure of a size in inches, and apply the report's style within the context."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(figure)
@@ -193,17 +196,17 @@ def styled(height: float, width: float = WIDTH) -> Iterator[Figure]:
 
 
 def as_bytes(figure: Figure, kind: str, dpi: int = PNG_DPI) -> bytes:
-    """Render a figure as "png" or "svg"; the same figure gives the same bytes."""
+    """Render a figure as "png" or "svg", reproducibly to the byte."""
     buffer = io.BytesIO()
     metadata = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
     with matplotlib.rc_context(STYLE):
         figure.savefig(buffer, format=kind, dpi=dpi, metadata=metadata)
-        figure.set_layout_engine("none")  # it is laid out now, also for the next time
+        figure.set_layout_engine("none")  # the layout stays for a second rendering
     return buffer.getvalue()
 
 
 def as_image(ax: Any, size: tuple[int, int]) -> None:
-    """Make axes look like an image of that size (width, height) [px]."""
+    """Set axes up as an image of a size (width, height) [px]."""
     width, height = size
     ax.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
     ax.grid(visible=False)
@@ -214,7 +217,7 @@ def as_image(ax: Any, size: tuple[int, int]) -> None:
 
 
 def magnification(corners: Corners) -> float:
-    """A round factor at which a typical residual is an arrow that is seen."""
+    """Choose a round factor at which a typical residual makes a visible arrow."""
     if not corners.sigma:
         return 1.0
     wanted = ARROW_SHARE * corners.size[0] / corners.sigma
@@ -246,7 +249,7 @@ def residual_figure(evidence: Evidence) -> Figure:
                     scale_units="xy",
                     scale=1,
                     width=0.004,
-                    in_layout=False,  # an arrow out of the image shall not push it aside
+                    in_layout=False,  # an arrow out of the image does not change the layout
                 )
             row[1].set_title(f"{TITLES[name]}: averages, ×{factor:g}")
         return figure
@@ -271,7 +274,7 @@ def _arrows(ax: Any, at: Any, residuals: Any, factor: float, lengths: Any) -> No
 
 
 def histogram_figure(evidence: Evidence) -> Figure:
-    """Draw the residuals' coordinates against the Gaussian of their standard deviation."""
+    """Draw histograms of the residuals' coordinates against the Gaussian of their standard deviation."""
     shown = [name for name in CAMERAS if len(evidence.corners[name].residuals)]
     with styled(2.6) as figure:
         for ax, name in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
@@ -298,7 +301,7 @@ def histogram_figure(evidence: Evidence) -> Figure:
 
 
 def coverage_figure(evidence: Evidence) -> Figure:
-    """Draw where corners were seen in both images, every single one over counts."""
+    """Draw the corners seen in both images, over their number in each cell."""
     shown = [name for name in CAMERAS if len(evidence.corners[name].seen_px)]
     with styled(3.3) as figure:
         for ax, name in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
@@ -320,7 +323,7 @@ def coverage_figure(evidence: Evidence) -> Figure:
 
 
 def situation_figure(evidence: Evidence, nominal_px: tuple[float, ...], has_head: bool) -> Figure:
-    """Draw how far the boards were and how they were turned, the head's poses, and the views of every stop."""
+    """Draw the boards' distances and tilts, the head's poses, and the number of views at each zoom sample."""
     several = len(nominal_px) > 1
     with styled(2.7) as figure:
         axes = figure.subplots(1, 2 + has_head + several, squeeze=False)[0].tolist()
@@ -348,7 +351,7 @@ def situation_figure(evidence: Evidence, nominal_px: tuple[float, ...], has_head
 
 
 def lens_figure(curves: LensCurves) -> Figure:
-    """Draw the zoom lens over its focal lengths, one standard deviation about every curve."""
+    """Draw the zoom lens over its focal range, with one standard deviation about every curve."""
     panels = (
         ("true over nominal focal length", "", {"ratio_x": "across", "ratio_y": "down"}),
         ("principal point from its mean", "[px]", {"cx": "across", "cy": "down"}),
@@ -377,13 +380,13 @@ def lens_figure(curves: LensCurves) -> Figure:
 
 
 def focal_ticks(ax: Any, stops_px: Sequence[float]) -> None:
-    """Mark the stops themselves on a logarithmic axis, as many as there is room for."""
+    """Label zoom samples on a logarithmic axis, as many as there is room for."""
     shown = stops_px if len(stops_px) <= 7 else stops_px[:: -(-len(stops_px) // 6)]
     ax.set_xticks(shown, [f"{n:.0f}" for n in shown])
     ax.minorticks_off()
 
 
-# --- pictures ---
+# All figures with their captions
 
 FIGURE_NAMES = (
     "pointing_map",
@@ -396,14 +399,14 @@ FIGURE_NAMES = (
     "lens",
 )
 Add = Callable[[str, Figure, str, str], None]  # name, figure, alt, caption
-# Those with many marks are embedded as PNG; thousands of arrows at a lower resolution, so that the page stays small.
+# Figures with many marks are embedded as PNG, with this resolution [dots per inch], so that the page stays small.
 DENSE = {"pointing_map": PNG_DPI, "residuals": 140, "coverage": PNG_DPI}
 
 
 def draw(
     calibration: Calibration, at: tuple[AtFocal, ...], between: tuple[AtFocal, ...], evidence: Evidence | None
 ) -> dict[str, Plot]:
-    """Draw what the calibration has the data for, by the names of `NAMES`."""
+    """Draw all figures for which the calibration has data, by the names of `FIGURE_NAMES`."""
     made: dict[str, Plot] = {}
 
     def add(name: str, figure: Figure, alt: str, caption: str) -> None:

@@ -1,6 +1,6 @@
-"""The report on a calibration: one HTML page that needs nothing beside it, and its pictures in a folder.
+"""HTML page of the calibration report, self-contained, with its figures in a folder beside it as well.
 
-Pieces of HTML; every text is escaped here and nowhere else.
+The functions before `write_report` make elements of HTML. All text is escaped there and nowhere else.
 """
 
 import base64
@@ -50,57 +50,57 @@ from cotarget.report.text import (
 
 
 def paragraph(text: str, kind: str = "") -> str:
-    """Write a paragraph."""
+    """Make a paragraph."""
     return f"<p{_class(kind)}>{escape(text)}</p>"
 
 
 def section(anchor: str, title: str, parts: Iterable[str]) -> str:
-    """Write a section with a heading."""
+    """Make a section with a heading."""
     body = "\n".join(parts)
     return f'<section id="{escape(anchor)}">\n<h2>{escape(title)}</h2>\n{body}\n</section>'
 
 
 def header(title: str, about: Sequence[str]) -> str:
-    """Write the page's title, and what it is about."""
+    """Make the page's title, with the calibration's source, method and date below."""
     return f"<header><h1>{escape(title)}</h1>{paragraph(' · '.join(about))}</header>"
 
 
 def verdict(level: str, label: str, text: str) -> str:
-    """Write what it all comes to; the level is good, care, bad or unknown."""
+    """Make the box with the verdict; the level is good, care, bad or unknown."""
     return f'<div class="verdict {escape(level)}" id="verdict">{paragraph(label, "label")}{paragraph(text)}</div>'
 
 
 def contents(entries: Sequence[tuple[str, str]]) -> str:
-    """Write links to sections: anchor and title."""
+    """Make links to sections, given as anchor and title."""
     links = "".join(f'<li><a href="#{escape(anchor)}">{escape(title)}</a></li>' for anchor, title in entries)
     return f"<nav><ul>{links}</ul></nav>"
 
 
 def subheading(text: str) -> str:
-    """Write a heading within a section."""
+    """Make a heading within a section."""
     return f"<h3>{escape(text)}</h3>"
 
 
 def preformatted(text: str) -> str:
-    """Write text as a terminal shows it."""
+    """Make preformatted text, as in a terminal."""
     return f"<pre>{escape(text)}</pre>"
 
 
 def bullets(items: Sequence[str], ordered: bool = False) -> str:
-    """Write a list."""
+    """Make a list with bullets, or with numbers if ``ordered``."""
     tag = "ol" if ordered else "ul"
     return f"<{tag}>" + "".join(f"<li>{escape(item)}</li>" for item in items) + f"</{tag}>"
 
 
 def definitions(pairs: Sequence[tuple[str, str]]) -> str:
-    """Write names and values side by side."""
+    """Make a list of names and values side by side."""
     return '<dl class="figures">' + "".join(
         f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs
     ) + "</dl>"  # fmt: skip
 
 
 def table(content: Table) -> str:
-    """Write a table; its first column names the rows."""
+    """Make a table whose first column names the rows."""
     head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in content.header)
     body = "".join(
         f'<tr><th scope="row">{escape(first)}</th>' + "".join(f"<td>{escape(cell)}</td>" for cell in rest) + "</tr>"
@@ -113,7 +113,7 @@ def table(content: Table) -> str:
 
 
 def bars(rows: Sequence[tuple[str, float, str]], unit: str) -> str:
-    """Write horizontal bars: name, share of the width in 0..1, and what is written beside."""
+    """Make horizontal bars, given as name, share of the width in 0..1, and text beside."""
     body = "".join(
         f'<tr><th scope="row">{escape(name)}</th><td class="bar"><span style="width:{100 * share:.1f}%"></span></td>'
         f"<td>{escape(text)}</td></tr>"
@@ -123,12 +123,12 @@ def bars(rows: Sequence[tuple[str, float, str]], unit: str) -> str:
 
 
 def folded(summary: str, body: str) -> str:
-    """Write something long that is opened by a click."""
+    """Make a part that opens by a click."""
     return f"<details><summary>{escape(summary)}</summary>{body}</details>"
 
 
 def figure(picture: Plot) -> str:
-    """Write a picture, embedded."""
+    """Make a figure with its image embedded."""
     kind, data = ("svg+xml", picture.svg) if picture.svg is not None else ("png", picture.png)
     text = base64.b64encode(data).decode("ascii")
     image = f'<img alt="{escape(picture.alt)}" src="data:image/{kind};base64,{text}">'
@@ -136,7 +136,7 @@ def figure(picture: Plot) -> str:
 
 
 def document(title: str, style: str, body: str) -> str:
-    """Write the whole page; it loads nothing."""
+    """Make the whole page, which loads nothing else."""
     return (
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -149,24 +149,27 @@ def _class(kind: str) -> str:
     return f' class="{escape(kind)}"' if kind else ""
 
 
-FOLDED_FROM = 8  # a longer list of rejected images is folded
+# The page
+
+FOLDED_FROM = 8  # number of rejected images from which their list is folded
 TWO_COLUMNS = 3  # tables with more columns take the whole width
 STYLE = Path(__file__).with_name("page.css")
 
 
 def write_report(path: Path, calibration: Calibration, source: str = "calibration.json") -> Verdict:
-    """Write the page, which is replaced in one step, and its pictures into a folder beside it.
+    """Write the report on a calibration: the page, and its figures into a folder beside it.
 
     Args:
-        path: of the page; report.html has its pictures in report_pictures.
-        calibration: of any kind; what it does not tell is left out and said.
-        source: how the page calls the calibration.
+        path: file of the page; report.html has its figures in report_pictures.
+        calibration: calibration by any method; the page says what it does not hold.
+        source: name of the calibration on the page.
 
     Returns:
         The verdict.
 
     Raises:
-        CalibrationError: a file cannot be written, or the calibration contradicts itself.
+        CalibrationError: a file cannot be written, the covariance is invalid, or the stored corners do not determine
+            the boards' poses.
     """
     if calibration.covariance is not None:
         check_covariance(calibration.covariance, len(calibration.zoom.stops))
@@ -184,7 +187,7 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
 
 
 def _write(path: Path, page: str, made: dict[str, Plot]) -> None:
-    """Write page and pictures, all or nothing; pictures of an earlier report that this one does not have go."""
+    """Write page and figures once all are made, and remove figures of an earlier report that this one lacks."""
     folder = path.with_name(f"{path.stem}_pictures")
     files = {folder / f"{name}.png": picture.png for name, picture in made.items()} | {path: page.encode()}
     try:

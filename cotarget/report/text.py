@@ -1,11 +1,4 @@
-"""Whether to trust a calibration, in one sentence.
-
-What to do to make a calibration better, told by its own figures.
-
-The parameters of a calibration with their uncertainty, and its key figures, as rows of text.
-
-Numbers as people read them.
-"""
+"""Text of the calibration report: verdict, advice, tables of parameters, key figures, and number formatting."""
 
 import math
 import re
@@ -56,15 +49,15 @@ ACTIONS = {
     "the head's axes": NEARER,
     "the encoders": "calibrate with --encoders, and move both pan and tilt from end to end",
 }
-WORTH_SAYING = 0.1  # share of the squared error
-MUCH_WORSE = 3.0  # than in the middle
-PATTERN = 0.1  # share of averages beyond chance, ten times what chance gives or more
-FAR_SHARE, FEW_FAR = 0.5, 0.25  # farther than half-way on the plan's scale; fewer placements than this are few
-LEAST_TURN = np.radians(10.0)  # of each axis of the head, over all poses
-TURNED, FEW_TURNED = np.radians(20.0), 1 / 3  # boards that tell the focal length, and fewer than this are few
-FEWEST_AT_STOP = 6  # views
-FEWEST_SHARED = 5  # placements seen by both cameras, so that some can be kept out
-MANY_REJECTED, MANY_WRONG = 0.2, 0.01  # of the images, of the corners
+WORTH_SAYING = 0.1  # share of the squared error from which a group is mentioned
+MUCH_WORSE = 3.0  # ratio of errors from which a place or focal length is mentioned
+PATTERN = 0.1  # share of cells' averages beyond chance that makes a pattern, nine times what chance gives
+FAR_SHARE, FEW_FAR = 0.5, 0.25  # share of the way from near to far beyond which boards are far; smallest share of these
+LEAST_TURN = np.radians(10.0)  # smallest range of each axis of the head over all poses
+TURNED, FEW_TURNED = np.radians(20.0), 1 / 3  # tilt that determines the focal length; smallest share of boards with it
+FEWEST_AT_STOP = 6  # fewest views of a zoom sample
+FEWEST_SHARED = 5  # fewest placements seen by both cameras, so that some can be kept out
+MANY_REJECTED, MANY_WRONG = 0.2, 0.01  # largest shares of rejected images and of wrong corners
 
 
 def advice(
@@ -74,7 +67,15 @@ def advice(
     parts: tuple[Contribution, ...],
     evidence: Evidence | None,
 ) -> list[str]:
-    """Say what would help most, in that order; empty where nothing stands out."""
+    """Advise how to improve a calibration, roughly the most useful first; empty where nothing stands out.
+
+    Args:
+        calibration: the calibration.
+        at: `pointing` at its zoom samples.
+        between: `pointing` between them.
+        parts: its `contributions`.
+        evidence: evidence from its corners, or None.
+    """
     items = [*_disagreement(calibration), *_missing(calibration), *_unconfirmed(calibration)]
     items += [*_largest_part(at, parts), *_between_stops(at, between), *_worst_corner(calibration, at)]
     if evidence is not None:
@@ -84,7 +85,7 @@ def advice(
 
 
 def _missing(calibration: Calibration) -> Iterator[str]:
-    """What is not there at all."""
+    """Advise on what the calibration lacks: undetermined parameters, a head, a covariance."""
     if open_ := undetermined(calibration):
         yield f"Add what is missing: {open_}."
     if calibration.T_head_zoom is None:
@@ -96,7 +97,7 @@ def _missing(calibration: Calibration) -> Iterator[str]:
 
 
 def _disagreement(calibration: Calibration) -> Iterator[str]:
-    """What captures kept out of the fit find wrong."""
+    """Advise where captures kept out of the fit disagree with it."""
     held_out = calibration.held_out
     if held_out is not None and held_out.widened > 1:
         yield (
@@ -107,7 +108,7 @@ def _disagreement(calibration: Calibration) -> Iterator[str]:
 
 
 def _unconfirmed(calibration: Calibration) -> Iterator[str]:
-    """What is missing so that captures could be kept out."""
+    """Advise where there were too few placements to keep any out of the fit."""
     if calibration.held_out is None and calibration.covariance is not None and calibration.provenance.get("folds"):
         shared = [{v.board for v in calibration.views if v.camera == camera} for camera in CAMERAS]
         number = len(shared[0] & shared[1])
@@ -118,7 +119,7 @@ def _unconfirmed(calibration: Calibration) -> Iterator[str]:
 
 
 def _largest_part(at: tuple[AtFocal, ...], parts: tuple[Contribution, ...]) -> Iterator[str]:
-    """Where the error comes from."""
+    """Advise on the groups of parameters that contribute most to the error."""
     total = at[-1].rms if at else 0.0
     if not total > 0:
         return
@@ -139,7 +140,7 @@ def _largest_part(at: tuple[AtFocal, ...], parts: tuple[Contribution, ...]) -> I
 
 
 def _between_stops(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Iterator[str]:
-    """Where the zoom lens is interpolated too far."""
+    """Advise where the zoom lens is interpolated too far between zoom samples."""
     worst = max(between, key=lambda one: one.rms, default=None)
     if worst is not None and worst.rms > MUCH_WORSE * max(stop.rms for stop in at):
         yield (
@@ -149,7 +150,7 @@ def _between_stops(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Ite
 
 
 def _worst_corner(calibration: Calibration, at: tuple[AtFocal, ...]) -> Iterator[str]:
-    """Where in the wide view pointing is much worse than in its middle."""
+    """Advise where pointing is much worse in a corner of the fixed image than in its middle."""
     if not at:
         return
     middle, corners = corner_errors(calibration, at[-1].nominal_px)
@@ -162,7 +163,7 @@ def _worst_corner(calibration: Calibration, at: tuple[AtFocal, ...]) -> Iterator
 
 
 def _images(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
-    """Images and corners that were left out."""
+    """Advise where many images or corners were left out."""
     residuals = calibration.residuals
     if residuals is None:
         return
@@ -178,7 +179,7 @@ def _images(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
 
 
 def board_in_words(shape: BoardShape) -> str:
-    """Say how far the board's corners are off."""
+    """Describe how far the board's corners are off their nominal positions."""
     number = int(shape.beyond_chance.sum())
     if not number:
         return "The board's corners are where they are believed to be, as far as noise lets see."
@@ -189,7 +190,7 @@ def board_in_words(shape: BoardShape) -> str:
 
 
 def _patterns(evidence: Evidence) -> Iterator[str]:
-    """What the residuals have in common."""
+    """Advise where the residuals show a wrong board, or a pattern in an image."""
     if evidence.shape.wrong:
         yield (
             f"{board_in_words(evidence.shape)} Measure the board, and mount it on something flat: what is predicted "
@@ -206,7 +207,7 @@ def _patterns(evidence: Evidence) -> Iterator[str]:
 
 
 def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
-    """Where boards were not, and how the head did not move."""
+    """Advise where boards, head poses or focal lengths were not covered."""
     for name in CAMERAS:
         places = empty_places(evidence.corners[name])
         if places:
@@ -250,7 +251,7 @@ def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
 
 
 def _more_of_the_same(calibration: Calibration, at: tuple[AtFocal, ...]) -> Iterator[str]:
-    """What more placements of the same kind would bring."""
+    """State what more placements of the same kind would gain."""
     total = at[-1].rms if at else 0.0
     if not total > 0:
         return
@@ -271,7 +272,7 @@ def _degrees(angle: float) -> str:
     return digits(float(np.degrees(angle)))
 
 
-# --- tables ---
+# Tables of parameters and key figures
 
 LENS_WORDS = {
     "fx": ("focal length across", "px"),
@@ -283,7 +284,7 @@ LENS_WORDS = {
     "p1": ("tangential distortion p1", ""),
     "p2": ("tangential distortion p2", ""),
 }
-HEAD_WORDS = {  # words, factor to the unit shown, unit
+HEAD_WORDS = {  # name, factor to the unit shown, unit
     "axis_offset": ("offset of the axes", 1000.0, "mm"),
     "squareness": ("axes off the right angle", 180 / np.pi, "degrees"),
     "pan_scale": ("scale of pan", 1.0, ""),
@@ -291,14 +292,14 @@ HEAD_WORDS = {  # words, factor to the unit shown, unit
     "pan_zero": ("zero of pan", 180 / np.pi, "degrees"),
     "tilt_zero": ("zero of tilt", 180 / np.pi, "degrees"),
 }
-STRONG = 0.95  # a correlation worth a word
+STRONG = 0.95  # correlation from which a pair is listed
 MOST_CORRELATIONS = 8
 STOP = re.compile(r"\[\d+\]")
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text, with what is to be known of it."""
+    """Table of text with a title and a note."""
 
     title: str
     header: tuple[str, ...]
@@ -307,7 +308,7 @@ class Table:
 
 
 def parameter_tables(calibration: Calibration) -> list[Table]:
-    """All parameters, value ± one standard deviation, in groups."""
+    """Make tables of all parameters in groups, with value ± one standard deviation."""
     header = ("parameter", "value ± σ", "unit")
     fixed = Table("Fixed camera", header, tuple(_lens(calibration, calibration.fixed, "fixed")), _about_k3(calibration))
     tables = [fixed, *_zoom(calibration)]
@@ -412,7 +413,7 @@ def _head(calibration: Calibration) -> Iterator[tuple[str, ...]]:
 
 
 def correlations(calibration: Calibration) -> list[str]:
-    """The strongest correlations between parameters, in words."""
+    """List the strongest correlations between parameters as text."""
     covariance = calibration.covariance
     if covariance is None:
         return []
@@ -425,14 +426,14 @@ def correlations(calibration: Calibration) -> list[str]:
         if abs(R[i, j]) > STRONG
     ]
     pairs.sort(key=lambda pair: -abs(pair[0]))
-    # Of the same two parameters of several stops, the strongest speaks for all.
+    # Of the same two parameters at several zoom samples, only the strongest correlation is listed.
     kinds = {tuple(STOP.sub("[]", name) for name in pair[1:]): pair for pair in reversed(pairs)}
     strongest = sorted(kinds.values(), key=lambda pair: -abs(pair[0]))[:MOST_CORRELATIONS]
     return [f"{a} with {b}: {r:+.4f}" for r, a, b in strongest]
 
 
 def key_figures(calibration: Calibration) -> list[tuple[str, str]]:
-    """Name and value of what is asked first."""
+    """List the key figures of a calibration as name and value."""
     found: list[tuple[str, str]] = []
     board, residuals, held_out = calibration.board, calibration.residuals, calibration.held_out
     if board is not None:
@@ -470,20 +471,20 @@ def key_figures(calibration: Calibration) -> list[tuple[str, str]]:
 
 
 def provenance(calibration: Calibration) -> Table:
-    """Everything that the calibration tells of where it comes from."""
+    """Make the table of the calibration's provenance."""
     rows = tuple((str(key), str(value)) for key, value in calibration.provenance.items())
     return Table("", ("what", "value"), rows)
 
 
-# --- wording ---
+# Number formatting
 
 MOST_DECIMALS = 9
-UNCERTAINTY_DIGITS = 2  # more of a standard deviation is not known
-VALUE_DIGITS = 6  # of a value whose uncertainty is not known
+UNCERTAINTY_DIGITS = 2  # significant digits of a standard deviation
+VALUE_DIGITS = 6  # significant digits of a value without one
 
 
 def digits(value: float, count: int = 2) -> str:
-    """Write a number with so many significant digits and, unless it is tiny, without an exponent: 0.0021, 12, 7200."""
+    """Format a number with ``count`` significant digits, without an exponent unless it is tiny: 0.0021, 12, 7200."""
     if not math.isfinite(value):
         return "unknown"
     if value == 0:
@@ -495,13 +496,13 @@ def digits(value: float, count: int = 2) -> str:
 
 
 def _decimals(value: float, count: int) -> int:
-    """How many decimals show so many significant digits, once the value is rounded to them: 0.0996 becomes 0.10."""
+    """Count the decimals that show ``count`` significant digits after rounding: 0.0996 becomes 0.10."""
     decimals = count - 1 - math.floor(math.log10(abs(value)))
     return count - 1 - math.floor(math.log10(abs(round(value, decimals))))
 
 
 def value_and_sigma(value: float, sigma: float | None) -> str:
-    """Write a value to the decimals that its standard deviation leaves: 692.31 ± 0.24."""
+    """Format a value with its standard deviation, to the same decimals: 692.31 ± 0.24."""
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
         return digits(value, VALUE_DIGITS)
     shown = min(max(_decimals(sigma, UNCERTAINTY_DIGITS), 0), MOST_DECIMALS)
@@ -509,12 +510,12 @@ def value_and_sigma(value: float, sigma: float | None) -> str:
 
 
 def count(number: int, one: str, many: str | None = None) -> str:
-    """Write a number of things: 1 view, 2 views."""
+    """Format a number of things: 1 view, 2 views."""
     return f"{number} {one if number == 1 else many or one + 's'}"
 
 
 def percent(share: float) -> str:
-    """Write a share: 0.04 %, 3 %, 62 %."""
+    """Format a share as a percentage: 0.04 %, 3 %, 62 %."""
     if 0 < share < 0.01:
         return f"{digits(100 * share, 1)} %"
     return f"{100 * share:.0f} %"
@@ -532,27 +533,28 @@ LABELS: dict[Level, str] = {
     "bad": "Do not rely on it",
     "unknown": "It does not say how well it points",
 }
-# Stops whose errors differ by less than this factor are spoken of together.
+# Ratio of the errors at two focal lengths from which the verdict names both.
 ALIKE = 1.25
-# Shares of the close-up's width by which a target may be off the middle: beyond the first it is worth a word, beyond
-# the second it is not in the picture.
+# Errors over the close-up's width: above the first the verdict mentions it, above the second the target is not in the
+# image.
 FAR_OFF, OUT_OF_SIGHT = 0.05, 0.5
-# Corners explained so many times worse than was recorded are other corners; exact ones are rounded to the floor.
+# Ratio of the corners' rms to the recorded one above which the corners do not belong to the calibration; and the
+# smallest recorded rms, for exact corners, which are rounded.
 CONTRADICTION, RECORDED_FLOOR_PX = 3.0, 1e-3
-TOO_CAREFUL = 0.6  # misses below this share of what was predicted are no chance either
-MOSTLY = 0.5  # share of the squared error
+TOO_CAREFUL = 0.6  # ratio of measured to predicted misses below which the covariance is too large, beyond chance
+MOSTLY = 0.5  # share of the squared error from which jitter is most of it
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The sentence, and how it is meant."""
+    """Verdict on a calibration: a sentence, and its level."""
 
     text: str
     level: Level
 
 
 def verdict(calibration: Calibration) -> str:
-    """Say in one sentence how well a calibration points, and whether captures kept out of its fit agree."""
+    """Describe in one sentence how well a calibration points, and whether captures kept out of its fit agree."""
     return judge(calibration).text
 
 
@@ -562,13 +564,13 @@ def judge(
     between: tuple[AtFocal, ...] | None = None,
     evidence: Evidence | None = None,
 ) -> Verdict:
-    """Give the verdict on a calibration.
+    """Judge how well a calibration points.
 
     Args:
-        calibration: of any kind.
-        at: what `pointing` gives of its stops, where that is known already.
-        between: what it gives of `between_stops`, likewise.
-        evidence: what `gather` gives of it, likewise.
+        calibration: calibration by any method.
+        at: `pointing` at its zoom samples; None to compute it.
+        between: `pointing` at `between_stops`; None to compute it.
+        evidence: evidence from its corners, as `gather` returns it; None to compute it.
     """
     if calibration.T_head_zoom is None:
         return Verdict(_without_head(calibration), "unknown")
@@ -620,7 +622,7 @@ def _sentence(parts: list[str]) -> str:
 
 
 def _contradicts(calibration: Calibration, evidence: Evidence) -> bool:
-    """Whether the stored corners are explained far worse than was recorded."""
+    """Check whether the stored corners have a far larger rms than was recorded."""
     r = calibration.residuals
     if r is None:
         return False
@@ -651,7 +653,10 @@ def _jitter(calibration: Calibration, last: AtFocal) -> str:
 
 
 def _mismatch(calibration: Calibration) -> list[str]:
-    """That captures kept out of the fit disagree, where they do, which comes before all that it makes wider."""
+    """Describe the disagreement of captures kept out of the fit, if any.
+
+    It comes first in the verdict, because it widens every other figure.
+    """
     held_out = calibration.held_out
     if held_out is None or held_out.widened <= 1:
         return []
