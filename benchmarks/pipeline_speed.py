@@ -107,7 +107,7 @@ def calibration_of(size: tuple[int, int]) -> Calibration:
 
 
 def needs(settings: PipelineSpeedSettings) -> str:
-    """Say what is missing."""
+    """Describe what is missing to run; empty if nothing."""
     if not FILM.is_file():
         return f"needs {FILM}, which is not part of the project"
     with Film(FILM) as film:
@@ -160,7 +160,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def describe(settings: PipelineSpeedSettings, summary: Mapping[str, Any]) -> str:
-    """The table."""
+    """Format the figures as a table."""
     return f"{FILM.name}, {settings.frames - settings.untimed} frames, {settings.seeds} times; medians\n" + table(
         ("way", "frames aimed", "ms a frame", "detect", "track", "aim", "of MOG2 alone", "wanted"),
         ([way, *found.values(), f"<= {WANTED[way]:g}" if way in WANTED else ""] for way, found in summary.items()),

@@ -223,12 +223,12 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     return [key for key, (low, high) in WANTED.items() if not low <= summary[key] <= high]
 
 
 def describe(settings: SimSpeedSettings, summary: Mapping[str, Any]) -> str:
-    """The tables."""
+    """Format the figures as tables."""
     lines = [
         f"a step: a frame of each camera, states and commands; medians of {settings.steps} steps, {seeds_of(settings)}",
         f"image effects off: {summary['loop_ms']:.1f} ms, mujoco.Renderer {summary['renderer_ms']:.1f} ms, ratio "

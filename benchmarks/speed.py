@@ -43,7 +43,7 @@ class SpeedSettings(Settings):
     noise_px: float = 0.2
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_least(FEWEST_VIEWS, self, "pairs")
 
@@ -110,7 +110,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def describe(settings: SpeedSettings, summary: Mapping[str, Any]) -> str:
-    """The table."""
+    """Format the figures as a table."""
     return f"{2 * settings.pairs} views of two cameras, median of {seeds_of(settings)}\n" + table(
         ("way", "seconds", "joint / this", "baseline off, rms [mm]"),
         ([way, *found.values()] for way, found in summary.items()),

@@ -94,7 +94,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     slow = [f"{sweep}: {found['faster']:.2f} times" for sweep, found in summary.items() if found["faster"] < WANTED]
     return slow + [f"{sweep}: rows differ" for sweep, found in summary.items() if found["rows_that_differ"]]
 

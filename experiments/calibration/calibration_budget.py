@@ -55,7 +55,7 @@ class BudgetSettings(Settings):
     targets: int = 100
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_above(0, self, "noises_px", "placements", "looks", "targets")
         check_session(self, "placements", "looks")

@@ -55,13 +55,13 @@ class ChainSettings(Settings):
     cases: tuple[str, ...] = tuple(CASES)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_session(self, "boards", "looks")
 
 
 def one(_: None, settings: ChainSettings, seed: int) -> list[Row]:
-    """Calibrate every case once; one row each."""
+    """Calibrate every case once; give a row per case."""
     return [_row(settings, seed, case) for case in settings.cases]
 
 
@@ -114,7 +114,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def describe(settings: ChainSettings, summary: Mapping[str, Any]) -> str:
-    """The table."""
+    """Format the figures as a table."""
     return f"rms pointing error [px at f = 7155 px], {seeds_of(settings)}\n" + table(
         ("case", "joint", "predicted", "Cramer-Rao", "intrinsics known", "sequential"),
         ([case, *(found[f"{name}_px"] for name in FIGURES)] for case, found in summary.items()),

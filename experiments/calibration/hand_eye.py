@@ -49,7 +49,7 @@ class HandEyeSettings(Settings):
     noise_px: float = 0.2
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_least(FEWEST_POSES, self, "poses")
         check_above(0, self, "noise_px")  # or there would be no bound to come near to
@@ -132,7 +132,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def describe(settings: HandEyeSettings, summary: Mapping[str, Any]) -> str:
-    """The table."""
+    """Format the figures as a table."""
     keys = ("rotation_deg", "translation_mm", "rotation_ratio", "translation_ratio", "inside")
     return f"T from {settings.poses} poses, rms over {seeds_of(settings)}\n" + table(
         ("method", "rotation [deg]", "translation [mm]", "x bound", "x bound", "in 90 % ellipsoid"),

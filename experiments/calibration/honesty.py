@@ -51,7 +51,7 @@ class HonestySettings(Settings):
     targets: int = 20
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_session(self, "boards", "looks")
 

@@ -136,7 +136,7 @@ class MismatchSettings(Settings):
 
 
 def one(_: None, settings: MismatchSettings, seed: int) -> list[Row]:
-    """Calibrate every case once; one row each."""
+    """Calibrate every case once; give a row per case."""
     return [_row(settings, seed, case) for case in settings.cases]
 
 
@@ -204,7 +204,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
 
 
 def describe(settings: MismatchSettings, summary: Mapping[str, Any]) -> str:
-    """The table."""
+    """Format the figures as a table."""
     keys = (
         "measured_px", "predicted_px", "ratio", "ratio_worst", "held_out_measured_px", "held_out_predicted_px",
         "widened", "jitter_deg", "refused", "good",

@@ -47,14 +47,14 @@ class PhotosSettings(Settings):
     square: float = 0.025
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_least(FEWEST_CORNERS, self, "columns", "rows")
         check_above(0, self, "square")
 
 
 def needs(settings: PhotosSettings) -> str:
-    """Say what is missing."""
+    """Describe what is missing to run; empty if nothing."""
     there = Path(settings.directory)
     return "" if there.is_dir() else f"needs photos in {there}, which are not part of the project"
 
@@ -166,7 +166,7 @@ EXPERIMENT = Experiment(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
+    """Run the command."""
     parser = Parser(prog="python -m experiments.calibration.photos", description=EXPERIMENT.purpose)
     parser.add_argument("directory", nargs="?", default=SETTINGS.directory, metavar="DIR", help="the photos")
     parser.add_argument("--left", default=SETTINGS.left, metavar="GLOB")

@@ -160,7 +160,7 @@ def _over_range(key: str, values: Sequence[Any]) -> dict[str, float]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     return [
         f"{head}: {key}"
         for head, found in summary.items()

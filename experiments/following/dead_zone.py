@@ -83,7 +83,7 @@ def _over(value: float, other: float) -> float:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     return [
         f"{name}: {key}"
         for name, figures in summary.items()

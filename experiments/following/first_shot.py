@@ -133,7 +133,7 @@ def _of(mean: Callable[[Sequence[float]], Any], values: Sequence[float]) -> floa
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     return [
         f"{name}: {key}"
         for name, figures in summary.items()

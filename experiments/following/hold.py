@@ -108,7 +108,7 @@ def _spread(key: str, values: Sequence[float | None]) -> dict[str, float]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     return [
         f"{name}: {key}"
         for name, figures in summary.items()

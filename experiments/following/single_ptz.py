@@ -64,7 +64,7 @@ class SingleSettings(Settings):
     lasts_s: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_above(BACKGROUND_S, self, "seconds")  # when the clock starts
         check_ways(self, "seconds")

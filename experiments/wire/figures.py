@@ -62,7 +62,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     return [name for name, figure in summary["figures"].items() if not figure["reached"]]
 
 

@@ -108,7 +108,7 @@ RUNS: Mapping[str, Callable[[WireSettings, Path], list[Row]]] = {
 
 
 def describe(settings: WireSettings, summary: Mapping[str, Any]) -> str:
-    """The tables."""
+    """Format the figures as tables."""
     found = summary["figures"]
     texts = [
         table(
@@ -160,7 +160,7 @@ EXPERIMENT = Experiment(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
+    """Run the command."""
     parser = Parser(prog="python -m experiments.wire.wire", description=EXPERIMENT.purpose)
     parser.add_argument("--only", nargs="+", choices=tuple(RUNS), default=SETTINGS.only, metavar="NAME", help="figures")
     parser.add_argument("--fault", nargs="+", choices=faults_module.all_faults(), metavar="DEVICE.FAULT", help="these")
