@@ -119,9 +119,9 @@ def _of_target(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The targets for which prediction is not worth what is wanted; of the whole pipeline, where that was measured.
+    """List the targets for which prediction misses its goal, and the whole pipeline where that was measured.
 
-    Where the field's delay was not asked for, nothing is wanted.
+    Without the field's delay among the settings there is no goal.
     """
     lost = []
     for name, figures in summary.items():
