@@ -64,7 +64,7 @@ class BudgetSettings(Settings):
 def one(_: None, settings: BudgetSettings, seed: int) -> list[Row]:
     """Calibrate for each number of placements and each noise; give a row for each.
 
-    The boards depend on seed and number of placements, not on the noise.
+    Each calibration has its own random boards, poses and noise.
     """
     rows: list[Row] = []
     for boards in settings.placements:
