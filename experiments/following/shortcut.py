@@ -244,7 +244,7 @@ def _texts(found: Mapping[str, float]) -> tuple[str, float]:
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Maps of both readings' errors over the wide image of mounted rigs, medians over the seeds; then all regions."""
+    """Maps of both readings' errors over the fixed image of mounted rigs, medians over the seeds; then all regions."""
     depths, rigs = _depths(rows), list(dict.fromkeys(row["rig"] for row in rows))
     figure.set_size_inches(3.2 * len(depths) + 5, 5)
     maps, regions = cast(list[SubFigure], figure.subfigures(1, 2, width_ratios=(3.2 * len(depths) + 1, 4)))
