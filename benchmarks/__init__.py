@@ -1,1 +1,1 @@
-"""What measures times: the simulation, the pipeline, sweeps, environments."""
+"""Benchmarks of computing time: simulation, pipeline, calibration, sweeps and environments."""

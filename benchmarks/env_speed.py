@@ -1,13 +1,13 @@
-"""How fast the environments are, beside MuJoCo alone on the same model: stepping it, and stepping and rendering it.
+"""Speed of the environments against MuJoCo alone on the same model, with and without rendering.
 
-An environment's step is a frame of the wide camera: commands to head and lens, what the cameras saw, detection,
-tracking, the observation, the reward and the truth in `info`. MuJoCo alone does a frame's time in steps of the model's
-own (`mj_step`, 20 of 2 ms), the targets' poses being ready and put in once a frame; with pictures, `mujoco.Renderer`
-then draws both cameras as large, with the same antialiasing and shadows. Both take turns within one run. The actions
-are those by which the pipeline holds the target, noted beforehand: that the target is in the close-up costs most.
+A step of an environment is a frame of the fixed camera: commands to head and lens, the cameras' views, detection,
+tracking, observation, reward, and the ground truth in `info`. MuJoCo alone simulates a frame's time in steps of the
+model's own (`mj_step`, 20 of 2 ms), with prepared target poses set once a frame; with pictures, `mujoco.Renderer` then
+draws both cameras at the same size, antialiasing and shadows. Both take turns within one run. The actions are recorded
+from the pipeline, because a target in the close-up is the most expensive case.
 
-Steps without pictures need one thread and are timed by its processor time, those with pictures by the clock. What a
-reset takes, which builds a world, is told beside.
+Steps without pictures run on one thread and are timed by processor time; those with pictures are timed by the clock.
+The time of a reset, which builds a world, is reported too.
 
     python -m benchmarks.env_speed [--seeds 1] [--seed-base 0] [--quick] [--out DIR]
 """
@@ -32,19 +32,19 @@ from experiments.engine.harness import Experiment, Row, Settings, seeds_of
 from experiments.engine.texts import table
 
 SIZE = (64, 64)
-BLOCK = 25  # steps of each, by turns: alone each finds the caches as the other left them
-# At least so many steps of an environment in the time of one of MuJoCo's.
+BLOCK = 25  # steps of each in turn; with single steps each would find the caches as the other left them
+# Goal: least number of steps of an environment in the time of one of MuJoCo's.
 WANTED = {"tracks": 0.5, "images": 0.8}
 
 
 @dataclass(frozen=True)
 class EnvSpeedSettings(Settings):
-    """How many seeds, which targets, and for how long.
+    """Settings: targets and lengths of the episodes.
 
     Attributes:
-        targets: book, person, bird.
-        seconds: of an episode without pictures [s].
-        seconds_seen: of one with pictures [s].
+        targets: book, person or bird.
+        seconds: length of an episode without pictures [s].
+        seconds_seen: length of an episode with pictures [s].
     """
 
     seeds: int = 1
@@ -53,7 +53,7 @@ class EnvSpeedSettings(Settings):
     seconds_seen: float = 6.0
 
     def __post_init__(self) -> None:
-        """Refuse what the environments do, and what is too short to be timed."""
+        """Refuse values that the environments refuse, and runs too short to time."""
         super().__post_init__()
         check_least(BLOCK / RigConfig().rate_hz, self, "seconds")
         check_above(0, self, "seconds_seen")
@@ -61,15 +61,15 @@ class EnvSpeedSettings(Settings):
 
 
 class Alone:
-    """MuJoCo and nothing else, on the model of a world and with its targets' poses."""
+    """MuJoCo alone, on a world's model with its targets' poses."""
 
     def __init__(self, world: SimWorld, model: "mujoco.MjModel", times: Sequence[float]) -> None:
-        """Work out the poses.
+        """Prepare the poses.
 
         Args:
-            world: whose.
-            model: of it.
-            times: of its frames [s].
+            world: the world.
+            model: model of the world.
+            times: times of its frames [s].
         """
         self._model, self._data = model, mujoco.MjData(model)
         self._steps = round(1 / world.config.rate_hz / model.opt.timestep)
@@ -78,7 +78,7 @@ class Alone:
         self._poses = [(data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()) for data in poses]
 
     def step(self, index: int) -> None:
-        """From one frame to the next."""
+        """Simulate from one frame to the next."""
         data, model = self._data, self._model
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = self._poses[index]
         data.qvel[:] = 0.0
@@ -87,12 +87,12 @@ class Alone:
 
 
 def one(shared: None, settings: EnvSpeedSettings, seed: int) -> list[Row]:
-    """Time everything once."""
+    """Time all cases once."""
     return [row for name in settings.targets for row in (*tracks(settings, name, seed), *images(settings, name, seed))]
 
 
 def tracks(settings: EnvSpeedSettings, name: str, seed: int) -> Iterator[Row]:
-    """Blocks of steps without pictures, and of MuJoCo's."""
+    """Time blocks of steps without pictures, and of MuJoCo's steps."""
     env = Follow(name, seconds=settings.seconds)
     actions, times = held(env, seed)
     began = time.perf_counter()
@@ -114,7 +114,7 @@ def tracks(settings: EnvSpeedSettings, name: str, seed: int) -> Iterator[Row]:
 
 
 def images(settings: EnvSpeedSettings, name: str, seed: int) -> Iterator[Row]:
-    """Steps with pictures, and MuJoCo's with its own renderer's."""
+    """Time steps with pictures, and MuJoCo's with its own renderer."""
     env = Follow(name, "images", seconds=settings.seconds_seen, image_size=SIZE)
     actions, times = held(env, seed)
     began = time.perf_counter()
@@ -139,7 +139,7 @@ def images(settings: EnvSpeedSettings, name: str, seed: int) -> Iterator[Row]:
 
 
 def held(env: Follow, seed: int) -> tuple[list[Vector], list[float]]:
-    """What the pipeline does in an episode, and the times of the frames [s]."""
+    """Record the pipeline's actions in an episode, and the times of the frames [s]."""
     policy, actions, times, over = PipelinePolicy(env), list[Vector](), list[float](), False
     observation, _ = env.reset(seed=seed)
     while not over:
@@ -150,7 +150,7 @@ def held(env: Follow, seed: int) -> tuple[list[Vector], list[float]]:
 
 
 def timed(clock: Callable[[], float], step: Callable[[int], object], block: Sequence[int]) -> float:
-    """How long each step of a block takes, on the mean [us]."""
+    """Give the mean time of a step in a block [us]."""
     began = clock()
     for i in block:
         step(i)
@@ -158,7 +158,7 @@ def timed(clock: Callable[[], float], step: Callable[[int], object], block: Sequ
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """For each kind of observation and target: medians, and steps a second as a part of MuJoCo's."""
+    """Give medians by kind of observation and target, and the speed over MuJoCo's."""
     found = {}
     for what, name in dict.fromkeys((row["what"], row["target"]) for row in rows):
         own = [row for row in rows if (row["what"], row["target"]) == (what, name)]
@@ -173,12 +173,12 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """Where an environment is slower than wanted."""
+    """List the environments slower than their goal."""
     return [name for name, found in summary.items() if not found["ratio"] >= WANTED[name.split(",")[0]]]
 
 
 def describe(settings: EnvSpeedSettings, summary: Mapping[str, Any]) -> str:
-    """A line for each kind of observation and target."""
+    """Format a line per kind of observation and target."""
     head = ("cotarget/Follow-v0", "steps/s", "MuJoCo alone", "ratio", "reset [ms]", "wanted")
     lines = [[name, *found.values(), f">= {WANTED[name.split(',')[0]]:g}"] for name, found in summary.items()]
     return f"steps a second beside MuJoCo alone, {seeds_of(settings)}; medians\n" + table(head, lines)

@@ -1,10 +1,10 @@
-"""How long the pipeline takes for a frame, beside the background subtraction that it is built from.
+"""Time of the pipeline for a frame, against the background subtraction that it is built from.
 
-A film of a real bird (V_BIRD_036 of Svanstroem et al., doi 10.5281/zenodo.5500576, CC0-1.0, looked for in
-../shared/data/birds beside the project). On each of its frames, in turns because a machine's pace drifts:
-`cv2.createBackgroundSubtractorMOG2().apply` alone on BGR, and what the loop does with a wide frame, each timed: detect,
-track in the image and in 3D, and aim exactly at where the target will be; what drives head and lens after that is left
-out, and so is the zoom view. On as many threads as OpenCV takes.
+The film shows a real bird (V_BIRD_036 of Svanstroem et al., doi 10.5281/zenodo.5500576, CC0-1.0, searched in
+../shared/data/birds beside the project). On each frame, in turns because a machine's speed drifts, two things are
+timed: `cv2.createBackgroundSubtractorMOG2().apply` alone on BGR, and the loop's work on a fixed-camera frame: detect,
+track in the image and in 3D, and aim exactly at the target's predicted position. Control of head and lens and the zoom
+view are left out. OpenCV uses its default number of threads.
 
     python -m benchmarks.pipeline_speed [--seeds 1: times through the film] [--quick] [--out DIR]
 """
@@ -39,36 +39,39 @@ from experiments.engine.texts import table
 
 FILM = Path(__file__).resolve().parents[2] / "shared" / "data" / "birds" / "V_BIRD_036.mp4"
 ALONE = "MOG2 alone"
-# The aim leads the target by this [s].
+# Lead of the aim [s].
 LEAD_S = 0.1
 STAGES = ("detect_ms", "track_ms", "aim_ms")
-WANTED = {"motion": 1.5, "speck": 2.5}  # times as long as the subtraction alone: at most
+WANTED = {"motion": 1.5, "speck": 2.5}  # goal: largest ratio to the subtraction alone
 
 
 @dataclass(frozen=True)
 class PipelineSpeedSettings(Settings):
-    """Times through the film as seeds; its first frames are not timed, for a model that learns costs more or less."""
+    """Settings: passes through the film as seeds.
+
+    The first frames are not timed, because a learning model costs more or less.
+    """
 
     seeds: int = 1
     frames: int = 300
     untimed: int = 60
 
     def __post_init__(self) -> None:
-        """Refuse to time nothing."""
+        """Refuse runs without timed frames."""
         super().__post_init__()
         if self.untimed >= self.frames:
             raise ConfigError(f"untimed: {self.untimed} is not below frames = {self.frames}, so that none is timed")
 
 
 class Pipeline:
-    """Detect, track and aim, as the loop does with a frame."""
+    """Detection, tracking and aiming, as the loop does them for a frame."""
 
     def __init__(self, kind: str, film: Film) -> None:
-        """Begin anew.
+        """Start without history.
 
         Args:
-            kind: of detector.
-            film: gives size and rate.
+            kind: name of the detector.
+            film: film that gives size and rate.
         """
         self.target: TargetConfig = replace(DEFAULT_TARGETS["bird"], detector=kind)  # type: ignore[arg-type]
         self.detector: Detector = make_detector(self.target, film.rate_hz)
@@ -81,7 +84,7 @@ class Pipeline:
         self.limits = PanTiltLimits(pan, tilt, math.inf, math.inf, 0.0)
 
     def __call__(self, frame: Frame) -> Row:
-        """Do a frame; the milliseconds of each stage, and whether there was a target to aim at."""
+        """Process a frame; give the milliseconds of each stage, and whether there was a target to aim at."""
         began = time.perf_counter()
         detections = self.detector.detect(frame)
         detected = time.perf_counter()
@@ -100,14 +103,14 @@ class Pipeline:
 
 
 def calibration_of(size: tuple[int, int]) -> Calibration:
-    """The default rig's calibration, with a wide view of that size."""
+    """Give the default rig's calibration, with a fixed image of that size."""
     calibration = true_calibration(SimWorld(RigConfig(), rendered=()))
     middle = ((size[0] - 1) / 2, (size[1] - 1) / 2)
     return replace(calibration, fixed=replace(calibration.fixed, size=size, center_px=middle))
 
 
 def needs(settings: PipelineSpeedSettings) -> str:
-    """Say what is missing."""
+    """Describe what is missing to run; empty if nothing."""
     if not FILM.is_file():
         return f"needs {FILM}, which is not part of the project"
     with Film(FILM) as film:
@@ -117,7 +120,7 @@ def needs(settings: PipelineSpeedSettings) -> str:
 
 
 def one(_: None, settings: PipelineSpeedSettings, seed: int) -> list[Row]:
-    """Go through the film once; one row for each frame and way."""
+    """Run through the film once; give a row per frame and way."""
     rows: list[Row] = []
     with Film(FILM) as film:
         subtractor = cv2.createBackgroundSubtractorMOG2()
@@ -132,7 +135,7 @@ def one(_: None, settings: PipelineSpeedSettings, seed: int) -> list[Row]:
         for index, frame in enumerate(film):
             if index >= settings.frames:
                 break
-            for k in range(len(ways)):  # the first to touch a frame pays for fetching it: each is first in turn
+            for k in range(len(ways)):  # the first to read a frame loads it into the cache: each is first in turn
                 way, work = ways[(k + index) % len(ways)]
                 done = work(frame)
                 if index >= settings.untimed:
@@ -141,7 +144,7 @@ def one(_: None, settings: PipelineSpeedSettings, seed: int) -> list[Row]:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Median milliseconds of the frames with something to aim at, and how many times as long as the subtraction."""
+    """Give median milliseconds of the frames with a target to aim at, and the ratio to the subtraction."""
     found = {}
     alone = float(np.median([row["ms"] for row in rows if row["way"] == ALONE]))
     for way in dict.fromkeys(sorted((row["way"] for row in rows), key=lambda way: way != ALONE)):
@@ -155,12 +158,12 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The ways that take longer than is wanted."""
+    """List the ways that take longer than their goal."""
     return [way for way, most in WANTED.items() if not summary[way]["ratio"] <= most]
 
 
 def describe(settings: PipelineSpeedSettings, summary: Mapping[str, Any]) -> str:
-    """The table."""
+    """Format the figures as a table."""
     return f"{FILM.name}, {settings.frames - settings.untimed} frames, {settings.seeds} times; medians\n" + table(
         ("way", "frames aimed", "ms a frame", "detect", "track", "aim", "of MOG2 alone", "wanted"),
         ([way, *found.values(), f"<= {WANTED[way]:g}" if way in WANTED else ""] for way, found in summary.items()),

@@ -1,4 +1,4 @@
-"""MuJoCo's own renderer, to compare the simulated rig and the environments with."""
+"""MuJoCo's own renderer, for comparison with the simulated rig and the environments."""
 
 import time
 
@@ -12,14 +12,14 @@ from cotarget.sim.world import CAMERAS, SimWorld
 
 
 class PlainRenderer:
-    """mujoco.Renderer on the frames of a world whose image effects are off."""
+    """mujoco.Renderer on the frames of a world without image effects."""
 
     def __init__(self, world: SimWorld, size: Size | None = None) -> None:
-        """Open it.
+        """Open the renderer.
 
         Args:
-            world: whose frames.
-            size: of the pictures, with the same field of view; that of the streams by default.
+            world: the world.
+            size: size of the pictures, with the same field of view; by default that of the streams.
         """
         sim, self._truth = world.config.sim, world.truth()
         drawn = sim.fixed.size if size is None else size
@@ -28,16 +28,16 @@ class PlainRenderer:
             "zoom": np.divide(drawn, sim.zoom.size) * RENDER_PITCH,
         }
         self.model = build_model(world.config, tuple(world.targets.values()), drawn)
-        if size is not None:  # no more is cleared and resolved than that
+        if size is not None:  # OpenGL clears and resolves the whole buffer
             self.model.vis.global_.offwidth, self.model.vis.global_.offheight = size
         self._state = WorldState(self.model, world.targets, world.head_drive, self._truth.T_world_fixed, None)
         self._renderer = make_renderer(self.model, *drawn)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = sim.effects.shadows
 
     def draw(self, t: float) -> float:
-        """Draw both cameras' frames of time t; how long that took, but for bringing the world to its pose [s]."""
+        """Draw both cameras' frames of time t [s]; give the time taken without moving the world to its pose [s]."""
         data, option, took = self._state.lit(t), mujoco.MjvOption(), 0.0
-        option.geomgroup[3:] = 0  # neither the board nor the rig itself
+        option.geomgroup[3:] = 0  # hide the board and the rig itself
         for camera in CAMERAS:
             number, focal = self.model.camera(RIG + camera).id, self._truth.lens(camera, t).focal_px
             self.model.cam_intrinsic[number] = (*(self._scales[camera] * focal), 0.0, 0.0)

@@ -1,15 +1,15 @@
-"""How fast the simulated rig is: beside mujoco.Renderer on the same frames, effect by effect, and against real time.
+"""Speed of the simulated rig: against mujoco.Renderer on the same frames, by effect, and against real time.
 
-A step is what the loop does to the rig at 25 Hz without detecting anything: a frame of each camera, the states of head
-and lens, a command to each. What is compared takes turns within one run, because a machine's pace drifts, and medians
-over the steps are given.
+A step is the loop's access to the rig at 25 Hz without detection: a frame of each camera, the states of head and lens,
+and a command to each. The compared ways take turns within one run, because a machine's speed drifts; figures are
+medians over the steps.
 
-1. Image effects off: a step, and mujoco.Renderer drawing the same two frames of the same world, as large, with the same
-   antialiasing, focal length and pose, the poses being ready.
-2. Each image effect alone, and all of them, beside none. Blur is that of 1/100 s under a turning head.
-3. Seconds of simulated time a second of the whole pipeline holding a bird, as `experiments.following.hold` does it:
-   both cameras rendered, all effects on; and nothing rendered, detections from the truth. Of the latter also what the
-   simulation alone takes.
+1. Image effects off: a step, and mujoco.Renderer drawing the same two frames of the same world, with the same size,
+   antialiasing, focal length and pose, the poses being prepared.
+2. Each image effect alone, and all of them, against none. Blur is that of 1/100 s under a turning head.
+3. Seconds of simulated time per second of the whole pipeline following a bird, as in `experiments.following.hold`: both
+   cameras rendered with all effects; and nothing rendered, with detections from ground truth. For the latter, the time
+   of the simulation alone is given too.
 
     python -m benchmarks.sim_speed [--seeds 1] [--seed-base 0] [--quick] [--out DIR]
 """
@@ -39,11 +39,11 @@ from experiments.following.field_scenes import hold_config
 
 IMAGE_EFFECTS = ("noise", "jpeg", "distortion", "blur", "clutter")
 TARGET = "bird"
-TURN, TURN_S = 0.15, 1.5  # the head swings so far [rad], and takes so long there and back [s]
-ZOOMED = 3.0  # times the shortest focal length
-SETTLED_S = 1.0  # before anything is timed; the lens is there then
+TURN, TURN_S = 0.15, 1.5  # amplitude [rad] and period [s] of the head's swing
+ZOOMED = 3.0  # factor on the shortest focal length
+SETTLED_S = 1.0  # time before anything is timed; the lens has arrived then
 RENDERER, LOOP, ALL = "mujoco.Renderer", "loop", "all of them"
-# What is wanted, at least and at most.
+# Goals: least and largest value.
 WANTED: Mapping[str, tuple[float, float]] = {
     "loop_over_renderer": (0.0, 1.15),
     "real_time_rendered": (0.5, math.inf),
@@ -53,12 +53,12 @@ WANTED: Mapping[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class SimSpeedSettings(FieldSettings):
-    """How many seeds; steps timed of each world; for how long a bird is held with pictures.
+    """Settings: timed steps per world, and lengths of the runs.
 
     Attributes:
-        seconds: without pictures [s].
-        steps: timed of each world.
-        seconds_rendered: with pictures [s].
+        seconds: length of the run without pictures [s].
+        steps: timed steps of each world.
+        seconds_rendered: length of the run with pictures [s].
     """
 
     seeds: int = 1
@@ -72,12 +72,12 @@ class SimSpeedSettings(FieldSettings):
 
     @property
     def lasting_s(self) -> tuple[float, float]:
-        """What is timed is counted from when the target has settled; ways last that much longer than a run."""
+        """Limits of a run's length [s]; timing starts after SETTLED_S, and the paths last longer by that."""
         return 0.0, super().lasting_s[1]
 
 
 def one(calibration: Calibration, settings: SimSpeedSettings, seed: int) -> list[Row]:
-    """Time everything once; a row for each step."""
+    """Time all cases once; give a row per step."""
     rows = _beside_renderer(settings, seed)
     for effects in (*((name,) for name in IMAGE_EFFECTS), IMAGE_EFFECTS):
         rows += _beside_none(settings, seed, effects)
@@ -91,24 +91,24 @@ def one(calibration: Calibration, settings: SimSpeedSettings, seed: int) -> list
 
 
 def config_with(seed: int, on: Sequence[str]) -> RigConfig:
-    """The bird to hold, with these image effects only; all others are as ever."""
+    """Configure the bird to follow with these image effects only; other effects are unchanged."""
     config = hold_config(TARGET, seed)
     effects = replace(config.sim.effects, **{name: name in on for name in IMAGE_EFFECTS})
     return replace(config, sim=replace(config.sim, effects=effects))
 
 
 class Stepper:
-    """Does to a rig what the loop does, without detecting anything."""
+    """The loop's access to a rig, without detection."""
 
     def __init__(self, config: RigConfig) -> None:
-        self.world = SimWorld(config, ahead=False)  # whose thread would render during other worlds' turns
+        self.world = SimWorld(config, ahead=False)  # its thread would render during other worlds' turns
         rig = self.world.rig
         rig.zoom.zoom(ZOOMED * rig.zoom.focal_range[0])
         rig.clock.sleep_until(SETTLED_S)
         self.t = SETTLED_S - config.sim.fixed.latency_s
 
     def step(self) -> float:
-        """One step; how long it took [s]."""
+        """Do one step; give the time taken [s]."""
         rig = self.world.rig
         began = time.perf_counter()
         self.t = rig.fixed.read(newer_than=self.t).t
@@ -122,7 +122,7 @@ class Stepper:
 
 
 def _beside_renderer(settings: SimSpeedSettings, seed: int) -> list[Row]:
-    """Steps without image effects, and mujoco.Renderer on their frames, by turns."""
+    """Time steps without image effects, and mujoco.Renderer on their frames, in turns."""
     stepper = Stepper(config_with(seed, ()))
     plain = PlainRenderer(stepper.world)
     rows = []
@@ -130,7 +130,7 @@ def _beside_renderer(settings: SimSpeedSettings, seed: int) -> list[Row]:
         for i in range(settings.steps + 1):
             loop = stepper.step()
             renderer = plain.draw(stepper.t)
-            if i:  # the first one fills caches
+            if i:  # the first step fills caches
                 rows += [
                     {"seed": seed, "what": LOOP, "step": i, "ms": 1e3 * loop},
                     {"seed": seed, "what": RENDERER, "step": i, "ms": 1e3 * renderer},
@@ -140,7 +140,7 @@ def _beside_renderer(settings: SimSpeedSettings, seed: int) -> list[Row]:
 
 
 def _beside_none(settings: SimSpeedSettings, seed: int, effects: Sequence[str]) -> list[Row]:
-    """Steps with these image effects and with none, by turns."""
+    """Time steps with these image effects and with none, in turns."""
     with_them, without = Stepper(config_with(seed, effects)), Stepper(config_with(seed, ()))
     what = effects[0] if len(effects) == 1 else ALL
     rows = []
@@ -153,13 +153,13 @@ def _beside_none(settings: SimSpeedSettings, seed: int, effects: Sequence[str]) 
 
 
 def held(calibration: Calibration, seconds: float, seed: int) -> Iterator[tuple[Step, Truth]]:
-    """Hold the bird, both cameras rendered, for so long after it has settled."""
+    """Follow the bird with both cameras rendered, for some seconds after SETTLED_S."""
     config = hold_config(TARGET, seed)
     return watched(calibration, config, target_of(config, TARGET), SETTLED_S + seconds)
 
 
 def held_unrendered(calibration: Calibration, seconds: float, seed: int) -> Iterator[tuple[Step, Truth]]:
-    """The same with nothing rendered, so that there is nothing to be looked for in the zoom view either."""
+    """Follow the bird with nothing rendered, and so without correction from the zoom view."""
     config = hold_config(TARGET, seed)
     world = SimWorld(config, rendered=())
     settings = FollowSettings.of(config, closed_loop=False)
@@ -168,7 +168,7 @@ def held_unrendered(calibration: Calibration, seconds: float, seed: int) -> Iter
 
 
 def real_time_factor(steps: Iterable[tuple[Step, Any]]) -> float:
-    """Simulated over real time of a run, from its first Step later than SETTLED_S on."""
+    """Give simulated over real time of a run, from its first Step later than SETTLED_S on."""
     began = start = end = math.nan
     for step, _ in steps:
         end = step.t
@@ -178,7 +178,7 @@ def real_time_factor(steps: Iterable[tuple[Step, Any]]) -> float:
 
 
 def _alone(settings: SimSpeedSettings, seed: int) -> float:
-    """What the simulation itself takes of a step when nothing is rendered: rig calls, poses, one box of truth [ms]."""
+    """Time the simulation alone in a step without rendering: rig calls, poses, one box of ground truth [ms]."""
     config = hold_config(TARGET, seed)
     world = SimWorld(config, rendered=())
     truth: Truth = world.truth()
@@ -198,7 +198,7 @@ def _alone(settings: SimSpeedSettings, seed: int) -> float:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """Medians over the steps of all seeds."""
+    """Give medians over the steps of all seeds."""
 
     def of(what: str, key: str = "ms") -> Any:
         return np.array([row[key] for row in rows if row["what"] == what], dtype=float)
@@ -223,12 +223,12 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     return [key for key, (low, high) in WANTED.items() if not low <= summary[key] <= high]
 
 
 def describe(settings: SimSpeedSettings, summary: Mapping[str, Any]) -> str:
-    """The tables."""
+    """Format the figures as tables."""
     lines = [
         f"a step: a frame of each camera, states and commands; medians of {settings.steps} steps, {seeds_of(settings)}",
         f"image effects off: {summary['loop_ms']:.1f} ms, mujoco.Renderer {summary['renderer_ms']:.1f} ms, ratio "

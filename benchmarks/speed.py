@@ -1,9 +1,9 @@
-"""How long the joint fit takes, beside OpenCV's calibration of the same corners.
+"""Time of the joint fit, against OpenCV's calibration of the same corners.
 
-40 views of a board by two cameras, 20 pairs with the head at home: both cameras' intrinsics and Gamma are wanted. Once
-`calibrate_views`, without captures held out; once cv2.calibrateCamera for each camera, then cv2.stereoCalibrate, once
-with the intrinsics held and once with everything free, as in the joint fit. They take turns, because a machine's pace
-drifts; medians over the seeds, on as many threads as each takes.
+There are 40 views of a board by two cameras, 20 pairs with the head at home; both cameras' intrinsics and Gamma are
+wanted. The ways are `calibrate_views` without held-out captures, and cv2.calibrateCamera for each camera followed by
+cv2.stereoCalibrate, with fixed intrinsics and with everything free, as in the joint fit. They take turns, because a
+machine's speed drifts; figures are medians over the seeds, on each way's default number of threads.
 
     python -m benchmarks.speed [--seeds 5] [--seed-base 0] [--quick] [--out DIR]
 """
@@ -36,20 +36,20 @@ JOINT, HELD, FREE = "joint fit", "OpenCV, intrinsics held", "OpenCV, everything 
 
 @dataclass(frozen=True)
 class SpeedSettings(Settings):
-    """How many seeds, pairs of views; noise of corners [px]."""
+    """Settings: pairs of views, and noise of corners [px]."""
 
     seeds: int = 5
     pairs: int = 20
     noise_px: float = 0.2
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_least(FEWEST_VIEWS, self, "pairs")
 
 
 def one(_: None, settings: SpeedSettings, seed: int) -> list[Row]:
-    """Time each way once; one row each."""
+    """Time each way once; give a row per way."""
     views = synthetic_views(
         TRUTH,
         POINTS,
@@ -81,7 +81,7 @@ def _joint(views: Sequence[View]) -> float:
 
 
 def _opencv(views: Sequence[View], flags: int) -> float:
-    """The baseline [m] by OpenCV."""
+    """Calibrate with OpenCV; give the baseline [m]."""
     left, right = (
         [v.corners_px.astype(np.float32) for v in views if v.camera == camera] for camera in ("fixed", "zoom")
     )
@@ -98,7 +98,7 @@ def _opencv(views: Sequence[View], flags: int) -> float:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Median seconds, the ratio to the joint fit's, and the baseline's rms error."""
+    """Give median seconds, the ratio to the joint fit's, and the baseline's rms error."""
     joint = np.median([row["seconds"] for row in rows if row["way"] == JOINT])
     found = {}
     for way in (JOINT, HELD, FREE):
@@ -110,7 +110,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def describe(settings: SpeedSettings, summary: Mapping[str, Any]) -> str:
-    """The table."""
+    """Format the figures as a table."""
     return f"{2 * settings.pairs} views of two cameras, median of {seeds_of(settings)}\n" + table(
         ("way", "seconds", "joint / this", "baseline off, rms [mm]"),
         ([way, *found.values()] for way, found in summary.items()),

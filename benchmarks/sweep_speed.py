@@ -1,8 +1,8 @@
-"""What a second process is worth to a sweep, and whether it changes anything.
+"""Speed of a sweep with two processes against one, and equality of their rows.
 
-The same seeds of two experiments, one that fits and one that renders, are done by one process and by two, in turns
-because a machine's pace drifts, each process held to one thread. The time is that of the whole sweep, the start of its
-processes included. Rows must be the same, number by number: how many jobs have others is counted.
+The same seeds of two experiments, one that fits and one that renders, are run by one process and by two, in turns
+because a machine's speed drifts, each process with one thread. The time is that of the whole sweep with the start of
+its processes. Rows must be equal number by number; jobs with different rows are counted.
 
     python -m benchmarks.sweep_speed [--seeds 1: times] [--quick] [--out DIR]
 """
@@ -27,12 +27,12 @@ from experiments.engine.workers import in_processes
 from experiments.following.field_scenes import hold_config
 
 PROCESSES = (1, 2)
-WANTED = 1.8  # times as fast with two processes
+WANTED = 1.8  # goal: speed of two processes over one
 
 
 @dataclass(frozen=True)
 class SweepSpeedSettings(Settings):
-    """Times as seeds; how many jobs each sweep has, and how long one of those that render looks [s]."""
+    """Settings: repetitions as seeds, jobs per sweep, and length of a rendered job's run [s]."""
 
     seeds: int = 1
     jobs: int = 12
@@ -40,13 +40,13 @@ class SweepSpeedSettings(Settings):
 
 
 def fitted(settings: SweepSpeedSettings, number: int) -> list[Row]:
-    """A job that fits: the chain's quick run."""
+    """Run a job that fits: the chain's quick run."""
     del settings
     return chain.one(None, chain.EXPERIMENT.quick, number)
 
 
 def rendered(settings: SweepSpeedSettings, number: int) -> list[Row]:
-    """A job that renders: both cameras of the field look for a person; what is found in each frame."""
+    """Run a job that renders: both cameras of the field search a person; give the detections of each frame."""
     config = hold_config("person", number)
     detector, rows = make_detector(config.target("person"), config.rate_hz), []
     with SimWorld(config).rig as rig:
@@ -63,7 +63,7 @@ SWEEPS = {"fitted": fitted, "rendered": rendered}
 
 
 def one(_: None, settings: SweepSpeedSettings, seed: int) -> list[Row]:
-    """Do each sweep with each number of processes; one row each."""
+    """Run each sweep with each number of processes; give a row per run."""
     rows: list[Row] = []
     numbers = range(seed * settings.jobs, (seed + 1) * settings.jobs)
     for sweep, job in SWEEPS.items():
@@ -80,7 +80,7 @@ def one(_: None, settings: SweepSpeedSettings, seed: int) -> list[Row]:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """Of each sweep the median seconds, how many times as fast two processes are, and how many jobs' rows differed."""
+    """Give each sweep's median seconds, the speed of two processes over one, and the number of jobs with other rows."""
     found: dict[str, Any] = {}
     for sweep in dict.fromkeys(row["sweep"] for row in rows):
         mine = [row for row in rows if row["sweep"] == sweep]
@@ -94,13 +94,13 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     slow = [f"{sweep}: {found['faster']:.2f} times" for sweep, found in summary.items() if found["faster"] < WANTED]
     return slow + [f"{sweep}: rows differ" for sweep, found in summary.items() if found["rows_that_differ"]]
 
 
 def describe(settings: SweepSpeedSettings, summary: Mapping[str, Any]) -> str:
-    """A line for each sweep."""
+    """Format a line per sweep."""
     lines = [
         [sweep, found["1_s"], found["2_s"], found["faster"], f">= {WANTED:g}", found["rows_that_differ"]]
         for sweep, found in summary.items()

@@ -1,1 +1,1 @@
-"""Experiments: one file a table or figure, each a script whose numbers the project states."""
+"""Experiments: one module for each table or figure that the project reports."""

@@ -1,12 +1,12 @@
-"""`python -m experiments`: see `experiments.engine.command`."""
+"""Run experiments with `python -m experiments`; see `experiments.engine.command`."""
 
 import sys
 
-INTERRUPTED = 130  # exit status of Ctrl-C; `experiments.engine.harness` has it too, but takes a second to load
+INTERRUPTED = 130  # exit status of Ctrl-C; a copy, because `experiments.engine.harness` takes a second to load
 
 
 def main() -> int:
-    """The command; Ctrl-C is told in one line while its modules are loaded too, which takes a second or two."""
+    """Run the command; Ctrl-C while its modules load, which takes a second or two, ends in one line too."""
     try:
         from experiments.engine.command import main as run
     except KeyboardInterrupt:

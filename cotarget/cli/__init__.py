@@ -1,4 +1,4 @@
-"""The commands: `cotarget COMMAND`."""
+"""Command-line interface: `cotarget COMMAND`."""
 
 from cotarget.cli.main import main
 

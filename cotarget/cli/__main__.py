@@ -1,4 +1,4 @@
-"""`python -m cotarget.cli COMMAND`."""
+"""Run the commands with `python -m cotarget.cli COMMAND`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The commands that make, judge and prepare calibrations: calibrate, report, board."""
+"""Commands for calibration: calibrate, report, board."""
 
 import argparse
 import contextlib
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from cotarget.calibration import Calibration
 
 
-LARGEST_SQUARE = 2.0  # [m]; more is surely meant in millimetres
+LARGEST_SQUARE = 2.0  # largest plausible square [m]; a larger value is in millimetres
 PHOTOS = ("fixed", "zoom", "board", "square")  # options that plain photos need
-LISTS = ("index.json", "session.json", "commands.jsonl")  # beside the images of a session
-SESSION = ("placements", "stops")  # and those of a capture session
+LISTS = ("index.json", "session.json", "commands.jsonl")  # files beside the images of a session
+SESSION = ("placements", "stops")  # options of a capture session
 
 
 def calibrate(options: argparse.Namespace) -> None:
-    """Cotarget calibrate."""
+    """Run `cotarget calibrate`: calibrate from a capture session, saved captures or photos, and print a summary."""
     from cotarget import calibration as cal
     from cotarget.backends import open_rig
     from cotarget.calibration.calibrate import calibrate as calibrate_rig
@@ -82,18 +82,18 @@ def calibrate(options: argparse.Namespace) -> None:
 
 
 def _lists(directory: Path | None) -> list[Path]:
-    """Where a folder of captures says what is in it."""
+    """Give the files that describe a folder of captures."""
     return [] if directory is None else [directory / name for name in LISTS]
 
 
 def _photos(options: argparse.Namespace) -> list[Path]:
-    """What is read of a folder of captures or photos; whatever else lies beside them may be a result."""
+    """List the files that are read from a folder of captures or photos; other files there may be outputs."""
     from cotarget.calibration.captures import matching, read_index
     from cotarget.errors import CalibrationError
 
     directory, globs = options.source, [glob for glob in (options.fixed, options.zoom) if glob is not None]
     found = _lists(directory)
-    with contextlib.suppress(CalibrationError):  # what cannot be read is told when it is to be
+    with contextlib.suppress(CalibrationError):  # an unreadable file is reported when it is read
         for glob in globs:
             found += matching(directory, glob)
         if not globs:
@@ -103,14 +103,14 @@ def _photos(options: argparse.Namespace) -> list[Path]:
 
 @contextlib.contextmanager
 def _captures_kept(directory: Path | None) -> Iterator[None]:
-    """Say, when a session fails or is interrupted, that what it has taken so far can be used."""
+    """Print, if a session fails or is interrupted, that its captures can be used."""
     index = None if directory is None else directory / "index.json"
-    others = index is not None and index.exists()  # of an earlier session, which this one does not touch
+    others = index is not None and index.exists()  # from an earlier session, which this one does not change
     try:
         yield
     except BaseException:
         if index is not None and index.exists() and not others:
-            with contextlib.suppress(OSError):  # a terminal that has gone hides no error
+            with contextlib.suppress(OSError):  # a closed terminal must not hide the error
                 print(
                     f"the captures so far are in {directory}: cotarget calibrate --from {directory} fits them",
                     file=sys.stderr,
@@ -119,7 +119,10 @@ def _captures_kept(directory: Path | None) -> Iterator[None]:
 
 
 def _enough_stops(wanted: int, focal_range_px: tuple[float, float]) -> int:
-    """As many stops as are wanted, or as it takes to get from one to the next; 1 is the shortest focal length alone."""
+    """Give the number of zoom samples: as requested, or as many as matching a board across them needs.
+
+    One sample means the shortest focal length alone.
+    """
     from cotarget.calibration.joint import fewest_stops
 
     needed = fewest_stops(*focal_range_px)
@@ -139,7 +142,7 @@ def _given(options: argparse.Namespace, names: Sequence[str]) -> list[str]:
 
 
 def _check_together(options: argparse.Namespace) -> None:
-    """Refuse options of calibrate that do not go together, or would have no effect."""
+    """Refuse options of calibrate that contradict each other or have no effect."""
     photos = _given(options, (*PHOTOS, "kind"))
     for name in ("encoders", "insist"):
         if getattr(options, name) and options.method == "sequential":
@@ -168,7 +171,7 @@ def _check_together(options: argparse.Namespace) -> None:
 
 
 def summary(found: "Calibration", path: Path) -> dict[str, Any]:
-    """What calibrate prints: the residuals, how well it points, and the verdict."""
+    """Build the output of calibrate: residuals, pointing accuracy and verdict."""
     import numpy as np
 
     from cotarget.report.analysis import MORE_PLACEMENTS, can_point, pointing, with_more_placements
@@ -194,7 +197,7 @@ def summary(found: "Calibration", path: Path) -> dict[str, Any]:
 
 
 def report(options: argparse.Namespace) -> None:
-    """Cotarget report."""
+    """Run `cotarget report`: write the report page of a calibration."""
     from cotarget.calibration import load_calibration
     from cotarget.report.page import write_report
 
@@ -206,7 +209,7 @@ def report(options: argparse.Namespace) -> None:
 
 
 def board(options: argparse.Namespace) -> None:
-    """Cotarget board."""
+    """Run `cotarget board`: write a board to print."""
     from cotarget.board import print_board
     from cotarget.config import BoardConfig
 

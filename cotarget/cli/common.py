@@ -1,8 +1,7 @@
-"""What the commands share: arguments and outputs that are checked before the work, progress, and results in JSON.
+"""Parts that the commands share: argument types, checks of outputs, progress, JSON output.
 
-Which of several targets a command follows: by a policy, by a click into the wide view, or by a track's number.
-
-Why the loop did what it did: how often each reason was, and which of them a user should hear of.
+`Choice` turns the options --policy, --click and --track into a rule of target selection. `Reasons` counts the reasons
+in a run's steps and picks those that a user must see.
 """
 
 import argparse
@@ -30,12 +29,12 @@ if TYPE_CHECKING:
     from cotarget.pipeline import Step
 
 
-# Those of `cotarget.control.selection`, which --help does not import; the paper's first.
+# Names of `cotarget.control.selection`, which --help does not import; the paper's first.
 POLICIES = ("first-come", "nearest-deadline", "most-served")
 
 
 def add_choice(parser: argparse.ArgumentParser, default: str = POLICIES[0]) -> None:
-    """Give a command its options for whom to follow, and say what it does without."""
+    """Add the options that select the target to follow; ``default`` is named in the help."""
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
         "--policy",
@@ -56,15 +55,15 @@ def add_choice(parser: argparse.ArgumentParser, default: str = POLICIES[0]) -> N
 
 
 def check_shown(config: "RigConfig", name: str, rig: Path) -> None:
-    """Refuse to follow what a simulated scene does not show.
+    """Refuse to follow a target that the simulated scene does not contain.
 
     Args:
-        config: of the rig.
-        name: of the target, one of the configuration's.
-        rig: the configuration's file.
+        config: the rig's configuration.
+        name: name of the target, one of the configuration's.
+        rig: file of the configuration.
 
     Raises:
-        ConfigError: it is not there, with what would be right.
+        ConfigError: the scene lacks the target; the message says how to add it.
     """
     from cotarget.config import TARGETS, known_targets, split_name
 
@@ -81,11 +80,11 @@ def check_shown(config: "RigConfig", name: str, rig: Path) -> None:
 
 
 class Choice:
-    """Whom the options ask for, and whether it was ever there.
+    """Selection of the target by the options, and whether a matching track ever appeared.
 
     Attributes:
-        target_choice: in words that a recording keeps.
-        policy: makes what decides.
+        target_choice: the selection as a recording stores it.
+        policy: makes the rule that selects the target.
     """
 
     def __init__(
@@ -94,12 +93,12 @@ class Choice:
         """Read the options.
 
         Args:
-            options: with those of `add_choice`.
-            size: (width, height) of the wide view [px].
-            recorded: whom a recorded run followed, for where no option says anything else.
+            options: parsed arguments with the options of `add_choice`.
+            size: (width, height) of the fixed camera's image [px].
+            recorded: selection of a recorded run, used where no option is given.
 
         Raises:
-            ConfigError: the click is not in the wide view, or a recording's policy is unknown.
+            ConfigError: the click is outside the fixed camera's image, or a recording's policy is unknown.
         """
         from cotarget.control.selection import POLICIES as MAKERS
         from cotarget.control.selection import Chosen
@@ -129,20 +128,23 @@ class Choice:
             )
 
     def see(self, step: "Step") -> None:
-        """Take note of a Step."""
+        """Record a step's confirmed tracks and whether a target was followed."""
         self._followed = self._followed or step.target is not None
         self._seen |= {track.id for track in step.tracks if track.confirmed}
 
     @property
     def unmet(self) -> str:
-        """Says that a click or a number meant none of the tracks; empty where it did, and where there was no track."""
+        """Message that no track matched the click or number; empty where one did, and where there were no tracks."""
         if self._followed or not self._wish or not self._seen:
             return ""
         return f"{self._wish}; the tracks were: {choices(map(str, self._seen))}"
 
 
 def _choice_of(options: argparse.Namespace, recorded: "TargetChoice | None") -> "TargetChoice":
-    """What the options say; else what was recorded; else the first policy, by its name, in case that changes."""
+    """Give the selection by the options, else the recorded one, else the default policy by its name.
+
+    The name is recorded, so that a replay does not depend on a later default.
+    """
     from cotarget.control.selection import ANY_TARGET, TargetChoice
 
     if options.click is not None:
@@ -152,13 +154,13 @@ def _choice_of(options: argparse.Namespace, recorded: "TargetChoice | None") -> 
     return TargetChoice(POLICIES[0]) if recorded in (None, ANY_TARGET) else recorded
 
 
-# --- reasons ---
+# Reasons of the steps, counted over a run
 
 NUMBER = re.compile(r"-?\d+(\.\d+)?(e-?\d+)?")
-ANY = "#"  # stands for a number
-EITHER = re.compile(rf"(\w[^;]*{ANY}) or \1")  # one solution or two make one reason
-# How the reasons begin that every good run has for a moment: a lens that waits, a target that is hidden or not yet
-# there. Only where they are for most of the frames after the first sighting is something wrong.
+ANY = "#"  # in place of a number
+EITHER = re.compile(rf"(\w[^;]*{ANY}) or \1")  # one and two solutions count as one reason
+# Prefixes of reasons that every good run has for a moment: the lens waits, or the target is hidden or not yet there.
+# Only where one holds in most frames after the first sighting is something wrong.
 USUAL = (
     "zoom: ",
     "nothing is detected",
@@ -166,11 +168,11 @@ USUAL = (
     "out of sight",
     "looked for",
     "the head waits: where it is by now",
-    "no track ",  # told by the option that asks for it
+    "no track ",  # reported by `Choice.unmet`
     "track ",
 )
-MOST, MANY = 0.5, 25  # share of those frames, and the fewest frames, from which these are told
-SOME, FEW = 0.05, 5  # and of all frames, from which every other reason is
+MOST, MANY = 0.5, 25  # share of those frames, and least count, from which a usual reason is reported
+SOME, FEW = 0.05, 5  # share of all frames, and least count, for any other reason
 IN_WORDS = {
     "zoom: unsure": "zoom: unsure, so the lens stays wider than wanted: where the target is, is not known well enough, "
     "or the head is too slow for it"
@@ -178,16 +180,16 @@ IN_WORDS = {
 
 
 class Reasons:
-    """Counts the reasons of a run's Steps, whose numbers do not matter: 0.5 s and 0.6 s are one reason."""
+    """Counts of the reasons in a run's steps, with numbers ignored: 0.5 s and 0.6 s are one reason."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
-        self._later: Counter[str] = Counter()  # those after the first sighting
+        self._later: Counter[str] = Counter()  # counts after the first sighting
         self._latest: dict[str, str] = {}
         self._steps = self._later_steps = 0
 
     def see(self, step: "Step") -> None:
-        """Count a Step's reasons."""
+        """Count the reasons of a step."""
         parts = {folded(part): part for part in step.reason.split("; ") if part}
         self._steps += 1
         self._counts.update(parts.keys())
@@ -198,40 +200,40 @@ class Reasons:
 
     @property
     def table(self) -> dict[str, int]:
-        """In how many frames each reason was, the most frequent first."""
+        """Number of frames with each reason, the most frequent first."""
         return dict(self._counts.most_common())
 
     @property
     def warning(self) -> str:
-        """What went wrong for how many frames, the most frequent first, with the latest numbers; empty if nothing."""
+        """One line with the reasons that held in too many frames, the most frequent first; empty if there are none."""
         wrong = [(count, name) for name, count in self._counts.most_common() if self._is_wrong(name, count)]
         told = [f"{count} of {self._steps} frames: {IN_WORDS.get(name, self._latest[name])}" for count, name in wrong]
-        return " ".join("; ".join(told).split())  # one line, whatever a device says
+        return " ".join("; ".join(told).split())  # a device's message may have several lines
 
     def _is_wrong(self, name: str, count: int) -> bool:
-        """Whether a reason was there for too many frames."""
+        """Check whether a reason held in too many frames."""
         if name.startswith(USUAL):
             return self._later[name] >= max(MANY, MOST * self._later_steps)
         return count >= max(FEW, SOME * self._steps)
 
 
 def folded(reason: str) -> str:
-    """A reason with its numbers taken out."""
+    """Replace the numbers in a reason by a placeholder."""
     return EITHER.sub(r"\1", NUMBER.sub(ANY, reason))
 
 
-REMARK_S = 30.0  # between lines of progress where stderr is no terminal [s]
+REMARK_S = 30.0  # between lines of progress where stderr is not a terminal [s]
 
 
 @contextmanager
 def progress_bar(now: Callable[[], float] = time.monotonic) -> Iterator[Any]:
-    """A progress bar on stderr, or a line now and then where that is no terminal.
+    """Show progress on stderr: a bar on a terminal, otherwise an occasional line.
 
     Args:
-        now: tells the time [s].
+        now: gives the time [s].
 
     Yields:
-        What is to be called with (what, done, of how much).
+        A function of (text, done, total) that updates the progress.
     """
     if not sys.stderr.isatty():
         yield _remarks(now)
@@ -248,7 +250,7 @@ def progress_bar(now: Callable[[], float] = time.monotonic) -> Iterator[Any]:
 
 
 def _remarks(now: Callable[[], float]) -> Callable[[str, int, int], None]:
-    """Progress for a file: a line at most every half a minute, so that short work says nothing."""
+    """Print progress as lines, at most one every half a minute, so that short work prints nothing."""
     begin = last = now()
 
     def remark(text: str, done: int, total: int) -> None:
@@ -256,19 +258,19 @@ def _remarks(now: Callable[[], float]) -> Callable[[str, int, int], None]:
         if (t := now()) - last < REMARK_S:
             return
         last = t
-        with contextlib.suppress(OSError):  # whoever read along may have gone; the work goes on
+        with contextlib.suppress(OSError):  # the reader of stderr may be closed; the work goes on
             print(f"{text} ({100 * done / max(total, 1):.0f} %, {t - begin:.0f} s)", file=sys.stderr, flush=True)
 
     return remark
 
 
 def print_json(table: Any) -> None:
-    """Print a result on stdout."""
+    """Print a result as JSON on stdout."""
     print(json.dumps(_positive_zeros(table), indent=2))
 
 
 def _positive_zeros(value: Any) -> Any:
-    """The same values, but for zeros, which have no sign to people."""
+    """Replace negative zeros by zeros, in nested values too."""
     if isinstance(value, dict):
         return {key: _positive_zeros(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -278,20 +280,20 @@ def _positive_zeros(value: Any) -> Any:
 
 @contextmanager
 def nothing() -> Iterator[None]:
-    """Stands where another command would have something to close."""
+    """Context manager without effect, in place of an output that was not requested."""
     yield None
 
 
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None], folder: Path | None = None) -> None:
-    """Refuse a result that cannot be written, or that would destroy an input, before the long work and not after it.
+    """Refuse outputs that cannot be written or would destroy an input, before the long work starts.
 
     Args:
         outputs: files to write.
-        inputs: files that are read, and folders of which nothing may be changed.
-        folder: a new one to write, in which no output may be.
+        inputs: files that are read, and folders whose contents must not change.
+        folder: new folder to write, which may not contain any output.
 
     Raises:
-        ConfigError: for the first one, in one line.
+        ConfigError: an output is refused; the message names the first one.
     """
     taken = {_real(path) for path in inputs if path is not None}
     if folder is not None:
@@ -315,7 +317,7 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None],
 
 
 def rig_files(rig: Path | None, config: "RigConfig") -> list[Path | None]:
-    """Files and folders that a rig is opened with, none of which may be a result too: rig.toml, and what it names."""
+    """List the files and folders that opening a rig reads: rig.toml and those that it names. None may be an output."""
     scene = Path(config.sim.scene)
     templates = [target.template for target in config.targets.values()]
     own = scene if scene.is_file() else None
@@ -323,12 +325,12 @@ def rig_files(rig: Path | None, config: "RigConfig") -> list[Path | None]:
 
 
 def check_board_is_told(rig: Path, config: "RigConfig") -> None:
-    """Refuse real cameras before a board of which the file does not say how large its squares are.
+    """Refuse a real rig whose configuration does not give the size of the board's squares.
 
-    All lengths of a calibration are multiples of that, so that nothing else would ever show that it is wrong.
+    All lengths of a calibration are multiples of that size, so that no later check can find it wrong.
 
     Raises:
-        ConfigError: it does not.
+        ConfigError: the size is missing.
     """
     from cotarget.config import read_tables
 
@@ -345,7 +347,7 @@ def _real(path: Path) -> Path:
 
 
 def _refuse_taken(path: Path, taken: Iterable[Path]) -> None:
-    """Refuse what is one of these files, or in one of these folders."""
+    """Refuse a path that is one of these files, or is inside one of these folders."""
     for each in taken:
         if _real(path) == each:
             raise ConfigError(f"{path}: is read or written for something else too; give another name for the result")
@@ -354,7 +356,7 @@ def _refuse_taken(path: Path, taken: Iterable[Path]) -> None:
 
 
 def _is_said_to(path: Path) -> bool:
-    """Whether a file is where stdout or stderr goes."""
+    """Check whether a file is the destination of stdout or stderr."""
     with contextlib.suppress(OSError):
         file = path.stat()
         return any(os.path.samestat(file, os.fstat(stream)) for stream in (1, 2))
@@ -363,12 +365,12 @@ def _is_said_to(path: Path) -> bool:
 
 @contextmanager
 def previous_kept(path: Path) -> Iterator[None]:
-    """Keep what an earlier run wrote under a name that says so, while the block writes another; and say where it is.
+    """Keep an earlier output under another name while the block writes a new one; print that name.
 
-    Both are whole at every moment. Where the block fails, everything is as it was before.
+    Both files are complete at every moment. If the block fails, the earlier file stays and the other name is removed.
 
     Raises:
-        CalibrationError: the earlier one cannot be kept.
+        CalibrationError: the earlier file cannot be kept.
     """
     kept = _second_name(behind_link(path))
     try:
@@ -382,7 +384,7 @@ def previous_kept(path: Path) -> Iterator[None]:
 
 
 def _second_name(path: Path) -> Path | None:
-    """Give a file another name beside its own; None where there is no such file."""
+    """Link a file to another name beside its own; None where there is no such file."""
     from cotarget.files import write_atomically
 
     if not path.exists():
@@ -391,20 +393,20 @@ def _second_name(path: Path) -> Path | None:
     kept = next(name for name in numbered if not os.path.lexists(name))
     try:
         os.link(path, kept)
-    except OSError:  # not every file system has second names
+    except OSError:  # not every file system has hard links
         write_atomically(kept, path.read_bytes())
     return kept
 
 
 def check_within(option: str, value: float, bounds: tuple[float, float], of: str, slack: float = 0.0) -> None:
-    """Refuse a value beyond what a device can do, but for some slack, in the same words for every option.
+    """Refuse a value outside a device's limits.
 
     Args:
-        option: as it is typed.
-        value: as it was typed.
-        bounds: lowest and highest, in the option's unit.
-        of: what the bounds are of, and their unit, with `{}` where they stand.
-        slack: by which a value may be beyond, as bounds are printed rounded.
+        option: name of the option, for the message.
+        value: value of the option.
+        bounds: lowest and highest value, in the option's unit.
+        of: description and unit of the bounds for the message, with `{}` in their place.
+        slack: tolerance, because bounds are printed rounded.
     """
     low, high = bounds
     if not low - slack <= value <= high + slack:
@@ -412,7 +414,7 @@ def check_within(option: str, value: float, bounds: tuple[float, float], of: str
 
 
 def number(text: str) -> float:
-    """Read an argument that is a finite number."""
+    """Parse a finite number."""
     try:
         value = float(text)
     except ValueError:
@@ -423,7 +425,7 @@ def number(text: str) -> float:
 
 
 def positive(text: str) -> float:
-    """Read an argument greater than zero."""
+    """Parse a finite number greater than zero."""
     value = number(text)
     if value <= 0:
         raise argparse.ArgumentTypeError(f"{text} is not greater than zero")
@@ -431,28 +433,28 @@ def positive(text: str) -> float:
 
 
 def not_negative(text: str) -> int:
-    """Read a whole number from 0."""
+    """Parse a whole number of at least 0."""
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 0")
     return int(text)
 
 
 def count(text: str) -> int:
-    """Read a whole number from 1."""
+    """Parse a whole number of at least 1."""
     if not (text.isdecimal() and int(text) > 0):
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number from 1")
     return int(text)
 
 
 def port(text: str) -> int:
-    """Read a TCP port; 0 is any."""
+    """Parse a TCP port; 0 stands for any free one."""
     if not (text.isdecimal() and int(text) < 65536):
         raise argparse.ArgumentTypeError(f"'{text}' is not a port, 0 to 65535")
     return int(text)
 
 
 def corners(text: str) -> tuple[int, int]:
-    """Read a board's inner corners, such as 9x6."""
+    """Parse a board's inner corners, such as 9x6."""
     columns, _, rows = text.partition("x")
     if not (columns.isdecimal() and rows.isdecimal() and int(columns) >= 3 and int(rows) >= 3):
         raise argparse.ArgumentTypeError(f"'{text}' is not like 9x6 (inner corners: columns x rows, 3 at least)")

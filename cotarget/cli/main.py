@@ -1,6 +1,7 @@
-"""The commands. Machine-readable output goes to stdout or the named file; a mistake ends in one line on stderr.
+"""Command-line parser and entry point of all commands.
 
-Parsers of the command line whose mistakes end in one line.
+Machine-readable output goes to stdout or to the named file. An error ends in one line on stderr and a non-zero exit
+status.
 """
 
 import argparse
@@ -23,54 +24,54 @@ USAGE = 2  # argparse's own exit status
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose mistakes, too, end in one line.
+    """Argument parser whose errors end in one line.
 
     Attributes:
-        more: what --help says last, found only then.
+        more: gives the last paragraph of --help; called only when help is printed.
     """
 
     more: Callable[[], str] | None = None
 
     def format_help(self) -> str:
-        """Say what there is to say."""
+        """Format the help, with the paragraph from ``more`` at its end."""
         if self.more is not None:
             self.epilog = self.more()
         return super().format_help()
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong, without the usage in front of it."""
+        """Exit with one line on stderr, without the usage."""
         self.exit(USAGE, f"{self.prog}: {message}; see {self.prog} --help\n")
 
 
 class CommandParser(Parser):
-    """A command's own, which complains itself of what it does not know, where its --help tells what it does."""
+    """Parser of one command, which rejects unknown options itself, so that the error names that command's --help."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As argparse has it; but all must be known."""
+        """Parse the arguments as argparse does, and reject unknown ones."""
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return found, unknown
 
 
-# Heavy modules (MuJoCo, OpenCV, matplotlib) are imported by the command that needs them, so that --help and
-# mistakes in the arguments answer at once, and `doctor` runs where one of them is broken.
+# Each command imports the heavy modules (MuJoCo, OpenCV, matplotlib) that it needs, so that --help and wrong arguments
+# answer at once, and `doctor` runs where one of them is broken.
 INTERRUPTED = 130  # a shell's exit status for Ctrl-C
-TERMINATED = 143  # for SIGTERM,
-HUNG_UP = 129  # and for SIGHUP: a terminal that was closed, a connection that broke
-KINDS = ("chessboard", "charuco")  # of boards
+TERMINATED = 143  # for SIGTERM
+HUNG_UP = 129  # for SIGHUP, from a closed terminal or a broken connection
+KINDS = ("chessboard", "charuco")  # kinds of calibration board
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit status."""
     parser = _parser()
     options = parser.parse_args(arguments)
-    # A polite end is an end: the rig halts and files are completed, as on Ctrl-C.
+    # SIGTERM and SIGHUP raise SystemExit, so that the rig halts and files are completed, as on Ctrl-C.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
-    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # and not where nohup has it ignored
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # nohup ignores SIGHUP; keep that
         signal.signal(signal.SIGHUP, lambda *_: sys.exit(HUNG_UP))
     logging.basicConfig(level=logging.INFO if options.verbose else logging.WARNING, format="%(message)s")
-    logging.getLogger("httpx").setLevel(logging.WARNING)  # which tells of every request
+    logging.getLogger("httpx").setLevel(logging.WARNING)  # httpx logs every request at INFO
     try:
         status = int(options.run(options) or 0)
         sys.stdout.flush()
@@ -80,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except BrokenPipeError:
         return 1
-    except OSError as error:  # a full disk, a folder without permission: whatever the commands' own checks missed
+    except OSError as error:  # not caught by the commands' own checks, such as a full disk
         where = "" if error.filename is None else f"{error.filename}: "
         _say(options.command, f"{where}{error.strerror or error}", error)
         return 1
@@ -94,8 +95,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _say(command: str, text: str, end: BaseException) -> None:
-    """Say in one line how a command ended, and which of its files are what there was until then."""
-    with contextlib.suppress(OSError):  # a terminal that has gone
+    """Print in one line how a command ended, with the notes on which files are unchanged."""
+    with contextlib.suppress(OSError):  # the terminal may be closed
         print("; ".join([f"cotarget {command}: {text}", *_notes(end)]), file=sys.stderr)
 
 

@@ -1,9 +1,4 @@
-"""What an operator does with a rig: point it, measure its latencies, stop it and clear the stop, reset the head.
-
-The command that tells where to point for one pixel of the fixed camera: aim.
-
-The command that puts a simulated rig behind the devices' protocols.
-"""
+"""Commands that operate a rig: aim, point, latency, stop, clear, reset-head; and emulate."""
 
 import argparse
 import math
@@ -24,11 +19,11 @@ if TYPE_CHECKING:
     from cotarget.config import TargetConfig
 
 
-SMALL_PX = 10.0  # sizes below are told with two digits, others in whole pixels
+SMALL_PX = 10.0  # smaller sizes are printed with two digits, others as whole pixels
 
 
 def aim(options: argparse.Namespace) -> None:
-    """Cotarget aim."""
+    """Run `cotarget aim`: print pan, tilt and focal length for one pixel of the fixed camera."""
     import numpy as np
 
     from cotarget.calibration import load_calibration
@@ -58,7 +53,7 @@ def aim(options: argparse.Namespace) -> None:
             )
     pitch_mm = calibration.pitch_mm or config.pitch_mm
     shortest, longest = config.focal_range_px
-    if options.rig is None:  # the calibration knows its own lens's shortest focal length
+    if options.rig is None:  # without a rig.toml, the calibration gives the shortest focal length
         shortest = calibration.zoom.nominal_px[0]
     reach = Reach(*config.head_limits, (shortest, max(shortest, longest)), step=config.head_step)
     closeup = (
@@ -79,7 +74,7 @@ def aim(options: argparse.Namespace) -> None:
     found = aim_at(
         calibration, point_at(calibration, pixel, depth), reach, closeup=closeup, nominal_px=nominal, method=options.ik
     )
-    # The budget speaks of the exact inverse; what the paper's shortcut loses beside it, nothing here knows.
+    # The error budget holds for the exact inverse; the shortcut's additional error is not modelled.
     budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px) if options.ik == "exact" else None
     calibrated = calibration.zoom.nominal_px
     within = calibrated[0] * (1 - SAME_FOCAL) <= found.nominal_px <= calibrated[-1] * (1 + SAME_FOCAL)
@@ -124,39 +119,42 @@ def aim(options: argparse.Namespace) -> None:
 
 
 def _fits_from(calibration: "Calibration", targets: Mapping[str, "TargetConfig"]) -> Iterator[tuple[float, str]]:
-    """From which depth on each target fits into the fixed view [m], and its name; a nearer one is hardly meant."""
+    """Give each target's least depth [m] at which it fits into the fixed view, and its name.
+
+    A depth below that is implausible.
+    """
     for name, target in targets.items():
         axis = 1 if target.dimension == "height" else 0
         yield calibration.fixed.focal_px[axis] * target.size / calibration.fixed.size[axis], name
 
 
 def _pixels(size: float) -> str:
-    """A size in an image in words: whole pixels, but for the smallest."""
+    """Format a size in pixels: whole pixels, or two digits for the smallest."""
     return f"{size:.2g}" if size < SMALL_PX else f"{size:.0f}"
 
 
-# --- emulating ---
+# Emulation of a simulated rig behind the devices' protocols
 
-# Mesa's software renderer: one thread, which leaves the client a core. Read when OpenGL starts.
+# One thread for Mesa's software renderer leaves a core to the client. Mesa reads the variable when OpenGL starts.
 RENDER_THREADS = ("LP_NUM_THREADS", "1")
-LOOK = 0.2  # between looks at the time [s]
-# How long a thread that works in Python keeps others waiting [s]; with Python's own 5 ms, a line that is paced by a
-# thread of its own loses half of its rate beside the world's rendering.
+LOOK = 0.2  # polling interval [s]
+# Python's switch interval [s]. With the default of 5 ms, a line that is paced by its own thread loses half of its rate
+# beside the rendering.
 SWITCH_S = 5e-4
-WHO_IS_THERE = ("person",)  # to be followed, where no rig.toml says who
+WHO_IS_THERE = ("person",)  # targets of the scene without a rig.toml
 NOBODY = 'none; [sim] targets = ["person"] has one to follow'
-STOP_FILE = "stop"  # beside the rig.toml that is written, where the simulated rig's names none
+STOP_FILE = "stop"  # default stop file, beside the rig.toml that is written
 
 
 def fault_names() -> str:
-    """The faults that can be switched on, as --help tells them."""
+    """List the faults that can be switched on, for --help."""
     from cotarget.emulators.emulation import FAULTS
 
     return "faults: " + ", ".join(f"{device}.{name}" for device, names in FAULTS.items() for name in names)
 
 
 def emulate(options: argparse.Namespace) -> None:
-    """Cotarget emulate."""
+    """Run `cotarget emulate`: serve a simulated rig by the devices' wire protocols, and write a rig.toml for it."""
     os.environ.setdefault(*RENDER_THREADS)
     sys.setswitchinterval(SWITCH_S)
     from cotarget.config import RigConfig, SimConfig, load_config, read_tables
@@ -203,15 +201,15 @@ def emulate(options: argparse.Namespace) -> None:
 
 
 CONSENT = "yes"
-# The line of a file that is not TOML any more which still says what file stops the head.
+# Line of an invalid TOML file that still names the stop file.
 STOP_FILE_LINE = r"""^[^#\n]*\bstop_file[ \t]*=[ \t]*(["'])([^"'\n]+)\1"""
-ENOUGH_DIGITS = 4  # of a latency in seconds
-# What is found is within so much of the truth; less than zero by more is no latency [s].
+ENOUGH_DIGITS = 4  # decimals of a latency [s]
+# Accuracy of a measured latency [s]; a more negative one is refused.
 ACCURACY_S = 0.01
 
 
 def latency(options: argparse.Namespace) -> None:
-    """Cotarget latency."""
+    """Run `cotarget latency`: measure the latencies of cameras, head and lens, and print them as keys of rig.toml."""
     from cotarget.backends import open_rig
     from cotarget.calibration import load_calibration
     from cotarget.config import load_config
@@ -223,7 +221,7 @@ def latency(options: argparse.Namespace) -> None:
     if config.backend == "replay":
         raise ConfigError(f"{options.rig}: backend is 'replay'; a recording's latencies cannot be measured any more")
     calibration = None if options.calibration is None else load_calibration(options.calibration)
-    if calibration is not None:  # refused now, and not when the head has been wiggled
+    if calibration is not None:  # refused before the head moves
         calibration.hand_eye()
         calibration.for_streams(*config.stream_sizes)
         check_board_is_told(options.rig, config)
@@ -236,11 +234,11 @@ def latency(options: argparse.Namespace) -> None:
             f"{where}.head.command_delay_s": head.command,
         }
         agreement = {"zoom": head.zoom.agreement}
-        if config.backend == "hardware":  # a simulated lens is as late as its head
+        if config.backend == "hardware":  # a simulated lens has the head's command delay
             found["hardware.zoom.command_delay_s"] = measure_lens(rig, head.zoom.seconds).command
         if calibration is not None:
             fixed, _ = measure_fixed(rig, calibration, config.board)
-            # Against the zoom camera, whose own frames are dated too late by what was just found.
+            # Relative to the zoom camera, whose frame times contain the error found above.
             found[f"{where}.fixed.latency_s"] = tables.fixed.latency_s + fixed.seconds + head.zoom.seconds
             agreement["fixed"] = fixed.agreement
     if calibration is None:
@@ -250,10 +248,10 @@ def latency(options: argparse.Namespace) -> None:
 
 
 def _plausible(name: str, seconds: float) -> float:
-    """A latency as it is written into rig.toml.
+    """Round a latency as it is written into rig.toml.
 
     Raises:
-        CalibrationError: nothing comes before its cause.
+        CalibrationError: the latency is negative beyond the measurement's accuracy.
     """
     if seconds < -ACCURACY_S:
         raise CalibrationError(
@@ -264,7 +262,7 @@ def _plausible(name: str, seconds: float) -> float:
 
 
 def point(options: argparse.Namespace) -> None:
-    """Cotarget point."""
+    """Run `cotarget point`: move head and lens, and write a picture of each camera on request."""
     from cotarget.backends import open_rig
     from cotarget.calibration.captures import write_image
     from cotarget.calibration.session import wait_for_lens
@@ -313,7 +311,7 @@ def point(options: argparse.Namespace) -> None:
 
 
 def stop(options: argparse.Namespace) -> None:
-    """Cotarget stop."""
+    """Run `cotarget stop`: write the stop file."""
     from cotarget.safety import write_stop_file
 
     path = _stop_file(options.rig)
@@ -322,7 +320,7 @@ def stop(options: argparse.Namespace) -> None:
 
 
 def clear(options: argparse.Namespace) -> None:
-    """Cotarget clear."""
+    """Run `cotarget clear`: remove the stop file."""
     from cotarget.safety import clear_stop_file
 
     path = _stop_file(options.rig)
@@ -331,7 +329,7 @@ def clear(options: argparse.Namespace) -> None:
 
 
 def reset_head(options: argparse.Namespace) -> None:
-    """Cotarget reset-head."""
+    """Run `cotarget reset-head`: reset the pan-tilt unit after consent."""
     from cotarget.config import load_config
     from cotarget.drivers.clock import MonotonicClock
     from cotarget.drivers.interlock import PositionLostMarker
@@ -359,18 +357,18 @@ def reset_head(options: argparse.Namespace) -> None:
 
 
 def _answer() -> str:
-    """What somebody types; nothing where nobody is there."""
+    """Read a line from stdin; empty where there is none."""
     try:
         return sys.stdin.readline() if sys.stdin is not None else ""
-    except (OSError, ValueError):  # a terminal that has gone, a file that is closed, no text
+    except (OSError, ValueError):  # closed terminal, closed file, or not text
         return ""
 
 
 def _stop_file(rig: Path) -> Path:
-    """The stop file that a rig.toml names; nothing else that is wrong with it may keep anybody from stopping.
+    """Find the stop file that a rig.toml names; no other fault of the file keeps a user from stopping the head.
 
     Raises:
-        ConfigError: it names none.
+        ConfigError: the file names no stop file.
     """
     by_hand = "the rig's stop file itself can be made and removed by hand"
     try:

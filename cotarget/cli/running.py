@@ -1,7 +1,4 @@
-"""The commands that run what was calibrated, and look around: demo, follow, replay, detect, doctor.
-
-The command that shows the simulated scene while the pipeline works in it.
-"""
+"""Commands that run the pipeline or inspect the installation: demo, follow, replay, detect, view, doctor."""
 
 import argparse
 import dataclasses
@@ -38,12 +35,12 @@ if TYPE_CHECKING:
     from cotarget.sim.world import SimWorld
 
 
-PORT = 8080  # of the page
-LOOKED_AT = ("person", "bird")  # who is there, where nobody says who
+PORT = 8080  # port of the page
+LOOKED_AT = ("person", "bird")  # targets of the scene without --rig and --target
 
 
 def view(options: argparse.Namespace) -> None:
-    """Cotarget view."""
+    """Run `cotarget view`: show the simulated scene, with the pipeline at work where a target is named."""
     from cotarget.calibration import load_calibration
     from cotarget.sim.world import SimWorld
 
@@ -53,7 +50,7 @@ def view(options: argparse.Namespace) -> None:
         raise ConfigError("--calibration: is for following a target; name it: --target NAME")
     config = _config(options)
     calibration = None if options.calibration is None else load_calibration(options.calibration)
-    opened = _opener(options)  # which refuses what cannot be before the world is made, as that takes a while
+    opened = _opener(options)  # called first, because making the world takes a while
     world = SimWorld(config)
     with closing(world), closing(opened(world.truth())) as window:
         print(f"{window.where} shows the scene; Ctrl-C ends it", file=sys.stderr, flush=True)
@@ -64,32 +61,32 @@ def view(options: argparse.Namespace) -> None:
 
 
 def watch(sights: "Iterator[Snapshot]", window: Any, now: Callable[[], float], sleep: Callable[[float], None]) -> None:
-    """Show what happens, no quicker than it happens, until it is over or the window is closed.
+    """Show snapshots in real time at most, until they end or the window is closed.
 
     Args:
-        sights: what there is to see.
-        window: shows it.
-        now: tells the time that people have [s].
-        sleep: lets so much of it pass [s].
+        sights: snapshots in order of time.
+        window: window that shows them.
+        now: gives the wall-clock time [s].
+        sleep: waits for a duration [s].
     """
-    ahead = math.inf  # of the rig's clock before people's
+    ahead = math.inf  # lead of the rig's clock over the wall clock
     for sight in sights:
         window.show(sight)
         if not window.is_open():
             return
-        ahead = min(ahead, sight.t - now())  # a machine that is slow does not hurry afterwards
+        ahead = min(ahead, sight.t - now())  # a slow machine does not catch up afterwards
         if (wait := sight.t - ahead - now()) > 0:
             sleep(wait)
 
 
 def _config(options: argparse.Namespace) -> "RigConfig":
-    """The rig that is viewed."""
+    """Load or make the configuration of the rig to view."""
     from cotarget.config import RigConfig, load_config
     from cotarget.demo import SCENES, sim_config
 
     if options.rig is None:
         if options.target is not None:
-            RigConfig().target(options.target)  # refused now
+            RigConfig().target(options.target)  # refuse an unknown target before the long work
         targets = LOOKED_AT if options.target is None else (options.target,)
         return sim_config(SCENES.get(targets[0].rstrip("0123456789"), "outdoor"), targets, 0)
     config = load_config(options.rig)
@@ -102,10 +99,10 @@ def _config(options: argparse.Namespace) -> "RigConfig":
 
 
 def _opener(options: argparse.Namespace) -> "Callable[[Truth], Any]":
-    """What opens the window on a world's truth.
+    """Give the function that opens a window on a world's truth.
 
     Raises:
-        DeviceError: there is no display, no web viewer, or the port is taken.
+        DeviceError: there is no display, no web viewer, or the port is in use.
     """
     if options.browser:
         from cotarget.sim.viewer.browser import BrowserWindow, listen
@@ -120,7 +117,7 @@ def _opener(options: argparse.Namespace) -> "Callable[[Truth], Any]":
 def _sights(
     options: argparse.Namespace, config: "RigConfig", world: "SimWorld", calibration: "Calibration | None"
 ) -> "Iterator[Snapshot]":
-    """What there is to see: the pipeline at work where there is a target, else the rig at rest."""
+    """Give the snapshots: of the pipeline following a target, or of the rig at rest without one."""
     from cotarget.evaluation import true_calibration
     from cotarget.safety import SafeRig
 
@@ -165,7 +162,7 @@ def _followed(
 
 
 def demo(options: argparse.Namespace) -> None:
-    """Cotarget demo."""
+    """Run `cotarget demo`: calibrate a simulated rig and follow a book, a person and a bird."""
     from cotarget.demo import run_demo, summary
 
     with progress_bar() as progress:
@@ -175,7 +172,7 @@ def demo(options: argparse.Namespace) -> None:
 
 
 def follow(options: argparse.Namespace) -> None:
-    """Cotarget follow."""
+    """Run `cotarget follow`: follow a target with the rig, and record it on request."""
     from cotarget.backends import open_devices
     from cotarget.calibration import load_calibration
     from cotarget.config import load_config
@@ -184,7 +181,7 @@ def follow(options: argparse.Namespace) -> None:
 
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
-    config.target(options.target)  # refused now
+    config.target(options.target)  # refuse an unknown target before the long work
     calibration = load_calibration(options.calibration)
     check_shown(config, options.target, options.rig)
     inputs = [*rig_files(options.rig, config), options.calibration]
@@ -205,7 +202,7 @@ def follow(options: argparse.Namespace) -> None:
 
 
 def replay(options: argparse.Namespace) -> int:
-    """Cotarget replay."""
+    """Run `cotarget replay`: run the pipeline on a recording and compare its commands; return the exit status."""
     from cotarget.calibration import load_calibration
     from cotarget.metrics import Tracked, read_labels
     from cotarget.recording.format import open_recording
@@ -251,9 +248,9 @@ def _follow(
     frames: int | None = None,
     see: "Callable[[Step], None]" = lambda _: None,
 ) -> dict[str, Any]:
-    """Follow a target, show the progress, keep what is asked for; how many steps there were, in which states and why.
+    """Follow a target with progress and outputs; return counts of steps, states and reasons.
 
-    However it ends, the head is halted first and the files are completed after that, with what there is by then.
+    However it ends, the head is halted first. The files are completed afterwards, with the steps up to then.
     """
     from cotarget.detection import make_detector
     from cotarget.drawing import side_by_side
@@ -289,7 +286,7 @@ def _follow(
 
 
 def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int], choice: Choice) -> None:
-    """Say so where there was nothing to follow all the time, and what would be right."""
+    """Print a hint where no target was detected in the whole run."""
     from cotarget.pipeline import State
 
     steps = sum(states.values())
@@ -305,7 +302,7 @@ def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int], c
 
 
 def detect(options: argparse.Namespace) -> None:
-    """Cotarget detect."""
+    """Run `cotarget detect`: run the fixed camera's detector and tracker on a video."""
     from cotarget.config import RigConfig, load_config
     from cotarget.detect_video import run_on_film
     from cotarget.metrics import read_labels, read_tracks
@@ -342,7 +339,7 @@ def _scores(
     *,
     whole: bool = True,
 ) -> dict[str, Any]:
-    """How well tracks keep to what is labelled; nothing where nobody gave labels."""
+    """Score tracks against labels; empty without labels."""
     from cotarget.metrics import score_tracks
 
     if labels is None:
@@ -358,7 +355,7 @@ def _scores(
 
 
 def doctor(options: argparse.Namespace) -> int:
-    """Cotarget doctor."""
+    """Run `cotarget doctor`: check the installation and print fixes; return the exit status."""
     from cotarget.doctor import examine
 
     config = None

@@ -1,1 +1,1 @@
-"""The simulated rig: a MuJoCo world behind the device Protocols."""
+"""MuJoCo simulation of the rig behind the device Protocols of `cotarget.rig`."""

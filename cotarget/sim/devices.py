@@ -1,4 +1,8 @@
-"""The simulated devices behind the Rig's Protocols; each knows what its real counterpart would know and no more."""
+"""Simulated devices behind the Protocols of `cotarget.rig`.
+
+Each device knows what its real counterpart knows, and no ground truth. Time is the rig's clock; a blocking call
+advances it.
+"""
 
 import math
 from collections.abc import Callable
@@ -11,47 +15,47 @@ from cotarget.geometry import RigidTransform
 from cotarget.rig import Camera, Clock, Frame, Image, PanTiltLimits, PanTiltState, Speed, ZoomState, to_step
 from cotarget.sim.motion import Axis, HeadDrive, LensDrive
 
-# Frame times are multiples of the frame period; this much of a period [1] absorbs their rounding.
+# Frame times are multiples of the frame period. This part of a period [1] absorbs their rounding.
 ROUNDING = 1e-6
-# How many images a camera keeps: a frame asked for twice is rendered once.
+# Number of images that a camera caches: a frame that is read twice is rendered once.
 KEPT_FRAMES = 2
 
 
 def _closed(*_: object) -> NoReturn:
-    """What the devices of a closed rig ask instead of its world, which they would keep alive."""
+    """Refuse access to the world of a closed rig; devices hold this in place of the world, so that it can be freed."""
     raise DeviceError("the simulated rig is closed; open it again")
 
 
 class SimClock:
-    """Simulated time, which only moves when somebody waits."""
+    """Simulated time that only a blocking call advances."""
 
     def __init__(self) -> None:
         self._now = 0.0
 
     def now(self) -> float:
-        """Seconds since the world began."""
+        """Give the seconds since the world began."""
         return self._now
 
     def sleep_until(self, t: float) -> None:
-        """Let the time pass; at once in real time."""
+        """Advance the time to t [s] without waiting in real time."""
         self._now = max(self._now, t)
 
 
 class SimStream:
-    """A camera that exposes at a fixed rate and delivers late.
+    """Camera with a constant frame rate and a latency.
 
     Args:
-        camera: its configuration.
-        effects: switches.
+        camera: the camera's configuration.
+        effects: switches of the simulated effects.
         clock: the rig's clock.
-        expose: gives the image of frame number k, exposed at time t.
+        expose: gives the image of frame number k, exposed at time t [s].
     """
 
     def __init__(
         self, camera: SimCamera, effects: SimEffects, clock: Clock, expose: Callable[[int, float], Image]
     ) -> None:
         self._camera, self._clock, self._expose = camera, clock, expose
-        # Light falls until half an exposure after a frame's time; no link is faster than that.
+        # An exposure ends half its length after the frame's time, so that no frame arrives earlier.
         half = camera.exposure_s / 2 if effects.blur else 0.0
         self._latency = max(camera.latency_s if effects.latency else 0.0, half)
         self._kept: dict[int, Frame] = {}
@@ -62,11 +66,11 @@ class SimStream:
         return self._camera.size
 
     def leave(self) -> None:
-        """Expose nothing from now on, and let go of the world."""
+        """Release the world; no frame can be exposed afterwards."""
         self._expose = _closed
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
+        """Wait for the newest frame, or with ``newer_than`` [s] for a frame exposed after that time.
 
         Raises:
             StaleFrameError: no such frame arrived within ``timeout`` [s].
@@ -90,15 +94,15 @@ class SimStream:
 
 
 class SimZoomStream(SimStream):
-    """A camera with a stepping zoom lens.
+    """Camera with a stepping zoom lens.
 
     Args:
-        camera: its configuration.
-        effects: switches.
+        camera: the camera's configuration.
+        effects: switches of the simulated effects.
         clock: the rig's clock.
-        expose: gives the image of frame number k, exposed at time t.
-        drive: the lens's drive.
-        delay: from a command to the start of motion [s].
+        expose: gives the image of frame number k, exposed at time t [s].
+        drive: the lens's positions and motion.
+        delay: time from a command to the start of motion [s].
     """
 
     def __init__(
@@ -116,19 +120,19 @@ class SimZoomStream(SimStream):
 
     @property
     def still_size(self) -> tuple[int, int]:
-        """That of the stream."""
+        """Size of a still, that of the stream [px]."""
         return self.size
 
     @property
     def focal_range(self) -> tuple[float, float]:
-        """Shortest and longest focal length [px], as the maker states them."""
+        """Shortest and longest nominal focal length [px]."""
         return self._drive.shortest_px, self._drive.longest_px
 
     def zoom(self, focal_px: float) -> float:
         """Start the lens moving; return the focal length [px] of the position that it will stop at.
 
         Raises:
-            DeviceError: no lens can go there.
+            DeviceError: the focal length is not positive and finite.
         """
         if not focal_px > 0 or math.isinf(focal_px):
             raise DeviceError(f"the lens cannot go to a focal length of {focal_px} px")
@@ -137,25 +141,25 @@ class SimZoomStream(SimStream):
         return self._drive.focal_of(position)
 
     def state(self) -> ZoomState:
-        """The lens's state now."""
+        """Give the lens's current focal length and whether it moves."""
         now = self._clock.now()
         return ZoomState(self._drive.focal_at(now), now < self._rests, now)
 
     def capture(self) -> Frame:
-        """This camera has no separate stills: the next frame exposed from now on."""
+        """Give the next frame exposed from now on; this camera has no separate stills."""
         return self.read(newer_than=self._clock.now())
 
 
 def lens_drive(camera: SimZoomCamera, effects: SimEffects) -> LensDrive:
-    """The drive of the lens that a configuration describes."""
+    """Make the drive of the configured zoom lens."""
     shortest, longest = (focal / camera.pitch_mm for focal in camera.focal_mm)
-    # The lens has no run-up: an acceleration that reaches full speed within a step is fast enough to be none.
+    # The lens's acceleration is not modelled: with this value it reaches full speed within a step.
     speed = camera.lens_speed if effects.lens else math.inf
     return LensDrive(shortest, longest, camera.lens_steps - 1, effects.lens, Axis(speed, speed * speed))
 
 
 def head_drive(head: SimHead, effects: SimEffects) -> HeadDrive:
-    """The axes of the pan-tilt unit that a configuration describes."""
+    """Make the axes of the configured pan-tilt unit."""
     speed = math.radians(head.speed_deg_s) if effects.profile else math.inf
     acceleration = math.radians(head.accel_deg_s2) if effects.profile else math.inf
     play = math.radians(head.backlash_deg) if effects.backlash else 0.0
@@ -163,7 +167,7 @@ def head_drive(head: SimHead, effects: SimEffects) -> HeadDrive:
 
 
 class SimPanTilt:
-    """A pan-tilt unit: delayed commands, trapezoidal profiles, steps, limits and play."""
+    """Pan-tilt unit with command delay, trapezoidal profiles, steps, limits and backlash."""
 
     def __init__(self, head: SimHead, effects: SimEffects, clock: Clock, drive: HeadDrive) -> None:
         self._clock, self._drive = clock, drive
@@ -179,20 +183,20 @@ class SimPanTilt:
 
     @property
     def limits(self) -> PanTiltLimits:
-        """What the unit can do."""
+        """Limits of angle, speed and acceleration, and the step size."""
         return self._limits
 
     def state(self) -> PanTiltState:
-        """What the unit's own step counters say now."""
+        """Give the angles that the unit's step counters show now; backlash is not visible in them."""
         now = self._clock.now()
         pan, tilt = (to_step(axis.motor(now)[0], self._limits.step) for axis in (self._drive.pan, self._drive.tilt))
         return PanTiltState(pan, tilt, now < self._rests, now)
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
-        """Command both axes [rad]; return what was commanded after clipping and rounding to steps.
+        """Command both axes [rad]; return the angles commanded after clipping and rounding to steps.
 
         Raises:
-            DeviceError: no head can go there.
+            DeviceError: an angle is not finite.
         """
         if not (math.isfinite(pan) and math.isfinite(tilt)):
             raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
@@ -205,7 +209,7 @@ class SimPanTilt:
         return pan, tilt
 
     def halt(self) -> None:
-        """Brake both axes."""
+        """Brake both axes after the command delay."""
         t = self._clock.now() + self._delay
         self._rests = max(self._drive.pan.halt(t), self._drive.tilt.halt(t))
 
@@ -218,10 +222,10 @@ class SimPanTilt:
 
 
 class SimBoard:
-    """A board that appears wherever it is wished.
+    """Calibration board that is at once where it is requested.
 
     Args:
-        place: puts the board somewhere from now on, given whether it swings there.
+        place: sets the board's pose from now on, and whether it swings there.
     """
 
     patience = 0.0
@@ -230,20 +234,20 @@ class SimBoard:
         self._place = place
 
     def present(self, T_fixed_board: RigidTransform | None) -> None:
-        """Put the board there, in the true fixed camera's frame, from now on; None takes it away."""
+        """Put the board at a pose in the true fixed camera's frame from now on; None removes it."""
         self._place(T_fixed_board, False)
 
     def leave(self) -> None:
-        """Put it nowhere from now on, and let go of the world."""
+        """Release the world; the board cannot be placed afterwards."""
         self._place = _closed
 
     def swing(self, T_fixed_board: RigidTransform) -> None:
-        """Swing the board about that pose from now on."""
+        """Swing the board about a pose from now on."""
         self._place(T_fixed_board, True)
 
 
 class SimRig:
-    """The simulated rig."""
+    """Simulated rig: both cameras, head, clock and board."""
 
     def __init__(
         self,
@@ -258,26 +262,26 @@ class SimRig:
         self.config = config
         self.fixed: Camera = fixed
         self.zoom, self.head, self.clock, self.board = zoom, head, clock, board
-        self._of_world = (fixed, zoom, board)  # whatever is put in their places
+        self._of_world = (fixed, zoom, board)  # released by `leave`, also where a caller has replaced the attributes
         self._release = release
 
     def close(self) -> None:
-        """Halt the head and release the renderer; more than once does no harm."""
+        """Halt the head and release the renderer; safe to call more than once."""
         self.head.halt()
         self._release()
 
     def leave(self) -> None:
-        """Let go of the world: without images and board, head and clock still go on."""
+        """Release the world: no more images and board, while head and clock go on working."""
         for part in self._of_world:
             part.leave()
         self._release = lambda: None
 
     def __enter__(self) -> "SimRig":
-        """Give the rig itself."""
+        """Return the rig itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Halt, then close."""
+        """Halt the head, then close."""
         self.close()

@@ -1,4 +1,4 @@
-"""The compiled MuJoCo model of a configuration: scene, rig, targets and board, edited through MjSpec."""
+"""Compiled MuJoCo model of a configuration: scene, rig, targets and board, edited through MjSpec."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -15,25 +15,25 @@ from cotarget.sim.targets.own_models import own_model
 from cotarget.sim.targets.target import Target, change_marker, scale_spec
 from cotarget.sim.weather import INDOORS, add_clutter
 
-# The only place where MuJoCo's camera axes (x right, y up, z back) become OpenCV's (x right, y down, z forward).
+# The only conversion from MuJoCo's camera axes (x right, y up, z back) to OpenCV's (x right, y down, z forward).
 T_OPENCV_MUJOCO = RigidTransform.from_rotation(Rotation.from_rotvec([np.pi, 0.0, 0.0]))
 MOUNT_SITE = "fixed_mount"
-RIG = "rig/"  # before the names of the rig's parts; a target's stand behind its own name and a slash
+RIG = "rig/"  # prefix of the rig's parts; the prefix of a target's parts is its name and a slash
 BOARD = RIG + "board"
-# Geoms by purpose: MuJoCo draws a group when the view's option says so.
+# Groups of geoms by purpose; MuJoCo draws the groups that the view's options enable.
 BOARD_GROUP, RIG_GROUP, FRAME_GROUP = 3, 4, 5
 BOARD_THICKNESS = 0.004  # [m]
 BOARD_MARGIN = 0.6  # white border around the squares, in squares
 BLACK, WHITE = (0.05, 0.05, 0.05, 1.0), (0.95, 0.95, 0.95, 1.0)
-ARM_RADIUS = 0.012  # [m], the bracket between the head and the zoom camera
-CAMERA_FOOT = (0.0, 0.038, -0.086)  # where the zoom camera's housing stands on it, in the camera's frame [m]
-# Sensor pixels are given this size [m]; only ratios to the focal length matter to the renderer.
+ARM_RADIUS = 0.012  # bracket between the head and the zoom camera [m]
+CAMERA_FOOT = (0.0, 0.038, -0.086)  # where the bracket meets the housing, in the zoom camera's frame [m]
+# Size of a sensor pixel [m]; only its ratio to the focal length matters to the renderer.
 RENDER_PITCH = 1e-5
-PORTRAIT_SIZE = (640, 560)  # of the pictures of the rig itself [px]
+PORTRAIT_SIZE = (640, 560)  # size of pictures of the rig itself [px]
 
 
 def scene_path(scene: str) -> Path:
-    """Find a scene by its name, or a user's MJCF file by its path.
+    """Find a built-in scene by its name, or a user's MJCF file by its path.
 
     Raises:
         ConfigError: there is no such scene or file.
@@ -50,13 +50,13 @@ def scene_path(scene: str) -> Path:
 
 
 def scene_spec(scene: str) -> "mujoco.MjSpec":
-    """Read a scene, by its name or its path.
+    """Read a scene, given by its name or its path.
 
     Raises:
-        ConfigError: it is not MJCF, or has no mount for the rig.
+        ConfigError: the file is not MJCF, or has no mount for the rig.
     """
     path = scene_path(scene)
-    if path.suffix != ".xml":  # MuJoCo decodes by the ending, and knows no other, nor .XML
+    if path.suffix != ".xml":  # MuJoCo chooses the decoder by the extension and does not know .XML
         raise ConfigError(f"{path}: does not end in .xml, as a scene does, which is an MJCF file")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
@@ -73,9 +73,9 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
     """Compile scene, rig, targets and board.
 
     Args:
-        config: the rig; its offsets are taken as they are.
-        targets: what else is in the scene, one mocap body each.
-        render_size: (width, height) [px] of the pinhole views.
+        config: the rig's configuration.
+        targets: targets in the scene, one mocap body each.
+        render_size: (width, height) of the pinhole views [px].
 
     Raises:
         ConfigError: the scene is not MJCF, or has no mount for the rig.
@@ -91,7 +91,7 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
         add_clutter(spec, config.sim.seed)
     spec.visual.quality.offsamples = 4 if config.sim.effects.multisampling else 0
     visual = spec.visual.global_
-    # No larger than what is drawn: OpenGL clears and resolves all of it for every picture.
+    # No larger than needed: OpenGL clears and resolves the whole buffer for every picture.
     visual.offwidth = max(PORTRAIT_SIZE[0], render_size[0])
     visual.offheight = max(PORTRAIT_SIZE[1], render_size[1])
     try:
@@ -101,7 +101,7 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
 
 
 def _target_spec(target: Target) -> "mujoco.MjSpec":
-    """A target's model."""
+    """Read a target's model, scaled to its true size and with its marker."""
     if target.own is not None:
         return own_model(target.own, target.kind, BOARD_GROUP)
     asset = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / f"{target.kind}.xml"))
@@ -111,12 +111,12 @@ def _target_spec(target: Target) -> "mujoco.MjSpec":
 
 
 def has_clutter(sim: SimConfig) -> bool:
-    """Whether anything but the targets moves."""
+    """Check whether anything besides targets and rig moves."""
     return sim.effects.clutter and sim.scene not in INDOORS
 
 
 def mount_pose(model: "mujoco.MjModel") -> RigidTransform:
-    """T_world_fixed of a compiled model, in OpenCV's axes."""
+    """Give T_world_fixed of a compiled model, in OpenCV's axes."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     site = data.site(MOUNT_SITE)
@@ -124,31 +124,31 @@ def mount_pose(model: "mujoco.MjModel") -> RigidTransform:
 
 
 def base_pose(T_world_fixed: RigidTransform, sim: SimConfig) -> RigidTransform:
-    """T_world_base: at pan = tilt = 0, T_base_zoom0 = T_head_zoom."""
+    """Compute T_world_base; at pan = tilt = 0, T_base_zoom0 = T_head_zoom."""
     return T_world_fixed * (sim.T_head_zoom * sim.T_zoom0_fixed).inv()
 
 
 def quaternion(T: RigidTransform) -> Array:
-    """A transform's rotation as MuJoCo writes it, (w, x, y, z)."""
+    """Give a transform's rotation as a quaternion in MuJoCo's order, (w, x, y, z)."""
     return T.rotation.as_quat(scalar_first=True)
 
 
 def _attach(scene: "mujoco.MjSpec", part: "mujoco.MjSpec", prefix: str) -> None:
-    """Put a part into the scene, its names behind a prefix; of the global settings, the scene's hold."""
+    """Attach a part to the scene with a prefix to its names; the scene's global settings are kept."""
     part.visual.map.znear, part.visual.map.zfar = scene.visual.map.znear, scene.visual.map.zfar
     scene.attach(part, frame=scene.worldbody.add_frame(), prefix=prefix)
 
 
 @lru_cache(maxsize=4)
 def _site_pose(scene: Path, changed: int) -> RigidTransform:
-    """T_world_fixed of a scene's file; worked out once, because to compile it takes as long as the whole world.
+    """Give T_world_fixed of a scene's file, cached because compiling it takes as long as building the world.
 
     Args:
         scene: the file.
-        changed: when it was changed last; of a file that it includes no change is noticed.
+        changed: modification time of the file, part of the cache's key; changes of included files are not noticed.
 
     Raises:
-        ConfigError: it does not compile.
+        ConfigError: the scene does not compile.
     """
     try:
         return mount_pose(mujoco.MjSpec.from_file(str(scene)).compile())
@@ -163,7 +163,7 @@ def _place(body: "mujoco.MjsBody", T: RigidTransform) -> None:
 def _edit_rig(
     rig: "mujoco.MjSpec", sim: SimConfig, T_world_fixed: RigidTransform, render_size: tuple[int, int]
 ) -> None:
-    """Put the rig's bodies where the configuration wants them."""
+    """Place the rig's bodies as configured."""
     _place(rig.body("fixed"), T_world_fixed)
     _place(rig.body("base"), base_pose(T_world_fixed, sim))
     _place(rig.body("zoom"), sim.T_head_zoom)
@@ -178,11 +178,11 @@ def _edit_rig(
         camera = rig.camera(name)
         camera.resolution = render_size
         camera.sensor_size = np.array(render_size) * RENDER_PITCH
-        camera.focal_length = (render_size[0] * RENDER_PITCH,) * 2  # set before every render
+        camera.focal_length = (render_size[0] * RENDER_PITCH,) * 2  # overwritten before every render
 
 
 def _add_board(spec: "mujoco.MjSpec", board: BoardConfig) -> None:
-    """A board whose tiles are flush: its frame is the first inner corner's, x along the columns, z away."""
+    """Add the calibration board: origin at the first inner corner, x along the columns, z away from the viewer."""
     body = spec.worldbody.add_body(name=BOARD, mocap=True)
     columns, rows = (n + 1 for n in board.corners)
 

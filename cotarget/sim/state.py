@@ -1,4 +1,4 @@
-"""Brings a compiled world to a time: head, targets, board and clutter; everything is a function of time alone."""
+"""Poses of a compiled world at a time: head, targets, board and clutter, as functions of time alone."""
 
 import copy
 import math
@@ -14,11 +14,11 @@ from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.targets.target import Target
 from cotarget.sim.weather import Clutter
 
-SWING, SWING_PERIOD = 0.15, 1.7  # of a board that swings, to each side [m], and there and back [s]
+SWING, SWING_PERIOD = 0.15, 1.7  # of a swinging board: amplitude [m] and period [s]
 
 
 class WorldState:
-    """The world's poses at any time up to now."""
+    """Poses of everything in the world at any time up to now."""
 
     def __init__(
         self,
@@ -28,14 +28,14 @@ class WorldState:
         T_world_fixed: RigidTransform,
         clutter: Clutter | None,
     ) -> None:
-        """Look up where in the model everything stands.
+        """Look up the addresses of joints and bodies in the model.
 
         Args:
             model: the compiled world.
-            targets: by name.
-            head: the axes of the pan-tilt unit.
-            T_world_fixed: the fixed camera.
-            clutter: what else moves; None for nothing.
+            targets: targets by name.
+            head: axes of the pan-tilt unit.
+            T_world_fixed: pose of the fixed camera.
+            clutter: moving foliage, clouds and light; None for none.
         """
         self._model, self._data = model, mujoco.MjData(model)
         self._head, self._T_world_fixed, self._clutter = head, T_world_fixed, clutter
@@ -50,18 +50,18 @@ class WorldState:
         self._cluttered = False
 
     def apart(self, model: "mujoco.MjModel") -> "WorldState":
-        """The same world's poses in a copy of its model, for another thread."""
+        """Give the same world's state on a copy of its model, for another thread."""
         other = copy.copy(self)
         other._model, other._data, other._shown = model, mujoco.MjData(model), None
         return other
 
     @property
     def faint(self) -> npt.NDArray[np.intp]:
-        """Numbers of the geoms without an edge that an exposure could blur."""
+        """Ids of the geoms without sharp edges, which exposure blur does not change."""
         return np.zeros(0, dtype=np.intp) if self._clutter is None else self._clutter.faint
 
     def at(self, t: float) -> "mujoco.MjData":
-        """Everything's pose at time t [s]; the data is the world's own and changes with the next call."""
+        """Move everything to its pose at time t [s]; the data is the world's own and changes with the next call."""
         data = self.bodies_at(t)
         if self._clutter is not None and not self._cluttered:
             self._clutter.move(data, t)
@@ -69,7 +69,7 @@ class WorldState:
         return data
 
     def bodies_at(self, t: float) -> "mujoco.MjData":
-        """The same for who asks for rig, targets and board only: foliage and clouds are where they were."""
+        """Move rig, targets and board to time t [s], and leave foliage and clouds at their last pose."""
         pan, tilt = self._head.angles_at(t)
         wanted = (t, pan, tilt, len(self._boards))
         if wanted == self._shown:
@@ -93,7 +93,7 @@ class WorldState:
         return data
 
     def lit(self, t: float) -> "mujoco.MjData":
-        """The same, with the cameras and lights that a picture needs."""
+        """Move everything to time t [s], with cameras and lights as rendering needs them."""
         data = self.at(t)
         mujoco.mj_comPos(self._model, data)
         mujoco.mj_camlight(self._model, data)
@@ -102,11 +102,11 @@ class WorldState:
         return data
 
     def place_board(self, since: float, T_fixed_board: RigidTransform | None, swings: bool) -> None:
-        """Put the board there from a time on; None takes it away."""
+        """Put the board at a pose from a time on [s]; None removes it."""
         self._boards.append((since, T_fixed_board, swings))
 
     def board_at(self, t: float) -> RigidTransform | None:
-        """T_fixed_board at a time; None while there is no board."""
+        """Give T_fixed_board at a time [s]; None while there is no board."""
         since, T, swings = next(placed for placed in reversed(self._boards) if placed[0] <= t)
         if T is None or not swings:
             return T

@@ -1,17 +1,11 @@
-"""What is really so in a simulated world: for tests and experiments, never for the pipeline.
+"""Ground truth of a simulated world: poses, pixels and silhouettes, for tests and experiments only.
 
-Poses come from MuJoCo's own kinematics and pixels from the true lenses, so that nothing here can share a mistake
-with the pipeline's geometry.
+Poses come from MuJoCo's kinematics and pixels from the true lenses. The pipeline's geometry is not used, so that a
+mistake in it cannot hide here.
 
-What may be asked about where the targets of a simulated world truly appear: `Truth` answers it, and `Outlines`.
-
-Where targets appear in both cameras, told in a fraction of the time that the truth takes, and a little less exact.
-
-`Truth` brings all bodies to their poses and projects every corner of them. Here a target's outermost points are worked
-out beforehand, for phases of its limbs' beat, so that a frame takes the target's own pose and one projection. Who asks
-at every frame for hours, as an environment does, asks these.
-
-Whether a scene has room for ways that were made for another: how much of them its wide camera sees.
+Two classes implement the Protocol `Appearances`. `Truth` moves all bodies to their poses and projects all of their
+corners. `Outlines` is faster and a little less exact: it prepares each target's outermost points for phases of the limb
+cycle. Environments use it, because they ask at every frame. Measurements: docs/design-notes.md.
 """
 
 import math
@@ -40,16 +34,16 @@ CameraName = Literal["fixed", "zoom"]
 
 @dataclass(frozen=True)
 class Silhouette:
-    """A target's true outline in one image, not clipped to it.
+    """True outline of a target in one image, not clipped to the image.
 
     Attributes:
-        low_px: top-left corner of its box, (2,).
-        high_px: bottom-right corner, (2,).
-        visible: fraction of the target that shows: of its outline's area, the fraction inside the image, times, of
-            its parts (geoms, each counting the same whatever its size), the fraction whose middle a ray from the
-            camera reaches with nothing but the target itself in the way. Hence exact for a target that is cut by the
-            image's border only; for one behind something it goes in steps of a part, and the two fractions are
-            taken to be independent. A board shown to the cameras and the rig itself hide nothing.
+        low_px: top-left corner of the bounding box [px], (2,).
+        high_px: bottom-right corner of the bounding box [px], (2,).
+        visible: visible fraction of the target, 0 to 1. It is the product of two fractions that are assumed to be
+            independent: the part of the outline's area inside the image, and the part of the geoms (each counts the
+            same, whatever its size) whose centre a ray from the camera reaches with only the target in the way. So it
+            is exact for a target that only the image's border cuts, and has steps of one geom for an occluded target.
+            The board and the rig occlude nothing.
     """
 
     low_px: Array
@@ -63,50 +57,50 @@ class Silhouette:
 
 
 class Appearances(Protocol):
-    """Where targets appear in both cameras, at any time up to now."""
+    """True image positions of the targets in both cameras, at any time up to now."""
 
     @property
     def targets(self) -> Mapping[str, Target]:
-        """By name."""
+        """Targets by name."""
 
     @property
     def fixed_lens(self) -> TrueLens:
-        """The wide camera's optics."""
+        """True optics of the fixed camera."""
 
     @property
     def longest_px(self) -> float:
-        """The zoom camera's true focal length at its longest, in pixels along the rows."""
+        """True longest focal length of the zoom camera, along the rows [px]."""
 
     def lens(self, camera: CameraName, t: float) -> TrueLens:
-        """A camera's optics at time t."""
+        """Give the true optics of a camera at time t [s]."""
 
     def center_px(self, name: str, camera: CameraName, t: float) -> Array:
-        """A target's body centre in a camera at time t, (2,) [px]; nan behind it."""
+        """Project a target's body centre at time t [s], (2,) [px]; nan behind the camera."""
 
     def box(self, name: str, camera: CameraName, t: float) -> tuple[Array, Array] | None:
-        """Top-left and bottom-right corner of a target's outline at time t, (2,) [px] each; None behind the camera."""
+        """Bound a target's outline at time t [s]: top-left and bottom-right corner, (2,) [px]; None behind camera."""
 
     def silhouette(self, name: str, camera: CameraName, t: float) -> Silhouette | None:
-        """A target's outline in a camera at time t; None behind the camera."""
+        """Give a target's outline and visible fraction at time t [s]; None behind the camera."""
 
     def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
-        """The larger side of the box, the maximum over one wing beat at the pose of time t [px]; nan behind."""
+        """Give the larger side of the box, its maximum over one limb cycle, at the pose of time t [px]; nan behind."""
 
 
-# --- room ---
+# Visibility of given paths in another scene
 
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def part_seen(sim: SimConfig, x_world: Array) -> float:
-    """Which part of some places is in the wide camera's picture, and not behind what stands in the scene.
+    """Compute the fraction of points that the fixed camera sees: inside its image and not occluded by the scene.
 
     Args:
-        sim: its scene and its wide camera count.
-        x_world: the places in the world [m], (n, 3).
+        sim: the simulation's configuration; its scene and fixed camera are used.
+        x_world: points in the world [m], (n, 3).
 
     Raises:
-        ConfigError: the scene is none.
+        ConfigError: the scene does not compile.
     """
     try:
         model = scene_spec(sim.scene).compile()
@@ -121,7 +115,7 @@ def part_seen(sim: SimConfig, x_world: Array) -> float:
 
 
 def _free(model: "mujoco.MjModel", eye: Array, x_world: Array) -> npt.NDArray[np.bool_]:
-    """Whether nothing that is drawn stands between an eye (3,) and each of some places (n, 3)."""
+    """Check for each point (n, 3) that no drawn geom lies between it and a camera's optical centre (3,)."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     ways = x_world - eye
@@ -133,20 +127,20 @@ def _free(model: "mujoco.MjModel", eye: Array, x_world: Array) -> npt.NDArray[np
     return np.asarray((hit < 0) | (distance > far))
 
 
-SURFACE_POINTS = 64  # samples on a round geom: its outline is then good to about 1 %
-SILHOUETTE_GRID = 96  # a silhouette is painted this large to compare areas [px]
-BEAT_PHASES = 8  # samples of one wing beat
+SURFACE_POINTS = 64  # samples on a round geom; the outline's error is then about 1 %
+SILHOUETTE_GRID = 96  # larger side of the raster in which areas are compared [px]
+BEAT_PHASES = 8  # samples of one limb cycle
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Points on a target's geoms: the outline is the union of what they span.
+    """Points on a target's geoms; the target's outline is the union of the geoms' convex hulls.
 
     Attributes:
-        geoms: numbers of the target's geoms, (g,).
-        owner: for each point the index of its geom among those, (n,).
-        starts: for each geom the index of its first point, (g,).
-        points: in their geom's own frame [m], (n, 3).
+        geoms: MuJoCo ids of the target's geoms, (g,).
+        owner: index into ``geoms`` for each point, (n,).
+        starts: index of each geom's first point, (g,).
+        points: coordinates in the frame of the point's geom [m], (n, 3).
     """
 
     geoms: npt.NDArray[np.intp]
@@ -160,17 +154,17 @@ class Truth:
     """True poses, pixels and silhouettes at any time up to now.
 
     Attributes:
-        model: the compiled world.
-        set_state: brings the world to a time.
-        set_bodies: brings rig and targets there, and not what may hide them.
-        fixed_lens: the wide camera's optics.
-        nominal_at: what the zoom camera's device calls its focal length at a time [px].
-        zoom_lens_for: the zoom camera's optics at what its device calls a focal length [px].
-        T_world_fixed: the fixed camera.
-        T_world_base: the pan-tilt unit.
-        head_at: the platform's pan and tilt [rad] at a time.
-        focal_range: what the zoom camera's device calls its shortest and longest focal length [px].
-        targets: by name.
+        model: compiled MuJoCo model of the world.
+        set_state: moves everything to its pose at a time [s] and gives the data.
+        set_bodies: moves rig, targets and board only, not foliage and clouds.
+        fixed_lens: true optics of the fixed camera.
+        nominal_at: nominal focal length of the zoom camera at a time [px].
+        zoom_lens_for: true optics of the zoom camera at a nominal focal length [px].
+        T_world_fixed: pose of the fixed camera.
+        T_world_base: pose of the pan-tilt unit.
+        head_at: true pan and tilt of the platform at a time [rad].
+        focal_range: shortest and longest nominal focal length of the zoom camera [px].
+        targets: targets by name.
     """
 
     model: "mujoco.MjModel"
@@ -189,41 +183,41 @@ class Truth:
     _scratch: list["mujoco.MjData"] = field(default_factory=list)
 
     def lens(self, camera: CameraName, t: float) -> TrueLens:
-        """A camera's optics at time t."""
+        """Give the true optics of a camera at time t [s]."""
         return self.fixed_lens if camera == "fixed" else self.zoom_lens_for(self.nominal_at(t))
 
     @property
     def longest_px(self) -> float:
-        """The zoom camera's true focal length at its longest, in pixels along the rows."""
+        """True longest focal length of the zoom camera, along the rows [px]."""
         return self.zoom_lens_for(self.focal_range[1]).focal_px[0]
 
     def T_world_camera(self, camera: CameraName, t: float) -> RigidTransform:
-        """Pose of a camera's optical centre at time t, in OpenCV's axes."""
+        """Give the pose of a camera's optical centre at time t [s], in OpenCV's axes."""
         eye, axes = self._camera(self.set_bodies(t), camera, self.lens(camera, t))
         return RigidTransform.from_components(eye, Rotation.from_matrix(axes, assume_valid=True))
 
     def center(self, name: str, t: float) -> Array:
-        """A target's body centre in the world [m], (3,)."""
+        """Give a target's body centre in the world at time t [s], (3,) [m]."""
         return self.targets[name].pose(t).position
 
     def pixel(self, camera: CameraName, x_world: Array, t: float) -> Array:
-        """Where a point of the world appears, (..., 2) [px]; nan behind the camera."""
+        """Project points of the world (..., 3) [m] at time t [s], (..., 2) [px]; nan behind the camera."""
         lens = self.lens(camera, t)
         eye, axes = self._camera(self.set_bodies(t), camera, lens)
         return lens.project((np.asarray(x_world, dtype=float) - eye) @ axes)
 
     def center_px(self, name: str, camera: CameraName, t: float) -> Array:
-        """A target's body centre in a camera at time t, (2,) [px]; nan behind it."""
+        """Project a target's body centre at time t [s], (2,) [px]; nan behind the camera."""
         return self.pixel(camera, self.center(name, t), t)
 
     def line_of_sight_miss(self, pan: float, tilt: float, nominal_px: float, x_world: Array) -> float:
-        """Angle between the ray through the middle of the zoom image and a point, with the head at pan, tilt [rad].
+        """Compute the angle [rad] between the ray through the zoom image's centre and a point.
 
         Args:
-            pan: of the platform, not rounded to steps [rad].
-            tilt: likewise.
-            nominal_px: what the device calls the focal length [px].
-            x_world: the point [m], (3,).
+            pan: pan of the platform, not rounded to steps [rad].
+            tilt: tilt of the platform, not rounded to steps [rad].
+            nominal_px: nominal focal length of the zoom lens [px].
+            x_world: the point in the world [m], (3,).
         """
         data = self._copy(self.set_bodies(0.0))
         data.joint(RIG + "pan").qpos[0], data.joint(RIG + "tilt").qpos[0] = pan, tilt
@@ -236,7 +230,10 @@ class Truth:
         return float(np.arctan2(np.linalg.norm(np.cross(ray, x_zoom)), ray @ x_zoom))
 
     def silhouette(self, name: str, camera: CameraName, t: float) -> Silhouette | None:
-        """A target's outline in a camera at time t; None if any of it is behind the camera, or beyond its lens."""
+        """Give a target's outline and visible fraction at time t [s].
+
+        None where a part of the target is behind the camera, or outside the angles that its lens images.
+        """
         data, lens = self.set_state(t), self.lens(camera, t)
         view = self._camera(data, camera, lens)
         pixels = self._outline(name, data, view, lens)
@@ -250,21 +247,21 @@ class Truth:
         return Silhouette(low, high, inside * self._unhidden(name, data, view[0]))
 
     def unhidden(self, name: str, camera: CameraName, t: float) -> float:
-        """The fraction of a target's parts that nothing but the target itself hides from a camera at time t."""
+        """Compute the fraction of a target's geoms that only the target itself occludes at time t [s]."""
         data = self.set_state(t)
         return self._unhidden(name, data, self._camera(data, camera, self.lens(camera, t))[0])
 
     def box(self, name: str, camera: CameraName, t: float) -> tuple[Array, Array] | None:
-        """Top-left and bottom-right corner of a target's outline, (2,) [px] each, whatever hides it.
+        """Bound a target's outline at time t [s], occluded or not: top-left and bottom-right corner, (2,) [px] each.
 
-        Quicker than its silhouette, whose corners they are; None if any of it is behind the camera.
+        Faster than `silhouette`, with the same corners. None where a part of the target is behind the camera.
         """
         data, lens = self.set_bodies(t), self.lens(camera, t)
         pixels = self._outline(name, data, self._camera(data, camera, lens), lens)
         return (pixels.min(axis=0), pixels.max(axis=0)) if np.isfinite(pixels).all() else None
 
     def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
-        """The larger side of the box, the maximum over one wing beat at the pose of time t [px]; nan behind."""
+        """Give the larger side of the box, its maximum over one limb cycle, at the pose of time t [px]; nan behind."""
         target = self.targets[name]
         phases = np.arange(BEAT_PHASES) / BEAT_PHASES * target.beat_s if target.beat_s else [0.0]
         data = self._copy(self.set_bodies(t))
@@ -281,7 +278,7 @@ class Truth:
         return float(np.max(sides))
 
     def _copy(self, data: "mujoco.MjData") -> "mujoco.MjData":
-        """A state that may be changed: the world's own is kept while nobody asks for another time."""
+        """Copy a state to data that may be changed; the world caches its own until another time is requested."""
         if not self._scratch:
             self._scratch.append(mujoco.MjData(self.model))
         copy = self._scratch[0]
@@ -290,7 +287,7 @@ class Truth:
         return copy
 
     def _outline(self, name: str, data: "mujoco.MjData", view: tuple[Array, Array], lens: TrueLens) -> Array:
-        """Pixels of the points on a target's geoms, one after the other, (n, 2); nan where the camera has none."""
+        """Project the points on a target's geoms, in their order, (n, 2) [px]; nan where the camera images none."""
         surface = self._surface(name)
         axes = data.geom_xmat[surface.geoms].reshape(-1, 3, 3)
         x_world = np.einsum("nij,nj->ni", axes[surface.owner], surface.points)
@@ -298,7 +295,7 @@ class Truth:
         return lens.project((x_world + (data.geom_xpos[surface.geoms] - eye)[surface.owner]) @ camera_axes)
 
     def _camera(self, data: "mujoco.MjData", camera: CameraName, lens: TrueLens) -> tuple[Array, Array]:
-        """A camera's pupil in the world [m], (3,), and its axes as columns, (3, 3)."""
+        """Give a camera's entrance pupil in the world [m], (3,), and its axes as columns, (3, 3)."""
         if camera not in self._bodies:
             self._bodies[camera] = self.model.body(RIG + camera).id
         body = self._bodies[camera]
@@ -306,7 +303,7 @@ class Truth:
         return data.xpos[body] + axes[:, 2] * lens.pupil, axes
 
     def _surface(self, name: str) -> "Surface":
-        """What a target's outline is made of."""
+        """Give the points on a target's geoms, computed once."""
         if name not in self._surfaces:
             root = self.model.body(self.targets[name].body).id
             geoms = np.flatnonzero(self.model.body_rootid[self.model.geom_bodyid] == root)
@@ -318,9 +315,9 @@ class Truth:
         return self._surfaces[name]
 
     def _unhidden(self, name: str, data: "mujoco.MjData", eye: Array) -> float:
-        """Fraction of the target's parts whose middle a ray from the eye reaches, through nothing but the target.
+        """Compute the fraction of the target's geoms whose centre a ray from the camera reaches unoccluded.
 
-        Parts inside or outside the image count alike. A mesh's middle is its centre of mass.
+        Geoms inside and outside the image count the same. A mesh's centre is its centre of mass.
         """
         own = self._surface(name).geoms
         groups = np.ones(mujoco.mjNGROUP, dtype=np.uint8)
@@ -334,7 +331,7 @@ class Truth:
 
 
 def _fraction_inside(outlines: list[Array], low: Array, high: Array, size: tuple[int, int]) -> float:
-    """Fraction of the area of a union of convex outlines that lies within the image."""
+    """Compute the fraction of the area of a union of convex outlines that lies inside the image."""
     scale = SILHOUETTE_GRID / max(float(np.max(high - low)), 1e-9)
     width, height = (np.ceil((high - low) * scale).astype(int) + 1).tolist()
     canvas = np.zeros((height, width), dtype=np.uint8)
@@ -348,7 +345,7 @@ def _fraction_inside(outlines: list[Array], low: Array, high: Array, size: tuple
 
 
 def surface_points(model: "mujoco.MjModel", geom: int) -> Array:
-    """Points on a geom's surface in its own frame, (n, 3)."""
+    """Sample points on a geom's surface in the geom's frame, (n, 3) [m]."""
     size, kind = model.geom_size[geom], mujoco.mjtGeom(model.geom_type[geom])
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
         return np.array(np.meshgrid(*([-s, s] for s in size))).reshape(3, -1).T
@@ -357,8 +354,8 @@ def surface_points(model: "mujoco.MjModel", geom: int) -> Array:
         start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         vertices = np.asarray(model.mesh_vert[start : start + count], dtype=float)
         try:
-            return vertices[np.unique(ConvexHull(vertices).simplices)]  # the others cannot be on an outline
-        except QhullError:  # it is flat
+            return vertices[np.unique(ConvexHull(vertices).simplices)]  # inner vertices are on no outline
+        except QhullError:  # the mesh is flat
             return vertices
     ball = sphere_points(SURFACE_POINTS)
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -376,30 +373,30 @@ def surface_points(model: "mujoco.MjModel", geom: int) -> Array:
 
 
 def sphere_points(count: int) -> Array:
-    """Evenly spread points on the unit sphere (Fibonacci's lattice), (count, 3)."""
+    """Sample the unit sphere evenly (Fibonacci lattice), (count, 3)."""
     i = np.arange(count) + 0.5
     z, around = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
     r = np.sqrt(1 - z * z)
     return np.column_stack([r * np.cos(around), r * np.sin(around), z])
 
 
-# --- outlines ---
+# Faster outlines, from points prepared for phases of the limb cycle
 
-PHASES = 48  # of a beat: from one to the next the tip of a wing moves by 2 % of the span at most
-EVERY = 6  # of these counts for the larger side over a beat
-ROOM = 0.5  # a target is no farther beside the knots of its way, and a lens's pupil before its camera [m]
-DIRECTIONS = 160  # in which a target's outermost points are looked for, some 16 degrees apart
-Outline = tuple[Array, Array, Array]  # pixels of the middle, of the top-left and of the bottom-right corner, (2,) each
+PHASES = 48  # of a limb cycle; from one to the next the tip of a wing moves by at most 2 % of the span
+EVERY = 6  # every sixth phase is used for the larger side over a cycle
+ROOM = 0.5  # largest distance of a target from the knots of its path, and of a pupil from its camera [m]
+DIRECTIONS = 160  # in which outermost points are searched, about 16 degrees apart
+Outline = tuple[Array, Array, Array]  # pixels of the centre, the top-left and the bottom-right corner, (2,) each
 
 
 class TrueView(NamedTuple):
-    """A camera at one time.
+    """Pose and optics of a camera at one time.
 
     Attributes:
-        eye: its optical centre in the world [m], (3,).
-        lens: its optics.
-        bent: whether they distort.
-        to_image: from directions in the world to homogeneous pixels, (3, 3); where the lens distorts, to its axes.
+        eye: optical centre in the world [m], (3,).
+        lens: true optics.
+        bent: whether the lens distorts.
+        to_image: maps directions in the world to homogeneous pixels, or to camera axes where the lens distorts, (3, 3).
     """
 
     eye: Array
@@ -409,18 +406,19 @@ class TrueView(NamedTuple):
 
 
 class Outlines:
-    """The outlines of a world's targets; see `Appearances`."""
+    """Fast approximation of `Truth` for the targets' outlines (see `Appearances`)."""
 
     def __init__(self, truth: Truth, still: bool) -> None:
-        """Prepare.
+        """Prepare each target's outermost points.
 
         Args:
-            truth: of the world.
-            still: whether nothing but its targets and its rig moves, so that what may hide a lone target is known.
+            truth: ground truth of the world.
+            still: whether only targets and rig move. A single target that no static geom can occlude then counts as
+                visible without a test by rays.
         """
         self._truth, self._model, self._data = truth, truth.model, mujoco.MjData(truth.model)
         mujoco.mj_kinematics(self._model, self._data)
-        data = self._data  # to ask it for its arrays takes as long as to work with them
+        data = self._data  # reading an array attribute takes as long as the computation with it
         self._qpos, self._places, self._turns = data.qpos, data.xpos, data.xmat.reshape(-1, 3, 3)
         self._points = {name: outermost(each.kind) * each.size for name, each in truth.targets.items()}
         self._beats = {name: np.concatenate(points[::EVERY], axis=1) for name, points in self._points.items()}
@@ -430,7 +428,7 @@ class Outlines:
         self._exposed = still and len(truth.targets) == 1 and self._stands_free(*truth.targets)
         self._longest_px = truth.longest_px
         self._fixed = self._placed("fixed", truth.fixed_lens)
-        # What was worked out for the time asked for last, and of the zoom camera for where head and lens were then.
+        # Cached results for the latest time, and for the zoom camera's latest pan, tilt and focal length.
         self._t = self._zoom_t = math.nan
         self._zoom, self._stood = self._fixed, (math.nan, math.nan, math.nan)
         self._poses: dict[str, tuple[Array, Array, int]] = {}
@@ -438,41 +436,41 @@ class Outlines:
 
     @property
     def targets(self) -> Mapping[str, Target]:
-        """By name."""
+        """Targets by name."""
         return self._truth.targets
 
     @property
     def fixed_lens(self) -> TrueLens:
-        """The wide camera's optics."""
+        """True optics of the fixed camera."""
         return self._truth.fixed_lens
 
     @property
     def longest_px(self) -> float:
-        """The zoom camera's true focal length at its longest, in pixels along the rows."""
+        """True longest focal length of the zoom camera, along the rows [px]."""
         return self._longest_px
 
     def lens(self, camera: CameraName, t: float) -> TrueLens:
-        """A camera's optics at time t."""
+        """Give the true optics of a camera at time t [s]."""
         return self.view(camera, t).lens
 
     def center(self, name: str, t: float) -> Array:
-        """A target's body centre in the world [m], (3,)."""
+        """Give a target's body centre in the world at time t [s], (3,) [m]."""
         return self._pose(name, t)[0]
 
     def center_px(self, name: str, camera: CameraName, t: float) -> Array:
-        """A target's body centre in a camera at time t, (2,) [px]; nan behind it."""
+        """Project a target's body centre at time t [s], (2,) [px]; nan behind the camera."""
         found = self._outline(name, camera, t)
         return np.full(2, np.nan) if found is None else found[0]
 
     def box(self, name: str, camera: CameraName, t: float) -> tuple[Array, Array] | None:
-        """Top-left and bottom-right corner of a target's outline at time t, (2,) [px] each; None behind the camera."""
+        """Bound a target's outline at time t [s]: top-left and bottom-right corner, (2,) [px]; None behind camera."""
         found = self._outline(name, camera, t)
         return None if found is None else found[1:]
 
     def silhouette(self, name: str, camera: CameraName, t: float) -> Silhouette | None:
-        """A target's outline in a camera at time t; None behind the camera.
+        """Give a target's outline and visible fraction at time t [s]; None behind the camera.
 
-        Of its area that fraction counts as inside the image that of its box is.
+        The fraction inside the image is that of the bounding box, not of the outline.
         """
         box = self.box(name, camera, t)
         if box is None:
@@ -488,7 +486,7 @@ class Outlines:
         return Silhouette(low, high, inside * self._unhidden(name, camera, t))
 
     def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
-        """The larger side of the box, the maximum over one beat at the pose of time t [px]; nan behind."""
+        """Give the larger side of the box, its maximum over one limb cycle, at the pose of time t [px]; nan behind."""
         pixels = self._project(name, camera, t, self._beats[name])
         if pixels is None:
             return math.nan
@@ -496,7 +494,7 @@ class Outlines:
         return max((high - low).ravel().tolist())
 
     def view(self, camera: CameraName, t: float) -> TrueView:
-        """A camera at time t."""
+        """Give pose and optics of a camera at time t [s]."""
         if camera == "fixed":
             return self._fixed
         if t != self._zoom_t:
@@ -509,7 +507,7 @@ class Outlines:
         return self._zoom
 
     def _placed(self, camera: CameraName, lens: TrueLens) -> TrueView:
-        """A camera as it stands now."""
+        """Read a camera's pose from the current kinematics."""
         body = self._bodies[camera]
         axes = self._turns[body].copy()
         (fx, fy), (cx, cy), bent = lens.focal_px, lens.center_px, any(lens.distortion)
@@ -517,12 +515,12 @@ class Outlines:
         return TrueView(self._places[body] + axes[:, 2] * lens.pupil, lens, bent, to_image)
 
     def _at(self, t: float) -> None:
-        """Forget what was worked out for another time."""
+        """Drop the results cached for another time."""
         if t != self._t:
             self._t, self._poses, self._found = t, {}, {}
 
     def _pose(self, name: str, t: float) -> tuple[Array, Array, int]:
-        """A target's position in the world [m], (3,), its axes as columns, (3, 3), and the nearest phase's number."""
+        """Give a target's position in the world [m], (3,), axes as columns, (3, 3), and index of the nearest phase."""
         self._at(t)
         if name not in self._poses:
             target = self.targets[name]
@@ -533,7 +531,7 @@ class Outlines:
         return self._poses[name]
 
     def _outline(self, name: str, camera: CameraName, t: float) -> Outline | None:
-        """A target's outline, and where its middle is; None behind the camera."""
+        """Compute centre and bounding box of a target's outline [px]; None behind the camera."""
         self._at(t)
         if (name, camera) not in self._found:
             pixels = self._project(name, camera, t, self._points[name][self._pose(name, t)[2]])
@@ -542,7 +540,7 @@ class Outlines:
         return self._found[name, camera]
 
     def _project(self, name: str, camera: CameraName, t: float, points: Array) -> Array | None:
-        """Pixels of points (3, n) in a target's body's frame, (2, n); None behind the camera or beyond its lens."""
+        """Project points (3, n) of a target's body frame, (2, n) [px]; None where the camera does not image them."""
         (position, turn, _), view = self._pose(name, t), self.view(camera, t)
         center = view.to_image @ (position - view.eye)
         x, y, z = center.tolist()
@@ -553,10 +551,10 @@ class Outlines:
         return (view.lens.bend(xy.T) * view.lens.focal_px + view.lens.center_px).T if view.bent else xy
 
     def _stands_free(self, name: str) -> bool:
-        """Whether nothing that stands can come between the cameras and a target, wherever it goes.
+        """Check that no static geom can come between the cameras and a target, anywhere on its path.
 
-        What stands beyond the box about the cameras and all of the target's way cannot. Neither can a plane before
-        which all of that is, whose middle counts: who walks on the ground is not hidden by it.
+        A geom outside the box around the cameras and the whole path cannot. A plane cannot either if the cameras and
+        the target's centres are all in front of it; the feet of a person on the ground may touch it.
         """
         model, data, path = self._model, self._data, self.targets[name].path
         way = np.array([path.position(t) for t in path.spline.x])
@@ -581,24 +579,24 @@ class Outlines:
         return True
 
     def _unhidden(self, name: str, camera: CameraName, t: float) -> float:
-        """The fraction of a target's parts that nothing but the target itself hides from a camera."""
+        """Compute the fraction of a target's geoms that only the target itself occludes."""
         return 1.0 if self._exposed else self._truth.unhidden(name, camera, t)
 
 
 def _ends(values: Array) -> tuple[Array, Array]:
-    """Lowest and highest along the last axis."""
+    """Give minimum and maximum along the last axis."""
     return np.minimum.reduce(values, axis=-1), np.maximum.reduce(values, axis=-1)
 
 
 @lru_cache
 def outermost(kind: str) -> Array:
-    """A target's outermost points at each phase of its beat, and its body's centre as the last of each.
+    """Compute a target's outermost points at each phase of its limb cycle, with the body's centre as the last point.
 
     Args:
-        kind: of the target.
+        kind: kind of the target.
 
     Returns:
-        In the body's frame, as large as the model is [m], (PHASES, 3, n).
+        Points in the body's frame, at the model's own size [m], (PHASES, 3, n).
     """
     model = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / f"{kind}.xml")).compile()
     data, body = mujoco.MjData(model), model.body(kind).id
@@ -614,5 +612,5 @@ def outermost(kind: str) -> Array:
         x = (x - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
         found.append(x[np.unique(np.argmax(x @ directions.T, axis=0))])
     most = max(map(len, found))
-    # In a table all phases have as many: where there are fewer, the first is there again.
+    # Pad each phase to the same number of points by repeating its first point.
     return np.array([np.transpose([*x, *[x[0]] * (most - len(x)), np.zeros(3)]) for x in found])

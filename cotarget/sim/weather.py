@@ -1,8 +1,8 @@
-"""What moves outdoors besides the targets: foliage in the wind, drifting clouds, shadows on the ground, changing light.
+"""Outdoor clutter: foliage that sways in the wind, drifting clouds, shadows on the ground, and changing light.
 
-Everything is a function of the seed and of time alone. Trees and bushes of a scene sway when their geoms' names begin
-with one of SWAYING; clouds, shadows, saplings and the tips of branches are added to it. Lengths in metres, the scene's
-world as in `cotarget.sim.targets.paths`.
+Everything is a function of the seed and of time alone. A scene's trees and bushes sway if their geoms' names begin with
+one of SWAYING. Clouds, shadows, saplings and twigs are added to the scene. Lengths are in metres; the world's axes are
+those of `cotarget.sim.targets.paths`.
 """
 
 import math
@@ -20,29 +20,29 @@ if TYPE_CHECKING:
 
 INDOORS = ("indoor",)  # scenes without weather
 SWAYING = ("crown_", "bush_", "clutter/crown_")
-LAYOUT, MOTION = 4, 5  # streams of random numbers, apart from the world's others
+LAYOUT, MOTION = 4, 5  # random streams, separate from the world's others
 TWIG, SHADE, CLOUD = "clutter/twig_", "clutter/shade_", "clutter/cloud_"
 TWIGS_A_TREE = 2
-TWIG_SIZE = (0.22, 0.42)  # half a side: 3 to 6 px of the wide view at 50 m
+TWIG_SIZE = (0.22, 0.42)  # half a side; 3 to 6 px in the fixed camera at 50 m
 TWIG_SWAY, TWIG_HZ = (0.06, 0.15), (0.4, 1.0)  # amplitude, frequency
 LEAF = (0.20, 0.28, 0.11, 1.0)
-SAPLINGS = ((-8.6, 21.0), (-5.6, 25.0), (6.4, 23.0), (9.4, 20.0))  # x, y; beside and behind where targets go
+SAPLINGS = ((-8.6, 21.0), (-5.6, 25.0), (6.4, 23.0), (9.4, 20.0))  # x, y; beside and behind the targets' paths
 SAPLING_HEIGHT = (2.4, 3.2)
-HAZE_SIZE = 128  # of the textures of clouds and shadows [px]
-CLOUDS, CLOUD_ALPHA, CLOUD_SPEED = 6, 0.5, (0.6, 1.8)  # [m/s]; 3 to 9 px/s in the wide view
+HAZE_SIZE = 128  # size of the textures of clouds and shadows [px]
+CLOUDS, CLOUD_ALPHA, CLOUD_SPEED = 6, 0.5, (0.6, 1.8)  # speed [m/s]; 3 to 9 px/s in the fixed camera
 SHADES, SHADE_ALPHA, SHADE_SPEED, SHADE_RANGE = 6, 0.30, (1.0, 3.0), (11.0, 45.0)  # [m/s], [m]
-SHADE_LIFT = 0.03  # over the ground, so that the ground does not show through
-VIEW_WIDTH = 0.62  # half the width that drifting things cross, at unit distance: beyond the wide view's edge
-SWAY = math.radians(0.5)  # of a crown as a whole, at 5 m and more; smaller ones sway more ...
-SWAY_HEIGHT, MOST_SWAY = 5.0, 3.0  # ... in proportion to this over their height [m], at most so many times
+SHADE_LIFT = 0.03  # height over the ground, so that the ground does not show through
+VIEW_WIDTH = 0.62  # half the width that clouds and shadows cross, at unit distance; beyond the fixed camera's edge
+SWAY = math.radians(0.5)  # amplitude of a crown 5 m high or more; lower ones sway more, ...
+SWAY_HEIGHT, MOST_SWAY = 5.0, 3.0  # ... by the ratio of this to their height [m], up to this factor
 SWAY_HZ = (0.2, 0.5)
-GUST_S = 7.0  # the wind's strength goes up and down about so often
-LIGHT_WAVE, LIGHT_WAVE_S = 0.05, 9.0  # slow change of the sun, relative
+GUST_S = 7.0  # period of the wind's strength
+LIGHT_WAVE, LIGHT_WAVE_S = 0.05, 9.0  # slow change of the sun's brightness, relative, and its period
 LIGHT_DROP, LIGHT_DROP_S, LIGHT_DROP_STEEPNESS = 0.20, 13.0, 6.0  # a cloud before the sun, within half a second
 
 
 def add_clutter(spec: "mujoco.MjSpec", seed: int) -> None:
-    """Put what drifts, flutters and casts shadows into a scene's spec; it stands still until `Clutter` moves it."""
+    """Add clouds, shadows, saplings and twigs to a scene's spec; they are static until `Clutter` moves them."""
     rng = np.random.default_rng((seed, LAYOUT))
     _add_saplings(spec, rng)
     _add_twigs(spec, rng)
@@ -61,7 +61,7 @@ def add_clutter(spec: "mujoco.MjSpec", seed: int) -> None:
 
 
 def _add_haze(spec: "mujoco.MjSpec", rng: np.random.Generator, name: str, grey: int, alpha: float) -> None:
-    """A material of one grey, with a ragged patch of opacity that fades out to its border."""
+    """Add a material of one grey level whose opacity is an irregular patch that fades out to its border."""
     v, u = np.mgrid[-1 : 1 : HAZE_SIZE * 1j, -1 : 1 : HAZE_SIZE * 1j]
     rough = cv2.resize(rng.random((9, 9)), (HAZE_SIZE, HAZE_SIZE), interpolation=cv2.INTER_CUBIC)
     density = np.clip(2.2 * (rough - 0.9 * np.hypot(u, v)) + 0.9, 0.0, 1.0) * np.clip(3 - 3 * np.hypot(u, v), 0.0, 1.0)
@@ -75,7 +75,7 @@ def _add_haze(spec: "mujoco.MjSpec", rng: np.random.Generator, name: str, grey: 
 
 
 def _add_sheet(spec: "mujoco.MjSpec", name: str, pos: list[float], half: list[float], material: str) -> None:
-    """A rectangle, upright or flat, whose half sides are given; the side that is 0 is its normal, towards -y or up."""
+    """Add a rectangle with given half sides; its normal is the side that is 0, towards -y (upright) or up (flat)."""
     first, second = (np.array(half) * axis for axis in ([1, 0, 0], [0, 1, 1]))
     mesh = spec.add_mesh(name=name)
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
@@ -86,13 +86,13 @@ def _add_sheet(spec: "mujoco.MjSpec", name: str, pos: list[float], half: list[fl
 
 
 def _add_mesh(spec: "mujoco.MjSpec", name: str, mesh: str, pos: list[float] | Array, **more: object) -> None:
-    """A geom that is seen and nothing else."""
+    """Add a geom that is drawn and does not collide."""
     kind = mujoco.mjtGeom.mjGEOM_MESH
     spec.worldbody.add_geom(name=name, type=kind, meshname=mesh, pos=pos, contype=0, conaffinity=0, **more)
 
 
 def _add_saplings(spec: "mujoco.MjSpec", rng: np.random.Generator) -> None:
-    """Young firs, where the scene has the outdoor scene's needles."""
+    """Add young firs where the scene has the outdoor scene's materials."""
     if spec.material("outdoor_needles") is None or spec.material("outdoor_bark") is None:
         return
     for i, (x, y) in enumerate(SAPLINGS):
@@ -113,7 +113,7 @@ def _add_saplings(spec: "mujoco.MjSpec", rng: np.random.Generator) -> None:
 
 
 def _add_twigs(spec: "mujoco.MjSpec", rng: np.random.Generator) -> None:
-    """Tips of branches at the leaves of every crown that the fixed camera sees."""
+    """Add twigs at the leaves of every crown that faces the fixed camera."""
     model = spec.copy().compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -136,26 +136,26 @@ def _add_twigs(spec: "mujoco.MjSpec", rng: np.random.Generator) -> None:
 
 
 def _named(model: "mujoco.MjModel", prefixes: tuple[str, ...]) -> "npt.NDArray[np.intp]":
-    """Numbers of the geoms whose names begin so."""
+    """Find the ids of the geoms whose names begin with one of the prefixes."""
     return np.array([g for g in range(model.ngeom) if model.geom(g).name.startswith(prefixes)], dtype=np.intp)
 
 
 def _extent(model: "mujoco.MjModel", data: "mujoco.MjData", geom: int) -> tuple[Array, Array]:
-    """Middle of a geom's box in the world and half its sides [m], (3,) each."""
+    """Give the centre of a geom's box in the world and half its sides [m], (3,) each."""
     axes = data.geom_xmat[geom].reshape(3, 3)
     middle = data.geom_xpos[geom] + axes @ model.geom_aabb[geom, :3]
     return middle, np.abs(axes) @ model.geom_aabb[geom, 3:]
 
 
 class Clutter:
-    """Moves what sways and drifts in a compiled world."""
+    """Motion of everything that sways or drifts in a compiled world."""
 
     def __init__(self, model: "mujoco.MjModel", seed: int) -> None:
-        """Find it and draw how it moves.
+        """Find the moving geoms and draw the parameters of their motion.
 
         Args:
             model: the compiled world.
-            seed: of everything random.
+            seed: seed of the random parameters.
         """
         rng = np.random.default_rng((seed, MOTION))
         data = mujoco.MjData(model)
@@ -189,10 +189,10 @@ class Clutter:
         self._sun = int(np.argmax(model.light_diffuse.sum(axis=1))) if model.nlight else -1
         self._sunlight = np.array(model.light_diffuse[self._sun]) if model.nlight else np.zeros(3)
         self._light_phase, self._drop_phase, self._gust_phase = rng.uniform(0, 2 * np.pi, 3)
-        self.faint = self._drifting  # without an edge that an exposure could blur
+        self.faint = self._drifting  # no sharp edges, so that exposure blur does not change them
 
     def move(self, data: "mujoco.MjData", t: float) -> None:
-        """Put everything where it is at time t [s]; after the kinematics, which know nothing of it."""
+        """Move everything to time t [s]; call it after the kinematics, which would undo it."""
         gust = 0.65 + 0.35 * math.sin(2 * math.pi * t / GUST_S + self._gust_phase)
         wave = np.sin(self._sway_rate * t + self._sway_phase)
         lean = self._sway * gust * (0.6 * wave[0] + 0.4 * wave[1])
@@ -206,7 +206,7 @@ class Clutter:
         data.geom_xpos[self._drifting, 0] = (x + self._span) % (2 * self._span) - self._span
 
     def light(self, model: "mujoco.MjModel", t: float) -> None:
-        """Make the sun as bright as it is at time t [s]."""
+        """Set the sun's brightness at time t [s]."""
         if self._sun < 0:
             return
         wave = LIGHT_WAVE * math.sin(2 * math.pi * t / LIGHT_WAVE_S + self._light_phase)

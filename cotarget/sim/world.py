@@ -1,4 +1,4 @@
-"""The simulated world: time -> poses -> images, with the rig's devices in front and the truth behind."""
+"""Simulated world: poses and images as functions of time, the rig's devices, and ground truth."""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -32,14 +32,14 @@ from cotarget.sim.weather import Clutter
 
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
-# Streams of random numbers, so that one effect's draws never shift another's.
+# Random streams of the sensors' noise, so that the draws of one effect never shift those of another.
 FIXED_NOISE, ZOOM_NOISE = 1, 2
-# The render's size is worked out for this many focal lengths of the zoom lens; between them its optics are smooth.
+# The render's size is computed from this many focal lengths of the zoom lens; its optics vary smoothly between them.
 SIZED_FOCALS = 17
 
 
 class SimWorld:
-    """A world with a rig in it. The pipeline gets `rig`; tests and experiments also get `truth()`."""
+    """Simulated world with a rig. The pipeline gets `rig`; tests and experiments also get `truth()`."""
 
     def __init__(
         self,
@@ -52,12 +52,12 @@ class SimWorld:
         """Build and compile the world.
 
         Args:
-            config: the rig.
-            clock: what its time goes by; by default its own, which only moves when somebody waits.
-            rendered: the cameras whose frames are rendered; the others' are black. All else is as ever: times,
-                latencies, head, lens and truth. Without any, no OpenGL is needed.
-            ahead: whether the zoom camera's next frame may be rendered, on another thread, before it is asked for;
-                nothing but the speed depends on it. COTARGET_AHEAD=0 in the environment forbids it.
+            config: the rig's configuration.
+            clock: source of time; by default a simulated clock, which only blocking calls advance.
+            rendered: cameras whose frames are rendered; the frames of others are black. Times, latencies, head, lens
+                and truth do not change. With none, no OpenGL is needed.
+            ahead: whether the zoom camera's next frame may be rendered on another thread before it is read. It changes
+                the speed only. COTARGET_AHEAD=0 in the environment forbids it.
 
         Raises:
             ConfigError: an unknown scene or target.
@@ -82,7 +82,7 @@ class SimWorld:
             self._views()
         ahead = ahead and is_allowed() and "zoom" in self._rendered
         self._ahead = Ahead(self._views().apart) if ahead else None
-        # The lens obeys as late as the head does.
+        # The lens has the same command delay as the head.
         delay = sim.head.command_delay_s if effects.command_delay else 0.0
         self._black = {name: _black(self._camera(name)) for name in CAMERAS}
         streams = {"fixed": FIXED_NOISE, "zoom": ZOOM_NOISE}
@@ -100,7 +100,7 @@ class SimWorld:
         )
 
     def truth(self) -> Truth:
-        """What is really so; for tests and experiments only."""
+        """Give the ground truth, for tests and experiments only."""
         return Truth(
             model=self._model,
             set_state=self._state.at,
@@ -116,11 +116,11 @@ class SimWorld:
         )
 
     def zoom_lens_at(self, t: float) -> TrueLens:
-        """The zoom camera's true optics at a time up to now."""
+        """Give the zoom camera's true optics at a time up to now [s]."""
         return self.zoom_lens_for(self.lens_drive.focal_at(t))
 
     def zoom_lens_for(self, nominal_px: float) -> TrueLens:
-        """The zoom camera's true optics at what its device calls a focal length [px]."""
+        """Give the zoom camera's true optics at a nominal focal length [px]."""
         factor = nominal_px / self.lens_drive.shortest_px
         if self.config.sim.effects.optics:
             optics = self.config.sim.zoom.optics_at(factor)
@@ -130,32 +130,38 @@ class SimWorld:
         return replace(self._zoom_lens, focal_px=(fx * factor, fy * factor))
 
     def render(self, camera: str, lens: TrueLens, t: float) -> Image:
-        """The perfect image that a lens sees at time t, without sensor effects, BGR."""
+        """Render the image of a lens at time t [s] without sensor effects, BGR."""
         return self._views().sharp(camera, lens, t)
 
     def pictures(self, size: tuple[int, int], before: SizedPictures | None = None) -> SizedPictures:
-        """What both cameras see, at another size (width, height) [px]; whoever asks for them closes them.
+        """Open a renderer of both cameras at another size; the caller closes it.
 
         Args:
-            size: of each picture.
-            before: those of a world before, as large; they are over, which saves to open OpenGL anew.
+            size: (width, height) of each picture [px].
+            before: renderer of an earlier world, with the same size. It ends, and its OpenGL context is used again
+                where possible, which saves the time of opening one.
         """
         return SizedPictures(self.config.sim, self._model, self._state, self._lens_at, self._lenses(), size, before)
 
     def portrait(self, azimuth_deg: float, axes: bool) -> Portrait:
-        """A picture of the rig as it is now, seen in a direction [degrees], with or without its frames' axes."""
+        """Render the rig itself as it is now.
+
+        Args:
+            azimuth_deg: direction of view [degrees].
+            axes: whether the axes of the rig's frames are drawn.
+        """
         return portrait(self._model, self._state.lit(self._clock.now()), azimuth_deg, axes)
 
     def close(self) -> None:
-        """Release the renderers, and the rig, which shows nothing from now on; more than once does no harm."""
+        """Release the renderers and the rig's access to the world; safe to call more than once."""
         if self._ahead is not None:
             self._ahead.close()
         if self._opened is not None:
             self._opened.close()
-        self.rig.leave()  # or each would keep the other, and the model's memory, until Python looks for cycles
+        self.rig.leave()  # breaks a reference cycle that would keep the model's memory until a garbage collection
 
     def _views(self) -> Views:
-        """The renderer of both cameras, opened when first needed."""
+        """Give the renderer of both cameras, opened on first use."""
         if self._opened is None:
             effects = self.config.sim.effects
             self._opened = Views(
@@ -177,7 +183,7 @@ class SimWorld:
         return make_target(name, sim.scene, rng, sim.effects.scatter, sim.paths.get(name), own)
 
     def _lenses(self) -> list[TrueLens]:
-        """Of both cameras, over all focal lengths."""
+        """Give the true lenses of both cameras, over all focal lengths."""
         drive, count = self.lens_drive, SIZED_FOCALS if self.config.sim.effects.optics else 1
         zooms = [self.zoom_lens_for(float(f)) for f in np.geomspace(drive.shortest_px, drive.longest_px, count)]
         return [self._fixed_lens, *zooms]
@@ -186,7 +192,7 @@ class SimWorld:
         return self.zoom_lens_at(t) if name == "zoom" else self._fixed_lens
 
     def expose(self, name: CameraName, index: int, t: float) -> Image:
-        """Gather light around time t, up to now, then add the sensor's effects to frame number ``index``."""
+        """Render the exposure around time t [s], up to now, and add the sensor's effects of frame number ``index``."""
         return self._exposed(self._views(), name, index, t) if name in self._rendered else self._black[name]
 
     def _exposed(self, views: Views, name: CameraName, index: int, t: float) -> Image:
@@ -197,7 +203,7 @@ class SimWorld:
         return self._camera(name).exposure_s if self.config.sim.effects.blur else 0.0
 
     def _expose_zoom(self, index: int, t: float) -> Image:
-        """A zoom frame for its stream; then, if what comes next has already happened, the next one is begun."""
+        """Give a zoom frame; start rendering the next one where its exposure is already over."""
         if self._ahead is None:
             return self.expose("zoom", index, t)
         image = self._ahead.take(index)
@@ -213,5 +219,5 @@ class SimWorld:
 
 
 def _black(camera: SimCamera) -> Image:
-    """What an unrendered camera shows."""
+    """Make the image of a camera that is not rendered."""
     return np.zeros((camera.size[1], camera.size[0], 3), dtype=np.uint8)

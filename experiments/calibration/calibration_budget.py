@@ -1,11 +1,11 @@
-"""What corners' noise and the number of placements of a calibration leave of pointing error, beside what it predicts.
+"""Pointing error over corner noise and number of placements of a calibration, against its prediction.
 
-Boards of 9 x 6 corners hang at 2.5 to 8 m all over the wide view, each looked at from four head poses; everything is
-unknown. The default rig, calibrated once for each noise and each number of placements, every seed with boards, poses
-and noise of its own. The pointing error is the angle between the line of sight and the true target, for targets all
-over the wide view at 4 to 30 m, pixel and depth given exactly; times 7155 it is what the longest focal length makes of
-it in pixels. The error should grow as the noise does, and shrink as one over the root of the placements, or faster
-where few of them leave parts of the view unseen; what it does are the exponents of a plane fitted to the logarithms.
+Boards of 9 x 6 corners at 2.5 to 8 m are spread over the fixed view, each seen from four head poses; everything is
+unknown. The default rig is calibrated for each noise and each number of placements; every seed has its own boards,
+poses and noise. The pointing error is the angle between line of sight and true target, for targets over the fixed view
+at 4 to 30 m, pixel and depth given exactly; times 7155 it is the error in pixels at the longest focal length. In theory
+the error is proportional to the noise, and to one over the root of the placements, or falls faster where few of them
+leave parts of the view empty. The measured exponents are those of a plane fitted to the logarithms.
 
     python -m experiments.calibration.calibration_budget [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out
     DIR]
@@ -32,20 +32,20 @@ from experiments.engine.texts import rms, table
 
 BOARD = BoardConfig()
 RIG = Truth()
-# The noise alone makes the error. More placements lessen it as one over their root, or more where few leave parts of
-# the view unseen: to a third from 6 to 12. What two seeds of a quick run tell of that is allowed for.
+# The error comes from the noise alone. More placements reduce it as one over their root, or more where few leave parts
+# of the view empty: to a third from 6 to 12. The limits allow for the two seeds of a quick run.
 WANTED = {"exponent_noise": (0.75, 1.25), "exponent_placements": (-1.6, -0.3), "reached_over_predicted": (0.67, 1.5)}
 
 
 @dataclass(frozen=True)
 class BudgetSettings(Settings):
-    """What is varied, and what is not.
+    """Settings: what is varied, and what is constant.
 
     Attributes:
-        noises_px: of corners [px].
-        placements: how many of the board.
-        looks: head poses for each.
-        targets: on which the error is measured.
+        noises_px: noise of corners [px].
+        placements: numbers of board placements.
+        looks: head poses per placement.
+        targets: number of targets on which the error is measured.
     """
 
     seeds: int = 5
@@ -55,14 +55,17 @@ class BudgetSettings(Settings):
     targets: int = 100
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_above(0, self, "noises_px", "placements", "looks", "targets")
         check_session(self, "placements", "looks")
 
 
 def one(_: None, settings: BudgetSettings, seed: int) -> list[Row]:
-    """A calibration, and a row, for each number of placements and each noise; boards differ by their number alone."""
+    """Calibrate for each number of placements and each noise; give a row for each.
+
+    Each calibration has its own random boards, poses and noise.
+    """
     rows: list[Row] = []
     for boards in settings.placements:
         for number, noise_px in enumerate(settings.noises_px):
@@ -85,7 +88,7 @@ def one(_: None, settings: BudgetSettings, seed: int) -> list[Row]:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """Rms over the seeds for each noise and number, and how the error grows with either."""
+    """Give rms over the seeds for each noise and number, and the exponents of the error."""
     cells = {}
     for boards, noise_px in dict.fromkeys((row["placements"], row["noise_px"]) for row in rows):
         mine = [row for row in rows if (row["placements"], row["noise_px"]) == (boards, noise_px)]
@@ -106,10 +109,10 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def exponents(rows: Sequence[Row], key: str = "reached_px") -> tuple[float, float]:
-    """How an error grows with the noise and with the number of placements: 1 and -0.5 in theory.
+    """Fit the exponents of an error over noise and number of placements; 1 and -0.5 in theory.
 
     Returns:
-        The exponents; nan of what was the same in all rows.
+        The exponents; nan for what is constant in all rows.
     """
     terms = [[np.log(row["noise_px"]), np.log(row["placements"]), 1.0] for row in rows]
     slopes, *_ = np.linalg.lstsq(np.array(terms), np.log([row[key] for row in rows]), rcond=None)
@@ -123,7 +126,7 @@ def _cell(noise_px: float, boards: int) -> str:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """What is not as theory has it, or as the calibrations predict for themselves; of what was measured."""
+    """List what differs from theory or from the calibrations' own predictions, among what was measured."""
     return [
         f"{name} is {summary[name]:.2f}, not {low:g} to {high:g}"
         for name, (low, high) in WANTED.items()
@@ -132,13 +135,13 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Each cell's error, and how much larger than predicted it is."""
+    """Give each cell's error, and its ratio to the prediction."""
     cells = {cell: found["reached_px"] for cell, found in summary["cells"].items()}
     return {"reached_px": cells, "reached_over_predicted": summary["reached_over_predicted"]}
 
 
 def describe(settings: BudgetSettings, summary: Mapping[str, Any]) -> str:
-    """A line for each number of placements: reached / predicted of each noise."""
+    """Format a line per number of placements: measured over predicted for each noise."""
     cells = summary["cells"]
     lines = []
     for boards in settings.placements:

@@ -1,12 +1,12 @@
-"""The whole chain from synthetic corners: how well a rig points, beside what it predicts and what is possible.
+"""Whole calibration from synthetic corners: pointing error against its prediction and the Cramer-Rao bound.
 
-15 boards of 0.88 x 0.68 m (14 x 11 corners) at 2.5 to 8 m, all over the wide view, each seen from six head poses, with
-corners of 0.2 px. Everything is unknown: both cameras' intrinsics, Gamma, T, the head's geometry. The pointing error is
-the angle between the line of sight and the true target at the shortest focal length, for targets all over the wide
-view at 4 to 30 m, pixel and depth given exactly; times 7155 it is what the longest focal length makes of it in pixels.
-Beside the joint fit stand its own prediction, the Cramer-Rao bound with the true noise, that bound if the intrinsics
-were known, and the sequential method. The default rig; one with a wide baseline, toed in and rolled, with a long lever;
-and the default rig with the usual board of 9 x 6 corners.
+15 boards of 0.88 x 0.68 m (14 x 11 corners) at 2.5 to 8 m are spread over the fixed view, each seen from six head
+poses, with corners of 0.2 px. Everything is unknown: both cameras' intrinsics, Gamma, T and the head's geometry. The
+pointing error is the angle between line of sight and true target at the shortest focal length, for targets over the
+fixed view at 4 to 30 m, pixel and depth given exactly; times 7155 it is the error in pixels at the longest focal
+length. The joint fit is compared with its own prediction, the Cramer-Rao bound for the true noise, that bound with
+known intrinsics, and the sequential method. The rigs are the default one; one with a wide baseline, toed in and rolled,
+with a long lever; and the default one with the usual board of 9 x 6 corners.
 
     python -m experiments.calibration.chain [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -45,7 +45,7 @@ FIGURES = ("joint", "predicted", "bound", "bound_intrinsics_known", "sequential"
 
 @dataclass(frozen=True)
 class ChainSettings(Settings):
-    """How many seeds; noise of corners [px], boards, head poses for each, targets for each seed, and which cases."""
+    """Settings: noise of corners [px], boards, head poses per board, targets per seed, and cases."""
 
     seeds: int = 20
     noise_px: float = 0.2
@@ -55,13 +55,13 @@ class ChainSettings(Settings):
     cases: tuple[str, ...] = tuple(CASES)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_session(self, "boards", "looks")
 
 
 def one(_: None, settings: ChainSettings, seed: int) -> list[Row]:
-    """Calibrate every case once; one row each."""
+    """Calibrate every case once; give a row per case."""
     return [_row(settings, seed, case) for case in settings.cases]
 
 
@@ -87,14 +87,14 @@ def _row(settings: ChainSettings, seed: int, case: str) -> Row:
 
 
 def bound(calibration: Calibration, noise_px: float, blocks: tuple[Block, ...], pixels: Array, depths: Array) -> Array:
-    """Cramer-Rao bound of the pointing error towards targets [rad], (n,).
+    """Compute the Cramer-Rao bound of the pointing error towards targets [rad], (n,).
 
     Args:
-        calibration: from views whose corners' coordinates have this noise and no other.
-        noise_px: its standard deviation.
-        blocks: what is unknown.
-        pixels: of the targets, (n, 2).
-        depths: of the targets [m], (n,).
+        calibration: calibration from views with this corner noise and no other.
+        noise_px: standard deviation of the corners' coordinates.
+        blocks: unknown parameters.
+        pixels: targets in the fixed view, (n, 2).
+        depths: depths of the targets [m], (n,).
     """
     assert calibration.board is not None
     points = board_points(calibration.board)
@@ -105,7 +105,7 @@ def bound(calibration: Calibration, noise_px: float, blocks: tuple[Block, ...], 
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Rms over the seeds [px at f = 7155 px]."""
+    """Give rms over the seeds [px at f = 7155 px]."""
     return {
         case: {f"{name}_px": rms(row[f"{name}_px"] for row in mine) for name in FIGURES}
         for case in CASES
@@ -114,7 +114,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def describe(settings: ChainSettings, summary: Mapping[str, Any]) -> str:
-    """The table."""
+    """Format the figures as a table."""
     return f"rms pointing error [px at f = 7155 px], {seeds_of(settings)}\n" + table(
         ("case", "joint", "predicted", "Cramer-Rao", "intrinsics known", "sequential"),
         ([case, *(found[f"{name}_px"] for name in FIGURES)] for case, found in summary.items()),

@@ -1,9 +1,9 @@
-"""T from 20 poses of one board, everything else known: how near each method comes to the Cramer-Rao bound.
+"""Hand-eye calibration: T from 20 poses of one board, all else known, against the Cramer-Rao bound.
 
-A board of 0.89 x 0.67 m stands 3 m away, the head turns as far as the board stays in the image (f = 693 px), and
-corners have noise of 0.2 px. Park and Martin's closed form and the weighted fit over poses are given the board's pose
-in each view; the joint fit works on the corners themselves. Root mean squares over the seeds; the bound is that of
-each seed's own poses.
+A board of 0.89 x 0.67 m is 3 m away, the head turns as far as the board stays in the image (f = 693 px), and corners
+have noise of 0.2 px. Park and Martin's closed form and the weighted fit over poses get the board's pose in each view;
+the joint fit uses the corners. Errors are root mean squares over the seeds; the bound is computed for each seed's own
+poses.
 
     python -m experiments.calibration.hand_eye [--seeds 100] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -31,32 +31,32 @@ from experiments.engine.harness import Experiment, Row, Settings, seeds_of
 from experiments.engine.texts import rms, table
 
 LENS = Lens(693.0, 693.0, 319.5, 239.5)
-COLUMNS, ROWS, WIDTH, HEIGHT = 14, 11, 0.89, 0.67  # corners, and between the outer ones [m]
+COLUMNS, ROWS, WIDTH, HEIGHT = 14, 11, 0.89, 0.67  # number of corners, and distance of the outer ones [m]
 DISTANCE = 3.0  # [m]
 BOARD_TURNED = (20.0, -15.0, 5.0)  # [degrees]
-REACH = (np.radians(40.0), np.radians(30.0))  # more than the image lets see
+REACH = (np.radians(40.0), np.radians(30.0))  # more than the image allows
 LEVEL = 0.9
 METHODS = ("Park and Martin", "poses, weighted", "joint fit")
-DRAWN = 400  # head poses at a time, of which the first are taken that see the board
-FEWEST_POSES = 3  # that tell T: from two of them the head turns about one axis only
+DRAWN = 400  # head poses drawn at a time; the first that see the board are taken
+FEWEST_POSES = 3  # least number that determines T: two poses rotate the head about one axis only
 
 
 @dataclass(frozen=True)
 class HandEyeSettings(Settings):
-    """How many poses, and the noise of corners [px]."""
+    """Settings: number of poses, and noise of corners [px]."""
 
     poses: int = 20
     noise_px: float = 0.2
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_least(FEWEST_POSES, self, "poses")
-        check_above(0, self, "noise_px")  # or there would be no bound to come near to
+        check_above(0, self, "noise_px")  # the bound is 0 without noise
 
 
 def one(_: None, settings: HandEyeSettings, seed: int) -> list[Row]:
-    """Draw poses and noise, solve by each method; one row each."""
+    """Draw poses and noise, solve by each method; give a row per method."""
     rng = np.random.default_rng((seed, 1))
     truth = Truth(zoom=LENS, dz=0.0, eps=0.0)
     v, u = np.mgrid[:ROWS, :COLUMNS]
@@ -112,7 +112,7 @@ def _row(
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Rms errors, their ratios to the bound, and how many of the 90 % ellipsoids hold the truth."""
+    """Give rms errors, their ratios to the bound, and the fraction of 90 % ellipsoids that contain the truth."""
     found = {}
     for method in METHODS:
         mine = [row for row in rows if row["method"] == method]
@@ -132,7 +132,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def describe(settings: HandEyeSettings, summary: Mapping[str, Any]) -> str:
-    """The table."""
+    """Format the figures as a table."""
     keys = ("rotation_deg", "translation_mm", "rotation_ratio", "translation_ratio", "inside")
     return f"T from {settings.poses} poses, rms over {seeds_of(settings)}\n" + table(
         ("method", "rotation [deg]", "translation [mm]", "x bound", "x bound", "in 90 % ellipsoid"),

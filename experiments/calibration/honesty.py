@@ -1,9 +1,9 @@
-"""Whether a calibration is as uncertain as it says: how many 90 % ellipses hold the truth.
+"""Consistency of a calibration's covariance: how many 90 % ellipses contain the truth.
 
-12 boards of 9 x 6 corners at 2.5 to 8 m, four head poses each, corners of 0.1 px; the default rig and one with a wide
-baseline, toed in and rolled. Each seed draws its own boards, poses and noise. Captures are not held out, because what
-they say could only widen the ellipses. Beside the ellipses stand the measured and the predicted pointing error, on the
-same targets.
+There are 12 boards of 9 x 6 corners at 2.5 to 8 m, four head poses each, and corners of 0.1 px; the rigs are the
+default one and one with a wide baseline, toed in and rolled. Each seed draws its own boards, poses and noise. No
+captures are held out, because they could only widen the ellipses. The measured and the predicted pointing error are
+given for the same targets.
 
     python -m experiments.calibration.honesty [--seeds 60] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -42,7 +42,7 @@ GROUPS = {
 
 @dataclass(frozen=True)
 class HonestySettings(Settings):
-    """How many seeds, boards, head poses for each, targets; noise of corners [px]."""
+    """Settings: boards, head poses per board, targets, and noise of corners [px]."""
 
     seeds: int = 60
     boards: int = 12
@@ -51,13 +51,13 @@ class HonestySettings(Settings):
     targets: int = 20
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_session(self, "boards", "looks")
 
 
 def one(_: None, settings: HonestySettings, seed: int) -> list[Row]:
-    """Calibrate both rigs once; one row each."""
+    """Calibrate both rigs once; give a row per rig."""
     return [_row(settings, seed, rig) for rig in RIGS]
 
 
@@ -79,7 +79,7 @@ def _row(settings: HonestySettings, seed: int, rig: str) -> Row:
 
 
 def inside(calibration: Calibration, truth: Truth, names: Sequence[str], level: float) -> bool:
-    """Whether the truth lies within the ellipsoid of a level that these parameters span."""
+    """Check that the truth is within the ellipsoid of a level of these parameters."""
     covariance, error = calibration.covariance, error_of(calibration, truth)
     assert covariance is not None
     rows = [covariance.parameters.index(name) for name in names]
@@ -88,7 +88,7 @@ def inside(calibration: Calibration, truth: Truth, names: Sequence[str], level: 
 
 
 def error_of(calibration: Calibration, truth: Truth) -> dict[str, float]:
-    """Truth less what was found, by name; a transform's as a turn exp(w) in front of R and a shift of t."""
+    """Compute truth minus estimate by name; for a transform, the rotation exp(w) in front of R and the shift of t."""
     pairs = [("fixed", truth.fixed, calibration.fixed), ("zoom[0]", truth.zoom, calibration.zoom.stops[0])]
     error = {
         f"{camera}.{name}": a - b
@@ -117,7 +117,7 @@ def error_of(calibration: Calibration, truth: Truth) -> dict[str, float]:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """Fractions of ellipses that hold the truth, and rms pointing errors."""
+    """Give fractions of ellipses that contain the truth, and rms pointing errors."""
     return {
         rig: {
             **{name: float(np.mean([row[name] for row in mine])) for name in GROUPS},
@@ -132,7 +132,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def describe(settings: HonestySettings, summary: Mapping[str, Any]) -> str:
-    """The table, a column a rig."""
+    """Format the figures as a table, a column per rig."""
     names = list(dict.fromkeys(name for found in summary.values() for name in found))
     lines = ([name.replace("_", " "), *(float(found[name]) for found in summary.values())] for name in names)
     head = f"{100 * LEVEL:.0f} % ellipses that hold the truth; pointing at f = 7155 px, {seeds_of(settings)}"

@@ -37,7 +37,7 @@ PHOTOS = Path(__file__).resolve().parents[3] / "shared" / "data" / "opencv_stere
 
 @dataclass(frozen=True)
 class PhotosSettings(Settings):
-    """Where the photos are, what they show, and how many of the pairs are left out in their turn (all, at most)."""
+    """Settings: the photos, their board, and the number of pairs to leave out in turn (at most all)."""
 
     directory: str = str(PHOTOS)
     left: str = "left*.jpg"
@@ -47,14 +47,14 @@ class PhotosSettings(Settings):
     square: float = 0.025
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_least(FEWEST_CORNERS, self, "columns", "rows")
         check_above(0, self, "square")
 
 
 def needs(settings: PhotosSettings) -> str:
-    """Say what is missing."""
+    """Describe what is missing to run; empty if nothing."""
     there = Path(settings.directory)
     return "" if there.is_dir() else f"needs photos in {there}, which are not part of the project"
 
@@ -66,13 +66,13 @@ def whole(settings: PhotosSettings) -> Calibration:
 
 
 def jobs(settings: PhotosSettings) -> Sequence[int]:
-    """Numbers of the pairs to be left out; one in which no board is found has a number and no row."""
+    """Give the numbers of the pairs to leave out; one without a board has a number and no row."""
     pairs = len(list(Path(settings.directory).glob(settings.left)))
     return range(min(settings.seeds, max(pairs, 1)))
 
 
 def one(calibration: Calibration, _: PhotosSettings, number: int) -> list[Row]:
-    """One row for each pair, and with the first one for the whole."""
+    """Give the row of a left-out pair, and with the first one the row of all pairs."""
     pairs = sorted({view.board for view in calibration.views})
     rows = [_all(calibration)] if number == 0 else []
     return rows + [_without(calibration, pair) for pair in pairs[number : number + 1]]
@@ -96,7 +96,7 @@ def _all(whole: Calibration) -> Row:
 
 
 def _without(whole: Calibration, pair: int) -> Row:
-    """Calibrate without a pair, then fit its board alone."""
+    """Calibrate without a pair, then fit the pose of its board alone."""
     assert whole.board is not None
     points = board_points(whole.board)
     sizes = {"fixed": whole.fixed.size, "zoom": whole.zoom.size}
@@ -111,7 +111,7 @@ def _without(whole: Calibration, pair: int) -> Row:
 
 
 def _baseline_sigma(calibration: Calibration) -> float:
-    """Standard deviation of the baseline [m]; nan without a covariance."""
+    """Give the standard deviation of the baseline [m]; nan without a covariance."""
     covariance = calibration.covariance
     if covariance is None:
         return float("nan")
@@ -122,7 +122,7 @@ def _baseline_sigma(calibration: Calibration) -> float:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """What the whole gives, and the pairs left out."""
+    """Give the figures of all pairs, and of the pairs left out."""
     whole, pairs = rows[0], rows[1:]
     squares = sum(row["left_out_rms_px"] ** 2 * row["corners"] for row in pairs)
     return {
@@ -135,7 +135,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def describe(_: PhotosSettings, summary: Mapping[str, Any]) -> str:
-    """The table, then the pairs."""
+    """Format the figures as a table, then the pairs."""
     figures = [[name.replace("_", " "), value] for name, value in summary.items() if name != "left_out"]
     pairs = [[name, value] for name, value in summary["left_out"].items()]
     return table(("all photos", ""), figures) + "\n\n" + table(("pair left out", "rms [px]"), pairs)
@@ -166,7 +166,7 @@ EXPERIMENT = Experiment(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
+    """Run the command."""
     parser = Parser(prog="python -m experiments.calibration.photos", description=EXPERIMENT.purpose)
     parser.add_argument("directory", nargs="?", default=SETTINGS.directory, metavar="DIR", help="the photos")
     parser.add_argument("--left", default=SETTINGS.left, metavar="GLOB")

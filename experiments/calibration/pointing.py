@@ -1,11 +1,11 @@
-"""How well a rig points after it was calibrated from rendered boards, and what simpler models lose.
+"""Pointing after a calibration from rendered boards, for the full model and for simpler ones.
 
-Two rigs, of which the software is told nothing: the default one, and one with a wide baseline, toed in and rolled,
-with a long lever arm; or one's own, `--set pointing.rig=rig.toml`. Each is calibrated from rendered boards with all
-effects on, once a seed. The pointing error is the angle between the zoom camera's line of sight and the true target,
-for targets all over the wide view at 4 to 30 m, pixel and depth given exactly, at the shortest focal length. Beside the
-full model stand the paper's shortcut in its two readings and a model that ignores the offsets between fixed camera,
-head and zoom camera.
+There are two rigs, about which the software knows nothing in advance: the default one, and one with a wide baseline,
+toed in and rolled, with a long lever. A user's own rig is tested with `--set pointing.rig=rig.toml`. Each is calibrated
+from rendered boards with all effects, once per seed. The pointing error is the angle between the zoom camera's line of
+sight and the true target, for targets over the fixed view at 4 to 30 m, pixel and depth given exactly, at the shortest
+focal length. The full model is compared with the paper's shortcut in its two readings, and with a model that ignores
+the offsets between fixed camera, head and zoom camera.
 
     python -m experiments.calibration.pointing [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -49,15 +49,15 @@ MODELS: dict[str, tuple[Method, bool]] = {
     "paper's shortcut, depth of Table 1": ("paper-table", False),
     "paper's shortcut, depth of Section 4.2": ("paper-example", False),
 }
-OWN = "own"  # name of a rig of one's own
-STREAM = 5  # of random numbers, apart from the world's own
-# What is wanted of the full model's median over the seeds, at most [degrees].
+OWN = "own"  # name of a user's own rig
+STREAM = 5  # random stream, separate from the world's
+# Goals for the full model's median over the seeds, at most [degrees].
 WANTED = {"median_deg": 0.003, "p95_deg": 0.006}
 
 
 @dataclass(frozen=True)
 class Settings(OwnRig):
-    """How many seeds, how many targets for each, and which rigs, where none of one's own is given."""
+    """Settings: targets per seed, and the rigs where no own one is given."""
 
     seeds: int = 3
     targets: int = 400
@@ -65,7 +65,7 @@ class Settings(OwnRig):
 
 
 def one(_: None, settings: Settings, seed: int) -> list[Row]:
-    """Calibrate every rig once; one row for each model's error then [degrees]."""
+    """Calibrate every rig once; give a row with the error of each model [degrees]."""
     rows: list[Row] = []
     for rig in (OWN,) if settings.rig else settings.rigs:
         config = (
@@ -95,7 +95,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
 
 
 def without_offsets(calibration: Calibration) -> Calibration:
-    """The model of those who ignore where the cameras are: the same rotations, everything in one place."""
+    """Remove all offsets from a calibration: the same rotations, and the whole rig at one point."""
     return dataclasses.replace(
         calibration,
         T_zoom0_fixed=RigidTransform.from_rotation(calibration.T_zoom0_fixed.rotation),
@@ -104,7 +104,7 @@ def without_offsets(calibration: Calibration) -> Calibration:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
-    """Of each rig's and model's median and 95th percentile the median over the seeds, least and largest [degrees]."""
+    """Give median, least and largest over the seeds of each rig's and model's median and 95th percentile [degrees]."""
     return {
         rig: {
             model: {
@@ -117,7 +117,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, dict[str, fl
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures of the full model that are larger than wanted."""
+    """List the figures of the full model that exceed their goal."""
     return [
         f"{rig}: {key}"
         for rig, models in summary.items()
@@ -127,7 +127,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
-    """A line for each rig and model."""
+    """Format a line per rig and model."""
     lines = [
         [f"{rig}: {model}", *(in_words(found[key], ".4f") for key in WANTED)]
         for rig, models in summary.items()

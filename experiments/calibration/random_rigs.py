@@ -1,15 +1,14 @@
-"""Random rigs: each is calibrated within twice its own predicted error, or refused with the reason.
+"""Random rigs: each is calibrated within twice its predicted error, or refused with a reason.
 
-The baseline is 0.1 to 10 m (even in its logarithm) in a random direction, no more than 30 degrees out of the fixed
-camera's image plane; the zoom camera is turned against the fixed one by up to 60 degrees about any axis, and by any
-roll; it sits on the head with a lever of up to 0.3 m, turned by up to 10 degrees about any axis, and by any roll.
-Lenses vary by a few per cent, corners have 0.1 to 0.2 px of noise. The head's limits are pan -158.9 to 158.9 and tilt
--46.6 to 31.1 degrees. Boards hang where the fixed camera sees them and some head poses within the limits let the zoom
-camera see them, turned to face halfway between both, at 2.5 to 8 m, with squares of 0.1 m; from a baseline of 3 m on,
-depths and squares grow with it. A mounting from which the zoom camera cannot look at a third of the fixed camera's view
-is none, and is drawn again. Targets lie all over the wide view at 4 to 30 m (grown likewise), wherever the head
-reaches. Beside the number of rigs beyond twice their predicted error stands how many chance would put there if every
-covariance were true.
+The baseline is 0.1 to 10 m (even in its logarithm) in a random direction, at most 30 degrees out of the fixed camera's
+image plane. The zoom camera is rotated against the fixed one by up to 60 degrees about any axis, with any roll. It sits
+on the head with a lever of up to 0.3 m, rotated by up to 10 degrees about any axis, with any roll. Lenses vary by a few
+per cent, and corners have 0.1 to 0.2 px of noise. The head's limits are pan -158.9 to 158.9 and tilt -46.6 to 31.1
+degrees. Boards are where the fixed camera sees them and the zoom camera does from some head poses within the limits,
+facing halfway between both, at 2.5 to 8 m, with squares of 0.1 m; from a baseline of 3 m on, depths and squares grow
+with it. A mounting from which the zoom camera cannot see a third of the fixed view is drawn again. Targets are over the
+fixed view at 4 to 30 m (growing in the same way), wherever the head reaches. The number of rigs beyond twice their
+predicted error is compared with the number expected by chance if every covariance is right.
 
     python -m experiments.calibration.random_rigs [--seeds 50] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -40,14 +39,14 @@ OUT_OF_PLANE = np.sin(np.radians(30.0))
 TURNED, ON_HEAD, LEVER = np.radians(60.0), np.radians(10.0), 0.3  # [rad], [rad], [m]
 GROWS_FROM = 3.0  # baseline from which boards and depths grow with it [m]
 NOISE_PX = (0.1, 0.2)
-SERVED = 1 / 3  # of the fixed camera's view that the zoom camera must reach
-WITHIN = 2.0  # times the predicted error
+SERVED = 1 / 3  # least fraction of the fixed view that the zoom camera reaches
+WITHIN = 2.0  # largest ratio to the predicted error
 CHANCE_DRAWS, CHANCE_TARGETS = 50, 50
 
 
 @dataclass(frozen=True)
 class RigsSettings(Settings):
-    """How many rigs, boards, head poses for each, and targets for each rig."""
+    """Settings: boards, head poses per board, and targets per rig."""
 
     seeds: int = 50
     boards: int = 20
@@ -57,7 +56,7 @@ class RigsSettings(Settings):
 
 @dataclass(frozen=True)
 class Drawn:
-    """A rig, how much larger than usual its scene is, and how much of the fixed camera's view it can serve."""
+    """Random rig, the scale of its scene, and the fraction of the fixed view that it reaches."""
 
     truth: Truth
     grown: float
@@ -66,7 +65,7 @@ class Drawn:
 
 
 def one(_: None, settings: RigsSettings, seed: int) -> list[Row]:
-    """Draw a rig, calibrate it, and judge it; one row."""
+    """Draw a rig, calibrate it, and judge it; give one row."""
     rng = np.random.default_rng((seed, 4))
     rig = draw_rig(rng)
     truth = rig.truth
@@ -119,10 +118,10 @@ def one(_: None, settings: RigsSettings, seed: int) -> list[Row]:
 
 
 def by_chance(calibration: Calibration, pixels: Array, depths: Array, rng: np.random.Generator) -> float:
-    """How often an rms error is beyond twice the predicted one although the covariance is true.
+    """Estimate how often an rms error exceeds twice the predicted one although the covariance is right.
 
     A rig's error has few degrees of freedom, so that its rms over many targets scatters. Calibrations are drawn from
-    the covariance and judged as if the one found were the truth.
+    the covariance and judged as if the fitted one were the truth.
     """
     covariance = calibration.covariance
     assert covariance is not None
@@ -151,7 +150,7 @@ def by_chance(calibration: Calibration, pixels: Array, depths: Array, rng: np.ra
 
 
 def draw_rig(rng: np.random.Generator) -> Drawn:
-    """A rig that can serve enough of the fixed camera's view."""
+    """Draw a rig that reaches enough of the fixed view."""
     redrawn = -1
     while True:
         redrawn += 1
@@ -180,7 +179,7 @@ def draw_rig(rng: np.random.Generator) -> Drawn:
 
 
 def reaches(truth: Truth, pixels: Array, depths: Array) -> Array:
-    """Which targets the head can look at, within its limits, (n,)."""
+    """Check for each target that the head can point at it within its limits, (n,)."""
     x_fixed = np.c_[undistorted(pixels, truth.fixed), np.ones(len(pixels))] * depths[:, None]
     q = aimed(truth, x_fixed, np.array([0.0, 0.0, 1.0]))
     limits: Array = np.array(HEAD_LIMITS)
@@ -193,26 +192,26 @@ def _target_depths(grown: float) -> tuple[float, float]:
 
 
 def any_direction(rng: np.random.Generator) -> Array:
-    """A unit vector, (3,)."""
+    """Draw a unit vector, (3,)."""
     v = rng.normal(0, 1, 3)
     return np.asarray(v / np.linalg.norm(v))
 
 
 def _any_turn(rng: np.random.Generator, largest: float) -> Rotation:
-    """About any axis, by any angle up to the largest, after any roll about z."""
+    """Draw a rotation about any axis by up to the largest angle, after any roll about z."""
     turn = Rotation.from_rotvec(any_direction(rng) * rng.uniform(0, largest))
     return turn * Rotation.from_rotvec([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
 
 
 def any_lens(rng: np.random.Generator, k1: float) -> Lens:
-    """One like the default ones, within a few per cent."""
+    """Draw a lens within a few per cent of the default one."""
     focal = rng.uniform(650, 730)
     cx, cy = rng.uniform([309, 229], [329, 249])
     return Lens(focal, focal * rng.uniform(0.995, 1.005), cx, cy, (k1 * rng.uniform(0.5, 1.5), 0.0, 0.0, 0.0, 0.0))
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """Counts, ratios, and what was refused or is further off than twice its own prediction."""
+    """Give counts and ratios, and list rigs that were refused or exceed twice their prediction."""
     found = [row for row in rows if not row["refused"]]
     ratios = np.array([row["ratio"] for row in found])
     return {
@@ -233,7 +232,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def describe(settings: RigsSettings, summary: Mapping[str, Any]) -> str:
-    """The table, then a line for each rig that was refused or is too far off."""
+    """Format the figures as a table, with a line per rig that was refused or is too far off."""
     lines = [[name.replace("_", " "), value] for name, value in summary.items() if not isinstance(value, Mapping)]
     refused = [f"rig {seed} refused: {reason}" for seed, reason in summary["why_refused"].items()]
     beyond = [f"rig {seed}: {ratio:.2f} times its predicted error" for seed, ratio in summary["beyond"].items()]

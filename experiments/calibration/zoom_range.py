@@ -1,10 +1,10 @@
-"""How well a rig points over its whole zoom range, calibrated from rendered boards, with an ideal head and with steps.
+"""Pointing over the whole zoom range, calibrated from rendered boards, with an ideal head and with steps.
 
-The default rig with all effects on, once a seed with a head that stands wherever it is sent and once with one of
-0.0514 degree steps. The pointing error is stated at the shortest focal length and over all others (the angle between
-the line of sight and targets all over the wide view at 4 to 30 m, pixel and depth given exactly); beside it how far
-focal length and boresight are off at and between the stops. With steps, the aim is rounded to them, and the error
-stands beside that of a true calibration rounded alike.
+The default rig with all effects is calibrated once per seed with an ideal head and once with steps of 0.0514 degrees.
+The pointing error is given at the shortest focal length and over all others: the angle between line of sight and
+targets over the fixed view at 4 to 30 m, pixel and depth given exactly. The errors of focal length and boresight at and
+between the zoom samples are given too. With steps, the aim is rounded to them, and the error is compared with that of a
+true calibration rounded in the same way.
 
     python -m experiments.calibration.zoom_range [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -35,7 +35,7 @@ from experiments.engine.harness import Experiment, Row, seeds_of
 from experiments.engine.spread import spread_of
 from experiments.engine.texts import rms, table
 
-# What is wanted of each head's figures, at least and at most; of an ideal head nothing is rounded.
+# Goals for each head's figures, least and largest; with an ideal head nothing is rounded.
 WANTED: Mapping[str, tuple[float, float]] = {
     "shortest_median_deg": (0.0, 0.003),
     "shortest_p95_deg": (0.0, 0.006),
@@ -44,16 +44,16 @@ WANTED: Mapping[str, tuple[float, float]] = {
     "rms_over_predicted": (0.4, 1.5),
     "ratio": (0.0, 1.1),
 }
-STREAM = 6  # of random numbers, apart from the world's own
-FOCAL_LENGTHS = 15  # over the range, evenly in the logarithm: every stop and the middle between any two
+STREAM = 6  # random stream, separate from the world's
+FOCAL_LENGTHS = 15  # evenly spaced in the logarithm: every zoom sample and the middle between any two
 HEADS = {"ideal": False, "steps": True}
-# A grid of targets for the prediction: pixels as shares of the image, and depths [m].
+# Grid of targets for the prediction: pixels as fractions of the image, and depths [m].
 SHARES, DEPTHS = np.linspace(0.05, 0.95, 4), np.array([5.0, 10.0, 25.0])
 
 
 @dataclass(frozen=True)
 class Settings(harness.Settings):
-    """How many seeds, how many targets at each focal length, and which heads."""
+    """Settings: targets per focal length, and heads."""
 
     seeds: int = 3
     targets: int = 60
@@ -61,7 +61,7 @@ class Settings(harness.Settings):
 
 
 def one(_: None, settings: Settings, seed: int) -> list[Row]:
-    """Calibrate with each head; one row for each focal length."""
+    """Calibrate with each head; give a row per focal length."""
     rows: list[Row] = []
     for head in settings.heads:
         sim = SimConfig(scene="indoor", seed=seed, effects=SimEffects(steps=HEADS[head]))
@@ -95,14 +95,14 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
 
 
 def predicted(calibration: Calibration, nominal_px: float) -> float:
-    """Predicted rms pointing error over the wide view and depth [rad]."""
+    """Predict the rms pointing error over fixed view and depth [rad]."""
     u, v, z = np.meshgrid(SHARES, SHARES, DEPTHS)
     pixels = np.stack([u.ravel(), v.ravel()], axis=-1) * (np.array(calibration.fixed.size) - 1)
     return rms(predicted_pointing(calibration, pixels, z.ravel(), nominal_px=nominal_px))
 
 
 def lens_errors(calibration: Calibration, truth: Truth, nominal_px: float) -> dict[str, float]:
-    """How far off the focal length is [%], and the ray through the image's middle in the head's frame [degrees]."""
+    """Give errors of the focal length [%] and of the ray through the image's centre in the head's frame [degrees]."""
     found, true = calibration.zoom.at(nominal_px), truth.zoom_lens_for(nominal_px)
     middle = found.image_center_px
     here = calibration.hand_eye().rotation.apply(found.ray(middle))
@@ -114,12 +114,12 @@ def lens_errors(calibration: Calibration, truth: Truth, nominal_px: float) -> di
 
 
 def truth_hand(truth: Truth) -> RigidTransform:
-    """The true T_head_zoom, from the world's own poses at home."""
+    """Give the true T_head_zoom, from the world's own poses at home."""
     return truth.T_world_base.inv() * truth.T_world_camera("zoom", 0.0)
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """Medians over the seeds, of the error over the range least and largest too, and the worst of the lens."""
+    """Give medians over the seeds, least and largest of the error over the range, and the worst error of the lens."""
     summary: dict[str, Any] = {}
     for head in dict.fromkeys(row["head"] for row in rows):
         mine = [row for row in rows if row["head"] == head]
@@ -154,13 +154,13 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _over_range(key: str, values: Sequence[Any]) -> dict[str, float]:
-    """A figure's median over the seeds under its own name, and least and largest beside it."""
+    """Give a figure's median over the seeds, with least and largest."""
     found = spread_of(map(float, values))
     return {key: found["median"], f"{key}, least": found["least"], f"{key}, largest": found["largest"]}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     return [
         f"{head}: {key}"
         for head, found in summary.items()
@@ -170,12 +170,12 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def median(values: Any) -> float:
-    """Median of an iterable."""
+    """Give the median of an iterable."""
     return float(np.median(list(values)))
 
 
 def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
-    """A line for each figure, a column for each head."""
+    """Format a line per figure, a column per head."""
     names = list(dict.fromkeys(name for found in summary.values() for name in found))
     lines = [
         [

@@ -1,1 +1,1 @@
-"""Run experiments over seeds, keep their rows, compare figures with bounds, write the report."""
+"""Engine of the experiments: run seeds, store rows, compare figures with bounds, write the report."""

@@ -1,4 +1,4 @@
-"""What the experiments' commands share: mistakes in their options end before the work."""
+"""Checks of command-line options that end before the work starts."""
 
 import os
 from pathlib import Path
@@ -7,10 +7,10 @@ from cotarget.errors import ConfigError
 
 
 def check_folder(out: Path) -> None:
-    """Refuse a folder for results that cannot be made or written to, before the work and not after it.
+    """Refuse a results folder that cannot be made or written, before the work starts.
 
     Raises:
-        ConfigError: it, or what it would be in, is a file or may not be written to.
+        ConfigError: the folder or one of its parents is a file, or is not writable.
     """
     there = next(path for path in (out.absolute(), *out.absolute().parents) if os.path.lexists(path))
     if not there.is_dir():

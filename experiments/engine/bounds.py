@@ -1,11 +1,11 @@
-"""What the experiments' quick runs have reached: bounds in expected/NAME.json, which only tighten.
+"""Bounds of the quick runs' figures, in expected/NAME.json; they only tighten.
 
-A file holds some of the figures of a summary, under the same names. In the place of each it says one or more of
+A file has some figures of a summary under the same names. Each has one or more of
 
-    at_most, at_least   the best that was reached; WORSE times as bad is still as good
-    within              a pair that is what is wanted itself, and stays
+    at_most, at_least   best value reached; a value up to WORSE times as bad passes
+    within              pair of limits, which never changes
 
-and null in the place of a number where it is not known yet. A number alone is short for at_most.
+with null for a number that is not known yet. A number alone means at_most.
 """
 
 import functools
@@ -22,8 +22,8 @@ from experiments.engine.harness import Experiment
 from experiments.engine.texts import plain
 
 EXPECTED = Path(__file__).parents[1] / "expected"
-WORSE = 1.10  # times: other versions of the libraries round and render otherwise by as much
-DIGITS = 4  # of a bound
+WORSE = 1.10  # factor; other versions of the libraries round and render differently by about as much
+DIGITS = 4  # significant digits of a bound
 AT_MOST, AT_LEAST, WITHIN = "at_most", "at_least", "within"
 WORDS = {AT_MOST: "at most", AT_LEAST: "at least", WITHIN: "within"}
 Trail = tuple[str, ...]
@@ -31,13 +31,13 @@ Trail = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Bound:
-    """A figure beside one of its bounds.
+    """Figure with one of its bounds.
 
     Attributes:
-        path: where it stands in the summary.
+        path: path of the figure in the summary.
         kind: AT_MOST, AT_LEAST or WITHIN.
-        bound: the best that was reached before, or a pair; None where that was never.
-        reached: now; None where it was not measured.
+        bound: best value reached before, or a pair of limits; None before the first.
+        reached: value of this run; None where it was not measured.
     """
 
     path: Trail
@@ -47,12 +47,12 @@ class Bound:
 
     @property
     def name(self) -> str:
-        """The path in words."""
+        """Path of the figure as text."""
         return " / ".join(self.path)
 
     @property
     def text(self) -> str:
-        """The bound in words."""
+        """Bound as text."""
         if self.bound is None:
             return f"{WORDS[self.kind]} -"
         values = self.bound if isinstance(self.bound, tuple) else (self.bound,)
@@ -60,19 +60,19 @@ class Bound:
 
     @property
     def kept(self) -> bool:
-        """Whether it is no worse."""
+        """Whether the figure is within its bound."""
         if self.reached is None:
             return False
         if isinstance(self.bound, tuple):
             return self.bound[0] <= self.reached <= self.bound[1]
         if self.bound is None:
             return True
-        worst = (self.bound * WORSE, self.bound / WORSE)  # which is which depends on the sign
+        worst = (self.bound * WORSE, self.bound / WORSE)  # for negative bounds the order is reversed
         return self.reached <= max(worst) if self.kind == AT_MOST else self.reached >= min(worst)
 
     @property
     def tighter(self) -> float | None:
-        """What the bound may become now; None where it stays."""
+        """New value of the bound; None where it stays."""
         if self.reached is None or self.kind == WITHIN:
             return None
         rounded = float(f"{self.reached:.{DIGITS}g}")
@@ -84,7 +84,7 @@ class Bound:
 
 
 def leaves(tree: Any, path: Trail = ()) -> Iterator[tuple[Trail, Any]]:
-    """Every value of nested dictionaries, with its path."""
+    """Iterate over all values of nested dictionaries, with their paths."""
     if not isinstance(tree, Mapping):
         yield path, tree
         return
@@ -93,7 +93,7 @@ def leaves(tree: Any, path: Trail = ()) -> Iterator[tuple[Trail, Any]]:
 
 
 def compare(experiment: Experiment[Any], summary: Mapping[str, Any], folder: Path = EXPECTED) -> list[Bound]:
-    """Each figure that has a bound, beside it; none where there is no file.
+    """List the figures that have bounds, with these; empty without a file.
 
     Raises:
         ConfigError: the file cannot be read.
@@ -104,7 +104,7 @@ def compare(experiment: Experiment[Any], summary: Mapping[str, Any], folder: Pat
 def _beside(
     experiment: Experiment[Any], summary: Mapping[str, Any], folder: Path
 ) -> tuple[list[tuple[Bound, Callable[[float], None]]], dict[str, Any]]:
-    """Each figure beside its bound, with what puts another in its place in the table; and the table."""
+    """Pair each bounded figure with a function that replaces its bound in the table; also give the table."""
     path = folder / f"{experiment.name}.json"
     tree = _read(path) if path.exists() else {}
     figures = dict(leaves(plain(summary if experiment.bounded is None else experiment.bounded(summary))))
@@ -133,16 +133,15 @@ def _put(tree: dict[str, Any], trail: Trail, value: float) -> None:
 
 
 def tighten(experiment: Experiment[Any], summary: Mapping[str, Any], folder: Path = EXPECTED) -> list[str]:
-    """Write what was reached where that is better than the bound.
+    """Write the values that are better than their bounds.
 
-    Times are not written: what one machine reaches on a good day binds no other.
+    Experiments that measure times have no bounds written, because machines differ.
 
     Returns:
-        A line for each bound that has changed.
+        A line for each bound that changed.
 
     Raises:
-        ConfigError: the file cannot be read.
-        ConfigError: it cannot be written.
+        ConfigError: the file cannot be read or written.
     """
     if experiment.alone:
         return []

@@ -1,4 +1,4 @@
-"""What is to be run: experiments by name, each with its settings, or with several choices of them to be compared."""
+"""Cases to run: experiments by name with their settings, or with several settings to compare."""
 
 import dataclasses
 import difflib
@@ -51,8 +51,8 @@ MODULES = (  # in the order of the report
 )
 EXPERIMENTS = {module.rpartition(".")[2]: module for module in MODULES}
 PROCESSES = "processes"
-SIGNED = ("depth_error.wrong",)  # settings that may be below zero
-SHORT = 6  # digits that tell folders apart whose names cannot be written in full
+SIGNED = ("depth_error.wrong",)  # settings that may be negative
+SHORT = 6  # digits of the hash in a folder's name, where a title is not a valid name
 Known = Mapping[str, Callable[[], Experiment[Any]]]
 
 
@@ -62,19 +62,19 @@ def _load(module: str) -> Experiment[Any]:
 
 
 def known_experiments() -> Known:
-    """All there are; each is loaded when it is called for."""
+    """Give all experiments by name; each is loaded when its function is called."""
     return {name: lambda module=module: _load(module) for name, module in EXPERIMENTS.items()}  # type: ignore[misc]
 
 
 @dataclass(frozen=True)
 class Case:
-    """An experiment with settings of its own.
+    """Experiment with given settings.
 
     Attributes:
-        experiment: what is done.
-        settings: how.
-        changes: what differs from the experiment's own settings, as it was typed.
-        quick: whether it takes seconds only, too few for what is wanted.
+        experiment: the experiment.
+        settings: its settings.
+        changes: changed settings, as typed.
+        quick: whether it is a quick run, which is too short for the experiment's goals.
     """
 
     experiment: Experiment[Any]
@@ -84,12 +84,12 @@ class Case:
 
     @property
     def title(self) -> str:
-        """How it is called."""
+        """Name of the case: the experiment and its changed settings."""
         return ", ".join([self.experiment.name, *self.changes])
 
     @property
     def folder(self) -> str:
-        """The same, as the name of a folder."""
+        """Name of the case's folder: the title with other characters replaced, and a hash where some were."""
         plain = re.sub(r"[^\w.=,-]+", "_", self.title.replace(", ", ","))
         if plain == self.title.replace(", ", ","):
             return plain
@@ -97,12 +97,12 @@ class Case:
 
     @property
     def numbers(self) -> Sequence[int]:
-        """Of its jobs."""
+        """Numbers of the jobs."""
         return self.experiment.jobs(self.settings)
 
     @property
     def has_bounds(self) -> bool:
-        """Whether this is the experiment's quick run as it is, whose figures have bounds."""
+        """Whether this is the unchanged quick run, whose figures have bounds."""
         quick = self.experiment.quick
         return identity(self.settings) == identity(quick) and self.settings.seeds == quick.seeds
 
@@ -116,20 +116,19 @@ def choose(
     seed_base: int | None = None,
     changes: Sequence[str] = (),
 ) -> list[Case]:
-    """Experiments with their settings.
+    """Make the cases of a run.
 
     Args:
-        known: those there are.
-        names: of those to run; all, where none is named.
-        quick: whether each does what takes seconds only.
-        seeds: how many; each experiment's own number by default.
-        seed_base: the first; each experiment's own by default.
-        changes: settings as NAME.KEY=VALUE, the value as TOML has it; where a key comes more than once, there is a case
-            for each of its values, however often and in whatever way each is written, and for each combination with
-            those of other keys.
+        known: known experiments.
+        names: experiments to run; all if empty.
+        quick: whether to use the quick settings.
+        seeds: number of seeds; by default each experiment's own.
+        seed_base: first seed; by default each experiment's own.
+        changes: settings as NAME.KEY=VALUE with a TOML value. A key that is given more than once makes a case of each
+            distinct value, in combination with the values of other keys.
 
     Raises:
-        ConfigError: an unknown experiment or setting, or a value that it cannot have.
+        ConfigError: an unknown experiment or setting, or an invalid value.
     """
     chosen = list(dict.fromkeys(_checked(name, known) for name in names)) or list(known)
     values = _parsed(changes, known, chosen)
@@ -145,7 +144,7 @@ def choose(
             settings = build(type(base), tables, name, base=base)
             for key in tables:
                 _check(settings, key, f"{name}.{key}")
-            if settings in already:  # the same values, written in another way
+            if settings in already:  # the same values in another spelling
                 continue
             already.append(settings)
             cases.append(Case(experiment, settings, tuple(f"{key}={text}" for key, text in picked), quick))
@@ -153,13 +152,13 @@ def choose(
 
 
 def _check(settings: Settings, key: str, where: str) -> None:
-    """Refuse a value that no seed can be done with, before all seeds fail one by one.
+    """Refuse a value with which every seed would fail.
 
-    Whole numbers count something, other numbers measure it, and times last; names are among those of the usual value,
-    which are all there are.
+    Integers are counts, other numbers are measures, and durations must be above zero. A text must be one of the
+    default's.
 
     Raises:
-        ConfigError: it is one.
+        ConfigError: the value is invalid.
     """
     usual = next(field.default for field in dataclasses.fields(settings) if field.name == key)
     value = getattr(settings, key)
@@ -185,7 +184,7 @@ def _checked(name: str, known: Known) -> str:
 
 
 def _parsed(changes: Sequence[str], known: Known, chosen: Sequence[str]) -> dict[str, dict[str, list[str]]]:
-    """The texts of each experiment's keys."""
+    """Collect the values' texts by experiment and key."""
     values: dict[str, dict[str, list[str]]] = {}
     for change in changes:
         path, equals, text = change.partition("=")
@@ -203,7 +202,7 @@ def _parsed(changes: Sequence[str], known: Known, chosen: Sequence[str]) -> dict
 
 
 def _value(text: str) -> Any:
-    """A value as TOML has it; what is none is a text."""
+    """Parse a TOML value; anything else is a text."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

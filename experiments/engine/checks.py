@@ -1,4 +1,4 @@
-"""What experiments' settings are held to before any work: whoever gives something else is told so in one line."""
+"""Checks of experiments' settings before any work; a wrong setting raises an error of one line."""
 
 from collections.abc import Iterator, Sequence
 
@@ -7,19 +7,19 @@ from cotarget.errors import ConfigError
 from cotarget.sim.targets.random_paths import SECONDS
 from experiments.engine.harness import Settings
 
-FEWEST_LOOKS = 2  # at a board that stays where it is, that tell how the zoom camera sits on the head
+FEWEST_LOOKS = 2  # least number of views of a static board that determine the zoom camera's pose on the head
 
 
 def check_above(low: float, settings: Settings, *names: str) -> None:
-    """Refuse settings that cannot be, before any work.
+    """Refuse settings that are not above a limit.
 
     Args:
-        low: what every number is to be above of.
-        settings: of an experiment.
-        names: of those that are numbers, or several.
+        low: the limit.
+        settings: settings of an experiment.
+        names: names of the settings to check, which are numbers or tuples of numbers.
 
     Raises:
-        ConfigError: a number is not above that, or there is none.
+        ConfigError: a number is not above the limit, or a tuple is empty.
     """
     for name, each in _numbers(settings, names):
         if not each > low:
@@ -27,19 +27,19 @@ def check_above(low: float, settings: Settings, *names: str) -> None:
 
 
 def check_least(least: float, settings: Settings, *names: str) -> None:
-    """The same where the least number is one that can be."""
+    """Refuse settings that are below a limit; arguments and errors as for `check_above`."""
     for name, each in _numbers(settings, names):
         if not each >= least:
             raise ConfigError(f"{name}: {each:g} is below {least:g}")
 
 
 def check_session(settings: Settings, boards: str, looks: str) -> None:
-    """Refuse calibrations that cannot come to anything.
+    """Refuse capture sessions that cannot give a calibration.
 
     Args:
-        settings: of an experiment.
-        boards: name of the one that says how many placements of the board there are.
-        looks: of the one that says from how many head poses each is looked at.
+        settings: settings of an experiment.
+        boards: name of the setting with the number of board placements.
+        looks: name of the setting with the number of head poses per placement.
 
     Raises:
         ConfigError: there are too few for a camera's intrinsics, or for T.
@@ -58,15 +58,15 @@ def _numbers(settings: Settings, names: Sequence[str]) -> Iterator[tuple[str, fl
 
 
 def check_ways(settings: Settings, *names: str, end_s: float = SECONDS) -> None:
-    """Refuse runs in which targets stand still at the end of their ways, where they are easily held.
+    """Refuse runs longer than the targets' paths: targets that stand still at the end are easily followed.
 
     Args:
-        settings: of an experiment.
-        names: of those that say how long a run is [s].
-        end_s: how long there are ways to go [s].
+        settings: settings of an experiment.
+        names: names of the settings with a run's length [s].
+        end_s: length of the paths [s].
 
     Raises:
-        ConfigError: a run is longer.
+        ConfigError: a run is longer than the paths.
     """
     for name in names:
         if not (value := getattr(settings, name)) <= end_s:

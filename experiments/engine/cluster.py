@@ -1,4 +1,4 @@
-"""The jobs of a sweep on a Dask cluster: a laboratory's own, or one on this machine."""
+"""Run the jobs of a sweep on a Dask cluster: an existing one, or one on this machine."""
 
 import concurrent.futures
 import contextlib
@@ -18,15 +18,15 @@ from experiments.engine.results import differing
 from experiments.engine.workers import LINEAR_ALGEBRA, ONE_THREAD, Died, Job, Results, one_thread_each
 
 EXTRA = "cotarget[sweeps]"
-ANSWER_S = 10.0  # for a scheduler to answer [s]
-# By OpenBLAS, the linear algebra of numpy and scipy as they are published: the first of these that is above zero.
+ANSWER_S = 10.0  # timeout of the scheduler's answer [s]
+# Variables that OpenBLAS reads (the linear algebra of numpy's and scipy's wheels): the first one above zero holds.
 HEEDED = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")
 START_SO = "start workers with --nthreads 1 (and --nworkers N)"
 WITHOUT_PACKAGES = (
     "does not find the packages cotarget and experiments; start it with PYTHONPATH set to a clone of this repository"
 )
 SEVERAL_THREADS = "has linear algebra on several threads"
-QUIET = logging.CRITICAL + 10  # what is wrong is told in one line
+QUIET = logging.CRITICAL + 10  # errors are reported in one line
 
 
 def on_dask(
@@ -38,24 +38,24 @@ def on_dask(
     version: str = "",
     any_libraries: bool = False,
 ) -> Results:
-    """Do jobs on a Dask cluster, begun in their order; what each gives as it comes, with its number.
+    """Run jobs on a Dask cluster in their order; yield each job's number and result as it completes.
 
-    A job whose worker dies is tried by others; whose workers die again and again, that is what came of it. (joblib's
-    dask backend, which stands on the same client, waits for such a job for ever.)
+    A job whose worker dies is tried on other workers; if they die repeatedly, its result is `Died`. (joblib's Dask
+    backend uses the same client, but waits for such a job for ever.)
 
     Args:
-        work: a function at the top of a module that the cluster's workers find too, or a partial one of it.
-        jobs: its arguments, one each.
-        processes: how many workers a cluster on this machine has, where none is named.
-        scheduler: the cluster's address, such as tcp://10.0.0.1:8786.
-        version: of the code that all workers must have, as `code_version` gives it; any by default.
-        any_libraries: whether the libraries' versions may be others.
+        work: a function at module level that the workers can import, or a partial of one.
+        jobs: arguments of the calls, one each.
+        processes: number of workers of a cluster on this machine, where no scheduler is given.
+        scheduler: address of the scheduler, such as tcp://10.0.0.1:8786.
+        version: version of the code that all workers must have, from `code_version`; any if empty.
+        any_libraries: whether workers may have other versions of the libraries.
 
     Raises:
-        ConfigError: Dask is missing, nobody answers there, or the workers are not fit for the work, those included that
-            join later.
+        ConfigError: Dask is missing, no scheduler answers, or a worker is unfit for the work, also one that joins
+            later.
         DeviceError: the scheduler is gone.
-        Exception: what a job raised.
+        Exception: an exception of a job.
     """
     distributed = _needed("distributed")
     with _client(distributed, scheduler, min(processes, len(jobs))) as client:
@@ -77,16 +77,16 @@ def on_dask(
                     raise ConfigError(f"a Dask worker that joined {where} {WITHOUT_PACKAGES}") from None
                 yield numbers.pop(future), result
         finally:
-            client.cancel(list(numbers))  # those that a worker has in hand it still finishes, for nobody
+            client.cancel(list(numbers))  # workers finish the jobs that they have begun, and the results are dropped
 
 
 def check_cluster(processes: int, scheduler: str | None, version: str, any_libraries: bool) -> None:
-    """Refuse a cluster that could not do the work, before anything is done for its sake; see `on_dask`.
+    """Refuse a cluster that cannot do the work, before any work starts (see `on_dask`).
 
-    One on this machine is as fit as this program is.
+    A cluster on this machine has this program's environment and needs no check.
 
     Raises:
-        ConfigError: as of `on_dask`.
+        ConfigError: as for `on_dask`.
     """
     distributed = _needed("distributed")
     if scheduler is not None:
@@ -103,7 +103,7 @@ def _needed(name: str) -> Any:
 
 @contextlib.contextmanager
 def _client(distributed: Any, scheduler: str | None, processes: int) -> Iterator[Any]:
-    """A client of the cluster at an address, or of one on this machine that ends with it."""
+    """Open a client of the cluster at an address, or of one on this machine that ends with the client."""
     with contextlib.ExitStack() as stack:
         log = logging.getLogger("distributed.client")
         stack.callback(log.setLevel, log.level)
@@ -129,7 +129,7 @@ def _client(distributed: Any, scheduler: str | None, processes: int) -> Iterator
 
 
 def _check_workers(client: Any, scheduler: str, version: str, any_libraries: bool) -> None:
-    """Refuse workers that could not do the work, or not one job at a time each, on one thread."""
+    """Refuse workers that cannot do the work, or that run more than one job at a time or several threads."""
     threads: dict[str, int] = client.nthreads()
     if not threads:
         raise ConfigError(f"the Dask scheduler at {scheduler} has no workers; start some with dask worker")
@@ -137,7 +137,7 @@ def _check_workers(client: Any, scheduler: str, version: str, any_libraries: boo
         if count > 1:  # an OpenGL context belongs to one thread
             raise ConfigError(f"the Dask worker at {worker} has {count} threads; {START_SO}")
 
-    def about() -> tuple[str, dict[str, str]]:  # sent as it stands: there may be nothing there to find it in
+    def about() -> tuple[str, dict[str, str]]:  # sent by value, because the worker may lack the packages
         told = {name: os.environ.get(name, "") for name in HEEDED}
         if not (importlib.util.find_spec("experiments") and importlib.util.find_spec("cotarget")):
             return "", told
@@ -156,14 +156,14 @@ def _check_workers(client: Any, scheduler: str, version: str, any_libraries: boo
 
 
 def _check_linear_algebra(worker: str, environment: Mapping[str, str]) -> None:
-    """Refuse a worker whose linear algebra takes several threads.
+    """Refuse a worker whose linear algebra uses several threads.
 
     Args:
-        worker: its address.
-        environment: its variables.
+        worker: address of the worker.
+        environment: environment variables of the worker.
 
     Raises:
-        ConfigError: what OpenBLAS heeds of them is not 1, or is none: then it takes all cores.
+        ConfigError: the variable that OpenBLAS obeys is not 1, or none is set, so that it uses all cores.
     """
     heeded = next((name for name in HEEDED if _number(environment.get(name, "")) > 0), None)
     if heeded is None:
@@ -174,22 +174,22 @@ def _check_linear_algebra(worker: str, environment: Mapping[str, str]) -> None:
 
 
 def _number(text: str) -> int:
-    """What OpenBLAS reads in a variable, which is what C's atoi does: the number that it begins with, or else 0."""
+    """Parse a variable as OpenBLAS does, by C's atoi: the leading number, else 0."""
     found = re.match(r"\s*[+-]?\d+", text, re.ASCII)
     return int(found[0]) if found else 0
 
 
 def _held_to_one_thread(work: Callable[[Job], Any], job: Job) -> Any:
-    """Do a job; a worker that has joined since the others were looked at may be unfit for it.
+    """Run a job on one thread; check the worker first, because it may have joined after the first check.
 
     Raises:
-        ConfigError: it is.
+        ConfigError: the worker is unfit for the work.
     """
     worker: Any = importlib.import_module("distributed").get_worker()
     if worker.state.nthreads > 1:
         raise ConfigError(f"the Dask worker at {worker.address} has {worker.state.nthreads} threads; {START_SO}")
     _check_linear_algebra(worker.address, os.environ)
-    for name in ONE_THREAD.keys() - set(LINEAR_ALGEBRA):  # heeded by rendering; linear algebra is loaded already
+    for name in ONE_THREAD.keys() - set(LINEAR_ALGEBRA):  # these concern rendering; linear algebra is loaded already
         os.environ.setdefault(name, ONE_THREAD[name])
     cv2.setNumThreads(1)
     return work(job)

@@ -1,4 +1,4 @@
-"""Runs all experiments, or those named, over the cores or on a cluster; what is done is kept, and the rest goes on.
+"""Run all experiments, or those named, on local processes or a Dask cluster; a repeated command resumes the run.
 
 python -m experiments [NAME ...] [--quick] [--out DIR] [--seeds N] [--seed-base B] [--set NAME.KEY=VALUE] [--list]
 """
@@ -33,19 +33,19 @@ from experiments.engine.workers import Engine, in_processes
 
 PROGRAM = "python -m experiments"
 OUT, OUT_QUICK = Path("experiments-out"), Path("experiments-out-quick")
-LINES = 12  # of failed jobs that are told on stderr; the report tells all
+LINES = 12  # failed jobs listed on stderr; the report lists all
 
 
 def main(arguments: Sequence[str] | None = None, known: Known | None = None, expected: Path = EXPECTED) -> int:
-    """The command.
+    """Run the command.
 
     Args:
-        arguments: what was typed.
-        known: the experiments there are.
-        expected: the folder of their bounds.
+        arguments: command-line arguments.
+        known: known experiments by name.
+        expected: folder of the bounds.
 
     Returns:
-        The exit status: 1 where a job failed, a bound is broken or, but for a quick run, a wanted figure is missed.
+        Exit status: 1 if a job failed, a bound is broken or a figure misses its goal (not for a quick run), else 0.
     """
     typed = sys.argv[1:] if arguments is None else list(arguments)
     known = known_experiments() if known is None else known
@@ -67,8 +67,8 @@ def main(arguments: Sequence[str] | None = None, known: Known | None = None, exp
 
 @contextlib.contextmanager
 def _polite_ends() -> Iterator[None]:
-    """Whoever ends this program by SIGTERM ends what it has started too."""
-    if threading.current_thread() is not threading.main_thread():  # which alone may say so
+    """Turn SIGTERM into an exit that also ends the child processes."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may set signal handlers
         yield
         return
     before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
@@ -140,7 +140,7 @@ def _run(given: argparse.Namespace, typed: Sequence[str], known: Known, expected
     cases, skipped = _split(chosen, named=bool(given.names))
     if given.report and not any((folder / case.folder).is_dir() for case in cases):
         raise ConfigError(f"{folder}: holds no results of what is asked for; --out names the folder that does")
-    if given.report:  # which tells what is of other code, instead of refusing it
+    if given.report:  # the report lists results of other code and does not refuse them
         sweep = Sweep(cases, folder, any_code=True)
     else:
         with taken(folder):
@@ -169,7 +169,7 @@ def _run(given: argparse.Namespace, typed: Sequence[str], known: Known, expected
 
 
 def _engine(given: argparse.Namespace) -> tuple[Engine, str, Callable[[], None]]:
-    """Who does the jobs, the same in words, and what finds out whether they can."""
+    """Give the engine that runs the jobs, its description, and a check that it is ready."""
     if given.backend == "dask":
         where = "a Dask cluster" if given.scheduler else f"a Dask cluster on this machine, {given.processes} at most"
         told = {"scheduler": given.scheduler, "version": code_version(), "any_libraries": given.any_code}
@@ -181,7 +181,7 @@ def _engine(given: argparse.Namespace) -> tuple[Engine, str, Callable[[], None]]
 
 
 def _split(chosen: Sequence[Case], *, named: bool) -> tuple[list[Case], dict[str, str]]:
-    """The cases that can be run, and why the others cannot; an experiment that was asked for by its name must."""
+    """Split cases into those that can run and the reasons of the others; a named experiment must be able to run."""
     lacks = {case.title: "" if (needs := case.experiment.needs) is None else needs(case.settings) for case in chosen}
     skipped = {title: lack for title, lack in lacks.items() if lack}
     if named and skipped:
@@ -191,7 +191,7 @@ def _split(chosen: Sequence[Case], *, named: bool) -> tuple[list[Case], dict[str
 
 
 def _do(sweep: Sweep, engine: Engine, what: str, fresh: bool) -> int:
-    """Do the jobs that are missing; the exit status where that was broken off."""
+    """Run the missing jobs; give the exit status of an interrupted run, else 0."""
     try:
         with progress_bar() as show:
             sweep.run(engine, show, what)
@@ -210,7 +210,7 @@ def _do(sweep: Sweep, engine: Engine, what: str, fresh: bool) -> int:
 
 
 def _tell(outcomes: Sequence[Outcome], skipped: dict[str, str]) -> None:
-    """Print each case's figures; on stderr what went wrong."""
+    """Print the figures of each case, and the errors on stderr."""
     for outcome in outcomes:
         print(f"\n{outcome.case.title} ({duration(sum(outcome.seconds))})")
         if outcome.text:

@@ -1,14 +1,14 @@
-"""What all experiments share: what they consist of, a command for each, a table, and the files of a run.
+"""Definition of an experiment, its own command, and the files that it writes.
 
-An experiment is a module with a dataclass of settings and some functions: `one(shared, settings, seed)` gives the rows
-of one seed, whichever process does it and whatever was done before; `prepare(settings)`, where there is one, gives what
-all seeds share; `summarise(rows)` the figures, `describe` a text to print, `plot` a picture. Rows are flat dictionaries
-of numbers, texts and truth values; everything reported is made from them alone, but for pictures that `one` may give
-beside them (`experiments.engine.pictured`).
+An experiment is a module with a dataclass of settings and some functions. `one(shared, settings, seed)` gives the rows
+of one seed; they depend on its arguments alone, not on the process or on earlier jobs. The optional `prepare(settings)`
+gives what all seeds share. `summarise(rows)` computes the figures, `describe` a text to print, `plot` a picture. Rows
+are flat dictionaries of numbers, texts and truth values. Everything reported is made from rows alone, except pictures
+that `one` may return beside them (`experiments.engine.pictured`).
 
     python -m experiments.NAME [--seeds N] [--seed-base B] [--processes P] [--quick] [--out DIR]
 
-`python -m experiments` does many of them at once, and goes on where it was broken off: `experiments.engine.runner`.
+`python -m experiments` runs many experiments and resumes an interrupted run: `experiments.engine.runner`.
 """
 
 import csv
@@ -41,16 +41,16 @@ if TYPE_CHECKING:
 
 
 Row = dict[str, Any]
-INTERRUPTED, TERMINATED = 130, 143  # exit status of Ctrl-C and of SIGTERM
-FIGURE = "figure"  # the plot's file
+INTERRUPTED, TERMINATED = 130, 143  # exit status after Ctrl-C and after SIGTERM
+FIGURE = "figure"  # name of the plot's file
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How many seeds, from which on, and over how many processes.
+    """Number of seeds, first seed and number of processes.
 
     Raises:
-        ConfigError: no seeds, no processes, or a seed below zero.
+        ConfigError: no seeds, no processes, or a negative seed.
     """
 
     seeds: int = 100
@@ -64,12 +64,12 @@ class Settings:
 
 
 def seeds_of(settings: Settings) -> str:
-    """Which seeds, in words."""
+    """Describe the range of seeds."""
     return f"seeds {settings.seed_base} to {settings.seed_base + settings.seeds - 1}"
 
 
 def seeds_in(settings: Settings) -> Sequence[int]:
-    """The seeds."""
+    """Give the seeds of a run."""
     return range(settings.seed_base, settings.seed_base + settings.seeds)
 
 
@@ -78,41 +78,42 @@ S = TypeVar("S", bound=Settings)
 
 @dataclass(frozen=True)
 class Preparation:
-    """What seeds share, told by less than all settings, so that it is made once for all who share it.
+    """Function that makes what seeds share, from a part of the settings; made once for all experiments that share it.
 
     Attributes:
-        make: a function at the top of a module.
-        arguments: gives its arguments, from the settings; at the top of a module too.
+        make: makes the shared object; a function at module level.
+        arguments: gives the arguments of ``make`` from the settings; at module level too.
     """
 
     make: Callable[..., Any]
     arguments: Callable[[Any], tuple[Any, ...]]
 
     def __call__(self, settings: Any) -> Any:
-        """Make it."""
+        """Make the shared object."""
         return self.make(*self.arguments(settings))
 
 
 @dataclass(frozen=True)
 class Experiment(Generic[S]):
-    """What an experiment consists of; all functions that other processes call are at the top of a module.
+    """Definition of an experiment. Functions that other processes call must be at module level.
 
     Attributes:
-        name: of its module.
-        purpose: one line, for --help.
-        settings: as it is reported.
-        quick: the same with less of everything.
-        one: gives the rows of a seed: (what `prepare` gave, settings, seed) -> rows, or rows with pictures.
-        summarise: gives the figures, from the rows alone; nan where nothing was measured.
-        describe: gives settings and figures as a text to print.
+        name: name of the module.
+        purpose: one line for --help.
+        settings: settings of the reported run.
+        quick: settings of the quick run, with less of everything.
+        one: gives the rows of a seed, with or without pictures, from the result of `prepare`, the settings and the
+            seed.
+        summarise: computes the figures from the rows; nan where nothing was measured.
+        describe: formats settings and figures as a text.
         plot: draws the rows.
-        missed: names the figures that are not what is wanted; the command fails where there is one.
-        prepare: gives what all seeds share, from the settings; a `Preparation` where several experiments share it.
+        missed: lists the figures that miss their goal; with any, the command fails.
+        prepare: makes what all seeds share, from the settings; a `Preparation` where several experiments share it.
         jobs: gives the numbers that `one` is called with, where these are not the seeds.
-        alone: whether it measures times: nothing else may be done meanwhile, and it may take all cores.
-        cost_s: about how long one seed takes on one core [s]; the longest are begun first.
-        bounded: gives the figures as the file of bounds names them, where these are not the summary.
-        needs: says what the experiment lacks to be done with these settings; nothing, if it lacks nothing.
+        alone: whether it measures times, so that nothing else may run and it may use all cores.
+        cost_s: approximate time of one seed on one core [s]; the longest are started first.
+        bounded: gives the figures under the names of the file of bounds, where these are not the summary's.
+        needs: describes what the experiment lacks to run with these settings; empty if nothing.
     """
 
     name: str
@@ -132,7 +133,7 @@ class Experiment(Generic[S]):
     needs: Callable[[S], str] | None = None
 
     def main(self, arguments: Sequence[str] | None = None) -> int:
-        """The command: run, print the figures, and write the files where asked to."""
+        """Run the experiment's command: run the seeds, print the figures, and write files on request."""
         parser = Parser(prog=f"python -m {self._module()}", description=self.purpose)
         seeds, processes = self.settings.seeds, os.cpu_count() or 1
         parser.add_argument("--seeds", type=count, metavar="N", help=f"how many ({seeds}; {self.quick.seeds} if quick)")
@@ -159,11 +160,11 @@ class Experiment(Generic[S]):
         return spec.name if spec is not None and spec.name.endswith(f".{self.name}") else f"experiments.{self.name}"
 
     def report(self, settings: S, out: Path | None, *, quick: bool = False) -> int:
-        """Run with these settings, print the figures, and write the files where there is a folder for them.
+        """Run with these settings, print the figures, and write the files if a folder is given.
 
         Returns:
-            The exit status: 1 where a seed failed, a figure is missed (but for a quick run, which is too short for
-            that), something is lacking or the folder cannot be written to, 130 on Ctrl-C.
+            Exit status: 130 on Ctrl-C; 1 if a seed failed, a figure misses its goal (not for a quick run, which is too
+                short for that), something is lacking or the folder cannot be written; else 0.
         """
         failed: dict[int, str] = {}
         try:
@@ -194,33 +195,34 @@ class Experiment(Generic[S]):
         return 1 if failed or lost else 0
 
     def shares(self, settings: S) -> tuple[Callable[..., Any], tuple[Any, ...]] | None:
-        """The function that makes what all seeds share, and its arguments; None where they share nothing."""
+        """Give the function that makes what all seeds share, and its arguments; None where they share nothing."""
         if isinstance(self.prepare, Preparation):
             return self.prepare.make, self.prepare.arguments(settings)
         return None if self.prepare is None else (self.prepare, (settings,))
 
     def run(self, settings: S, engine: Engine = in_processes) -> list[Row]:
-        """All rows, in the order of the seeds; see `run_pictured`."""
+        """Give all rows in the order of the seeds (see `run_pictured`)."""
         return self.run_pictured(settings, engine).rows
 
     def run_pictured(
         self, settings: S, engine: Engine = in_processes, failed: dict[int, str] | None = None
     ) -> Pictured:
-        """All rows, in the order of the seeds, and the pictures of the first seed that has any.
+        """Give all rows in the order of the seeds, and the pictures of the first seed that has any.
 
         Args:
-            settings: how many seeds, and over how many processes.
-            engine: does the jobs; those that measure times are done in this process, one after the other.
-            failed: gets, of each seed that fails, why; the others go on. Without it the first that fails ends all.
+            settings: settings with number of seeds and processes.
+            engine: runs the jobs; jobs that measure times run in this process, one after the other.
+            failed: receives the reason for each seed that fails, while the others go on; without it, the first failure
+                ends the run.
 
         Raises:
-            ConfigError: something is missing that it needs.
+            ConfigError: something that the experiment needs is missing.
             DeviceError: a process died.
         """
         if self.needs is not None and (lack := self.needs(settings)):
             raise ConfigError(lack)
         engine = here if self.alone else engine
-        # By a worker too: whoever does it, it has one thread of linear algebra, and the same last digits.
+        # A worker makes it too: with one thread of linear algebra, its last digits do not depend on the engine.
         shared = None if self.prepare is None else _all(engine, self.prepare, [settings], 1)[0]
         jobs = functools.partial(self.one, shared, settings)
         if failed is not None:
@@ -242,10 +244,10 @@ class Experiment(Generic[S]):
         picture: bytes | None,
         pictures: Mapping[str, bytes] = MappingProxyType({}),
     ) -> None:
-        """Write result.json, rows.csv and, where there is a plot, figure.png; and the pictures of the jobs.
+        """Write result.json and rows.csv, figure.png if there is a plot, and the pictures of the jobs.
 
         Raises:
-            ConfigError: one of them cannot be written.
+            ConfigError: a file cannot be written.
         """
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -267,7 +269,7 @@ class Experiment(Generic[S]):
             write_whole(out / f"{name}.png", png)
 
     def picture(self, rows: Sequence[Row]) -> bytes | None:
-        """The plot as a PNG, where there is one."""
+        """Draw the plot as a PNG; None without a plot."""
         if self.plot is None:
             return None
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -282,7 +284,7 @@ class Experiment(Generic[S]):
 
 
 def _tried(one: Callable[[int], Any], number: int) -> Any:
-    """What a seed gives, or why it gives nothing."""
+    """Run a seed; give its rows, or the exception that it raised."""
     try:
         return one(number)
     except Exception as error:
@@ -290,7 +292,7 @@ def _tried(one: Callable[[int], Any], number: int) -> Any:
 
 
 def _all(engine: Engine, work: Callable[[Any], Any], jobs: Sequence[Any], processes: int) -> list[Any]:
-    """What each job gives, in the order of the jobs."""
+    """Run all jobs and give their results in the order of the jobs."""
     found: dict[int, Any] = {}
     for number, result in tqdm(engine(work, jobs, processes), total=len(jobs), disable=None, leave=False):
         if result is Died:
@@ -300,7 +302,7 @@ def _all(engine: Engine, work: Callable[[Any], Any], jobs: Sequence[Any], proces
 
 
 def _less(settings: Settings, quick: Settings) -> str:
-    """What a quick run has other than the whole one, for --help."""
+    """List the settings of a quick run that differ from the full one, for --help."""
     parts = {field.name: getattr(quick, field.name) for field in dataclasses.fields(quick)}
     other = {name: value for name, value in parts.items() if value != getattr(settings, name)}
     texts = (f"{name} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in other.items())

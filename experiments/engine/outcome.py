@@ -1,4 +1,4 @@
-"""What the rows of a case come to: its figures, in words and as a picture, beside what is wanted and the bounds."""
+"""Results of a case: its figures as text and picture, beside its goals and bounds."""
 
 import inspect
 import traceback
@@ -16,20 +16,20 @@ from experiments.engine.results import NOTHING, Record, Spent, code_version
 
 @dataclass(frozen=True)
 class Outcome:
-    """A case that was run, wholly or in part.
+    """Result of a case that was run in full or in part.
 
     Attributes:
-        case: what was to be run.
-        records: what came of its jobs, by number.
-        summary: the figures; None where there are none.
-        text: the same, to print.
-        missed: the figures that are not what is wanted; None where nothing is.
-        bounds: the figures that have bounds, beside them; of other settings than the quick ones there are none.
+        case: the case.
+        records: results of its jobs, by number.
+        summary: its figures; None where there are none.
+        text: its figures as text.
+        missed: figures that miss their goal; None where the experiment has no goals.
+        bounds: figures with their bounds; only for the quick settings.
         picture: the plot as a PNG.
-        caption: what it shows.
-        broken: why there are no figures, or no picture.
-        pictures: of the first job that has any, PNGs by name.
-        shared: what it took to prepare what its jobs share.
+        caption: caption of the plot.
+        broken: why there are no figures or no picture.
+        pictures: PNGs by name, from the first job that has any.
+        shared: cost of preparing what its jobs share.
     """
 
     case: Case
@@ -46,49 +46,49 @@ class Outcome:
 
     @property
     def failed(self) -> dict[int, Record]:
-        """The jobs that failed."""
+        """Failed jobs by number."""
         return {number: record for number, record in sorted(self.records.items()) if record.failed}
 
     @property
     def pictured(self) -> int | None:
-        """The first job that has pictures."""
+        """Number of the first job that has pictures."""
         return next((number for number, record in sorted(self.records.items()) if record.pictures), None)
 
     @property
     def undone(self) -> int:
-        """How many jobs were not done yet."""
+        """Number of jobs that have not run."""
         return len(self.case.numbers) - len(self.records)
 
     @property
     def worse(self) -> tuple[Bound, ...]:
-        """The figures beyond their bounds."""
+        """Figures beyond their bounds."""
         return tuple(bound for bound in self.bounds if not bound.kept)
 
     @property
     def seconds(self) -> list[float]:
-        """That the jobs took [s]."""
+        """Wall times of the jobs [s]."""
         return [record.seconds for record in self.records.values()]
 
     @property
     def cpu_s(self) -> float:
-        """Processor time of the jobs and of what they share [s]."""
+        """Processor time of the jobs and of their preparation [s]."""
         return self.shared.cpu_s + sum(record.cpu_s for record in self.records.values())
 
     @property
     def renders(self) -> int:
-        """How many pictures MuJoCo drew for the jobs and for what they share."""
+        """Number of pictures that MuJoCo drew for the jobs and their preparation."""
         return self.shared.renders + sum(record.renders for record in self.records.values())
 
     @property
     def other_code(self) -> tuple[str, ...]:
-        """Versions of the code that jobs were done by, where that is not this one."""
+        """Versions of other code than this that jobs were run with."""
         return tuple(sorted({record.version for record in self.records.values()} - {code_version()}))
 
     @property
     def ok(self) -> bool:
-        """Whether all was done and, as far as these settings can tell, is as it should be.
+        """Whether all jobs ran and no figure misses its goal or bound.
 
-        A quick run is too short for what is wanted; it is held to its bounds instead.
+        A quick run is too short for the goals; only its bounds count.
         """
         lost = () if self.case.quick else self.missed
         return not (self.failed or self.undone or self.broken or lost or self.worse)
@@ -97,14 +97,14 @@ class Outcome:
 def conclude(
     case: Case, records: Mapping[int, Record], folder: Path, expected: Path = EXPECTED, shared: Spent = NOTHING
 ) -> Outcome:
-    """Work out a case's figures from its rows, and write result.json, rows.csv, figure.png and other pictures.
+    """Compute a case's figures from its rows; write result.json, rows.csv, figure.png and other pictures.
 
     Args:
-        case: that was run.
-        records: what came of its jobs.
-        folder: for the files.
-        expected: where the bounds are.
-        shared: what it took to prepare what the jobs share.
+        case: case that was run.
+        records: results of its jobs.
+        folder: folder for the files.
+        expected: folder of the bounds.
+        shared: cost of preparing what the jobs share.
 
     Raises:
         ConfigError: a file of bounds cannot be read.
@@ -117,7 +117,7 @@ def conclude(
         summary = experiment.summarise(rows)
         text = experiment.describe(case.settings, summary)
         missed = None if experiment.missed is None else tuple(experiment.missed(summary))
-    except Exception as error:  # of an incomplete run, which lacks what the figures are made of
+    except Exception as error:  # an incomplete run may lack rows that the figures need
         return Outcome(case, records, broken=f"the rows give no figures: {_where(error)}", shared=shared)
     picture, broken = _draw(case, rows)
     pictures = shown(record.pictures for _, record in sorted(records.items()))

@@ -1,4 +1,4 @@
-"""Pictures laid out as the paper's figures are: rows of panels, each with its caption below."""
+"""Pictures in the layout of the paper's figures: rows of panels with captions below."""
 
 from collections.abc import Iterable, Sequence
 
@@ -8,13 +8,13 @@ import numpy as np
 from cotarget.drawing import PAPER, captioned
 from cotarget.rig import Image
 
-WIDTH_PX = 480  # of a panel, a little less than a camera's image: noise that is averaged takes less room on disk
-GAP_PX = 6  # right of a panel
+WIDTH_PX = 480  # width of a panel, less than a camera's image: averaged noise takes less disk space
+GAP_PX = 6  # gap right of a panel
 Panel = tuple[Image, str]
 
 
 def laid_out(rows: Iterable[Sequence[Panel]]) -> bytes:
-    """Rows of as many panels each, all of one aspect ratio, as one PNG.
+    """Arrange rows of panels, all of one aspect ratio and equally many per row, as one PNG.
 
     Args:
         rows: images, BGR or grey, with their captions.

@@ -1,4 +1,4 @@
-"""Pictures that a job makes on its way to its rows, for the report alone: no figure is made of them."""
+"""Pictures that a job returns beside its rows, for the report only; no figure is computed from them."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -7,11 +7,11 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Pictured:
-    """What `one` gives where there is something to be seen.
+    """Rows of a job with pictures.
 
     Attributes:
-        rows: as without pictures.
-        pictures: PNGs by the names of their files, without ending; like the rows of settings and seed alone.
+        rows: rows of the job.
+        pictures: PNGs by file name without extension; they depend on settings and seed alone.
     """
 
     rows: list[dict[str, Any]]
@@ -19,10 +19,10 @@ class Pictured:
 
 
 def parted(given: list[dict[str, Any]] | Pictured) -> tuple[list[dict[str, Any]], Mapping[str, bytes]]:
-    """The rows of a job, and its pictures; none where it gave rows only."""
+    """Split a job's result into rows and pictures; no pictures if it gave rows only."""
     return (given.rows, given.pictures) if isinstance(given, Pictured) else (given, {})
 
 
 def shown(pictures: Iterable[Mapping[str, bytes]]) -> Mapping[str, bytes]:
-    """Of the pictures of many jobs those to be shown: of the first that has any."""
+    """Select the pictures to show: those of the first job that has any."""
     return next(filter(None, pictures), {})

@@ -1,4 +1,4 @@
-"""The report on all experiments: one HTML page that needs nothing beside it, with every picture, figure and bound."""
+"""Report on all experiments: one self-contained HTML page with every picture, figure and bound."""
 
 import dataclasses
 import json
@@ -20,22 +20,22 @@ from experiments.engine.sessions import Session
 from experiments.engine.texts import plain
 
 MINUTE_S, HOUR_S = 60.0, 3600.0
-WANTED_MIN, WANTED_RENDERS = 60, 80_000  # of all experiments as they are reported, on two cores
-WANTED_QUICK_MIN = 5  # of a quick run of all
-FEW = 8  # failed jobs that a summary names
+WANTED_MIN, WANTED_RENDERS = 60, 80_000  # budget of a full run, on two cores
+WANTED_QUICK_MIN = 5  # budget of a quick run of all experiments
+FEW = 8  # failed jobs listed in the summary
 
 
 @dataclass(frozen=True)
 class Run:
-    """All that a report is about.
+    """Content of a report.
 
     Attributes:
-        outcomes: of the cases.
-        skipped: experiments that were not run, and why.
-        sessions: when jobs were done, by whom and for how long.
-        command: how to get the same again.
-        is_full: whether these are all experiments as they are reported.
-        is_quick: whether these are all, each quick.
+        outcomes: results of the cases.
+        skipped: reasons by experiment for those that were not run.
+        sessions: sessions in which the jobs were run.
+        command: command that repeats the run.
+        is_full: whether these are all experiments with their reported settings.
+        is_quick: whether these are all experiments with their quick settings.
     """
 
     outcomes: Sequence[Outcome]
@@ -50,7 +50,7 @@ def write_report(path: Path, run: Run) -> None:
     """Write the page.
 
     Raises:
-        ConfigError: it cannot be written.
+        ConfigError: the page cannot be written.
     """
     anchored = [(f"case-{i}", outcome) for i, outcome in enumerate(run.outcomes)]
     links = [(anchor, outcome.case.title) for anchor, outcome in anchored]
@@ -183,7 +183,7 @@ def _figure(value: float | None) -> str:
 
 
 def _comparisons(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """For each experiment that was run with several choices of settings, its figures side by side."""
+    """Make a table for each experiment that was run with several settings, with its figures side by side."""
     for name in dict.fromkeys(outcome.case.experiment.name for outcome in outcomes):
         mine = [o for o in outcomes if o.case.experiment.name == name and o.summary is not None]
         if len(mine) < 2:
@@ -252,7 +252,7 @@ def _times(run: Run) -> Iterator[str]:
 
 
 def used(run: Run) -> str:
-    """What all took, in words, beside what a full run may take."""
+    """Describe time and renders of a run, beside the budget."""
     wall_s, renders = sum(each.wall_s for each in run.sessions), sum(outcome.renders for outcome in run.outcomes)
     took, wanted = f"{duration(wall_s)} and {renders} renders", f"{WANTED_MIN} min and {WANTED_RENDERS} renders"
     if run.is_quick:
@@ -278,7 +278,7 @@ def _made(run: Run) -> Iterator[str]:
 
 
 def duration(seconds: float) -> str:
-    """Write a time: 0.21 s, 34 s, 5 min 10 s, 2 h 3 min."""
+    """Format a time: 0.21 s, 34 s, 5 min 10 s, 2 h 3 min."""
     if seconds < MINUTE_S:
         return f"{digits(seconds)} s"
     if seconds < HOUR_S:

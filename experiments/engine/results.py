@@ -1,14 +1,14 @@
-"""Results on disk: a file a job, written at once and whole, so that a sweep that was broken off goes on.
+"""Result files: one file per job, written atomically, so that an interrupted sweep can resume.
 
-    DIR/NAME/jobs/000007.json            what one job gave, with its settings, its seed and the version of the code;
-                                         pictures as PNG in base64
-    DIR/NAME/jobs/000007.traceback.txt   where one failed
-    DIR/NAME/jobs/shared.json            what it took to prepare what the jobs share
+    DIR/NAME/jobs/000007.json            rows of one job, with settings, seed and version of the code; pictures as PNG
+                                         in base64
+    DIR/NAME/jobs/000007.traceback.txt   traceback of a failed job
+    DIR/NAME/jobs/shared.json            time and renders that the preparation took
     DIR/NAME/result.json, rows.csv, figure.png, and the pictures of the first job that has any
-    DIR/sessions.json                    when jobs were done, by whom and for how long
+    DIR/sessions.json                    when jobs were done, by which workers, and how long they took
     DIR/report.html
 
-Numbers are written so that they are read back as they were; NaN and Infinity stand as Python writes them.
+Numbers are written so that they are read back exactly; NaN and Infinity are written as Python does.
 """
 
 import base64
@@ -30,17 +30,17 @@ from cotarget.files import assets_dir, write_whole
 from experiments.engine.harness import Row, Settings
 from experiments.engine.versions import versions
 
-FORMAT = 2  # of the files
-JOBS = "jobs"  # their folder
-JOB_FILES = "[0-9]*.json"  # what a killed run has left half-written begins with a dot
-LOCK = ".lock"  # held by the run that writes
-ONLY_HOW_MANY = ("seeds", "processes")  # settings that change no job, only how many there are and who does them
-SHORT = 8  # digits of a fingerprint
+FORMAT = 2  # format of the job files
+JOBS = "jobs"  # folder of the job files
+JOB_FILES = "[0-9]*.json"  # files that a killed run leaves half-written begin with a dot
+LOCK = ".lock"  # lock file of the run that writes
+ONLY_HOW_MANY = ("seeds", "processes")  # settings that change no row
+SHORT = 8
 REMEDY = "take another folder with --out, or begin anew with --fresh"
 AS_BEFORE = "ask as before (--quick, --seed-base, --set), "
 KEEP = ", or keep it all the same with --any-code"
 SHARED = "shared.json"
-# Modules of the experiments on which no row depends: they choose what is done, record it and tell it.
+# Modules on which no row depends: they select, record and report.
 NO_ROWS = (
     "__main__",
     *("paper/gallery", "paper/teaser"),
@@ -51,18 +51,18 @@ NO_ROWS = (
 
 @dataclass(frozen=True)
 class Record:
-    """What came of one job.
+    """Result of one job.
 
     Attributes:
-        number: its seed.
-        seconds: that it took [s].
-        cpu_s: processor time of it [s]; see `Spent`.
-        version: of the code that did it, as `code_version` gives it.
-        renders: pictures that MuJoCo drew for it; see `Spent`.
-        rows: that it gave; None where it failed.
-        failed: why, in one line.
-        traceback: where.
-        pictures: that it made, PNGs by name.
+        number: seed of the job.
+        seconds: wall time [s].
+        cpu_s: processor time [s]; see `Spent`.
+        version: version of the code that did the job, from `code_version`.
+        renders: number of pictures that MuJoCo drew; see `Spent`.
+        rows: rows of the job; None if it failed.
+        failed: reason of the failure in one line.
+        traceback: traceback of the failure.
+        pictures: PNGs by name.
     """
 
     number: int
@@ -78,12 +78,12 @@ class Record:
 
 @dataclass(frozen=True)
 class Spent:
-    """What something took.
+    """Time and renders that some work took.
 
     Attributes:
-        seconds: by the clock [s].
-        cpu_s: processor time, that of processes included which it has started and waited for [s].
-        renders: pictures that MuJoCo drew, in whatever process.
+        seconds: wall time [s].
+        cpu_s: processor time, including processes that it started and waited for [s].
+        renders: number of pictures that MuJoCo drew, in any process.
     """
 
     seconds: float = 0.0
@@ -95,9 +95,10 @@ NOTHING = Spent()
 
 
 def fingerprint() -> str:
-    """The package's version, and fingerprints of what rows depend on: the code, and the libraries' versions.
+    """Compute the package's version with hashes of what rows depend on: the code and the libraries' versions.
 
-    Of the scenes and targets the descriptions count; their meshes and pictures are made by a program that does.
+    Of scenes and targets only the MJCF files are hashed; their meshes and textures are made by a program that is
+    hashed.
     """
     found, here = hashlib.sha256(), Path(experiments.__file__ or "").parent
     for folder in (Path(cotarget.__file__ or "").parent, here, here.parent / "benchmarks", assets_dir()):
@@ -110,12 +111,12 @@ def fingerprint() -> str:
 
 @functools.cache
 def code_version() -> str:
-    """The `fingerprint` when this was first called: to be called before a process loads what it is of."""
+    """Give the first `fingerprint` of this process; call it before the process loads the code that it is of."""
     return fingerprint()
 
 
 def differing(one: str, other: str) -> str:
-    """What two fingerprints differ in: "version" of the package, "code", "libraries"; empty where in nothing."""
+    """Give the first difference of two fingerprints: "version" of the package, "code" or "libraries"; empty if none."""
     parts: Mapping[str, Callable[[str], str]] = {
         "version": lambda v: v.partition("+")[0],
         "code": lambda v: v.rpartition(".")[0],
@@ -125,7 +126,7 @@ def differing(one: str, other: str) -> str:
 
 
 def identity(settings: Settings) -> dict[str, Any]:
-    """The settings that a job's rows depend on, as JSON has them."""
+    """Give the settings that a job's rows depend on, as JSON reads them back."""
     told = {key: value for key, value in dataclasses.asdict(settings).items() if key not in ONLY_HOW_MANY}
     read: dict[str, Any] = json.loads(json.dumps(told, default=str))
     return read
@@ -133,10 +134,10 @@ def identity(settings: Settings) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def taken(folder: Path) -> Iterator[None]:
-    """Keep other runs from writing results into a folder, which is made where there is none, as long as this lasts.
+    """Lock a folder against other runs that write results; make it where it does not exist.
 
     Raises:
-        ConfigError: another run does.
+        ConfigError: another run holds the lock.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / LOCK).open("w") as file:
@@ -146,28 +147,28 @@ def taken(folder: Path) -> Iterator[None]:
             raise ConfigError(
                 f"{folder}: another run is writing its results there; wait for it, or take another folder with --out"
             ) from None
-        except OSError:  # not every file system knows locks
+        except OSError:  # not every file system supports locks
             pass
         yield
 
 
 class Jobs:
-    """The files of one experiment's jobs with one choice of settings.
+    """Job files of one experiment with given settings.
 
     Args:
-        folder: of the experiment.
-        name: how it is called in messages.
-        settings: that all jobs share.
+        folder: folder of the experiment.
+        name: name of the experiment in messages.
+        settings: settings of all jobs.
     """
 
     def __init__(self, folder: Path, name: str, settings: Settings) -> None:
         self._folder, self._name, self._identity = folder / JOBS, name, identity(settings)
 
     def read(self, *, any_code: bool = False) -> dict[int, Record]:
-        """What is there, by number.
+        """Read all job files, by number.
 
         Raises:
-            ConfigError: a file cannot be read, or is of another version, or of other settings.
+            ConfigError: a file cannot be read, or is of another version or of other settings.
         """
         return {record.number: record for record in self._records(any_code)}
 
@@ -202,10 +203,10 @@ class Jobs:
         return f"is of {self._name} with {keys[0]} = {there}, here it is {here}"
 
     def write(self, record: Record) -> None:
-        """Put a job's file there, whole or not at all.
+        """Write a job's file atomically.
 
         Raises:
-            ConfigError: it cannot be written.
+            ConfigError: the file cannot be written.
         """
         self._folder.mkdir(parents=True, exist_ok=True)
         told = {**self._head, "seed": record.number}
@@ -223,16 +224,16 @@ class Jobs:
         return {"format": FORMAT, "experiment": self._name, "settings": self._identity}
 
     def write_shared(self, spent: Spent) -> None:
-        """Note what it took to prepare what the jobs share.
+        """Record what the preparation of the shared object took.
 
         Raises:
-            ConfigError: it cannot be written.
+            ConfigError: the file cannot be written.
         """
         self._folder.mkdir(parents=True, exist_ok=True)
         write_whole(self._folder / SHARED, (json.dumps({**self._head, **dataclasses.asdict(spent)}) + "\n").encode())
 
     def read_shared(self) -> Spent:
-        """What it took; nothing where that is not known."""
+        """Read what the preparation took; zero where that is unknown."""
         try:
             told = json.loads((self._folder / SHARED).read_text(encoding="utf-8"))
             return Spent(**{part.name: told[part.name] for part in dataclasses.fields(Spent)})

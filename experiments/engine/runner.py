@@ -1,8 +1,8 @@
-"""Does the jobs of many experiments, each job at most once: what is on disk is not done again, what is done is on disk.
+"""Run the jobs of many experiments, each job at most once; a run resumes from the results on disk.
 
-A job is one seed of one case. What seeds share is prepared first, by a worker as well, and once where several cases
-share it; then come all jobs, the longest first, so that at the end nobody waits long for the last; those that measure
-times come last, one after the other, in a process that nothing is beside.
+A job is one seed of one case. What seeds share is prepared first, by a worker, once for all cases that share it. Then
+come all jobs, the longest first, so that the end of the run is not one long job. Jobs that measure times come last, one
+after the other, in a process that nothing runs beside.
 """
 
 import contextlib
@@ -20,24 +20,24 @@ from experiments.engine.tasks import Done, Task, perform
 from experiments.engine.workers import Engine, in_turn
 
 DIED = "its process died; is there memory enough?"
-Show = Callable[[str, float, float], None]  # what, how much is done, of how much
+Show = Callable[[str, float, float], None]  # called with (text, amount done, total)
 
 
 @dataclass
 class Sweep:
-    """The jobs of some cases, and what came of them so far.
+    """Jobs of some cases, and their results so far.
 
     Args:
-        cases: what is to be run.
-        folder: for the results.
-        processes: how many jobs at a time.
+        cases: cases to run.
+        folder: folder of the results.
+        processes: number of jobs at a time.
         any_code: whether results of other code of the same version are kept, and workers may have other libraries.
 
     Attributes:
-        records: of each case, what came of its jobs, by number.
+        records: results of each case's jobs, by number.
 
     Raises:
-        ConfigError: there are results of another version or of other settings in the folder.
+        ConfigError: the folder has results of another version or of other settings.
     """
 
     cases: Sequence[Case]
@@ -47,7 +47,7 @@ class Sweep:
     records: list[dict[int, Record]] = field(init=False)
 
     def __post_init__(self) -> None:
-        code_version()  # as it is when the sweep begins
+        code_version()  # fixes the version at the sweep's start
         self._files = [Jobs(self.folder / case.folder, case.title, case.settings) for case in self.cases]
         self.records = []
         for case, files in zip(self.cases, self._files, strict=True):
@@ -61,31 +61,31 @@ class Sweep:
 
     @property
     def total(self) -> int:
-        """How many jobs there are."""
+        """Number of jobs."""
         return sum(len(case.numbers) for case in self.cases)
 
     @property
     def done(self) -> int:
-        """How many have their rows."""
+        """Number of jobs that have their rows."""
         return sum(not record.failed for records in self.records for record in records.values())
 
     @property
     def failed(self) -> int:
-        """How many have failed."""
+        """Number of failed jobs."""
         return sum(bool(record.failed) for records in self.records for record in records.values())
 
     @property
     def shared(self) -> list[Spent]:
-        """What it took to prepare what each case's jobs share; nothing where another case's share it too."""
+        """Cost of preparing what each case's jobs share; zero where it is counted with another case."""
         return [files.read_shared() for files in self._files]
 
     def run(self, engine: Engine, show: Show, what: str) -> None:
-        """Do what is missing, and once more what failed.
+        """Run the missing jobs, and the failed ones again.
 
         Args:
-            engine: does all but the timings.
-            show: is told how much is done.
-            what: the engine in words, for the report.
+            engine: runs all jobs that do not measure times.
+            show: called with the progress.
+            what: description of the engine, for the report.
 
         Raises:
             CotargetError: a result cannot be written, the engine fails, or workers have other code.
@@ -102,7 +102,7 @@ class Sweep:
             self._log.write()
 
     def _prepare(self, engine: Engine, show: Show) -> dict[int, Any]:
-        """What the jobs of each case share, by its number; where that cannot be had, the jobs have failed."""
+        """Prepare what the jobs of each case share, by case number; where that fails, the jobs count as failed."""
         wanted: dict[Any, list[int]] = {}
         for i, case in enumerate(self.cases):
             if self._missing[i] and (key := case.experiment.shares(case.settings)) is not None:
@@ -116,19 +116,19 @@ class Sweep:
                 for number in tuple(self._missing[i]) if done.failed else ():
                     self._keep(i, number, replace(done, seconds=0.0, cpu_s=0.0, renders=0))
 
-        sharing = {cases[0]: cases for cases in wanted.values()}  # counted as the first one's
+        sharing = {cases[0]: cases for cases in wanted.values()}  # counted with the first case that shares it
         tasks = [Task(cases[0], None, functools.partial(make, *given)) for (make, given), cases in wanted.items()]
         self._do(tasks, engine, show, keep)
         return shared
 
     def _jobs(self, i: int, shared: Any) -> list[Task]:
-        """The jobs of a case that are missing."""
+        """List the missing jobs of a case."""
         case = self.cases[i]
         one = functools.partial(case.experiment.one, shared, case.settings)
         return [Task(i, number, functools.partial(one, number)) for number in sorted(self._missing[i])]
 
     def _do(self, tasks: Sequence[Task], using: Engine, show: Show, keep: Callable[[Task, Done], None]) -> None:
-        """Do tasks, the longest first; what comes of each is kept at once."""
+        """Run tasks, the longest first, and keep each result at once."""
         if not tasks:
             return
         tasks = sorted(tasks, key=lambda task: -self.cases[task.case].experiment.cost_s)
@@ -143,22 +143,22 @@ class Sweep:
                 self._tell(show, case.title if task.number is None else f"{case.title} {task.number}")
 
     def _check_version(self, done: Done) -> None:
-        """Refuse what other code has done: a program that was changed meanwhile, or a worker that is no copy of this.
+        """Refuse results of other code: the program was changed during the run, or a worker has another copy.
 
         Raises:
-            ConfigError: it has.
+            ConfigError: the code differs.
         """
         other = differing(done.version, code_version())
         if other and not (self.any_code and other == "libraries"):
             raise ConfigError(f"a worker has cotarget {done.version}, this is {code_version()}; was the code changed?")
 
     def _keep_rows(self, task: Task, done: Done) -> None:
-        """Put what came of a task of one seed on disk."""
+        """Store the result of a task of one seed."""
         assert task.number is not None, "what jobs share is no seed's"
         self._keep(task.case, task.number, done)
 
     def _keep(self, i: int, number: int, done: Done) -> None:
-        """Put what came of a job on disk."""
+        """Store the result of a job."""
         rows, told = None if done.failed else done.result, (done.failed, done.traceback, done.pictures)
         record = Record(number, done.seconds, done.cpu_s, done.version, done.renders, rows, *told)
         self._files[i].write(record)
@@ -166,7 +166,7 @@ class Sweep:
         self._missing[i].discard(number)
 
     def _tell(self, show: Show, last: str = "") -> None:
-        """Say how much is done, a long job counting for more than a short one."""
+        """Show the progress, in which jobs count by their expected time."""
         costs = [case.experiment.cost_s for case in self.cases]
         total = sum(cost * len(case.numbers) for cost, case in zip(costs, self.cases, strict=True))
         left = sum(cost * len(missing) for cost, missing in zip(costs, self._missing, strict=True))
@@ -176,7 +176,7 @@ class Sweep:
 
 
 def forget(cases: Sequence[Case], folder: Path) -> None:
-    """Delete what some cases' jobs have left in a folder, whatever it is of."""
+    """Delete the results of some cases in a folder, of whatever version and settings they are."""
     for case in cases:
         Jobs(folder / case.folder, case.title, case.settings).forget()
     sessions.forget(folder, {case.folder for case in cases})

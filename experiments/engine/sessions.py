@@ -1,4 +1,4 @@
-"""When jobs were done in a folder, by whom and for how long."""
+"""Sessions of a results folder: when jobs were run, by which workers, and how long they took."""
 
 import dataclasses
 import datetime
@@ -18,12 +18,12 @@ from experiments.engine.results import code_version
 from experiments.engine.versions import versions
 
 SESSIONS = "sessions.json"
-OFTEN_S = 20.0  # a session that is killed has left word of what it did until so long before [s]
+OFTEN_S = 20.0  # interval at which a session is saved; a killed one loses at most this [s]
 
 
 @dataclass(frozen=True)
 class Share:
-    """What was done of one case in a session: how many jobs, how long they took and what they share [s], renders."""
+    """Work on one case in a session: number of jobs, their time [s], time of their preparation [s], and renders."""
 
     jobs: int = 0
     job_s: float = 0.0
@@ -36,16 +36,16 @@ class Share:
 
 @dataclass(frozen=True)
 class Session:
-    """From a run's first job to its last.
+    """One run, from its first job to its last.
 
     Attributes:
-        began: when, as ISO 8601 has it.
-        wall_s: how long it lasted [s].
-        workers: who did the jobs, in words.
-        cotarget: version and fingerprints of the code.
-        machine: kind, cores and system.
-        versions: of the libraries.
-        cases: what was done of each case, by its folder.
+        began: start time in ISO 8601.
+        wall_s: wall time [s].
+        workers: description of the workers.
+        cotarget: version and hashes of the code.
+        machine: architecture, number of cores and system.
+        versions: versions of the libraries.
+        cases: work on each case, by its folder.
     """
 
     began: str
@@ -58,22 +58,22 @@ class Session:
 
     @property
     def whole(self) -> Share:
-        """What was done of all cases."""
+        """Work on all cases."""
         return sum(self.cases.values(), Share())
 
     def of(self, folders: Collection[str]) -> "Session":
-        """The part of it that went to some cases; of its time as large a part as theirs is of the work."""
+        """Give the part of the session for some cases; its wall time is shared in proportion to the work."""
         cases = {folder: share for folder, share in self.cases.items() if folder in folders}
         kept, whole = (sum(each.job_s + each.shared_s for each in some.values()) for some in (cases, self.cases))
         return dataclasses.replace(self, cases=cases, wall_s=self.wall_s * kept / whole if whole else 0.0)
 
 
 class Log:
-    """Writes down the session that begins with it.
+    """Record of the session that begins when this is made.
 
     Args:
-        folder: of the results.
-        workers: who does the jobs, in words.
+        folder: folder of the results.
+        workers: description of the workers.
     """
 
     def __init__(self, folder: Path, workers: str) -> None:
@@ -82,20 +82,20 @@ class Log:
         self._since = self._written = time.perf_counter()
 
     def add(self, case: str, share: Share) -> None:
-        """Something of a case was done.
+        """Add work on a case.
 
         Raises:
-            ConfigError: it cannot be written down.
+            ConfigError: the file cannot be written.
         """
         self._cases[case] = self._cases.get(case, Share()) + share
         if time.perf_counter() - self._written > OFTEN_S:
             self.write()
 
     def write(self) -> None:
-        """Write down what was done so far; nothing where nothing was.
+        """Save the session so far, if any work was done.
 
         Raises:
-            ConfigError: it cannot be written.
+            ConfigError: the file cannot be written.
         """
         if self._cases:
             self._written = time.perf_counter()
@@ -106,7 +106,7 @@ class Log:
 
 
 def sessions(folder: Path) -> list[Session]:
-    """Those of a folder; what cannot be read is left out, as it changes no result."""
+    """Read the sessions of a folder; unreadable ones are left out, because they change no result."""
     try:
         found = json.loads((folder / SESSIONS).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -123,7 +123,7 @@ def _read(told: Any) -> Session | None:
 
 
 def forget(folder: Path, cases: Collection[str]) -> None:
-    """Leave some cases out of the sessions of a folder."""
+    """Remove some cases from the sessions of a folder."""
     found = sessions(folder)
     kept = [each.of(each.cases.keys() - set(cases)) for each in found]
     if found:

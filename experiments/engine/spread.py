@@ -1,4 +1,4 @@
-"""A figure over the seeds: its median, the least and the largest, or its mean, in numbers, in words and drawn."""
+"""Statistics of a figure over the seeds (median, least and largest; or mean), as numbers, text and plots."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,32 +13,32 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-WHOLE = 1000.0  # from here on numbers are told without decimals
-HEADROOM = 1.1  # times the highest value, of axes
-BESIDE = 0.12  # so far right of the median the values stand
+WHOLE = 1000.0  # numbers from this on are printed without decimals
+HEADROOM = 1.1  # upper limit of an axis over the highest value
+BESIDE = 0.12  # offset of the values to the right of the median
 
 
 def spread(rows: Sequence[Row], key: str) -> dict[str, float]:
-    """Median, least and largest of a figure, over the rows that have it; nan where none has."""
+    """Give median, least and largest of a figure, over the rows that have it; nan where none has."""
     return spread_of(float(row[key]) for row in rows if row[key] is not None)
 
 
 def spread_of(values: Iterable[float]) -> dict[str, float]:
-    """The same of values; nan of none."""
+    """Give median, least and largest of values; nan of none."""
     told = list(values)
     three = (np.median(told), min(told), max(told)) if told else (np.nan,) * 3
     return dict(zip(("median", "least", "largest"), map(float, three), strict=True))
 
 
 def mean_of(values: Iterable[float]) -> tuple[float, float]:
-    """Mean of values and its standard error; nan of none, and an error of nan of one."""
+    """Give mean of values and its standard error; nan of no value, and an error of nan of one."""
     told = list(values)
     error = float(np.std(told, ddof=1) / math.sqrt(len(told))) if len(told) > 1 else math.nan
     return (float(np.mean(told)) if told else math.nan), error
 
 
 def in_words(found: Mapping[str, float], form: str = "") -> str:
-    """The median, then least and largest where they differ; with three significant digits, or as a format has them."""
+    """Format a spread: the median, then least and largest where they differ; three significant digits by default."""
     three = (found[key] for key in ("median", "least", "largest"))
     median, least, largest = (_text(each, form) for each in three)
     return median if least == largest else f"{median} ({least} to {largest})"
@@ -49,7 +49,7 @@ def _text(value: float, form: str) -> str:
 
 
 def ways_of(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """The rows of each way, in the order in which the ways come up."""
+    """Group rows by their "way", in the order of first appearance."""
     found: dict[str, list[Row]] = {}
     for row in rows:
         found.setdefault(row["way"], []).append(row)
@@ -57,19 +57,19 @@ def ways_of(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def ways_table(what: str, summary: Mapping[str, Mapping[str, Any]], figures: Mapping[str, str]) -> str:
-    """Spreads as a text, a line a figure with its words, a column a way."""
+    """Format spreads as a table with a line per figure and a column per way."""
     lines = [[words, *(in_words(found[key]) for found in summary.values())] for key, words in figures.items()]
     return table((what, *summary), lines)
 
 
 def points(ax: "Axes", at: float, values: Sequence[float], **how: Any) -> None:
-    """Draw values above a place of the x axis: their median with a bar from least to largest, each a point beside it.
+    """Draw values at a place on the x axis: their median with a bar from least to largest, and each value beside it.
 
     Args:
-        ax: where.
-        at: the place.
-        values: to be drawn; nothing is, where there are none.
-        how: colour and label, as matplotlib has them.
+        ax: axes to draw in.
+        at: place on the x axis.
+        values: values to draw; with none, nothing is drawn.
+        how: colour and label, as for matplotlib.
     """
     if values:
         found = spread_of(values)
@@ -82,11 +82,11 @@ def bars(ax: "Axes", at: Sequence[float], values: Sequence[Sequence[float]], wid
     """Draw the mean of each group of values as a bar with its standard error, and each value as a point on it.
 
     Args:
-        ax: where.
-        at: each group's place on the x axis.
-        values: of each group.
-        width: of a bar.
-        how: colour and label, as matplotlib has them.
+        ax: axes to draw in.
+        at: place of each group on the x axis.
+        values: values of each group.
+        width: width of a bar.
+        how: colour and label, as for matplotlib.
     """
     means, errors = np.array([mean_of(each) for each in values]).T
     ax.bar(at, means, width, yerr=np.nan_to_num(errors), capsize=3, **how)
@@ -95,7 +95,7 @@ def bars(ax: "Axes", at: Sequence[float], values: Sequence[Sequence[float]], wid
 
 
 def by_way(axes: "Iterable[Axes]", rows: Sequence[Row], titles: Mapping[str, str]) -> None:
-    """Draw each figure in axes of its own, from zero on, the rows of each way side by side, under a title."""
+    """Draw each figure in its own axes from zero on, with the rows of each way side by side, under a title."""
     ways = ways_of(rows)
     for ax, (key, title) in zip(axes, titles.items(), strict=True):
         for i, mine in enumerate(ways.values()):

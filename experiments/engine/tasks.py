@@ -1,4 +1,4 @@
-"""What a worker is told to do, and what it answers; imported by every worker, so it imports little."""
+"""Task and result of a worker; every worker imports this module, so it imports little."""
 
 import contextlib
 import functools
@@ -20,17 +20,17 @@ from experiments.engine.pictured import parted
 from experiments.engine.results import code_version, fingerprint
 from experiments.engine.texts import in_one_line
 
-TALLY = "COTARGET_TALLY"  # of `cotarget.sim.render.opengl`, which many tasks have no need of
+TALLY = "COTARGET_TALLY"  # copy of the name in `cotarget.sim.render.opengl`, which many tasks do not load
 
 
 @dataclass(frozen=True)
 class Task:
-    """Something for a worker to do.
+    """Work for a worker.
 
     Attributes:
-        case: number of the case.
-        number: of the job; None for what the case's jobs share.
-        call: gives the rows, or what they share.
+        case: index of the case.
+        number: number of the job; None for the preparation of what the case's jobs share.
+        call: gives the rows, or the shared object.
     """
 
     case: int
@@ -40,7 +40,10 @@ class Task:
 
 @dataclass(frozen=True)
 class Done:
-    """What came of a task; `failed` and `traceback` where nothing did. See `experiments.engine.results.Record`."""
+    """Result of a task; the fields are those of `experiments.engine.results.Record`.
+
+    ``failed`` and ``traceback`` are set if the task failed.
+    """
 
     seconds: float
     cpu_s: float
@@ -53,7 +56,7 @@ class Done:
 
 
 def perform(task: Task) -> Done:
-    """Do a task; whatever goes wrong is told, not raised."""
+    """Run a task; an exception is reported in the result and not raised."""
     version = code_version()
     began, cpu_s, drawn = time.perf_counter(), _cpu_s(), _drawn()
     result, pictures, failed, where = None, dict[str, bytes](), "", ""
@@ -62,32 +65,32 @@ def perform(task: Task) -> Done:
             result = task.call()
             if task.number is not None:
                 rows, seen = parted(result)
-                result, pictures = json.loads(json.dumps(rows, default=_scalar)), dict(seen)  # as read from the file
+                result, pictures = json.loads(json.dumps(rows, default=_scalar)), dict(seen)  # as read from a file
         except Exception as error:
             failed, where = in_one_line(error), traceback.format_exc()
         renders = max(round(_drawn() - drawn), tally())
     took, used = time.perf_counter() - began, _cpu_s() - cpu_s
-    if (now := _fingerprint_with(len(sys.modules))) != version:  # what was loaded last is not what was loaded first
+    if (now := _fingerprint_with(len(sys.modules))) != version:  # the code was changed between two imports
         version = f"{version} and {now}"
     return Done(took, used, version, renders, result, failed, where, pictures)
 
 
 @functools.cache
 def _fingerprint_with(modules: int) -> str:
-    """The fingerprint when so many modules were loaded first: it need not be looked at again until there are more."""
+    """Give the fingerprint, computed again only when more modules are loaded than at the last call."""
     return fingerprint()
 
 
 def _cpu_s() -> float:
-    """Processor time of this process, and of those that it has started and waited for [s]."""
+    """Give the processor time of this process and of child processes that it has waited for [s]."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return time.process_time() + children.ru_utime + children.ru_stime
 
 
 @contextlib.contextmanager
 def _tallied() -> Iterator[Callable[[], int]]:
-    """How many pictures this process and those that it starts meanwhile have drawn since; none where it cannot tell."""
-    if threading.current_thread() is not threading.main_thread():  # the environment is not this thread's alone
+    """Count the pictures drawn inside the block by this process and its children; zero outside the main thread."""
+    if threading.current_thread() is not threading.main_thread():  # other threads share the environment
         yield lambda: 0
         return
     with tempfile.NamedTemporaryFile(prefix="cotarget-tally-") as file:
@@ -99,7 +102,7 @@ def _tallied() -> Iterator[Callable[[], int]]:
 
 
 def _drawn() -> float:
-    """How many pictures MuJoCo has drawn in this process, which may have no need of it."""
+    """Give the number of pictures that MuJoCo has drawn in this process; zero where MuJoCo is not loaded."""
     opengl = sys.modules.get("cotarget.sim.render.opengl")
     return 0 if opengl is None else opengl.Canvas.drawn
 

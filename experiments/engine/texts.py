@@ -1,4 +1,4 @@
-"""Figures as they are told: as text, as JSON, and how a mistake is told in one line."""
+"""Formatting of figures as text and JSON, and of an error as one line."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 
 def rms(values: "Iterable[float] | Array") -> float:
-    """Root mean square; nan values do not count."""
+    """Compute the root mean square without nan values."""
     squared = np.square(np.array(list(values), dtype=float))
     return float(np.sqrt(np.nanmean(squared))) if np.isfinite(squared).any() else math.nan
 
 
 def table(head: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
-    """A table as text: the first column to the left, numbers to the right with three significant digits or more."""
+    """Format a table: first column left-aligned, numbers right-aligned with at least three significant digits."""
     cells = [list(head), *([_text(cell) for cell in line] for line in lines)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
     return "\n".join(
@@ -35,7 +35,7 @@ def _text(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """As JSON has it: null where nothing was measured."""
+    """Convert a value for JSON; numbers that are not finite become null."""
     if isinstance(value, Mapping):
         return {str(key): plain(v) for key, v in value.items()}
     if isinstance(value, list | tuple):
@@ -48,6 +48,6 @@ def plain(value: Any) -> Any:
 
 
 def in_one_line(error: Exception) -> str:
-    """What went wrong, for those who read no traceback."""
+    """Format an error as one line; the type is named except for errors of this project."""
     text = " ".join(str(error).split())
     return text if isinstance(error, CotargetError) else f"{type(error).__name__}: {text}".rstrip(": ")

@@ -1,4 +1,4 @@
-"""What figures depend on beside the code."""
+"""Versions of the software that figures depend on, besides the code."""
 
 import os
 import platform
@@ -10,18 +10,18 @@ import cotarget
 from cotarget.errors import CotargetError
 
 PACKAGES = ("numpy", "scipy", "mujoco", "matplotlib", "gymnasium", "av")
-# An environment variable: who draws, as a process is told by the one that starts it; to ask takes half a second.
+# Environment variable with the OpenGL renderer, which a child process inherits; finding it takes half a second.
 OPENGL = "COTARGET_OPENGL"
 
 
 def versions() -> dict[str, str]:
-    """Of what the figures depend on; of OpenGL who draws too, nothing where nobody does."""
+    """Give the versions of Python, the libraries and OpenGL's renderer; the latter is empty without OpenGL."""
     if OPENGL not in os.environ:
         try:
             from cotarget.sim.render.opengl import renderer_version
 
             os.environ[OPENGL] = renderer_version()
-        except CotargetError:  # what needs no pictures is done all the same
+        except CotargetError:  # experiments without pictures run without OpenGL
             os.environ[OPENGL] = ""
     found = {"cotarget": cotarget.__version__, "python": platform.python_version(), "opencv": cv2.__version__}
     return found | {name: version(name) for name in PACKAGES} | {"opengl": os.environ[OPENGL]}

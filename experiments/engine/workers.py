@@ -1,8 +1,8 @@
-"""Local processes that do the jobs of a sweep, each held to one thread; see `experiments.engine.cluster` for Dask.
+"""Local processes that run the jobs of a sweep, with one thread each (`experiments.engine.cluster` uses Dask).
 
-What a job gives comes as soon as it is there, with the job's number, in whatever order. Linear algebra, OpenCV and
-rendering take as many threads as there are cores, each: with a job for every core they would only get into each other's
-way, and sums that threads share come out differently in their last digits.
+An engine yields each job's number and result as it completes, in any order. Linear algebra, OpenCV and rendering each
+use one thread, because with a job per core more threads slow each other down, and sums over threads vary in their last
+digits.
 """
 
 import concurrent.futures
@@ -22,56 +22,56 @@ import cv2
 from cotarget.parallel import end_with_parent, interrupts_kept_from_children
 
 Job = TypeVar("Job")
-Results = Generator[tuple[int, Any], None, None]  # numbers of jobs, and what they gave, or `Died`
-Engine = Callable[[Callable[[Any], Any], Sequence[Any], int], Results]  # does (work, jobs, so many at a time)
+Results = Generator[tuple[int, Any], None, None]  # numbers and results of jobs; `Died` for a dead process
+Engine = Callable[[Callable[[Any], Any], Sequence[Any], int], Results]  # called with (work, jobs, number of processes)
 # Read when linear algebra is loaded, when Mesa's software renderer starts, and when a simulated world is opened.
 LINEAR_ALGEBRA = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 ONE_THREAD = dict.fromkeys((*LINEAR_ALGEBRA, "LP_NUM_THREADS"), "1") | {"COTARGET_AHEAD": "0"}
 
 
 class Died:
-    """Stands for what a job would have given whose process ended without a word."""
+    """Result of a job whose process died without an exception."""
 
 
 def here(work: Callable[[Job], Any], jobs: Sequence[Job], processes: int = 1) -> Results:
-    """Do jobs one after the other in this process, on as many threads as each takes; what each gives, with its number.
+    """Run jobs one after the other in this process, with as many threads as each uses; yield number and result.
 
     Args:
-        work: a function.
-        jobs: its arguments, one each.
-        processes: is not heeded.
+        work: function of a job.
+        jobs: arguments of the calls, one each.
+        processes: ignored.
     """
     del processes
     yield from enumerate(map(work, jobs))
 
 
 def in_processes(work: Callable[[Job], Any], jobs: Sequence[Job], processes: int) -> Results:
-    """Do jobs in as many processes of this machine, in their order; what each gives as it comes, with its number.
+    """Run jobs in several processes of this machine, in their order; yield number and result as each completes.
 
-    A process that dies (out of memory, say) takes nobody else's job along, and another takes its place. All processes
-    end with this one, however it ends.
+    A process that dies (out of memory, for example) loses its own job only, and another process replaces it. All
+    processes end with this one, however it ends.
 
     Args:
-        work: a function at the top of a module, or a partial one of it.
-        jobs: its arguments, one each.
-        processes: how many.
+        work: a function at module level, or a partial of one.
+        jobs: arguments of the calls, one each.
+        processes: number of processes.
 
     Raises:
-        Exception: what a job raised.
+        Exception: an exception of a job.
     """
     return _in_pools(work, jobs, processes, _begin, one_thread_each)
 
 
 def in_turn(work: Callable[[Job], Any], jobs: Sequence[Job], processes: int = 1) -> Results:
-    """Do jobs one after the other, as `in_processes` does, on as many threads and processes of its own as each takes.
+    """Run jobs one after the other in another process, which may use any number of threads and child processes.
 
     Args:
-        work: a function at the top of a module, or a partial one of it.
-        jobs: its arguments, one each.
-        processes: is not heeded.
+        work: a function at module level, or a partial of one.
+        jobs: arguments of the calls, one each.
+        processes: ignored.
 
     Raises:
-        Exception: what a job raised.
+        Exception: an exception of a job.
     """
     del processes
     return _in_pools(work, jobs, 1, _begin_in_turn, contextlib.nullcontext)
@@ -84,7 +84,7 @@ def _in_pools(
     begin: Callable[[], None],
     limits: Callable[[], contextlib.AbstractContextManager[None]],
 ) -> Results:
-    """Do jobs in pools of one process each: when one dies it is known which job it had in hand."""
+    """Run jobs in pools of one process each, so that a dead process identifies its job."""
     context = multiprocessing.get_context("spawn")  # a forked process would share the parent's OpenGL
     waiting, running = enumerate(jobs), dict[concurrent.futures.Future[Any], tuple[int, ProcessPoolExecutor]]()
     with contextlib.ExitStack() as pools, _ended_early():
@@ -98,7 +98,7 @@ def _in_pools(
                 for pool, (number, job) in zip(idle, waiting, strict=False):
                     try:
                         running[pool.submit(work, job)] = number, pool
-                    except BrokenProcessPool:  # it has died since its last job
+                    except BrokenProcessPool:  # the process died after its last job
                         another = opened()
                         running[another.submit(work, job)] = number, another
             if not running:
@@ -115,13 +115,13 @@ def _in_pools(
 
 
 def _begin() -> None:
-    """One process begins: gone when the one that started it is, deaf to Ctrl-C, and with one thread for OpenCV."""
+    """Set up a worker: it ends with its parent, ignores Ctrl-C, and has one thread for OpenCV."""
     _begin_any()
     cv2.setNumThreads(1)
 
 
 def _begin_in_turn() -> None:
-    """As `_begin`, with as many threads as it likes; where it is ended, it ends what it has started itself."""
+    """Set up a worker as `_begin` does, with any number of threads; SIGTERM ends its child processes too."""
     _begin_any()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
 
@@ -129,13 +129,13 @@ def _begin_in_turn() -> None:
 def _begin_any() -> None:
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Before any job brings its experiment along; `experiments.engine.results` needs this module.
+    # Before a job loads its experiment; imported late because `experiments.engine.results` needs this module.
     importlib.import_module("experiments.engine.results").code_version()
 
 
 @contextlib.contextmanager
 def _ended_early() -> Iterator[None]:
-    """Whatever ends this before its end ends the processes started meanwhile; nobody waits for what they are at."""
+    """Terminate the processes started inside the block if it ends by an exception."""
     before = set(multiprocessing.active_children())
     try:
         yield
@@ -147,7 +147,7 @@ def _ended_early() -> Iterator[None]:
 
 @contextlib.contextmanager
 def one_thread_each() -> Iterator[None]:
-    """Processes started meanwhile have one thread."""
+    """Set the environment so that processes started inside the block use one thread."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)
     try:

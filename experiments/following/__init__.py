@@ -1,1 +1,1 @@
-"""How well a target is held in the close-up."""
+"""Experiments on following: how well the rig keeps a target in the close-up, and against what alternatives."""

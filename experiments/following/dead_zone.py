@@ -1,9 +1,7 @@
-"""What the dead zone spares the motors: commands and reversals a minute with it and without, and the offset it costs.
+"""Value of the head's deadband: commands and reversals a minute with and without it, and the offset that it costs.
 
-A book that is put elsewhere once and a person who walks are held in the field of `experiments.following.field_scenes`,
-by the
-whole pipeline; all that differs is whether the head is ever left alone: how it is driven, when it is told anything, is
-the same.
+A book that is moved once and a person who walks are followed in the field of `experiments.following.field_scenes` by
+the whole pipeline. Only the deadband differs between the runs.
 
     python -m experiments.following.dead_zone [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -30,17 +28,17 @@ from experiments.following.wide_view import record
 
 WAYS = {"with": HeadSettings(), "without": HeadSettings(deadband=False)}
 FIGURES = ("commands_per_min", "reversals_per_min", "tpo_width_median")
-# With the dead zone over without: at most.
+# Goals: largest ratio of the figure with the deadband to that without.
 WANTED = {"commands_per_min": 0.5, "reversals_per_min": 0.5, "tpo_width_median": 1.1}
 
 
 @dataclass(frozen=True)
 class DeadZoneSettings(FieldSettings):
-    """How many seeds, and which targets.
+    """Settings: targets of the runs.
 
     Attributes:
-        targets: book, person.
-        closed_loop: whether the offset is corrected from the zoom view too.
+        targets: book or person.
+        closed_loop: whether the zoom view corrects the aim.
     """
 
     seeds: int = 2
@@ -49,7 +47,7 @@ class DeadZoneSettings(FieldSettings):
 
 
 def one(calibration: Calibration, settings: DeadZoneSettings, seed: int) -> list[Row]:
-    """Hold each target with the dead zone and without; one row each."""
+    """Follow each target with and without the deadband; give a row per run."""
     rows: list[Row] = []
     for name in settings.targets:
         config = hold_config(name, seed)
@@ -62,7 +60,7 @@ def one(calibration: Calibration, settings: DeadZoneSettings, seed: int) -> list
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Of each target and figure median, least and largest over the seeds, and the one median over the other."""
+    """Give median, least and largest by target and figure over the seeds, and the ratio of the medians."""
     found: dict[str, dict[str, dict[str, Any]]] = {}
     for name in dict.fromkeys(row["target"] for row in rows):
         found[name] = {}
@@ -73,17 +71,17 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def _spread(values: Sequence[float | None]) -> dict[str, float]:
-    """Over the seeds; nan where a run never acquired its target."""
+    """Summarise values over the seeds; nan where a run never acquired its target."""
     return spread_of([] if None in values else [float(value) for value in values if value is not None])
 
 
 def _over(value: float, other: float) -> float:
-    """A ratio, which is 1 of nothing over nothing."""
+    """Give a ratio; 1 for zero over zero."""
     return 1.0 if value == other == 0 else value / other if other else math.inf
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     return [
         f"{name}: {key}"
         for name, figures in summary.items()
@@ -93,7 +91,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def describe(settings: DeadZoneSettings, summary: Mapping[str, Any]) -> str:
-    """A line for each target and figure."""
+    """Format a line per target and figure."""
     lines = [
         [f"{name}, {key}", *(in_words(found[way]) for way in WAYS), found["over"], f"<= {WANTED[key]:g}"]
         for name, figures in summary.items()
@@ -110,7 +108,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
         highest = 0.0
         for name in dict.fromkeys(row["target"] for row in rows):
             with_it, without = ([r[key] for r in rows if (r["target"], r["way"]) == (name, way)] for way in WAYS)
-            # A run that never acquired its target has no figure, and none is no zero, which would be the best place.
+            # A run that never acquired its target has no figure; it must not count as zero, the best value.
             both = [pair for pair in zip(without, with_it, strict=True) if None not in pair]
             of_way = [[pair[i] for pair in both] for i in range(len(WAYS))]
             (dots,) = ax.plot(*of_way, ".", alpha=0.6)
@@ -129,7 +127,7 @@ EXPERIMENT = Experiment(
     "dead_zone",
     "Commands and reversals a minute with the dead zone and without, and the offset it costs.",
     SETTINGS,
-    # By the wide view alone, which takes a third of the time.
+    # Without correction from the zoom view, which takes a third of the time.
     dataclasses.replace(SETTINGS, seeds=1, targets=("person",), seconds=10.0, calibrated=False, closed_loop=False),
     one,
     summarise,

@@ -1,12 +1,10 @@
-"""What prediction is worth: the offset in the close-up with it and without, over the delay of cameras and head.
+"""Value of prediction: the close-up's offset with and without it, over the delay of cameras and head.
 
-A person walks and a bird flies in the field of `experiments.following.field_scenes`, and the delay from light to the
-start of
-motion goes from none to 600 ms, of which three fifths are the cameras' and the rest the head's and the lens's, as in
-the field's 120 + 80 ms. Without prediction the head is sent where the target was seen. The curve is of the wide view
-alone, so that nothing is rendered but its frames, once a seed; at one delay, the field's, both are compared once more
-with the correction from the zoom view where that is asked for (`--set delay.closed_loop=true`). A run in which the
-target was never acquired counts with half the diagonal.
+A person walks and a bird flies in the field of `experiments.following.field_scenes`. The delay from light to the start
+of motion goes from 0 to 600 ms; three fifths are the cameras' and the rest that of head and lens, as in the field's 120
++ 80 ms. Without prediction the head is sent to where the target was detected. The curve uses the fixed view alone,
+rendered once per seed. At the field's delay both can also be compared with correction from the zoom view (`--set
+delay.closed_loop=true`). A run in which the target was never acquired counts half the diagonal.
 
     python -m experiments.following.delay [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -33,20 +31,20 @@ from experiments.following.field_scenes import COMMAND_DELAY_S, LATENCY_S, hold_
 from experiments.following.wide_view import record
 
 FIELD_S = LATENCY_S + COMMAND_DELAY_S
-LIGHT_PART = LATENCY_S / FIELD_S  # of a delay, that from light to frame
+LIGHT_PART = LATENCY_S / FIELD_S  # part of a delay from light to frame
 WIDTH, HEIGHT = SimZoomCamera().size
-NEVER = math.hypot(WIDTH, HEIGHT) / 2 / WIDTH  # offset over the width, of a target that is never acquired
-WANTED = 3.0  # times smaller with prediction than without, at the field's delay
+NEVER = math.hypot(WIDTH, HEIGHT) / 2 / WIDTH  # offset over the width of a target that is never acquired
+WANTED = 3.0  # goal: offset without prediction over that with it, at the field's delay
 
 
 @dataclass(frozen=True)
 class DelaySettings(FieldSettings):
-    """How many seeds, which targets, and at which delays.
+    """Settings: targets and delays.
 
     Attributes:
-        targets: person, bird.
-        delays: from light to the start of motion [s]; what is wanted is held against the field's, if it is among them.
-        closed_loop: whether both ways are compared with the zoom view's correction too, at the field's delay.
+        targets: person or bird.
+        delays: delays from light to the start of motion [s]; the goal applies to the field's, if it is among them.
+        closed_loop: whether both ways are also compared with the zoom view's correction, at the field's delay.
     """
 
     seeds: int = 2
@@ -56,7 +54,7 @@ class DelaySettings(FieldSettings):
 
 
 def one(calibration: Calibration, settings: DelaySettings, seed: int) -> list[Row]:
-    """Follow each target at each delay, with prediction and without; one row each."""
+    """Follow each target at each delay, with and without prediction; give a row per run."""
     cases = [(delay, predict, False) for delay in settings.delays for predict in (True, False)]
     if settings.closed_loop:
         cases += [(FIELD_S, predict, True) for predict in (True, False)]
@@ -121,9 +119,9 @@ def _of_target(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The targets for which prediction is not worth what is wanted; of the whole pipeline, where that was measured.
+    """List the targets for which prediction misses its goal, and the whole pipeline where that was measured.
 
-    Where the field's delay was not asked for, nothing is wanted.
+    Without the field's delay among the settings there is no goal.
     """
     lost = []
     for name, figures in summary.items():
@@ -139,7 +137,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def describe(settings: DelaySettings, summary: Mapping[str, Any]) -> str:
-    """A line for each target and delay."""
+    """Format a line per target and delay."""
     lines: list[list[Any]] = []
     for name, figures in summary.items():
         shown = {f"{name}, {delay}": found for delay, found in figures["wide view alone"].items()}

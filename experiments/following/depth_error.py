@@ -1,19 +1,19 @@
-"""How an error of the depth becomes a pointing error, over depth and baseline: first order beside Monte Carlo.
+"""Pointing error from an error of the depth, over depth and baseline: first order against Monte Carlo.
 
-The depth comes from a size known beforehand, z = f x_size / u_measured, and errs by the same part as either of them:
+The depth comes from a size known beforehand, z = f x_size / u_measured, so that its relative error is that of either
+size:
 
     wrong size      all targets are believed to be 10 % larger than they are
-    scatter         true sizes scatter by 10 % about the one believed
+    scatter         true sizes scatter by 10 % about the believed one
     pixels          the measured size has 0.5 px of noise
     together        scatter and pixels
 
-A target seen at x [m] from the fixed camera, x_zoom from the turned zoom camera, is then looked for at x (1 + e): to
-first order that turns the line of sight by e |x_zoom x x| / |x_zoom|^2, about e b / z for a baseline b across the view.
-Since e is u_noise z / (f x_size) for pixels, their part does not depend on the depth. Monte Carlo has the whole way: a
-bar of the target's true size is projected, measured, and aimed at through `cotarget.camera.depth_from_size`, on rigs
-mounted by eye (`experiments.following.mounted`) that are known exactly. The part of the close-up's width is at the
-focal length
-at which a bird of 0.8 m is 160 px wide, within the lens's range.
+A target at x [m] from the fixed camera, and x_zoom from the rotated zoom camera, is then estimated at x (1 + e). To
+first order that rotates the line of sight by e |x_zoom x x| / |x_zoom|^2, about e b / z for a baseline b across the
+view. With e = u_noise z / (f x_size) for pixels, their part does not depend on the depth. Monte Carlo has no
+approximation: a bar of the target's true size is projected, measured, and aimed at through
+`cotarget.camera.depth_from_size`, on rigs mounted by eye (`experiments.following.mounted`) that are known exactly. The
+fraction of the close-up's width is at the focal length that shows a bird of 0.8 m 160 px wide, within the lens's range.
 
     python -m experiments.following.depth_error [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -38,24 +38,24 @@ from experiments.engine.texts import rms, table
 from experiments.following.mounted import TARGET, at, cell_name, exact_calibration, mounted, off_px, wanted_focal_px
 
 CAUSES = ("wrong size", "scatter", "pixels", "together")
-# Monte Carlo over first order, the median over all: a size 10 % too large turns by 1 / 1.1 of what first order says.
+# Limits of Monte Carlo over first order, median over all. A size 10 % too large rotates by 1 / 1.1 of first order.
 AGREES = (0.88, 1.12)
-# Nearer than this some bird at the image's edge, half of it outside, reaches where the lens's model tells no depth.
+# Nearer, a bird at the image's edge, half outside, is where the lens model gives no depth.
 NEAREST_M = 2.0
 SHOWN_BASELINE, SHOWN_DEPTH = 0.4, 10.0  # [m]
 
 
 @dataclass(frozen=True)
 class DepthSettings(Settings):
-    """What is mounted, where targets are, and what errs.
+    """Settings: rigs, targets and errors.
 
     Attributes:
-        baselines: of the rigs of each seed [m].
-        depths: of the targets [m].
-        targets: at each depth.
-        wrong: by how much the known size is too large, relative.
-        scatter: standard deviation of true sizes, relative.
-        noise_px: of the measured size [px].
+        baselines: baselines of the rigs of each seed [m].
+        depths: depths of the targets [m].
+        targets: number of targets at each depth.
+        wrong: relative excess of the known size.
+        scatter: relative standard deviation of true sizes.
+        noise_px: noise of the measured size [px].
     """
 
     seeds: int = 20
@@ -67,7 +67,7 @@ class DepthSettings(Settings):
     noise_px: float = 0.5
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_above(0, self, "baselines", "depths", "targets", "scatter", "noise_px")
         check_least(NEAREST_M, self, "depths")
@@ -77,7 +77,7 @@ class DepthSettings(Settings):
 
 
 def one(_: None, settings: DepthSettings, seed: int) -> list[Row]:
-    """A rig of each baseline; a row for each depth and cause."""
+    """Draw a rig of each baseline; give a row per depth and cause."""
     return [row for i in range(len(settings.baselines)) for row in _of_rig(settings, seed, i)]
 
 
@@ -93,7 +93,7 @@ def _of_rig(settings: DepthSettings, seed: int, number: int) -> list[Row]:
         x_fixed = at(truth, pixels, depth)
         focal_px, arm = wanted_focal_px(truth, x_fixed), turned_by(calibration, truth, x_fixed)
         by_pixels = settings.noise_px * depth / (truth.fixed.fx * TARGET.size)
-        # Of each cause: true sizes [m], noise of the measured ones [px], and the relative error to first order.
+        # For each cause: true sizes [m], noise of measured sizes [px], and relative error to first order.
         still, right = np.zeros(settings.targets), np.full(settings.targets, TARGET.size)
         causes = {
             "wrong size": (right / (1 + settings.wrong), still, settings.wrong),
@@ -120,12 +120,12 @@ def _of_rig(settings: DepthSettings, seed: int, number: int) -> list[Row]:
 
 
 def turned_by(calibration: Calibration, truth: Truth, x_fixed: Array) -> Array:
-    """Turn of the line of sight per relative error of the depth, to first order [rad], (n,).
+    """Compute the rotation of the line of sight per relative error of the depth, to first order, (n,) [rad].
 
     Args:
-        calibration: exactly that of the rig.
+        calibration: exact calibration of the rig.
         truth: the rig.
-        x_fixed: targets (n, 3) [m].
+        x_fixed: targets in the fixed frame, (n, 3) [m].
     """
     q = aim(calibration, x_fixed)
     looking = truth.zoom_fixed(q[:, 0], q[:, 1])
@@ -137,15 +137,15 @@ def turned_by(calibration: Calibration, truth: Truth, x_fixed: Array) -> Array:
 def measured_depths(
     calibration: Calibration, truth: Truth, pixels: Array, x_fixed: Array, sizes: Array, noise_px: Array
 ) -> Array:
-    """Depths from how wide targets appear, (n,) [m].
+    """Compute depths from apparent widths, (n,) [m].
 
     Args:
-        calibration: gives the camera that measures.
-        truth: through whose lens bars as wide as the targets are seen.
-        pixels: of their middles, (n, 2).
-        x_fixed: where these are [m], (n, 3).
-        sizes: their true ones [m], (n,).
-        noise_px: of the measured size, (n,).
+        calibration: calibration that gives the depth.
+        truth: true rig, whose lens projects bars as wide as the targets.
+        pixels: centres of the targets, (n, 2) [px].
+        x_fixed: positions of the centres, (n, 3) [m].
+        sizes: true sizes, (n,) [m].
+        noise_px: noise of the measured sizes, (n,) [px].
     """
     half = np.c_[sizes / 2, np.zeros((len(sizes), 2))]
     wide = truth.fixed.project(x_fixed + half)[:, 0] - truth.fixed.project(x_fixed - half)[:, 0] + noise_px
@@ -158,7 +158,7 @@ def measured_depths(
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """Medians over the seeds by cause, depth and baseline, and how well first order agrees."""
+    """Give medians over the seeds by cause, depth and baseline, and the agreement with first order."""
     summary: dict[str, Any] = {}
     for cause in dict.fromkeys(row["cause"] for row in rows):
         mine = [row for row in rows if row["cause"] == cause]
@@ -176,7 +176,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The causes of which first order tells another story than Monte Carlo."""
+    """List the causes for which first order and Monte Carlo disagree."""
     low, high = AGREES
     return [
         f"{cause}: {median:.2f} times first order"
@@ -186,7 +186,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def describe(settings: DepthSettings, summary: Mapping[str, Any]) -> str:
-    """A line for each cause, depth and baseline; then how well first order agrees."""
+    """Format a line per cause, depth and baseline, and the agreement with first order."""
     lines = [
         [f"{cause}, {cell}", 100 * v["relative"], v["reached_deg"], v["first_order_deg"], 100 * v["width"]]
         for cause, found in summary.items()
@@ -234,7 +234,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 def _nearest(rows: Sequence[Row], key: str, wanted: float) -> float:
-    """The value there is that is nearest to the one wanted."""
+    """Give the existing value that is nearest to the wanted one."""
     return float(min({row[key] for row in rows}, key=lambda value: abs(value - wanted)))
 
 

@@ -1,12 +1,11 @@
-"""What each detector finds in the field and what it takes for a target, by a camera that stands and by one that shakes.
+"""Detectors compared in the field: targets found and false tracks, with a static and with a shaking camera.
 
-Five persons, five birds, or nobody at all, in the field of `experiments.following.field_scenes`: foliage, clouds and
-shadows move
-about as strongly as the targets. Each frame is rendered once, searched by every detector and tracked, and judged by the
-truth: how much of the time that a target is wholly in view a confirmed track is on it, false tracks a minute, and how
-often a track goes over to another target. A shaken camera's frames are those of the one that stands, shifted to and fro
-at random with a memory of a tenth of a second; its tracks are judged as if somebody had held it still. Where nobody is,
-it stands.
+Scenes have five persons, five birds or no target in the field of `experiments.following.field_scenes`, where foliage,
+clouds and shadows move about as strongly as the targets. Each frame is rendered once, searched by every detector and
+tracked. Ground truth judges the tracks: the fraction of time that a wholly visible target has a confirmed track, false
+tracks a minute, and switches of a track to another target. The shaking camera's frames are those of the static one,
+shifted by random offsets with a correlation time of a tenth of a second; its tracks are judged after the shift is
+removed. Without targets, the camera is static.
 
     python -m experiments.following.detectors [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -42,9 +41,9 @@ from experiments.following.wide_view import WIDE
 DetectorName = Literal["mog2", "motion", "speck"]
 DETECTORS: tuple[DetectorName, ...] = ("mog2", "motion", "speck")
 STANDS, SHAKES = "stands", "shakes"
-MEMORY_S = 0.1  # of the shake
-COME_S = 3.0  # by then the first of five is in view, whatever the seed, and the background was learnt [s]
-STREAM = 11  # of random numbers, apart from the world's own
+MEMORY_S = 0.1  # correlation time of the shake
+COME_S = 3.0  # by then the first of five is in view with any seed, and the background was learnt [s]
+STREAM = 11  # random stream, separate from the world's
 FIGURES = {
     "found": "targets in view with a track on them",
     "false_per_min": "false tracks a minute",
@@ -54,13 +53,13 @@ FIGURES = {
 
 @dataclass(frozen=True)
 class DetectorsSettings(Settings):
-    """How many seeds, which scenes, and how much the camera shakes.
+    """Settings: scenes, detectors and camera shake.
 
     Attributes:
-        seconds: of each run [s].
-        kinds: person, bird; of each five, and of each nobody.
-        detectors: which are compared.
-        shake_px: standard deviation of the shaken picture's place, along each axis [px].
+        seconds: length of each run [s].
+        kinds: kinds of target, person or bird; each is run with five targets and with none.
+        detectors: detectors to compare.
+        shake_px: standard deviation of the image's shift along each axis [px].
     """
 
     seeds: int = 2
@@ -70,7 +69,7 @@ class DetectorsSettings(Settings):
     shake_px: float = 1.0
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_above(COME_S, self, "seconds")
         check_ways(self, "seconds")
@@ -78,15 +77,17 @@ class DetectorsSettings(Settings):
 
 @dataclass
 class Watch:
-    """A detector and its tracker behind one camera, and what was so in each frame.
+    """Detector and tracker behind one camera, with the results of each frame.
 
     Attributes:
-        kind: of the target that is looked for.
-        name: of the detector.
-        camera: whether it stands.
-        on: which track was on which target.
-        off: the time [s], and which tracks were on none.
-        found: of each target wholly in view, whether a track was on it.
+        kind: kind of target that is searched.
+        name: name of the detector.
+        camera: STANDS or SHAKES.
+        target: configuration of the target.
+        config: configuration of the rig.
+        on: pairs of track and target that match, per frame.
+        off: time [s] and tracks on no target, per frame.
+        found: for each wholly visible target in each frame, whether a track was on it.
     """
 
     kind: str
@@ -103,7 +104,7 @@ class Watch:
         self._tracker = Tracker(settings_for(self.target), self.config.sim.fixed.size)
 
     def see(self, frame: Frame, shift: Array, outlines: Mapping[str, Silhouette | None]) -> None:
-        """Search a frame that is shifted so far (du, dv) [px], and judge what is tracked then."""
+        """Search a frame with a shift (du, dv) [px], and judge the tracks."""
         tracks = self._tracker.update(self._detector.detect(frame), frame.t)
         held = [dataclasses.replace(track, center_px=track.center_px - shift) for track in tracks]
         if frame.t < BACKGROUND_S:
@@ -115,7 +116,7 @@ class Watch:
         self.found += [name in with_track for name in in_view]
 
     def row(self, seed: int) -> Row:
-        """What came of it; nothing was to be found where nobody was."""
+        """Give the figures as a row; None for those that need targets where there were none."""
         minutes = (self.off[-1][0] - self.off[0][0]) / 60
         return {
             "seed": seed,
@@ -129,13 +130,13 @@ class Watch:
 
 
 def one(_: None, settings: DetectorsSettings, seed: int) -> list[Row]:
-    """Watch each scene once with all detectors; one row for each of them and either camera."""
+    """Run each scene once with all detectors; give a row per detector and camera."""
     rows = [row for kind in settings.kinds for row in watched(five_targets_config(seed, kind), (kind,), settings, seed)]
     return [*rows, *watched(field_config({}, seed), settings.kinds, settings, seed)]
 
 
 def watched(config: RigConfig, kinds: Sequence[str], settings: DetectorsSettings, seed: int) -> Iterator[Row]:
-    """Watch a scene for targets of some kinds."""
+    """Run all detectors on a scene, for targets of some kinds."""
     watches = [
         Watch(kind, name, camera, dataclasses.replace(config.target(kind), detector=name), config)
         for kind in kinds
@@ -159,14 +160,14 @@ def watched(config: RigConfig, kinds: Sequence[str], settings: DetectorsSettings
 
 
 class _Shake:
-    """Where a shaken picture is: normal, with a memory."""
+    """Random shift of an image: Gaussian, with an exponential correlation."""
 
     def __init__(self, sigma_px: float, rng: np.random.Generator) -> None:
         self._sigma, self._rng = sigma_px, rng
         self._t, self._at = -np.inf, np.zeros(2)
 
     def at(self, t: float) -> Array:
-        """At a time that is no earlier than the last [s], (du, dv) [px]."""
+        """Give the shift (du, dv) [px] at a time no earlier than the last [s]."""
         kept = float(np.exp((self._t - t) / MEMORY_S))
         self._at = kept * self._at + np.sqrt(1 - kept**2) * self._rng.normal(0.0, self._sigma, 2)
         self._t = t
@@ -174,13 +175,13 @@ class _Shake:
 
 
 def _shifted(image: Any, shift: Array) -> Any:
-    """A picture moved by so much (du, dv) [px]."""
+    """Shift an image by (du, dv) [px]."""
     M = np.column_stack([np.eye(2), shift])
     return cv2.warpAffine(image, M, image.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, dict[str, float]]]]:
-    """Of each scene, detector with its camera, and figure median, least and largest over the seeds."""
+    """Give median, least and largest over the seeds for each scene, detector with camera, and figure."""
     found: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
     for scene, way in dict.fromkeys((row["scene"], _way(row)) for row in rows):
         mine = [row for row in rows if (row["scene"], _way(row)) == (scene, way)]
@@ -194,7 +195,7 @@ def _way(row: Row) -> str:
 
 
 def describe(settings: DetectorsSettings, summary: Mapping[str, Any]) -> str:
-    """A table for each figure: a line a scene, a column a detector and camera."""
+    """Format a table per figure: a line per scene, a column per detector and camera."""
     texts = [
         f"median (least to largest) of {seeds_of(settings)}, {settings.seconds:g} s each; the camera stands, or shakes "
         f"by {settings.shake_px:g} px along each axis, one standard deviation"

@@ -1,8 +1,8 @@
-"""What the project's own pipeline earns in the environments, and what chance earns.
+"""Scores of the project's pipeline and of random actions in the environments.
 
-In `cotarget/Follow-v0` the score is the part of an episode's frames with a good close-up, its reward over its steps; in
-`cotarget/Schedule-v0` the reward of an episode, and how many of the five targets were served. Chance draws every action
-anew; where it chooses a slot, one that is not empty.
+In `cotarget/Follow-v0` the score is the fraction of an episode's frames with a good close-up: reward over steps. In
+`cotarget/Schedule-v0` it is an episode's reward, and the number of the five targets that were served. Random actions
+are drawn independently; a slot is drawn among those that are not empty.
 
     python -m experiments.following.env_score [--seeds 5] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -25,30 +25,30 @@ from experiments.engine.spread import bars, mean_of
 from experiments.engine.texts import table
 
 CHANCE, PIPELINE = "chance", "pipeline"
-SERVED = ", served"  # of a figure's name: how many targets, beside the reward
+SERVED = ", served"  # suffix of a figure's name: number of targets served, beside the reward
 Policy = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)
 class ScoreSettings(Settings):
-    """How many seeds, and for how long.
+    """Settings: length of an episode.
 
     Attributes:
-        seconds: of an episode [s].
+        seconds: length of an episode [s].
     """
 
     seeds: int = 5
     seconds: float = SECONDS
 
     def __post_init__(self) -> None:
-        """Refuse what the environments do."""
+        """Refuse values that the environments refuse."""
         super().__post_init__()
         check_above(0, self, "seconds")
         check_ways(self, "seconds")
 
 
 def one(shared: None, settings: ScoreSettings, seed: int) -> list[Row]:
-    """All episodes of a seed, a row each."""
+    """Run all episodes of a seed; give a row per episode."""
     rows = []
     for target in LONE:
         env = gymnasium.make(FOLLOW, target=target, seconds=settings.seconds)
@@ -66,7 +66,7 @@ def one(shared: None, settings: ScoreSettings, seed: int) -> list[Row]:
 
 
 def chance(env: gymnasium.Env[Any, Any], seed: int) -> Policy:
-    """Actions by chance, the same for the same seed."""
+    """Make a policy of random actions, the same for the same seed."""
     env.action_space.seed(seed)
 
     def act(observation: Any) -> Any:
@@ -79,7 +79,7 @@ def chance(env: gymnasium.Env[Any, Any], seed: int) -> Policy:
 
 
 def episode(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> dict[str, float]:
-    """An episode's reward, its steps, and the targets served where that is told."""
+    """Run an episode; give its reward, its steps, and the targets served where the environment reports them."""
     observation, info = env.reset(seed=seed)
     reward, steps, over = 0.0, 0, False
     while not over:
@@ -89,7 +89,7 @@ def episode(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> dict[str
 
 
 def figures_of(rows: Sequence[Row]) -> dict[str, dict[str, list[float]]]:
-    """Of each figure and policy a value a seed: reward a step of following; reward and targets served of scheduling."""
+    """Collect values by figure and policy: reward per step of Follow; reward and targets served of Schedule."""
     found: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         name, follows = f"{row['env']} {row['of']}", row["env"] == FOLLOW
@@ -100,7 +100,7 @@ def figures_of(rows: Sequence[Row]) -> dict[str, dict[str, list[float]]]:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """Means of the figures over the seeds, with their standard errors."""
+    """Give means of the figures over the seeds, with standard errors."""
     return {
         name: {policy: dict(zip(("mean", "error"), mean_of(values), strict=True)) for policy, values in found.items()}
         for name, found in figures_of(rows).items()
@@ -108,18 +108,18 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
 
 
 def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """The means."""
+    """Give the means."""
     return {name: {policy: each["mean"] for policy, each in found.items()} for name, found in summary.items()}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """Where chance earns as much as the best of the project's own."""
+    """List where random actions score as well as the best of the project's policies."""
     means = bounded(summary)
     return [name for name, found in means.items() if found[CHANCE] >= max(v for k, v in found.items() if k != CHANCE)]
 
 
 def describe(settings: ScoreSettings, summary: Mapping[str, Any]) -> str:
-    """A table for each environment."""
+    """Format a table per environment."""
     texts = [f"means with standard errors of {seeds_of(settings)}, {settings.seconds:g} s each"]
     for env in (FOLLOW, SCHEDULE):
         own = {name: found for name, found in summary.items() if name.startswith(env)}

@@ -1,6 +1,6 @@
-"""What all experiments in the field share: its calibration, who is followed there, and every frame judged by the truth.
+"""Shared by all experiments in the field: its calibration, the targets' settings, and runs judged by ground truth.
 
-`experiments.following.field_scenes` says where that is.
+The field itself is described in `experiments.following.field_scenes`.
 """
 
 import dataclasses
@@ -29,14 +29,14 @@ from experiments.paper.paper_loop import Follow
 
 @dataclass(frozen=True)
 class FieldSettings(harness.Settings):
-    """How many runs in the field, how long they are, and what is known of the rig.
+    """Settings of runs in the field: their length, and whether the rig is calibrated.
 
     Attributes:
-        seconds: of each run [s].
+        seconds: length of each run [s].
         calibrated: whether the rig is calibrated from rendered boards; otherwise it is known exactly.
 
     Raises:
-        ConfigError: the clock does not start in a run, or targets' ways end before it.
+        ConfigError: a run ends before the clock starts, or after the targets' paths end.
     """
 
     seconds: float = SECONDS
@@ -50,13 +50,13 @@ class FieldSettings(harness.Settings):
 
     @property
     def lasting_s(self) -> tuple[float, float]:
-        """When there begins to be something to be told of a run, and how long its targets have ways to go [s]."""
+        """Limits of a run's length [s]: the start of the clock, and the end of the targets' paths."""
         return BACKGROUND_S, SECONDS
 
 
 @dataclass(frozen=True)
 class OwnRigInField(OwnRig, FieldSettings):
-    """The same for an experiment that takes a rig of one's own."""
+    """Settings of runs in the field for an experiment that accepts a user's own rig."""
 
 
 def _of_calibration(settings: FieldSettings) -> tuple[bool, int, RigText]:
@@ -74,7 +74,7 @@ def _calibrated(from_boards: bool, seed: int, rig: RigText) -> Calibration:
         return calibrate(safe, config.board, pitch_mm=config.pitch_mm, seed=config.sim.seed)
 
 
-# A rig's calibration, from rendered boards or exact; the same for all experiments in the field with that rig.
+# Calibration of a rig, from rendered boards or exact; shared by all experiments in the field with that rig.
 calibrated = harness.Preparation(_calibrated, _of_calibration)
 
 
@@ -86,15 +86,15 @@ def held(
     settings: FollowSettings | None = None,
     view: WideView | None = None,
 ) -> list[Judged]:
-    """Hold a target of a simulated rig, and judge every frame.
+    """Follow a target of a simulated rig, and judge every frame.
 
     Args:
-        calibration: what is known of the rig.
-        config: the rig and its world.
-        name: of the target.
-        seconds: for how long [s].
-        settings: how it is followed; as always, by default.
-        view: what the wide camera sees, where that was recorded.
+        calibration: calibration that the pipeline uses.
+        config: configuration of the rig and its world.
+        name: name of the target.
+        seconds: length of the run [s].
+        settings: settings of the pipeline; the defaults for this rig if None.
+        view: recorded view of the fixed camera; rendered if None.
     """
     target, rows = target_of(config, name), list[Judged]()
     for step, truth in watched(calibration, config, target, seconds, settings, view):
@@ -110,7 +110,7 @@ def watched(
     settings: FollowSettings | None = None,
     view: WideView | None = None,
 ) -> Iterator[tuple[Step, Truth]]:
-    """Follow a target of a simulated rig; each Step, and the truth to judge it by. See `held`."""
+    """Follow a target of a simulated rig; yield each Step with the ground truth. Arguments as for `held`."""
     settings = settings or FollowSettings.of(config)
     if view is None:
         world, detector = SimWorld(config), make_detector(target, config.rate_hz)
@@ -128,7 +128,7 @@ def watched_in(
     settings: FollowSettings,
     how: Follow = follow,
 ) -> Iterator[tuple[Step, Truth]]:
-    """The same in a world that is open, with a detector and perhaps a loop of one's own."""
+    """Follow a target in an open world with a given detector and loop; yield each Step with the ground truth."""
     truth = world.truth()
     with SafeRig(world.rig, world.config.safety) as rig:
         for step in how(rig, calibration, target, detector, seconds=seconds, settings=settings):
@@ -136,6 +136,6 @@ def watched_in(
 
 
 def target_of(config: RigConfig, name: str) -> TargetConfig:
-    """What is told of a target in the field, where clutter that moves by itself drowns a bird for all but `speck`."""
+    """Give a target's settings in the field; a bird is found by `speck`, because clutter hides it from others."""
     target = config.target(name)
     return dataclasses.replace(target, detector="speck") if target.dimension == "wingspan" else target

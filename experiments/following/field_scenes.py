@@ -1,10 +1,9 @@
-"""The field in which targets are held: a book put elsewhere, a person walking, a bird flying, five of a kind at once.
+"""The field: simulated scenes with a book that is moved, a walking person, a flying bird, or five of a kind.
 
-The rig is the default one under harder conditions: 1/100 s of exposure, 120 ms from light to frame, 80 ms from command
-to motion, and outdoors, with the clutter on. Paths are random by seed (`cotarget.sim.targets.random_paths`).
+The rig is the default one under harder conditions: exposure of 1/100 s, 120 ms from light to frame, 80 ms from command
+to motion, outdoors, with clutter. Paths are random by seed (`cotarget.sim.targets.random_paths`).
 
-Accuracy runs that need no pictures open `SimWorld(config, rendered=())` and detect with
-`cotarget.evaluation.TruthDetector`.
+Runs that need no pictures open `SimWorld(config, rendered=())` and detect with `cotarget.evaluation.TruthDetector`.
 """
 
 from collections.abc import Mapping
@@ -20,40 +19,40 @@ SCENE = "outdoor"
 
 
 def hold_config(name: str, seed: int, scene: str = SCENE) -> RigConfig:
-    """One target to hold for 20 s.
+    """Configure one target to follow for 20 s.
 
     Args:
         name: book, person or bird.
-        seed: of everything random.
-        scene: the scene; outdoors there is clutter.
+        seed: seed of everything random.
+        scene: name of the scene; outdoor scenes have clutter.
 
     Raises:
-        ConfigError: no such target.
+        ConfigError: an unknown target.
     """
     return field_config(lone_path(name, seed), seed, scene)
 
 
 def five_targets_config(seed: int, kind: str = "person", scene: str = SCENE) -> RigConfig:
-    """Five persons or birds that cross the wide view, as `cotarget.sim.targets.random_paths.group_paths` has them.
+    """Configure five persons or birds that cross the fixed view (`cotarget.sim.targets.random_paths.group_paths`).
 
     Args:
-        seed: of everything random.
+        seed: seed of everything random.
         kind: person or bird.
-        scene: the scene; outdoors there is clutter.
+        scene: name of the scene; outdoor scenes have clutter.
 
     Raises:
-        ConfigError: another kind.
+        ConfigError: an unknown kind.
     """
     return field_config(group_paths(kind, seed), seed, scene)
 
 
 def field_config(paths: Mapping[str, tuple[Waypoint, ...]], seed: int, scene: str = SCENE) -> RigConfig:
-    """The default rig under the field's conditions.
+    """Configure the default rig under the field's conditions.
 
     Args:
-        paths: of the targets, by their names; nobody is there without any.
-        seed: of everything random.
-        scene: the scene; outdoors there is clutter.
+        paths: paths of the targets by name; without any there is no target.
+        seed: seed of everything random.
+        scene: name of the scene; outdoor scenes have clutter.
     """
     sim = SimConfig()
     sim = replace(

@@ -1,13 +1,12 @@
-"""How well a single shot from the wide view alone hits, what one correction adds, and what a miss consists of.
+"""Single shots from the fixed view alone: how well they hit, what one correction adds, and the error budget.
 
-A book, a person and a bird in the field of `experiments.following.field_scenes` are shot at again and again
-(`experiments.following.shots`): each time one command from what the wide view has told, judged in the zoom frame that
-follows at
-the focal length solved for, then one more after a look through the zoom camera. Beside what was measured stands the
-sum, in quadrature, of what each cause leaves alone while all else is as it truly is: detection, size, calibration,
-delay, the head's steps and the lens's positions. A shot at something else than the target counts as a miss, and not in
-the budget. A chance passes unused while the target is not seen or cannot be reached: how many did is told beside, and a
-correction that could not be fired counts as one that missed.
+A book, a person and a bird in the field of `experiments.following.field_scenes` are shot at repeatedly
+(`experiments.following.shots`). Each shot is one command from the fixed view, judged in the next zoom frame at the
+solved focal length, followed by a correction from that zoom frame. The measured error is compared with the root sum
+square of the errors that each cause leaves alone: detection, size, calibration, delay, the head's steps and the lens's
+positions. A shot at something else than the target counts as a miss and is left out of the budget. A shot that is
+skipped, because the target is not detected or out of reach, is counted separately; a correction that could not be fired
+counts as a miss.
 
     python -m experiments.following.first_shot [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -31,22 +30,22 @@ from experiments.following.field import FieldSettings, calibrated, target_of
 from experiments.following.field_scenes import LATENCY_S, hold_config
 from experiments.following.shots import BEGIN_S, CAUSES, Fired, fire
 
-# What is wanted of each target, at least and at most.
+# Goals for each target: least and largest value.
 WANTED: Mapping[str, tuple[float, float]] = {
     "in_frame": (0.98, 1.0),
     "tpo_width": (0.0, 0.08),
     "corrected_width": (0.0, 0.02),
     "sum over measured": (0.85, 1.15),
 }
-SEEDS = "each seed"  # of the figures: what its shots alone come to
+SEEDS = "each seed"  # key of the figures of each seed's shots alone
 
 
 @dataclass(frozen=True)
 class FirstShotSettings(FieldSettings):
-    """How many seeds, and which targets; a chance to shoot every 0.8 s from the third second on.
+    """Settings: targets, with a shot every 0.8 s from the third second on.
 
     Attributes:
-        targets: book, person, bird.
+        targets: book, person or bird.
     """
 
     seeds: int = 2
@@ -54,12 +53,15 @@ class FirstShotSettings(FieldSettings):
 
     @property
     def lasting_s(self) -> tuple[float, float]:
-        """The first shot is fired in the first wide frame of its time, which comes as late as frames do."""
+        """Limits of a run's length [s].
+
+        The first shot uses the fixed-camera frame of BEGIN_S, which arrives LATENCY_S later.
+        """
         return BEGIN_S + LATENCY_S, super().lasting_s[1]
 
 
 def one(calibration: Calibration, settings: FirstShotSettings, seed: int) -> list[Row]:
-    """Shoot at each target; a row for each chance."""
+    """Shoot at each target; give a row per due shot."""
     rows: list[Row] = []
     for name in settings.targets:
         config = hold_config(name, seed)
@@ -69,13 +71,13 @@ def one(calibration: Calibration, settings: FirstShotSettings, seed: int) -> lis
 
 
 def _row(fired: Fired | None) -> Row:
-    """One shot; angles as parts of the image's width. Nothing of a chance that passed."""
+    """Make the row of one shot, with angles as fractions of the image's width; empty for a skipped shot."""
     if fired is None:
         return {}
     row = fired.row
 
     def of_width(angle: float) -> float:
-        return math.tan(min(angle, 1.5)) * row.focal_px / row.width_px  # short of a right angle
+        return math.tan(min(angle, 1.5)) * row.focal_px / row.width_px  # keep below a right angle
 
     return {
         "t_s": fired.shot.exposed_t,
@@ -91,9 +93,9 @@ def _row(fired: Fired | None) -> Row:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
-    """Of each target the figures of all shots, and the budget: rms of each cause, their sum, and what was measured.
+    """Give the figures of all shots by target, with the budget: rms of each cause, their sum, and the measured error.
 
-    Beside them stands what comes of each seed's shots alone, from the least to the largest.
+    The figures of each seed's shots alone are added, from least to largest.
     """
     found: dict[str, dict[str, Any]] = {}
     for name in dict.fromkeys(row["target"] for row in rows):
@@ -128,12 +130,12 @@ def _figures(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def _of(mean: Callable[[Sequence[float]], Any], values: Sequence[float]) -> float:
-    """A mean or median; nan of nothing."""
+    """Apply a mean or median; nan of no values."""
     return float(mean(values)) if values else math.nan
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     return [
         f"{name}: {key}"
         for name, figures in summary.items()
@@ -143,7 +145,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def describe(settings: FirstShotSettings, summary: Mapping[str, Any]) -> str:
-    """A line a figure, a column a target."""
+    """Format a line per figure, a column per target."""
     keys = [key for key in next(iter(summary.values()), {}) if key != SEEDS]
     lines = [
         [
@@ -180,7 +182,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 def _draw(ax: Axes, shots: Sequence[Row], key: str, **how: Any) -> None:
-    """How many of the shots come so near."""
+    """Plot the cumulative distribution of the shots' offsets."""
     offsets = np.sort([row[key] for row in shots if row[key] is not None])
     ax.plot(offsets, (np.arange(len(offsets)) + 1) / len(shots), **how)
 
@@ -190,7 +192,7 @@ EXPERIMENT = Experiment(
     "first_shot",
     "How well a single shot from the wide view alone hits, and what a miss consists of.",
     SETTINGS,
-    # Nine shots each. A bird's correction is bounded by what it reaches, short of what is wanted as the whole run is.
+    # Nine shots each. A bird's correction is bounded by the value reached, which misses the goal in the full run too.
     dataclasses.replace(SETTINGS, seeds=1, targets=("book", "bird"), seconds=10.0, calibrated=False),
     one,
     summarise,

@@ -1,10 +1,9 @@
-"""Of five targets at once, how many get a good close-up under each policy.
+"""Target selection: how many of five targets get a good close-up under each policy.
 
-Five persons, or five birds, cross the wide view in the field of `experiments.following.field_scenes`: all at once for a
-while,
-each gone after a time. A target counts as served when it was well in the close-up, by the metrics' definition, for a
-second in all. What the wide camera sees is rendered and searched once a seed and kind, and followed under each policy;
-by the wide view alone, unless the zoom view's correction is asked for (`--set five_targets.closed_loop=true`).
+Five persons or five birds cross the fixed view in the field of `experiments.following.field_scenes`, for a while all at
+once. A target is served when it was well in the close-up, as defined by the metrics, for a second in total. The fixed
+view is rendered and searched once for each seed and kind, and followed under each policy, by default without correction
+from the zoom view (`--set five_targets.closed_loop=true`).
 
     python -m experiments.following.five_targets [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -35,16 +34,16 @@ from experiments.following.field_scenes import five_targets_config
 from experiments.following.wide_view import WideView, record
 
 FIRST = "first-come"
-WANTED = 1.5  # times as many served by the best policy as by first-come
+WANTED = 1.5  # goal: targets served by the best policy over those by first-come
 
 
 @dataclass(frozen=True)
 class FiveSettings(FieldSettings):
-    """How many seeds, and which kinds.
+    """Settings: kinds of targets.
 
     Attributes:
-        kinds: person, bird.
-        closed_loop: whether the zoom view corrects.
+        kinds: person or bird.
+        closed_loop: whether the zoom view corrects the aim.
     """
 
     seeds: int = 2
@@ -53,7 +52,7 @@ class FiveSettings(FieldSettings):
 
 
 def one(calibration: Calibration, settings: FiveSettings, seed: int) -> list[Row]:
-    """Follow five of each kind under each policy; one row each."""
+    """Follow five of each kind under each policy; give a row per policy."""
     rows: list[Row] = []
     for kind in settings.kinds:
         config = five_targets_config(seed, kind)
@@ -83,12 +82,12 @@ def good_seconds(
     how: FollowSettings,
     view: WideView,
 ) -> dict[str, float]:
-    """How long each target of a world was well in the close-up, by the truth [s]."""
+    """Measure for how long each target of a world was well in the close-up, by ground truth [s]."""
     good = dict.fromkeys(config.sim.targets, 0.0)
     last: float | None = None
     for step, truth in watched(calibration, config, target, seconds, how, view):
         t = step.zoom.t
-        if last is not None and t > last:  # a frame stands for the time since the one before
+        if last is not None and t > last:  # a frame counts for the time since the one before
             for name in good:
                 if _near(truth, name, t) and closeup_of(truth, name, target, t).good:
                     good[name] += t - last
@@ -97,14 +96,14 @@ def good_seconds(
 
 
 def _near(truth: Truth, name: str, t: float) -> bool:
-    """Whether a target's middle is in the zoom image; quicker than all that a row says."""
+    """Check whether a target's centre is in the zoom image; faster than the full row."""
     width, height = truth.lens("zoom", t).size
     u, v = truth.pixel("zoom", truth.center(name, t), t)
     return bool(-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5)
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
-    """Targets served under each policy, mean, least and most over the seeds, and the best mean over first-come's."""
+    """Give targets served by policy (mean, least and most over the seeds), and the best mean over first-come's."""
     found: dict[str, dict[str, Any]] = {}
     for kind in dict.fromkeys(row["kind"] for row in rows):
         served = {
@@ -121,12 +120,12 @@ def _of(served: Sequence[int]) -> dict[str, float]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The kinds for which no policy serves enough more than first-come."""
+    """List the kinds for which no policy meets the goal."""
     return [kind for kind, found in summary.items() if not found["best over first"] >= WANTED]
 
 
 def describe(settings: FiveSettings, summary: Mapping[str, Any]) -> str:
-    """A line for each kind."""
+    """Format a line per kind."""
     head = ("", *POLICIES, "best / first-come", "wanted")
     lines = [
         [

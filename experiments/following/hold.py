@@ -1,11 +1,10 @@
-"""How long and how well a target is held in the close-up: a book, a person and a bird in the field, by the truth.
+"""Following in the field: how long and how well a book, a person and a bird are kept in the close-up.
 
 The rig is the default one, calibrated from rendered boards, under the field's conditions
-(`experiments.following.field_scenes`):
-exposure blur, clutter, 120 ms from light to frame, 80 ms from command to motion, true sizes that nobody knows. Each
-seed is another path, another size and other noise. Figures are medians over the seeds of the field's terms, with the
-least and the largest, as `cotarget.metrics` defines them; everything is judged by the simulation's truth, which the
-pipeline cannot see.
+(`experiments.following.field_scenes`): exposure blur, clutter, 120 ms from light to frame, 80 ms from command to
+motion, and true sizes that differ from the nominal ones. Each seed has another path, size and noise. Figures are
+medians over the seeds with the least and the largest, as defined in `cotarget.metrics`. Ground truth judges every
+frame; the pipeline has no access to it.
 
     python -m experiments.following.hold [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -28,7 +27,7 @@ from experiments.engine.texts import table
 from experiments.following.field import FieldSettings, calibrated, held
 from experiments.following.field_scenes import hold_config
 
-# What is wanted of each figure's median: at least, or at most.
+# Goals for each figure's median: least and largest value.
 WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "book": {
         "closeup_yield": (0.88, 1.0),
@@ -61,18 +60,18 @@ WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
         "identification_wide": (0.0, 0.01),
     },
 }
-# Parts of the frames of which more is better: a target that was never acquired had none.
+# Fractions of the frames for which larger is better; they are 0 for a target that was never acquired.
 SHARES = ("closeup_yield", "in_frame_ratio", "identification")
-# Told beside them.
+# Figures without goals.
 ALSO = ("tpe_px_median", "false_tracks_per_min", "commands_per_min", "reversals_per_min", "lens_commands_per_min")
 
 
 @dataclass(frozen=True)
 class HoldSettings(FieldSettings):
-    """How many seeds, and which targets.
+    """Settings: targets of the runs.
 
     Attributes:
-        targets: book, person, bird.
+        targets: book, person or bird.
     """
 
     seeds: int = 2
@@ -80,7 +79,7 @@ class HoldSettings(FieldSettings):
 
 
 def one(calibration: Calibration, settings: HoldSettings, seed: int) -> list[Row]:
-    """Hold each target once; one row each."""
+    """Follow each target once; give a row per target."""
     return [
         {
             "seed": seed,
@@ -92,7 +91,7 @@ def one(calibration: Calibration, settings: HoldSettings, seed: int) -> list[Row
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """Of each target's figures the median over the seeds, the least and the largest."""
+    """Give median, least and largest of each target's figures over the seeds."""
     return {
         name: {key: _spread(key, [row[key] for row in rows if row["target"] == name]) for key in (*wanted, *ALSO)}
         for name, wanted in WANTED.items()
@@ -101,14 +100,14 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
 
 
 def _spread(key: str, values: Sequence[float | None]) -> dict[str, float]:
-    """In the median a run without the figure counts as the worst there is; the others are nan then."""
+    """Summarise a figure; a run without it counts as the worst in the median, and makes the others nan."""
     worst = 0.0 if key in SHARES else math.inf
     found = spread_of(worst if value is None else float(value) for value in values)
     return found if None not in values else {**dict.fromkeys(found, math.nan), "median": found["median"]}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     return [
         f"{name}: {key}"
         for name, figures in summary.items()
@@ -118,7 +117,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def describe(settings: HoldSettings, summary: Mapping[str, Any]) -> str:
-    """A line a figure, a column a target with least and largest, what is wanted of the median beside it."""
+    """Format a line per figure, with a column and the goal per target."""
     lines = []
     for key in (*WANTED["book"], *ALSO):
         cells: list[Any] = [key]

@@ -1,12 +1,12 @@
-"""A single pan-tilt-zoom camera that finds a target, follows it and finds it again by itself, after Cai and Dinh.
+"""Single pan-tilt-zoom camera that finds, follows and finds again its target, after Cai and Dinh.
 
-It scans the field of view that it is given with the lens at its shortest, until it detects something in its own view.
-That is believed by the rule by which the pair believes what its wide view shows, the pipeline's own tracker; until then
-it waits, or turns back to what it saw in passing. Then it centres it, leads it by a constant velocity, and zooms in as
-far as it is sure of it. A target out of sight is expected where it would be for a moment, then sought with the lens
-out, about that place, and then everywhere again; while it is sought there, whatever turns up is believed at once.
-Head and lens are driven as the pair's are: by the same steering and the same zoom policy, with the same delays. Where
-head and lens were when a frame's light fell it is told exactly, which makes it better than a real one.
+It scans a given field at the shortest focal length until it detects something. The pipeline's tracker confirms a
+detection by the same rule as for the pair's fixed camera; until then the camera waits, or turns back to a detection
+made while it moved. Then it centres the target, leads it by a constant velocity, and zooms in as far as the uncertainty
+allows. A target out of sight is predicted for a moment, then searched around the prediction at the shortest focal
+length, then scanned for everywhere. During the search any detection is accepted at once. Head and lens use the pair's
+controllers and delays. Their state at a frame's exposure is taken from ground truth, which makes this camera better
+than a real one.
 """
 
 import math
@@ -29,18 +29,18 @@ from cotarget.tracking.track import settings_for
 from cotarget.tracking.tracker import Tracker
 from experiments.following.lone_course import SEARCH_S, Course, Sighting
 
-COAST_S = 0.6  # so long a target out of sight is expected where it would be [s]
-SIZE_SIGMA = 0.1  # relative standard deviation of a size, for the zoom policy
-FIRST_INTERVAL_S = 0.04  # until a second frame has come [s]
-OVERLAP = 0.1  # of neighbouring views of a scan
-RING = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))  # half views about a place
+COAST_S = 0.6  # longest prediction of a target out of sight [s]
+SIZE_SIGMA = 0.1  # relative standard deviation of a size, for the zoom controller
+FIRST_INTERVAL_S = 0.04  # frame interval before the second frame [s]
+OVERLAP = 0.1  # overlap of neighbouring views of a scan
+RING = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))  # search pattern in half views
 
 
 class LoneCamera:
-    """The camera, its head and its lens, after one target.
+    """Control of one pan-tilt-zoom camera after one target.
 
     Attributes:
-        mode: what it does: "scanning", "waiting", "following" or "searching".
+        mode: current behaviour: "scanning", "waiting", "following" or "searching".
     """
 
     def __init__(
@@ -55,16 +55,16 @@ class LoneCamera:
         field: Sequence[Angles],
         lasts_s: float | None = None,
     ) -> None:
-        """Begin with a scan, at the pose that is nearest to where it looks.
+        """Start a scan at the pose that is nearest to the current one.
 
         Args:
-            rig: of which its fixed camera is not used.
-            truth: says where head and lens were.
-            calibration: of the zoom camera, its place on the head, and the head.
-            target: what is known of it.
-            detector: searches the zoom camera's frames.
-            delay_s: from a command to motion [s].
-            noise_px: standard deviation of the detector's middle [px].
+            rig: the rig, whose fixed camera is not used.
+            truth: ground truth, which gives head and lens at a frame's time.
+            calibration: calibration of zoom camera, T and head.
+            target: configuration of the target.
+            detector: detector for the zoom camera's frames.
+            delay_s: time from a command to motion [s].
+            noise_px: standard deviation of a detection's centre [px].
             field: poses of the scan [rad]; see `scan_of`.
             lasts_s: see `Course`.
         """
@@ -80,7 +80,7 @@ class LoneCamera:
         self.mode = ""
 
     def run(self, seconds: float) -> Iterator[Frame]:
-        """Each frame of the zoom camera, after what it led to."""
+        """Run for some seconds; yield each frame of the zoom camera after it was processed."""
         end, last = self._rig.clock.now() + seconds, None
         while self._rig.clock.now() < end:
             frame = self._rig.zoom.read(newer_than=last)
@@ -103,7 +103,7 @@ class LoneCamera:
             yield frame
 
     def _take(self, t: float, found: Sequence[tuple[Sighting, float]]) -> Sighting | None:
-        """Take a frame's sightings into account; the one that is not believed yet, if there is one."""
+        """Process a frame's sightings; give the one that is not confirmed, if there is one."""
         boxes = [Detection(*self._at_shortest(seen), 1.0, seen.clipped) for seen, _ in found]
         tracks = self._tracker.update(boxes, t)
         if not found:
@@ -115,11 +115,11 @@ class LoneCamera:
         return found[0][0]
 
     def _at_shortest(self, seen: Sighting) -> tuple[Array, Array]:
-        """Middle and sides as a view of all directions at the shortest focal length would have them [px], (2,) each."""
+        """Give centre and sides in an unbounded view at the shortest focal length, (2,) [px] each."""
         return self._shortest * np.array([seen.pan, -seen.tilt]), self._shortest * np.array(seen.sides)
 
     def _sighting(self, t: float, found: Detection) -> tuple[Sighting, float]:
-        """A detection as directions, and the focal length then [px]."""
+        """Convert a detection to directions; also give the focal length at its time [px]."""
         (pan, tilt), nominal = self._truth.head_at(t), self._truth.nominal_at(t)
         lens = self._zoom.at(nominal)
         (fx, fy), (w, h) = lens.focal_px, found.size_px.tolist()
@@ -139,12 +139,12 @@ class LoneCamera:
         try:
             pointing = nearest(ways, limits.pan, limits.tilt, (pan, tilt), self._calibration.head)
             pan, tilt = float(pointing.pan), float(pointing.tilt)
-        except UnreachableError:  # beyond the head's limits: as far as it goes
+        except UnreachableError:  # beyond the head's limits: clip
             pan, tilt = (min(max(q, low), high) for q, (low, high) in ((pan, limits.pan), (tilt, limits.tilt)))
         return Sighting(t, pan, tilt, sides, found.clipped), fx
 
     def _follow(self, interval: float) -> None:
-        """Send the head after the target, and the lens in as far as it surely stays in view."""
+        """Command the head towards the target, and the focal length that keeps it in view."""
         course, rig = self._course, self._rig
         now = rig.clock.now()
         effect = now + self._delay_s
@@ -167,14 +167,14 @@ class LoneCamera:
         )
         now_px = self._zoom.at(rig.zoom.state().focal_px).focal_px[0]
         wanted_px = self._target.wanted_px / course.size
-        if not course.whole:  # not nearer, before all of it was seen
+        if not course.whole:  # do not zoom in before the whole target was seen
             wanted_px = min(wanted_px, true_px)
         choice = self._policy.choose(expected, wanted_px, true_px, now, now_px)
         if abs(choice.focal_px / true_px - 1) > NO_CHANGE:
             self._focal = rig.zoom.zoom(self._zoom.nominal_for(choice.focal_px))
 
     def _look_around(self, mode: str, frame_t: float) -> None:
-        """With the lens out, from one pose to the next, as soon as a frame from there has shown nothing."""
+        """At the shortest focal length, go to the next pose once a frame from the current one has shown nothing."""
         rig = self._rig
         shortest = rig.zoom.focal_range[0]
         if self._focal > shortest:
@@ -197,12 +197,12 @@ class LoneCamera:
             self._go(self._round[self._next])
 
     def _go(self, pose: Angles) -> None:
-        """Turn the head there, as fast as it can."""
+        """Move the head to a pose at full speed."""
         self._rig.head.move(*pose)
         self._set_out, self._arrived = self._rig.clock.now(), math.inf
 
     def _about(self, t: float) -> list[Angles]:
-        """Poses about where the target should be by now, half a view apart."""
+        """Give poses around the predicted target, half a view apart."""
         (pan, tilt), _ = self._course.at(t)
         width, height = self._rig.zoom.size
         steps = math.atan(width / 2 / self._shortest), math.atan(height / 2 / self._shortest)
@@ -217,11 +217,11 @@ class LoneCamera:
 
 
 def scan_of(rig: Rig, calibration: Calibration) -> list[Angles]:
-    """Poses whose views at the shortest focal length cover the wide camera's field, overlapping, row by row [rad].
+    """Give poses whose overlapping views at the shortest focal length cover the fixed camera's field, row by row [rad].
 
     Args:
-        rig: gives the limits.
-        calibration: tells where the wide camera looks, and how much it sees.
+        rig: the rig, for its limits.
+        calibration: calibration, for the fixed camera's direction and field of view.
     """
     width, height = rig.zoom.size
     fx, fy = calibration.zoom.stops[0].focal_px

@@ -1,4 +1,4 @@
-"""Where a lone camera believes its target to be: pan and tilt at which it is centred, each with a constant velocity."""
+"""Motion estimate of a single pan-tilt-zoom camera: the target's pan and tilt, each with constant velocity."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,25 +10,23 @@ from cotarget.estimation.motion_model import estimation_settings_for
 from cotarget.rig import Angles
 from cotarget.tracking.track import AxisFilter
 
-SEARCH_S = 3.0  # so long a target out of sight is sought about where it should be [s]
-SIZES_S = 0.5  # so far back its size is looked at: a wing's beat or a step [s]
-# A manoeuvre, which outlasts what the camera leads by, counts as white acceleration of so long [s], by the dimension of
-# what is wanted. Of 0.05, 0.1, 0.15, 0.25, 0.5, 1, 2 and 4 s these gave the most close-ups of seeds 1000 to 1002, each
-# for its target, as means of 5 % and of 50 % missed, or 0.003 less, as 0.05 to 0.5 s do for a person. It is the setting
-# lasts_s of `experiments.following.single_ptz`. A book is carried at times, and then speeds up more than its own motion
-# has it.
+SEARCH_S = 3.0  # longest search around the prediction [s]
+SIZES_S = 0.5  # window of the size estimate, a wing beat or a step [s]
+# Duration of a manoeuvre as white acceleration [s], by the target's dimension. The choice is in docs/design-notes.md
+# (Experiments). It is the setting lasts_s of `experiments.following.single_ptz`. A book that is carried accelerates
+# more than its motion model says.
 LASTS_S = {"width": 2.0, "height": 0.25, "wingspan": 0.1}
-CLIPPED = 9.0  # times the variance of a middle of which a part is outside the image
+CLIPPED = 9.0  # factor on the variance of a centre that the image's border cuts
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """A detection as directions.
+    """Detection as directions.
 
     Attributes:
-        t: when [s].
-        pan: at which it would be centred [rad]; tilt likewise.
-        tilt: [rad].
+        t: time [s].
+        pan: pan that centres it [rad].
+        tilt: tilt that centres it [rad].
         sides: width and height over the focal length.
         clipped: whether the image's border cuts it.
     """
@@ -41,15 +39,15 @@ class Sighting:
 
 
 class Course:
-    """Where a target is, by its own pan and tilt, each with a constant velocity."""
+    """Target's pan and tilt, each filtered with constant velocity."""
 
     def __init__(self, target: TargetConfig, noise_px: float, lasts_s: float | None = None) -> None:
-        """Begin without a sighting.
+        """Start without a sighting.
 
         Args:
-            target: what is known of it.
-            noise_px: standard deviation of a detection's middle [px].
-            lasts_s: how long a manoeuvre counts as white acceleration [s]; LASTS_S of such a target by default.
+            target: configuration of the target.
+            noise_px: standard deviation of a detection's centre [px].
+            lasts_s: duration of a manoeuvre as white acceleration [s]; by default LASTS_S of the target's dimension.
         """
         self._target, self._noise_px = target, noise_px
         self._lasts_s = LASTS_S[target.dimension] if lasts_s is None else lasts_s
@@ -57,38 +55,38 @@ class Course:
         self._axes: list[AxisFilter] = []
         self._sizes: list[Sighting] = []
         self.seen_t = -math.inf
-        self.whole = False  # whether the last sighting was
+        self.whole = False  # whether the last sighting was not clipped
 
     @property
     def known(self) -> bool:
-        """Whether it was ever seen."""
+        """Whether the target was ever sighted."""
         return bool(self._axes)
 
     @property
     def sides(self) -> tuple[float, float]:
-        """Its width and height as tangents: the largest of the last moment for wings, else the median."""
+        """Width and height as tangents: the largest of the window for wings, else the median."""
         sides = np.array([each.sides for each in self._sizes])
         w, h = sides.max(axis=0) if self._target.dimension == "wingspan" else np.median(sides, axis=0)
         return float(w), float(h)
 
     @property
     def size(self) -> float:
-        """The dimension wanted, as a tangent."""
+        """The dimension with a known size, as a tangent."""
         w, h = self.sides
         return {"width": w, "height": h}.get(self._target.dimension, max(w, h))
 
     @property
     def range(self) -> float:
-        """By its known size [m]."""
+        """Distance from the known size [m]."""
         return self._target.size / self.size
 
     def saw(self, seen: Sighting, focal_px: float) -> None:
-        """Take a sighting into account; one after a long time begins anew."""
+        """Update with a sighting; one after a long gap restarts the filter."""
         self.whole = not seen.clipped
         if self.whole:
             past = [each for each in self._sizes if each.t >= seen.t - SIZES_S and not each.clipped]
             self._sizes = [*past, seen]
-        else:  # it is at least as large as what shows of it
+        else:  # the visible part is a lower limit of the size
             w, h = seen.sides if not self._sizes else map(max, zip(seen.sides, self.sides, strict=True))
             self._sizes = [replace(seen, sides=(w, h))]
         motion, distance = self._settings.motion, self.range
@@ -104,7 +102,7 @@ class Course:
         self.seen_t = seen.t
 
     def at(self, t: float) -> tuple[Angles, Angles]:
-        """Pan and tilt at a time, and their variances."""
+        """Predict pan and tilt at a time, with their variances."""
         dt = t - self.seen_t
         spread = [axis.spread.after(dt, self._noise(self.range)).at for axis in self._axes]
         (pan, tilt) = (axis.at + dt * axis.speed for axis in self._axes)
@@ -112,10 +110,10 @@ class Course:
 
     @property
     def rates(self) -> Angles:
-        """Of pan and tilt [rad/s]."""
+        """Rates of pan and tilt [rad/s]."""
         pan, tilt = self._axes
         return pan.speed, tilt.speed
 
     def _noise(self, distance: float) -> float:
-        """White acceleration of an angle [rad^2/s^3] that does to a constant velocity what manoeuvres do."""
+        """Give the white acceleration of an angle [rad^2/s^3] that stands for manoeuvres at constant velocity."""
         return self._lasts_s * (self._settings.motion.acceleration / distance) ** 2

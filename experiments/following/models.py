@@ -1,16 +1,15 @@
-"""What the models of the related work lose beside the full one, over depth and baseline.
+"""Simpler models of the related work against the full model, over depth and baseline.
 
-Rigs are mounted by eye (`experiments.following.mounted`), their baselines given; each is calibrated from synthetic
-corners, and
-that calibration is the full model. The others (`experiments.following.simpler` says which) know less; those that leave
-out or
-misjudge a turn are there as they are and `zeroed`, with pan and tilt set on one target. Targets lie all over the wide
-view.
-The pointing error is the angle between the line of sight and the true target; in the close-up it is a part of the
-image's width at the focal length at which a bird of 0.8 m is 160 px wide, within the lens's range.
+Rigs are mounted by eye with given baselines (`experiments.following.mounted`). Each is calibrated from synthetic
+corners; that calibration is the full model. The simpler models are described in `experiments.following.simpler`. Those
+that neglect or misjudge a rotation are tested twice: unchanged, and `zeroed`, with pan and tilt set on one target.
+Targets are spread over the fixed view. The pointing error is the angle between line of sight and target; in the
+close-up it is a fraction of the image's width at the focal length that shows a bird of 0.8 m 160 px wide, within the
+lens's range.
 
-Twice: `exact`, pixel and depth given as they are, the head without steps: what the models alone lose; and `seen`, the
-pixel with 0.5 px of noise, the depth with 5 %, the head in steps of 0.0514 degrees, the same for all models.
+There are two conditions. `exact`: pixel and depth without error and a head without steps, for the error of the models
+alone. `seen`: 0.5 px of noise in the pixel, 5 % in the depth, and head steps of 0.0514 degrees, the same for all
+models.
 
     python -m experiments.following.models [--seeds 10] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -46,24 +45,24 @@ BOARD = BoardConfig()
 STEP = np.radians(SimHead().step_deg)
 CONDITIONS = ("exact", "seen")
 OPPONENTS = (IGNORED, ZEROED[IGNORED])
-SHOWN = ((10.0, 0.4), (20.0, 1.5), (50.0, 0.4))  # depth and baseline [m] of the printed table
+SHOWN = ((10.0, 0.4), (20.0, 1.5), (50.0, 0.4))  # depth and baseline [m] in the printed table
 
 
 @dataclass(frozen=True)
 class ModelsSettings(Settings):
-    """What is mounted, how it is calibrated, and what is looked at.
+    """Settings: rigs, calibration and targets.
 
     Attributes:
-        baselines: of the rigs of each seed [m].
-        depths: of the targets [m].
-        targets: at each depth.
-        mounted_deg: standard deviation of each angle of a mounting that should be zero [degrees].
-        boards: placements of the calibration's board, each looked at from `looks` head poses.
-        looks: head poses.
+        baselines: baselines of the rigs of each seed [m].
+        depths: depths of the targets [m].
+        targets: number of targets at each depth.
+        mounted_deg: standard deviation of each mounting angle that should be zero [degrees].
+        boards: placements of the calibration board.
+        looks: head poses per placement.
         corner_px: noise of corners [px].
         pixel_px: noise of the target's pixel [px].
-        depth_error: relative error of its depth.
-        zero_depth: of the target on which pan and tilt are set [m].
+        depth_error: relative error of the target's depth.
+        zero_depth: depth of the target on which pan and tilt are set [m].
     """
 
     seeds: int = 10
@@ -79,7 +78,7 @@ class ModelsSettings(Settings):
     zero_depth: float = CENTRING.zero_depth
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_above(0, self, "baselines", "depths", "targets", "boards", "looks")
         check_above(0, self, "mounted_deg", "corner_px", "pixel_px", "depth_error", "zero_depth")
@@ -87,7 +86,7 @@ class ModelsSettings(Settings):
 
 
 def one(_: None, settings: ModelsSettings, seed: int) -> list[Row]:
-    """A rig of each baseline; a row for each depth and model."""
+    """Draw a rig of each baseline; give a row per depth and model."""
     return [row for i in range(len(settings.baselines)) for row in _of_rig(settings, seed, i)]
 
 
@@ -117,7 +116,7 @@ def _of_rig(settings: ModelsSettings, seed: int, number: int) -> list[Row]:
 
 
 def _figures(condition: str, angles: Array, focal_px: Array) -> Row:
-    """Of the errors at one depth; a model that finds no pose has lost its target."""
+    """Compute the figures at one depth; a model without a solution counts as off by a right angle."""
     lost = np.isnan(angles)
     angles = np.where(lost, np.pi / 2, angles)
     return {
@@ -127,7 +126,7 @@ def _figures(condition: str, angles: Array, focal_px: Array) -> Row:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """Medians over the seeds of each model's error by condition, depth and baseline, and the regime."""
+    """Give medians over the seeds of each model's error by condition, depth and baseline, and the regime."""
     summary: dict[str, Any] = {}
     for condition in CONDITIONS:
         cells: dict[str, dict[str, dict[str, float]]] = {}
@@ -152,7 +151,7 @@ def _of(rows: Sequence[Row], model: str, key: str) -> list[float]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The conditions in which no regime was found where the full model beats "offset ignored" as wanted."""
+    """List the conditions without a regime in which the full model is FACTOR times better than "offset ignored"."""
     return [
         f"{condition}: full model {FACTOR:g} times better than {name}"
         for condition in CONDITIONS
@@ -162,7 +161,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Each model's errors: one that gets worse makes the full model look better."""
+    """Give each model's errors; a bound keeps a simpler model from getting worse, which would favour the full one."""
     return {
         condition: {
             name: {cell: found[name]["deg"] for cell, found in summary[condition]["errors"].items()} for name in MODELS
@@ -172,7 +171,7 @@ def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def describe(settings: ModelsSettings, summary: Mapping[str, Any]) -> str:
-    """A line a model, a column for each depth and baseline, in degrees and in % of the close-up's width."""
+    """Format a line per model, a column per depth and baseline, in degrees and in % of the close-up's width."""
     texts = []
     for condition in CONDITIONS:
         errors = summary[condition]["errors"]
@@ -230,7 +229,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 def _over_depth(ax: "Axes", rows: Sequence[Row], key: str, number: int, **style: Any) -> None:
-    """One model's medians and quartiles over the seeds; a little aside, and smaller, the later it is drawn."""
+    """Plot one model's medians and quartiles over the seeds, shifted and thinner by its number."""
     depths = sorted({row["depth_m"] for row in rows})
     values = [[row[key] for row in rows if row["depth_m"] == depth] for depth in depths]
     low, mid, high = np.array([np.percentile(v, [25, 50, 75]) for v in values]).T
@@ -240,10 +239,10 @@ def _over_depth(ax: "Axes", rows: Sequence[Row], key: str, number: int, **style:
 
 
 def _regimes(ax: "Axes", rows: Sequence[Row], model: str) -> None:
-    """By how much a model's error is larger than the full one's, quartiles over the seeds, and where it is FACTOR."""
+    """Plot the ratio of a model's error to the full model's, quartiles over the seeds, and the regime of FACTOR."""
     for condition, colour in zip(CONDITIONS, ("C0", "C1"), strict=True):
         by_reach = {far: values for far, values in ratios(rows, condition, model).items() if math.isfinite(far)}
-        if not by_reach:  # all targets are as far away as the one on which the zeros were set
+        if not by_reach:  # all targets are at the depth of the zeros
             continue
         low, mid, high = np.array([np.percentile(values, [25, 50, 75]) for values in by_reach.values()]).T
         error = [mid - low, high - mid]

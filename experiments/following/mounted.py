@@ -1,8 +1,8 @@
-"""What the experiments on simpler models share: rigs as people mount them, and what an error means in the close-up.
+"""Rigs as people mount them, and the effect of an error in the close-up; shared by the experiments on simpler models.
 
-A zoom camera is mounted beside the wide one, at a baseline in any direction no more than 30 degrees out of the wide
-camera's image plane, its axes parallel by eye; on its head likewise, with a lever of up to 0.15 m. Lenses, axis offset
-and squareness vary as those of `experiments.calibration.random_rigs`.
+The zoom camera is mounted beside the fixed one, at a given baseline in any direction at most 30 degrees out of the
+fixed camera's image plane, with axes parallel by eye. It is mounted on its head by eye too, with a lever of up to 0.15
+m. Lenses, axis offset and squareness vary as in `experiments.calibration.random_rigs`.
 """
 
 from dataclasses import replace
@@ -17,22 +17,22 @@ from cotarget.pantilt import HeadGeometry
 from experiments.calibration.random_rigs import OUT_OF_PLANE, any_direction, any_lens
 from experiments.calibration.synthetic.rig import LONGEST_PX, NOMINAL_PX, SIZE, Lens, Truth, undistorted
 
-MOUNTED_DEG = 1.5  # standard deviation of each of the three angles of a mounting by eye, as the default rig's
+MOUNTED_DEG = 1.5  # standard deviation of each angle of a mounting by eye; the default rig's mounting is of that size
 LEVER = 0.15  # [m]
-TARGET = DEFAULT_TARGETS["bird"]  # of 0.8 m, wanted 160 px wide: the close-up is 3.2 m wide wherever the lens reaches
+TARGET = DEFAULT_TARGETS["bird"]  # 0.8 m, wanted 160 px wide: the close-up is 3.2 m wide within the lens's range
 
 
 def cell_name(depth: float, baseline: float) -> str:
-    """What a depth [m] with a baseline [m] is called in summaries, tables and bounds."""
+    """Name a depth [m] with a baseline [m] in summaries, tables and bounds."""
     return f"depth {depth:g} m, baseline {baseline:g} m"
 
 
 def mounted(rng: np.random.Generator, baseline: float, mounted_deg: float = MOUNTED_DEG) -> Truth:
-    """A rig as people mount it.
+    """Draw a rig as people mount it.
 
     Args:
-        rng: draws everything.
-        baseline: between the cameras' optical centres, the head at home [m].
+        rng: source of all random values.
+        baseline: distance between the cameras' optical centres with the head at home [m].
         mounted_deg: standard deviation of each angle that should be zero [degrees].
     """
     while abs((direction := any_direction(rng))[2]) > OUT_OF_PLANE:
@@ -49,13 +49,13 @@ def mounted(rng: np.random.Generator, baseline: float, mounted_deg: float = MOUN
 
 
 def idealised(truth: Truth) -> Truth:
-    """The same rig on a head whose axes cross at a right angle, the zoom camera's axis in the middle of its image."""
+    """Give the same rig with head axes that cross at a right angle and the zoom camera's axis at its image's centre."""
     cx, cy = (np.array(SIZE) - 1) / 2
     return replace(truth, dz=0.0, eps=0.0, zoom=replace(truth.zoom, cx=float(cx), cy=float(cy)))
 
 
 def exact_calibration(truth: Truth) -> Calibration:
-    """What a calibration without any error would be."""
+    """Give the calibration of a rig without error."""
     return Calibration(
         fixed=_intrinsics(truth.fixed),
         zoom=ZoomLens((NOMINAL_PX,), (_intrinsics(truth.zoom),)),
@@ -71,18 +71,21 @@ def _intrinsics(lens: Lens) -> Intrinsics:
 
 
 def at(truth: Truth, pixels: Array, depths: Array | float) -> Array:
-    """Where targets seen at these pixels (n, 2) and depths [m] truly are, in the fixed camera's frame, (n, 3) [m]."""
+    """Give the true positions of targets seen at pixels (n, 2) and depths [m], in the fixed frame, (n, 3) [m]."""
     return np.asarray(np.c_[undistorted(pixels, truth.fixed), np.ones(len(pixels))] * np.reshape(depths, (-1, 1)))
 
 
 def wanted_focal_px(
     truth: Truth, x_fixed: Array, size: float = TARGET.size, wanted_px: float = TARGET.wanted_px
 ) -> Array:
-    """Focal lengths (n,) that show targets (n, 3) [m] of a size [m] as large as wanted, within the lens's range."""
+    """Give focal lengths (n,) [px] that show targets (n, 3) [m] of a size [m] as large as wanted.
+
+    They are limited to the lens's range.
+    """
     reach = np.linalg.norm(truth.gamma.apply(x_fixed), axis=1)
     return np.clip(wanted_px * reach / size, truth.zoom.fx, LONGEST_PX)
 
 
 def off_px(angles: Array, focal_px: Array) -> Array:
-    """By how many pixels errors [rad] put a target off the middle of the image at these focal lengths."""
+    """Convert pointing errors [rad] to offsets from the image's centre at these focal lengths [px]."""
     return np.asarray(focal_px * np.tan(np.minimum(angles, np.radians(89.0))))

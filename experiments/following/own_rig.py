@@ -1,7 +1,6 @@
-"""A rig of one's own for an experiment: the offsets, cameras and head of a rig.toml in the place of the default ones.
+"""A user's own rig in an experiment: offsets, cameras and head of a rig.toml in place of the default ones.
 
-The experiment says by itself what the rig looks at: of the file everything counts but scene, seed and targets, and
-their models and paths.
+The experiment sets scene, seed, targets, models and paths itself; everything else is taken from the file.
 """
 
 import dataclasses
@@ -16,18 +15,18 @@ from experiments.engine import harness
 
 @dataclass(frozen=True)
 class RigText:
-    """What a rig.toml said when it was read, and where it was; it is not read again.
+    """Content and path of a rig.toml when it was read; it is not read again.
 
     Attributes:
-        text: of the file; empty for the default rig.
-        path: of it, absolute, for relative paths in it; empty for the default rig.
+        text: content of the file; empty for the default rig.
+        path: absolute path of the file, for relative paths in it; empty for the default rig.
     """
 
     text: str = ""
     path: str = ""
 
     def config(self, scene: str, targets: tuple[str, ...], seed: int) -> RigConfig:
-        """The rig in a scene with targets."""
+        """Configure the rig in a scene with targets."""
         config = config_of(self.text, Path(self.path)) if self.path else RigConfig()
         sim = dataclasses.replace(config.sim, scene=scene, targets=targets, seed=seed, models={}, paths={})
         return dataclasses.replace(config, sim=sim)
@@ -35,14 +34,14 @@ class RigText:
 
 @dataclass(frozen=True)
 class OwnRig(harness.Settings):
-    """How many seeds, and of which rig.
+    """Settings with an optional rig of the user's own.
 
     Attributes:
         rig: path of a rig.toml of a simulated rig; empty for the default rig.
-        rig_toml: what that file says, so that the results of another one are not taken for these; not to be given.
+        rig_toml: content of that file, so that results of another file are not reused; set by the class.
 
     Raises:
-        ConfigError: the file cannot be read, says something impossible or other than before, or is of no simulated rig.
+        ConfigError: the file cannot be read, is invalid, has changed, or is not of a simulated rig.
     """
 
     rig: str = ""
@@ -59,20 +58,20 @@ class OwnRig(harness.Settings):
                 f"rig_toml: is not what rig = '{self.rig}' says; give the path of a rig.toml as rig alone"
             )
         object.__setattr__(self, "rig_toml", said)
-        _ = self.text  # worked out now: it goes along to processes in other folders and on other machines
+        _ = self.text  # computed now, because processes on other machines or in other folders cannot read the file
 
     @functools.cached_property
     def text(self) -> RigText:
-        """What the file says, and where it is."""
+        """Content and path of the file."""
         return RigText(self.rig_toml, str(Path(self.rig).absolute())) if self.rig else RigText()
 
     def config(self, scene: str, targets: tuple[str, ...], seed: int) -> RigConfig:
-        """The rig in a scene with targets, as its file was when these settings were made."""
+        """Configure the rig in a scene with targets, from the file as it was when these settings were made."""
         return self.text.config(scene, targets, seed)
 
 
 def _check(text: str, path: Path) -> None:
-    """Refuse what is no simulated rig's rig.toml."""
+    """Refuse a file that is not the configuration of a simulated rig."""
     config = config_of(text, path)
     if config.backend != "sim":
         raise ConfigError(f"{path}: backend = '{config.backend}' cannot be tried here; give a rig.toml with 'sim'")

@@ -1,4 +1,4 @@
-"""Where the full model beats one that ignores the offset, over depths and baselines by what these make of it."""
+"""Regime of depth and baseline in which the full model is clearly better than a simpler one."""
 
 import math
 from collections.abc import Sequence
@@ -9,25 +9,25 @@ from cotarget.geometry import Array
 from experiments.engine.harness import Row
 from experiments.following.simpler import FULL, IGNORED
 
-FACTOR = 5.0  # by which the full model is to beat "offset ignored" somewhere
+FACTOR = 5.0  # factor by which the full model has to be better than "offset ignored" somewhere
 
 
 def reach(depth: float, baseline: float, zero_depth: float = math.inf) -> float:
-    """How far away a target is for who ignores the offset, in baselines.
+    """Compute a target's distance in baselines, as far as an ignored offset is concerned.
 
-    The baseline is seen from the target at an angle of 1 / this [rad], or at another than from the target on which the
-    zeros were set.
+    The baseline subtends an angle of 1 / this [rad] at the target, or that angle less the one at the target of the
+    zeros.
     """
     angle = baseline * abs(1 / depth - 1 / zero_depth)
     return 1 / angle if angle else math.inf
 
 
 def ratios(rows: Sequence[Row], condition: str, model: str = IGNORED) -> dict[float, Array]:
-    """By how much a model's rms error is larger than the full model's, by `reach`.
+    """Give the ratio of a model's rms error to the full model's, by `reach`.
 
     Returns:
-        For each reach in rising order, of each seed; where several depths and baselines have the same reach, those of
-        the one with the least median.
+        For each reach in rising order, the ratio of each seed; of several depths and baselines with the same reach, the
+        one with the least median.
     """
     errors = {(r["depth_m"], r["baseline_m"], r["seed"]): r[f"{condition}_deg"] for r in rows if r["model"] == FULL}
     cells: dict[tuple[float, float, float], list[float]] = {}
@@ -43,11 +43,11 @@ def ratios(rows: Sequence[Row], condition: str, model: str = IGNORED) -> dict[fl
 
 
 def regime(rows: Sequence[Row], condition: str, model: str = IGNORED) -> tuple[float, float]:
-    """The `reach` up to which the full model's error is FACTOR times smaller than another's.
+    """Give the range of `reach` in which the full model's error is FACTOR times smaller than another's.
 
     Returns:
-        The smallest reach measured, and the largest up to which the median over the seeds of every depth and baseline
-        says so; both nan where even the smallest does not.
+        The smallest reach measured, and the largest up to which the median over the seeds holds for all cells; both nan
+        where it does not hold at the smallest.
     """
     within: list[float] = []
     for far, values in ratios(rows, condition, model).items():

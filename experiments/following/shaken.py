@@ -1,4 +1,4 @@
-"""A zoom camera's detector from the simulation's truth, which misses more while head or lens move the picture."""
+"""Ground-truth detector for the zoom camera that misses more detections while head or lens move the image."""
 
 from dataclasses import replace
 
@@ -10,38 +10,38 @@ from cotarget.rig import Frame, Image
 from cotarget.sim.truth import Outlines, Truth
 
 NOISE = TruthNoise()
-APART = 1 << 32  # of seeds: other numbers than the detectors'
-MOVED_PX, MOVED_S = 1.0, 0.02  # the picture moves that shifts so far within so long before and after its exposure
+APART = 1 << 32  # offset of the seed from the detectors' own
+MOVED_PX, MOVED_S = 1.0, 0.02  # least shift of a moving image, within this time before and after its exposure
 
 
 class Shaken:
-    """Finds the target where it truly is, with noise, and misses it more while the picture moves."""
+    """Detector with true positions and noise, and more misses while the image moves."""
 
     mask: Image | None = None
 
     def __init__(self, outlines: Outlines, truth: Truth, seed: int, miss: float) -> None:
-        """Begin.
+        """Prepare the detectors at rest and in motion.
 
         Args:
-            outlines: of the world.
-            truth: of its head and lens.
-            seed: of the noise.
-            miss: part of the frames in which it finds nothing while the picture moves.
+            outlines: targets' outlines in the world.
+            truth: ground truth of head and lens.
+            seed: seed of the noise.
+            miss: fraction of frames without a detection while the image moves.
         """
         self._still = TruthDetector(outlines, seed, NOISE, numbers=counted, camera="zoom")
         self._moving = TruthDetector(outlines, seed, replace(NOISE, miss=miss), numbers=counted, camera="zoom")
         self._truth, self._miss, self._numbers_at = truth, miss, counted(seed + APART)
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """Find the target."""
+        """Detect the target."""
         return (self._moving if self.moves(frame.t) else self._still).detect(frame)
 
     def misses(self, t: float) -> bool:
-        """Whether a target is missed at a time [s], for who finds it otherwise."""
+        """Decide whether the target is missed at a time [s], for another detector."""
         return self._numbers_at(t).random() < (self._miss if self.moves(t) else NOISE.miss)
 
     def moves(self, t: float) -> bool:
-        """Whether head or lens shift the picture at a time [s]."""
+        """Check whether head or lens move the image at a time [s]."""
         width = self._truth.lens("zoom", t).size[0]
         before, after = max(t - MOVED_S, 0.0), t + MOVED_S
         focal_px = self._truth.lens("zoom", t).focal_px[0]

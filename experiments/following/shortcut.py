@@ -1,17 +1,15 @@
-"""The exact range beside the paper's shortcut over the wide view: where a depth in the range's place fails.
+"""Exact inverse kinematics against the paper's shortcut over the fixed view: where depth in place of range fails.
 
-Two kinds of rigs, both known exactly, on a head whose axes cross at a right angle, with the zoom camera's axis in the
-middle of its image: the shortcut takes both for granted. `mounted` by eye (`experiments.following.mounted`) at a
-baseline of 0.4
-m, as the default one; and `Section 4.2`, whose zoom camera stands where the paper's worked example has it, 2.2 m aside
-and 0.46 m ahead, the example's T beside it (`experiments.paper.worked_example`), with lenses drawn as those of the
-others.
+Two kinds of rigs, both known exactly, whose head axes cross at a right angle and whose zoom camera has its principal
+point at the image's centre, as the shortcut assumes. `mounted` rigs (`experiments.following.mounted`) have a baseline
+of 0.4 m, as the default rig. `Section 4.2` rigs have the zoom camera of the paper's worked example, 2.2 m aside and
+0.46 m ahead, with the example's T (`experiments.paper.worked_example`) and lenses drawn as for the others.
 
-Targets stand at several depths, on a grid over the wide image and all over a disc about the zoom camera's axis at home.
-Each is aimed at by `cotarget.targeting.aim` with the exact range and with both readings of the shortcut; the error is
-the angle between the line of sight and the target, and what that is in pixels at the focal length at which the paper's
-book of 0.234 m is 160 px wide, within the lens's range: 7155 px at 10.5 m and beyond. Off the axis means off the zoom
-camera's at home.
+Targets are at several depths, on a grid over the fixed image and in a disc about the zoom camera's axis at home.
+`cotarget.targeting.aim` aims at each with the exact range and with both readings of the shortcut. The error is the
+angle between line of sight and target, also in pixels at the focal length that shows the paper's book of 0.234 m 160 px
+wide, within the lens's range: 7155 px at 10.5 m and beyond. Angles off the axis are from the zoom camera's axis at
+home.
 
     python -m experiments.following.shortcut [--seeds 20] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -42,27 +40,27 @@ if TYPE_CHECKING:
 
 
 BOOK = DEFAULT_TARGETS["book"]
-ANYWHERE = (-np.pi, np.pi)  # both axes: what a head's limits forbid is no matter of the range
+ANYWHERE = (-np.pi, np.pi)  # limits of both axes; the head's own limits are not studied here
 EXACT, TABLE, EXAMPLE = METHODS
 READINGS = (TABLE, EXAMPLE)
 NAMES: Mapping[Method, str] = {EXACT: "exact range", TABLE: "depth of Table 1", EXAMPLE: "depth of Section 4.2"}
-NEAR_DEG, AT_DEG, AROUND_DEG = 4.0, 20.0, 2.0  # off the axis: near it; at 20 degrees, within these
+NEAR_DEG, AT_DEG, AROUND_DEG = 4.0, 20.0, 2.0  # limit of "near", middle and half width of "20 degrees"
 REGIONS = ("near the axis", "at 20 degrees", "whole view")
 RIGS = MOUNTED, PAPERS = "mounted", "Section 4.2"
-GAMMA_MM = np.subtract(X_ZOOM0_MM, X_FIXED_MM)  # of the worked example, if its cameras are parallel
-ROUNDING_DEG = 1e-6  # arctan2 tells no smaller angles from zero
+GAMMA_MM = np.subtract(X_ZOOM0_MM, X_FIXED_MM)  # Gamma's translation in the worked example, for parallel cameras
+ROUNDING_DEG = 1e-6  # arctan2 does not resolve smaller angles
 
 
 @dataclass(frozen=True)
 class ShortcutSettings(Settings):
-    """Which rigs, and where targets stand.
+    """Settings: rigs and positions of the targets.
 
     Attributes:
-        baseline: of the rigs [m].
-        depths: of the targets [m].
-        grid: columns and rows of their pixels in the wide image, from edge to edge.
-        near: how many more stand near the zoom camera's axis.
-        rigs: of RIGS.
+        baseline: baseline of the mounted rigs [m].
+        depths: depths of the targets [m].
+        grid: columns and rows of target pixels in the fixed image, from edge to edge.
+        near: number of additional targets near the zoom camera's axis.
+        rigs: kinds of rig, from RIGS.
     """
 
     seeds: int = 20
@@ -73,19 +71,19 @@ class ShortcutSettings(Settings):
     rigs: tuple[Literal["mounted", "Section 4.2"], ...] = ("mounted", "Section 4.2")
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
         check_above(0, self, "baseline", "depths", "near")
         check_above(1, self, "grid")
 
 
 def one(_: None, settings: ShortcutSettings, seed: int) -> list[Row]:
-    """A rig of each kind; a row for each target, with the error of each method."""
+    """Draw a rig of each kind; give a row per target with the error of each method."""
     return [row for rig in settings.rigs for depth in settings.depths for row in _at_depth(settings, seed, rig, depth)]
 
 
 def rig_of(name: str, seed: int, baseline: float) -> Truth:
-    """One of RIGS, `mounted` at a baseline [m] or with the offsets of the worked example."""
+    """Draw one of RIGS: `mounted` with a baseline [m], or with the offsets of the worked example."""
     truth = idealised(mounted(np.random.default_rng((seed, 22)), baseline))
     if name == MOUNTED:
         return truth
@@ -125,7 +123,7 @@ def _at_depth(settings: ShortcutSettings, seed: int, rig: str, depth: float) -> 
 
 
 def near_axis(truth: Truth, depth: float, count: int, rng: np.random.Generator) -> Array:
-    """Targets at a depth [m] all over the disc of NEAR_DEG about the zoom camera's axis, (count, 3) [m]."""
+    """Draw targets at a depth [m] in the disc of NEAR_DEG about the zoom camera's axis, (count, 3) [m]."""
     radius, angle = np.tan(np.radians(NEAR_DEG)) * np.sqrt(rng.uniform(size=count)), rng.uniform(0, 2 * np.pi, count)
     home = truth.gamma.inv()
     rays = home.rotation.apply(np.c_[radius * np.cos(angle), radius * np.sin(angle), np.ones(count)])
@@ -133,7 +131,7 @@ def near_axis(truth: Truth, depth: float, count: int, rng: np.random.Generator) 
 
 
 def _aimed(calibration: Any, x_fixed: Array, reach: Reach, method: Method) -> tuple[float, float]:
-    """Pan and tilt [rad]; nan where the method has no solution."""
+    """Give pan and tilt [rad]; nan where the method has no solution."""
     try:
         found = aim(calibration, x_fixed, reach, method=method)
     except UnreachableError:
@@ -142,19 +140,19 @@ def _aimed(calibration: Any, x_fixed: Array, reach: Reach, method: Method) -> tu
 
 
 def region(row: Row, name: str) -> bool:
-    """Whether a target is in one of REGIONS; those that were put near the axis are in no other."""
+    """Check whether a target is in one of REGIONS; targets drawn near the axis are in that region only."""
     off: float = row["off_axis_deg"]
     on_grid = math.isfinite(row["u_px"])
     return {REGIONS[0]: not on_grid, REGIONS[1]: on_grid and abs(off - AT_DEG) <= AROUND_DEG, REGIONS[2]: on_grid}[name]
 
 
 def px(row: Row, method: Method) -> float:
-    """A target's error at the wanted focal length [px]."""
+    """Convert a target's error to pixels at its wanted focal length."""
     return float(off_px(np.radians(row[f"{method}_deg"]), row["focal_px"]))
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """By rig, method, region and depth: rms over the targets of a seed, median and quartiles of that over the seeds."""
+    """Summarise by rig, method, region and depth: rms over a seed's targets, then median and quartiles."""
     summary: dict[str, Any] = {}
     for rig in dict.fromkeys(row["rig"] for row in rows):
         of_rig, found = [row for row in rows if row["rig"] == rig], summary.setdefault(rig, {})
@@ -173,7 +171,7 @@ def _depths(rows: Sequence[Row]) -> list[float]:
 
 
 def _figures(rows: Sequence[Row], method: Method) -> dict[str, float]:
-    """Of a region in which there are targets; a coarse grid may have none at 20 degrees."""
+    """Compute the figures of a region; nan without targets, as on a coarse grid at 20 degrees."""
     if not rows:
         return dict.fromkeys(("deg", "deg_low", "deg_high", "worst_deg", "px"), math.nan)
     seeds: dict[int, list[Row]] = {}
@@ -192,7 +190,7 @@ def _figures(rows: Sequence[Row], method: Method) -> dict[str, float]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """Whether the exact range is not exact, or has no solution somewhere."""
+    """List where the exact range has an error or no solution."""
     unsolved = any(found[EXACT]["unsolved"] > 0 for found in summary.values())
     return [
         text
@@ -205,12 +203,12 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _worst(summary: Mapping[str, Any]) -> float:
-    """The exact range's worst error [degrees]; on the grid and near the axis there are always targets."""
+    """Give the largest error of the exact range [degrees]."""
     return float(np.nanmax([found[EXACT][name]["all"]["worst_deg"] for found in summary.values() for name in REGIONS]))
 
 
 def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """What each reading of the shortcut errs by [degrees]; the exact range's rounding is nobody's bound."""
+    """Give the errors of the shortcut's readings [degrees]; the exact range's rounding error needs no bound."""
     return {
         rig: {method: {name: found[method][name]["all"]["deg"] for name in REGIONS} for method in READINGS}
         for rig, found in summary.items()
@@ -218,7 +216,7 @@ def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def describe(settings: ShortcutSettings, summary: Mapping[str, Any]) -> str:
-    """A line for each rig, region and depth."""
+    """Format a table with a line per rig, region and depth."""
     head = ["where", *(text for name in NAMES.values() for text in (f"{name} [deg]", "px"))]
     lines = [
         [f"{rig}, {name}, {depth}", *(text for m in METHODS for text in _texts(methods[m][name][depth]))]
@@ -246,7 +244,7 @@ def _texts(found: Mapping[str, float]) -> tuple[str, float]:
 
 
 def plot(rows: Sequence[Row], figure: Figure) -> None:
-    """Maps of both readings' errors over the wide image of mounted rigs, medians over the seeds; then all regions."""
+    """Maps of both readings' errors over the fixed image of mounted rigs, medians over the seeds; then all regions."""
     depths, rigs = _depths(rows), list(dict.fromkeys(row["rig"] for row in rows))
     figure.set_size_inches(3.2 * len(depths) + 5, 5)
     maps, regions = cast(list[SubFigure], figure.subfigures(1, 2, width_ratios=(3.2 * len(depths) + 1, 4)))
@@ -269,7 +267,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 def _by_region(ax: "Axes", summary: Mapping[str, Any]) -> None:
-    """The error in each region at all depths, quartiles over the seeds."""
+    """Plot the error in each region over all depths, with quartiles over the seeds."""
     for i, (rig, found) in enumerate(summary.items()):
         for j, method in enumerate(READINGS):
             figures = [found[method][name]["all"] for name in REGIONS]
@@ -291,7 +289,7 @@ def _by_region(ax: "Axes", summary: Mapping[str, Any]) -> None:
 
 
 def _map(rows: Sequence[Row], method: Method, depth: float) -> tuple[Array, Array, Array]:
-    """Columns and rows [px], and the median over the seeds of the error there [degrees]."""
+    """Give columns and rows [px], and the median error over the seeds at each [degrees]."""
     cells: dict[tuple[float, float], list[float]] = {}
     for row in rows:
         if row["depth_m"] == depth and math.isfinite(row["u_px"]):

@@ -1,9 +1,9 @@
-"""Single shots at a target in the simulated field, each followed by one correction, and what each cause adds to a miss.
+"""Single shots at a target in the simulated field, each followed by one correction, with an error budget.
 
-A shot is one command to head and lens from what the wide view has told so far: direction from the detections, depth
-from the size, motion over the delay from its track. The head and the lens are there as soon as the delay is over: what
-they need for the way is left out, as it is in the delay's definition. The zoom frame that is then exposed is judged by
-the truth, looked at once, and a second shot taken with what it showed.
+A shot is one command to head and lens, computed from the fixed camera alone: direction from the detections, depth from
+the size, motion over the delay from the track. Head and lens reach it as soon as the delay is over; their travel time
+is left out, as in the definition of the delay. Ground truth judges the zoom frame exposed then. The target is searched
+in that frame, and a second shot uses the result.
 """
 
 import copy
@@ -33,28 +33,28 @@ from cotarget.targeting import Aim, Reach, aim
 from cotarget.tracking.track import Track, settings_for
 from cotarget.tracking.tracker import Tracker
 
-# A head and a lens that are wherever they are sent within a millisecond.
+# Head and lens that reach any pose within a millisecond.
 QUICK_DEG_S, QUICK_DEG_S2, QUICK_STEPS_S = 1e6, 1e9, 1e6
-BEGIN_S = 3.0  # of the first shot, one second after the background was learnt
-EVERY_S = 0.8  # from one chance to shoot to the next; a shot and its correction take 0.7 s
-ROUNDING = 1e-6  # of frame times, and of them over the period
+BEGIN_S = 3.0  # time of the first shot, one second after the background was learnt
+EVERY_S = 0.8  # interval of the shots; a shot and its correction take 0.7 s
+ROUNDING = 1e-6  # tolerance of frame times, in seconds and in periods
 CAUSES = ("detection", "size", "calibration", "delay", "steps", "lens")
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One command, and what it was made from.
+    """One command, and what it was computed from.
 
     Attributes:
-        seen_t: of the wide frame [s].
-        exposed_t: of the zoom frame that it was aimed for [s].
-        pixel: the target in the wide frame as it was estimated, (2,).
-        depth: likewise [m].
-        moved: how far it was expected to come until then, fixed frame [m], (3,).
-        wished_px: nominal focal length that was solved for.
-        pan: commanded, rounded to steps [rad].
-        tilt: likewise.
-        nominal_px: the lens's position.
+        seen_t: time of the fixed camera's frame [s].
+        exposed_t: time of the zoom frame that it was computed for [s].
+        pixel: estimated target position in the fixed camera's frame [px], (2,).
+        depth: estimated depth of the target in that frame [m].
+        moved: predicted motion from ``seen_t`` to ``exposed_t``, in the fixed frame [m], (3,).
+        wished_px: solved nominal focal length [px].
+        pan: commanded pan, rounded to steps [rad].
+        tilt: commanded tilt, rounded to steps [rad].
+        nominal_px: nominal focal length of the lens's position [px].
     """
 
     seen_t: float
@@ -70,16 +70,16 @@ class Shot:
 
 @dataclass(frozen=True)
 class Fired:
-    """A shot and what came of it.
+    """A shot and its result.
 
     Attributes:
-        shot: the first.
-        on_target: whether it was aimed at the target: what it was made from is no farther from it than its larger side.
-        row: its zoom frame, judged.
-        parts: what each cause alone leaves, see `budget` [rad].
-        missed: between the line of sight and the target when the zoom frame was exposed [rad].
+        shot: first shot.
+        on_target: whether its estimate was on the target, no farther off than the target's larger side.
+        row: scores of its zoom frame.
+        parts: error of each cause alone [rad]; see `budget`.
+        missed: angle between the line of sight and the target when the zoom frame was exposed [rad].
         found: whether the target was found in that frame.
-        corrected: the second shot's zoom frame; None where there was no second.
+        corrected: scores of the second shot's zoom frame; None without a second shot.
     """
 
     shot: Shot
@@ -92,7 +92,7 @@ class Fired:
 
 
 def quick(config: RigConfig) -> RigConfig:
-    """The same rig with a head and a lens that need no time for the way."""
+    """Give the same rig with a head and a lens that need no travel time."""
     head = replace(config.sim.head, speed_deg_s=QUICK_DEG_S, accel_deg_s2=QUICK_DEG_S2)
     zoom = replace(config.sim.zoom, lens_speed=QUICK_STEPS_S)
     return replace(config, sim=replace(config.sim, head=head, zoom=zoom))
@@ -101,19 +101,19 @@ def quick(config: RigConfig) -> RigConfig:
 def fire(
     calibration: Calibration, config: RigConfig, name: str, target: TargetConfig, seconds: float
 ) -> list[Fired | None]:
-    """Shoot at a target again and again, each time from the wide view alone.
+    """Shoot at a target repeatedly, each time from the fixed camera alone.
 
-    A chance to shoot comes every EVERY_S, and passes where the target is not seen just then or cannot be reached.
+    A shot is due every EVERY_S. It is skipped where the target is not detected at that time or is out of reach.
 
     Args:
-        calibration: what is known of the rig.
-        config: the rig and its world.
-        name: of the target.
-        target: what is told of it.
-        seconds: for how long [s].
+        calibration: calibration that the shots use.
+        config: configuration of the rig and its world.
+        name: name of the target.
+        target: configuration of the target.
+        seconds: length of the run [s].
 
     Returns:
-        What came of each chance; None where nothing was fired.
+        Result of each due shot; None where it was skipped.
     """
     config = quick(config)
     world = SimWorld(config)
@@ -148,11 +148,11 @@ def _on_target(truth: Truth, name: str, shot: Shot) -> bool:
 
 
 class _Lookout:
-    """Watches the wide view of a rig, and shoots at whom the pipeline would follow: the first who came.
+    """Fixed-camera pipeline that shoots at the target that first-come selection picks.
 
     Attributes:
-        frame: the newest of the wide view.
-        track: who that is, if anybody.
+        frame: newest frame of the fixed camera.
+        track: selected track; None without one.
     """
 
     frame: Frame
@@ -161,7 +161,7 @@ class _Lookout:
         self._rig, self._config, self._calibration = rig, config, calibration
         self._detector = make_detector(target, config.rate_hz)
         self._tracker = Tracker(settings_for(target), rig.fixed.size)
-        self._wide = TargetFusion(calibration, target, rig.fixed.size)  # which never sees the zoom view
+        self._wide = TargetFusion(calibration, target, rig.fixed.size)  # never updated from the zoom camera
         self._both: TargetFusion | None = None
         self._policy = FirstCome()
         self._tracks: list[Track] = []
@@ -169,7 +169,7 @@ class _Lookout:
         self.track: Track | None = None
 
     def look(self) -> None:
-        """Take the next wide frame into account."""
+        """Process the next frame of the fixed camera."""
         self.frame = self._rig.fixed.read(newer_than=self._t)
         self._t = self.frame.t
         self._tracks = self._tracker.update(self._detector.detect(self.frame), self.frame.t)
@@ -189,7 +189,7 @@ class _Lookout:
             yield self._both
 
     def shoot(self) -> Shot | None:
-        """Aim at the track for the first zoom frame that can be exposed then, and wait for it; None if it cannot be."""
+        """Aim at the track for the first zoom frame that can be exposed then, and wait for it; None if out of reach."""
         fusion = self._wide if self._both is None else self._both
         rate, now = self._config.rate_hz, self._rig.clock.now()
         still = now + self._config.command_delay_s + self._config.sim.zoom.exposure_s / 2
@@ -221,16 +221,16 @@ class _Lookout:
         return Shot(self.frame.t, t, pixel, at.depth, moved, found.nominal_px, pan, tilt, nominal)
 
     def update_zoom(self) -> bool:
-        """Look for the target in the shot's zoom frame, for the next shot; whether it was found."""
+        """Search the target in the shot's zoom frame, for the next shot; give whether it was found."""
         assert self._both is not None, "a shot was taken"
         return self._both.update_zoom(self._zoom, self.frame.t) is not None
 
     def forget(self) -> None:
-        """Forget what the zoom view has shown."""
+        """Drop what the zoom camera has shown."""
         self._both = None
 
     def judged(self, shot: Shot) -> Step:
-        """The shot as a Step, to be put beside the truth."""
+        """Give the shot as a Step, for comparison with the ground truth."""
         return Step(
             index=0,
             t=self._rig.clock.now(),
@@ -252,20 +252,20 @@ class _Lookout:
 def budget(
     truth: Truth, exact: Calibration, calibration: Calibration, reach: Reach, name: str, shot: Shot
 ) -> dict[str, float]:
-    """What each cause alone leaves between the line of sight and the target, all else as it truly is [rad].
+    """Compute the error that each cause alone leaves between line of sight and target, with all else true [rad].
 
     Args:
-        truth: of the world.
-        exact: its calibration without error.
-        calibration: what is known of it.
-        reach: of head and lens.
-        name: of the target.
-        shot: what was commanded, and from what.
+        truth: ground truth of the world.
+        exact: calibration of the world without error.
+        calibration: calibration that the shots use.
+        reach: limits of head and lens.
+        name: name of the target.
+        shot: the command and what it was computed from.
 
     Returns:
-        "detection": the pixel; "size": the depth; "calibration": everything in it; "delay": what the target did until
-        the exposure beside what was expected; "steps": rounding of the head; "lens": its being at a position beside the
-        focal length solved for.
+        "detection": error of the pixel; "size": of the depth; "calibration": of the whole calibration; "delay": of the
+        predicted motion until the exposure; "steps": rounding of the head; "lens": the lens's position beside the
+        solved focal length.
     """
     seen, then = (truth.center(name, t) for t in (shot.seen_t, shot.exposed_t))
     x_seen, x_then = truth.T_world_fixed.inv().apply(np.array([seen, then]))
@@ -283,7 +283,7 @@ def budget(
         "detection": miss(exact, exact.fixed.ray(shot.pixel) * depth, seen),
         "size": miss(exact, exact.fixed.ray(pixel) * shot.depth, seen),
         "calibration": miss(calibration, calibration.fixed.ray(pixel) * depth, seen),
-        # A depth that is wrong makes the way longer as it makes the distance: in angles it is right.
+        # A wrong depth scales the motion as it scales the distance, so that the angle is right.
         "delay": miss(exact, x_seen + shot.moved * depth / shot.depth, then),
         "steps": miss(exact, x_then, then, step=reach.step),
         "lens": miss(exact, x_then, then, nominal=shot.nominal_px),

@@ -1,23 +1,23 @@
-"""The models of the related work: where each would send the head for a pixel of the wide view and a depth.
+"""Models of the related work: where each sends the head for a pixel of the fixed view and a depth.
 
-All but the look-up table are calibrations of which something is left out or known crudely. Lenses, the head's axes and
-the depth are known to all as to the full model; of the two mountings, of the zoom camera beside the wide one and on its
-head, each knows
+All but the look-up table are calibrations with parts that are neglected or known crudely. Lenses, head axes and depth
+are known to all as to the full model. Of the two mountings, of the zoom camera beside the fixed one and on its head,
+each model knows
 
-                               turns          places
-    offset ignored             as calibrated  none: all of the rig is in one place
-    parallel axes              none           as calibrated between the wide camera and the head, whose axes go through
+                               rotations      positions
+    offset ignored             as calibrated  none: the whole rig is at one point
+    parallel axes              none           as calibrated between the fixed camera and the head, whose axes go through
                                               the zoom camera (Choi)
-    planar translation         none           the same without its part along the wide camera's axis
+    planar translation         none           the same without its part along the fixed camera's axis
                                               (Bodor, Dinh, Lalonde, Marchesotti)
-    planar, turns known        as calibrated  that: what the plane alone costs
+    planar, turns known        as calibrated  the same: the cost of the plane alone
     crude known offset         by protractor  by tape measure, with the scatter of CRUDE (Hampapur, Stillman, Zhou)
     look-up table              pan and tilt are learnt at pixels of a grid from targets at one depth, each centred with
                                the scatter of `Centring`, and interpolated; it ignores the depth
 
-Whoever has such a rig can look at one target and set pan and tilt to zero there. Each model but the full one, and the
-table, which is learnt that way, is therefore there twice: as it is, and `zeroed` on a target in the middle of the wide
-view, which takes away the most of unknown turns, and of an unknown offset at that depth.
+A user of such a rig can point it at one target and set pan and tilt to zero there. So each model but the full one and
+the table, which is learnt that way, is also tested `zeroed` on a target in the middle of the fixed view. That removes
+most of the effect of unknown rotations, and of an unknown offset at that depth.
 """
 
 from collections.abc import Callable, Mapping
@@ -36,19 +36,19 @@ from experiments.following.mounted import at
 Model = Callable[[Array, Array], Array]  # pixels (n, 2) and depths (n,) [m] -> pan and tilt (n, 2) [rad]
 FULL, IGNORED, PARALLEL, PLANAR = "full model", "offset ignored", "parallel axes", "planar translation"
 PLANAR_TURNED, CRUDE_OFFSET, TABLE = "planar, turns known", "crude known offset", "look-up table"
-TURNED = (IGNORED, PARALLEL, PLANAR, PLANAR_TURNED, CRUDE_OFFSET)  # which may be right but for two angles
+TURNED = (IGNORED, PARALLEL, PLANAR, PLANAR_TURNED, CRUDE_OFFSET)  # models that two angles may correct
 ZEROED = {name: f"{name}, zeroed" for name in TURNED}
 MODELS = (FULL, *TURNED, TABLE, *ZEROED.values())
 
 
 @dataclass(frozen=True)
 class Crude:
-    """What tape measure and protractor scatter by, one standard deviation along or about each axis.
+    """Standard deviation of measurements by tape measure and protractor, along or about each axis.
 
     Attributes:
-        between: of the offset between the cameras [m].
-        lever: of the camera's place on the head [m].
-        turn: of either's turn [rad].
+        between: offset between the cameras [m].
+        lever: position of the camera on the head [m].
+        turn: rotation of either [rad].
     """
 
     between: float = 0.02
@@ -58,14 +58,14 @@ class Crude:
 
 @dataclass(frozen=True)
 class Centring:
-    """How a look-up table is learnt, and pan and tilt are set to zero.
+    """How the look-up table is learnt and the zeros are set.
 
     Attributes:
-        grid: columns and rows of pixels, from edge to edge of the wide image.
-        depth: of the table's targets [m].
-        zero_depth: of the target for the zeros [m].
-        scatter: of each axis when a target is brought to the middle [rad]; a person's, or a servo's, about one step
-            of the head.
+        grid: columns and rows of pixels, from edge to edge of the fixed image.
+        depth: depth of the table's targets [m].
+        zero_depth: depth of the target for the zeros [m].
+        scatter: standard deviation of each axis when a person or a servo centres a target, about one step of the head
+            [rad].
     """
 
     grid: tuple[int, int] = (9, 7)
@@ -79,15 +79,15 @@ class Models:
     """All models of a rig.
 
     Attributes:
-        models: as they are.
-        zeros: what is added to pan and tilt of those that are zeroed besides, (2,) [rad].
+        models: models by name.
+        zeros: offsets of pan and tilt of the zeroed models, (2,) [rad].
     """
 
     models: Mapping[str, Model]
     zeros: Mapping[str, Array]
 
     def poses(self, pixels: Array, depths: Array) -> dict[str, Array]:
-        """Pan and tilt of every one of MODELS for pixels (n, 2) and depths (n,) [m], (n, 2) [rad]."""
+        """Give pan and tilt by each of MODELS for pixels (n, 2) and depths (n,) [m], (n, 2) [rad]."""
         found = {name: model(pixels, depths) for name, model in self.models.items()}
         return found | {ZEROED[name]: found[name] + zero for name, zero in self.zeros.items()}
 
@@ -103,16 +103,16 @@ def models_of(
     crude: Crude = CRUDE,
     centring: Centring = CENTRING,
 ) -> Models:
-    """Every model of a rig.
+    """Make every model of a rig.
 
     Args:
-        truth: the rig, on which the table is learnt and which is measured crudely.
-        calibration: of that rig; the full model, and what the others know.
-        rng: draws the scatter.
-        crude: how the offsets are measured.
-        centring: how the table is learnt, and the zeros are set.
+        truth: the rig, on which the table is learnt and crude measurements are made.
+        calibration: calibration of the rig: the full model, and the source of what the others know.
+        rng: source of the scatter.
+        crude: scatter of crude measurements.
+        centring: how the table is learnt and the zeros are set.
     """
-    beside = -calibration.T_base_fixed.inv().translation  # the head's place as the wide camera has it, free of turns
+    beside = -calibration.T_base_fixed.inv().translation  # position of the head, seen from the fixed camera
     still = RigidTransform.identity()
     planar = replace(
         calibration,
@@ -133,7 +133,7 @@ def models_of(
     }
     models: dict[str, Model] = {name: _by(found) for name, found in believed.items()}
     models[TABLE] = learnt(truth, rng, centring)
-    others = rng.spawn(len(TURNED))  # which leave the numbers that the caller draws as they are
+    others = rng.spawn(len(TURNED))  # do not change the caller's random numbers
     zeros = {name: zero_of(models[name], truth, each, centring) for name, each in zip(TURNED, others, strict=True)}
     return Models(models, zeros)
 
@@ -143,7 +143,7 @@ def _by(calibration: Calibration) -> Model:
 
 
 def in_plane(calibration: Calibration) -> Calibration:
-    """The calibration with the head's centre in the wide camera's image plane, and its camera there too."""
+    """Move the head's centre into the fixed camera's image plane, and the zoom camera to that centre."""
     fixed_base = calibration.T_base_fixed.inv()
     centre = fixed_base.translation * [1.0, 1.0, 0.0]
     base_fixed = RigidTransform.from_components(centre, fixed_base.rotation).inv()
@@ -152,13 +152,13 @@ def in_plane(calibration: Calibration) -> Calibration:
 
 
 def scattered(T: RigidTransform, shift: float, turn: float, rng: np.random.Generator) -> RigidTransform:
-    """A transform as it is measured, with a scatter of each axis [m] and of the turn about each [rad]."""
+    """Add measurement scatter to a transform: of each axis [m] and of the rotation about each axis [rad]."""
     wrong = Rotation.from_rotvec(rng.normal(0, turn, 3))
     return RigidTransform.from_components(T.translation + rng.normal(0, shift, 3), wrong * T.rotation)
 
 
 def learnt(truth: Truth, rng: np.random.Generator, centring: Centring = CENTRING) -> Model:
-    """A look-up table over the wide image, learnt on the rig itself; cubic between the pixels of its grid."""
+    """Learn a look-up table over the fixed image on the rig itself; cubic interpolation on its grid."""
     columns, rows = (np.linspace(0.0, side - 1.0, count) for side, count in zip(SIZE, centring.grid, strict=True))
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     q = centred(truth, pixels, centring.depth, rng, centring.scatter)
@@ -167,13 +167,13 @@ def learnt(truth: Truth, rng: np.random.Generator, centring: Centring = CENTRING
 
 
 def zero_of(model: Model, truth: Truth, rng: np.random.Generator, centring: Centring = CENTRING) -> Array:
-    """What a model's pan and tilt lack at one target in the middle of the wide view of the rig itself, (2,) [rad]."""
+    """Measure a model's error of pan and tilt at one target in the middle of the rig's fixed view, (2,) [rad]."""
     middle = (np.array([SIZE]) - 1.0) / 2
     q = centred(truth, middle, centring.zero_depth, rng, centring.scatter)
     return np.asarray(q - model(middle, np.array([centring.zero_depth])))[0]
 
 
 def centred(truth: Truth, pixels: Array, depth: float, rng: np.random.Generator, scatter: float) -> Array:
-    """Pan and tilt at which targets at these pixels (n, 2) and a depth [m] were brought to the middle, (n, 2) [rad]."""
+    """Give pan and tilt that centre targets at pixels (n, 2) and a depth [m], with scatter, (n, 2) [rad]."""
     q = aimed(truth, at(truth, pixels, depth), np.append(middle_of(truth.zoom), 1.0))
     return np.asarray(q + rng.normal(0, scatter, q.shape))

@@ -1,20 +1,16 @@
-"""A single pan-tilt-zoom camera that has to find and follow its target by itself, against the pair: time on target.
+"""Single pan-tilt-zoom camera that finds and follows its target by itself, against the pair.
 
-The field of `experiments.following.field_scenes` without its clutter: the same unit, lens, delays, ways and sizes, the
-rig known
-exactly. Nothing is rendered: detections are the truth with a detector's noise (`cotarget.evaluation`), for the pair in
-its
-wide camera, for the lone camera (`experiments.following.lone_camera`) in its own view; either believes them by the same
-tracker
-with the same settings, those of a detector that goes by what a target looks like, as a lone camera has no background.
-The pair finds the target in its zoom view besides. What is missed there while the picture moves, because head or lens
-do, is what users of lone cameras fight with; three cases, of the pair's zoom view as well: 5 %, as of a camera that
-stands, a half, and nine of ten.
+The scene is the field of `experiments.following.field_scenes` without clutter: the same head, lens, delays, paths and
+sizes, and a rig known exactly. Nothing is rendered. Detections are ground truth with a detector's noise
+(`cotarget.evaluation`): in the fixed camera for the pair, in its own view for the single camera
+(`experiments.following.lone_camera`). Both use the same tracker with the settings of a detector by appearance, because
+the single camera has no static background. The pair finds the target in its zoom view besides. While head or lens move,
+the zoom camera misses more detections: 5 %, as at rest, 50 % or 90 %, for the pair's zoom view too.
 
-Both are judged by the truth. The clock starts when the target is wholly in the wide view, after the first 2 s. Until
-then neither looks: the head stands in a direction drawn from all over the wide view, with the lens at its shortest, so
-that the target has to be found. What a lone camera costs besides is the view of all else: `watched` is how much of the
-wide camera's field its own view is as large as, where the pair always sees all of it.
+Ground truth judges both. The clock starts when the target is wholly in the fixed view, after the first 2 s. Until then
+neither searches: the head points in a random direction of the fixed view, at the shortest focal length, so that the
+target has to be found. The single camera also loses the overview: `watched` is the area of its view over that of the
+fixed camera's, which is 1 for the pair.
 
     python -m experiments.following.single_ptz [--seeds 6] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -41,20 +37,20 @@ from experiments.following.single_runs import PAIR, WAYS, held
 
 WIDE_PX = SimConfig().fixed.focal_px[0]
 LEAST_MISS = 0.05
-HELD = 0.85  # least part of the frames after acquisition in which either has any target, if hardly anything is missed
+HELD = 0.85  # least in-frame ratio of both if hardly anything is missed
 FIGURES = ("closeup_yield", "in_frame_ratio", "in_frame_of_all", "tpo_width_median", "watched")
 
 
 @dataclass(frozen=True)
 class SingleSettings(Settings):
-    """How many runs, of what.
+    """Settings: runs and detection losses.
 
     Attributes:
-        seconds: of each run [s].
-        targets: book, person, bird.
-        misses: parts of the zoom camera's frames in which the target is missed while the picture moves.
-        lasts_s: of the lone camera's manoeuvres [s], see `experiments.following.lone_course`; each target's own by
-        default.
+        seconds: length of each run [s].
+        targets: book, person or bird.
+        misses: fractions of zoom frames in which the target is missed while the image moves.
+        lasts_s: duration of the single camera's manoeuvres [s] (see `experiments.following.lone_course`); by default
+            that of each target.
     """
 
     seeds: int = 6
@@ -64,9 +60,9 @@ class SingleSettings(Settings):
     lasts_s: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse impossible values."""
         super().__post_init__()
-        check_above(BACKGROUND_S, self, "seconds")  # when the clock starts
+        check_above(BACKGROUND_S, self, "seconds")  # start of the clock
         check_ways(self, "seconds")
         if parts := [miss for miss in self.misses if not 0 <= miss <= 1]:
             raise ConfigError(f"misses: {parts[0]:g} is no part of the frames, which is 0 to 1")
@@ -74,7 +70,7 @@ class SingleSettings(Settings):
 
 
 def one(_: None, settings: SingleSettings, seed: int) -> list[Row]:
-    """Each target held by the pair and by the lone camera; a row each."""
+    """Run each target with the pair and with the single camera; give a row per run."""
     rows: list[Row] = []
     for name in settings.targets:
         for way in WAYS:
@@ -85,12 +81,12 @@ def one(_: None, settings: SingleSettings, seed: int) -> list[Row]:
 
 
 def case(way: str, miss: float) -> str:
-    """What a way is called that misses the target in so many frames of the zoom camera while the picture moves."""
+    """Name a way with a fraction of missed zoom frames while the image moves."""
     return f"{way}, misses {100 * miss:g} %"
 
 
 def figures(judged: Sequence[Judged], way: str) -> Row:
-    """Of one run of PAIR or LONE_CAMERA; what never came to be, as an acquisition, is None."""
+    """Compute the figures of one run; None for what never occurred, such as an acquisition."""
     found = score(judged)
     since = judged[-found.frames :] if found.frames else []
     return {
@@ -104,14 +100,14 @@ def figures(judged: Sequence[Judged], way: str) -> Row:
 
 
 def _watched(since: Sequence[Judged], way: str) -> float | None:
-    """Which part of the wide camera's field is in view, in the mean; None of no frame."""
+    """Compute the mean area of the view over the fixed camera's; None without frames."""
     if way == PAIR:
         return 1.0
     return float(np.mean([min(1.0, (WIDE_PX / row.focal_px) ** 2) for row in since])) if since else None
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """Of each target and way the means over the seeds with their standard errors; quartiles of the time to acquire."""
+    """Give means over the seeds with standard errors by target and way, and quartiles of the time to acquire."""
     summary: dict[str, dict[str, dict[str, float]]] = {}
     for name, way in dict.fromkeys((row["target"], row["way"]) for row in rows):
         mine = [row for row in rows if (row["target"], row["way"]) == (name, way)]
@@ -126,17 +122,20 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
 
 
 def _told(rows: Sequence[Row], key: str) -> list[float]:
-    """A figure's values in the rows that have it."""
+    """Collect a figure's values from the rows that have it."""
     return [float(row[key]) for row in rows if row[key] is not None]
 
 
 def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Every close-up yield: one of the lone camera's that falls makes the pair look better."""
+    """Give every close-up yield; a bound keeps the single camera's from falling, which would favour the pair."""
     return {name: {way: v["closeup_yield"] for way, v in ways.items()} for name, ways in summary.items()}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """Whatever is not found and held even if hardly anything is missed: then one of the two is not at its best."""
+    """List where a target is not acquired and kept although hardly anything is missed.
+
+    Then one of the two cameras is not at its best, and the comparison is not fair.
+    """
     return [
         f"{name}, {way}: {what}"
         for name, ways in summary.items()
@@ -151,7 +150,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def describe(settings: SingleSettings, summary: Mapping[str, Any]) -> str:
-    """A line for each target and way."""
+    """Format a line per target and way."""
     head = ("", "close-up yield", "in frame", "of all", "offset / width", "watched", "to acquire [s]", "never")
     lines = [
         [f"{name}, {way}"]

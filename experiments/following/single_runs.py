@@ -1,4 +1,4 @@
-"""The pair and a lone camera on the same targets, each from where nobody looks yet, judged by the truth."""
+"""Runs of the pair and of a single pan-tilt-zoom camera on the same targets, judged by ground truth."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -22,30 +22,30 @@ from experiments.following.lone_camera import LoneCamera, scan_of
 from experiments.following.shaken import NOISE, Shaken
 
 WAYS = PAIR, LONE_CAMERA = "pair", "lone"
-FAR = 1000.0  # where the cameras' offset does not count [m]
-STREAM = 25  # of random numbers
+FAR = 1000.0  # distance at which the offset of the cameras is negligible [m]
+STREAM = 25  # random stream
 
 
 def config_of(name: str, seed: int) -> RigConfig:
-    """The field without clutter, which detections from the truth do not see, and its target as looks tell it."""
+    """Configure the field without clutter, which ground-truth detections ignore, and detection by appearance."""
     config = hold_config(name, seed)
     config = replace(config, sim=replace(config.sim, effects=replace(config.sim.effects, clutter=False)))
     target = config.target(name)
-    # As a thing that moves it would have to come some way before it is believed, which the lone camera cannot tell.
+    # With `motion`, a target must move some way before it is confirmed, which a single camera cannot measure.
     looks = target if target.detector == "colour" else replace(target, detector="speck")
     return replace(config, targets={**config.targets, name: looks})
 
 
 def held(way: str, name: str, seed: int, seconds: float, miss: float, lasts_s: float | None = None) -> list[Judged]:
-    """A run from when nobody looks yet on, judged at each zoom frame.
+    """Run one way from a start without search; judge each zoom frame.
 
     Args:
         way: PAIR or LONE_CAMERA.
-        name: of the target.
-        seed: of everything random.
-        seconds: of the run [s].
-        miss: part of the zoom camera's frames in which the target is missed while the picture moves.
-        lasts_s: of the lone camera's manoeuvres, see `Course`.
+        name: name of the target.
+        seed: seed of everything random.
+        seconds: length of the run [s].
+        miss: fraction of zoom frames in which the target is missed while the image moves.
+        lasts_s: duration of the single camera's manoeuvres; see `Course`.
     """
     world = SimWorld(config_of(name, seed), rendered=())
     target, calibration = world.config.target(name), true_calibration(world)
@@ -72,7 +72,7 @@ def held(way: str, name: str, seed: int, seconds: float, miss: float, lasts_s: f
 
 
 def any_pose(rig: Rig, calibration: Calibration, seed: int) -> tuple[float, float]:
-    """Pan and tilt at which the zoom camera looks somewhere into the wide view [rad]."""
+    """Draw pan and tilt at which the zoom camera looks into the fixed view [rad]."""
     rng = np.random.default_rng((seed, STREAM))
     pixel = rng.uniform(0.0, np.array(rig.fixed.size) - 1.0)
     pan, tilt = towards(calibration.T_base_fixed.apply(FAR * calibration.fixed.ray(pixel)))
@@ -81,7 +81,7 @@ def any_pose(rig: Rig, calibration: Calibration, seed: int) -> tuple[float, floa
 
 
 def begun(rows: Sequence[Judged]) -> bool:
-    """Whether the clock has started, as `cotarget.metrics.score` has it."""
+    """Check whether the clock has started, as defined in `cotarget.metrics.score`."""
     return bool(rows) and rows[-1].in_wide and rows[-1].t_s >= rows[0].t_s + BACKGROUND_S - ROUNDING_S
 
 
@@ -96,7 +96,7 @@ def by_pair(
     seconds: float,
     delay_s: float,
 ) -> Iterator[float]:
-    """Both cameras, by the project's own pipeline; the times of the zoom frames, some of them again."""
+    """Run the project's pipeline with both cameras; yield the times of the zoom frames, with repetitions."""
 
     def finder(calibration: Calibration, target: TargetConfig) -> TruthFinder:
         return TruthFinder(calibration, target, outlines, name, seed, shaken.misses)
@@ -108,7 +108,7 @@ def by_pair(
 
 
 def judge(outlines: Outlines, name: str, target: TargetConfig, t: float) -> Judged:
-    """What a zoom frame truly shows, as a row to be scored; what is said of commands and tracks is left out."""
+    """Make the row of a zoom frame from ground truth; fields of commands and tracks are placeholders."""
     closeup = closeup_of(outlines, name, target, t)
     wide = outlines.silhouette(name, "fixed", t)
     lens = outlines.lens("zoom", t)

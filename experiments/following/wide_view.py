@@ -1,7 +1,7 @@
-"""What the wide camera sees of a scene, rendered and searched once, so that it can be followed many times over.
+"""Recorded view of the fixed camera: frames and detections of a scene, computed once and used for several runs.
 
-Its frames and what is found in them depend neither on where the zoom camera looks nor on how late they come. A world
-opened on such a view renders the zoom camera only, and nothing at all where nobody looks through it.
+They depend neither on the zoom camera's pose nor on latencies. A world opened on a recorded view renders the zoom
+camera only, or nothing in open-loop runs.
 """
 
 import os
@@ -24,19 +24,19 @@ CLOSE: tuple[CameraName] = ("zoom",)
 
 
 class Shelf:
-    """Images in a file that no folder lists, and that is gone with the last one who knows it.
+    """Images in an unlinked temporary file, which is deleted with the last reference.
 
-    They are kept as they are: 20 s of pictures and masks take 600 MB, and compressing them would take longer than
-    following.
+    They are stored uncompressed: 20 s of images and masks take 600 MB, and compressing them would take longer than the
+    run.
     """
 
     def __init__(self) -> None:
-        """Make the file."""
+        """Create the file."""
         self._file = TemporaryFile(prefix="cotarget-")  # noqa: SIM115  closed below
         weakref.finalize(self, self._file.close)
 
     def put(self, image: Image | None) -> "Kept | None":
-        """Keep an image; nothing where there is none."""
+        """Store an image; None gives None."""
         if image is None:
             return None
         offset = self._file.tell()
@@ -45,7 +45,7 @@ class Shelf:
         return Kept(self, offset, image.shape)
 
     def take(self, offset: int, shape: tuple[int, ...]) -> Image:
-        """An image of that shape from there, the caller's own."""
+        """Read an image of a shape at an offset; the caller owns it."""
         image = np.empty(shape, dtype=np.uint8)
         read = os.preadv(self._file.fileno(), [image.data], offset)
         assert read == image.nbytes, "it was written whole"
@@ -54,14 +54,14 @@ class Shelf:
 
 @dataclass(frozen=True)
 class Kept:
-    """An image on a shelf, and where."""
+    """Stored image: its file, offset and shape."""
 
     shelf: Shelf = field(repr=False)
     offset: int
     shape: tuple[int, ...]
 
     def image(self) -> Image:
-        """The image, the caller's own."""
+        """Read the image; the caller owns it."""
         return self.shelf.take(self.offset, self.shape)
 
 
@@ -70,9 +70,9 @@ class Seen:
     """One frame.
 
     Attributes:
-        detections: in it.
-        picture: of it; None where nothing was rendered.
-        mask: the detector's foreground, likewise.
+        detections: detections in the frame.
+        picture: its image; None where nothing was rendered.
+        mask: the detector's foreground mask; None where there is none.
     """
 
     detections: tuple[Detection, ...]
@@ -82,28 +82,28 @@ class Seen:
 
 @dataclass(frozen=True)
 class WideView:
-    """The frames of one run by their times.
+    """Frames of one run by time.
 
     Attributes:
-        frames: by microseconds.
-        pictures: whether they are there.
+        frames: frames by microseconds.
+        pictures: whether the images are stored.
     """
 
     frames: Mapping[int, Seen] = field(repr=False)
     pictures: bool
 
     def at(self, t: float) -> Seen:
-        """The frame of a time [s]."""
+        """Give the frame of a time [s]."""
         return self.frames[microseconds(t)]
 
 
 def record(config: RigConfig, target: TargetConfig, seconds: float) -> WideView:
-    """Look through the wide camera alone, and search each frame.
+    """Read the fixed camera alone, and run the detector on each frame.
 
     Args:
-        config: the rig and its world.
-        target: what is looked for.
-        seconds: for how long [s].
+        config: configuration of the rig and its world.
+        target: configuration of the target.
+        seconds: length of the run [s].
     """
     frames: dict[int, Seen] = {}
     detector, shelf = make_detector(target, config.rate_hz), Shelf()
@@ -117,36 +117,36 @@ def record(config: RigConfig, target: TargetConfig, seconds: float) -> WideView:
 
 
 def open_on(view: WideView, config: RigConfig, *, closed_loop: bool) -> tuple[SimWorld, "RecordedDetector"]:
-    """A world whose wide frames are those recorded, and the detector that finds in them what was found.
+    """Open a world with the recorded frames, and the detector that gives the recorded detections.
 
     Args:
-        view: of the same world, whatever its latencies.
-        config: the rig and its world.
+        view: recording of the same world, with any latencies.
+        config: configuration of the rig and its world.
         closed_loop: whether the zoom camera is rendered.
     """
     assert view.pictures or not closed_loop, "the zoom view is searched for what the wide view shows"
     world = SimWorld(config, rendered=CLOSE if closed_loop else ())
-    if view.pictures:  # the middle of a body is told by its outline, whoever looks at the zoom view
+    if view.pictures:  # a body's centre is estimated from image and mask in open loop too
         world.rig.fixed = _RecordedCamera(world.rig.fixed, view)
     return world, RecordedDetector(view)
 
 
 class RecordedDetector:
-    """Finds in a frame what was found in it before."""
+    """Detector that gives the recorded detections of a frame."""
 
     def __init__(self, view: WideView) -> None:
         self._view = view
         self.mask: Image | None = None
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """What was found, best first."""
+        """Give the recorded detections, best first."""
         seen = self._view.at(frame.t)
         self.mask = None if seen.mask is None else seen.mask.image()
         return list(seen.detections)
 
 
 class _RecordedCamera:
-    """A camera that delivers when the simulated one does, and what was recorded."""
+    """Camera with the simulated camera's timing and the recorded images."""
 
     def __init__(self, camera: Camera, view: WideView) -> None:
         self._camera, self._view = camera, view
@@ -157,7 +157,7 @@ class _RecordedCamera:
         return self._camera.size
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """As the simulated camera."""
+        """Read the recorded frame at the time of the simulated camera's."""
         t = self._camera.read(newer_than, timeout).t
         picture = self._view.at(t).picture
         assert picture is not None, "pictures were kept"

@@ -1,1 +1,1 @@
-"""The paper's figures and tables."""
+"""Experiments that reproduce the paper's figures and tables."""

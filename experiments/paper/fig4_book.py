@@ -1,13 +1,10 @@
-"""Fig. 4 of the paper: indoors, a book about 10 m away, found by its colours: before, centred, and close up.
+"""Fig. 4 of the paper: indoors, a book about 10 m away, found by its colours: before, centred, and in close-up.
 
-Each seed puts the book somewhere, and after a while elsewhere (`cotarget.sim.targets.random_paths.lone_path`). At
-either place
-the zoom camera begins where pan = tilt = 0; it is turned to the book with the lens kept at its shortest, as in the
-paper's Fig. 4(c), and then goes on to the close-up: once by this project's pipeline, and once as the paper does it
-(`experiments.paper.paper_loop`), with the same calibration. What each zoom view shows is judged by the simulation's
-truth:
-the target point offset (a view without the book counts half the diagonal), the size over the one wanted, and whether
-the book's marker decodes.
+Each seed puts the book at one place, and later at another (`cotarget.sim.targets.random_paths.lone_path`). At each
+place the zoom camera starts at pan = tilt = 0. It is pointed at the book with the lens at its shortest focal length, as
+in the paper's Fig. 4(c), and then zooms in. This project's pipeline and the paper's method
+(`experiments.paper.paper_loop`) use the same calibration. Ground truth judges each zoom view: target point offset (a
+view without the book counts half the diagonal), size over the wanted size, and whether the book's marker decodes.
 
     python -m experiments.paper.fig4_book [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -41,12 +38,12 @@ from experiments.following.field import OwnRigInField, calibrated
 from experiments.paper.paper_loop import OURS, WAYS, picture_name
 
 NAME = "book"
-TURN_S = 1.2  # that the head is given to turn to the book, all latencies included [s]
-ARRIVES_S = (0.0, BOOK_MOVED_AT[1] + BOOK_TAKES[1])  # the book is at either place from then on, at the latest [s]
-LEAST_S = 0.2  # of a run, in which both cameras give several frames [s]
-# So small that the lens never leaves its shortest focal length for it [px].
+TURN_S = 1.2  # time for the head to turn to the book, with all latencies [s]
+ARRIVES_S = (0.0, BOOK_MOVED_AT[1] + BOOK_TAKES[1])  # latest time from which the book is at each place [s]
+LEAST_S = 0.2  # shortest run, in which both cameras give several frames [s]
+# So small that the lens stays at its shortest focal length [px].
 SPECK_PX = 1.0
-KEYS = ("tpo_px", "tpo_percent", "size_ratio", "focal_px")  # of each stage
+KEYS = ("tpo_px", "tpo_percent", "size_ratio", "focal_px")  # figures of each stage
 STAGES = ("before", "centred", "close up")
 WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "centred": {"tpo_percent": (0.0, 2.0)},
@@ -56,14 +53,14 @@ WANTED: Mapping[str, Mapping[str, tuple[float, float]]] = {
 
 @dataclass(frozen=True)
 class BookSettings(OwnRigInField):
-    """How many seeds, and how long head and lens are given.
+    """Settings: time for head and lens, and places.
 
     Attributes:
-        seconds: from centred to close up [s].
-        places: one or two of the book.
+        seconds: time from centred to close-up [s].
+        places: number of places of the book, one or two.
 
     Raises:
-        ConfigError: more places, no time to see anything, or so much that the book is taken elsewhere meanwhile.
+        ConfigError: more places, a run too short to show anything, or one during which the book is moved.
     """
 
     seeds: int = 2
@@ -81,12 +78,12 @@ class BookSettings(OwnRigInField):
 
     @property
     def lasting_s(self) -> tuple[float, float]:
-        """At its first place the book stays until it is taken elsewhere, at its second one for good."""
+        """Limits of a run's length [s]; the book leaves its first place when it is moved, and its second one never."""
         return 0.0, BOOK_MOVED_AT[0] - TURN_S
 
 
 def one(calibration: Calibration, settings: BookSettings, seed: int) -> Pictured:
-    """Show the book at each place in either way; a row each, and of the first seed the last place in pictures."""
+    """Show the book at each place by each method; give a row per run, and pictures of the first seed's last place."""
     rows: list[Row] = []
     pictures: dict[str, bytes] = {}
     for way in WAYS:
@@ -100,7 +97,7 @@ def one(calibration: Calibration, settings: BookSettings, seed: int) -> Pictured
 def _shown(
     calibration: Calibration, settings: BookSettings, seed: int, way: str
 ) -> tuple[list[Row], Mapping[str, Step]]:
-    """A row a place, and the Steps of the last one by stage."""
+    """Give a row per place, and the Steps of the last place by stage."""
     config = settings.config("indoor", (NAME,), seed)
     config = dataclasses.replace(config, sim=dataclasses.replace(config.sim, paths=lone_path(NAME, seed)))
     target, how = config.target(NAME), FollowSettings.of(config)
@@ -127,7 +124,7 @@ def _shown(
 
 
 def _ends(steps: Iterator[Step]) -> tuple[Step, Step]:
-    """The first of a run in which the book is found, before the head has turned, and the last; no others are kept."""
+    """Give the first Step in which the book is found, before the head has turned, and the last Step."""
     first = last = next(steps)
     for last in steps:
         if first.target is None and last.target is not None:
@@ -146,7 +143,7 @@ def _told(judged: Judged) -> dict[str, Any]:
 
 
 def _picture(shown: Mapping[str, Step]) -> bytes:
-    """As Fig. 4 of the paper: (a), (b) above (c), (d)."""
+    """Arrange pictures as in Fig. 4 of the paper: (a), (b) above (c), (d)."""
     before, centred, close = (shown[stage] for stage in STAGES)
     return laid_out(
         [
@@ -160,7 +157,7 @@ def _picture(shown: Mapping[str, Step]) -> bytes:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Of either way and each stage median, least and largest over all places, and the share of markers that decode."""
+    """Give median, least and largest over all places by method and stage, and the fraction of decoded markers."""
     return {
         way: {
             stage: {key: spread(mine, f"{stage} {key}") for key in KEYS}
@@ -172,7 +169,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures of this project that are not what is wanted."""
+    """List this project's figures that miss their goal."""
     return [
         f"{stage}: {key}"
         for stage, wanted in WANTED.items()
@@ -182,7 +179,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def describe(settings: BookSettings, summary: Mapping[str, Any]) -> str:
-    """A line a way and stage."""
+    """Format a line per method and stage."""
     lines = [
         [f"{way}: {stage}", *(in_words(found[key]) for key in KEYS), found["decoded"]]
         for way, stages in summary.items()

@@ -1,11 +1,9 @@
-"""Fig. 5 of the paper: indoors, a person who walks, found by an adaptive Gaussian mixture and connected components.
+"""Fig. 5 of the paper: indoors, a walking person, found by an adaptive Gaussian mixture and connected components.
 
-He is followed once by this project's pipeline and once as the paper does it (`experiments.paper.paper_loop`), with the
-same
-calibration and with the paper's plain detector, `mog2`; `--set fig5_person.detector=motion` gives this project's
-pipeline its own. The person walks in after the background was learnt for some two seconds and goes to and fro about 10
-m away. Figures are medians over the seeds, with the least and the largest, of what `cotarget.metrics` defines, by the
-simulation's truth.
+This project's pipeline and the paper's method (`experiments.paper.paper_loop`) use the same calibration and the paper's
+plain detector, `mog2`; `--set fig5_person.detector=motion` gives this project's pipeline its own. The person walks in
+after the background was learnt for about two seconds, then goes to and fro about 10 m away. Figures are medians over
+the seeds with the least and the largest, as defined in `cotarget.metrics`, by ground truth.
 
     python -m experiments.paper.fig5_person [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -37,8 +35,8 @@ from experiments.following.field import OwnRigInField, calibrated, watched_in
 from experiments.paper.paper_loop import OURS, WAYS, picture_name
 
 NAME = "person"
-MOMENTS, FIRST_S = 3, 4.4  # in the picture, the first of them then and the last at the end; he is there from 3 s on [s]
-FIGURES = {  # of a run, with words
+MOMENTS, FIRST_S = 3, 4.4  # moments in the picture; time of the first [s], after the person's entry at 3 s
+FIGURES = {  # figures of a run, with descriptions
     "tpe_px_median": "detection's error in the fixed view, px",
     "tpo_px_median": "target point offset in the close-up, px",
     "tpo_percent_median": "target point offset in the close-up, % of width",
@@ -61,13 +59,13 @@ WANTED: Mapping[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class PersonSettings(OwnRigInField):
-    """How many seeds, for how long, and how the person is found.
+    """Settings: length of the runs, and detector.
 
     Attributes:
-        detector: mog2 or motion, of this project's pipeline.
+        detector: detector of this project's pipeline, mog2 or motion.
 
     Raises:
-        ConfigError: it ends before there is anything to be shown.
+        ConfigError: a run ends before there is anything to show.
     """
 
     seeds: int = 2
@@ -83,12 +81,12 @@ class PersonSettings(OwnRigInField):
 
     @property
     def lasting_s(self) -> tuple[float, float]:
-        """The person goes to and fro for good (`cotarget.sim.targets.paths`)."""
+        """Limits of a run's length [s]; the person's path does not end (`cotarget.sim.targets.paths`)."""
         return FIRST_S, math.inf
 
 
 def one(calibration: Calibration, settings: PersonSettings, seed: int) -> Pictured:
-    """Follow a person in either way; a row each, and pictures of the first seed."""
+    """Follow a person by each method; give a row per method, and pictures of the first seed."""
     rows: list[Row] = []
     pictures: dict[str, bytes] = {}
     for way in WAYS:
@@ -100,14 +98,14 @@ def one(calibration: Calibration, settings: PersonSettings, seed: int) -> Pictur
 
 
 def _followed(calibration: Calibration, settings: PersonSettings, seed: int, way: str) -> tuple[Row, list[Step]]:
-    """The figures, and some moments."""
+    """Follow a person; give the figures and some moments."""
     config = settings.config("indoor", (NAME,), seed)
     found_by = settings.detector if way == OURS else "mog2"
     target = dataclasses.replace(config.target(NAME), detector=found_by)
     how = FollowSettings.of(config)
     judged: list[Judged] = []
     moments: list[Step] = []
-    # The last step is done a frame before the end, or later.
+    # The last step comes a frame before the end, or later.
     due = np.linspace(FIRST_S, settings.seconds - 1 / config.rate_hz, MOMENTS).tolist()
     detector, world = make_detector(target, config.rate_hz), SimWorld(config)
     for step, truth in watched_in(world, detector, calibration, target, settings.seconds, how, WAYS[way]):
@@ -122,7 +120,7 @@ def _followed(calibration: Calibration, settings: PersonSettings, seed: int, way
 
 
 def _picture(moments: Sequence[Step]) -> bytes:
-    """As Fig. 5 of the paper, for some moments: (a) above (b)."""
+    """Arrange pictures of some moments as in Fig. 5 of the paper: (a) above (b)."""
     return laid_out(
         [
             [(draw_wide(step), f"(a) stationary camera, t = {step.fixed.t:.1f} s") for step in moments],
@@ -132,7 +130,7 @@ def _picture(moments: Sequence[Step]) -> bytes:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """Of either way's figures the median over the seeds, least and largest; a run without it is told apart."""
+    """Give median, least and largest of each method's figures over the seeds, and mark runs without a figure."""
     return {
         way: {
             key: spread(mine, key) | {"not measured": float(sum(row[key] is None for row in mine))} for key in FIGURES
@@ -142,7 +140,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures of this project that are not what is wanted, or were not measured in some run."""
+    """List this project's figures that miss their goal, or were not measured in some run."""
     return [
         key
         for key, (low, high) in WANTED.items()
@@ -151,7 +149,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def describe(settings: PersonSettings, summary: Mapping[str, Any]) -> str:
-    """A line a figure, a column a way."""
+    """Format a line per figure, a column per method."""
     what = f"a person, {settings.detector}, median (least to largest) of {seeds_of(settings)}"
     return ways_table(what, summary, FIGURES)
 

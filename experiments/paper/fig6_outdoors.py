@@ -1,11 +1,10 @@
-"""Fig. 6 of the paper: outdoors, several who move, the first followed until it disappears, then the next.
+"""Fig. 6 of the paper: outdoors, several persons, the first followed until it disappears, then the next.
 
-Three persons cross the wide view from either side, each coming in before the one before has left, while foliage sways,
-clouds drift and shadows cross the ground. This project finds them by an adaptive Gaussian mixture and connected
-components with what foliage needs (`motion`; `--set fig6_outdoors.detector=mog2` takes the plain mixture); beside it
-stands the paper's own way, the plain mixture and one open-loop command at a time (`experiments.paper.paper_loop`), with
-the
-same calibration. The policy is the paper's, first-come.
+Three persons cross the fixed view from either side; each enters before the one before has left, while foliage sways,
+clouds drift and shadows cross the ground. This project detects them by an adaptive Gaussian mixture and connected
+components, with additions for foliage (`motion`; `--set fig6_outdoors.detector=mog2` takes the plain mixture). The
+paper's method, the plain mixture and one open-loop command at a time (`experiments.paper.paper_loop`), uses the same
+calibration. The policy is the paper's, first-come.
 
     python -m experiments.paper.fig6_outdoors [--seeds 2] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -40,16 +39,16 @@ from experiments.paper.paper_loop import OURS, WAYS, picture_name
 
 KIND = "person"
 NAMES = (KIND, f"{KIND}2", f"{KIND}3")
-# When the first comes in, how much later each next one does, and by how much that varies [s].
+# Time at which the first enters, interval to each next one, and its variation [s].
 ENTERS_S, LATER_S, EARLIER_S = 2.0, 2.8, 0.3
-NEAREST_M, APART_M, EDGE = 9.6, 0.7, 0.52  # of their ways, of which that many times the distance is beside the view
+NEAREST_M, APART_M, EDGE = 9.6, 0.7, 0.52  # depth of the paths, spacing [m]; edge of the view over the depth
 SPEED = (1.6, 2.0)  # [m/s]
-KNOT_S = 0.5  # of their paths; they set out and stop so long outside the view that its ends do not matter
-STREAM = 11  # of random numbers, apart from the world's own
-CLOSE_S = 1.0  # so long after a target was taken up it is shown [s]
-MOMENTS = 3  # in the picture: the first close up, as it leaves, and the next one close up
-PRESENT = 0.5  # of a target's outline in the wide view; with less it has as good as left
-FIGURES = {  # of a run, with words
+KNOT_S = 0.5  # knot spacing of the paths; both ends are far enough outside the view
+STREAM = 11  # random stream, separate from the world's
+CLOSE_S = 1.0  # a target is shown this long after its acquisition [s]
+MOMENTS = 3  # moments in the picture: the first target in close-up, as it leaves, and the next one in close-up
+PRESENT = 0.5  # least visible fraction of a present target's outline in the fixed view
+FIGURES = {  # figures of a run, with descriptions
     "followed": "targets followed for a second or more, of three",
     "tpe_px": "detection's error in the fixed view, px",
     "tpo_px": "target point offset in the close-up, px",
@@ -61,8 +60,8 @@ FIGURES = {  # of a run, with words
     "off_target_s": "followed is a track on nobody, s",
 }
 SHOWN = ("followed", "tpo_percent", "size_ratio", "in_frame", "handover_s", "off_target_s")
-# Of the median over the seeds; of handovers that come too early the largest counts: where two pass before each other
-# the track of the one may go over to the other, once a run.
+# Goals for the median over the seeds. For early handovers the largest counts: where two persons cross, a track may
+# switch from one to the other, once a run.
 WANTED: Mapping[str, tuple[str, float, float]] = {
     "followed": ("median", 2.0, 3.0),
     "tpo_percent": ("median", 0.0, 4.0),
@@ -75,11 +74,11 @@ WANTED: Mapping[str, tuple[str, float, float]] = {
 
 @dataclass(frozen=True)
 class OutdoorSettings(OwnRigInField):
-    """How many seeds, for how long, and how targets are found.
+    """Settings: length of the runs, and detection.
 
     Attributes:
-        detector: motion or mog2, of this project's pipeline.
-        ways: of following them, by name.
+        detector: detector of this project's pipeline, motion or mog2.
+        ways: methods of following, by name.
     """
 
     seeds: int = 2
@@ -94,14 +93,14 @@ class OutdoorSettings(OwnRigInField):
 
     @property
     def lasting_s(self) -> tuple[float, float]:
-        """Before the first comes in nothing is to be seen; the ways end outside the view, where nobody is held."""
+        """Limits of a run's length [s]: the first person's entry, and the end of the paths outside the view."""
         return ENTERS_S, math.inf
 
 
 def one(calibration: Calibration, settings: OutdoorSettings, seed: int) -> Pictured:
-    """Follow those who pass in each way; a row each, and pictures of the first seed."""
+    """Follow the persons by each method; give a row per method, and pictures of the first seed."""
     config = outdoors(settings, seed)
-    how = FollowSettings.of(config)  # whose policy is first-come
+    how = FollowSettings.of(config)  # its policy is first-come
     rows: list[Row] = []
     pictures: dict[str, bytes] = {}
     for way in settings.ways:
@@ -117,7 +116,7 @@ def one(calibration: Calibration, settings: OutdoorSettings, seed: int) -> Pictu
 
 
 def outdoors(settings: OutdoorSettings, seed: int) -> RigConfig:
-    """The rig outdoors, everything moving."""
+    """Configure the rig outdoors with all motion switched on."""
     rng = np.random.default_rng((seed, STREAM))
     rows = rng.permutation(len(NAMES))
     paths = {name: _crossing(rng, i, NEAREST_M + APART_M * rows[i], name, seed) for i, name in enumerate(NAMES)}
@@ -127,7 +126,7 @@ def outdoors(settings: OutdoorSettings, seed: int) -> RigConfig:
 
 
 def _crossing(rng: np.random.Generator, number: int, away: float, name: str, seed: int) -> tuple[Waypoint, ...]:
-    """Straight across the view, from the one side and the other by turns, at a distance [m]."""
+    """Make a straight path across the view at a distance [m]; successive persons start from alternate sides."""
     side, speed = (1.0 if number % 2 else -1.0), rng.uniform(*SPEED)
     enters = ENTERS_S + LATER_S * number + rng.uniform(0.0, EARLIER_S)
     half, z = EDGE * away, PERSON_HEIGHT / 2 * draw_size(name, target_rng(seed, name), scatter=True)
@@ -137,21 +136,21 @@ def _crossing(rng: np.random.Generator, number: int, away: float, name: str, see
 
 @dataclass
 class Watch:
-    """Judges the Steps of a run, and keeps those to be shown.
+    """Judges the Steps of a run, and keeps those to show.
 
     Attributes:
-        moments: what was so.
-        shown: Steps with words.
+        moments: the judged moments.
+        shown: Steps with captions.
     """
 
     moments: list[Moment] = field(default_factory=list)
     shown: list[tuple[Step, str]] = field(default_factory=list)
-    _names: dict[int, str] = field(default_factory=dict)  # of tracks, as long as they are seen alone
+    _names: dict[int, str] = field(default_factory=dict)  # targets of the tracks, while they are on one target only
     _last: tuple[Step, str] | None = None
     _since: float = 0.0
 
     def see(self, step: Step, truth: Truth, target: TargetConfig) -> None:
-        """Take a Step into account."""
+        """Process a Step."""
         t, t_zoom = step.fixed.t, step.zoom.t
         outlines = {name: truth.silhouette(name, "fixed", t) for name in truth.targets}
         present = frozenset(name for name, each in outlines.items() if each is not None and each.visible >= PRESENT)
@@ -168,12 +167,12 @@ class Watch:
         self._choose(step, name)
 
     def _name(self, track: int, on: Sequence[str]) -> None:
-        """A track's target is the one that it was on before, as long as it is, or else the nearest that it is on."""
+        """Assign a target to a track: the earlier one while the track is on it, else the nearest that it is on."""
         if on and self._names.get(track) not in on:
             self._names[track] = on[0]
 
     def _choose(self, step: Step, name: str | None) -> None:
-        """Keep a Step of each target close up, and the last one before it leaves."""
+        """Keep a Step of each target in close-up, and the last one before it leaves."""
         before = None if self._last is None else self._last[1]
         if name is not None and name != before:
             self._leave()
@@ -194,7 +193,7 @@ class Watch:
 
 
 def _picture(shown: Sequence[tuple[Step, str]]) -> bytes:
-    """As Fig. 6 of the paper: a moment a row; (a) foreground, (b) stationary camera, (c) close-up."""
+    """Arrange pictures as in Fig. 6 of the paper, a moment per row: (a) foreground, (b) fixed camera, (c) close-up."""
     rows = []
     for step, words in shown[:MOMENTS]:
         mask = np.zeros(step.fixed.image.shape[:2], np.uint8) if step.mask is None else step.mask
@@ -209,18 +208,18 @@ def _picture(shown: Sequence[tuple[Step, str]]) -> bytes:
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """Of each way's figures the median over the seeds, the least and the largest, of the runs that have it."""
+    """Give median, least and largest of each method's figures over the seeds, from the runs that have them."""
     return {way: {key: spread(mine, key) for key in FIGURES} for way, mine in ways_of(rows).items()}
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures of this project that are not what is wanted."""
+    """List this project's figures that miss their goal."""
     mine = summary.get(OURS, {})
     return [key for key, (which, low, high) in WANTED.items() if mine and not low <= mine[key][which] <= high]
 
 
 def describe(settings: OutdoorSettings, summary: Mapping[str, Any]) -> str:
-    """A line a figure, a column a way."""
+    """Format a line per figure, a column per method."""
     what = f"three persons, {settings.detector}, {settings.seconds:g} s, median (least to largest) of"
     return ways_table(f"{what} {seeds_of(settings)}", summary, FIGURES)
 
@@ -235,7 +234,7 @@ EXPERIMENT = Experiment(
     "fig6_outdoors",
     "Fig. 6: several persons outdoors, the first followed until it leaves: foreground, fixed view, close-up.",
     SETTINGS,
-    dataclasses.replace(SETTINGS, seeds=1, seconds=9.0, calibrated=False, ways=(OURS,)),  # the first handed over
+    dataclasses.replace(SETTINGS, seeds=1, seconds=9.0, calibrated=False, ways=(OURS,)),  # the first handover
     one,
     summarise,
     describe,

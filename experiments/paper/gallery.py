@@ -1,7 +1,6 @@
-"""Copy the pictures that the documentation shows from results, as JPEGs small enough to be kept with the code.
+"""Copy the pictures of the documentation from results, as JPEGs small enough for the repository.
 
-docs/results.md says beside each table how many seeds its picture has; those of hold and single_ptz are more than a full
-run does.
+docs/results.md states the number of seeds beside each table; hold and single_ptz have more than in a full run.
 
 python -m experiments.paper.gallery [NAME ...] [--results experiments-out] [--out docs/pictures]
 """
@@ -30,11 +29,11 @@ QUALITY = 85
 
 @dataclass(frozen=True)
 class Shown:
-    """A picture of the documentation.
+    """Picture of the documentation.
 
     Attributes:
-        experiment: name of the experiment whose results it shows.
-        picture: name of its file among those results, without suffix.
+        experiment: name of the experiment that makes it.
+        picture: name of its file among the results, without suffix.
         name: name of its file in docs/pictures, without suffix.
     """
 
@@ -54,7 +53,7 @@ SHOWN = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; the exit status."""
+    """Run the command; return the exit status."""
     parser = Parser(prog=PROGRAM, description=(__doc__ or "").splitlines()[0])
     names = tuple(dict.fromkeys(each.experiment for each in SHOWN))
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"experiments whose pictures; all of {choices(names)}")
@@ -73,18 +72,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def gather(results: Path, out: Path, names: Collection[str]) -> list[Path]:
-    """Write every picture of some experiments that the documentation shows, or none.
+    """Write all pictures of some experiments that the documentation shows; on an error, none.
 
     Args:
-        results: folder of `python -m experiments`.
+        results: results folder of `python -m experiments`.
         out: folder for the pictures.
-        names: of the experiments.
+        names: names of the experiments.
 
     Returns:
-        What was written.
+        The files that were written.
 
     Raises:
-        ConfigError: a picture is missing or cannot be read, or one cannot be written.
+        ConfigError: a picture is missing, cannot be read or cannot be written.
     """
     check_folder(out)
     shown = [each for each in SHOWN if each.experiment in names]
@@ -96,10 +95,10 @@ def gather(results: Path, out: Path, names: Collection[str]) -> list[Path]:
 
 
 def _jpeg(path: Path) -> bytes:
-    """A PNG as a JPEG no wider than what a page shows.
+    """Convert a PNG to a JPEG no wider than a page shows.
 
     Raises:
-        ConfigError: there is none, or it cannot be read.
+        ConfigError: the file is missing or cannot be read.
     """
     try:
         data = path.read_bytes()

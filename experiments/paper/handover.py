@@ -1,4 +1,4 @@
-"""Who of several is followed from moment to moment, and how one is handed over to the next: figures by the truth."""
+"""Figures of handovers: which of several targets is followed at each moment, by ground truth."""
 
 import math
 from collections.abc import Sequence
@@ -9,20 +9,20 @@ import numpy as np
 
 from cotarget.metrics import Closeup
 
-FOLLOWED_S = 1.0  # who was followed for so long counts [s]
+FOLLOWED_S = 1.0  # a target counts if it was followed for this long [s]
 
 
 @dataclass(frozen=True)
 class Moment:
-    """What is so in one Step.
+    """Ground truth of one Step.
 
     Attributes:
-        t: of the zoom frame [s].
-        followed: the target that the followed track is on; None where it is on none, or there is none.
-        is_following: whether anybody is followed.
-        present: targets of which half or more is in the wide view.
-        tpe_px: from its detection to it in the wide view; nan where it is not seen alone [px].
-        closeup: what the zoom view shows of it.
+        t: time of the zoom frame [s].
+        followed: target of the followed track; None where the track is on no target, or there is no track.
+        is_following: whether a track is followed.
+        present: targets of which at least half is in the fixed view.
+        tpe_px: error of the followed target's detection in the fixed view; nan where it is not detected alone [px].
+        closeup: the followed target in the zoom view.
     """
 
     t: float
@@ -34,13 +34,13 @@ class Moment:
 
 
 def figures(moments: Sequence[Moment]) -> dict[str, float | int | None]:
-    """The figures of a run; None where there is nothing to measure."""
+    """Compute the figures of a run; None where there is nothing to measure."""
     t = np.array([each.t for each in moments])
     took = np.diff(t, append=t[-1])
     names = [each.followed for each in moments]
     seconds = {name: float(sum(d for d, each in zip(took, names, strict=True) if each == name)) for name in set(names)}
     closeups = [each.closeup for each in moments if each.closeup is not None]
-    # Where the track that is followed is on nobody, nobody is in frame.
+    # Where the followed track is on no target, no target is in frame.
     in_frame = [each.closeup is not None and each.closeup.in_frame for each in moments if each.is_following]
     handovers = [(old, new) for old, new in turns(names) if old is not None]
     gaps = [gap for old, new in handovers if (gap := _gap(moments, names, old, new)) is not None]
@@ -59,7 +59,7 @@ def figures(moments: Sequence[Moment]) -> dict[str, float | int | None]:
 
 
 def turns(names: Sequence[str | None]) -> list[tuple[int | None, int]]:
-    """Where somebody else is followed than before: the last moment of the one, and the first of the other."""
+    """Find the handovers: last moment of the earlier target, and first moment of the next."""
     found: list[tuple[int | None, int]] = []
     last: int | None = None
     for i, name in enumerate(names):
@@ -72,7 +72,10 @@ def turns(names: Sequence[str | None]) -> list[tuple[int | None, int]]:
 
 
 def _gap(moments: Sequence[Moment], names: Sequence[str | None], old: int, new: int) -> float | None:
-    """From the one's leaving the wide view to the other's being in frame [s]; None where either never was."""
+    """Give the time from the first target's leaving the fixed view to the second's being in frame [s].
+
+    None if either is missing.
+    """
     name = names[old]
     there = [i for i, each in enumerate(moments[:new]) if name in each.present]
     came = next(

@@ -1,9 +1,10 @@
-"""The paper's own way to follow, beside this project's: one open-loop command from the wide view at a time.
+"""The paper's method of following, for comparison: one open-loop command from the fixed view at a time.
 
-As in its Table 1: detect, depth from the size, pan and tilt by its shortcut, focal length for the size wanted, command
-head and lens. Nothing is predicted, filtered or corrected by the zoom view, and no policy holds the lens back; the next
-command comes when head and lens stand again, and the first target is kept until it disappears. What the paper does not
-say is this project's: the calibration, and which connected component is the one that was there before (`Tracker`).
+As in its Table 1: detect, depth from the size, pan and tilt by the shortcut, focal length for the wanted size, command
+head and lens. Nothing is predicted, filtered or corrected by the zoom view, and no policy limits the lens. The next
+command comes when head and lens stand again, and the first target is kept until it disappears. The paper leaves two
+things open, which are this project's: the calibration, and the association of connected components over time
+(`Tracker`).
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -19,8 +20,8 @@ from cotarget.targeting import Aim, Method, WantedSize, aim, depth_of, point_at
 from cotarget.tracking.track import Track, settings_for
 from cotarget.tracking.tracker import Tracker
 
-METHOD: Method = "paper-table"  # the depth as Table 1 has it
-Follow = Callable[..., Iterator[Step]]  # with the arguments of `follow`
+METHOD: Method = "paper-table"  # depth as in Table 1
+Follow = Callable[..., Iterator[Step]]  # takes the arguments of `follow`
 
 
 def follow_as_the_paper(
@@ -32,16 +33,17 @@ def follow_as_the_paper(
     seconds: float,
     settings: FollowSettings,
 ) -> Iterator[Step]:
-    """Follow a target as the paper does; takes, gives and raises what `follow` does.
+    """Follow a target by the paper's method; arguments, Steps and errors are those of `follow`.
 
-    Of the settings only the delay of commands counts, by which the head's standing is told from its not having begun.
+    Of the settings only the command delay is used. It distinguishes a head that has stopped from one that has not
+    started.
     """
     calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
     eyes, tracker = FrameSource(rig.fixed, rig.zoom, rig.clock), Tracker(settings_for(target), rig.fixed.size)
     head = rig.head.state()
     commanded = (head.pan, head.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
     mine: Track | None = None
-    index, sent, begun = 0, 0, rig.clock.now()  # when what was commanded last has begun [s]
+    index, sent, begun = 0, 0, rig.clock.now()  # time at which the last command takes effect [s]
     end = begun + seconds
     while rig.clock.now() < end:
         frame = eyes.read_fixed()
@@ -77,7 +79,7 @@ def follow_as_the_paper(
 
 
 def _first(tracks: list[Track], before: Track | None) -> Track | None:
-    """The one that was followed before until it disappears, then the eldest."""
+    """Keep the followed track until it disappears, then select the eldest."""
     confirmed = {track.id: track for track in tracks if track.confirmed}
     if before is not None and before.id in confirmed:
         return confirmed[before.id]
@@ -85,7 +87,7 @@ def _first(tracks: list[Track], before: Track | None) -> Track | None:
 
 
 def _aim(calibration: Calibration, target: TargetConfig, track: Track, rig: Rig) -> Aim | None:
-    """By the track's last box alone; None where the shortcut has no solution, or none that can be reached."""
+    """Aim by the track's last box alone; None where the shortcut has no reachable solution."""
     vertical = target.dimension == "height"
     size_px, center_px = float(track.box.size_px[int(vertical)]), track.box.center_px
     try:
@@ -101,5 +103,5 @@ OURS = "this project"
 
 
 def picture_name(figure: str, way: str) -> str:
-    """Name of the picture of a figure that follows in one of `WAYS`, without ending; this project's is the figure's."""
+    """Name the picture of a figure by one of `WAYS`, without suffix; this project's has the figure's name."""
     return figure if way == OURS else f"{figure}_{way.replace(' ', '_')}"

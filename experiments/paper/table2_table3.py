@@ -1,12 +1,11 @@
-"""Tables 2 and 3 of the paper: the intrinsics of both cameras, Gamma and T, with uncertainty and beside the truth.
+"""Tables 2 and 3 of the paper: intrinsics of both cameras, Gamma and T, with uncertainty and true values.
 
-A simulated rig whose true lenses are the paper's Table 2 is calibrated from rendered boards with all effects on, once a
-seed, at the shortest focal length as in the paper. The values of the paper's Table 3 are lost: offsets of that kind
-stand in for them. One calibration gives both tables, and rendering takes most of the time, which is
-why they are one experiment.
+A simulated rig whose true lenses are the paper's Table 2 is calibrated from rendered boards with all effects, once per
+seed, at the shortest focal length as in the paper. The values of the paper's Table 3 are lost; offsets of that kind
+replace them. One calibration gives both tables, because rendering takes most of the time.
 
-The error over the seeds stands beside the standard deviation that each calibration predicts for itself; rotations err
-by the components of the rotation vector from the true orientation to the one found.
+The error over the seeds is compared with the standard deviation that each calibration predicts. Errors of rotations are
+the components of the rotation vector from the true orientation to the estimate.
 
     python -m experiments.paper.table2_table3 [--seeds 3] [--seed-base 0] [--processes P] [--quick] [--out DIR]
 """
@@ -31,30 +30,30 @@ from experiments.engine.harness import Experiment, Row, seeds_of
 from experiments.engine.texts import rms, table
 from experiments.following.own_rig import OwnRig
 
-# Table 2: rows of the paper's list [v, u]; the CCD's size and the pitch are the makers'.
+# Table 2: rows of the paper's list [v, u]; the CCD's size and the pitch are the manufacturers'.
 CAMERAS = {"zoom": "Canon PowerShot S5 IS (zoom camera)", "fixed": "Philips LTC 0600 (stationary camera)"}
 PITCH_MM = {"zoom": 0.009, "fixed": 0.01}
 CCD_MM = {"zoom": (5.74, 4.31), "fixed": (6.40, 4.80)}
 TRANSFORMS = {"T_zoom0_fixed": "Gamma", "T_head_zoom": "T"}
 PLACES = ("tx", "ty", "tz")
 TURNS = ("rx", "ry", "rz")
-LENS = ("fy", "fx", "cy", "cx")  # in the order of the paper's [v, u]
+LENS = ("fy", "fx", "cy", "cx")  # order of the paper's [v, u]
 MILLI = 1e3
-# Rms error over predicted standard deviation, of all parameters, that is taken for honest: from as much too careful ...
+# Limits of rms error over predicted standard deviation, over all parameters: from too cautious ...
 HONEST = (0.7, 1.3)
-# ... and a parameter's mean error over the seeds, over what it should scatter by, sigma / sqrt(seeds). Of twenty right
-# ones one is beyond 3 in one run of twenty.
+# ... and limit of a parameter's mean error over the seeds, over its expected scatter, sigma / sqrt(seeds). Of twenty
+# unbiased parameters one exceeds 3 in one run of twenty.
 BIASED = 3.0
-NOT_KNOWN = "-"  # in a table
+NOT_KNOWN = "-"  # unknown value in a table
 CAMERA_WORDS = {"zoom": "zoom camera", "fixed": "fixed camera"}
 
 
 @dataclass(frozen=True)
 class Settings(OwnRig):
-    """How many seeds, and how much of a capture session.
+    """Settings: size of the capture session.
 
     Attributes:
-        placements: of the board.
+        placements: number of board placements.
     """
 
     seeds: int = 3
@@ -62,7 +61,7 @@ class Settings(OwnRig):
 
 
 def one(_: None, settings: Settings, seed: int) -> list[Row]:
-    """Calibrate the rig once; one row a parameter."""
+    """Calibrate the rig once; give a row per parameter."""
     config = settings.config("indoor", (), seed)
     world = SimWorld(config)
     with SafeRig(world.rig, config.safety) as rig:
@@ -83,7 +82,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
 
 
 def _pose_rows(seed: int, calibration: Calibration, name: str, true: RigidTransform) -> Iterator[Row]:
-    """Translation [mm] and rotation vector [degrees]."""
+    """Make the rows of a translation [mm] and a rotation vector [degrees]."""
     mine: RigidTransform = getattr(calibration, name)
     turned = np.degrees((mine.rotation * true.rotation.inv()).as_rotvec())
     vectors = [each.rotation.as_rotvec(degrees=True) for each in (mine, true)]
@@ -96,7 +95,7 @@ def _pose_rows(seed: int, calibration: Calibration, name: str, true: RigidTransf
 
 
 def _sigma(calibration: Calibration, name: str) -> float:
-    """Standard deviation of a parameter, as the calibration predicts it; nan where it tells none."""
+    """Give a parameter's standard deviation as predicted by the calibration; nan without one."""
     covariance = calibration.covariance
     return math.nan if covariance is None else float(covariance.sigma(name))
 
@@ -107,7 +106,7 @@ def _row(seed: int, of: str, name: str, found: float, sigma: float, true: float,
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """Of each parameter the truth, means and rms over the seeds; of each camera and transform how honest sigma is."""
+    """Give each parameter's truth, mean and rms over the seeds, and the consistency of sigma."""
     found: dict[str, Any] = {}
     for of in dict.fromkeys(row["of"] for row in rows):
         mine = [row for row in rows if row["of"] == of]
@@ -141,9 +140,9 @@ def _parameter(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """What a calibration predicts of each kind of parameter, the worst, and how far all are from that.
+    """Give the largest predicted deviation of each kind of parameter, and how far the ratios are from 1.
 
-    How large one run's error of one parameter is, is chance.
+    The error of one parameter in one run is random, and has no bound.
     """
     kinds = {"focal length, px": LENS[:2], "centre, px": LENS[2:], "translation, mm": PLACES, "rotation, deg": TURNS}
     return {
@@ -158,7 +157,7 @@ def bounded(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """Whether errors are larger or smaller than predicted, and which parameters err to one side."""
+    """List predictions that are too small or too large, and parameters with a bias."""
     low, high = HONEST
     lost = [] if low <= summary["all"]["error over sigma"] <= high else ["all: error over sigma"]
     return lost + [
@@ -171,7 +170,7 @@ def missed(summary: Mapping[str, Any]) -> list[str]:
 
 
 def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
-    """Both tables in the paper's layout, then error and standard deviation of each parameter."""
+    """Format both tables in the paper's layout, then error and standard deviation of each parameter."""
     return "\n\n".join(
         [
             f"Table 2: as the run of seed {settings.seed_base} has it, ± the standard deviation that it predicts\n"
@@ -204,7 +203,7 @@ def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
 
 
 def _table_2(settings: Settings, summary: Mapping[str, Any]) -> str:
-    """Table 2 of the paper's cameras, or of one's own, of which no maker is known, nor how large their CCDs are."""
+    """Format Table 2 for the paper's cameras, or for a user's own, whose manufacturer and CCD size are unknown."""
     head = ("rows are [v, u]", "focal length, px", "mm", "centre, px", "CCD, mm", "pitch, mm")
     if not settings.rig:
         return table(head, _lens(summary, CAMERAS, "  true, as printed", PITCH_MM, CCD_MM))
@@ -219,14 +218,14 @@ def _lens(
     pitch_mm: Mapping[str, float],
     ccd_mm: Mapping[str, tuple[float, float]] | None = None,
 ) -> Iterator[list[str]]:
-    """The rows of Table 2, each camera's truth under what was found.
+    """Make the rows of Table 2, with each camera's truth below the estimate.
 
     Args:
         summary: the figures.
-        names: of the cameras, in words.
-        truth: what it is called; of the paper's cameras it is what the paper printed.
-        pitch_mm: size of a pixel [mm] of the cameras of which it is known.
-        ccd_mm: the CCDs' sizes [mm], where there is to be a column of them.
+        names: descriptions of the cameras.
+        truth: name of the true values; for the paper's cameras these are the printed ones.
+        pitch_mm: size of a pixel of the cameras for which it is known [mm].
+        ccd_mm: sizes of the CCDs, if there is a column for them [mm].
     """
     for camera in CAMERAS:
         parameters, pitch = summary[camera], pitch_mm.get(camera)
@@ -252,7 +251,7 @@ def _lens(
 
 
 def _matrices(words: str, parameters: Mapping[str, Any], settings: Settings) -> str:
-    """A transform as Table 3 has it, found beside true, in millimetres."""
+    """Format a transform as Table 3 does, estimate beside truth, in millimetres."""
     found, true = (_matrix(parameters, key) for key in ("first", "true"))
     lines = [
         "   ".join(" ".join(f"{value:10.4f}" for value in row) for row in (mine, other))
@@ -266,7 +265,7 @@ def _matrices(words: str, parameters: Mapping[str, Any], settings: Settings) -> 
 
 
 def _matrix(parameters: Mapping[str, Any], key: str) -> Array:
-    """4x4, its translation in millimetres."""
+    """Give a transform as a 4x4 matrix, with its translation in millimetres."""
     place, turn = ([parameters[axis][key] for axis in axes] for axes in (PLACES, TURNS))
     return pose(place, turn).as_matrix()
 

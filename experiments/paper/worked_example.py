@@ -1,13 +1,13 @@
 """Section 4.2 of the paper, step by step, beside the numbers that it prints.
 
-A book is found at pixel (529, 275), taken to be 10 m away, and is to be 160 px wide in the close-up. What the paper
-prints of that is worked out again from its own printed inputs. The entries of its Gamma and T are lost, so that
-what they do to a point cannot be; what survives of their results can still be checked for agreement with itself,
-because T and P move points rigidly.
+A book is found at pixel (529, 275), is assumed 10 m away, and should be 160 px wide in the close-up. Each printed
+number that follows from the paper's printed inputs is computed again. The entries of its Gamma and T are lost, so that
+their effect on a point cannot be computed. What survives of their results can still be checked for consistency, because
+T and P are rigid motions.
 
-Beside it stands the exact method, with a T that gives every printed digit with the least rotation: one of many that do,
-as the printed results leave T's rotation about the line of sight, and its first translation, open. What it says is not
-held against the paper, which does not claim it.
+The exact method is run too, with a T that gives every printed digit with the least rotation. It is one of many, because
+the printed results leave T's rotation about the line of sight and its first translation open. Its results are not
+compared with the paper's claims.
 
     python -m experiments.paper.worked_example [--out DIR]
 """
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # Table 2 as (u, v); the paper lists [v, u].
 FIXED = Intrinsics((640, 480), (686.0, 684.0), (325.0, 239.0))
 ZOOM_SHORTEST_MM, PITCH_MM = 6.237, 0.009
-# Section 4.2, in millimetres; what is lost is nan.
+# Section 4.2, in millimetres; lost numbers are nan.
 PIXEL, DEPTH_MM = (529.0, 275.0), 10000.0
 X_FIXED_MM = (2973.0, 519.0, 10000.0)
 X_ZOOM0_MM = (811.0, 563.0, 10464.0)
@@ -44,27 +44,27 @@ X_BASE_MM = (661.92, math.nan, 10426.0)  # T Gamma x_fixed
 ANGLE_DEG = 3.08
 BOOK_MM, WANTED_PX = 234.0, 160.0
 ZOOM_FACTOR, LARGEST_ZOOM = 10.3, 12.0
-CLOSEUP_PX = 7155.0  # the focal length of the paper's close-up, at which misses are told in pixels
-OFF_MM = 20.0  # by so much and more both norms of a rigid motion differ
-KNOWN = "x_fixed: y [mm]"  # what does not follow from the paper's own numbers
-BESIDE = ("exact", "stand-in T")  # steps that the paper does not have
+CLOSEUP_PX = 7155.0  # focal length of the paper's close-up, at which errors are given in pixels
+OFF_MM = 20.0  # least difference of both norms of a rigid motion
+KNOWN = "x_fixed: y [mm]"  # does not follow from the paper's own numbers
+BESIDE = ("exact", "stand-in T")  # steps without a counterpart in the paper
 RIGHT, WRONG, OTHER = "#1f6f8b", "#d9534f", "#999999"
 
 
 @dataclass(frozen=True)
 class Settings(harness.Settings):
-    """There is nothing to choose, and nothing random."""
+    """Settings without choices; nothing is random."""
 
     seeds: int = 1
 
 
 def once(settings: Settings) -> Sequence[int]:
-    """One job, whatever the seeds."""
+    """Give one job, whatever the number of seeds."""
     return (settings.seed_base,)
 
 
 def one(_: None, settings: Settings, seed: int) -> list[Row]:
-    """Every step; one row a number: what is printed (nan where nothing is), what follows, and what is to be said."""
+    """Compute every step; give a row per number: printed value (nan if none), computed value, and remark."""
     return [
         {"step": step, "quantity": quantity, "unit": unit, "printed": printed, "last_digit": digit, "found": found}
         | {"difference": found - printed, "remark": remark}
@@ -76,7 +76,7 @@ Line = tuple[str, str, str, float, float, float, str]  # as in `one`; the digit 
 
 
 def _paper() -> list[Line]:
-    """What can be worked out from the printed inputs."""
+    """Compute what follows from the printed inputs."""
     x, y, _ = FIXED.ray(np.array(PIXEL)) * DEPTH_MM
     y_half = float((PIXEL[1] - 239.5) / FIXED.focal_px[1] * DEPTH_MM)
     focal_px = focal_for_size(BOOK_MM, WANTED_PX, X_ZOOM0_MM[2])
@@ -94,12 +94,12 @@ def _paper() -> list[Line]:
 
 
 def _norms() -> list[Line]:
-    """What must be equal, because P is a rotation: |x_head| and |x_base|."""
+    """Compare |x_head| and |x_base|, which must be equal because P is a rotation."""
     base = math.hypot(X_BASE_MM[0], X_BASE_MM[2])
-    head_x = X_BASE_MM[0] - X_ZOOM0_MM[0]  # of a T that does not rotate
+    head_x = X_BASE_MM[0] - X_ZOOM0_MM[0]  # for a T without rotation
     head = math.hypot(head_x, *X_HEAD_MM[1:])
     pan = math.radians(ANGLE_DEG)
-    head_x_pan = (X_BASE_MM[0] - math.sin(pan) * X_HEAD_MM[2]) / math.cos(pan)  # (14), the tilt left out
+    head_x_pan = (X_BASE_MM[0] - math.sin(pan) * X_HEAD_MM[2]) / math.cos(pan)  # (14) without the tilt
     head_pan = math.hypot(head_x_pan, *X_HEAD_MM[1:])
     nan, mm = math.nan, "mm"
     return [
@@ -112,8 +112,8 @@ def _norms() -> list[Line]:
 
 
 def stand_in() -> RigidTransform:
-    """The T of least rotation that gives all the printed digits of x_head and x_base [mm]."""
-    # T takes (811, 563, 0), what x_zoom0 is beside the axis, to x_base - x_head, whose z is 2 mm: about what is across.
+    """Find the T of least rotation that gives all printed digits of x_head and x_base [mm]."""
+    # T rotates (811, 563, 0), the part of x_zoom0 across the axis, to x_base - x_head, whose z is 2 mm.
     x, y, _ = X_ZOOM0_MM
     aside = math.hypot(x, y)
     angle = math.asin((X_BASE_MM[2] - X_HEAD_MM[2]) / aside)
@@ -124,7 +124,7 @@ def stand_in() -> RigidTransform:
 
 
 def _exactly() -> list[Line]:
-    """The exact method, and what both readings of the shortcut make of the same T."""
+    """Compute the exact method, and both readings of the shortcut, with the same T."""
     T, x_zoom0 = stand_in(), np.array(X_ZOOM0_MM)
     nearly = float(np.linalg.norm(x_zoom0))
     found = solve(T.apply(x_zoom0), T)
@@ -154,7 +154,7 @@ def _exactly() -> list[Line]:
             "what the exact method asks for",
         ),
     ]
-    gamma = RigidTransform.from_translation(x_zoom0 - np.array(X_FIXED_MM))  # for the depth in x_fixed alone
+    gamma = RigidTransform.from_translation(x_zoom0 - np.array(X_FIXED_MM))  # used for the depth in x_fixed only
     for words, reading in (("Table 1", "table"), ("Section 4.2", "example")):
         short = shortcut(np.array(X_FIXED_MM), gamma, T, reading)  # type: ignore[arg-type]
         off = _miss(T, x_zoom0, float(short.pan), float(short.tilt))
@@ -167,13 +167,13 @@ def _exactly() -> list[Line]:
 
 
 def _miss(T: RigidTransform, x_zoom0: Array, pan: float, tilt: float) -> float:
-    """Angle between the zoom camera's axis, with the head at pan and tilt, and a point [rad]."""
+    """Compute the angle between the zoom camera's axis, with the head at pan and tilt, and a point [rad]."""
     x_zoom = (T.inv() * base_head(pan, tilt).inv() * T).apply(x_zoom0)  # (2)
     return float(angle_between(np.array([0.0, 0.0, 1.0]), x_zoom))
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """Every number by step and quantity, and which of the printed ones do not follow."""
+    """Give every number by step and quantity, and the printed ones that do not follow."""
     found: dict[str, Any] = {}
     for i, row in enumerate(rows, 1):
         key = f"{i}. {row['step']}: {row['quantity']} [{row['unit']}]"
@@ -183,19 +183,19 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def agrees(row: Row) -> bool | None:
-    """Whether a printed number is what follows, cut or rounded to its last digit; None where none is printed."""
+    """Check that a printed number is the computed one, cut or rounded to its last digit; None where none is printed."""
     if math.isnan(row["printed"]):
         return None
     return bool(abs(row["difference"]) < row["last_digit"])
 
 
 def _is_beside(key: str) -> bool:
-    """Whether a figure is one that the paper does not have."""
+    """Check whether a figure has no counterpart in the paper."""
     return any(f". {step}: " in key for step in BESIDE)
 
 
 def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
-    """A line a number."""
+    """Format a line per number."""
     words = {True: "as printed", False: "NOT as printed", None: ""}
     lines = [
         (
@@ -211,13 +211,13 @@ def describe(settings: Settings, summary: Mapping[str, Any]) -> str:
 
 
 def _number(value: float, line: Mapping[str, Any]) -> str:
-    """A number with one digit more than is printed."""
+    """Format a number with one digit more than is printed."""
     decimals = 1 - round(math.log10(line["last_digit"]))
     return "-" if math.isnan(value) else f"{value:.{decimals}f}"
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """What follows from the paper otherwise than is said of it here."""
+    """List numbers that follow from the paper in another way than this module states."""
     own = {key: line for key, line in summary.items() if not _is_beside(key)}
     wrong = [
         key for key, line in own.items() if line["agrees"] is not (KNOWN not in key) and line["agrees"] is not None
@@ -256,7 +256,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 
 
 def _printed(ax: "Axes", rows: Sequence[Row]) -> None:
-    """What follows, less what is printed, in units of the last digit printed; within the band both agree."""
+    """Plot computed minus printed, in units of the last printed digit; within the band both agree."""
     ax.axvspan(-1, 1, color="#dddddd", lw=0)
     colours = [OTHER if row["step"] in BESIDE else RIGHT if agrees(row) else WRONG for row in rows]
     for colour, words in (

@@ -1,1 +1,1 @@
-"""The figures of drivers and emulators over the wire."""
+"""Experiments on drivers and emulators, which communicate by the devices' wire protocols."""

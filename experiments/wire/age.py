@@ -1,4 +1,4 @@
-"""How old the newest frame of an Axis stream is when a slow consumer has it, from its first byte sent."""
+"""Age of the newest frame of an Axis stream at a slow consumer, from the first byte sent."""
 
 import itertools
 import multiprocessing
@@ -21,17 +21,17 @@ from experiments.wire.rig import beside, load
 
 SIZE = (704, 576)  # 4CIF [px]
 STREAM_HZ, CONSUMER_HZ = 25.0, 5.0
-JITTER_S = 0.04  # so that the consumer comes at all times between two frames: a period of the stream
-COARSE = (44, 36)  # of the noise that the pictures show, blown up [px]
-BITS = 8  # of a picture's number, in black and white squares along its upper edge
+JITTER_S = 0.04  # random delay of a read, one period of the stream, so that reads fall anywhere between two frames
+COARSE = (44, 36)  # size of the noise pattern before it is enlarged [px]
+BITS = 8  # bits of a picture's number, as black and white squares along its upper edge
 SQUARE = 32  # [px]
 PICTURES = 2**BITS
-LEAST = 0.05  # before a read, so that it has slept [s]
+LEAST = 0.05  # least pause before a read, so that the consumer has slept [s]
 
 
 def serve(pipe: Connection, sent: Any) -> None:
-    """Stream ready-made pictures from a process of its own; when each was sent last stands under its number."""
-    sys.setswitchinterval(5e-4)  # as `cotarget emulate` has it
+    """Stream prepared pictures from another process; ``sent`` gets the time of the latest sending of each number."""
+    sys.setswitchinterval(5e-4)  # as in `cotarget emulate`
     feed, images = Feed(), [picture(number) for number in range(PICTURES)]
 
     def note(index: int, t: float) -> None:
@@ -48,7 +48,7 @@ def serve(pipe: Connection, sent: Any) -> None:
 
 
 def picture(number: int) -> Image:
-    """Coloured clouds that drift, with the number in squares."""
+    """Make a picture with drifting coloured clouds and its number in squares."""
     noise = np.random.default_rng(0).integers(0, 255, (COARSE[1], COARSE[0], 3), dtype=np.uint8)
     image = np.roll(cv2.resize(noise, SIZE, interpolation=cv2.INTER_CUBIC), 3 * number, axis=1)
     for bit in range(BITS):
@@ -64,7 +64,7 @@ def number_of(image: Image) -> int:
 
 
 def run(seconds: float, seed: int) -> list[Row]:
-    """One row for each frame that the consumer takes."""
+    """Measure the age of each frame that the consumer takes; give a row per frame."""
     sent = multiprocessing.get_context("spawn").Array("d", PICTURES, lock=False)
     with beside(serve, sent) as url:
         return _consume(url, sent, seconds, np.random.default_rng(seed))

@@ -1,7 +1,7 @@
-"""From a frame's arrival to the first byte of the command that follows from it, through an emulated rig, in its parts.
+"""Time from a frame's arrival to the first byte of the resulting command, in its parts, through an emulated rig.
 
-The pipeline runs as it is: what is timed are the calls that it makes, by devices and a detector that note when they
-are called, and the serial port.
+The pipeline runs unchanged. Devices and a detector that record their calls, and a tap on the serial port, give the
+times.
 """
 
 import bisect
@@ -20,12 +20,12 @@ from experiments.engine.harness import Row
 from experiments.wire.rig import EmulatedRig, Tap, exact_calibration, load, tapped
 
 SCENES = {"book": "indoor", "person": "outdoor"}
-ORDER = re.compile(rb"[PT][PS]-?\d+ ")  # the first bytes of a move; questions have no number
+ORDER = re.compile(rb"[PT][PS]-?\d+ ")  # first bytes of a move; queries have no number
 
 
 @dataclass
 class Turn:
-    """When one turn of the loop came to what [s]; None where it did not."""
+    """Times of the events in one turn of the loop [s]; None where one did not occur."""
 
     arrived: float
     read: float
@@ -44,7 +44,7 @@ class Notes:
 
 
 class TimedCamera:
-    """Notes when a frame arrived, and when it was in hand."""
+    """Camera that records when a frame arrived and when it was returned."""
 
     def __init__(self, camera: Camera, notes: Notes) -> None:
         self._camera, self._notes = camera, notes
@@ -55,50 +55,50 @@ class TimedCamera:
         return self._camera.size
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """The camera's."""
+        """Read a frame from the camera."""
         frame = self._camera.read(newer_than, timeout)
         self._notes.turns.append(Turn(frame.t + self._notes.latency_s, self._notes.clock.now()))
         return frame
 
 
 class TimedHead:
-    """Notes when a move is commanded."""
+    """Head that records when a move is commanded."""
 
     def __init__(self, head: PanTilt, notes: Notes) -> None:
         self._head, self._notes = head, notes
 
     @property
     def limits(self) -> PanTiltLimits:
-        """The head's."""
+        """Limits of the head."""
         return self._head.limits
 
     def state(self) -> PanTiltState:
-        """The head's."""
+        """Give the head's state."""
         return self._head.state()
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
-        """The head's."""
+        """Command the head."""
         self._notes.turns[-1].called = self._notes.clock.now()
         return self._head.move(pan, tilt, speed, wait)
 
     def halt(self) -> None:
-        """The head's."""
+        """Halt the head."""
         self._head.halt()
 
 
 class TimedDetector:
-    """Notes when a frame is looked at."""
+    """Detector that records when a frame is searched."""
 
     def __init__(self, detector: Detector, notes: Notes) -> None:
         self._detector, self._notes = detector, notes
 
     @property
     def mask(self) -> Image | None:
-        """The detector's."""
+        """Foreground mask of the detector."""
         return self._detector.mask
 
     def detect(self, frame: Frame) -> list[Detection]:
-        """The detector's."""
+        """Run the detector."""
         turn, clock = self._notes.turns[-1], self._notes.clock
         turn.detecting = clock.now()
         found = self._detector.detect(frame)
@@ -107,7 +107,7 @@ class TimedDetector:
 
 
 class TimedRig:
-    """A rig whose fixed camera and head note when they are called; its owner closes it."""
+    """Rig whose fixed camera and head record their calls; its owner closes it."""
 
     def __init__(self, rig: Rig, notes: Notes) -> None:
         self.fixed, self.head = TimedCamera(rig.fixed, notes), TimedHead(rig.head, notes)
@@ -115,7 +115,7 @@ class TimedRig:
 
 
 def run(folder: Path, targets: tuple[str, ...], seconds: float) -> list[Row]:
-    """One row for each command that was sent."""
+    """Follow targets and give a row per command that was sent."""
     rows = []
     for name in targets:
         tables = {"sim": {"scene": SCENES[name], "targets": [name]}}
@@ -140,7 +140,7 @@ def _follow(emulated: EmulatedRig, name: str, seconds: float) -> list[Row]:
 
 
 def open_tapped(config: RigConfig, taps: list[Tap]) -> Rig:
-    """Open a rig with the line to its head tapped."""
+    """Open a rig with a tap on the line to its head."""
     with tapped(MonotonicClock()) as found:
         rig = open_devices(config)
     taps += found
@@ -148,7 +148,7 @@ def open_tapped(config: RigConfig, taps: list[Tap]) -> Rig:
 
 
 def _parts(turns: list[Turn], tap: Tap) -> list[Row]:
-    """The parts of each turn whose command reached the wire before the next one was given."""
+    """Give the parts of each turn whose command reached the wire before the next one was given."""
     orders = [t for t, data in tap.written if ORDER.fullmatch(data)]
     calls = [turn for turn in turns if turn.called is not None]
     rows = []
@@ -157,7 +157,7 @@ def _parts(turns: list[Turn], tap: Tap) -> list[Row]:
         assert turn.detecting is not None
         assert turn.detected is not None
         next_order = bisect.bisect_left(orders, turn.called)
-        # Nothing is sent where the head is on its way there already.
+        # Nothing is sent where the head is already on its way to that pose.
         if next_order == len(orders) or (after is not None and orders[next_order] >= (after.called or 0.0)):
             continue
         first_byte = orders[next_order]

@@ -1,11 +1,11 @@
-"""What `cotarget follow` does when a device behind it fails: each fault of the emulators, while the head turns.
+"""Behaviour of `cotarget follow` when a device fails: each fault of the emulators, while the head turns.
 
-A book goes round and round, so that a head that follows never stands. At a random moment a fault is switched on. Once
-it passes: it is off again after a while, and the head should follow again. Once it is held: the head should stand, or
-go on following where the fault can be lived with. Everything is judged from outside: by where the head truly is, as the
-emulator tells it, beside where the book truly is, and by how the command ends. Where the line to the head is unplugged
-no halt can reach the unit: it ends at the goal of its last command, and how long that takes and how far it goes is what
-is told.
+A book moves in a round, so that a head that follows never stands. A fault is switched on at a random moment, in two
+ways. In the first it passes: it is switched off after a while, and the head should follow again. In the second it is
+held: the head should stand, or go on following where the fault allows that. Everything is judged from outside: by the
+head's true pose from the emulator, by the book's true direction, and by how the command ends. If the line to the head
+is unplugged, no halt can reach the unit. It ends at the goal of its last command; the time and the angle until then are
+reported.
 """
 
 import functools
@@ -30,28 +30,28 @@ from cotarget.targeting import Reach, aim
 from experiments.engine.harness import Row
 from experiments.wire.rig import MOUNT, EmulatedRig, end, exact_calibration, load
 
-# The book's round: x and z about the fixed camera's axis, at a distance [m], and how long one takes [s].
+# The book's round: x and z about the fixed camera's axis, at a distance [m], and its period [s].
 ROUND, DISTANCE, HEIGHT, PERIOD_S, KNOTS = (1.2, 0.6), 6.0, 1.6, 6.0, 8
-ROUNDS = 150  # as long as one emulator is used
-PAN_DEG, TILT_DEG = (-25.0, 25.0), (-20.0, 20.0)  # soft limits, some way beyond the round as the head sees it
-PASSES_S = 0.3  # that a fault which passes is on [s]
-ONCE = ("head.power-cycle", "head.limit-hit")  # pass by themselves, but the unit has lost its position
-TABLE_S = 0.05  # between the book's directions in a table [s]
-EVERY_S = 0.01  # between looks at the truth [s]
-OFF_DEG = 6.0  # a head that follows trails the book's 13 degrees/s by at most 4
-STILL_DEG, REST_S = 0.03, 0.25  # a head that moves by less for longer stands
-FOLLOWS_S, START_S = 1.0, 30.0  # a head that has moved for so long follows; it must begin to within the latter [s]
-MOMENT_S = (0.3, 2.0)  # from then to the fault [s]
-WATCH_S = 2.5  # how long a fault that has passed is watched [s]
-HELD_S = 5.0  # the same of one that is held [s]
-HANG_S = 5.0  # who neither follows nor ends for so long hangs [s]
-GIVEN_UP_S = 20.0  # and is given up after this [s]
-AFTER_S = 0.5  # that the head is watched after the command has ended [s]
+ROUNDS = 150  # number of rounds, longer than one emulator is used
+PAN_DEG, TILT_DEG = (-25.0, 25.0), (-20.0, 20.0)  # soft limits, with a margin around the round as the head sees it
+PASSES_S = 0.3  # duration of a fault that passes [s]
+ONCE = ("head.power-cycle", "head.limit-hit")  # pass by themselves; the unit has lost its position then
+TABLE_S = 0.05  # spacing of the table of the book's directions [s]
+EVERY_S = 0.01  # interval of reading the truth [s]
+OFF_DEG = 6.0  # a following head trails the book, at 13 degrees/s, by at most 4
+STILL_DEG, REST_S = 0.03, 0.25  # a head that moves by less than the first for the second stands
+FOLLOWS_S, START_S = 1.0, 30.0  # moving time of a head that follows, and timeout of its start [s]
+MOMENT_S = (0.3, 2.0)  # range of the time from then to the fault [s]
+WATCH_S = 2.5  # observation after a fault that passes [s]
+HELD_S = 5.0  # observation of a fault that is held [s]
+HANG_S = 5.0  # a command that neither follows nor ends within this hangs [s]
+GIVEN_UP_S = 20.0  # and is terminated after this [s]
+AFTER_S = 0.5  # observation of the head after the command has ended [s]
 
 
 @dataclass
 class Watch:
-    """Where the head truly was: times [s], pan and tilt [degrees], and how far from the book [degrees]."""
+    """True poses of the head: times [s], pan and tilt [degrees], and angle to the book [degrees]."""
 
     emulated: EmulatedRig
     times: list[float] = field(default_factory=list)
@@ -59,7 +59,7 @@ class Watch:
     off: list[float] = field(default_factory=list)
 
     def until(self, end_s: float, process: "subprocess.Popen[str] | None" = None) -> None:
-        """Look until a time on the machine's monotonic clock, or until a process has ended."""
+        """Record until a time on the machine's monotonic clock, or until a process has ended."""
         while time.monotonic() < end_s and (process is None or process.poll() is None):
             told = self.emulated.truth()
             self.times.append(told["t"])
@@ -68,7 +68,7 @@ class Watch:
             time.sleep(EVERY_S)
 
     def rests(self, since: float) -> list[tuple[float, float]]:
-        """From when to when the head stood for `REST_S` or more [s]; the last may not be over."""
+        """Give the intervals in which the head stood for `REST_S` or more [s]; the last may be unfinished."""
         t, at = np.array(self.times), np.array(self.angles)
         t, at = t[t >= since], at[t >= since]
         found, begin = [], 0
@@ -80,29 +80,29 @@ class Watch:
         return found
 
     def standing(self, since: float) -> float | None:
-        """Since when the head has stood until now [s]; None if it does not."""
+        """Give the time since when the head stands [s]; None if it moves."""
         rests = self.rests(since)
         return rests[-1][0] if rests and rests[-1][1] == self.times[-1] else None
 
     def strayed(self, since: float) -> float:
-        """When it was last away from the book [s]; the given time, if it never was."""
+        """Give the last time at which it was off the book [s]; the given time if it never was."""
         away = [t for t, off in zip(self.times, self.off, strict=True) if t >= since and off > OFF_DEG]
         return away[-1] if away else since
 
     def moved(self, since: float) -> float:
-        """How far it went from where it was then, at most [degrees]."""
+        """Give the largest angle from its pose at a time [degrees]."""
         at = np.array(self.angles)[np.array(self.times) >= since]
         return float(np.abs(at - at[0]).max()) if len(at) else math.nan
 
     def beyond(self) -> float:
-        """How far it was outside the soft limits, at most [degrees]."""
+        """Give the largest excess over the soft limits [degrees]."""
         at: Array = np.array(self.angles)
         low, high = np.array([PAN_DEG, TILT_DEG]).T
         return float(np.maximum(np.maximum(low - at, at - high), 0.0).max())
 
 
 class Follower:
-    """`cotarget follow`, as a user would start it, until it is ended; a context manager."""
+    """Process of `cotarget follow`, started as a user starts it; a context manager that ends it."""
 
     def __init__(self, folder: Path, emulated: EmulatedRig) -> None:
         calibration = folder / "calibration.json"
@@ -124,7 +124,7 @@ class Follower:
         )
 
     def said(self) -> str:
-        """What it wrote to stderr."""
+        """Text that the process wrote to stderr."""
         self._errors.seek(0)
         return self._errors.read()
 
@@ -137,14 +137,14 @@ class Follower:
 
 
 def run(folder: Path, faults: tuple[str, ...], repetitions: int, seed: int) -> list[Row]:
-    """Two rows for each fault and repetition; one for those that pass by themselves."""
+    """Try each fault repeatedly; give two rows per fault and repetition, one for faults that pass by themselves."""
     rng = np.random.default_rng(seed)
     jobs = [(fault, number) for number in range(repetitions) for fault in faults]
     rows: list[Row] = []
     for rig in itertools.count():
         if not jobs:
             break
-        # A folder each: that a head's position may be lost is remembered beside the rig's files.
+        # A folder each, because the position-lost marker is stored beside the rig's files.
         files = folder / f"faults{rig}"
         with EmulatedRig(files, _tables()) as emulated:
             begun = time.monotonic()
@@ -158,27 +158,27 @@ def run(folder: Path, faults: tuple[str, ...], repetitions: int, seed: int) -> l
 
 
 def all_faults() -> tuple[str, ...]:
-    """All of the three devices; those that cost an emulator last."""
+    """List all faults of the three devices; those that end an emulator come last."""
     names = [f"{device}.{name}" for device, known in FAULTS.items() for name in known]
     return tuple(sorted(names, key=lambda name: name in ONCE))
 
 
 def directions(world_s: float) -> Array:
-    """Pan and tilt that point at the book at a time of the world, (2,) [degrees]."""
+    """Give pan and tilt that point at the book at a time of the world, (2,) [degrees]."""
     phase = np.arange(PERIOD_S / TABLE_S + 1) * TABLE_S
     return np.array([np.interp(world_s % PERIOD_S, phase, angles) for angles in _directions()])
 
 
 @functools.cache
 def _directions() -> Array:
-    """The same over one round, (2, n); from the path and the true calibration alone."""
+    """Compute pan and tilt over one round from the path and the true calibration, (2, n) [degrees]."""
     config = parse_config(_tables())
     calibration = exact_calibration(config)
     path = waypoint_path(config.sim.paths["book"])
     reach = Reach(*config.head_limits, config.focal_range_px)
     found = []
     for t in np.arange(PERIOD_S / TABLE_S + 1) * TABLE_S:
-        x, y, z = path.position(PERIOD_S + t)  # the first round begins from rest
+        x, y, z = path.position(PERIOD_S + t)  # skip the first round, which starts from rest
         there = aim(calibration, np.array([x, MOUNT - z, y]), reach)
         found.append((there.pan, there.tilt))
     return np.degrees(found).T
@@ -196,7 +196,7 @@ def _tables() -> dict[str, Any]:
 
 
 def _try(folder: Path, emulated: EmulatedRig, fault: str, rng: np.random.Generator) -> Iterator[Row]:
-    """The fault that passes, then the one that is held."""
+    """Try the fault that passes, then the one that is held."""
     ways = ["once"] if fault in ONCE else ["passed", "held"]
     while ways:
         with Follower(folder, emulated) as follower:
@@ -220,7 +220,7 @@ def _try(folder: Path, emulated: EmulatedRig, fault: str, rng: np.random.Generat
 
 
 def _follows(watch: Watch, follower: Follower) -> bool:
-    """Wait until the head has followed for a while; whether it does."""
+    """Wait until the head has followed for a while; give whether it did."""
     begun = time.monotonic()
     while follower.process.poll() is None and time.monotonic() < begun + START_S:
         watch.until(time.monotonic() + FOLLOWS_S, follower.process)
@@ -233,7 +233,7 @@ def _follows(watch: Watch, follower: Follower) -> bool:
 
 
 def _one(watch: Watch, follower: Follower, fault: str, way: str) -> Row:
-    """Switch a fault on, see what happens."""
+    """Switch a fault on, and record what happens."""
     process, emulated = follower.process, watch.emulated
     began = time.monotonic()
     emulated.switch(fault)
@@ -256,7 +256,7 @@ def _one(watch: Watch, follower: Follower, fault: str, way: str) -> Row:
     if ended is not None:
         watch.until(time.monotonic() + AFTER_S)
     stands = watch.standing(began)
-    rests = [(since, until) for since, until in watch.rests(began) if since < over + REST_S]  # later ones do not count
+    rests = [(since, until) for since, until in watch.rests(began) if since < over + REST_S]  # ignore later ones
     halted, recovered = math.nan, math.nan
     if stands is not None:
         outcome, halted = "ended" if ended is not None else "stands", stands - began

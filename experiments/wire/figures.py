@@ -1,4 +1,4 @@
-"""What the rows of `experiments.wire.wire` come to: each figure beside what is wanted, and what lies behind it."""
+"""Figures from the rows of `experiments.wire.wire`, beside their goals."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,25 +9,25 @@ import numpy as np
 from experiments.engine.harness import Row
 
 MS = 1e3
-SHARE = 0.9  # of the line's rate, at least
-AGE_MS, DRIFT_MS = 60.0, 10.0  # at most; a median of a third of the frames varies by some 3 ms
-BEYOND_MS = 25.0  # p95 of a command, beyond detection itself
-SETTLED_S = 0.5  # from a fault to a head that stands, or to recovery
+SHARE = 0.9  # least fraction of the line's rate
+AGE_MS, DRIFT_MS = 60.0, 10.0  # limits; a median over a third of the frames varies by about 3 ms
+BEYOND_MS = 25.0  # limit of p95 of a command, detection excluded
+SETTLED_S = 0.5  # limit of the time from a fault to a standing head, or to recovery
 LATENCY_MS = 10.0
 PARITY_STEPS = 1.0
-ROUNDING = 1e-6  # of steps that were angles in between
+ROUNDING = 1e-6  # rounding of steps that were converted to angles
 PARTS = ("in_hand", "detection", "aiming", "line", "total", "beyond")
 PART_COLUMNS = ("median [ms]", "p95 [ms]", "max [ms]")
 FAULT_COLUMNS = (
     "outcome", "settled [s]", "halted [s]", "recovered [s]", "moved [deg]", "beyond [deg]", "ended [s]", "hangs",
     "tracebacks", "runs",
 )  # fmt: skip
-AGAIN = "measured"  # how often, in the rows of what was measured more than once
+AGAIN = "measured"  # number of repetitions, in rows of what was measured more than once
 Figure = dict[str, Any]
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """Each figure, the parts of commands and ages, and each fault."""
+    """Compute each figure, the parts of commands and ages, and the result of each fault."""
     of: dict[str, list[Row]] = {}
     for row in rows:
         of.setdefault(row["figure"], []).append(row)
@@ -62,12 +62,12 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def missed(summary: Mapping[str, Any]) -> list[str]:
-    """The figures that are not what is wanted."""
+    """List the figures that miss their goal."""
     return [name for name, figure in summary["figures"].items() if not figure["reached"]]
 
 
 def bounded(summary: Mapping[str, Any]) -> dict[str, float]:
-    """What was measured, under names that do not tell what it was measured to be."""
+    """Give the measured values by names without values."""
     return {
         name.partition(":")[0] if name.startswith("latency") else name: figure["measured"]
         for name, figure in summary["figures"].items()
@@ -75,12 +75,12 @@ def bounded(summary: Mapping[str, Any]) -> dict[str, float]:
 
 
 def at_most(measured: float, wanted: float, unit: str) -> Figure:
-    """A figure that shall not be larger."""
+    """Make a figure with an upper limit."""
     return {"measured": measured, "wanted": f"<= {wanted:g}", "unit": unit, "reached": bool(measured <= wanted)}
 
 
 def at_least(measured: float, wanted: float, unit: str) -> Figure:
-    """A figure that shall not be smaller."""
+    """Make a figure with a lower limit."""
     return {"measured": measured, "wanted": f">= {wanted:g}", "unit": unit, "reached": bool(measured >= wanted)}
 
 
@@ -92,7 +92,7 @@ def _by(rows: Iterable[Row], *names: str) -> dict[str, list[Row]]:
 
 
 def _parts(of: dict[str, list[Row]]) -> dict[str, dict[str, float]]:
-    """Median, p95 and longest of what a command and an age consist of."""
+    """Give median, p95 and longest of the parts of a command and of an age."""
     values = {
         f"{name}: {part}": [row[f"{part}_s"] for row in mine]
         for name, mine in _by(of.get("command", []), "target").items()
@@ -108,13 +108,13 @@ def _parts(of: dict[str, list[Row]]) -> dict[str, dict[str, float]]:
 
 
 def _fault(rows: Sequence[Row]) -> dict[str, Any]:
-    """The worst of a fault's repetitions."""
+    """Give the worst of a fault's repetitions."""
 
     def worst(name: str) -> float:
         values = [float(row.get(name, math.nan)) for row in rows]
         return float(np.nanmax(values)) if np.isfinite(values).any() else math.nan
 
-    # Who never began to follow has settled nothing.
+    # A run that never followed cannot have settled.
     started = all("settled_s" in row for row in rows)
     said = (
         "/".join(sorted({row["outcome"] for row in rows})),

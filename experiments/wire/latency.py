@@ -1,9 +1,9 @@
-"""The latencies that `cotarget latency` finds over the wire, beside what they really are.
+"""Latencies measured by `cotarget latency` over the wire, against their true values.
 
-Truth of a camera's frame is when it arrived less when its light fell: a thread asks the emulator all the time when the
-light of each camera's newest picture fell and when it was published, and a frame shows the newest picture that had been
-published when it arrived: what the wire adds is far shorter than a period.
-Truth of a command is when its last byte was on the wire, and the configured delay from there, after it was given.
+A camera frame's true latency is its arrival time minus the exposure time of its picture. A thread polls the emulator
+for the exposure and publication times of each camera's newest picture; a frame shows the newest picture that was
+published when it arrived, because the wire adds far less than a period. A command's true delay is the time until its
+last byte was on the wire, plus the configured delay.
 """
 
 import bisect
@@ -22,31 +22,31 @@ from experiments.wire.command import ORDER, Notes, TimedHead, Turn, open_tapped
 from experiments.wire.polls import BYTES_S
 from experiments.wire.rig import EmulatedRig, Tap, exact_calibration, load
 
-LOOK_S = 0.01  # between questions for the newest exposures [s]
+LOOK_S = 0.01  # polling interval of the newest exposures [s]
 CAMERAS = ("fixed", "zoom")
 
 
 @dataclass
 class Exposures:
-    """Those of one camera: when each picture was published, and when its light fell, in order [s]."""
+    """Exposures of one camera: when each picture was published and exposed, in order [s]."""
 
     published: list[float] = field(default_factory=list)
     exposed: list[float] = field(default_factory=list)
 
     def add(self, exposed: float, published: float) -> None:
-        """Note the newest."""
+        """Add the newest exposure."""
         if not self.published or published > self.published[-1]:
             self.published.append(published)
             self.exposed.append(exposed)
 
     def before(self, arrived: float) -> float:
-        """The newest that could be seen by then [s]; nan if none could."""
+        """Give the newest exposure that was visible at a time [s]; nan if none was."""
         found = bisect.bisect_right(self.published, arrived)
         return self.exposed[found - 1] if found else math.nan
 
 
 class Watcher:
-    """Asks an emulator for exposures, on a connection and a thread of its own; a context manager."""
+    """Polls an emulator for exposures, on its own connection and thread; a context manager."""
 
     def __init__(self, emulated: EmulatedRig) -> None:
         self._emulated = emulated
@@ -70,7 +70,7 @@ class Watcher:
 
 
 class NotedCamera:
-    """A camera that keeps the times of its frames."""
+    """Camera that records the times of its frames."""
 
     def __init__(self, camera: ZoomCamera) -> None:
         self._camera = camera
@@ -80,18 +80,18 @@ class NotedCamera:
         return getattr(self._camera, name)
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        """The camera's."""
+        """Read a frame from the camera."""
         frame = self._camera.read(newer_than, timeout)
         self.times.add(frame.t)
         return frame
 
     def state(self) -> ZoomState:
-        """The camera's."""
+        """Give the camera's zoom state."""
         return self._camera.state()
 
 
 class NotedRig:
-    """A rig whose cameras and head note what is asked of them; its owner closes it."""
+    """Rig whose cameras and head record their calls; its owner closes it."""
 
     def __init__(self, rig: Rig, notes: Notes) -> None:
         self.fixed, self.zoom = NotedCamera(rig.fixed), NotedCamera(rig.zoom)  # type: ignore[arg-type]
@@ -99,17 +99,17 @@ class NotedRig:
 
 
 class NotedHead(TimedHead):
-    """Notes each move as a turn of its own."""
+    """Head that records each move as a separate turn."""
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
-        """The head's."""
+        """Command the head."""
         now = self._notes.clock.now()
         self._notes.turns.append(Turn(now, now))
         return super().move(pan, tilt, speed, wait)
 
 
 def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
-    """One row for each camera and for the head's commands."""
+    """Measure all latencies; give a row for each camera and for the head's commands."""
     with EmulatedRig(folder / "latency", {"sim": {"scene": "outdoor"}}) as emulated, Watcher(emulated) as watcher:
         config = emulated.config()
         hardware = config.hardware
@@ -146,13 +146,13 @@ def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
 
 
 def _truth(camera: NotedCamera, latency_s: float, exposures: Exposures) -> list[float]:
-    """From light to each frame of a camera [s]."""
+    """Give the true time from exposure to arrival of each frame of a camera [s]."""
     arrived = [t + latency_s for t in sorted(camera.times)]
     return [t - exposures.before(t) for t in arrived]
 
 
 def _commands(notes: Notes, tap: Tap, delay_s: float) -> list[float]:
-    """From each move's call to the motion that its pan ordered [s]."""
+    """Give the true time from each move's call to the motion of its pan [s]."""
     pans = [(t, len(data)) for t, data in tap.written if ORDER.fullmatch(data) and data.startswith(b"PP")]
     found = []
     for turn in notes.turns:

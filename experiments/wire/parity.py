@@ -1,8 +1,8 @@
-"""Whether the simulation opened directly and through the wire ends up aiming alike at a book that hangs still.
+"""Parity of the simulation opened directly and over the wire: the head's final aim at a static book.
 
-A still book is turned a little to and fro by the simulation, so both look at the same times of the world. The wire's
-zoom camera streams smaller pictures: the book is wanted smaller there by as much, or the lens would stand elsewhere,
-and with it its optical axis.
+The simulation swings the book a little, so that both runs must look at the same times of the world. The wire's zoom
+camera streams smaller pictures. The book's wanted size is reduced in proportion; otherwise the lens would be at another
+position, with another optical axis.
 """
 
 from pathlib import Path
@@ -22,19 +22,19 @@ from experiments.engine.harness import Row
 from experiments.wire.rig import LONGEST_S, MOUNT, EmulatedRig, exact_calibration, load
 
 NAME = "book"
-DISTANCE = (5.0, 9.0)  # of the book [m]
-SIDE, HEIGHT = 0.3, 0.12  # of its distance, to each side of the fixed camera's axis
-SETTLED_S = 1.0  # at the end, over which the head's angles count [s]
+DISTANCE = (5.0, 9.0)  # range of the book's distance [m]
+SIDE, HEIGHT = 0.3, 0.12  # largest offset from the fixed camera's axis, relative to the distance
+SETTLED_S = 1.0  # averaging time of the head's angles at the end [s]
 
 
 def run(folder: Path, places: int, seconds: float, seed: int) -> list[Row]:
-    """One row a place."""
+    """Compare several places; give a row per place."""
     rng = np.random.default_rng(seed)
     return [_one(folder / f"parity_{number}", number, place(rng), seconds) for number in range(places)]
 
 
 def place(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Somewhere in view, x, y, z in the world [m]."""
+    """Draw a place in view, x, y, z in the world [m]."""
     y = rng.uniform(*DISTANCE)
     return float(rng.uniform(-SIDE, SIDE) * y), float(y), float(MOUNT + rng.uniform(-HEIGHT, HEIGHT) * y)
 
@@ -61,7 +61,7 @@ def _one(folder: Path, number: int, at: tuple[float, float, float], seconds: flo
 
 
 def _aims(rig: Rig, config: RigConfig, calibration: Calibration, seconds: float) -> np.ndarray:
-    """Pan and tilt of the head at the end of following, (n, 2) [rad]."""
+    """Follow the book; give pan and tilt of the head at the end, (n, 2) [rad]."""
     target = config.target(NAME)
     detector = make_detector(target, config.rate_hz)
     settings = FollowSettings.of(config)

@@ -1,4 +1,4 @@
-"""How often the pan-tilt unit's position is polled over a paced pseudo-terminal, beside what the line could carry."""
+"""Polling rate of the pan-tilt unit's position over a paced pseudo-terminal, against the line's capacity."""
 
 import time
 from dataclasses import replace
@@ -17,40 +17,40 @@ from experiments.wire.rig import EmulatedRig, Tap, beside, load, tapped
 
 BAUD, BITS = 9600, 10
 BYTES_S = BAUD / BITS
-NEAR, FAR = (0, 0), (-3000, -1500)  # steps of pan and tilt; the latter take the most digits that a D46's can
-PAN_DEG, TILT_DEG = (-180.0, 180.0), (-79.97, 29.98)  # of D46_PAPER
+NEAR, FAR = (0, 0), (-3000, -1500)  # steps of pan and tilt; the latter have the most digits of a D46's
+PAN_DEG, TILT_DEG = (-180.0, 180.0), (-79.97, 29.98)  # ranges of D46_PAPER
 UNIT = HardwareHead(baud=BAUD, pan_deg=PAN_DEG, tilt_deg=TILT_DEG, speed_deg_s=100.0)
-QUESTION = b"PP "  # each begins a pair
+QUESTION = b"PP "  # first query of a pair
 
 
 class Standing:
-    """An axis that stands; an `AxisPlant`."""
+    """Axis at rest; an `AxisPlant`."""
 
     def __init__(self, position: int) -> None:
         self._position = position
 
     def command(self, goal: int, speed: float, acceleration: float) -> None:
-        """Be there."""
+        """Go to the goal at once."""
         self._position = goal
 
     def halt(self, acceleration: float) -> None:
-        """Stand on."""
+        """Stay at rest."""
 
     def position(self) -> int:
-        """Where it is."""
+        """Position [steps]."""
         return self._position
 
     def speed(self) -> float:
-        """None."""
+        """Speed, which is zero."""
         return 0.0
 
     def moving(self) -> bool:
-        """Never."""
+        """Whether it moves, which is never."""
         return False
 
 
 def serve(pipe: Connection, position: tuple[int, int]) -> None:
-    """A unit on a pseudo-terminal in a process of its own, until somebody says something."""
+    """Emulate a unit on a pseudo-terminal in another process, until the pipe receives something."""
     pan, tilt = map(Standing, position)
     with SerialLine(D46(pan, tilt, D46_PAPER, Faults(D46_FAULTS), time.monotonic), BAUD) as line:
         pipe.send(line.port)
@@ -58,20 +58,20 @@ def serve(pipe: Connection, position: tuple[int, int]) -> None:
 
 
 def poll_alone(position: tuple[int, int], seconds: float) -> Row:
-    """Poll a unit that stands there, with nothing beside it."""
+    """Poll a unit at rest, with no other load."""
     with beside(serve, position) as port:
         name = "alone, {} and {} steps".format(*position)
         return _poll(name, replace(UNIT, port=port), seconds)
 
 
 def poll_in_world(folder: Path, seconds: float) -> Row:
-    """Poll the unit of an emulated rig, which renders both cameras meanwhile."""
+    """Poll the unit of an emulated rig while both cameras are rendered."""
     with EmulatedRig(folder, {"sim": {"scene": "outdoor", "targets": ["person"]}}) as emulated:
         return _poll("beside the rendering world", emulated.config().hardware.head, seconds)
 
 
 def run(folder: Path, seconds: float) -> list[Row]:
-    """One row each."""
+    """Measure all cases; give a row per case."""
     rows = [poll_alone(NEAR, seconds), poll_alone(FAR, seconds), poll_in_world(folder / "polls", seconds)]
     return [{"figure": "polls", **row, "load": load()} for row in rows]
 

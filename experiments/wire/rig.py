@@ -1,4 +1,4 @@
-"""An emulated rig in a process of its own, who switches its faults and knows its truth, and its exact calibration."""
+"""Emulated rig in another process, with its faults, its ground truth and its exact calibration."""
 
 import contextlib
 import json
@@ -25,23 +25,23 @@ from cotarget.errors import DeviceError
 from cotarget.evaluation import true_calibration
 from cotarget.sim.world import SimWorld
 
-READY, CONTROL = "connects to them", "control "  # what the command says when it is up, and where its faults are
-LONGEST_S = 3600  # an emulator whose parent was killed outright ends by itself then [s]
-END_S = 15.0  # for a process to end when it is asked to [s]
-ANSWER_S = 10.0  # for an answer of the control socket [s]
-STOPS = 17  # focal lengths of the exact calibration; in between its spline is smoother than any lens
+READY, CONTROL = "connects to them", "control "  # output when it is ready, and prefix of the control socket
+LONGEST_S = 3600  # lifetime of an emulator whose parent was killed [s]
+END_S = 15.0  # timeout of a process's end [s]
+ANSWER_S = 10.0  # timeout of the control socket's answer [s]
+STOPS = 17  # zoom samples of the exact calibration; its spline between them is smoother than any lens
 MOUNT = 1.6  # height of the fixed camera in every scene [m]
 
 
 class EmulatedRig:
-    """`cotarget emulate` of a simulated rig, until it is closed; a context manager.
+    """Process of `cotarget emulate` with a simulated rig, until it is closed; a context manager.
 
     Args:
-        folder: for its files.
-        tables: of the simulated rig's rig.toml.
+        folder: folder for its files.
+        tables: tables of the simulated rig's rig.toml.
 
     Raises:
-        DeviceError: it does not start.
+        DeviceError: the process does not start.
     """
 
     def __init__(self, folder: Path, tables: Mapping[str, Any]) -> None:
@@ -60,18 +60,18 @@ class EmulatedRig:
             raise
 
     def rig_toml(self) -> Path:
-        """The rig.toml that connects to it now: a head that was unplugged comes back under another name."""
+        """Path of the rig.toml that connects to it now; a head that was unplugged returns under another name."""
         tables = tomllib.loads(self._written.read_text(encoding="utf-8"))
         tables["hardware"]["head"]["port"] = self.truth()["port"]
         self._written.write_text(tomli_w.dumps(tables), encoding="utf-8")
         return self._written
 
     def config(self) -> RigConfig:
-        """The same, read."""
+        """Configuration from that rig.toml."""
         return load_config(self.rig_toml())
 
     def truth(self) -> dict[str, Any]:
-        """What is really so now."""
+        """Give the current ground truth."""
         return self._ask({"truth": True})
 
     def switch(self, fault: str, on: bool = True) -> None:
@@ -79,7 +79,7 @@ class EmulatedRig:
         self._ask({"fault": fault, "on": on})
 
     def close(self) -> None:
-        """End it; more than once does no harm."""
+        """End the process; safe to call more than once."""
         if hasattr(self, "_connection"):
             self._connection.close()
         end(self._process)
@@ -123,7 +123,7 @@ class EmulatedRig:
 
 
 def end(process: "subprocess.Popen[str]") -> None:
-    """Ask it to end, and if that does not help, more. Not by Ctrl-C, which who runs in the background does not hear."""
+    """Terminate a process, then kill it if needed; not by SIGINT, which background processes ignore."""
     if process.poll() is None:
         process.terminate()
         try:
@@ -134,19 +134,19 @@ def end(process: "subprocess.Popen[str]") -> None:
 
 
 def exact_calibration(config: RigConfig) -> Calibration:
-    """The exact calibration of a simulated rig, over the whole range of its lens."""
+    """Give the exact calibration of a simulated rig over the whole range of its lens."""
     return true_calibration(SimWorld(config, rendered=()), STOPS if config.sim.effects.optics else 1)
 
 
 @dataclass
 class Tap:
-    """A serial port that notes what goes through it.
+    """Serial port that records its traffic.
 
     Attributes:
-        port: the real one.
-        clock: the rig's.
-        written: each piece that was sent, and when its first byte was [s].
-        received: how many bytes came.
+        port: real port.
+        clock: clock of the rig.
+        written: each piece that was sent, with the time of its first byte [s].
+        received: number of bytes received.
     """
 
     port: Any
@@ -158,20 +158,20 @@ class Tap:
         return getattr(self.port, name)
 
     def read(self, size: int = 1, /) -> bytes:
-        """What the port has."""
+        """Read from the port."""
         data: bytes = self.port.read(size)
         self.received += len(data)
         return data
 
     def write(self, data: bytes, /) -> Any:
-        """Send, and note it."""
+        """Write to the port, and record it."""
         self.written.append((self.clock.now(), data))
         return self.port.write(data)
 
 
 @contextlib.contextmanager
 def tapped(clock: Any) -> Iterator[list[Tap]]:
-    """While it lasts, each serial port that the driver of the head opens is tapped; the taps so far."""
+    """Tap each serial port that the head's driver opens inside the block; yield the taps so far."""
     taps: list[Tap] = []
 
     def tap(name: str, baud: int) -> Any:
@@ -184,14 +184,14 @@ def tapped(clock: Any) -> Iterator[list[Tap]]:
 
 @contextlib.contextmanager
 def beside(serve: Callable[..., None], *arguments: Any) -> Iterator[Any]:
-    """Run a server in a process of its own, while it lasts; what it says first.
+    """Run a server in another process inside the block; yield its first message.
 
     Args:
-        serve: gets a pipe and the arguments, says where it is, and ends when it is told something.
-        arguments: must be fit for another process.
+        serve: function that gets a pipe and the arguments, sends its address, and ends when it receives something.
+        arguments: arguments that can be pickled.
 
     Raises:
-        DeviceError: it ended without a word.
+        DeviceError: the process ended without a message.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
@@ -212,12 +212,12 @@ def beside(serve: Callable[..., None], *arguments: Any) -> Iterator[Any]:
 
 
 def _ignoring_interrupts(serve: Callable[..., None], pipe: Connection, arguments: tuple[Any, ...]) -> None:
-    """Ctrl-C reaches every process; this one ends when the one that started it says so, or is gone."""
+    """Run the server without reaction to Ctrl-C, which reaches every process; its parent ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(EOFError):
         serve(pipe, *arguments)
 
 
 def load() -> float:
-    """How many processes wait for the machine's cores, over the last minute."""
+    """Give the average number of processes that wait for a core, over the last minute."""
     return os.getloadavg()[0]

@@ -1,13 +1,13 @@
-"""How the hardware backend does over the wire, through the emulated devices: the figures of the step that built it.
+"""Hardware backend over the wire, with emulated devices.
 
-- polls: pairs of D46 positions a second at 9600 baud over a paced pseudo-terminal, beside what the line can carry.
-- age: of the newest Axis frame at a consumer of 5 Hz, from its first byte sent.
-- command: from a frame's arrival to the first byte of the command on the wire, in its parts.
-- faults: from each fault of the emulated devices to a head that stands, or to recovery.
-- latency: of cameras and commands, as they are measured at bring-up, against the emulator's truth.
-- parity: where the head ends up, the simulation opened directly and through the wire.
+- polls: pairs of D46 positions a second at 9600 baud over a paced pseudo-terminal, against the line's capacity.
+- age: age of the newest Axis frame at a consumer of 5 Hz, from the first byte sent.
+- command: time from a frame's arrival to the first byte of the command on the wire, in its parts.
+- faults: time from each fault of the emulated devices to a standing head, or to recovery.
+- latency: latencies of cameras and commands as measured at bring-up, against the emulator's truth.
+- parity: final pose of the head, the simulation opened directly and over the wire.
 
-All run in real time beside the emulator, which needs a core of its own: figures from a busy machine are its own.
+All run in real time beside the emulator, which needs its own core. On a busy machine the figures include its load.
 
     python -m experiments.wire.wire [--only NAME ...] [--seed-base 0] [--quick] [--out DIR]
 """
@@ -30,26 +30,26 @@ from experiments.wire import age, command, latency, parity, polls
 from experiments.wire import faults as faults_module
 from experiments.wire.figures import AGAIN, FAULT_COLUMNS, PART_COLUMNS, bounded, missed, summarise
 
-NEVER = (0.0, 0.0)  # the bound of what no machine may do, however busy: hang, move beyond the limits
+NEVER = (0.0, 0.0)  # bound of what must never happen, on any machine: hanging, or moving beyond the limits
 
 
 @dataclass(frozen=True)
 class WireSettings(Settings):
-    """Which figures, and how long each is measured.
+    """Settings: figures and durations of their measurement.
 
     Attributes:
-        only: the figures.
+        only: figures to measure.
         poll_s: polling of one unit [s].
-        age_s: the consumer of the stream [s].
-        targets: that are followed to time commands.
-        command_s: how long, each [s].
-        faults: of the devices; all, if none is named.
-        repetitions: of each fault.
-        wiggle_s: of the head [s].
-        swing_s: of the board [s].
-        places: of the book that hangs still.
-        still_s: how long each is followed [s].
-        tries: how often a figure is measured at most, where a busy machine has spoilt it.
+        age_s: reading of the stream [s].
+        targets: targets that are followed to time commands.
+        command_s: following of each target [s].
+        faults: faults of the devices; all if empty.
+        repetitions: repetitions of each fault.
+        wiggle_s: turning of the head [s].
+        swing_s: swinging of the board [s].
+        places: places of the static book.
+        still_s: following at each place [s].
+        tries: largest number of measurements of a figure that a busy machine has disturbed.
     """
 
     only: tuple[str, ...] = ("polls", "age", "command", "faults", "latency", "parity")
@@ -66,19 +66,19 @@ class WireSettings(Settings):
     tries: int = 1
 
     def __post_init__(self) -> None:
-        """Refuse a fault that there is not."""
+        """Refuse unknown faults."""
         super().__post_init__()
         if unknown := sorted(set(self.faults) - set(faults_module.all_faults())):
             raise ConfigError(f"faults: {unknown[0]!r} is not one of: {choices(faults_module.all_faults())}")
 
 
 def jobs(settings: WireSettings) -> Sequence[int]:
-    """A job for each figure, by its number among those asked for."""
+    """Give a job for each figure, by its index in ``only``."""
     return range(len(settings.only))
 
 
 def one(_: None, settings: WireSettings, number: int) -> list[Row]:
-    """All rows of one of the figures, of the last time that it was measured; of a second and later one they tell."""
+    """Measure one of the figures; give the rows of the last measurement, with its number if it was repeated."""
     for time in range(1, settings.tries + 1):
         with TemporaryDirectory(prefix="cotarget-wire-") as name:
             rows = RUNS[settings.only[number]](settings, Path(name))
@@ -88,7 +88,7 @@ def one(_: None, settings: WireSettings, number: int) -> list[Row]:
 
 
 def _spoilt(rows: Sequence[Row]) -> bool:
-    """Whether times are beyond their bounds, as on a busy machine; not where what must never be is."""
+    """Check whether only bounds on times are exceeded, as on a busy machine, and none on what must never happen."""
     summary = summarise(rows)
     measured = bounded(summary)
     broken = [each for each in compare(EXPERIMENT, summary) if each.name in measured and not each.kept]
@@ -108,7 +108,7 @@ RUNS: Mapping[str, Callable[[WireSettings, Path], list[Row]]] = {
 
 
 def describe(settings: WireSettings, summary: Mapping[str, Any]) -> str:
-    """The tables."""
+    """Format the figures as tables."""
     found = summary["figures"]
     texts = [
         table(
@@ -160,7 +160,7 @@ EXPERIMENT = Experiment(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command."""
+    """Run the command."""
     parser = Parser(prog="python -m experiments.wire.wire", description=EXPERIMENT.purpose)
     parser.add_argument("--only", nargs="+", choices=tuple(RUNS), default=SETTINGS.only, metavar="NAME", help="figures")
     parser.add_argument("--fault", nargs="+", choices=faults_module.all_faults(), metavar="DEVICE.FAULT", help="these")
@@ -174,7 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings = replace(settings, faults=tuple(given.fault))
     if given.repetitions is not None:
         settings = replace(settings, repetitions=given.repetitions)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))  # so that the emulated devices end too
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))  # ends the emulated devices too
     return EXPERIMENT.report(settings, given.out, quick=given.quick)
 
 

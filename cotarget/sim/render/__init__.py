@@ -1,1 +1,1 @@
-"""Offscreen rendering of both cameras."""
+"""Offscreen rendering of both cameras: optics, exposure and sensor."""

@@ -1,4 +1,7 @@
-"""MuJoCo with an offscreen OpenGL that works without a screen; import mujoco from here before anything renders."""
+"""MuJoCo with an offscreen OpenGL backend that needs no screen.
+
+Import ``mujoco`` from this module before anything renders: it sets MUJOCO_GL, which mujoco reads when it is imported.
+"""
 
 import contextlib
 import ctypes.util
@@ -21,15 +24,15 @@ INSTALL = {
     "osmesa": "install it: apt-get install -y libosmesa6, or unset MUJOCO_GL",
 }
 OTHERWISE = "unset MUJOCO_GL to render without a screen"
-# An environment variable: a file that each picture makes longer by a byte, drawn by whatever process. It counts what a
-# program's processes draw, those included that are killed.
+# Environment variable: a file that grows by one byte with each picture drawn, in any process. It also counts the
+# pictures of processes that are killed.
 TALLY = "COTARGET_TALLY"
 
 
 def choose_backend() -> str:
-    """Set MUJOCO_GL, where the user has not, to the first offscreen backend whose library is on this machine.
+    """Set MUJOCO_GL, unless the user has, to the first offscreen backend whose library is installed.
 
-    Must run before mujoco is imported, because it reads the variable then.
+    Must run before mujoco is imported, because mujoco reads the variable then.
     """
     chosen = os.environ.get("MUJOCO_GL", "")
     if not chosen and sys.platform == "linux":
@@ -53,9 +56,9 @@ def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.R
     """Open an offscreen renderer on this thread.
 
     Raises:
-        DeviceError: the machine has no OpenGL that can do it, or this process has inherited one.
+        DeviceError: the machine has no suitable OpenGL, or this process was forked from one that has rendered.
     """
-    if _first_process() != os.getpid() and BACKEND != "osmesa":  # it would wait for threads that were not inherited
+    if _first_process() != os.getpid() and BACKEND != "osmesa":  # it would wait for threads that a fork does not copy
         raise DeviceError(
             "a process that was forked after something was rendered cannot render; start it with the method 'spawn', "
             "as AsyncVectorEnv(..., context='spawn') does"
@@ -75,13 +78,13 @@ def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.R
 
 @cache
 def _first_process() -> int:
-    """The number of the first process that opens OpenGL, which those that it forks inherit."""
+    """Give the id of the first process that opens OpenGL; a forked process inherits the value."""
     return os.getpid()
 
 
 @cache
 def renderer_version() -> str:
-    """Who draws, and its version, as OpenGL names them: pictures differ with it; empty where there is none."""
+    """Give OpenGL's renderer and version, on which pictures depend; empty where there is no OpenGL."""
     with contextlib.suppress(Exception):  # PyOpenGL and the backends raise whatever they meet
         context = mujoco.GLContext(8, 8)
         try:
@@ -94,11 +97,10 @@ def renderer_version() -> str:
 
 
 class Canvas:
-    """An offscreen renderer that draws any pinhole view, or a part of one, of a size up to its own.
+    """Offscreen renderer that draws a pinhole view, or a part of one, of any size up to its own.
 
     Attributes:
-        drawn: how many pictures all canvases of this process have drawn so far, for those who count the cost; a part of
-            a picture counts as that part.
+        drawn: number of pictures that all canvases of this process have drawn; a part of a picture counts as that part.
     """
 
     drawn: ClassVar[float] = 0.0
@@ -107,12 +109,12 @@ class Canvas:
         """Open OpenGL on this thread.
 
         Args:
-            model: what is drawn.
+            model: compiled model to draw.
             size: (width, height) of the largest picture [px].
-            shadows: whether lights cast them.
+            shadows: whether lights cast shadows.
 
         Raises:
-            DeviceError: the machine has no OpenGL that can do it.
+            DeviceError: the machine has no suitable OpenGL.
         """
         self._model, self._size, self._shadows, self._told = model, size, shadows, _told(model)
         self._renderer: Any = make_renderer(model, *size)
@@ -122,7 +124,7 @@ class Canvas:
         self._others: list[Canvas] = []
 
     def without_multisampling(self) -> "Canvas":
-        """Another one that does not antialias, closed with this one."""
+        """Open a canvas of the same model that does not antialias; it is closed with this one."""
         if self._others:
             return self._others[0]
         quality = self._model.vis.quality
@@ -134,12 +136,12 @@ class Canvas:
         return self._others[0]
 
     def turn_to(self, model: "mujoco.MjModel") -> bool:
-        """Draw another model from now on, if it differs from the one before in its meshes' measures at most.
+        """Draw another model from now on, if it differs from the current one in mesh vertices at most.
 
-        To open OpenGL anew, with all textures, takes some hundred times as long.
+        Opening OpenGL again with all textures takes some hundred times as long.
 
         Returns:
-            Whether it does; nothing is changed where not.
+            Whether the model was accepted; otherwise nothing changes.
         """
         told = _told(model)
         if told != self._told or not np.array_equal(model.tex_data, self._model.tex_data):
@@ -154,12 +156,12 @@ class Canvas:
         return True
 
     def look(self, data: "mujoco.MjData", camera_id: int, layers: int) -> None:
-        """Take the scene as a camera of the model has it.
+        """Load the scene from a camera of the model.
 
         Args:
-            data: with everything's pose.
-            camera_id: the camera's number.
-            layers: geoms of so many groups are drawn, from group 0 on one group after the other.
+            data: data with the current poses.
+            camera_id: MuJoCo id of the camera.
+            layers: number of geom groups to draw, one after the other from group 0.
         """
         self._option.geomgroup[:] = np.arange(mujoco.mjNGROUP) == 0
         self._renderer.update_scene(data, camera_id, self._option)
@@ -180,13 +182,13 @@ class Canvas:
 
         Args:
             eye: optical centre in the world [m], (3,).
-            axes: the world's coordinates of right, down and forward, as columns, (3, 3).
-            tangents: of the picture's borders: left, right, bottom, top; right and up are positive.
+            axes: world coordinates of right, down and forward as columns, (3, 3).
+            tangents: tangents of the picture's borders: left, right, bottom, top; right and up are positive.
             size: (width, height) [px].
-            part: as how much of a picture it counts.
+            part: fraction of a picture that it counts as in `drawn`.
         """
         renderer, (left, right, bottom, top) = self._renderer, tangents
-        for camera in renderer.scene.camera:  # two for stereo; their mean is the view
+        for camera in renderer.scene.camera:  # MuJoCo keeps two for stereo; both get the same pose
             near = camera.frustum_near
             camera.pos, camera.forward, camera.up = eye, axes[:, 2], -axes[:, 1]
             camera.frustum_center, camera.frustum_width = near * (left + right) / 2, near * (right - left) / 2
@@ -206,13 +208,13 @@ class Canvas:
         return image[::-1]  # OpenGL's rows begin at the bottom
 
     def close(self) -> None:
-        """Release OpenGL; more than once does no harm."""
+        """Release OpenGL; safe to call more than once."""
         for canvas in (*self._others, self):
             canvas._renderer.close()
 
 
 def _told(model: "mujoco.MjModel") -> tuple[object, ...]:
-    """What OpenGL is told of a model once and for all, the textures aside: not where its meshes' vertices are."""
+    """List what is uploaded to OpenGL once for a model, except textures and mesh vertices."""
     visual, planes = model.vis, model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     return (
         *(model.ntex, model.nmesh, model.nhfield, model.nskin, model.stat.extent),

@@ -1,6 +1,6 @@
-"""The simulated lenses: true Brown-Conrady distortion, and the maps that bend a pinhole render into it.
+"""True optics of the simulated lenses: Brown-Conrady distortion, and the maps that resample a pinhole render with it.
 
-Written apart from `cotarget.camera`, so that a mistake shared between the simulation and the fit cannot hide.
+Written independently of `cotarget.camera`, so that the simulation and the fit share no mistake.
 """
 
 import math
@@ -14,34 +14,33 @@ import numpy as np
 from cotarget.geometry import Array
 from cotarget.rig import Image
 
-# A render is finer than the lens's image in its middle by this. Bilinear interpolation moves an edge by up to 0.03 px,
-# inwards or outwards by where between two pixels of the render it falls. Were both equally fine, that would be the same
-# all around the axis: a fit took it for distortion, and for a focal length 0.02 % too short. As it is, everything comes
-# up within 33 px, and ever more quickly towards the rim.
+# A render is this much finer than the lens's image in its centre. Bilinear interpolation moves an edge by up to 0.03
+# px, depending on its phase between two pixels of the render. With equal fineness that phase is the same all around the
+# axis, and a fit takes it for distortion. With 1.03, all phases occur within 33 px. Measurements: docs/design-notes.md.
 FINENESS = 1.03
 # The map is computed at every fourth pixel and interpolated: a distortion of k1 = -0.2 curves by less than
-# 6 |k1| r / f a pixel, so this costs at most 0.005 px, in the corners.
+# 6 |k1| r / f a pixel, so that this costs at most 0.005 px, in the corners.
 MAP_STRIDE = 4
-REAL_ROOT = 1e-9  # imaginary over absolute value of a root that is real but for rounding
-# Fields and maps are kept for the lens positions in use: the fixed camera's one and the zoom camera's latest.
+REAL_ROOT = 1e-9  # largest imaginary part over absolute value of a root that is real up to rounding
+# Cache sizes. Maps are cached for the lens positions in use: the fixed camera's and the zoom camera's latest.
 KEPT_MAPS = 8
-KEPT_FIELDS = 128  # a few numbers each; a rig that is built again and again asks for all its focal lengths
-# A fixed point: every round shrinks the error by about 3 |k1| r^2, less than 0.3 for the usual lenses.
+KEPT_FIELDS = 128  # fields of view are a few numbers each; a rig that is rebuilt often asks for all its focal lengths
+# Fixed-point iteration: each round shrinks the error by about 3 |k1| r^2, less than 0.3 for usual lenses.
 UNDISTORT_ROUNDS = 60
-DIVERGED = 10.0  # times its smallest step: a lens that stretches by two and more makes plain steps grow
-UNDISTORTED = 1e-14  # step of the normalised coordinates at which it has converged
+DIVERGED = 10.0  # times the smallest step: plain steps grow for lenses that stretch by two and more
+UNDISTORTED = 1e-14  # step of the normalised coordinates at convergence
 
 
 @dataclass(frozen=True)
 class TrueLens:
-    """What a simulated camera's optics really do.
+    """True optics of a simulated camera.
 
     Attributes:
         size: (width, height) [px].
         focal_px: (fx, fy) [px].
         center_px: principal point [px].
         distortion: (k1, k2, p1, p2, k3).
-        pupil: where the optical centre, the lens's entrance pupil, is along z of the camera's body [m].
+        pupil: position of the optical centre (entrance pupil) along z of the camera's body [m].
     """
 
     size: tuple[int, int]
@@ -51,9 +50,9 @@ class TrueLens:
     pupil: float = 0.0
 
     def project(self, x_camera: Array) -> Array:
-        """Project points (..., 3) in the camera's frame to pixels (..., 2); not clipped to the image.
+        """Project points (..., 3) in the camera's frame to pixels (..., 2), not clipped to the image.
 
-        Pixels are nan behind the camera, and as far off its axis as the distortion has folded back.
+        Pixels are nan behind the camera, and beyond the angle at which the distortion folds back.
         """
         depth = np.where(x_camera[..., 2:] > 0, x_camera[..., 2:], np.nan)
         xy = x_camera[..., :2] / depth
@@ -61,7 +60,7 @@ class TrueLens:
         return np.where(seen[..., None], self.bend(xy) * self.focal_px + self.center_px, np.nan)
 
     def directions(self, pixels: Array) -> Array:
-        """Undistorted image-plane coordinates (x / z, y / z) of pixels, (..., 2)."""
+        """Undistort pixels (..., 2) to image-plane coordinates (x / z, y / z), (..., 2)."""
         bent = (pixels - self.center_px) / self.focal_px
         xy, most = bent, math.inf
         for _ in range(UNDISTORT_ROUNDS):
@@ -76,7 +75,7 @@ class TrueLens:
         return self._by_newton(bent)
 
     def _by_newton(self, bent: Array) -> Array:
-        """The same of distorted coordinates, (..., 2), where the lens stretches so much that plain steps go too far."""
+        """Undistort image-plane coordinates (..., 2) by Newton's method, for lenses whose plain steps diverge."""
         k1, k2, p1, p2, k3 = self.distortion
         xy = bent
         for _ in range(UNDISTORT_ROUNDS):
@@ -97,7 +96,7 @@ class TrueLens:
         return xy
 
     def bend(self, xy: Array) -> Array:
-        """Image-plane coordinates (x / z, y / z) as the lens distorts them, (..., 2)."""
+        """Distort image-plane coordinates (x / z, y / z), (..., 2)."""
         k1, k2, p1, p2, k3 = self.distortion
         x, y = xy[..., 0], xy[..., 1]
         r2 = x**2 + y**2
@@ -110,11 +109,11 @@ class TrueLens:
 
 @lru_cache(maxsize=KEPT_MAPS)
 def fold(distortion: tuple[float, float, float, float, float]) -> float:
-    """Tangent of the angle off the axis where the radial distortion begins to shrink; infinite if it never does."""
+    """Give the tangent of the off-axis angle at which radial distortion folds back; infinite if it never does."""
     k1, k2, _, _, k3 = distortion
     if k2 == k3 == 0.0:
         return float((-3 * k1) ** -0.5) if k1 < 0 else np.inf
-    # Where the slope of r (1 + k1 r^2 + k2 r^4 + k3 r^6) is zero, in r^2.
+    # Zeros of the slope of r (1 + k1 r^2 + k2 r^4 + k3 r^6), in r^2.
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     turns = roots.real[(np.abs(roots.imag) < REAL_ROOT * np.abs(roots)) & (roots.real > 0)]
     return float(np.sqrt(turns.min())) if len(turns) else np.inf
@@ -122,10 +121,10 @@ def fold(distortion: tuple[float, float, float, float, float]) -> float:
 
 @lru_cache(maxsize=KEPT_FIELDS)
 def covering_half_field(lens: TrueLens) -> tuple[float, float]:
-    """Tangents of the half field (horizontal, vertical) of a centred pinhole view that covers the whole image."""
+    """Give tangents of the half field (horizontal, vertical) of a centred pinhole view that covers the image."""
     w, h = lens.size
     u, v = np.linspace(-1, w, 41), np.linspace(-1, h, 31)
-    # The image's rim: a lens that does not fold sees farthest aside there.
+    # A lens that does not fold has its largest angles at the image's border.
     sides = [np.column_stack([u, np.full_like(u, y)]) for y in (-1, h)]
     sides += [np.column_stack([np.full_like(v, x), v]) for x in (-1, w)]
     reach = np.abs(lens.directions(np.concatenate(sides))).max(axis=0)
@@ -133,14 +132,14 @@ def covering_half_field(lens: TrueLens) -> tuple[float, float]:
 
 
 def covering_size(lenses: Sequence[TrueLens], least: tuple[int, int]) -> tuple[int, int]:
-    """A size that the covering views of all these lenses fit into, (width, height) [px], somewhat above the least."""
+    """Give a size (width, height) [px] for the covering views of all these lenses, somewhat above the least size."""
     bent = [_fine_size(lens) for lens in lenses if any(lens.distortion)]
     width, height = np.max([(least[0] + 3, least[1] + 3), *bent], axis=0).tolist()
     return width, height
 
 
 def _fine_size(lens: TrueLens) -> tuple[int, int]:
-    """Of a render that covers the lens's image and is `FINENESS` times as fine in its middle, (width, height) [px]."""
+    """Give (width, height) [px] of a render that covers a lens's image, `FINENESS` times as fine in its centre."""
     half = covering_half_field(lens)
     width, height = (math.ceil(2 * half[i] * FINENESS * lens.focal_px[i] + 2) for i in range(2))
     return width, height
@@ -148,7 +147,7 @@ def _fine_size(lens: TrueLens) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A view without distortion: size (width, height), focal length and centre [px]."""
+    """View without distortion: size (width, height), focal length and principal point [px]."""
 
     size: tuple[int, int]
     focal_px: tuple[float, float]
@@ -156,7 +155,7 @@ class Pinhole:
 
 
 def covering_view(lens: TrueLens, largest: tuple[int, int]) -> Pinhole:
-    """The view of which a distorting lens's image is made: `FINENESS` times as fine, or as fine as the largest size."""
+    """Give the view that a distorting lens's image is resampled from, `FINENESS` times as fine if size allows."""
     half = covering_half_field(lens)
     width, height = np.minimum(_fine_size(lens), largest).tolist()
     focal = min((width / 2 - 1) / half[0], (height / 2 - 1) / half[1])
@@ -167,22 +166,21 @@ def bend(render: Image, view: Pinhole, lens: TrueLens) -> Image:
     """Resample a pinhole render into the lens's image.
 
     Args:
-        render: of the view.
-        view: that covers all that the lens sees.
-        lens: the lens wanted.
+        render: image of the view.
+        view: pinhole view that covers everything in the lens's image.
+        lens: lens whose image is made.
     """
     return cv2.remap(render, _map(lens, view), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 @lru_cache(maxsize=KEPT_MAPS)
 def _map(lens: TrueLens, view: Pinhole) -> Array:
-    """For every pixel of the lens's image where to look in the pinhole render, (H, W, 2) float32."""
+    """Map each pixel of the lens's image to its position in the pinhole render, (H, W, 2) float32."""
     w, h = lens.size
     u, v = np.arange(0, w + MAP_STRIDE, MAP_STRIDE), np.arange(0, h + MAP_STRIDE, MAP_STRIDE)
     coarse = lens.directions(np.stack(np.meshgrid(u, v), axis=-1).astype(float)) * view.focal_px
     coarse += view.center_px
-    # Interpolate between the coarse samples exactly at multiples of the stride: an affine warp, not a resize,
-    # because a resize would shift by half a sample.
+    # Interpolate exactly at multiples of the stride: an affine warp, because a resize shifts by half a sample.
     scale = np.array([[1 / MAP_STRIDE, 0, 0], [0, 1 / MAP_STRIDE, 0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(coarse.astype(np.float32), scale, (w, h), flags=flags)

@@ -1,7 +1,7 @@
-"""What both cameras see at another size than that of their streams, rendered at that size and not scaled down to it.
+"""Both cameras rendered at another size than their streams, for users of many small pictures.
 
-For who wants many small pictures: the field of view is the streams', whatever the size's proportions. The effects of
-the configuration hold: the blur of an exposure, the sensor's noise and JPEG.
+The field of view is that of the streams, whatever the aspect ratio. The configured effects apply: exposure blur, sensor
+noise and JPEG. The pictures are rendered at the requested size and not scaled down to it.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,11 +16,11 @@ from cotarget.sim.render.views import Views
 from cotarget.sim.state import WorldState
 from cotarget.sim.truth import CameraName
 
-NOISE = {"fixed": 6, "zoom": 7}  # streams of random numbers, apart from the world's others
+NOISE = {"fixed": 6, "zoom": 7}  # random streams, separate from the world's others
 
 
 class SizedPictures:
-    """Renders both cameras of a world, for the thread that makes it."""
+    """Renderer of both cameras at one size; use it on the thread that makes it."""
 
     def __init__(
         self,
@@ -36,12 +36,13 @@ class SizedPictures:
 
         Args:
             sim: the world's configuration.
-            model: the compiled world; of its settings, the size of what is drawn changes.
-            state: brings it to a time.
-            lens_at: a camera's true optics at a time, for its stream's size.
-            lenses: all that there may be.
+            model: the compiled world; its offscreen buffer's size is changed.
+            state: moves the world to a time.
+            lens_at: gives a camera's true optics at a time, for its stream's size.
+            lenses: all lenses that may occur.
             size: (width, height) of the pictures [px].
-            before: of another world, as large; they are over, and what they had open is used where that can be.
+            before: renderer of another world, with the same size. It ends, and its OpenGL context is used again where
+                possible.
 
         Raises:
             DeviceError: the machine cannot render.
@@ -58,28 +59,28 @@ class SizedPictures:
         }
 
     def take(self, name: CameraName, t: float) -> Image:
-        """What a camera's frame of time t [s] shows, BGR, (height, width, 3)."""
+        """Render a camera's picture at time t [s], BGR, (height, width, 3)."""
         camera = self._cameras[name]
         exposure = camera.exposure_s if self._blurs else 0.0
         image = self._views.exposed(name, lambda when: _resized(self._lens_at(name, when), self._size), t, exposure)
         return self._sensors[name].expose(image, round(t * camera.rate_hz))
 
     def hand_over(self, model: "mujoco.MjModel") -> Canvas | None:
-        """What draws, for another model; None where it cannot draw that. These are over then."""
+        """Hand the canvas to another model, and end this renderer; None where the canvas cannot draw the model."""
         if self._views.canvas.turn_to(model):
             return self._views.canvas
         self.close()
         return None
 
     def close(self) -> None:
-        """Release OpenGL; more than once does no harm."""
+        """Release OpenGL; safe to call more than once."""
         self._views.close()
 
 
 def _resized(lens: TrueLens, size: tuple[int, int]) -> TrueLens:
-    """A lens with the same field of view and a picture of another size (width, height)."""
+    """Scale a lens to a picture of another size (width, height) with the same field of view."""
     across, down = (new / old for new, old in zip(size, lens.size, strict=True))
     (fx, fy), (cx, cy) = lens.focal_px, lens.center_px
-    # Pixels are counted from the first one's centre: the picture begins half a pixel before.
+    # The first pixel's centre is (0, 0), so that the image begins half a pixel before it.
     center = (cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5
     return TrueLens(size, (fx * across, fy * down), center, lens.distortion, lens.pupil)

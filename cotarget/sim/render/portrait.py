@@ -1,4 +1,4 @@
-"""Pictures of the simulated rig itself, from its MJCF, with the pixels of its frames' origins."""
+"""Pictures of the simulated rig itself, with the pixels of its frames' origins."""
 
 from dataclasses import dataclass
 
@@ -12,32 +12,32 @@ from cotarget.sim.render.opengl import make_renderer, mujoco
 FIELD_DEG = 40.0
 ELEVATION_DEG = -18.0
 CLOSEST = 1.25  # [m]
-FILL = 2.2  # distance over the rig's extent
+FILL = 2.2  # ratio of the viewing distance to the rig's extent
 FRAMES = ("fixed", "zoom", "base")
 
 
 @dataclass(frozen=True)
 class Portrait:
-    """A picture of the rig, (H, W, 3) BGR, and where the origins of its frames are in it, (2,) [px] each."""
+    """Picture of the rig, (H, W, 3) BGR, and the pixels of its frames' origins, (2,) each."""
 
     image: Image
     origins_px: dict[str, Array]
 
 
 def portrait(model: "mujoco.MjModel", data: "mujoco.MjData", azimuth_deg: float, axes: bool) -> Portrait:
-    """Picture the rig as the world's state has it.
+    """Render the rig in its current state.
 
     Args:
         model: the compiled world.
-        data: its state.
-        azimuth_deg: direction to look in, 90 is the world's +y [degrees].
+        data: state of the world.
+        azimuth_deg: direction of view; 90 is the world's +y [degrees].
         axes: whether the frames' axes are drawn (x red, y green, z blue).
     """
     origins = {name: np.array(data.body(RIG + name).xpos) for name in FRAMES}
     points = np.array(list(origins.values()))
     camera = mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-    camera.lookat = points.mean(axis=0) - [0.0, 0.0, 0.12]  # the unit's body hangs below the frames
+    camera.lookat = points.mean(axis=0) - [0.0, 0.0, 0.12]  # the body of the pan-tilt unit is below the frames
     camera.distance = max(CLOSEST, FILL * float(np.linalg.norm(np.ptp(points, axis=0))))
     camera.azimuth, camera.elevation = azimuth_deg, ELEVATION_DEG
     option = mujoco.MjvOption()
@@ -58,8 +58,8 @@ def portrait(model: "mujoco.MjModel", data: "mujoco.MjData", azimuth_deg: float,
 
 
 def _project(scene: "mujoco.MjvScene", x_world: Array) -> Array:
-    """Pixel of a point in a free camera's render, (2,)."""
-    left, right = scene.camera[0], scene.camera[1]  # MuJoCo keeps two for stereo; their middle is the view
+    """Project a point of the world into a free camera's render, (2,) [px]."""
+    left, right = scene.camera[0], scene.camera[1]  # MuJoCo keeps two for stereo; their mean is the view
     forward, up = np.array(left.forward), np.array(left.up)
     offset = x_world - (np.array(left.pos) + np.array(right.pos)) / 2
     focal = PORTRAIT_SIZE[1] / 2 / np.tan(np.radians(FIELD_DEG) / 2)

@@ -1,4 +1,4 @@
-"""What a simulated sensor and its link do to an image: noise and JPEG, the same for the same seed and frame."""
+"""Sensor noise and JPEG coding of a simulated camera; the same seed and frame number give the same image."""
 
 import functools
 
@@ -9,13 +9,13 @@ import numpy.typing as npt
 from cotarget.config import SimCamera, SimEffects
 from cotarget.rig import Image
 
-# Fresh Gaussian noise for every frame costs more than the frame; a few prepared fields, shifted at random, do not.
+# Fresh Gaussian noise for every frame costs more than the frame; a few prepared fields with random shifts do not.
 NOISE_FIELDS = 8
-NOISE_MARGIN = 64  # a field is this much larger than the image [px], and the shift is drawn from it
+NOISE_MARGIN = 64  # excess of a field over the image [px], from which the shift is drawn
 
 
 class Sensor:
-    """Adds a camera's noise and compression to a perfect image."""
+    """Adds a camera's noise and JPEG coding to a perfect image."""
 
     def __init__(self, camera: SimCamera, effects: SimEffects, seed: tuple[int, ...]) -> None:
         self._seed = seed
@@ -23,11 +23,11 @@ class Sensor:
         self._noise = camera.noise if effects.noise else 0.0
 
     def expose(self, image: Image, index: int) -> Image:
-        """The image as it arrives.
+        """Add noise and coding to a frame.
 
         Args:
-            image: the perfect image, (H, W, 3).
-            index: the frame's number, which alone decides its noise.
+            image: perfect image, (H, W, 3).
+            index: number of the frame, which alone determines its noise.
         """
         if self._noise > 0:
             h, w = image.shape[:2]
@@ -41,9 +41,9 @@ class Sensor:
         return image
 
 
-@functools.lru_cache(maxsize=4)  # 9 MB each for 640x480; worlds of one seed in one process share them
+@functools.lru_cache(maxsize=4)  # 9 MB each for 640x480; worlds with the same seed share them
 def _noise_fields(seed: tuple[int, ...], size: tuple[int, int], sigma: float) -> list[npt.NDArray[np.int8]]:
-    """Fields of Gaussian noise, rounded as pixels are."""
+    """Prepare fields of Gaussian noise, rounded to whole grey levels."""
     rng = np.random.default_rng(seed)
     shape = (size[1] + NOISE_MARGIN, size[0] + NOISE_MARGIN, 3)
     fields = (rng.normal(0.0, sigma, shape) for _ in range(NOISE_FIELDS))

@@ -1,15 +1,12 @@
-"""What the simulated lenses see: renders of the world, bent into the lens's image, with the blur of an exposure.
+"""Images of the simulated lenses: renders of the world, resampled with the lens's distortion, with exposure blur.
 
-An exposure is the mean of four renders spread over it, but only where something moves by more than a fraction of a
-pixel meanwhile. If the camera turns or zooms that is the whole picture: four renders without multisampling, shifted by
-parts of a pixel against each other, so that their mean is antialiased as well. If only a target moves it is a window
-around it. At rest it is a single render.
+An exposure is the mean of four renders, but only where something moves by more than a fraction of a pixel during it. If
+the camera turns or zooms, that is the whole image: four renders without multisampling, shifted by parts of a pixel, so
+that their mean is antialiased. If only a target moves, it is a window around the target. At rest it is one render.
 
-Frames rendered before they are asked for, on a thread with an OpenGL of its own.
-
-The world up to now is settled: commands act from now on. As frames arrive late, the frame after the newest one is
-often already exposed when that one is read, and can be rendered while the reader is at work. What is rendered does
-not depend on it.
+`Ahead` renders the next frame on another thread, with its own OpenGL context, before it is read. This is possible
+because commands act from now on only, and a frame is often already exposed when the one before it is read. The image
+does not depend on it. Measurements: docs/design-notes.md.
 """
 
 import copy
@@ -33,23 +30,23 @@ from cotarget.sim.render.opengl import Canvas, mujoco
 from cotarget.sim.render.optics import Pinhole, TrueLens, bend, covering_view
 from cotarget.sim.state import WorldState
 
-# A blurred image is the mean of this many renders spread over the exposure.
+# A blurred image is the mean of this many renders, spread over the exposure.
 BLUR_RENDERS = 4
-# What moves less than this during an exposure is as sharp as at rest [px].
+# Motion below this during an exposure counts as rest [px].
 SHARP_PX = 0.3
-# Where those renders look beside the middle of a pixel [px]: the rotated grid that multisampling uses too.
+# Shifts of these renders from the pixel's centre [px]: the rotated grid of multisampling.
 JITTER = ((-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125))
-SOFT_MARGIN_PX = 3  # of a render that is resampled half a pixel aside
-WINDOW_MARGIN_PX = 4  # around what moves
-LARGEST_WINDOWS = 0.3  # of the picture; where more of it moves, all of it is rendered four times
-NEAREST = 3.0  # nothing is nearer to a camera than this, for what its own shifts do to the picture [m]
-LAYERS = mujoco.mjNGROUP - 1  # of geoms, drawn from the nearest to the farthest; the last group is not drawn
-PROBES = 3  # directions on each side of the picture that tell how the camera turned
+SOFT_MARGIN_PX = 3  # margin of a render that is resampled half a pixel aside
+WINDOW_MARGIN_PX = 4  # margin of a window around a moving geom
+LARGEST_WINDOWS = 0.3  # largest part of the image that windows may cover; above it, all of it is rendered four times
+NEAREST = 3.0  # least distance of any geom from a camera, which bounds the image motion of the camera's own shift [m]
+LAYERS = mujoco.mjNGROUP - 1  # groups of geoms, drawn from the nearest to the farthest; the last group is not drawn
+PROBES = 3  # directions per side of the image that measure the camera's rotation
 
 
 @dataclass(frozen=True)
 class Window:
-    """A part of a picture: its top-left pixel, and its size."""
+    """Rectangle in an image: top-left pixel and size [px]."""
 
     left: int
     top: int
@@ -59,14 +56,14 @@ class Window:
 
 @dataclass(frozen=True)
 class Moment:
-    """Where the camera and every geom is at one time.
+    """Poses of the camera and of every geom at one time.
 
     Attributes:
         eye: the camera's optical centre in the world [m], (3,).
-        axes: the world's coordinates of the camera's x (right), y (down) and z (forward), as columns, (3, 3).
-        positions: of the geoms [m], (n, 3).
-        turns: their axes, (n, 3, 3).
-        view: the camera's.
+        axes: world coordinates of the camera's x (right), y (down) and z (forward) as columns, (3, 3).
+        positions: positions of the geoms in the world [m], (n, 3).
+        turns: rotation matrices of the geoms, (n, 3, 3).
+        view: the camera's pinhole view.
     """
 
     eye: Array
@@ -76,18 +73,18 @@ class Moment:
     view: Pinhole
 
     def pixels(self, x_world: Array) -> Array:
-        """Where points (..., 3) are in the view, (..., 2) [px]; nan behind the camera."""
+        """Project points of the world (..., 3) into the view, (..., 2) [px]; nan behind the camera."""
         return self.toward(x_world - self.eye)
 
     def toward(self, way_world: Array) -> Array:
-        """Where directions (..., 3) are in the view, (..., 2) [px]; nan behind the camera."""
+        """Project directions in the world (..., 3) into the view, (..., 2) [px]; nan behind the camera."""
         way = way_world @ self.axes
         depth = np.where(way[..., 2:] > 0, way[..., 2:], np.nan)
         return way[..., :2] / depth * self.view.focal_px + self.view.center_px
 
 
 class Views:
-    """Renders both cameras of a world; ``canvas`` draws."""
+    """Renderer of both cameras of a world; its ``canvas`` draws."""
 
     def __init__(
         self,
@@ -103,19 +100,19 @@ class Views:
 
         Args:
             model: the compiled world.
-            state: brings it to a time.
+            state: moves the world to a time.
             size: (width, height) of the largest render [px].
-            shadows: whether lights cast them.
+            shadows: whether lights cast shadows.
             multisampling: whether a single render is antialiased.
-            canvas: that draws this model; its own by default.
-            soft: whether a lens without distortion is resampled like every other.
+            canvas: canvas that draws this model; opened here by default.
+            soft: whether a lens without distortion is resampled like any other, and so gets the same softness.
 
         Raises:
             DeviceError: the machine cannot render.
         """
         self._model, self._state, self._size, self._shadows = model, state, size, shadows
         self.canvas = canvas or Canvas(model, size, shadows)
-        self._plain = self.canvas  # without multisampling; made when first needed
+        self._plain = self.canvas  # canvas without multisampling, opened on first use
         self._multisampling, self._soft = multisampling, soft
         corners = np.stack(np.meshgrid(*([-1, 1],) * 3), axis=-1).reshape(-1, 3)
         self._corners = model.geom_aabb[:, None, :3] + corners * model.geom_aabb[:, None, 3:]
@@ -125,7 +122,7 @@ class Views:
         self._blurs = self._shown & ~np.isin(np.arange(model.ngeom), state.faint)
 
     def apart(self) -> "Views":
-        """Another one of the same world, which shares nothing that either of them changes: for the calling thread."""
+        """Open another renderer of the same world for the calling thread; the two share no mutable data."""
         model = copy.copy(self._model)
         other = Views(model, self._state.apart(model), self._size, self._shadows, self._multisampling)
         if self._multisampling:
@@ -133,22 +130,22 @@ class Views:
         return other
 
     def close(self) -> None:
-        """Release OpenGL; more than once does no harm."""
+        """Release OpenGL; safe to call more than once."""
         self.canvas.close()
 
     def sharp(self, camera: str, lens: TrueLens, t: float) -> Image:
-        """What a lens sees in an instant, BGR."""
+        """Render a lens's image at one instant, BGR."""
         view = self._view(lens)
         return self._through(lens, view, self._render(camera, lens, view, t))
 
     def exposed(self, camera: str, lens_at: Callable[[float], TrueLens], t: float, exposure: float) -> Image:
-        """What a lens gathers during an exposure around time t, BGR.
+        """Render a lens's image over an exposure, BGR.
 
         Args:
-            camera: its name.
-            lens_at: its optics at a time.
+            camera: the camera's name.
+            lens_at: gives the lens's optics at a time [s].
             t: middle of the exposure [s].
-            exposure: how long it is [s].
+            exposure: length of the exposure [s].
         """
         lens = lens_at(t)
         if exposure == 0.0:
@@ -168,7 +165,7 @@ class Views:
             return self._through(lens, view, cv2.convertScaleAbs(total, alpha=1 / BLUR_RENDERS))
         image = np.ascontiguousarray(self._render(camera, lens, view, t))
         parts = [np.zeros((window.height, window.width, 3), dtype=np.float32) for window in windows]
-        for moment in moments:  # each once: to put everything in its place takes as long as to draw a small window
+        for moment in moments:  # placing the bodies takes as long as drawing a small window
             for window, part in zip(windows, parts, strict=True):
                 cv2.accumulate(self._render(camera, lens, view, moment, window), part)
         for window, part in zip(windows, parts, strict=True):
@@ -177,9 +174,9 @@ class Views:
         return self._through(lens, view, image)
 
     def _view(self, lens: TrueLens) -> Pinhole:
-        """The render that a lens's image is made from.
+        """Choose the pinhole view that a lens's image is resampled from.
 
-        Where softness is wanted, it is resampled as softly whether the lens distorts or not.
+        With ``soft``, a lens without distortion gets a larger view, so that it is resampled too.
         """
         if not any(lens.distortion):
             (w, h), (cx, cy), margin = lens.size, lens.center_px, SOFT_MARGIN_PX * self._soft
@@ -187,7 +184,7 @@ class Views:
         return covering_view(lens, self._size)
 
     def _through(self, lens: TrueLens, view: Pinhole, image: Image) -> Image:
-        """Bend a render, RGB, into a lens's image, BGR."""
+        """Resample a render, RGB, into a lens's image, BGR."""
         if view != Pinhole(lens.size, lens.focal_px, lens.center_px):
             image = bend(np.ascontiguousarray(image), view, lens)
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR), dtype=np.uint8)
@@ -222,19 +219,19 @@ class Views:
         return Moment(eye, axes, np.array(data.geom_xpos), turns, view)
 
     def _visible(self, t: float) -> npt.NDArray[np.bool_]:
-        """Which geoms are there to be seen; (n,) bool."""
+        """Select the geoms that are shown, (n,) bool; the board's only while there is a board."""
         return self._shown if self._state.board_at(t) is None else self._shown | (self._groups == BOARD_GROUP)
 
     def _layers(self, moment: Moment, window: Window, visible: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-        """When to draw each geom: the nearest first, so that what they hide need not be painted; (n,) int.
+        """Assign each geom its drawing layer, (n,) int, the nearest first, so that occluded pixels are not shaded.
 
-        What a window cannot show, by its bounding sphere, is left out.
+        A geom whose bounding sphere is outside the window is left out.
         """
         (fx, fy), (cx, cy) = moment.view.focal_px, moment.view.center_px
         x, y, z = ((moment.positions - moment.eye) @ moment.axes).T
         radius = np.where(self._endless, np.inf, self._model.geom_rbound)
         inside = visible & (z >= -radius)
-        # Signed distance to each side of the frustum, whose planes go through the eye.
+        # Signed distance to each side of the frustum, whose planes contain the optical centre.
         for along, tangent, sign in (
             (x, (window.left - 0.5 - cx) / fx, -1),
             (x, (window.left + window.width - 0.5 - cx) / fx, 1),
@@ -248,7 +245,7 @@ class Views:
         return layers
 
     def _moving(self, ends: list[Moment], t: float) -> list[Window] | None:
-        """Windows around what moves during an exposure while the camera does not; None if they are too large."""
+        """Find windows around geoms that move during an exposure of a camera at rest; None if too large."""
         before, after = ends
         moved = (before.positions != after.positions).any(axis=1) | (before.turns != after.turns).any(axis=(1, 2))
         moved &= self._blurs | ((self._groups == BOARD_GROUP) & self._visible(t))
@@ -272,7 +269,7 @@ class Views:
 
 
 def _camera_moved(before: Moment, after: Moment) -> float:
-    """How far the picture of what stands still moves between two moments [px]."""
+    """Bound the image motion of static points between two moments [px]."""
     u, v = (np.linspace(-0.5, n - 0.5, PROBES) for n in before.view.size)
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     rays = np.append((pixels - before.view.center_px) / before.view.focal_px, np.ones((len(pixels), 1)), axis=1)
@@ -282,7 +279,7 @@ def _camera_moved(before: Moment, after: Moment) -> float:
 
 
 def _merged(boxes: list[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
-    """Boxes that cover the same, none of which overlap."""
+    """Merge overlapping boxes into disjoint ones that cover the same area."""
     found: list[tuple[Array, Array]] = []
     for low, high in boxes:
         while hit := next((b for b in found if (b[0] < high).all() and (low < b[1]).all()), None):
@@ -293,10 +290,11 @@ def _merged(boxes: list[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
 
 
 def _as_if(view: Pinhole, lens: TrueLens, now: TrueLens) -> Pinhole:
-    """The view that, bent as if by ``lens``, gives what the lens ``now`` sees.
+    """Give the view that, resampled as for ``lens``, shows the image of the lens ``now``.
 
-    While a zoom lens travels, its focal length and centre change during an exposure. The change of its distortion alone
-    is neglected: at most 0.3 px in the corners, at 129 positions a second and 1/100 s, where zooming moves them by 5.
+    Focal length and principal point of a zoom lens change while it travels during an exposure. The change of its
+    distortion is neglected: at most 0.3 px in the corners, at 129 positions a second and 1/100 s, where zooming moves
+    them by 5 px.
     """
     if now is lens or now == lens:
         return view
@@ -307,31 +305,31 @@ def _as_if(view: Pinhole, lens: TrueLens, now: TrueLens) -> Pinhole:
 
 
 def _shifted(view: Pinhole, by_px: tuple[float, float]) -> Pinhole:
-    """A view whose pixels look a little aside."""
+    """Shift the sampling points of a view by a part of a pixel."""
     return replace(view, center_px=(view.center_px[0] - by_px[0], view.center_px[1] - by_px[1]))
 
 
-# --- ahead ---
+# Rendering the next frame ahead on another thread
 
 Job = Callable[[Views], Image]
 Jobs = queue.SimpleQueue[tuple[Job, "Future[Image]"] | None]
-# So many frames must have been read one after the other, none left out, before the next one is expected to be: opening
-# another OpenGL takes as long as it saves in some 20 frames.
+# Number of frames that must be read in sequence before the next one is rendered ahead. Opening another OpenGL context
+# takes as long as this saves in some 20 frames.
 READ_IN_TURN = 10
-# An environment variable; "0" where every core has work of its own, such as one of many runs side by side.
+# Environment variable; "0" forbids rendering ahead where every core has its own work, as with parallel runs.
 ALLOWED = "COTARGET_AHEAD"
 
 
 def is_allowed() -> bool:
-    """Whether frames may be rendered on another thread at all."""
+    """Check that the environment allows rendering on another thread."""
     return os.environ.get(ALLOWED) != "0"
 
 
 class Ahead:
-    """Renders the next frame of a camera whose frames are read one after the other.
+    """Renders the next frame of a camera whose frames are read in sequence.
 
     Args:
-        open_views: opens the renderer; called on the thread that will use and close it.
+        open_views: opens the renderer; called on the thread that uses and closes it.
     """
 
     def __init__(self, open_views: Callable[[], Views]) -> None:
@@ -342,13 +340,13 @@ class Ahead:
         self._begun: tuple[int, Future[Image]] | None = None
 
     def take(self, index: int) -> Image | None:
-        """Frame number ``index``, waited for if it was begun; None if it was not."""
+        """Wait for frame number ``index`` if it was started; None if it was not."""
         self._in_turn = self._in_turn + 1 if index == self._last + 1 else 0
         begun, self._begun, self._last = self._begun, None, index
         return begun[1].result() if begun is not None and begun[0] == index else None
 
     def begin(self, index: int, job: Job) -> None:
-        """Begin to render frame number ``index``, if it is expected to be read next.
+        """Start rendering frame number ``index`` if it is expected to be read next.
 
         Raises:
             DeviceError: the machine cannot render.
@@ -362,24 +360,24 @@ class Ahead:
         self._jobs.put((job, future))
 
     def close(self) -> None:
-        """Release OpenGL, once what was begun is ready; more than once does no harm."""
+        """Finish the started frame and release OpenGL; safe to call more than once."""
         if self._finish is not None:
             self._finish()
         self._finish, self._in_turn, self._begun = None, 0, None
 
     def _start(self) -> None:
-        """Open the renderer; waited for, because nothing may be rendered while another OpenGL is being opened."""
+        """Open the renderer and wait for it; no other thread may render while an OpenGL context is being opened."""
         opened: Future[None] = Future()
         work = (self._jobs, self._open_views, opened)
         thread = threading.Thread(target=_render, args=work, name="render ahead", daemon=True)
         thread.start()
         opened.result()
-        # Also if nobody closes it, and at the interpreter's end.
+        # Runs also without `close`, and at the interpreter's exit.
         self._finish = weakref.finalize(self, _end, self._jobs, thread)
 
 
 def _render(jobs: Jobs, open_views: Callable[[], Views], opened: "Future[None]") -> None:
-    """Open a renderer, do jobs with it until there is None, and close it."""
+    """Open a renderer, do jobs with it until the queue gives None, and close it."""
     try:
         views = open_views()
     except Exception as error:
@@ -389,7 +387,7 @@ def _render(jobs: Jobs, open_views: Callable[[], Views], opened: "Future[None]")
     del opened
     while (work := jobs.get()) is not None:
         _do(views, *work)
-        del work  # it knows the world, which shall not live on while there is nothing to do
+        del work  # it references the world, which must be freed while the queue is empty
     views.close()
 
 

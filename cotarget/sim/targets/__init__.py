@@ -1,1 +1,1 @@
-"""The simulated targets: pose, gait and path."""
+"""Simulated targets: pose, gait, path and model."""

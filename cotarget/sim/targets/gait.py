@@ -1,6 +1,6 @@
-"""How the targets hold themselves: the attitude of their bodies, and their limbs at each moment of a beat or a stride.
+"""Attitude of the targets' bodies, and joint angles of their limbs over a wing beat or a stride.
 
-Mostly in floats: numpy takes several times as long for so few numbers.
+Mostly in floats, which for a few numbers is several times as fast as numpy.
 """
 
 import math
@@ -13,36 +13,36 @@ from cotarget.sim.targets.paths import MOUNT
 
 GRAVITY = 9.81  # [m/s^2]
 STANDING = 1e-9  # [m/s]
-TURNS, NODS = np.radians(7.0), np.radians(4.0)  # of a book that is held out [rad]
+TURNS, NODS = np.radians(7.0), np.radians(4.0)  # swing of a book in yaw, and in pitch and roll [rad]
 STRIDE = 1.44  # length of two steps of a walking person 1.75 m tall [m]
 WALK_SPEED = 1.5  # [m/s]
 WING_BEAT_HZ = 4.0
 WING_SWING = np.radians(35.0)  # amplitude of the inner wing
-OUTER_SWING, OUTER_LAG = np.radians(24.0), np.radians(70.0)  # of the outer wing against the inner one
+OUTER_SWING, OUTER_LAG = np.radians(24.0), np.radians(70.0)  # amplitude and lag of the outer wing against the inner one
 Vector = tuple[float, float, float]
-Axes = tuple[Vector, Vector, Vector]  # forward, left and up, in the world
+Axes = tuple[Vector, Vector, Vector]  # world coordinates of forward, left and up
 
 
 def limbs(kind: str, beat: float) -> Mapping[str, float]:
-    """Each joint's angle [rad] by name, of a bird that flies or a person who walks, at an angle of the beat [rad]."""
+    """Give the joint angles [rad] by name of a flying bird or a walking person at a phase of the limb cycle [rad]."""
     return flap(beat) if kind == "bird" else walk(beat, 1.0)[0] if kind == "person" else {}
 
 
 def heading(position: Sequence[float], velocity: Sequence[float]) -> Axes:
-    """Turn x along the way, z as far up as that allows; whoever stands still faces the camera."""
+    """Compute the axes with x along the velocity and z as far up as that allows; a target at rest faces the camera."""
     x, y, z = velocity
     if math.hypot(x, y, z) < STANDING:
         x, y, z = (MOUNT - position).tolist()
         z = 0.0
     if math.hypot(x, y) < STANDING * math.hypot(x, y, z):
-        y -= 1e-6 * math.hypot(x, y, z)  # straight up or down: towards the camera, if anywhere
+        y -= 1e-6 * math.hypot(x, y, z)  # vertical motion has no heading: face the camera
     ahead, whole = math.hypot(x, y), math.hypot(x, y, z)
     forward, left = (x / whole, y / whole, z / whole), (-y / ahead, x / ahead, 0.0)
     return forward, left, (-forward[2] * left[1], forward[2] * left[0], forward[0] * left[1] - forward[1] * left[0])
 
 
 def face_mount(position: Array | Sequence[float], t: float, phase: float) -> tuple[float, float, float]:
-    """Yaw, pitch and roll that turn the book's cover to the camera, swinging a few degrees [rad]."""
+    """Give yaw, pitch and roll that turn the book's cover to the fixed camera, with a swing of some degrees [rad]."""
     x, y, z = MOUNT - position
     yaw = np.arctan2(y, x) + TURNS * np.sin(0.55 * t + phase)
     pitch = -np.arctan2(z, np.hypot(x, y)) + NODS * np.sin(0.40 * t + 2.0 * phase)
@@ -51,7 +51,7 @@ def face_mount(position: Array | Sequence[float], t: float, phase: float) -> tup
 
 
 def turned(yaw: float, pitch: float, roll: float) -> Axes:
-    """The axes of what was turned about z, then about its own y and x [rad]."""
+    """Compute the axes of a body rotated about z, then about its own y and x [rad]."""
     (cy, sy), (cp, sp), (cr, sr) = ((math.cos(angle), math.sin(angle)) for angle in (yaw, pitch, roll))
     forward = cy * cp, sy * cp, -sp
     left = cy * sp * sr - sy * cr, sy * sp * sr + cy * cr, cp * sr
@@ -59,7 +59,7 @@ def turned(yaw: float, pitch: float, roll: float) -> Axes:
 
 
 def bank(upright: Axes, acceleration: Sequence[float]) -> Axes:
-    """Lean the bird into its turn, as far as the turn's acceleration asks for."""
+    """Roll the bird into its turn, as the turn's lateral acceleration requires."""
     forward, left, up = upright
     lateral = float(np.dot(acceleration, left))
     whole = math.hypot(lateral, GRAVITY)
@@ -73,14 +73,14 @@ def bank(upright: Axes, acceleration: Sequence[float]) -> Axes:
 
 
 def walk(step: float, pace: float) -> tuple[dict[str, float], float]:
-    """Swing limbs at a phase of the stride; ``pace`` from 0, standing, to 1.
+    """Give the joint angles of a stride at a phase; ``pace`` goes from 0 (standing) to 1 (walking speed).
 
     Returns:
-        Joint angles [rad], and how far the hips rise or sink [m].
+        Joint angles [rad], and vertical offset of the hips [m].
     """
     joints = {}
     for side, phase in (("left", step), ("right", step + np.pi)):
-        swing = 0.5 - 0.5 * np.cos(phase + 0.5 * np.pi)  # 1 while the leg comes forward
+        swing = 0.5 - 0.5 * np.cos(phase + 0.5 * np.pi)  # 1 while the leg swings forward
         joints[f"hip_{side}"] = pace * (0.06 + 0.42 * np.sin(phase))
         joints[f"knee_{side}"] = pace * (0.08 + 0.85 * swing**2 * (0.5 + 0.5 * np.cos(phase + 0.2)))
         joints[f"shoulder_{side}"] = pace * -0.40 * np.sin(phase) + 0.02
@@ -89,7 +89,7 @@ def walk(step: float, pace: float) -> tuple[dict[str, float], float]:
 
 
 def flap(beat: float) -> dict[str, float]:
-    """Beat the wings; the outer part follows late."""
+    """Give the wings' joint angles at a phase of the beat; the outer wing lags."""
     inner = 0.10 + WING_SWING * np.sin(beat)
     outer = -0.06 + OUTER_SWING * np.sin(beat - OUTER_LAG)
     return {

@@ -1,4 +1,4 @@
-"""Targets of a user's own: a mesh, or an MJCF file with one body, as the model of what flies or walks by."""
+"""Models of a user's own targets, from a mesh or an MJCF file with one body."""
 
 from pathlib import Path
 
@@ -7,23 +7,23 @@ import numpy as np
 from cotarget.errors import ConfigError, choices
 from cotarget.sim.render.opengl import mujoco
 
-GREY = (0.55, 0.55, 0.55, 1.0)  # of a mesh without a picture beside it
-SHAPES = ("box", "capsule", "cylinder", "ellipsoid", "mesh", "sphere")  # whose outline is known
+GREY = (0.55, 0.55, 0.55, 1.0)  # colour of a mesh without a texture
+SHAPES = ("box", "capsule", "cylinder", "ellipsoid", "mesh", "sphere")  # geom types with a known outline
 
 
 def own_model(path: Path, kind: str, hidden: int) -> "mujoco.MjSpec":
-    """Read a target's model: lengths in metres, x forward, y left, z up, the origin where its path leads.
+    """Read a user's target model: lengths in metres, x forward, y left, z up, origin on the path.
 
-    It goes where its path leads and is rigid: of the file, bodies and what they look like count.
+    The target is rigid. Only bodies and the geoms that are drawn are used.
 
     Args:
-        path: a mesh (.obj, .stl), whose texture is the .png of the same name beside it, if there is one; or an MJCF
-            file (.xml) with one body in its worldbody.
-        kind: the target's name without a number, which becomes the body's.
-        hidden: the first of the groups of geoms that are not drawn, where models keep what collides.
+        path: a mesh (.obj, .stl) with an optional texture, the .png of the same name beside it; or an MJCF file (.xml)
+            with one body in its worldbody.
+        kind: the target's name without a number, which becomes the name of the body.
+        hidden: first group of geoms that are not drawn; models keep collision geoms there.
 
     Raises:
-        ConfigError: it cannot be read, or is no such model.
+        ConfigError: the file cannot be read, or is not such a model.
     """
     if not path.is_file():
         raise ConfigError(f"sim.models.{kind}: {path}: no such file; give the path of a mesh or an MJCF file")
@@ -46,17 +46,17 @@ def own_model(path: Path, kind: str, hidden: int) -> "mujoco.MjSpec":
 
 
 def _stiffen(spec: "mujoco.MjSpec") -> None:
-    """Delete the joints, and before them all that may refer to one or to what it moves."""
+    """Delete the joints, after everything that may refer to a joint or to what it moves."""
     for parts in ("keys", "actuators", "sensors", "tendons", "equalities", "excludes", "pairs", "tuples", "joints"):
         for part in list(getattr(spec, parts)):
             spec.delete(part)
 
 
 def _keep_drawn(spec: "mujoco.MjSpec", path: Path, hidden: int) -> None:
-    """Delete the geoms that nobody sees; the others touch nothing.
+    """Delete the geoms that are not drawn, and switch off the collisions of the others.
 
     Raises:
-        ConfigError: there are no others, or one has no outline.
+        ConfigError: no geom is left, or one has no known outline.
     """
     for geom in list(spec.geoms):
         geom.contype = geom.conaffinity = 0
@@ -70,9 +70,9 @@ def _keep_drawn(spec: "mujoco.MjSpec", path: Path, hidden: int) -> None:
 
 
 def _of_mesh(path: Path) -> "mujoco.MjSpec":
-    """A body that is a mesh."""
+    """Make a model with one body from a mesh."""
     spec = mujoco.MjSpec()
-    # A surface need not enclose anything.
+    # A mesh may be open, so that it has no volume.
     spec.add_mesh(name="mesh", file=str(path), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
     geom = spec.worldbody.add_body().add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", rgba=np.array(GREY))
     if (picture := path.with_suffix(".png")).is_file():

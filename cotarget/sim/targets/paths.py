@@ -1,7 +1,7 @@
-"""Smooth ways through the simulated world, and the ones that book, person and bird take where nobody says otherwise.
+"""Smooth paths through the simulated world, and the default paths of book, person and bird.
 
-Paths are in the scene's world: z up, the fixed camera 1.6 m above the origin, looking along +y. Moving targets stay out
-of the wide view while the background is learnt, then come in and stay in.
+Paths are in the scene's world: z up, the fixed camera 1.6 m above the origin, looking along +y. A moving target stays
+outside the fixed camera's view while the background is learnt, then enters and stays inside.
 """
 
 from bisect import bisect_right
@@ -17,19 +17,19 @@ from cotarget.config import Waypoint
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array
 
-MOUNT = np.array([0.0, 0.0, 1.6])  # where the fixed camera is in every scene of sim_assets [m]
-VIEW_EDGE = np.tan(np.radians(25.0))  # half the wide view's width at unit distance
-PATH_SECONDS = 600.0  # a loop is laid out for this long; from then on one of its last laps is gone again and again
+MOUNT = np.array([0.0, 0.0, 1.6])  # position of the fixed camera in every built-in scene [m]
+VIEW_EDGE = np.tan(np.radians(25.0))  # half the width of the fixed camera's view at unit distance
+PATH_SECONDS = 600.0  # length of a loop; afterwards one of its last laps is repeated [s]
 
 
 @dataclass(frozen=True)
 class Path:
-    """A smooth way through the world.
+    """Smooth path through the world.
 
     Attributes:
         spline: position [m] as a function of time [s].
         length: distance travelled [m] as a function of time [s].
-        lap: begin and end [s] of a lap that is gone again and again after its end; None for a way that ends.
+        lap: start and end [s] of a lap that is repeated after its end; None for a path that ends.
     """
 
     spline: CubicSpline
@@ -37,35 +37,35 @@ class Path:
     lap: tuple[float, float] | None = None
 
     def within(self, t: float) -> float:
-        """The time within the path's at which all is as at ``t``: in the lap, or else held at both ends."""
+        """Map a time to one on the spline: inside the repeated lap, or clamped to the path's ends."""
         if self.lap is not None and t > self.lap[1]:
             begin, end = self.lap
             return begin + (t - begin) % (end - begin)
         return min(max(t, self._knots[0]), self._knots[-1])
 
     def position(self, t: float) -> Array:
-        """Position [m], (3,)."""
+        """Give the position at time t [s], (3,) [m]."""
         (a, b, c, d), s = self._piece(self.within(t))
         return ((a * s + b) * s + c) * s + d
 
     def velocity(self, t: float) -> Array:
-        """Direction and speed of travel [m/s], (3,); while the target is held, a trace of how it moves just inside."""
+        """Give the velocity at time t [s], (3,) [m/s]; beyond the path's ends, the velocity just inside them."""
         first, last = self._knots[0], self._knots[-1]
         inside = 1e-3 * (last - first)
         (a, b, c, _), s = self._piece(min(max(self.within(t), first + inside), last - inside))
         return (3 * a * s + 2 * b) * s + c
 
     def acceleration(self, t: float) -> Array:
-        """Acceleration [m/s^2], (3,)."""
+        """Give the acceleration at time t [s], (3,) [m/s^2]."""
         (a, b, _, _), s = self._piece(self.within(t))
         return 6 * a * s + 2 * b
 
     def motion(self, t: float) -> tuple[list[float], list[float], list[float]]:
-        """Position [m], velocity [m/s] and acceleration [m/s^2] at once, (3,) each; the same, and quicker in floats."""
+        """Give position [m], velocity [m/s] and acceleration [m/s^2], (3,) each, as floats; faster than one by one."""
         first, last = self._knots[0], self._knots[-1]
         inside = 1e-3 * (last - first)
         at = self.within(t)
-        if not first + inside <= at <= last - inside:  # it is held, or nearly
+        if not first + inside <= at <= last - inside:  # the target is at an end of the path
             return self.position(t).tolist(), self.velocity(t).tolist(), self.acceleration(t).tolist()
         piece, s = self._piece(at)
         axes = list(zip(*piece.tolist(), strict=True))
@@ -78,16 +78,16 @@ class Path:
 
     @cached_property
     def _pieces(self) -> Array:
-        """Each piece's cubic, highest power first, (pieces, 4, 3)."""
+        """Coefficients of each cubic piece, highest power first, (pieces, 4, 3)."""
         return np.ascontiguousarray(np.moveaxis(self.spline.c, 1, 0))
 
     def _piece(self, t: float) -> tuple[Array, float]:
-        """The cubic at a time within the path's, (4, 3), and the time since its beginning: quicker than the spline."""
+        """Give the cubic piece at a time on the spline, (4, 3), and the time since its start."""
         i = min(bisect_right(self._knots, t) - 1, len(self._pieces) - 1)
         return self._pieces[i], t - self._knots[i]
 
     def travelled(self, t: float) -> float:
-        """Distance since the path's start [m]."""
+        """Give the distance since the path's start at time t [s], [m]."""
         here = float(self.length(self.within(t)))
         if self.lap is None or t <= self.lap[1]:
             return here
@@ -96,10 +96,10 @@ class Path:
 
 
 def waypoint_path(waypoints: Sequence[Waypoint], where: str = "waypoints") -> Path:
-    """Lay a smooth path through [t, x, y, z], at rest at both ends.
+    """Fit a smooth path through [t, x, y, z], at rest at both ends.
 
     Raises:
-        ConfigError: no waypoint, or times that do not increase.
+        ConfigError: there is no waypoint, or the times do not increase.
     """
     table = np.asarray(waypoints, dtype=float)
     if table.ndim != 2 or table.shape[1] != 4 or not np.all(np.isfinite(table)):
@@ -127,15 +127,15 @@ def _loop_path(
     lead_in: float = 0.0,
     edge: tuple[float, float] | None = None,
 ) -> Path:
-    """Go round a closed line for ever at constant speed, where wanted after a straight way in.
+    """Make a path that follows a closed line at constant speed without end, after an optional straight approach.
 
     Args:
-        loop: closed line, first point not repeated, [m], (N, 3).
-        speed: [m/s].
-        spacing: between the path's knots [m].
-        soften: scale over which curvature is evened out [m].
-        lead_in: length of the straight way in, tangent to the loop at its first point [m].
-        edge: time [s] at which the target shall pass the coordinate x [m] of its way in.
+        loop: closed line, first point not repeated, (N, 3) [m].
+        speed: speed along the line [m/s].
+        spacing: distance between the path's knots [m].
+        soften: length scale over which curvature is smoothed [m].
+        lead_in: length of the straight approach, tangent to the loop at its first point [m].
+        edge: time [s] at which the target passes the coordinate x [m] on its approach.
     """
     count = int(PATH_SECONDS * speed / spacing)
     line = _even(np.vstack([loop, loop[:1]]), spacing)[:-1]
@@ -151,13 +151,13 @@ def _loop_path(
         way_in = points[: len(straight) + 1, 0]
         inward = np.sign(way_in[-1] - way_in[0])
         t = t + time - np.interp(inward * x, inward * way_in, t[: len(straight) + 1])
-    # The last lap but one: what the end of the line does to smoothing and spline does not reach so far back.
+    # The last lap but one: smoothing and spline ends do not affect it.
     begin, end = t[-2 * len(line) - 1], t[-len(line) - 1]
     return _measured(CubicSpline(t, points), (float(begin), float(end)))
 
 
 def _even(points: Array, spacing: float) -> Array:
-    """Sample a line evenly, about ``spacing`` apart, both ends kept."""
+    """Resample a line at about ``spacing``, with both ends kept."""
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     at = np.linspace(0.0, s[-1], round(s[-1] / spacing) + 1)
     return np.stack([np.interp(at, s, points[:, k]) for k in range(3)], axis=1)
@@ -168,7 +168,7 @@ def _angles(count: int = 720) -> Array:
 
 
 def book_path(scene: str, rng: np.random.Generator) -> Path:
-    """Carry the book slowly round an ellipse about 10 m away, in view from the start."""
+    """Carry the book slowly along an ellipse about 10 m away, in view from the start."""
     a, phase = _angles(), rng.uniform(0, 2 * np.pi)
     wide, deep, high = rng.uniform(1.2, 1.6), rng.uniform(0.3, 0.5), rng.uniform(0.25, 0.4)
     center = np.array([rng.uniform(-0.3, 0.3), rng.uniform(9.8, 10.2), rng.uniform(1.5, 1.7)])
@@ -178,8 +178,8 @@ def book_path(scene: str, rng: np.random.Generator) -> Path:
 
 
 def person_path(scene: str, rng: np.random.Generator) -> Path:
-    """Walk in from one side at about 1.5 m/s, then weave a figure of eight; z is the ground's."""
-    # Outdoors the camera looks up: nearer than 13 m it does not see the feet.
+    """Walk in from one side at about 1.5 m/s, then along a figure of eight; z is that of the ground."""
+    # The outdoor camera looks up: nearer than 13 m it does not see the feet.
     near, reach, deep = (13.4, 4.4, 2.2) if scene == "outdoor" else (8.95, 2.65, 1.0)
     side = rng.choice([-1.0, 1.0])
     a = _angles() - np.pi / 4  # starts at the nearest point of the figure's first half, heading inwards
@@ -190,9 +190,9 @@ def person_path(scene: str, rng: np.random.Generator) -> Path:
 
 
 def bird_path(scene: str, rng: np.random.Generator) -> Path:
-    """Fly in from one side at about 5 m/s, then round after round; indoors a smaller and slower round.
+    """Fly in from one side at about 5 m/s, then in rounds; indoors the rounds are smaller and slower.
 
-    Rounds are two half circles and two straights across the view, so that the bird shows its side most of the time.
+    A round has two half circles and two straights across the view, so that the bird shows its side most of the time.
     """
     a = _angles()
     side = rng.choice([-1.0, 1.0])

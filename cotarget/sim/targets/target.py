@@ -1,7 +1,6 @@
-"""The simulated targets: where a book, a person or a bird is at a time, how its joints stand, and how large it is.
+"""Simulated targets (book, person, bird): pose, joint angles and true size at any time.
 
-There may be several of a kind: ``bird2`` is a second bird. The ways that they take are in `cotarget.sim.targets.paths`,
-the
+A scene may have several targets of one kind: ``bird2`` is a second bird. Paths are in `cotarget.sim.targets.paths`, the
 models in sim_assets/targets.
 """
 
@@ -50,19 +49,19 @@ __all__ = [
     "target_rng",
     "waypoint_path",
 ]
-# The markers that they carry, ids in DICT_4X4_50: those of the first of a kind, and what is added for each further one;
-# the models' textures are drawn for five of a kind, after which the ids repeat. All books carry the same.
+# Markers on the targets, ids in DICT_4X4_50: the first target of each kind, and the step for each further one of
+# persons and birds. There are textures for five of a kind, after which the ids repeat. All books have the same marker.
 MARKERS = {"book": 1, "person": 2, "bird": 3}
 MARKER_STEP, MARKERS_OF_A_KIND = 10, 5
-RANDOM = 3  # the stream of random numbers of the targets, apart from the world's others
-PERSON_HEIGHT = 1.75  # of the model [m]
-SCATTER = {"book": 0.0, "person": 0.04, "bird": 0.15}  # of the true sizes, relative; all within this
-SCATTER_SIGMA = 0.5  # the range above is two standard deviations
+RANDOM = 3  # random stream of the targets, separate from the world's others
+PERSON_HEIGHT = 1.75  # height of the model [m]
+SCATTER = {"book": 0.0, "person": 0.04, "bird": 0.15}  # largest relative deviation from the nominal size
+SCATTER_SIGMA = 0.5  # standard deviation over that range: it is two of them
 
 
 @dataclass(frozen=True)
 class TargetPose:
-    """Where a target is in the world: its body's position [m], its rotation, and each joint's angle [rad] by name."""
+    """Pose of a target in the world: position of its body [m], rotation, and joint angles [rad] by name."""
 
     position: Array
     rotation: Rotation
@@ -70,7 +69,7 @@ class TargetPose:
 
     @property
     def T_world_target(self) -> RigidTransform:
-        """The body's pose."""
+        """Pose of the target's body."""
         return RigidTransform.from_components(self.position, self.rotation)
 
 
@@ -79,13 +78,13 @@ class Target:
     """One target of the simulated world.
 
     Attributes:
-        name: its kind, and a number where it is not the first of its kind.
-        beat_s: period of its limbs' motion [s]; 0 for a rigid target.
-        size: true size over the model's.
-        path: where it goes.
-        phase: where in its limbs' motion it starts [rad].
-        grounded: whether its height follows from its size, because it stands on the ground.
-        own: file of a user's own model; it has no moving parts, and its true size is the model's.
+        name: kind of the target, with a number from the second of its kind on.
+        beat_s: period of the limb cycle [s]; 0 for a rigid target.
+        size: true size over the model's size.
+        path: path of the body through the world.
+        phase: phase of the limb cycle at the start [rad].
+        grounded: whether the target stands on the ground, so that its height follows from its size.
+        own: file of a user's own model, which is rigid and has the model's size.
     """
 
     name: str
@@ -98,16 +97,16 @@ class Target:
 
     @property
     def kind(self) -> str:
-        """One of TARGETS, or of a user's own; also the name of the model's body."""
+        """Kind of the target, one of TARGETS or a user's own; also the name of the model's body."""
         return split_name(self.name)[0]
 
     @property
     def body(self) -> str:
-        """The name of its body in the compiled world."""
+        """Name of the target's body in the compiled world."""
         return f"{self.name}/{self.kind}"
 
     def pose(self, t: float) -> TargetPose:
-        """Tell pose and joints at time ``t`` [s]."""
+        """Give pose and joint angles at time ``t`` [s]."""
         if self.kind == "book":
             place = self.path.position(t)
             return TargetPose(place, Rotation.from_euler("ZYX", face_mount(place, t, self.phase)), {})
@@ -115,14 +114,14 @@ class Target:
         return TargetPose(np.array(position), Rotation.from_matrix(np.transpose(axes), assume_valid=True), joints)
 
     def stance(self, t: float, beat: float) -> tuple[list[float], Axes, Mapping[str, float]]:
-        """The same in floats, which is quicker.
+        """Give pose and joint angles as floats, which is faster than `pose`.
 
         Args:
             t: the time [s].
-            beat: of its limbs then, as `beat` tells it [rad].
+            beat: phase of the limb cycle at that time, from `beat` [rad].
 
         Returns:
-            Its body's position [m], (3,); the body's axes in the world; each joint's angle [rad].
+            Position of the body [m], (3,); axes of the body in the world; joint angles [rad] by name.
         """
         position, velocity, acceleration = self.path.motion(t)
         kind = self.kind
@@ -133,12 +132,12 @@ class Target:
         if self.own is not None:
             return position, heading(position, velocity), {}
         joints, bob = walk(beat, min(math.hypot(*velocity) / WALK_SPEED, 1.0))
-        axes = heading(position, [*velocity[:2], 0.0 * velocity[2]])  # whoever walks stays upright
+        axes = heading(position, [*velocity[:2], 0.0 * velocity[2]])  # a walking person stays upright
         position[2] += bob * self.size + (0.5 * PERSON_HEIGHT * self.size if self.grounded else 0.0)
         return position, axes, joints
 
     def beat(self, t: float) -> float:
-        """Where its limbs are in their motion at time ``t`` [s], as an angle that grows without end [rad]."""
+        """Give the phase of the limb cycle at time ``t`` [s], which grows without limit [rad]."""
         if self.kind == "person":
             return self.phase + 2 * np.pi * self.path.travelled(t) / (STRIDE * self.size)
         return self.phase + 2 * np.pi * WING_BEAT_HZ * t
@@ -156,22 +155,22 @@ def make_target(
 
     Args:
         name: one of TARGETS, with a number from 2 on for a further one of its kind.
-        scene: name or path of the scene; any but the built-in ones has the book and the person as indoors and the
-            bird as outdoors.
-        rng: source of the small differences between one run and the next; same seed, same path.
-        scatter: whether the true size differs from what the pipeline is told.
-        waypoints: [t, x, y, z] of the body's centre in the world [s, m] to go through instead.
+        scene: name or path of the scene. Any scene but the built-in ones has the indoor paths of book and person and
+            the outdoor path of the bird.
+        rng: source of the small differences between runs; the same seed gives the same path.
+        scatter: whether the true size differs from the nominal size.
+        waypoints: [t, x, y, z] of the body's centre in the world [s, m], in place of the kind's own path.
         own: file of a user's own model, which needs waypoints.
 
     Raises:
-        ConfigError: no such target, or waypoints that do not advance in time.
+        ConfigError: an unknown target, or waypoints whose times do not increase.
     """
     if own is not None:
         if waypoints is None:
             raise ConfigError(f"sim.targets: a {name} of your own needs a way: [sim.paths] {name}")
         return Target(name, 0.0, 1.0, waypoint_path(waypoints, f"sim.paths.{name}"), own=own)
     kind = kind_of(name)
-    # Drawn whether used or not, so that no switch changes the path.
+    # Drawn also where it is not used, so that no switch changes the path.
     size = draw_size(name, rng, scatter)
     phase = float(rng.uniform(0.0, 2 * np.pi))
     make = {"book": book_path, "person": person_path, "bird": bird_path}[kind]
@@ -182,29 +181,29 @@ def make_target(
 
 
 def target_rng(seed: int, name: str) -> np.random.Generator:
-    """The random numbers of one target, whatever else is in the scene."""
+    """Make the random generator of one target, independent of the scene's other targets."""
     return np.random.default_rng((seed, RANDOM, zlib.crc32(name.encode())))
 
 
 def draw_size(name: str, rng: np.random.Generator, scatter: bool) -> float:
-    """Draw a target's true size over what the pipeline is told; the first number that its rng gives."""
+    """Draw a target's true size over its nominal size; it is the first number from its generator."""
     return 1.0 + SCATTER[kind_of(name)] * SCATTER_SIGMA * float(np.clip(rng.standard_normal(), -2.0, 2.0)) * scatter
 
 
 def kind_of(name: str) -> str:
-    """The kind of a target by its name: ``bird`` of ``bird`` and of ``bird2``.
+    """Give the kind of a target by its name: ``bird`` for ``bird`` and for ``bird2``.
 
     Raises:
-        ConfigError: no such target.
+        ConfigError: an unknown target.
     """
     return TARGETS[_place_of(name)[0]]
 
 
 def marker_of(name: str) -> int:
-    """The marker that a target carries, an id in DICT_4X4_50.
+    """Give the marker on a target, an id in DICT_4X4_50.
 
     Raises:
-        ConfigError: no such target.
+        ConfigError: an unknown target.
     """
     kind, number = _place_of(name)
     marker = MARKERS[TARGETS[kind]]
@@ -213,7 +212,7 @@ def marker_of(name: str) -> int:
 
 @lru_cache(maxsize=256)
 def _place_of(name: str) -> tuple[int, int]:
-    """Index of a target's kind in TARGETS, and its number among its kind, from 1 on."""
+    """Split a name into the index of its kind in TARGETS and its number, counted from 1."""
     kind, number = split_name(name)
     if kind not in TARGETS:
         raise ConfigError(f"unknown target '{name}'; {known_targets()}")
@@ -221,19 +220,19 @@ def _place_of(name: str) -> tuple[int, int]:
 
 
 def change_marker(spec: "mujoco.MjSpec", name: str) -> None:
-    """Give a target's model the marker of that name; do it before attaching."""
+    """Set the marker of that name on a target's model; do it before attaching."""
     kind, number = _place_of(name)
     if kind and (number - 1) % MARKERS_OF_A_KIND:
         spec.texture(f"{TARGETS[kind]}_marker").file = f"{TARGETS[kind]}_marker_{marker_of(name)}.png"
 
 
 def scale_spec(spec: "mujoco.MjSpec", factor: float) -> None:
-    """Make every length of a target's model ``factor`` times as large; do it before attaching."""
+    """Scale all lengths of a target's model by ``factor``; do it before attaching."""
     for mesh in spec.meshes:
         mesh.scale = np.asarray(mesh.scale) * factor
     for geom in spec.geoms:
         geom.size = np.asarray(geom.size) * factor
         geom.pos = np.asarray(geom.pos) * factor
-        geom.fromto = np.asarray(geom.fromto) * factor  # nan where it is not used
+        geom.fromto = np.asarray(geom.fromto) * factor  # nan where the geom has none
     for element in [*spec.bodies[1:], *spec.sites, *spec.joints]:
         element.pos = np.asarray(element.pos) * factor

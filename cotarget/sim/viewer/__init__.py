@@ -1,1 +1,1 @@
-"""Windows on a simulated world: desktop and browser."""
+"""Interactive windows on a simulated world: desktop and browser."""

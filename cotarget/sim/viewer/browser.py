@@ -1,7 +1,7 @@
-"""A world in a web browser, by the web viewer that comes with MuJoCo (its manual: studio/web_viewers).
+"""View of a simulated world in a web browser, by MuJoCo's web viewer (its manual: studio/web_viewers).
 
-The browser draws the scene by itself; what is sent is the model, then its state, and the cameras' pictures. MuJoCo's
-viewer listens on all of a machine's networks, for anybody; here it is given a socket that only this machine reaches.
+The browser renders the scene; it receives the model, then the state and the cameras' pictures. MuJoCo's viewer listens
+on all network interfaces, without access control. Here it gets a socket that only this machine reaches.
 """
 
 import contextlib
@@ -32,28 +32,28 @@ except ImportError as error:
 
 HOST = "127.0.0.1"
 TITLE = "cotarget"
-START_S = 20.0  # for the viewer to come up [s]
-PICTURE_PX = 400  # width of a camera's picture in the page
+START_S = 20.0  # timeout of the viewer's start [s]
+PICTURE_PX = 400  # width of a camera's picture on the page
 MARGIN_PX = 12
-TITLE_PX = 30  # a window's title bar
-AFTER_ALL = messages.Priority.INTERNAL - 1  # of handlers: after the viewer's own
+TITLE_PX = 30  # height of a window's title bar
+AFTER_ALL = messages.Priority.INTERNAL - 1  # priority of a handler that runs after the viewer's own
 NAMES = {"fixed": "wide camera", "zoom": "zoom camera"}
 
 
 class BrowserWindow:
-    """MuJoCo's web viewer, with the frusta in the scene and both cameras' pictures in windows of their own."""
+    """MuJoCo's web viewer, with the frusta in the scene and the pictures of both cameras in separate windows."""
 
     def __init__(self, truth: Truth, listener: socket.socket) -> None:
-        """Begin to serve the page.
+        """Start serving the page.
 
         Args:
-            truth: of the world that is shown.
-            listener: where to serve it; closed with the window.
+            truth: ground truth of the world that is shown.
+            listener: socket to serve on; closed with the window.
 
         Raises:
             DeviceError: the viewer does not start.
         """
-        logging.getLogger("WebServer").setLevel(logging.WARNING)  # who comes and goes is nobody's business
+        logging.getLogger("WebServer").setLevel(logging.WARNING)  # connections are not logged
         self.where = f"http://{HOST}:{listener.getsockname()[1]}/"
         self._onlooker = Onlooker(truth)
         self._overlay = Overlay(self._onlooker.aim)
@@ -69,7 +69,7 @@ class BrowserWindow:
             started.put(None)
             viewer_protocol.run_viewer_loop(viewer)
 
-        with contextlib.redirect_stdout(io.StringIO()):  # its banner; the command says where the page is
+        with contextlib.redirect_stdout(io.StringIO()):  # hide the viewer's banner; the command prints the address
             self._handle = launch_thread.launch_thread(serve)
             try:
                 if (failed := started.get(timeout=START_S)) is not None:
@@ -77,7 +77,7 @@ class BrowserWindow:
                 self._handle.set_model(self._onlooker.model, data=self._onlooker.data)
                 self._overlay.ready.get(timeout=START_S)
             except BaseException as error:
-                with contextlib.suppress(Exception):  # what it fails of is told already
+                with contextlib.suppress(Exception):  # the first error is the one to report
                     self.close()
                 listener.close()
                 if isinstance(error, queue.Empty):
@@ -85,45 +85,45 @@ class BrowserWindow:
                 raise
 
     def _viewer(self, endpoint: Any, listener: socket.socket) -> Any:
-        """MuJoCo's web viewer on a socket of ours; on the thread that runs it."""
+        """Open MuJoCo's web viewer on our socket; called on the viewer's thread."""
         config = viewer_protocol.ViewerConfig(title=TITLE, gfx="web")
         with _bound_to(listener):
             viewer = web_viewer.WebViewer(config, endpoint, plugins=[self._overlay])
-        if viewer._http_sock is not listener:  # another version's, which may be open to everybody
+        if viewer._http_sock is not listener:  # another version of the viewer may have opened a public socket
             viewer.close()
             raise DeviceError(f"that of MuJoCo {mujoco.__version__} cannot be kept to this machine")
         self._overlay.viewer = viewer
         return viewer
 
     def is_open(self) -> bool:
-        """Whether the page is served."""
+        """Check that the page is served."""
         return bool(self._handle.is_running())
 
     def show(self, sight: Snapshot) -> None:
-        """Show a moment."""
+        """Show a snapshot."""
         self._onlooker.come_to(sight.t)
         self._overlay.sight = sight
         self._handle.sync()
 
     def close(self) -> None:
-        """End the page; more than once does no harm."""
+        """Stop serving the page; safe to call more than once."""
         self._handle.close()
 
 
 class Overlay:
-    """What is drawn over MuJoCo's scene, on the viewer's thread: lines in it, and windows with pictures.
+    """Lines in MuJoCo's scene and windows with pictures, drawn on the viewer's thread.
 
     Attributes:
-        sight: what is to be seen; put here by any thread.
-        viewer: MuJoCo's, once it is there.
-        ready: gets something when the viewer has taken over the model.
+        sight: snapshot to show; any thread may set it.
+        viewer: MuJoCo's viewer, once it is open.
+        ready: gets an item when the viewer has loaded the model.
     """
 
     def __init__(self, aim: Callable[[Any, Any], None]) -> None:
-        """Begin.
+        """Prepare an overlay without a snapshot.
 
         Args:
-            aim: puts a camera where the scene is looked at first, and chooses what is seen.
+            aim: sets the first view of a camera, and which geoms are shown.
         """
         self.sight: Snapshot | None = None
         self.viewer: Any = None
@@ -134,13 +134,13 @@ class Overlay:
 
     @messages.handler(priority=AFTER_ALL)  # type: ignore[untyped-decorator]
     def on_model(self, _: messages.PostModelEvent) -> None:
-        """Look at a model that is new."""
+        """Set the first view of a new model."""
         self._aim(self.viewer.camera, self.viewer.vis_options)
         self.ready.put(None)
 
     @messages.handler  # type: ignore[untyped-decorator]
     def on_update(self, _: messages.UpdateEvent) -> None:
-        """Draw the frusta, and send pictures that are new."""
+        """Draw the frusta, and send new pictures."""
         sight = self.sight
         if sight is None:
             return
@@ -175,19 +175,19 @@ class Overlay:
 
 
 def listen(port: int) -> socket.socket:
-    """A socket that only this machine reaches.
+    """Open a socket that only this machine reaches.
 
     Args:
-        port: 0 for any that is free.
+        port: port number; 0 for any free one.
 
     Raises:
-        DeviceError: the port is taken, or not this user's.
+        DeviceError: the port is in use or not permitted.
     """
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((HOST, port))
-        listener.listen()  # or another program of this user's could take it meanwhile
+        listener.listen()  # listen now, before another program can take the port
     except OSError as error:
         listener.close()
         raise DeviceError(f"--port {port}: {error.strerror}; give another one, or 0 for any that is free") from None
@@ -196,7 +196,7 @@ def listen(port: int) -> socket.socket:
 
 @contextlib.contextmanager
 def _bound_to(listener: socket.socket) -> Iterator[None]:
-    """Let MuJoCo's web viewer take a socket of ours, as it has no option for that."""
+    """Make MuJoCo's web viewer use our socket, for which it has no option."""
     own = web_server.bind_public_socket
     web_server.bind_public_socket = lambda *_: listener
     try:

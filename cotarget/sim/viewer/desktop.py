@@ -1,4 +1,4 @@
-"""A world in MuJoCo's own viewer, on a machine with a display."""
+"""View of a simulated world in MuJoCo's desktop viewer, on a machine with a display."""
 
 import os
 import sys
@@ -14,30 +14,30 @@ from cotarget.sim.truth import Truth
 from cotarget.sim.viewer.scene import Onlooker, Snapshot, line_geoms
 
 OTHERWISE = "--browser shows the scene in a web browser instead"
-PICTURE_SHARE = 0.3  # of the window's width, for each camera's picture
+PICTURE_SHARE = 0.3  # width of each camera's picture over the window's
 MARGIN_PX = 8
 
 
 class DesktopWindow:
-    """MuJoCo's passive viewer, with the frusta in the scene and both cameras' pictures at the window's right."""
+    """MuJoCo's passive viewer, with the frusta in the scene and the pictures of both cameras at the right."""
 
     def __init__(self, truth: Truth) -> None:
-        """Open the window; `check_display` has been asked before the world was made.
+        """Open the window; call `check_display` before the world is made.
 
         Args:
-            truth: of the world that is shown.
+            truth: ground truth of the world that is shown.
 
         Raises:
             DeviceError: the viewer does not open.
         """
-        import mujoco.viewer  # which needs GLFW
+        import mujoco.viewer  # needs GLFW
 
         self._onlooker = Onlooker(truth)
         try:
             self._handle = mujoco.viewer.launch_passive(
                 self._onlooker.model, self._onlooker.data, show_left_ui=False, show_right_ui=False
             )
-        except RuntimeError as error:  # macOS asks for its own launcher
+        except RuntimeError as error:  # on macOS the viewer needs its own launcher
             raise DeviceError(f"the viewer does not open: {error}; {OTHERWISE}") from None
         with self._handle.lock():
             self._onlooker.aim(self._handle.cam, self._handle.opt)
@@ -45,11 +45,11 @@ class DesktopWindow:
     where = "the viewer's window"
 
     def is_open(self) -> bool:
-        """Whether nobody has closed it."""
+        """Check that the window is open."""
         return bool(self._handle.is_running())
 
     def show(self, sight: Snapshot) -> None:
-        """Show a moment."""
+        """Show a snapshot."""
         handle = self._handle
         with handle.lock():
             self._onlooker.come_to(sight.t)
@@ -61,12 +61,12 @@ class DesktopWindow:
         handle.sync()
 
     def close(self) -> None:
-        """Close the window; more than once does no harm."""
+        """Close the window; safe to call more than once."""
         self._handle.close()
 
 
 def _placed(pictures: list[Image], width: int, height: int) -> "list[tuple[mujoco.MjrRect, Image]]":
-    """Pictures in RGB, one above the other at a window's right, as far as they fit."""
+    """Place pictures in RGB one below the other at a window's right, scaled to fit."""
     placed, top = [], height - MARGIN_PX
     for picture in pictures:
         high, wide = picture.shape[:2]
@@ -80,9 +80,9 @@ def _placed(pictures: list[Image], width: int, height: int) -> "list[tuple[mujoc
 
 
 def check_display() -> None:
-    """Refuse a machine on which the viewer would wait for ever; to be asked before anything is rendered.
+    """Refuse a machine on which the viewer would wait for ever; call it before anything is rendered.
 
-    A window of GLFW's that is opened and closed after that leaves Mesa with a context that no thread can take.
+    A GLFW window that is opened and closed later leaves Mesa with a context that no thread can use.
 
     Raises:
         DeviceError: there is no display, or it has no OpenGL.
@@ -94,7 +94,7 @@ def check_display() -> None:
     except ImportError as error:
         raise DeviceError(f"the viewer needs GLFW: {error}; {OTHERWISE}") from None
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # GLFW's errors come as such; it also says by its answers that it failed
+        warnings.simplefilter("ignore")  # GLFW's errors are raised as warnings; its return values report them too
         if not glfw.init():
             raise DeviceError(f"the display cannot be used: {_glfw_error(glfw)}; {OTHERWISE}")
         glfw.window_hint(glfw.VISIBLE, False)

@@ -1,8 +1,8 @@
-"""A rig made of numbers: its truth, what its cameras see of a board, and how far off a calibration of it points.
+"""Synthetic rig: its true geometry, its cameras' views of a board, and the pointing error of a calibration.
 
-Nothing here uses the package's camera or head model: corners come from OpenCV's projections and written-out matrices.
-The truth can have what a model lacks: lenses of other kinds, a head that sags, lags, scatters or counts wrongly, a
-lever that gives way.
+The package's camera and head models are not used: corners come from OpenCV's projections and explicit matrices. The
+truth can have what a model lacks: lenses of other kinds, a head that sags, lags, scatters or has a wrong scale, and a
+lever that bends.
 """
 
 from experiments.calibration.synthetic.aims import (

@@ -1,4 +1,4 @@
-"""Where a synthetic rig's head must point, solved numerically, and how far off a calibration sends it."""
+"""Pointing of a synthetic rig: the head's true pose for a target, solved numerically, and a calibration's error."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ TARGET_DEPTHS = (4.0, 30.0)  # [m]
 def draw_targets(
     rng: np.random.Generator, count: int, depths: tuple[float, float] = TARGET_DEPTHS
 ) -> tuple[Array, Array]:
-    """Pixels (n, 2) all over the wide view, and depths (n,) [m], even in their logarithm."""
+    """Draw pixels (n, 2) over the fixed view, and depths (n,) [m] even in their logarithm."""
     drawn = [
         (rng.uniform([0, 0], np.array(SIZE) - 1.0), np.exp(rng.uniform(*np.log(np.array(depths)))))
         for _ in range(count)
@@ -30,14 +30,14 @@ def draw_targets(
 
 
 def aim(calibration: Calibration, x_fixed: Array) -> Array:
-    """Pan and tilt that bring points to the middle of the zoom image, by the calibration; solved numerically.
+    """Solve pan and tilt that centre points in the zoom image by the calibration, numerically.
 
     Args:
-        calibration: whose word is taken for the truth.
+        calibration: calibration that is taken as true.
         x_fixed: points in the fixed camera's frame [m], (3,) or (n, 3).
 
     Returns:
-        As the head reports them [rad], (2,) or (n, 2); nan where there is no such pose.
+        Angles as the head reports them [rad], (2,) or (n, 2); nan where there is no such pose.
     """
     head = calibration.head
     model = truth_of(calibration)
@@ -48,9 +48,9 @@ def aim(calibration: Calibration, x_fixed: Array) -> Array:
 
 
 def aimed(model: Truth, x_fixed: Array, ray: Array) -> Array:
-    """True pan and tilt at which a ray (3,) or (n, 3) of the zoom camera meets points (n, 3) [rad], (n, 2).
+    """Solve the true pan and tilt at which a ray (3,) or (n, 3) of the zoom camera meets points (n, 3), (n, 2) [rad].
 
-    Newton's method, from where a head without levers would look; nan where there is no such pose.
+    Newton's method, started from the solution of a head without levers; nan where there is no such pose.
     """
     x_base = (model.hand * model.gamma).apply(x_fixed)
     look = model.hand.rotation.apply(ray)
@@ -82,9 +82,9 @@ def aimed(model: Truth, x_fixed: Array, ray: Array) -> Array:
 
 
 def pointing_errors(calibration: Calibration, truth: Truth, rng: np.random.Generator, count: int = 200) -> Array:
-    """Angles between where the true zoom camera looks and the true target [degrees], (count,).
+    """Measure the angles between the true zoom camera's line of sight and true targets, (count,) [degrees].
 
-    Targets lie all over the wide view; see `draw_targets` and `misses`.
+    Targets are spread over the fixed view; see `draw_targets` and `misses`.
 
     Raises:
         AssertionError: a target cannot be reached.
@@ -103,22 +103,22 @@ def misses(
     *,
     by_distance: bool = False,
 ) -> Array:
-    """Angles between where the true zoom camera looks and true targets, one after the other [rad], (n,).
+    """Measure the angles between the true zoom camera's line of sight and true targets in turn, (n,) [rad].
 
-    Pixel and depth are known exactly, and the head goes where it is told as well as the true one does. The camera
-    looks along the true ray through the middle of its image, at its shortest focal length.
+    Pixel and depth are known exactly, and the head executes commands as the true one does. The line of sight is the
+    true ray through the image's centre at the shortest focal length.
 
     Args:
-        calibration: by which the head is sent.
+        calibration: calibration that gives the commands.
         truth: the rig.
-        pixels: of the targets in the wide view, (n, 2).
-        depths: of the targets [m], (n,).
-        rng: for the head's jitter.
-        by_distance: whether the calibration is told the targets' distance in place of their depth. That serves where
-            the true lens follows another model, whose axis the calibration cannot know.
+        pixels: targets in the fixed view, (n, 2).
+        depths: depths of the targets [m], (n,).
+        rng: source of the head's jitter.
+        by_distance: whether the calibration gets the targets' distance in place of their depth, for true lenses of
+            another model, whose axis the calibration cannot know.
 
     Returns:
-        nan where the calibration finds no pose.
+        Angles; nan where the calibration finds no pose.
     """
     x_true = np.c_[undistorted(pixels, truth.fixed), np.ones(len(pixels))] * depths[:, None]
     x_believed = calibration.fixed.ray(pixels) * depths[:, None]
@@ -128,17 +128,16 @@ def misses(
 
 
 def looking_off(truth: Truth, x_fixed: Array, q: Array, rng: np.random.Generator | None = None) -> Array:
-    """Angles between where the true zoom camera looks and points, one after the other [rad], (n,).
+    """Measure the angles between the true zoom camera's line of sight and points in turn, (n,) [rad].
 
     Args:
-        truth: the rig; its camera looks along the true ray through the middle of its image, at its shortest focal
-            length.
-        x_fixed: the points in the fixed camera's frame [m], (n, 3).
-        q: pan and tilt told to the head for each of them [rad], (n, 2).
-        rng: for the head's jitter.
+        truth: the rig; the line of sight is the true ray through its image's centre at the shortest focal length.
+        x_fixed: points in the fixed camera's frame [m], (n, 3).
+        q: pan and tilt commanded for each of them [rad], (n, 2).
+        rng: source of the head's jitter.
 
     Returns:
-        nan where q is.
+        Angles; nan where q is nan.
     """
     before = np.concatenate([np.zeros((1, 2)), q[:-1]])
     stood = np.array([truth.stands(*pair, rng) for pair in zip(q, before, strict=True)])

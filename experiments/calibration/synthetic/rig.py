@@ -1,4 +1,4 @@
-"""The truth of a rig made of numbers: its lenses, its head's matrices written out, what its parts do wrong."""
+"""Truth of a synthetic rig: its lenses, its head's explicit matrices, and the faults of its parts."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,12 +14,12 @@ from cotarget.geometry import Array, RigidTransform, pose
 
 SIZE = (640, 480)
 SIZES: Mapping[CameraName, tuple[int, int]] = {"fixed": SIZE, "zoom": SIZE}
-NOMINAL_PX = 667.0  # what the zoom camera's device calls its shortest focal length
-LONGEST_PX = 7155.0  # the focal length at which errors are stated in pixels
-WIDEST = 1.2  # tangent of the angle off the axis beyond which distortion may have folded back
-NEAREST = 0.2  # [m]; no camera sees anything nearer
+NOMINAL_PX = 667.0  # shortest nominal focal length of the zoom camera
+LONGEST_PX = 7155.0  # focal length at which errors are given in pixels
+WIDEST = 1.2  # tangent of the off-axis angle beyond which distortion may have folded back
+NEAREST = 0.2  # least distance of a visible point [m]
 NEWTON_STEPS = 50
-SOLVED = 1e-10  # [rad] or normalised; far below the smallest error of interest, 1e-6
+SOLVED = 1e-10  # convergence [rad] or normalised; far below the smallest error of interest, 1e-6
 DIFFERENCE = 1e-6  # step of central differences
 
 
@@ -28,10 +28,13 @@ class Lens:
     """True intrinsics.
 
     Attributes:
-        fx: focal length [px]; fy likewise.
-        cx: principal point [px]; cy likewise.
-        distortion: OpenCV's coefficients, 4, 5, 8 (rational) or 12 (thin prism) of them; the 4 of `cv2.fisheye`.
-        fisheye: whether they are those.
+        fx: focal length along the rows [px].
+        fy: focal length along the columns [px].
+        cx: principal point along u [px].
+        cy: principal point along v [px].
+        distortion: OpenCV's coefficients: 4, 5, 8 (rational) or 12 (thin prism); with ``fisheye`` the 4 of
+            `cv2.fisheye`.
+        fisheye: whether the coefficients are those of `cv2.fisheye`.
     """
 
     fx: float
@@ -43,18 +46,18 @@ class Lens:
 
     @property
     def K(self) -> Array:
-        """The camera matrix."""
+        """Camera matrix, (3, 3)."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def project(self, x_camera: Array) -> Array:
-        """Pixels (n, 2) of points (n, 3)."""
+        """Project points (n, 3) to pixels (n, 2)."""
         project = cv2.fisheye.projectPoints if self.fisheye else cv2.projectPoints
         x = np.ascontiguousarray(np.asarray(x_camera, float).reshape(-1, 1, 3))
         px, _ = project(x, np.zeros((3, 1)), np.zeros((3, 1)), self.K, np.array(self.distortion, float))
         return np.asarray(px).reshape(-1, 2)
 
     def inside(self, x_camera: Array, margin: float = 0.0) -> npt.NDArray[np.bool_]:
-        """Which of the points (n, 3) are in front of the camera, unfolded, and inside the image."""
+        """Check for each point (n, 3) that it is in front of the camera, before the fold, and inside the image."""
         x_camera = np.asarray(x_camera, float)
         ahead = x_camera[:, 2] >= NEAREST
         ahead &= np.abs(x_camera[:, :2]).max(axis=1) <= WIDEST * np.abs(x_camera[:, 2])
@@ -62,13 +65,13 @@ class Lens:
         return np.asarray(ahead & ((px >= margin) & (px <= np.array(SIZE) - 1 - margin)).all(axis=1))
 
     def sees(self, x_camera: Array, margin: float = 0.0) -> bool:
-        """Whether all points are seen."""
+        """Check that all points are visible."""
         return bool(self.inside(x_camera, margin).all())
 
 
 @dataclass(frozen=True)
 class Stop:
-    """The zoom lens at another focal length: by the device's account [px], in truth, and where its pupil is [m]."""
+    """Zoom sample: nominal focal length [px], true lens, and position of the pupil along the axis [m]."""
 
     nominal_px: float
     lens: Lens
@@ -77,23 +80,24 @@ class Stop:
 
 @dataclass(frozen=True)
 class Truth:
-    """A whole rig, and the matrices of its head written out.
+    """Whole rig, with explicit matrices of its head.
 
-    The matrices take the axes' true angles; `stands` says what these are where the head reports others.
+    The matrices take the axes' true angles; `stands` gives these from the reported ones.
 
     Attributes:
-        fixed: the fixed camera.
-        zoom: the zoom camera at its shortest focal length.
+        fixed: lens of the fixed camera.
+        zoom: lens of the zoom camera at its shortest focal length.
         gamma: T_zoom0_fixed.
         hand: T_head_zoom.
-        dz: from the pan axis to the tilt axis [m].
-        eps: how far the tilt axis leans [rad].
-        stops: the zoom lens's further stops.
-        pan_scale: true turn over the reported one; tilt_scale likewise.
-        sag: by how much the tilt gives way to the camera's weight when it is level [rad].
-        play: backlash of both axes [rad]; they lag half of it behind.
-        jitter: standard deviation of where either axis really stops, at every move anew [rad].
-        give: how far the camera shifts on the head per radian of tilt [m].
+        dz: offset from the pan axis to the tilt axis [m].
+        eps: deviation of the tilt axis from a right angle with the pan axis [rad].
+        stops: further zoom samples.
+        pan_scale: true over reported pan.
+        tilt_scale: true over reported tilt.
+        sag: deflection of the tilt by the camera's weight at level tilt [rad].
+        play: backlash of both axes [rad]; they lag by half of it.
+        jitter: standard deviation of an axis's position, drawn for every move [rad].
+        give: shift of the camera on the head per radian of tilt [m].
     """
 
     fixed: Lens = Lens(686.0, 684.0, 325.0, 239.0, (-0.2, 0.0, 0.0, 0.0, 0.0))
@@ -113,12 +117,12 @@ class Truth:
     def stands(
         self, reported: Array, before: Array | None = None, rng: np.random.Generator | None = None
     ) -> tuple[float, float]:
-        """The axes' true pan and tilt [rad].
+        """Give the axes' true pan and tilt [rad].
 
         Args:
-            reported: pan and tilt as the head says [rad], (2,).
-            before: where it came from, likewise; for the backlash.
-            rng: for the jitter.
+            reported: pan and tilt reported by the head [rad], (2,).
+            before: reported pan and tilt before the move, for the backlash [rad], (2,).
+            rng: source of the jitter.
         """
         true = np.array([self.pan_scale, self.tilt_scale]) * np.asarray(reported, float)
         if before is not None:
@@ -128,7 +132,7 @@ class Truth:
         return float(true[0]), float(true[1] + self.sag * np.cos(true[1]))
 
     def base_head(self, pan: Array | float, tilt: Array | float) -> Array:
-        """T_base_head at true angles (...), (..., 4, 4)."""
+        """Compute T_base_head at true angles (...), (..., 4, 4)."""
         pan, tilt = np.broadcast_arrays(np.asarray(pan, float), np.asarray(tilt, float))
         o, i = np.zeros(pan.shape), np.ones(pan.shape)
         c, s = np.cos(pan), np.sin(pan)
@@ -142,7 +146,7 @@ class Truth:
         return Y @ D @ Z @ X @ Z.T @ np.linalg.inv(D)
 
     def zoom_fixed(self, pan: Array | float, tilt: Array | float) -> Array:
-        """T_zoom_fixed at true angles (...), (..., 4, 4)."""
+        """Compute T_zoom_fixed at true angles (...), (..., 4, 4)."""
         T = self.hand.as_matrix()
         given = np.tile(np.eye(4), (*np.shape(tilt), 1, 1))
         given[..., :3, 3] = np.multiply.outer(tilt, self.give)
@@ -150,7 +154,7 @@ class Truth:
         return np.linalg.inv(T_head_zoom) @ np.linalg.inv(self.base_head(pan, tilt)) @ T @ self.gamma.as_matrix()
 
     def in_zoom(self, x_fixed: Array, pan: Array | float, tilt: Array | float) -> Array:
-        """Points (..., 3) in the moved zoom camera's frame; one pair of true angles for all, or one for each."""
+        """Transform points (..., 3) to the moved zoom camera's frame; one pair of true angles for all, or for each."""
         M = self.zoom_fixed(pan, tilt)
         return np.asarray(np.einsum("...ij,...j->...i", M[..., :3, :3], x_fixed) + M[..., :3, 3])
 
@@ -160,7 +164,7 @@ def _stacked(rows: Sequence[Sequence[Array]]) -> Array:
 
 
 def truth_of(calibration: Calibration) -> Truth:
-    """The rig that a calibration describes, at its shortest focal length."""
+    """Make the rig that a calibration describes, at its shortest focal length."""
     fixed, zoom = (
         Lens(*lens.focal_px, *lens.center_px, lens.distortion)
         for lens in (calibration.fixed, calibration.zoom.stops[0])
@@ -179,18 +183,18 @@ def truth_of(calibration: Calibration) -> Truth:
 
 
 def other_rig() -> Truth:
-    """A wide baseline, toed in, with a long lever and a rolled camera."""
+    """Make a rig with a wide baseline, toed in, with a long lever and a rolled camera."""
     return Truth(gamma=pose([-1.5, 0.1, -0.1], [1.0, 12.0, 5.0]), hand=pose([0.1, -0.15, 0.08], [2.0, 1.5, 5.0]))
 
 
 def with_lever_shifted(truth: Truth, shift: Sequence[float]) -> Truth:
-    """The rig after the camera has slipped on the head by a shift in the head's frame [m], (3,)."""
+    """Make the rig after the camera has slipped on the head by a shift in the head's frame [m], (3,)."""
     hand = RigidTransform.from_translation(np.array(shift, float)) * truth.hand
     return replace(truth, hand=hand, gamma=hand.inv() * truth.hand * truth.gamma)
 
 
 def undistorted(pixel: Array | Sequence[float], lens: Lens) -> Array:
-    """Image-plane coordinates x / z, y / z of pixels (..., 2), by Newton's method on the projection."""
+    """Undistort pixels (..., 2) to image-plane coordinates x / z, y / z, by Newton's method on the projection."""
     pixel = np.asarray(pixel, float)
     wanted = pixel.reshape(-1, 2)
 
@@ -208,5 +212,5 @@ def undistorted(pixel: Array | Sequence[float], lens: Lens) -> Array:
 
 
 def middle_of(lens: Lens) -> Array:
-    """Image-plane coordinates of the middle of a camera's image, (2,)."""
+    """Give the image-plane coordinates of an image's centre, (2,)."""
     return undistorted((np.array(SIZE) - 1) / 2, lens)

@@ -1,4 +1,4 @@
-"""What a synthetic rig's cameras see of boards that are held before them."""
+"""Views of calibration boards by a synthetic rig's cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ from experiments.calibration.synthetic.aims import aimed
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Stop, Truth, undistorted
 
 BOARD_DEPTHS = (2.5, 8.0)  # [m]
-MARGIN_PX = 40.0  # the middle of a board stays so far inside the wide view
-# Of the head in use: pan and tilt [rad].
+MARGIN_PX = 40.0  # least distance of a board's centre from the border of the fixed image
+# Limits of the head in use: pan and tilt [rad].
 HEAD_LIMITS = ((np.radians(-158.9), np.radians(158.9)), (np.radians(-46.6), np.radians(31.1)))
-CELLS = (5, 3)  # of the wide view, in columns and rows, over which boards are spread
-CELL_STEP = 7  # cells are taken in this step, so that a few boards reach all over as well
-FLATTEST = np.cos(np.radians(65.0))  # a board is not found that is seen at a flatter angle
-FARTHER = 0.03  # by which a board moves away that is not wholly seen, relative to its depth
-GOLDEN = (np.sqrt(5) - 1) / 2  # multiples of it, modulo 1, are evenly spread from the first on
-LOOKS_DRAWN = 80  # head poses among which those far apart are chosen
-FEWEST_CORNERS = 12  # of a board seen in part, through a longer focal length
-TRIES = 200  # head poses drawn for a placement
+CELLS = (5, 3)  # grid of the fixed view, columns and rows, over which boards are spread
+CELL_STEP = 7  # step between successive cells, so that a few boards are spread too
+FLATTEST = np.cos(np.radians(65.0))  # largest viewing angle at which a board is found
+FARTHER = 0.03  # relative increase of the depth of a board that is not wholly visible
+GOLDEN = (np.sqrt(5) - 1) / 2  # multiples of it, modulo 1, are evenly spread for any count
+LOOKS_DRAWN = 80  # head poses drawn, of which those far apart are chosen
+FEWEST_CORNERS = 12  # least corners of a board in partial view, at a longer focal length
+TRIES = 200  # head poses drawn per placement
 PLACEMENT_TRIES = 100_000
 
 
@@ -39,19 +39,19 @@ def synthetic_views(
     shape: Array | None = None,
     first: int = 0,
 ) -> list[View]:
-    """Views of boards held at random where the fixed camera sees them, home and moved.
+    """Make views of boards at random poses in the fixed view, with the head at home and moved.
 
     Args:
         truth: the rig.
-        points: the board's corners as everybody believes them to be [m], (N, 3).
-        rng: draws everything.
-        boards: how many placements.
+        points: nominal corners of the board [m], (N, 3).
+        rng: source of all random values.
+        boards: number of placements.
         noise_px: standard deviation of a corner's coordinate.
-        moved: how many head poses for each placement, besides one at home where that sees it.
-        pan_range: how far the head turns either way [rad].
-        tilt_range: likewise.
-        far: the farthest depth [m].
-        shape: where the corners really are on the board [m], (N, 3); by default the same.
+        moved: number of head poses per placement, besides home where the zoom camera sees the board from there.
+        pan_range: largest pan to either side [rad].
+        tilt_range: largest tilt to either side [rad].
+        far: largest depth [m].
+        shape: true corners of the board [m], (N, 3); by default the nominal ones.
         first: number of the first placement.
     """
     views: list[View] = []
@@ -83,15 +83,15 @@ def synthetic_views(
 
 @dataclass(frozen=True)
 class Placing:
-    """Where boards are put, and from where they are looked at.
+    """Placement of boards and head poses.
 
     Attributes:
-        boards: how many placements, one in each cell of the wide view in turn.
-        looks: head poses for each placement, as far apart as the zoom camera's view and the head's limits allow; the
-            one at home is among them where it sees the board.
-        depths: of the boards, even in their logarithm [m].
-        turned: how far a board is turned out of the direction halfway between both cameras [rad].
-        limits: of pan and of tilt [rad].
+        boards: number of placements, one in each cell of the fixed view in turn.
+        looks: head poses per placement, as far apart as the zoom camera's view and the head's limits allow; home is
+            among them where the zoom camera sees the board from there.
+        depths: range of depths, even in the logarithm [m].
+        turned: largest rotation of a board from facing halfway between both cameras [rad].
+        limits: limits of pan and tilt [rad].
     """
 
     boards: int = 15
@@ -112,15 +112,15 @@ def spread_views(
     placing: Placing = DEFAULT_PLACING,
     shape: Array | None = None,
 ) -> list[View]:
-    """Views of boards all over the wide view, each looked at from head poses that bring it all over the zoom view.
+    """Make views of boards over the whole fixed view, each from head poses that spread it over the zoom view.
 
     Args:
         truth: the rig.
-        points: the board's corners as everybody believes them to be [m], (N, 3).
-        rng: draws everything.
+        points: nominal corners of the board [m], (N, 3).
+        rng: source of all random values.
         noise_px: standard deviation of a corner's coordinate.
-        placing: where boards are put.
-        shape: where the corners really are on the board [m], (N, 3); by default the same.
+        placing: placement of boards and head poses.
+        shape: true corners of the board [m], (N, 3); by default the nominal ones.
 
     Raises:
         AssertionError: there is no room for a board.
@@ -137,12 +137,12 @@ def spread_views(
 
 
 def placed(truth: Truth, points: Array, rng: np.random.Generator, placing: Placing, number: int) -> tuple[Array, Array]:
-    """Find a place for a board: its corners in the fixed camera's frame [m], (N, 3), and head poses (n, 2) [rad].
+    """Place a board: its corners in the fixed camera's frame [m], (N, 3), and head poses (n, 2) [rad].
 
-    A board too near for its cell moves away from the camera; a cell that the zoom camera cannot see gives way to any.
+    A board too near for its cell is moved away; a cell that the zoom camera cannot see is replaced by any other.
 
     Raises:
-        AssertionError: there is none.
+        AssertionError: there is no room for the board.
     """
     centered = points - points.mean(axis=0)
     row, column = divmod(number * CELL_STEP % (CELLS[0] * CELLS[1]), CELLS[0])
@@ -171,14 +171,14 @@ def placed(truth: Truth, points: Array, rng: np.random.Generator, placing: Placi
 
 
 def _looks(truth: Truth, x_fixed: Array, rng: np.random.Generator) -> Array:
-    """Head poses that bring a point (3,) to pixels all over the zoom view, (n, 2)."""
+    """Draw head poses that bring a point (3,) to pixels over the whole zoom view, (n, 2)."""
     pixels = rng.uniform([0, 0], np.array(SIZE) - 1.0, (LOOKS_DRAWN, 2))
     rays = np.c_[(pixels - [truth.zoom.cx, truth.zoom.cy]) / [truth.zoom.fx, truth.zoom.fy], np.ones(LOOKS_DRAWN)]
     return aimed(truth, np.tile(x_fixed, (LOOKS_DRAWN, 1)), rays)
 
 
 def _apart(poses: Array, count: int) -> Array:
-    """So many of the poses (n, 2), the first one and each time the one farthest from all taken."""
+    """Select poses (n, 2): the first one, then each time the one farthest from those selected."""
     taken = [0]
     while len(taken) < count:
         away = np.linalg.norm(poses[:, None] - poses[taken][None], axis=-1).min(axis=1)
@@ -187,7 +187,7 @@ def _apart(poses: Array, count: int) -> Array:
 
 
 def _towards(direction: Array) -> Rotation:
-    """The smallest rotation that turns +z into a direction (3,)."""
+    """Give the smallest rotation of +z to a direction (3,)."""
     return Rotation.align_vectors(direction[None], np.array([[0.0, 0.0, 1.0]]))[0]
 
 
@@ -196,7 +196,7 @@ def _unit(v: Array) -> Array:
 
 
 def seen_from(truth: Truth, x_fixed: Array, poses: Array) -> npt.NDArray[np.bool_]:
-    """From which head poses (n, 2) the zoom camera sees all points (N, 3)."""
+    """Check for each head pose (n, 2) that the zoom camera sees all points (N, 3)."""
     x_zoom = truth.in_zoom(x_fixed, poses[:, :1], poses[:, 1:])
     inside = truth.zoom.inside(x_zoom.reshape(-1, 3)).reshape(x_zoom.shape[:2])
     return np.asarray(inside.all(axis=1))
@@ -212,17 +212,17 @@ def zoom_view(
     rng: np.random.Generator,
     stop: Stop | None = None,
 ) -> View:
-    """What the zoom camera sees of a board's corners (N, 3), in part perhaps, from a pose that the head reports.
+    """Make the zoom camera's view of a board's corners (N, 3), perhaps in part, at a reported head pose.
 
     Args:
         truth: the rig.
-        x_fixed: where the corners are [m], (N, 3).
-        number: of the placement.
-        reported: pan and tilt [rad], (2,).
-        before: where the head came from, likewise.
+        x_fixed: true corners in the fixed frame [m], (N, 3).
+        number: number of the placement.
+        reported: reported pan and tilt [rad], (2,).
+        before: reported pan and tilt before the move [rad], (2,).
         noise_px: standard deviation of a corner's coordinate.
-        rng: draws noise and jitter.
-        stop: the zoom lens's; the shortest focal length by default.
+        rng: source of noise and jitter.
+        stop: zoom sample; the shortest focal length by default.
     """
     lens, pupil, nominal = (truth.zoom, 0.0, NOMINAL_PX) if stop is None else (stop.lens, stop.pupil, stop.nominal_px)
     x = truth.in_zoom(x_fixed, *truth.stands(reported, before, rng)) - [0.0, 0.0, pupil]
@@ -235,14 +235,14 @@ def zoom_view(
 def views_at_stops(
     truth: Truth, placements: Sequence[Array], rng: np.random.Generator, noise_px: float = 0.1, looks: int = 2
 ) -> list[View]:
-    """Views of boards through the zoom lens's further stops, seen in part where they fill more than the image.
+    """Make views of boards at the further zoom samples, in part where a board is larger than the image.
 
     Args:
-        truth: with stops.
-        placements: corners of each placement in the fixed camera's frame [m], (N, 3); their numbers count from 0.
-        rng: draws which corner is looked at, and the noise.
+        truth: the rig, with zoom samples.
+        placements: corners of each placement in the fixed camera's frame [m], (N, 3), numbered from 0.
+        rng: source of the corner that is centred, and of the noise.
         noise_px: standard deviation of a corner's coordinate.
-        looks: how many head poses for each placement and stop.
+        looks: head poses per placement and zoom sample.
     """
     views: list[View] = []
     before = np.zeros(2)
@@ -258,5 +258,5 @@ def views_at_stops(
 
 
 def noisy(corners_px: Array, noise_px: float, rng: np.random.Generator) -> Array:
-    """Corners (N, 2) with Gaussian noise."""
+    """Add Gaussian noise to corners (N, 2)."""
     return corners_px + rng.normal(0, noise_px, corners_px.shape)
