@@ -5,7 +5,7 @@ python -m experiments.paper.teaser [--out docs/pictures/teaser.webp]
 
 import io
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         check_folder(out.parent)
         config = ct.RigConfig(sim=ct.SimConfig(scene="outdoor", targets=("bird",)))
-        write_whole(out, animated_webp(pictures(config), config.rate_hz))
+        write_whole(out, animated_webp(list(pictures(config)), config.rate_hz))
     except CotargetError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         return 1
@@ -63,8 +63,8 @@ def side_by_side(step: ct.Step) -> Image:
         scale = WIDTH_PX / step.fixed.image.shape[1]
         box = step.target.box
         center, half = (box.center_px + 0.5) * scale - 0.5, box.size_px * scale / 2 + BOX_MARGIN_PX
-        corners = (np.round(corner).astype(int).tolist() for corner in (center - half, center + half))
-        cv2.rectangle(fixed, *corners, BOX_COLOR, 2)
+        (left, top), (right, bottom) = np.round([center - half, center + half]).astype(int).tolist()
+        cv2.rectangle(fixed, (left, top), (right, bottom), BOX_COLOR, 2)
     write_text(fixed, "fixed camera", (10, 20), 0.5)
     write_text(zoom, "zoom camera", (10, 20), 0.5)
     return np.hstack([fixed, zoom])
@@ -76,14 +76,14 @@ def small(image: Image) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def animated_webp(images: Iterable[Image], rate_hz: float) -> bytes:
+def animated_webp(images: Sequence[Image], rate_hz: float) -> bytes:
     """Encode images as an animated WebP that repeats for ever."""
     data = io.BytesIO()
     with av.open(data, "w", format="webp", options={"loop": "0"}) as file:
         stream = file.add_stream("libwebp_anim", rate=Fraction(rate_hz), options=ENCODER)
         stream.pix_fmt = "yuv420p"
+        stream.height, stream.width = images[0].shape[:2]
         for image in images:
-            stream.height, stream.width = image.shape[:2]
             file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
         file.mux(stream.encode(None))
     return data.getvalue()
