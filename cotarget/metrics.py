@@ -488,6 +488,17 @@ class Score:
     lens_commands_per_min: float | None = None
     id_switches_per_min: float | None = None
 
+    def summary(self) -> str:
+        """The figures that matter most, in one line."""
+        if not self.frames:
+            return "never wholly in the fixed view"
+        if self.time_to_acquire_s is None or self.tpo_width_median is None or self.size_ratio_median is None:
+            return f"never acquired in {self.frames} frames"
+        return (
+            f"acquired after {self.time_to_acquire_s:.2f} s, yield {self.closeup_yield:.2f}, offset "
+            f"{self.tpo_width_median:.1%} of the width, size ratio {self.size_ratio_median:.2f}"
+        )
+
 
 def score(rows: Sequence[Row]) -> Score:
     """Score one run that follows one target; the fields of `Score` hold the definitions."""

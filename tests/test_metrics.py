@@ -102,6 +102,13 @@ def test_acquisition_is_dated_to_the_start_of_the_first_half_second_on_end():
     assert found.closeup_yield == pytest.approx((12 + 30) / 70)  # counted from row 50 on
 
 
+def test_a_score_in_one_line():
+    late = run((60, AWAY), (90, {"u_px": CENTRE[0] + 6.4, "size_px": 168.0}))
+    assert score(late).summary() == "acquired after 0.40 s, yield 0.90, offset 1.0% of the width, size ratio 1.05"
+    assert score(run((150, AWAY))).summary() == "never acquired in 100 frames"
+    assert score(run((150, {"in_wide": False}))).summary() == "never wholly in the fixed view"
+
+
 def test_lost_frames_count():
     found = score(run((50, {}), (60, {}), (40, {**AWAY, "track": -1, "state": "lost"})))
     assert found.in_frame_ratio == pytest.approx(0.6)
