@@ -95,7 +95,7 @@ class Pipeline:
         estimate = None if number is None else self.fusion.estimate(number, frame.t + LEAD_S)
         tracked = time.perf_counter()
         if estimate is not None:
-            aim(self.calibration, estimate.x_fixed, self.reach, closeup=estimate.closeup)
+            aim(self.calibration, estimate.x_fixed, self.reach, wanted_size=estimate.wanted_size)
         ended = time.perf_counter()
         times = (began, detected, tracked, ended)
         stages = {name: 1e3 * (b - a) for name, a, b in zip(STAGES, times[:-1], times[1:], strict=True)}

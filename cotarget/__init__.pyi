@@ -24,6 +24,7 @@ from .rig import Frame as Frame
 from .rig import Rig as Rig
 from .sim.world import SimWorld as SimWorld
 from .targeting import Aim as Aim
+from .targeting import Reach as Reach
 from .targeting import WantedSize as WantedSize
 from .targeting import aim as aim
 

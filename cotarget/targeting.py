@@ -126,7 +126,7 @@ def aim(
     *,
     pixel: npt.ArrayLike | None = None,
     depth: float | None = None,
-    closeup: WantedSize | None = None,
+    wanted_size: WantedSize | None = None,
     nominal_px: float | None = None,
     method: Method = "exact",
     zoom_pixel: Array | None = None,
@@ -141,7 +141,7 @@ def aim(
         reach: limits, and where the head is; by default any angles, and the calibrated focal lengths.
         pixel: target in the fixed image, (2,) [px].
         depth: depth along the fixed camera's optical axis [m].
-        closeup: wanted size of the target, which decides the focal length.
+        wanted_size: wanted size of the target, which decides the focal length.
         nominal_px: nominal focal length if no size is wanted [px]; the shortest by default.
         method: the exact inverse, or the paper's shortcut in one of its two readings.
         zoom_pixel: wanted place of the target in the zoom image, (2,) [px]; its centre by default.
@@ -159,11 +159,13 @@ def aim(
         reach = Reach((-math.pi, math.pi), (-math.pi, math.pi), (focal_px[0], focal_px[-1]))
     x_base = calibration.in_base(x_fixed)  # (6)
     wanted = calibration.zoom.stops[0].image_center_px if zoom_pixel is None else np.asarray(zoom_pixel, dtype=float)
-    if closeup:  # start with the distance from the base for the range
-        nominal_px = calibration.zoom.nominal_for(focal_for_size(closeup.size, closeup.wanted_px, math.hypot(*x_base)))
+    if wanted_size:  # start with the distance from the base for the range
+        nominal_px = calibration.zoom.nominal_for(
+            focal_for_size(wanted_size.size, wanted_size.wanted_px, math.hypot(*x_base))
+        )
     nominal, limited = _limit(reach.focal_px[0] if nominal_px is None else nominal_px, reach)
     lens = calibration.zoom.at(nominal)
-    for _ in range(FOCAL_ROUNDS if closeup else 1):
+    for _ in range(FOCAL_ROUNDS if wanted_size else 1):
         ray = lens.ray(wanted)
         if method == "exact":
             pupil = calibration.zoom.pupil_at(nominal)
@@ -171,10 +173,10 @@ def aim(
             pointing = nearest(ways, reach.pan, reach.tilt, reach.now, calibration.head)
         else:
             pointing = _paper(calibration, x_fixed, method, reach)
-        if closeup:
+        if wanted_size:
             z = float(pointing.range * ray[2]) / math.hypot(*ray)
-            focal = focal_for_size(closeup.size, closeup.wanted_px, z)  # (17)
-            if closeup.vertical:  # this focal length is fy, and the lens is commanded by fx
+            focal = focal_for_size(wanted_size.size, wanted_size.wanted_px, z)  # (17)
+            if wanted_size.vertical:  # this focal length is fy, and the lens is commanded by fx
                 fx, fy = lens.focal_px
                 focal *= fx / fy
             previous = nominal

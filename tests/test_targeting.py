@@ -83,10 +83,10 @@ def test_the_exact_aim_brings_the_target_to_the_wanted_pixel(real_head, pixel):
         truth = random_truth(rng, real_head)
         assert np.hypot(truth.zoom.cx - 319.5, truth.zoom.cy - 239.5) > 0  # else a mixed-up centre could hide
         x_fixed = np.array([*rng.uniform(-0.4, 0.4, 2), 1.0]) * rng.uniform(4, 40)
-        closeup = WantedSize(0.3, rng.uniform(20, 300))
-        for how in ({}, {"nominal_px": rng.uniform(667, 8000)}, {"closeup": closeup}):
+        wanted_size = WantedSize(0.3, rng.uniform(20, 300))
+        for how in ({}, {"nominal_px": rng.uniform(667, 8000)}, {"wanted_size": wanted_size}):
             found = aim(calibration_of(truth), x_fixed, ANYWHERE, zoom_pixel=pixel, **how)
-            tolerance = IN_TURN_PX if "closeup" in how else PIXEL
+            tolerance = IN_TURN_PX if "wanted_size" in how else PIXEL
             np.testing.assert_allclose(seen_by_zoom(truth, found, x_fixed)[0], wanted, rtol=0, atol=tolerance)
             x_zoom = truth.in_zoom(x_fixed[None], found.pan, found.tilt)[0]
             assert found.range == pytest.approx(np.linalg.norm(x_zoom), rel=RELATIVE)
@@ -99,7 +99,7 @@ def test_the_closeup_is_as_large_as_wanted():
     for _ in range(10):
         truth = replace(random_truth(rng, True), zoom=Lens(692.0, 693.0, 326.0, 235.0))
         x_fixed = np.array([*rng.uniform(-0.4, 0.4, 2), 1.0]) * rng.uniform(4, 10)
-        found = aim(calibration_of(truth), x_fixed, ANYWHERE, closeup=WantedSize(0.234, 160.0))
+        found = aim(calibration_of(truth), x_fixed, ANYWHERE, wanted_size=WantedSize(0.234, 160.0))
         assert not found.limited
         M = truth.zoom_fixed(found.pan, found.tilt)
         half = M[:3, :3].T @ [0.117, 0, 0]
@@ -109,7 +109,7 @@ def test_the_closeup_is_as_large_as_wanted():
 
 def test_a_height_is_magnified_by_the_vertical_focal_length():
     """300 px for 1.75 m at 12 m take fy = 300 x 12 / 1.75; fx is 686 / 684 of that, the lens calls it 667 / 684."""
-    found = aim(HOME, np.array([0.0, 0.0, 12.0]), ANYWHERE, closeup=WantedSize(1.75, 300.0, vertical=True))
+    found = aim(HOME, np.array([0.0, 0.0, 12.0]), ANYWHERE, wanted_size=WantedSize(1.75, 300.0, vertical=True))
     fy = 300 * 12 / 1.75
     assert found.focal_px == pytest.approx(fy * 686 / 684, rel=RELATIVE)
     assert found.nominal_px == pytest.approx(fy * 667 / 684, rel=RELATIVE)
@@ -132,13 +132,13 @@ def test_the_papers_worked_point():
     x_fixed = np.array([2.9738, 0.5263, 10.0])
     calibration = shifted(*(np.array([0.811, 0.563, 10.464]) - x_fixed))
     book = WantedSize(0.234, 160.0)
-    exact = aim(calibration, x_fixed, ANYWHERE, closeup=book)
+    exact = aim(calibration, x_fixed, ANYWHERE, wanted_size=book)
     assert round(1000 * exact.range) == 10510
     assert exact.focal_px == pytest.approx(7186, abs=WHOLE_MM_PX)
-    example = aim(calibration, x_fixed, ANYWHERE, closeup=book, method="paper-example")
+    example = aim(calibration, x_fixed, ANYWHERE, wanted_size=book, method="paper-example")
     assert round(example.focal_px) == 7155
     assert round(math.degrees(-example.tilt), 2) == 3.08  # the one angle that the paper prints; down is negative
-    table = aim(calibration, x_fixed, ANYWHERE, closeup=book, method="paper-table")
+    table = aim(calibration, x_fixed, ANYWHERE, wanted_size=book, method="paper-table")
     assert table.focal_px == pytest.approx(160 * 10 / 0.234, rel=RELATIVE)  # that reading takes the depth in x_fixed
     assert METHODS == ("exact", "paper-table", "paper-example")
 
@@ -173,7 +173,7 @@ def test_the_shortcut_says_where_it_has_no_solution():
     (1000.0, 8000.0, True),
 ])  # fmt: skip
 def test_the_focal_length_is_limited_to_the_lens(wanted_px, nominal, limited):
-    found = aim(HOME, np.array([0.0, 0.0, 10.0]), ANYWHERE, closeup=WantedSize(0.234, wanted_px))
+    found = aim(HOME, np.array([0.0, 0.0, 10.0]), ANYWHERE, wanted_size=WantedSize(0.234, wanted_px))
     assert found.nominal_px == pytest.approx(nominal, rel=RELATIVE)
     assert found.limited is limited
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import check_board_is_told, check_outputs, previous_kept, print_json, progress_bar, rig_files
-from cotarget.errors import ConfigError
+from cotarget.errors import CalibrationError, ConfigError
 from cotarget.files import behind_link, check_writable
 
 if TYPE_CHECKING:
@@ -89,7 +89,6 @@ def _lists(directory: Path | None) -> list[Path]:
 def _photos(options: argparse.Namespace) -> list[Path]:
     """List the files that are read from a folder of captures or photos; other files there may be outputs."""
     from cotarget.calibration.captures import matching, read_index
-    from cotarget.errors import CalibrationError
 
     directory, globs = options.source, [glob for glob in (options.fixed, options.zoom) if glob is not None]
     found = _lists(directory)

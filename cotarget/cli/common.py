@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cotarget.errors import ConfigError, choices
-from cotarget.files import behind_link
+from cotarget.files import behind_link, write_atomically
 
 if TYPE_CHECKING:
     from cotarget.config import RigConfig
@@ -385,8 +385,6 @@ def previous_kept(path: Path) -> Iterator[None]:
 
 def _second_name(path: Path) -> Path | None:
     """Link a file to another name beside its own; None where there is no such file."""
-    from cotarget.files import write_atomically
-
     if not path.exists():
         return None
     numbered = (path.with_name(f"{path.stem}.previous-{n}{path.suffix}") for n in itertools.count(1))

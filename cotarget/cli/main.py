@@ -15,8 +15,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cotarget.cli import calibrating, operating, running
-from cotarget.cli import operating as operating_module
-from cotarget.cli import running as running_module
 from cotarget.cli.common import add_choice, corners, count, not_negative, number, port, positive
 from cotarget.errors import CotargetError
 
@@ -178,7 +176,7 @@ def _parser() -> argparse.ArgumentParser:
 
     aim = command(
         "aim",
-        operating_module.aim,
+        operating.aim,
         "solve pan, tilt and focal length for one pixel of the fixed camera; JSON on stdout",
     )
     aim.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
@@ -269,7 +267,7 @@ def _parser() -> argparse.ArgumentParser:
     reset_head.add_argument("--yes", action="store_true", help="confirm that camera and cables are clear of it")
 
     emulate = command(
-        "emulate", operating_module.emulate, "put a simulated rig behind the real devices' protocols, in real time"
+        "emulate", operating.emulate, "put a simulated rig behind the real devices' protocols, in real time"
     )
     emulate.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml of the simulated rig (the default rig)")
     emulate.add_argument(
@@ -287,19 +285,17 @@ def _parser() -> argparse.ArgumentParser:
         metavar="DEVICE.FAULT",
         help="fault to be on from the start, one of those below; the control socket switches faults later",
     )
-    emulate.more = operating_module.fault_names
+    emulate.more = operating.fault_names
     emulate.add_argument("--seconds", type=positive, metavar="S", help="duration [s] (until Ctrl-C)")
 
-    view = command("view", running_module.view, "show the simulated scene, both cameras' frusta and their images")
+    view = command("view", running.view, "show the simulated scene, both cameras' frusta and their images")
     view.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml of the simulated rig (the default rig)")
     view.add_argument("--target", metavar="NAME", help="follow this target of rig.toml")
     view.add_argument(
         "--calibration", type=Path, metavar="FILE", help="calibration.json (the simulation's true calibration)"
     )
     view.add_argument("--browser", action="store_true", help="serve a page for a web browser on this machine")
-    view.add_argument(
-        "--port", type=port, metavar="P", help=f"port of the page; 0: any free one ({running_module.PORT})"
-    )
+    view.add_argument("--port", type=port, metavar="P", help=f"port of the page; 0: any free one ({running.PORT})")
     view.add_argument("--seconds", type=positive, metavar="S", help="duration [s] (until it is closed, or Ctrl-C)")
 
     detect = command("detect", running.detect, "run the fixed camera's detector and tracker on any video")

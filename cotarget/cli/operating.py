@@ -56,7 +56,7 @@ def aim(options: argparse.Namespace) -> None:
     if options.rig is None:  # without a rig.toml, the calibration gives the shortest focal length
         shortest = calibration.zoom.nominal_px[0]
     reach = Reach(*config.head_limits, (shortest, max(shortest, longest)), step=config.head_step)
-    closeup = (
+    wanted_size = (
         WantedSize(target.size, options.wanted_px, target.dimension == "height")
         if target and options.wanted_px is not None
         else None
@@ -72,7 +72,12 @@ def aim(options: argparse.Namespace) -> None:
             f"--pixel: ({pixel[0]:g}, {pixel[1]:g}) is not in the fixed camera's {size[0]}x{size[1]} image"
         )
     found = aim_at(
-        calibration, point_at(calibration, pixel, depth), reach, closeup=closeup, nominal_px=nominal, method=options.ik
+        calibration,
+        point_at(calibration, pixel, depth),
+        reach,
+        wanted_size=wanted_size,
+        nominal_px=nominal,
+        method=options.ik,
     )
     # The error budget holds for the exact inverse; the shortcut's additional error is not modelled.
     budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px) if options.ik == "exact" else None
@@ -93,9 +98,9 @@ def aim(options: argparse.Namespace) -> None:
             "meant?",
             file=sys.stderr,
         )
-    if closeup is not None and found.limited:
-        focal = calibration.zoom.at(found.nominal_px).focal_px[int(closeup.vertical)]
-        shown, wanted = _pixels(focal * closeup.size / found.range), _pixels(closeup.wanted_px)
+    if wanted_size is not None and found.limited:
+        focal = calibration.zoom.at(found.nominal_px).focal_px[int(wanted_size.vertical)]
+        shown, wanted = _pixels(focal * wanted_size.size / found.range), _pixels(wanted_size.wanted_px)
         if shown != wanted:
             print(
                 f"cotarget aim: the lens shows the {options.target} {shown} px large there, and not {wanted}",

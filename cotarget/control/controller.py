@@ -208,7 +208,7 @@ class Controller:
     def _aim(self, estimate: Estimate, reach: Reach, zoomed: Aim | None = None) -> Aim:
         """Solve the aim at an estimate, corrected by the head's bias; at the focal length of another aim if given."""
         if zoomed is None:
-            found = aim(self._calibration, estimate.x_fixed, reach, closeup=estimate.closeup)
+            found = aim(self._calibration, estimate.x_fixed, reach, wanted_size=estimate.wanted_size)
         else:
             found = aim(self._calibration, estimate.x_fixed, reach, nominal_px=zoomed.nominal_px)
         pan, tilt = found.pan - estimate.bias[0], found.tilt - estimate.bias[1]

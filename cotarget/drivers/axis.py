@@ -27,6 +27,8 @@ from cotarget.rig import Clock, Frame, Image
 if TYPE_CHECKING:
     import httpx
 
+log = logging.getLogger(__name__)
+
 
 # Environment variable of the password, where rig.toml has none.
 PASSWORD_VARIABLE = "COTARGET_PASSWORD"
@@ -437,7 +439,6 @@ def _import_httpx() -> ModuleType:
 
 # The fixed camera
 
-log = logging.getLogger(__name__)
 # Time limit for the first image; a busy server is asked again until then [s].
 OPEN_S = 5.0
 # Pauses before the stream is opened again: shortest, after a stream that worked; longest; after a refusal, because

@@ -33,6 +33,8 @@ from cotarget.drivers.mjpeg import JpegDecoder
 from cotarget.errors import ConfigError, CotargetError, DeviceError, StaleFrameError
 from cotarget.rig import Clock, Frame, Image, ZoomState
 
+log = logging.getLogger(__name__)
+
 
 @dataclass
 class SharedState:
@@ -80,7 +82,6 @@ class SharedState:
 
 # Setup of an opened camera
 
-log = logging.getLogger(__name__)
 # gphoto2's names of the settings for shooting mode and for the destination of stills. Stills go to memory: they are
 # sent at once, and the card does not fill up.
 SHOOTING, TARGET, MEMORY = "capture", "capturetarget", "Internal RAM"

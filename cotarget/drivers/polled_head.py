@@ -45,6 +45,8 @@ from cotarget.drivers.ptu_protocol import (
 from cotarget.errors import ConfigError, DeviceError, HaltedError
 from cotarget.rig import Clock, PanTiltLimits, PanTiltState, Speed
 
+log = logging.getLogger(__name__)
+
 # Axis positions from polls
 
 # An axis stands when it has stayed at one step for longer than the slowest speed, 31 steps/s, takes for a step [s].
@@ -172,7 +174,6 @@ def drained(queue: deque[Request]) -> list[Request]:
 
 # The thread that owns the line
 
-log = logging.getLogger(__name__)
 Meaning = TypeVar("Meaning")
 TRIES = 3  # of one exchange; the line is synchronised again before each but the first
 PATIENCE_S = 2.0  # for a move, beyond its travel and its acceleration [s]

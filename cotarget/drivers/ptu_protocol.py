@@ -20,6 +20,8 @@ from cotarget.drivers.serial_line import Port, open_port
 from cotarget.errors import DeviceError
 from cotarget.rig import Clock
 
+log = logging.getLogger(__name__)
+
 NO_DATA = "returned no data"  # pyserial's text for a port that has disappeared
 
 
@@ -228,7 +230,6 @@ def _either(text: str, one: re.Pattern[str], other: re.Pattern[str]) -> bool:
 
 # The line
 
-log = logging.getLogger(__name__)
 Meaning = TypeVar("Meaning")
 # Time limits, beyond the time that the bytes take on the wire [s]:
 PATIENCE_S = 1.0  # for an answer while a unit is opened

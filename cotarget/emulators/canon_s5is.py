@@ -53,12 +53,13 @@ from cotarget.emulators.ptpip import (
 from cotarget.errors import CotargetError
 from cotarget.rig import Image
 
+log = logging.getLogger(__name__)
+
 # Viewfinder and stills
 
 THUMB_SIZE = (160, 120)  # px
 PICTURE_WAIT_S = 1.0  # time limit for the viewfinder's next image [s]
 SLICE_S = 0.1  # period of checking whether to go on waiting [s]
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ from cotarget.sim.motion import Axis, LensDrive
 from cotarget.sim.truth import CameraName
 from cotarget.sim.world import SimWorld
 
+log = logging.getLogger(__name__)
+
 REMEMBERED = 5.0  # age of the oldest exposure for which axes and lens keep their motion [s]
 
 
@@ -125,7 +127,6 @@ class EmulatedLens:
 
 # The world
 
-log = logging.getLogger(__name__)
 FIXED_HZ, ZOOM_HZ = 15.0, 10.0  # frame rates that one core renders, with a client on another core
 OLDEST = REMEMBERED - 1.0  # age of the oldest exposure that is rendered, after the program was suspended [s]
 STILL_TIMEOUT = 5.0  # [s]

@@ -183,7 +183,7 @@ class Estimate:
         return math.hypot(*self.bias) / self.bias_prior
 
     @property
-    def closeup(self) -> WantedSize:
+    def wanted_size(self) -> WantedSize:
         """Wanted size of the target for `aim`, from its present apparent size, foreshortened or not."""
         apparent = self.target.size * math.exp(self.state[K] + self.state[G])
         return WantedSize(apparent, self.target.wanted_px, self.target.dimension == "height")

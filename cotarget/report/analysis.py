@@ -34,6 +34,8 @@ from cotarget.camera import ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array
 
+log = logging.getLogger(__name__)
+
 # The zoom lens over its focal range
 
 POINTS = 61
@@ -335,7 +337,6 @@ def undetermined(calibration: Calibration) -> str:
 TITLES = {"fixed": "fixed camera", "zoom": "zoom camera"}
 
 
-log = logging.getLogger(__name__)
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
 CELLS = (16, 12)  # cells across and down an image, in which residuals are averaged
 FEWEST_IN_CELL = 5  # fewest corners of an average

@@ -31,6 +31,8 @@ from cotarget.safety.signals import end_politely
 from cotarget.safety.stop_file import refuse_if_stopped
 from cotarget.safety.watchdog import Guard, Watcher
 
+log = logging.getLogger(__name__)
+
 # A frame cannot be from the future; this tolerance allows for a configured latency that is too long [s].
 FUTURE_S = 0.05
 # A loaded unit may take longer than its speed and acceleration give, by this factor.
@@ -300,8 +302,6 @@ def _outermost(limits: tuple[float, float], step: float) -> tuple[float, float]:
 
 
 # The guarded rig
-
-log = logging.getLogger(__name__)
 
 
 class SafeRig:

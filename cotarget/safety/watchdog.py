@@ -18,6 +18,8 @@ from cotarget.errors import DeviceError, EmergencyStopError
 from cotarget.rig import Clock, PanTilt, PanTiltState
 from cotarget.safety.stop_file import stop_reason, stopped_by_file
 
+log = logging.getLogger(__name__)
+
 LOOK_POLL_S = 0.05  # reading the stop file takes well below 1 ms; the answer is awaited in slices of this time [s]
 # After this number of slices without an answer the file counts as a stop. Slices are counted and not timed, so that a
 # suspended machine does not count as an unreadable file.
@@ -103,7 +105,6 @@ class StopLook:
 
 # State of the watchdog
 
-log = logging.getLogger(__name__)
 HALT_TRIES = 2  # when the rig is closed; the driver limits the time of each
 AT_GOAL = math.radians(0.1)  # a head that rests within this and a step of its goal has arrived [rad]
 

@@ -134,7 +134,7 @@ def fire(
             t = shot.exposed_t
             miss = truth.line_of_sight_miss(*truth.head_at(t), truth.nominal_at(t), truth.center(name, t))
             parts = budget(truth, exact, calibration, reach_of(rig), name, shot)
-            found = lookout.update_zoom()
+            found = lookout.find_in_zoom()
             second = lookout.shoot()
             corrected = None if second is None else observe(lookout.judged(second), truth, name, target)
             lookout.forget()
@@ -200,7 +200,7 @@ class _Lookout:
         if at is None or then is None:
             return None
         try:
-            found = aim(self._calibration, then.x_fixed, reach_of(self._rig), closeup=then.closeup)
+            found = aim(self._calibration, then.x_fixed, reach_of(self._rig), wanted_size=then.wanted_size)
         except UnreachableError:
             return None
         shot = self._command(at, then, found, t)
@@ -220,7 +220,7 @@ class _Lookout:
         moved = then.x_fixed - at.x_fixed
         return Shot(self.frame.t, t, pixel, at.depth, moved, found.nominal_px, pan, tilt, nominal)
 
-    def update_zoom(self) -> bool:
+    def find_in_zoom(self) -> bool:
         """Search the target in the shot's zoom frame, for the next shot; give whether it was found."""
         assert self._both is not None, "a shot was taken"
         return self._both.update_zoom(self._zoom, self.frame.t) is not None

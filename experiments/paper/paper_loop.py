@@ -92,8 +92,8 @@ def _aim(calibration: Calibration, target: TargetConfig, track: Track, rig: Rig)
     size_px, center_px = float(track.box.size_px[int(vertical)]), track.box.center_px
     try:
         x_fixed = point_at(calibration, center_px, depth_of(calibration, target, size_px, center_px))
-        closeup = WantedSize(target.size, target.wanted_px, vertical)
-        return aim(calibration, x_fixed, reach_of(rig), closeup=closeup, method=METHOD)
+        wanted_size = WantedSize(target.size, target.wanted_px, vertical)
+        return aim(calibration, x_fixed, reach_of(rig), wanted_size=wanted_size, method=METHOD)
     except UnreachableError:
         return None
 

@@ -93,7 +93,7 @@ class Known:
         return self.t
 
     @property
-    def closeup(self):
+    def wanted_size(self):
         return WantedSize(BOOK.size, BOOK.wanted_px)
 
     def appearance(self, pan, tilt, nominal_px):

@@ -150,7 +150,7 @@ def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
         calibration,
         np.array([x, MOUNT_M - z, y]),
         Reach(*config.head_limits, config.focal_range_px),
-        closeup=WantedSize(book.size, book.wanted_px),
+        wanted_size=WantedSize(book.size, book.wanted_px),
     )
     truth = rig.truth()
     assert truth["pan_deg"] == pytest.approx(math.degrees(there.pan), abs=LOOKED_AT_DEG)

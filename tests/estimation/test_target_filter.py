@@ -443,8 +443,8 @@ def test_the_appearance_is_the_truths_and_its_covariance_that_of_samples():
     np.testing.assert_allclose(np.cov([appears(s) for s in samples], rowvar=False), seen.covariance, rtol=0.1, atol=2.0)
     true_px = flight.size * lens.fy / flight.truth.in_zoom(flight.path(t + 0.1), pan, tilt)[2]
     assert abs(math.log(seen.size_px / true_px)) < 3 * seen.size_sigma + 0.02
-    assert found.closeup.vertical
-    assert found.closeup.size == pytest.approx(flight.size, rel=0.1)
+    assert found.wanted_size.vertical
+    assert found.wanted_size.size == pytest.approx(flight.size, rel=0.1)
 
 
 @pytest.mark.parametrize(("name", "focal"), [("book", 500.0), ("person", 1000.0), ("bird", 500.0)])
@@ -456,7 +456,7 @@ def test_a_height_appears_by_the_vertical_focal_length(name, focal):
     assert estimator.update_fixed(Detection(np.array([320.0, 240.0]), np.array([50.0, 40.0]), 1.0), 0.0)
     found = estimator.at(0.0)
     seen = found.appearance(0.0, 0.0, 500.0)
-    assert seen.size_px == pytest.approx(focal * found.closeup.size / found.depth, rel=EXACT)
+    assert seen.size_px == pytest.approx(focal * found.wanted_size.size / found.depth, rel=EXACT)
 
 
 def test_nothing_is_told_before_anything_is_seen():
