@@ -215,5 +215,8 @@ def opened_from(rig: Rig) -> "RigConfig":
     """
     config: RigConfig | None = getattr(rig, "config", None)
     if config is None:
-        raise ConfigError(f"a {type(rig).__name__} has no configuration; pass target, detector and settings yourself")
+        raise ConfigError(
+            f"a {type(rig).__name__} has no configuration: open the rig by cotarget.open_rig, or pass the board, or "
+            "the target's table, a detector and settings"
+        )
     return config

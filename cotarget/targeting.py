@@ -13,7 +13,7 @@ import numpy.typing as npt
 from cotarget.calibration import Calibration, predicted_pointing
 from cotarget.camera import depth_from_size, focal_for_size
 from cotarget.config import TargetConfig
-from cotarget.errors import UnreachableError
+from cotarget.errors import ConfigError, UnreachableError, choices
 from cotarget.geometry import FARTHEST_M, Array
 from cotarget.pantilt import Pointing, nearest, shortcut, solve
 
@@ -119,6 +119,18 @@ def point_at(calibration: Calibration, pixel: Array, depth: float) -> Array:
     return ray * depth
 
 
+def _seen_at(calibration: Calibration, pixel: npt.ArrayLike | None, depth: float | None) -> Array:
+    """The point at a pixel of the fixed camera and a depth, checked as a user gives them."""
+    if pixel is None or depth is None:
+        raise ConfigError("aim: give x_fixed, or pixel and depth")
+    if np.shape(pixel) != (2,):
+        raise ConfigError(f"aim: pixel is {pixel}; give (u, v) in the fixed camera's image")
+    (u, v), (width, height) = np.asarray(pixel, dtype=float), calibration.fixed.size
+    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+        raise ConfigError(f"aim: pixel ({u:g}, {v:g}) is not in the fixed camera's {width}x{height} image")
+    return point_at(calibration, np.array([u, v]), depth)
+
+
 def aim(
     calibration: Calibration,
     x_fixed: Array | None = None,
@@ -148,12 +160,15 @@ def aim(
 
     Raises:
         CalibrationError: the calibration has no T.
+        ConfigError: the target is given in no way or in two, or the method is unknown.
         UnreachableError: no pan and tilt within the limits do it.
     """
+    if method not in METHODS:
+        raise ConfigError(f"unknown method '{method}'; the methods are: {choices(METHODS)}")
     if x_fixed is None:
-        if pixel is None or depth is None:
-            raise TypeError("aim() needs x_fixed, or pixel and depth")
-        x_fixed = point_at(calibration, np.asarray(pixel, dtype=float), depth)
+        x_fixed = _seen_at(calibration, pixel, depth)
+    elif pixel is not None or depth is not None:
+        raise ConfigError("aim: give x_fixed, or pixel and depth, and not both")
     if reach is None:
         focal_px = calibration.zoom.nominal_px
         reach = Reach((-math.pi, math.pi), (-math.pi, math.pi), (focal_px[0], focal_px[-1]))

@@ -2,9 +2,13 @@
 
 import pkgutil
 import re
+import sys
+import types
 from pathlib import Path
 
 import pytest
+
+from experiments.engine.workers import here
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(path for path in (ROOT / "docs").rglob("*.md") if path.name != "upgrading.md")  # it lists what there was
@@ -29,3 +33,13 @@ def test_every_name_exists(page):
 def test_every_linked_file_exists(page):
     links = re.findall(r"\]\(([^)#\s]+)", (ROOT / page).read_text(encoding="utf-8"))
     assert [link for link in links if "://" not in link and not (ROOT / link).exists()] == []
+
+
+def test_the_experiment_that_the_documentation_adds_runs(monkeypatch):
+    text = (ROOT / "docs/experiments.md").read_text(encoding="utf-8")
+    (block,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "EXPERIMENT = " in block)
+    module = types.ModuleType("rounding")
+    monkeypatch.setitem(sys.modules, "rounding", module)  # dataclasses look there
+    exec(block, module.__dict__)
+    rows = module.EXPERIMENT.run(module.EXPERIMENT.quick, here)
+    assert module.missed(module.summarise(rows)) == []

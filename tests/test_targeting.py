@@ -9,7 +9,7 @@ import pytest
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.errors import CalibrationError, CotargetError, UnreachableError
+from cotarget.errors import CalibrationError, ConfigError, CotargetError, UnreachableError
 from cotarget.geometry import RigidTransform, Rotation
 from cotarget.pantilt import HeadGeometry
 from cotarget.targeting import METHODS, Reach, WantedSize, aim, depth_of, error_budget, point_at
@@ -281,3 +281,25 @@ def test_error_budget_off_to_the_side():
     high = replace(aim(HOME, np.array([0.0, 0.0, 10.0]), ANYWHERE), tilt=math.radians(60))
     steps = error_budget(HOME, pixel, high, replace(ANYWHERE, step=0.001))["steps"]
     assert steps == pytest.approx(0.001 * SIGMA * math.sqrt(1 + 0.25), rel=RELATIVE)
+
+
+def test_a_pixel_and_its_depth_aim_at_the_point_that_they_mean():
+    by_pixel = aim(HOME, pixel=(400, 100), depth=9.0)
+    by_point = aim(HOME, point_at(HOME, np.array([400.0, 100.0]), 9.0))
+    assert (by_pixel.pan, by_pixel.tilt, by_pixel.nominal_px) == (by_point.pan, by_point.tilt, by_point.nominal_px)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {},
+        {"pixel": (400, 100)},
+        {"pixel": 3, "depth": 9.0},
+        {"pixel": (900, 100), "depth": 9.0},
+        {"pixel": (400, 100), "depth": 9.0, "x_fixed": np.array([0.0, 0.0, 9.0])},
+        {"pixel": (400, 100), "depth": 9.0, "method": "foo"},
+    ],
+)
+def test_a_target_given_in_no_way_or_in_two_is_refused(given):
+    with pytest.raises(ConfigError):
+        aim(HOME, **given)
