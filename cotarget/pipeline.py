@@ -271,8 +271,8 @@ def follow(
 ) -> Iterator[Step]:
     """Follow a target and yield one Step for each frame of the fixed camera.
 
-    Missing arguments come from the configuration that the rig was opened from. This is a generator: the first step raises
-    what is wrong with them.
+    Missing arguments come from the configuration that the rig was opened from. This is a generator: errors are raised
+    with the first step.
 
     Args:
         rig: any rig; the caller closes it.
