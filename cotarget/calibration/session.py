@@ -260,7 +260,7 @@ class CaptureRecorder:
         frame = self._look(self._read_fixed)
         return self._keep(Capture(frame.image, "fixed", self.number, t=frame.t), expected)
 
-    def update_zoom(self, *, expected: bool = True, find: Finder | None = None) -> View | None:
+    def see_zoom(self, *, expected: bool = True, find: Finder | None = None) -> View | None:
         """Take an image with the zoom camera at the present head pose and find the board in it.
 
         Args:
@@ -400,7 +400,7 @@ def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> RigModel
         )
     focal = smallest_spacing(view.corners_px, board.corners) * depth / board.square
     lens = replace(lens, focal_px=(focal, focal))
-    recorder.update_zoom(expected=False)
+    recorder.see_zoom(expected=False)
     coverage = {"fixed": Coverage(size)}
     for k in range(LEARNING):
         model = RigModel(boards={}, fixed=lens)
@@ -411,7 +411,7 @@ def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> RigModel
         recorder.present(wishes[0])
         if (view := recorder.see_fixed()) is not None:
             coverage["fixed"].add(view.corners_px[view.seen])
-        recorder.update_zoom(expected=False)
+        recorder.see_zoom(expected=False)
     views = [view for view in recorder.views if view.camera == "fixed"]
     return RigModel(boards={}, fixed=rough_intrinsics("fixed", views, points, size))
 
@@ -441,7 +441,7 @@ def _present_otherwise_tilted(recorder: CaptureRecorder, model: RigModel, view: 
     recorder.turn(view.pan, view.tilt)
     recorder.present(facing_board(recorder.board, middle, CLEARLY_TILTED.inv()))
     recorder.see_fixed()
-    recorder.update_zoom(expected=False)
+    recorder.see_zoom(expected=False)
 
 
 def _likeliest(model: RigModel, recorder: CaptureRecorder, seen: Sequence[View]) -> RigModel:
@@ -503,7 +503,7 @@ def _find_with_zoom(recorder: CaptureRecorder, model: RigModel) -> View:
         tried.append(f"{depth:.1f}")
         for pan, tilt in grid:
             recorder.turn(pan, tilt)
-            view = recorder.update_zoom(expected=False)
+            view = recorder.see_zoom(expected=False)
             if view is not None:
                 return view
     reach = " and ".join(f"{np.degrees(max(abs(q) for q in axis)):.0f} degrees" for axis in zip(*grid, strict=True))
@@ -528,7 +528,7 @@ def _turn_a_little(recorder: CaptureRecorder, view: View) -> tuple[View, View]:
             if not limits.allow(pan, tilt):
                 continue
             recorder.turn(pan, tilt)
-            turned = recorder.update_zoom(expected=False)
+            turned = recorder.see_zoom(expected=False)
             if turned is not None:
                 seen.append(turned)
                 break
@@ -562,7 +562,7 @@ def _centred(recorder: CaptureRecorder, view: View, by_pan: View, by_tilt: View)
         float(np.clip(view.pan + d_pan, *limits.pan)),
         float(np.clip(view.tilt + d_tilt, *limits.tilt)),
     )
-    return recorder.update_zoom(expected=False) or view
+    return recorder.see_zoom(expected=False) or view
 
 
 def refitted(model: RigModel, recorder: CaptureRecorder) -> Fit:
@@ -771,7 +771,7 @@ def _see_part(
     if turn is None:
         return None
     recorder.turn(*turn)
-    view = recorder.update_zoom(
+    view = recorder.see_zoom(
         find=lambda image, view: find_expected(image, recorder.board, expected_corners(model, view, points))
     )
     if view is not None:
@@ -1096,10 +1096,10 @@ def _see_from_everywhere(
         model, T, board, coverage["zoom"], rig.head.limits, MOVED_VIEWS + (not home), rng, margin * rig.zoom.size[0]
     )
     if home:
-        recorder.update_zoom()
+        recorder.see_zoom()
     for pan, tilt in turns:
         recorder.turn(pan, tilt)
-        recorder.update_zoom()
+        recorder.see_zoom()
     for view in recorder.of_placement(recorder.number):
         coverage[view.camera].add(view.corners_px[view.seen])
     return T

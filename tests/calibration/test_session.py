@@ -200,7 +200,7 @@ def test_a_head_that_was_stopped_is_not_sent_again(error):
 
     made.rig.head.move = stopped
     with pytest.raises(type(error), match=str(error)):
-        recorder.update_zoom()
+        recorder.see_zoom()
     assert (len(made.sent), len(made.seen)) == (1, 1)
 
 
@@ -211,7 +211,7 @@ def test_a_late_frame_is_waited_for_again_with_the_head_where_it_should_be(camer
     recorder = CaptureRecorder(made.rig, BOARD)
     recorder.turn(0.5, 0.1)
     pushed = made.rig.pose
-    look = {"fixed": recorder.see_fixed, "zoom": recorder.update_zoom}[camera]
+    look = {"fixed": recorder.see_fixed, "zoom": recorder.see_zoom}[camera]
     made.rig.pose = (0.4, 0.1)  # as after a halt
     if times < 3:
         assert look(expected=False) is None
