@@ -29,6 +29,14 @@ def test_every_name_exists(page):
     assert [name for name in sorted(names) if not exists(name)] == []
 
 
+def test_what_upgrading_leads_to_exists():
+    rows = re.findall(
+        r"^\| `[\w.]+` \| `(cotarget[\w.]+)` \|$", (ROOT / "docs/upgrading.md").read_text("utf-8"), re.MULTILINE
+    )
+    assert len(rows) > 100
+    assert [name for name in rows if not exists(name)] == []
+
+
 @pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md"])
 def test_every_linked_file_exists(page):
     links = re.findall(r"\]\(([^)#\s]+)", (ROOT / page).read_text(encoding="utf-8"))

@@ -4,8 +4,10 @@ The blocks of a page run in order, in one temporary folder and one Python namesp
 before a block, `file: NAME` makes it a file that is there from the beginning, and `no-run: REASON` leaves it out.
 """
 
+import contextlib
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -24,15 +26,33 @@ def blocks_of(page):
     return [(found[1] or "", found[2], found[3]) for found in BLOCK.finditer(page.read_text(encoding="utf-8"))]
 
 
-def run_shell(text, folder):
+@pytest.fixture
+def shells():
+    """Process groups of a page's shell blocks; what is left of them is ended with the page, whether it passed or not."""
+    started = []
+    yield started
+    for group in started:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(group, signal.SIGTERM)
+
+
+def run_shell(text, folder, shells):
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    environment = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
-    # The checkout is where `python -m experiments` is run from.
-    command = ["bash", "-euo", "pipefail", "-c", text]
-    done = subprocess.run(
-        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=SECONDS, check=False
+    # The package's checkout, so that `python -m experiments` is found.
+    environment = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT)}
+    shell = subprocess.Popen(
+        ["bash", "-euo", "pipefail", "-c", text],
+        cwd=folder,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
     )
-    assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
+    shells.append(shell.pid)
+    output, _ = shell.communicate(timeout=SECONDS)
+    assert shell.returncode == 0, f"{text}\n{output}"
 
 
 def test_there_are_blocks_to_run():
@@ -48,7 +68,7 @@ def test_every_block_left_out_has_a_reason():
 @pytest.mark.docs
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_blocks_run(page, tmp_path, monkeypatch):
+def test_blocks_run(page, tmp_path, monkeypatch, shells):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
     names = {"__name__": "__main__"}
@@ -62,4 +82,4 @@ def test_blocks_run(page, tmp_path, monkeypatch):
         if language == "python":
             exec(compile(text, f"{page.name}: a block of Python", "exec"), names)
         elif language == "sh":
-            run_shell(text, tmp_path)
+            run_shell(text, tmp_path, shells)
