@@ -28,7 +28,7 @@ def blocks_of(page):
 
 @pytest.fixture
 def shells():
-    """Process groups of a page's shell blocks; what is left of them is ended with the page, whether it passed or not."""
+    """Process groups of a page's shell blocks; what is left of them is ended with the page, passed or not."""
     started = []
     yield started
     for group in started:
