@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cotarget.errors import ConfigError
-from cotarget.rig import Rig
+from cotarget.rig import Rig, RigSpec
 
 if TYPE_CHECKING:
     from cotarget.config import RigConfig
@@ -53,3 +53,22 @@ def open_devices(config: "RigConfig") -> Rig:
             if config.recording is None:
                 raise ConfigError("recording: is missing; backend 'replay' needs the folder of a recording")
             return ReplayRig(open_recording(config.recording))
+
+
+def describe(config: "RigConfig") -> RigSpec:
+    """Describe the configured rig without opening a device: sizes, rates, delays, and limits within the soft ones.
+
+    Raises:
+        ConfigError: the soft limits leave nothing of the head's range.
+    """
+    from dataclasses import replace
+
+    from cotarget.safety.safe_rig import soft_limits
+
+    match config.backend:
+        case "sim":
+            from cotarget.sim.devices import rig_spec as spec_of
+        case _:
+            from cotarget.drivers.rig import rig_spec as spec_of
+    spec = spec_of(config)
+    return replace(spec, head=replace(spec.head, limits=soft_limits(spec.head.limits, config.safety)))

@@ -92,6 +92,63 @@ class PanTiltLimits:
         return np.asarray((pan >= self.pan[0]) & (pan <= self.pan[1]) & (tilt >= self.tilt[0]) & (tilt <= self.tilt[1]))
 
 
+@dataclass(frozen=True)
+class CameraSpec:
+    """What a camera knows of itself.
+
+    Attributes:
+        size: (width, height) of its stream [px].
+        rate_hz: frames per second.
+        latency_s: time from light to frame [s].
+    """
+
+    size: tuple[int, int]
+    rate_hz: float
+    latency_s: float
+
+
+@dataclass(frozen=True)
+class ZoomSpec(CameraSpec):
+    """What a zoom camera knows of itself.
+
+    Attributes:
+        focal_range: shortest and longest nominal focal length [px].
+        pitch_mm: nominal size of a pixel of the stream [mm].
+        still_size: (width, height) of full stills [px]; that of the stream if the device has no separate stills.
+        delay_s: time from a command to the start of the lens's motion [s].
+    """
+
+    focal_range: tuple[float, float]
+    pitch_mm: float
+    still_size: tuple[int, int]
+    delay_s: float
+
+
+@dataclass(frozen=True)
+class HeadSpec:
+    """What a head knows of itself: its limits, and the time from a command to the start of its motion [s]."""
+
+    limits: PanTiltLimits
+    delay_s: float
+
+
+@dataclass(frozen=True)
+class RigSpec:
+    """What a rig knows of itself.
+
+    Attributes:
+        fixed: the fixed camera.
+        zoom: the zoom camera.
+        head: the head.
+        real_time: whether time passes without calls; a simulation's passes only inside them.
+    """
+
+    fixed: CameraSpec
+    zoom: ZoomSpec
+    head: HeadSpec
+    real_time: bool = False
+
+
 class Camera(Protocol):
     """A camera that streams frames."""
 

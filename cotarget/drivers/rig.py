@@ -1,6 +1,7 @@
 """Open the real devices as one Rig; every exit halts the head and releases all devices."""
 
 import contextlib
+import math
 import sys
 from types import TracebackType
 
@@ -12,7 +13,7 @@ from cotarget.drivers.gphoto_camera import GphotoCamera
 from cotarget.drivers.interlock import rig_lock
 from cotarget.drivers.polled_head import D46Head
 from cotarget.errors import ConfigError
-from cotarget.rig import Board
+from cotarget.rig import Board, CameraSpec, HeadSpec, PanTiltLimits, RigSpec, ZoomSpec
 
 # Python's thread switch interval [s], instead of 5 ms: a driver's thread that waits for its turn delays every command.
 # Measurements: docs/design-notes.md.
@@ -52,6 +53,32 @@ class HardwareRig:
     ) -> None:
         """Halt, then close."""
         self.close()
+
+
+def rig_spec(config: RigConfig) -> RigSpec:
+    """Describe the configured devices without opening them; the head's acceleration is not known before."""
+    head, fixed, zoom = config.hardware.head, config.hardware.fixed, config.hardware.zoom
+    limits = PanTiltLimits(
+        pan=(math.radians(head.pan_deg[0]), math.radians(head.pan_deg[1])),
+        tilt=(math.radians(head.tilt_deg[0]), math.radians(head.tilt_deg[1])),
+        speed=math.radians(head.speed_deg_s),
+        acceleration=math.inf,
+        step=math.radians(head.step_deg),
+    )
+    return RigSpec(
+        fixed=CameraSpec(fixed.size, fixed.rate_hz, fixed.latency_s),
+        zoom=ZoomSpec(
+            size=zoom.size,
+            rate_hz=zoom.rate_hz,
+            latency_s=zoom.latency_s,
+            focal_range=(zoom.lens[0][1] / zoom.pitch_mm, zoom.lens[-1][1] / zoom.pitch_mm),
+            pitch_mm=zoom.pitch_mm,
+            still_size=zoom.still_size,
+            delay_s=zoom.command_delay_s,
+        ),
+        head=HeadSpec(limits, head.command_delay_s),
+        real_time=True,
+    )
 
 
 def open_hardware(config: RigConfig) -> HardwareRig:

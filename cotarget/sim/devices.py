@@ -12,7 +12,21 @@ from typing import NoReturn
 from cotarget.config import RigConfig, SimCamera, SimEffects, SimHead, SimZoomCamera
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
-from cotarget.rig import Camera, Clock, Frame, Image, PanTiltLimits, PanTiltState, Speed, ZoomState, to_step
+from cotarget.rig import (
+    Camera,
+    CameraSpec,
+    Clock,
+    Frame,
+    HeadSpec,
+    Image,
+    PanTiltLimits,
+    PanTiltState,
+    RigSpec,
+    Speed,
+    ZoomSpec,
+    ZoomState,
+    to_step,
+)
 from cotarget.sim.motion import Axis, HeadDrive, LensDrive
 
 # Frame times are multiples of the frame period. This part of a period [1] absorbs their rounding.
@@ -166,19 +180,46 @@ def head_drive(head: SimHead, effects: SimEffects) -> HeadDrive:
     return HeadDrive(Axis(speed, acceleration, play), Axis(speed, acceleration, play))
 
 
+def head_spec(head: SimHead, effects: SimEffects) -> HeadSpec:
+    """Describe the configured pan-tilt unit."""
+    drive = head_drive(head, effects)
+    limits = PanTiltLimits(
+        pan=(math.radians(head.pan_deg[0]), math.radians(head.pan_deg[1])),
+        tilt=(math.radians(head.tilt_deg[0]), math.radians(head.tilt_deg[1])),
+        speed=drive.pan.speed,
+        acceleration=drive.pan.acceleration,
+        step=math.radians(head.step_deg) if effects.steps else 0.0,
+    )
+    return HeadSpec(limits, head.command_delay_s if effects.command_delay else 0.0)
+
+
+def rig_spec(config: RigConfig) -> RigSpec:
+    """Describe the configured simulated rig."""
+    fixed, zoom, effects = config.sim.fixed, config.sim.zoom, config.sim.effects
+    head, drive = head_spec(config.sim.head, effects), lens_drive(zoom, effects)
+    latency_s = (fixed.latency_s, zoom.latency_s) if effects.latency else (0.0, 0.0)
+    return RigSpec(
+        fixed=CameraSpec(fixed.size, fixed.rate_hz, latency_s[0]),
+        zoom=ZoomSpec(
+            size=zoom.size,
+            rate_hz=zoom.rate_hz,
+            latency_s=latency_s[1],
+            focal_range=(drive.shortest_px, drive.longest_px),
+            pitch_mm=zoom.pitch_mm,
+            still_size=zoom.size,
+            delay_s=head.delay_s,  # the lens starts after the head's command delay
+        ),
+        head=head,
+    )
+
+
 class SimPanTilt:
     """Pan-tilt unit with command delay, trapezoidal profiles, steps, limits and backlash."""
 
     def __init__(self, head: SimHead, effects: SimEffects, clock: Clock, drive: HeadDrive) -> None:
         self._clock, self._drive = clock, drive
-        self._delay = head.command_delay_s if effects.command_delay else 0.0
-        self._limits = PanTiltLimits(
-            pan=(math.radians(head.pan_deg[0]), math.radians(head.pan_deg[1])),
-            tilt=(math.radians(head.tilt_deg[0]), math.radians(head.tilt_deg[1])),
-            speed=drive.pan.speed,
-            acceleration=drive.pan.acceleration,
-            step=math.radians(head.step_deg) if effects.steps else 0.0,
-        )
+        spec = head_spec(head, effects)
+        self._delay, self._limits = spec.delay_s, spec.limits
         self._rests = 0.0
 
     @property
