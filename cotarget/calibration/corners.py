@@ -3,8 +3,8 @@
 The board's frame has its origin at the first inner corner, x along the columns, y along the rows, and z into the board,
 away from the viewer. The square diagonally outside the first corner is black.
 
-- `find_corners` finds a whole chessboard. With one odd and one even count of corners, the colours alone show which way
-  up it is.
+- `find_corners` finds a whole chessboard. It searches a large image at a fraction of its size and refines the corners
+  at full size. With one odd and one even count of corners, the colours alone show which way up it is.
 - `find_charuco` finds a ChArUco board, whole or in part. Its markers number the corners.
 - `find_near` finds a part of a chessboard, as the zoom camera sees it at long focal lengths. The colours alone do not
   show which part, so the corners are numbered by a prediction that is good to a fraction of a square.
@@ -410,6 +410,9 @@ def _as_predicted(grey: Image, grid: Array, predicted: Array, found: FoundCorner
 
 FILLABLE_PX = (-10000.0, 10000.0)  # OpenCV fills no polygons with corners much farther out
 LARGEST_BEND = 0.4  # largest distance of a corner from the image of a plane, in squares; a lens bends real ones by 0.3
+# Longer side of the image in which a chessboard is searched first. In the texture of a larger image the finders see
+# boards that are not there, and take 10 to 20 times as long.
+LARGEST_SEARCHED_PX = 1280
 SMALLEST_RIGHT = 0.7  # smallest share of corners with the right colours around, in any row or column
 
 
@@ -429,18 +432,32 @@ def find_corners(image: Image, board: BoardConfig, *, thorough: bool = True) -> 
     grey = np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
     if board.kind == "charuco":
         return find_charuco(grey, board, thorough=thorough)
-    for search in SEARCHES if thorough else SEARCHES[:1]:
-        found = search(grey, board.corners)
-        if found is None:
-            continue
-        numbered = _number(grey, found, board.corners)
-        if numbered is not None and _is_whole(grey, numbered, board):
-            return np.round(_refine(grey, numbered, board.corners), CORNER_DECIMALS)
+    for level in _pyramid(grey):
+        for search in SEARCHES if thorough else SEARCHES[:1]:
+            found = search(level, board.corners)
+            if found is None:
+                continue
+            numbered = _number(level, found, board.corners)
+            if numbered is not None and _is_whole(level, numbered, board):
+                factor = np.array(grey.shape[::-1]) / level.shape[::-1]
+                start = numbered if level is grey else (numbered + 0.5) * factor - 0.5
+                return np.round(_refine(grey, start, board.corners), CORNER_DECIMALS)
     return None
+
+
+def _pyramid(grey: Image) -> list[Image]:
+    """Halve an image until its longer side is at most `LARGEST_SEARCHED_PX`; the smallest image comes first."""
+    levels = [grey]
+    while max(levels[0].shape) > LARGEST_SEARCHED_PX:
+        height, width = levels[0].shape
+        levels.insert(0, cv2.resize(levels[0], (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+    return levels
 
 
 def another_board(image: Image, board: BoardConfig, corners_px: Array) -> bool:
     """Check whether an image shows a second board of the same kind and size, by the fastest finder alone.
+
+    A large image is searched for a second chessboard at a fraction of its size only, as `find_corners` begins.
 
     Args:
         image: image, (H, W, 3) BGR, or grey (H, W).
@@ -455,7 +472,8 @@ def another_board(image: Image, board: BoardConfig, corners_px: Array) -> bool:
     if not np.isfinite(outline).all():
         return False
     cv2.fillConvexPoly(grey, np.round(np.clip(outline, *FILLABLE_PX)).astype(np.int32), float(np.median(grey)))
-    return find_corners(grey, board, thorough=False) is not None
+    searched = _pyramid(grey)[0] if board.kind == "chessboard" else grey
+    return find_corners(searched, board, thorough=False) is not None
 
 
 def guess_corners(image: Image) -> tuple[int, int] | None:
@@ -468,6 +486,7 @@ def guess_corners(image: Image) -> tuple[int, int] | None:
         Columns and rows, the larger count first; None where no chessboard is surely seen.
     """
     grey = np.asarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    grey = _pyramid(grey)[0]
     ok, _, layout = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), cv2.CALIB_CB_LARGER)
     if not ok:
         return None

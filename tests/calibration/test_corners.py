@@ -104,6 +104,51 @@ def test_a_picture_of_two_boards_gives_one_and_tells_of_the_other():
     assert corners is None or another_board(two, BOARD, corners)
 
 
+STILL_PX = (3264, 2448)  # a still of 8 MP
+STILL_TOLERANCE_PX = 0.3  # the picture is drawn without antialiasing across the squares' edges
+
+
+def still_with_board(outline_px):
+    """A still of 8 MP: grass-like texture, a board at four corners, and a tiny picture of a board beside it."""
+    width, height = STILL_PX
+    rng = np.random.default_rng(3)
+    coarse = cv2.resize(rng.normal(128, 50, (height // 12, width // 12)), STILL_PX, interpolation=cv2.INTER_CUBIC)
+    still = np.clip(coarse + rng.normal(0, 12, (height, width)), 0, 255).astype(np.uint8)
+    tiny = draw_board(BOARD, 20)[..., 0]
+    still[100 : 100 + tiny.shape[0], 100 : 100 + tiny.shape[1]] = tiny
+    drawn = draw_board(BOARD, 150)[..., 0]
+    outer = np.array([[0, 0], [drawn.shape[1], 0], drawn.shape[::-1], [0, drawn.shape[0]]], np.float32) - 0.5
+    H = cv2.getPerspectiveTransform(outer, np.array(outline_px, np.float32))
+    seen = cv2.warpPerspective(np.full_like(drawn, 255), H, STILL_PX) > 0
+    still = np.where(seen, cv2.warpPerspective(drawn, H, STILL_PX, flags=cv2.INTER_AREA), still)
+    points = board_points(BOARD)[:, :2] / BOARD.square * 150 + 299.5
+    return still, cv2.perspectiveTransform(points[None], H)[0]
+
+
+@pytest.mark.parametrize(
+    "outline_px",
+    [
+        ((900, 500), (2700, 650), (2650, 1900), (950, 2000)),
+        ((2900, 2300), (1100, 2200), (1000, 900), (2800, 1000)),
+    ],
+)
+def test_the_large_board_of_a_still_is_found_to_a_fraction_of_a_pixel_and_nothing_else(outline_px):
+    still, truth = still_with_board(outline_px)
+    corners = find_corners(still, BOARD)
+    assert corners is not None
+    assert np.abs(corners - truth).max() < STILL_TOLERANCE_PX
+    assert not another_board(still, BOARD, corners)
+
+
+def test_a_board_too_small_for_the_reduced_still_is_found_at_full_size():
+    still = np.full(STILL_PX[::-1], 128, np.uint8)
+    tiny = draw_board(BOARD, 12)[..., 0]
+    still[1000 : 1000 + tiny.shape[0], 2000 : 2000 + tiny.shape[1]] = tiny
+    corners = find_corners(still, BOARD, thorough=False)
+    assert corners is not None
+    assert np.abs(corners[0] - (2000 + 23.5, 1000 + 23.5)).max() < STILL_TOLERANCE_PX
+
+
 def test_spacing_is_of_the_corners_that_are_seen():
     corners = board_points(BoardConfig(corners=(3, 4)))[:, :2] * 100
     corners[0] = np.nan
