@@ -95,7 +95,7 @@ def _run(
     film: Film,
     target: TargetConfig,
     write_row: Callable[[list[str]], object],
-    write_image: Callable[[Image], None] | None,
+    write_image: Callable[[Image, float], None] | None,
     progress: Progress | None,
     template: Image | None,
 ) -> FilmSummary:
@@ -114,7 +114,7 @@ def _run(
         with_target += bool(tracks)
         times.append(frame.t)
         if write_image is not None:
-            write_image(trails.draw(frame.image, tracks, frame.t))
+            write_image(trails.draw(frame.image, tracks, frame.t), frame.t)
         if progress is not None:
             progress(film.number + 1, film.count)
     duration = max(times) - min(times)

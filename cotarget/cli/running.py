@@ -278,7 +278,7 @@ def _follow(
             see(step)
             states[step.state] += 1
             if film is not None:
-                film.write(side_by_side(step, name))
+                film.write(side_by_side(step, name), step.fixed.t)
             progress(f"following: {name}: {step.state}", min(step.index + 1, expected), expected)
     for line in filter(None, (choice.unmet, reasons.warning and f"cotarget {options.command}: {reasons.warning}")):
         print(line, file=sys.stderr)

@@ -112,7 +112,7 @@ def test_a_replay_keeps_what_was_seen(folder, capsys, monkeypatch):
 def test_detect_keeps_what_was_found(folder, capsys, monkeypatch):
     with FilmWriter(folder / "film.mp4", 25.0) as film:
         for index in range(2 * FRAMES):
-            film.write(ToyRig().fixed.expose(index))
+            film.write(ToyRig().fixed.expose(index), index / 25)
     seen = []
 
     def detect(self, frame, plain=Bright.detect):
