@@ -295,15 +295,15 @@ class FilmWriter:
         self._path, self._keep = path, keep
         self.epoch: datetime | None = None
         self._part = PartFile(path)
+        self._file = _FilmFile(self._part.path)
         self._rate = Fraction(rate_hz).limit_denominator(1001 * 30)
         self._stream: av.VideoStream | None = None
         self._begin, self._last = 0.0, -TICKS_HZ
         try:
-            self._file = _FilmFile(self._part.path)
             options = FRAGMENTS if path.suffix.lower() in FRAGMENTED else {}
             self._container = av.open(self._file, "w", options=options)
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            with self._part.ending(keep=False):
+            with self._part.ending(keep=False), contextlib.closing(self._file):
                 raise self._said(error) from None
 
     def write(self, image: Image, t: float) -> None:
