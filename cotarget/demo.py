@@ -165,7 +165,7 @@ def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, repo
         for step in follow(rig, calibration, target, detector, seconds=RUN_S[name], settings=settings):
             stages.see(step)
             add_row(rows, step, truth, name, target)
-            film.write(side_by_side(step, name))
+            film.write(side_by_side(step, name, step.fixed.t), step.fixed.t)
             report(min(step.index + 1, frames), frames)
     write_picture(work / f"{name}.png", stages.picture(name))
     return rows

@@ -10,6 +10,7 @@ import numpy as np
 
 from cotarget.config import TargetConfig
 from cotarget.detection import make_detector
+from cotarget.drawing import draw_box
 from cotarget.errors import CotargetError
 from cotarget.files import CsvFile
 from cotarget.geometry import Array
@@ -23,8 +24,6 @@ COLUMNS = ("frame", "t", "track", "u_px", "v_px", "width_px", "height_px", "scor
 TRAIL_S = 1.0
 # Colours (BGR) that are distinct on sky, grass and asphalt; a track keeps its own.
 COLOURS = ((60, 60, 255), (0, 200, 255), (80, 220, 60), (255, 160, 40), (255, 80, 220), (40, 140, 255), (230, 230, 60))
-# Distance of a drawn box from the target [px], so that it does not cover a bird of five pixels.
-BOX_MARGIN_PX = 4
 Progress = Callable[[int, int | None], None]
 
 
@@ -95,7 +94,7 @@ def _run(
     film: Film,
     target: TargetConfig,
     write_row: Callable[[list[str]], object],
-    write_image: Callable[[Image], None] | None,
+    write_image: Callable[[Image, float], None] | None,
     progress: Progress | None,
     template: Image | None,
 ) -> FilmSummary:
@@ -114,7 +113,7 @@ def _run(
         with_target += bool(tracks)
         times.append(frame.t)
         if write_image is not None:
-            write_image(trails.draw(frame.image, tracks, frame.t))
+            write_image(trails.draw(frame.image, tracks, frame.t), frame.t)
         if progress is not None:
             progress(film.number + 1, film.count)
     duration = max(times) - min(times)
@@ -151,12 +150,5 @@ class Trails:
                 trail.popleft()
             way = np.rint([center for _, center in trail]).astype(np.int32)
             cv2.polylines(image, [way.reshape(-1, 1, 2)], False, colour, 1, cv2.LINE_AA)
-            half = track.size_px / 2 + BOX_MARGIN_PX
-            low = np.rint(track.center_px - half).astype(int).tolist()
-            high = np.rint(track.center_px + half).astype(int).tolist()
-            cv2.rectangle(image, low, high, colour, 2 if track.missed == 0 else 1)
-            above = low[1] - 5 if low[1] > 18 else high[1] + 15
-            cv2.putText(
-                image, str(track.id), (max(0, low[0]), above), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA
-            )
+            draw_box(image, track.center_px, track.size_px, colour, str(track.id), bold=track.missed == 0)
         return image

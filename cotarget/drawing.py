@@ -1,5 +1,6 @@
 """Draw Steps and runs: frames side by side, one picture for each target, and plots of the aim error over time."""
 
+import itertools
 import math
 import textwrap
 from collections import deque
@@ -40,7 +41,14 @@ def aim_error_figure(rows: Mapping[str, Sequence[Row]]) -> Figure:
         ax.plot(t, offset, lw=1.2, color=OFFSET, label="offset from the centre of the zoom image")
         out = np.array([not row.in_frame and row.in_wide for row in run])
         ax.fill_between(
-            t, 0, 50, where=out, color="#d9534f", alpha=0.15, lw=0, label="in the wide view, not in the close-up"
+            t,
+            0,
+            50,
+            where=out,
+            color="#d9534f",
+            alpha=0.15,
+            lw=0,
+            label="seen by the fixed camera, not in the close-up",
         )
         ax.set(ylim=(0, 50), xlim=(t[0], t[-1]), ylabel="offset [% of width]", title=name)
         zoom = ax.twinx()
@@ -56,31 +64,77 @@ def aim_error_figure(rows: Mapping[str, Sequence[Row]]) -> Figure:
     return figure
 
 
-FOUND, FOLLOWED, CROSS, INK, PAPER, ARROW = (
-    (190, 190, 0),
-    (0, 200, 255),
-    (80, 220, 80),
-    (40, 40, 40),
-    (250, 250, 250),
-    (0, 120, 235),
-)
+# Colours (BGR): boxes of tracks and of the followed one, cross, text, and what is behind them; arrows.
+FOUND, FOLLOWED, CROSS = (230, 230, 0), (0, 200, 255), (80, 220, 80)
+INK, PAPER, DARK, ARROW = (40, 40, 40), (250, 250, 250), (20, 20, 20), (0, 120, 235)
+FULL_WIDTH_PX = 640  # lines, letters and captions grow with images wider than this; the lengths below are at this width
+FULL_HEIGHT_PX = 480  # smaller images are enlarged to this height in a film
+LETTER_SCALE = 0.55  # OpenCV's scale of the font
 STRIP_PX = 36  # height of a caption
+MARGIN_PX = 10  # of texts to the border
+LINE_PX = 19  # distance of lines of text
+PLATE = 0.65  # opacity of the dark plate behind a text
 SIZE_KNOWN_S = 1.5  # time after which a target's size is known: it may have been clipped, or not seen with wings spread
 RECENT_STEPS = 16  # states kept to interpolate the lens at a frame's exposure; more than any latency needs
 # Largest deviations for a picture of the close-up: of the focal length (relative), and of the target (over the width).
 SETTLED = 0.08
 CENTRED = 0.04  # largest distance of a target from the centre that is shown as centred, over the image's width
-REASON_SCALE, REASON_LETTER_PX, REASON_LINE_PX, REASON_MARGIN_PX = 0.45, 8, 16, 8  # few letters are wider
 BOX_MARGIN_PX = 4  # distance of a drawn box from the target
 
 
-def write_text(image: Image, text: str, at: Sequence[float] | Array, scale: float = 0.55, *, halo: bool = True) -> None:
-    """Write text into an image in dark ink, with a light halo for pictures as a background."""
+def write_text(
+    image: Image, text: str, at: Sequence[float] | Array, colour: tuple[int, int, int] = PAPER, *, outlined: bool = True
+) -> None:
+    """Write text into an image, as large as the image asks for.
+
+    Args:
+        image: the image, which is changed.
+        text: the text.
+        at: pixel of the text's lower left corner.
+        colour: colour of the letters, BGR.
+        outlined: whether they have a dark outline, which makes them legible on any background.
+    """
+    scale, font = _scale_of(image), cv2.FONT_HERSHEY_SIMPLEX
     u, v = round(at[0]), round(at[1])
-    font = cv2.FONT_HERSHEY_SIMPLEX
-    for du, dv in ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, 1), (-1, 1), (1, -1)) if halo else ():
-        cv2.putText(image, text, (u + du, v + dv), font, scale, PAPER, 1, cv2.LINE_AA)
-    cv2.putText(image, text, (u, v), font, scale, INK, 1, cv2.LINE_AA)
+    reach = range(-round(scale), round(scale) + 1) if outlined else ()
+    for du, dv in itertools.product(reach, reach):
+        cv2.putText(image, text, (u + du, v + dv), font, scale * LETTER_SCALE, DARK, 1, cv2.LINE_AA)
+    cv2.putText(image, text, (u, v), font, scale * LETTER_SCALE, colour, 1, cv2.LINE_AA)
+
+
+def _scale_of(image: Image) -> float:
+    """Scale of lines and letters in an image."""
+    return max(1.0, image.shape[1] / FULL_WIDTH_PX)
+
+
+def _width_of(text: str, scale: float) -> int:
+    """Width of a text [px]."""
+    return int(cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale * LETTER_SCALE, 1)[0][0])
+
+
+def draw_box(
+    image: Image, center_px: Array, size_px: Array, colour: tuple[int, int, int], label: str, *, bold: bool = True
+) -> None:
+    """Draw a box around a target, with its label; the target itself stays free.
+
+    Args:
+        image: the image, which is changed.
+        center_px: centre of the target (u, v), (2,).
+        size_px: its width and height, (2,).
+        colour: colour of the line, BGR; a dark line is around it.
+        label: text above the box, or below it at the image's top.
+        bold: whether its line is bold; it grows outwards.
+    """
+    scale = _scale_of(image)
+    line = round(2 * scale) if bold else 1
+    half = size_px / 2 + BOX_MARGIN_PX * scale
+    low, high = np.rint(center_px - half).astype(int), np.rint(center_px + half).astype(int)
+    for away in range(line + 1):
+        cv2.rectangle(image, (low - away).tolist(), (high + away).tolist(), colour if away < line else DARK, 1)
+    room = LINE_PX * scale
+    above = low[1] - 6 * scale if low[1] > room else high[1] + room
+    left = min(max(0, low[0]), image.shape[1] - _width_of(label, scale) - 2)
+    write_text(image, label, (left, above), colour)
 
 
 def write_picture(path: Path, image: Image) -> None:
@@ -93,69 +147,91 @@ def write_picture(path: Path, image: Image) -> None:
 
 
 def captioned(image: Image, text: str) -> Image:
-    """Append a caption below an image."""
-    strip = np.full((STRIP_PX, image.shape[1], 3), PAPER, np.uint8)
-    write_text(strip, text, (10, STRIP_PX - 12), halo=False)
+    """Append a caption below an image, in letters that let it fit."""
+    scale = _scale_of(image)
+    height, margin = round(STRIP_PX * scale), MARGIN_PX * scale
+    fitted = scale * min(1.0, (image.shape[1] - 2 * margin) / max(1, _width_of(text, scale)))
+    strip = np.full((height, image.shape[1], 3), PAPER, np.uint8)
+    at = round(margin), round(height - 12 * scale)
+    cv2.putText(strip, text, at, cv2.FONT_HERSHEY_SIMPLEX, fitted * LETTER_SCALE, INK, 1, cv2.LINE_AA)
     return np.vstack([image, strip])
 
 
-def draw_wide(step: Step) -> Image:
-    """Draw the fixed camera's frame with every confirmed track's box, the followed one in another colour, (H, W, 3)."""
-    image = step.fixed.image.copy()
+def draw_wide(step: Step, factor: float = 1.0) -> Image:
+    """Draw the fixed camera's frame with every confirmed track's box, the followed one in another colour.
+
+    Args:
+        step: the Step.
+        factor: by which the frame is enlarged, (factor H, factor W, 3).
+    """
+    image = _enlarged(step.fixed.image, factor)
     for track in step.tracks:
-        if not track.confirmed:
-            continue
-        followed = step.target is not None and track.id == step.target.id
-        half = track.size_px / 2 + BOX_MARGIN_PX
-        low, high = np.rint(track.center_px - half).astype(int), np.rint(track.center_px + half).astype(int)
-        colour = FOLLOWED if followed else FOUND
-        cv2.rectangle(image, low.tolist(), high.tolist(), colour, 2 if followed else 1, cv2.LINE_AA)
-        write_text(image, f"{track.id}", (high[0] + 3, low[1] + 10))
+        if track.confirmed:
+            followed = step.target is not None and track.id == step.target.id
+            center = factor * (track.center_px + 0.5) - 0.5
+            draw_box(
+                image, center, factor * track.size_px, FOLLOWED if followed else FOUND, f"{track.id}", bold=followed
+            )
     return image
 
 
-def draw_zoom(step: Step) -> Image:
-    """Draw the zoom camera's frame with a small cross at its centre."""
-    image = step.zoom.image.copy()
-    u, v = image.shape[1] // 2, image.shape[0] // 2
-    for a, b in (
-        ((u - 12, v), (u - 4, v)),
-        ((u + 4, v), (u + 12, v)),
-        ((u, v - 12), (u, v - 4)),
-        ((u, v + 4), (u, v + 12)),
-    ):
-        cv2.line(image, a, b, CROSS, 1, cv2.LINE_AA)
+def _enlarged(image: Image, factor: float) -> Image:
+    """Copy an image, enlarged by a factor."""
+    if factor == 1:
+        return image.copy()
+    return np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+def draw_zoom(step: Step, factor: float = 1.0) -> Image:
+    """Draw the zoom camera's frame with a small cross at its centre; ``factor`` as for `draw_wide`."""
+    image = _enlarged(step.zoom.image, factor)
+    line = max(1, round(_scale_of(image)))
+    u, v, near, far = image.shape[1] // 2, image.shape[0] // 2, 4 * line, 12 * line
+    for colour, width in ((DARK, 3 * line), (CROSS, line)):
+        for a, b in (
+            ((u - far, v), (u - near, v)),
+            ((u + near, v), (u + far, v)),
+            ((u, v - far), (u, v - near)),
+            ((u, v + near), (u, v + far)),
+        ):
+            cv2.line(image, a, b, colour, width, cv2.LINE_AA)
     return image
 
 
-def side_by_side(step: Step, title: str) -> Image:
-    """Draw one frame of the video: both cameras' frames, with the detection and the state of the pipeline."""
+def side_by_side(step: Step, title: str, t: float) -> Image:
+    """Draw one frame of a film: both cameras' frames of one height, with detection and state of the pipeline.
+
+    Args:
+        step: the Step.
+        title: name of the target.
+        t: time since the film began [s].
+    """
+    heights = step.fixed.image.shape[0], step.zoom.image.shape[0]
+    fixed, zoom = (max(FULL_HEIGHT_PX, *heights) / height for height in heights)
+    depth = f"   depth {step.aim.depth:.1f} m" if step.aim is not None else ""
+    left = f"fixed camera: {title}   t = {t:.2f} s   {step.state}{depth}"
     pan, tilt = np.degrees(step.head.pan), np.degrees(step.head.tilt)
-    depth = f"depth {step.aim.depth:5.1f} m" if step.aim is not None else ""
-    wide = captioned(
-        _explained(draw_wide(step), step.reason), f"{title}   t = {step.fixed.t:5.2f} s   {step.state}   {depth}"
-    )
-    zoomed = draw_zoom(step)
-    if zoomed.shape[0] < step.fixed.image.shape[0]:  # enlarge a small viewfinder frame to the fixed frame's height
-        factor = step.fixed.image.shape[0] / zoomed.shape[0]
-        zoomed = np.asarray(cv2.resize(zoomed, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC), np.uint8)
-    close = captioned(
-        zoomed,
-        f"zoom view   pan {pan:6.2f}   tilt {tilt:6.2f} deg   focal length {step.lens.focal_px:5.0f} px",
-    )
-    height = max(wide.shape[0], close.shape[0])
-    padded = [
-        cv2.copyMakeBorder(i, 0, height - i.shape[0], 0, 0, cv2.BORDER_CONSTANT, value=PAPER) for i in (wide, close)
-    ]
+    right = f"close-up   pan {pan:6.2f}   tilt {tilt:6.2f} deg   focal length {step.lens.focal_px:5.0f} px"
+    panels = [captioned(_explained(draw_wide(step, fixed), step.reason), left), captioned(draw_zoom(step, zoom), right)]
+    height = max(panel.shape[0] for panel in panels)  # the caption of a wider image is higher
+    padded = [cv2.copyMakeBorder(i, 0, height - i.shape[0], 0, 0, cv2.BORDER_CONSTANT, value=PAPER) for i in panels]
     return np.hstack(padded)
 
 
 def _explained(image: Image, reason: str) -> Image:
-    """Write the reason of a state at the bottom of an image, wrapped to its width."""
-    lines = textwrap.wrap(reason, max(1, (image.shape[1] - 2 * REASON_MARGIN_PX) // REASON_LETTER_PX))
-    for number, line in enumerate(reversed(lines)):
-        at = (REASON_MARGIN_PX, image.shape[0] - REASON_MARGIN_PX - number * REASON_LINE_PX)
-        write_text(image, line, at, REASON_SCALE)
+    """Write the reason of a state on a dark plate at the bottom of an image, wrapped to its width."""
+    if not reason:
+        return image
+    scale = _scale_of(image)
+    margin, line = MARGIN_PX * scale, LINE_PX * scale
+    widest = image.shape[1] - 2 * margin
+    lines = textwrap.wrap(reason, max(1, int(len(reason) * widest / max(1, _width_of(reason, scale)))))
+    while len(lines) > 1 and max(_width_of(each, scale) for each in lines) > widest:  # letters differ in width
+        lines = textwrap.wrap(reason, max(map(len, lines)) - 1)
+    top = max(0, round(image.shape[0] - len(lines) * line - margin))
+    image[top:] = cv2.addWeighted(image[top:], 1 - PLATE, np.full_like(image[top:], DARK), PLATE, 0)
+    for number, each in enumerate(lines, start=1):
+        write_text(image, each, (margin, top + number * line), outlined=False)
     return image
 
 
@@ -205,17 +281,17 @@ class TargetStages:
         before, centred, close = self.before or missing, self.centred or missing, self.close or missing
         mask = np.zeros(close.fixed.image.shape[:2], np.uint8) if close.mask is None else close.mask
         rows = [
-            (draw_wide(close), f"(a) {title}: wide view and detection"),
+            (draw_wide(close), f"(a) {title}: fixed camera and detection"),
             (cv2.cvtColor(mask, cv2.COLOR_GRAY2BGR), "(b) what the detector marked in it"),
-            (before.zoom.image, "(c) zoom view before"),
-            (draw_zoom(centred), "(d) zoom view, turned to the target"),
-            (self._enlarged(close), "(e) the wide view enlarged as much as the close-up"),
+            (before.zoom.image, "(c) zoom camera before"),
+            (draw_zoom(centred), "(d) zoom camera, turned to the target"),
+            (self._magnified(close), "(e) the fixed camera enlarged as much as the close-up"),
             (draw_zoom(close), f"(f) close-up, at {close.lens.focal_px:.0f} px"),
         ]
         panels = [captioned(np.asarray(image, np.uint8), text) for image, text in rows]
         return np.vstack([np.hstack(panels[i : i + 2]) for i in range(0, len(panels), 2)])
 
-    def _enlarged(self, step: Step) -> Image:
+    def _magnified(self, step: Step) -> Image:
         """Enlarge the fixed frame around the target to the close-up's scale (if both lenses are alike when short)."""
         image = step.fixed.image
         if step.target is None:

@@ -7,6 +7,7 @@ finds the files that are installed with cotarget.
 import contextlib
 import csv
 import fcntl
+import io
 import os
 import signal
 import threading
@@ -235,7 +236,10 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 class CsvFile:
-    """Write a table as csv, under its name only when it is complete. A context manager."""
+    """Write a table as csv, under its name only when it is complete. A context manager.
+
+    Each row is on the disk before the next one, so that the temporary file of a killed run holds all rows.
+    """
 
     def __init__(self, path: Path, columns: Sequence[str], *, keep: bool = False, line_end: str = "\r\n") -> None:
         """Open the table for writing.
@@ -249,24 +253,36 @@ class CsvFile:
         Raises:
             ConfigError: the file cannot be written.
         """
-        self._path, self._keep, self._rows, self._broken = path, keep, 0, False
+        self._path, self._keep, self._rows = path, keep, 0
         self._part = PartFile(path)
-        self._file = self._part.path.open("w", newline="", encoding="utf-8")
-        self._writer = csv.writer(self._file, lineterminator=line_end)
-        self._writer.writerow(columns)
+        self._file = self._part.path.open("wb", buffering=0)
+        self._line = io.StringIO(newline="")
+        self._writer = csv.writer(self._line, lineterminator=line_end)
+        try:
+            self._append(columns)
+        except ConfigError as error:
+            self.__exit__(type(error), error, None)
+            raise
 
     def write(self, row: Iterable[object]) -> None:
         """Append a line.
 
         Raises:
-            ConfigError: the disk is full.
+            ConfigError: the disk is full; the lines before this one stay whole.
         """
-        try:
-            self._writer.writerow(row)
-        except OSError as error:
-            self._broken = True
-            raise said(self._path, error) from None
+        self._append(row)
         self._rows += 1
+
+    def _append(self, cells: Iterable[object]) -> None:
+        self._writer.writerow(cells)
+        data, begin = self._line.getvalue().encode(), self._file.tell()
+        self._line.seek(0)
+        self._line.truncate()
+        try:
+            write_all(self._file, data)
+        except OSError as error:
+            self._file.truncate(begin)
+            raise said(self._path, error) from None
 
     def __enter__(self) -> "CsvFile":
         """Return the table itself."""
@@ -278,8 +294,18 @@ class CsvFile:
         """Complete the file and give it its name; after an error, remove it or keep the rows so far.
 
         Raises:
-            ConfigError: the file could not be completed, for example on a full disk.
+            ConfigError: the file could not be completed.
         """
-        keep = not self._broken and (error is None or (self._keep and self._rows > 0))
-        with self._part.ending(keep=keep, error=error):
-            self._file.close()  # flushes the rest, and may find the disk full
+        with self._part.ending(keep=error is None or (self._keep and self._rows > 0), error=error):
+            self._file.close()
+
+
+def write_all(file: io.RawIOBase, data: bytes) -> None:
+    """Write all bytes to an unbuffered file, which may take them in parts.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    rest = memoryview(data)
+    while rest:
+        rest = rest[file.write(rest) or 0 :]

@@ -5,7 +5,9 @@ shift those after it. The choice of x264's settings: docs/design-notes.md.
 """
 
 import contextlib
+import os
 from collections.abc import Iterator, Sequence
+from datetime import datetime, timedelta
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -16,7 +18,7 @@ import cv2
 import numpy as np
 
 from cotarget.errors import CotargetError
-from cotarget.files import PartFile
+from cotarget.files import HeldSignals, PartFile, write_all
 from cotarget.rig import Frame, Image
 
 # Codecs in which a packet without a frame is normal.
@@ -259,32 +261,57 @@ class Film:
         return "its last frame is damaged" if damaged else ""
 
 
+# Clock of a film's frames [Hz], MPEG's own. A container for constant rates alone, such as AVI, counts in frames.
+TICKS_HZ = 90_000
+LEAST_S = 1e-3  # least time from frame to frame [s], Matroska's unit
+# A film in a MOV container is written in pieces of a second, each of which can be played while later ones are missing,
+# and becomes one whole when it is complete.
+FRAGMENTED = (".mp4", ".mov", ".m4v")
+FRAGMENTS = {"movflags": "hybrid_fragmented+delay_moov", "frag_duration": "1000000"}
+KEYFRAME_S = 1.0  # a piece begins with a keyframe
+
+
 class FilmWriter:
-    """Write a film as H.264 yuv420p, under its name only when it is complete. A context manager."""
+    """Write a film as H.264 yuv420p, under its name only when it is complete. A context manager.
+
+    Frames are shown at their own times. What a killed run has written so far can be played from its temporary file.
+
+    Attributes:
+        epoch: wall-clock time at which the frames' clock showed 0, for the film's creation time; None if it has none.
+            To be set before the first frame.
+    """
 
     def __init__(self, path: Path, rate_hz: float, *, keep: bool = False) -> None:
         """Open a film for writing.
 
         Args:
             path: file of the film, with a suffix that names a container, such as .mp4.
-            rate_hz: frame rate [Hz].
+            rate_hz: nominal frame rate, which gives the last frame's duration [Hz].
             keep: whether to keep the frames so far as a film if the block ends in an error.
 
         Raises:
             CotargetError: the folder is missing, the suffix names no container, or another run is writing the film.
         """
-        self._path, self._keep, self._broken = path, keep, False
+        self._path, self._keep = path, keep
+        self.epoch: datetime | None = None
         self._part = PartFile(path)
+        self._file = _FilmFile(self._part.path)
         self._rate = Fraction(rate_hz).limit_denominator(1001 * 30)
         self._stream: av.VideoStream | None = None
+        self._begin, self._last = 0.0, -TICKS_HZ
         try:
-            self._container = av.open(str(self._part.path), "w")
+            options = FRAGMENTS if path.suffix.lower() in FRAGMENTED else {}
+            self._container = av.open(self._file, "w", options=options)
         except (av.error.FFmpegError, OSError, ValueError) as error:
-            with self._part.ending(keep=False):
+            with self._part.ending(keep=False), contextlib.closing(self._file):
                 raise self._said(error) from None
 
-    def write(self, image: Image) -> None:
-        """Append an image, (H, W, 3) BGR; an odd side is extended by repeating its last row or column.
+    def write(self, image: Image, t: float) -> None:
+        """Append an image.
+
+        Args:
+            image: (H, W, 3) BGR; an odd side is extended by repeating its last row or column.
+            t: time at which it is shown, on any clock [s]; the film begins at the first one.
 
         Raises:
             CotargetError: the container cannot hold H.264, or the disk is full.
@@ -292,18 +319,37 @@ class FilmWriter:
         height, width = image.shape[:2]
         if height % 2 or width % 2:
             image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE).astype(np.uint8)
+        held = HeldSignals()  # an exception while the file is written would be lost in FFmpeg
+        held.hold()
         try:
             if self._stream is None:
-                self._stream = self._container.add_stream(
-                    "libx264", rate=self._rate, options={"crf": QUALITY, "preset": PRESET}
-                )
-                self._stream.width, self._stream.height = image.shape[1], image.shape[0]
-                self._stream.pix_fmt = "yuv420p"
+                self._stream, self._begin = self._begun(image, t), t
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="bgr24")
+            tick = self._stream.codec_context.time_base
+            assert tick is not None
+            least = max(1, round(LEAST_S / tick))
+            self._last = max(self._last + least, round((t - self._begin) / tick))  # a clock may jump back
+            picture.pts, picture.time_base, picture.duration = self._last, tick, round(1 / self._rate / tick)
             self._container.mux(self._stream.encode(picture))
         except (av.error.FFmpegError, ValueError) as error:
-            self._broken = True
-            raise self._said(error) from None
+            self._file.refuse(error)
+        finally:
+            held.restore()
+        held.deliver()
+        if self._file.failure is not None:
+            raise self._said(self._file.failure)
+
+    def _begun(self, image: Image, t: float) -> av.VideoStream:
+        """Add the stream for images of this size."""
+        variable = self._container.format.flags & av.format.Flags.variable_fps.value
+        stream = self._container.add_stream("libx264", rate=self._rate, options={"crf": QUALITY, "preset": PRESET})
+        stream.width, stream.height, stream.pix_fmt = image.shape[1], image.shape[0], "yuv420p"
+        stream.codec_context.time_base = stream.time_base = Fraction(1, TICKS_HZ) if variable else 1 / self._rate
+        stream.codec_context.gop_size = max(1, round(KEYFRAME_S * self._rate))
+        if self.epoch is not None:
+            began = self.epoch + timedelta(seconds=t)
+            self._container.metadata["creation_time"] = began.isoformat(timespec="microseconds")
+        return stream
 
     def _said(self, error: Exception) -> CotargetError:
         return CotargetError(f"{self._path}: cannot be written ({reason_of(error)}); name e.g. an .mp4")
@@ -320,17 +366,88 @@ class FilmWriter:
         Raises:
             CotargetError: the film could not be completed, for example on a full disk.
         """
-        keep = self._stream is not None and not self._broken and (error is None or self._keep)
+        keep = self._stream is not None and (error is None or self._keep)
         with self._part.ending(keep=keep, error=error):
             try:
-                if keep and self._stream is not None:
+                if keep and self._stream is not None and self._file.failure is None:
                     self._container.mux(self._stream.encode(None))
-                    self._container.close()
+                self._container.close()
             except (av.error.FFmpegError, OSError) as failed:
-                raise CotargetError(f"{self._path}: cannot be completed ({reason_of(failed)})") from None
+                self._file.refuse(failed)
             finally:
                 with contextlib.suppress(av.error.FFmpegError, OSError):
                     self._container.close()
+                self._file.close()
+            failure = self._file.failure
+            if keep and failure is not None and not _can_be_played(self._part.path):
+                raise CotargetError(f"{self._path}: cannot be completed ({reason_of(failure)})")
+        if error is None and failure is not None:
+            raise CotargetError(f"{self._path}: is cut short ({reason_of(failure)}); holds what there was until then")
+
+
+def _can_be_played(path: Path) -> bool:
+    """Check whether a film has a frame that can be decoded."""
+    try:
+        with Film(path) as film:
+            return next(iter(film), None) is not None
+    except CotargetError:
+        return False
+
+
+class _FilmFile:
+    """File of a film in the making, which can be played up to where the disk was full.
+
+    FFmpeg completes a film by overwriting its beginning. That is done when the file is closed, and only if everything
+    else could be written; after a failure nothing more is written.
+
+    Attributes:
+        name: path of the file, by which FFmpeg chooses the container.
+        failure: the first error; None if there was none.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.name = str(path)
+        self.failure: Exception | None = None
+        self._file = path.open("wb", buffering=0)
+        self._at = self._size = 0
+        self._overwritten: list[tuple[int, bytes]] = []
+
+    def refuse(self, error: Exception) -> None:
+        """Write nothing more because of an error."""
+        self.failure = self.failure or error
+
+    def write(self, data: bytes) -> int:
+        """Append data; keep what overwrites earlier data for the end."""
+        data = bytes(data)
+        inside = min(len(data), self._size - self._at)
+        if inside:
+            self._overwritten.append((self._at, data[:inside]))
+        if len(data) > inside and self.failure is None:
+            try:
+                write_all(self._file, data[inside:])
+            except OSError as error:
+                self.refuse(error)
+                self._file.truncate(self._size)
+        self._at += len(data)
+        self._size = max(self._size, self._at)
+        return len(data)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Move to a place of the file, as it would be without failures."""
+        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._size}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        """Return the place in the file."""
+        return self._at
+
+    def close(self) -> None:
+        """Write what overwrites earlier data, and close the file."""
+        with self._file:
+            if self.failure is None:
+                for at, data in self._overwritten:
+                    self._file.seek(at)
+                    write_all(self._file, data)
 
 
 def join_films(parts: Sequence[Path], path: Path) -> None:

@@ -7,7 +7,16 @@ import pytest
 
 from cotarget import drawing
 from cotarget.detection import Detection
-from cotarget.drawing import SIZE_KNOWN_S, TargetStages, aim_error_figure, draw_frames
+from cotarget.drawing import (
+    SIZE_KNOWN_S,
+    TargetStages,
+    aim_error_figure,
+    captioned,
+    draw_box,
+    draw_frames,
+    side_by_side,
+    write_text,
+)
 from cotarget.estimation.zoom_matching import ZoomMeasurement
 from cotarget.metrics import Row
 from cotarget.pipeline import State, Step
@@ -71,6 +80,68 @@ def test_the_rigs_frames_have_the_names_of_the_paper(monkeypatch):
     monkeypatch.setattr(drawing, "write_text", lambda image, text, *_: told.extend(text.split(", ")))
     draw_frames(PICTURE, {"fixed": np.zeros(2), "zoom": np.ones(2), "base": np.ones(2)})
     assert set(told) == {"fixed", "zoom0", "base", "head", "Gamma", "T"}
+
+
+VISIBLE = 80  # least difference of something drawn from its background [grey levels]
+BIRD_PX = np.array([6.0, 4.0])
+
+
+@pytest.mark.parametrize("grey", [0, 60, 128, 200, 255])
+@pytest.mark.parametrize("width", [320, 640, 1280])
+@pytest.mark.parametrize("bold", [True, False])
+def test_a_box_can_be_seen_on_any_background_and_leaves_a_small_bird_free(grey, width, bold):
+    image = np.full((width * 3 // 4, width, 3), grey, np.uint8)
+    u, v = width // 2, width // 4
+    draw_box(image, np.array([u, v]), BIRD_PX, (0, 200, 255), "1", bold=bold)
+    changed = np.abs(image.astype(int) - grey).max(axis=2)
+    low, high = (np.array([u, v]) - BIRD_PX / 2 - 2).astype(int), (np.array([u, v]) + BIRD_PX / 2 + 3).astype(int)
+    assert not changed[low[1] : high[1], low[0] : high[0]].any()
+    assert changed[v, u:].max() >= VISIBLE  # its right side
+    assert changed[: v - 12 * width // 640].max() >= VISIBLE  # its label
+
+
+@pytest.mark.parametrize("at", [(0.0, 0.0), (639.0, 479.0), (639.0, 0.0)])
+def test_the_label_of_a_box_at_the_border_is_in_the_image(at):
+    """Its number takes as many pixels as in the middle of the image."""
+    shown = []
+    for place in (np.array([320.0, 240.0]), np.array(at)):
+        with_label, without = (np.zeros((480, 640, 3), np.uint8) for _ in range(2))
+        draw_box(with_label, place, BIRD_PX, (0, 200, 255), "42")
+        draw_box(without, place, BIRD_PX, (0, 200, 255), "")
+        shown.append(int((with_label != without).any(axis=2).sum()))
+    assert shown[1] == pytest.approx(shown[0], rel=0.1)
+
+
+@pytest.mark.parametrize("grey", [0, 60, 128, 200, 255])
+def test_a_text_can_be_read_on_any_background(grey):
+    image = np.full((60, 200, 3), grey, np.uint8)
+    write_text(image, "bird", (10, 40))
+    assert np.abs(image.astype(int) - grey).max() >= VISIBLE
+
+
+@pytest.mark.parametrize("width", [320, 640, 1920])
+def test_a_caption_fits_below_its_image(width):
+    text = "close-up   pan -123.45   tilt -12.34 deg   focal length 12345 px   and more than was ever there"
+    image = captioned(np.zeros((240, width, 3), np.uint8), text)
+    strip = image[240:].min(axis=2)
+    assert (strip[:, -5:] > 200).all()
+    assert (strip < 100).any()
+
+
+@pytest.mark.parametrize(
+    ("fixed", "zoom"), [((320, 240), (320, 240)), ((640, 480), (320, 240)), ((320, 240), (800, 600))]
+)
+def test_a_film_shows_both_cameras_equally_high_and_not_too_small_to_be_read(fixed, zoom):
+    made = step(0.0)
+    images = (np.full((size[1], size[0], 3), 128, np.uint8) for size in (fixed, zoom))
+    made = dataclasses.replace(
+        made, **{name: Frame(image, 0.0) for name, image in zip(("fixed", "zoom"), images, strict=True)}
+    )
+    image = side_by_side(made, "bird", 12.34)
+    height = max(480, fixed[1], zoom[1])
+    assert image.shape[1] == sum(height * size[0] // size[1] for size in (fixed, zoom))
+    assert (image[height - 1] == 128).all()  # without a reason nothing is written into the images
+    assert image.shape[0] > height
 
 
 def row(t, focal_px):

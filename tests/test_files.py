@@ -11,7 +11,7 @@ import pytest
 
 from cotarget import files
 from cotarget.drawing import write_picture
-from cotarget.errors import ConfigError
+from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile, PartFile, write_whole
 from cotarget.video import Film, FilmWriter
 from tests.full_disk import SAID, full_disk
@@ -34,8 +34,8 @@ def write_table(path, rows, error=None, keep=False):
 
 def write_film(path, frames, error=None, keep=False):
     with FilmWriter(path, 25.0, keep=keep) as film:
-        for _ in range(frames):
-            film.write(IMAGE)
+        for number in range(frames):
+            film.write(IMAGE, number / 25)
         if error is not None:
             raise error
 
@@ -66,23 +66,60 @@ def test_what_there_is_can_be_kept_after_an_error_which_says_so(tmp_path, name, 
             assert len(list(film)) == 3
 
 
-@pytest.mark.parametrize("rows", [1, 10_000])  # found full at the end, and on the way
-@pytest.mark.parametrize("error", [None, KeyboardInterrupt()])
-def test_a_full_disk_keeps_no_half_table(tmp_path, rows, error):
+@pytest.mark.parametrize("keep", [True, False])
+def test_a_disk_that_is_full_from_the_beginning_leaves_the_old_table(tmp_path, keep):
     path = tmp_path / "a.csv"
     path.write_text("old")
-    with full_disk(), pytest.raises((ConfigError, KeyboardInterrupt)):
-        write_table(path, rows, error, keep=True)
+    with full_disk(), pytest.raises(ConfigError, match=f"a.csv: cannot be written: {SAID}"):
+        write_table(path, 1, keep=keep)
     assert path.read_text() == "old"
     assert names(tmp_path) == ["a.csv"]
 
 
-def test_a_full_disk_keeps_no_half_film(tmp_path):
+def test_a_table_on_a_disk_that_gets_full_keeps_its_whole_lines(tmp_path):
+    """The name of the column and 3 lines of "9\\r\\n" are 12 bytes, and the next is cut."""
+    path = tmp_path / "a.csv"
+    with full_disk(14), pytest.raises(ConfigError, match="cannot be written") as caught:
+        write_table(path, 9, keep=True)
+    assert caught.value.__notes__ == [f"{path} holds what there was until then"]
+    assert path.read_text().split() == ["n", "0", "1", "2"]
+
+
+def test_a_film_of_which_the_disk_holds_nothing_is_not_there(tmp_path):
     path = tmp_path / "a.mp4"
     with full_disk(1000), pytest.raises(KeyboardInterrupt) as caught:
         write_film(path, 3, KeyboardInterrupt(), keep=True)
     assert caught.value.__notes__ == [f"{path} could not be completed"]
     assert names(tmp_path) == []
+
+
+def noisy_film(path, seconds):
+    """A film at 25 Hz whose seconds take some 60 kB each."""
+    rng = np.random.default_rng(0)
+    with FilmWriter(path, 25.0, keep=True) as film:
+        for number in range(25 * seconds):
+            film.write(rng.integers(0, 256, (48, 64, 3), np.uint8), number / 25)
+
+
+def times_in(path):
+    with Film(path) as film:
+        return [frame.t for frame in film]
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
+def test_a_film_on_a_disk_that_gets_full_can_be_played_up_to_there(tmp_path, suffix):
+    whole, path = tmp_path / f"whole{suffix}", tmp_path / f"a{suffix}"
+    noisy_film(whole, 6)
+    size = whole.stat().st_size
+    for part, least, most in ((0.6, 50, 100), (1 - 1e-3, 125, 150)):  # on the way, and when it is completed
+        with full_disk(int(part * size)), pytest.raises(CotargetError, match=rf"a{suffix}: .*{SAID}") as caught:
+            noisy_film(path, 6)
+        said = [str(caught.value), *getattr(caught.value, "__notes__", ())]
+        assert said[-1].endswith("holds what there was until then")
+        times = times_in(path)
+        assert least <= len(times) <= most
+        np.testing.assert_allclose(times, np.arange(len(times)) / 25, atol=1e-3)
+    assert names(tmp_path) == sorted([f"a{suffix}", f"whole{suffix}"])
 
 
 @pytest.mark.parametrize(("name", "make"), [
@@ -170,8 +207,8 @@ def test_one_who_insists_need_not_wait_for_a_file(tmp_path):
 
 def write_and_end(writer, error):
     with writer as film:
-        for _ in range(3):
-            film.write(IMAGE)
+        for number in range(3):
+            film.write(IMAGE, number / 25)
         raise error
 
 
@@ -203,15 +240,27 @@ class _Signalled(FilmWriter):
         super().__exit__(*error)
 
 
-def test_what_a_killed_run_has_left_is_taken_over(tmp_path):
+KILLED = """
+import os, pathlib
+import numpy as np
+from cotarget.files import CsvFile
+from cotarget.video import FilmWriter
+table, film = CsvFile(pathlib.Path("a.csv"), ("n",)), FilmWriter(pathlib.Path("a.mp4"), 25.0)
+rng = np.random.default_rng(0)
+for number in range(150):
+    table.write([number])
+    film.write(rng.integers(0, 256, (48, 64, 3), np.uint8), number / 25)
+os.kill(os.getpid(), 9)
+"""
+
+
+def test_what_a_killed_run_has_left_can_be_read_and_is_taken_over(tmp_path):
     path = tmp_path / "a.csv"
-    killed = (
-        "import os, pathlib\nfrom cotarget.files import CsvFile\n"
-        "table = CsvFile(pathlib.Path('a.csv'), ('much',) * 1000)\n"
-        "table._file.flush()\nos.kill(os.getpid(), 9)\n"
-    )
-    subprocess.run([sys.executable, "-c", killed], cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}, check=False)
-    assert names(tmp_path) == [".a.part.csv"]
+    subprocess.run([sys.executable, "-c", KILLED], cwd=tmp_path, env={"PYTHONPATH": str(ROOT)}, check=False)
+    assert names(tmp_path) == [".a.part.csv", ".a.part.mp4"]
+    assert (tmp_path / ".a.part.csv").read_text().split() == ["n", *map(str, range(150))]
+    assert len(times_in(tmp_path / ".a.part.mp4")) >= 50
+    (tmp_path / ".a.part.mp4").unlink()
     write_table(path, 1)
     assert names(tmp_path) == ["a.csv"]
     assert path.read_text().split() == ["n", "0"]

@@ -144,7 +144,7 @@ def test_the_command_scores_a_film(tmp_path, capsys):
             image = np.full((120, 320, 3), 170, np.uint8) + rng.integers(-3, 4, (120, 320, 3)).astype(np.uint8)
             x = 20 + 3 * i
             image[50:60, x : x + 10] = 20
-            film.write(image)
+            film.write(image, i / RATE)
             rows.append(f"{i},{x},50,10,10")
     labels = write_labels(tmp_path / "labels.csv", rows)
     arguments = ["detect", str(tmp_path / "film.mp4"), "--target", "bird", "--csv", str(tmp_path / "tracks.csv")]

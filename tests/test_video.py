@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from datetime import UTC, datetime, timedelta
 from fractions import Fraction
 
 import av
@@ -27,7 +28,7 @@ def bird_film(path, count=60, size=(161, 121)):
             image = np.full((size[1], size[0], 3), (220, 190, 160), np.uint8)
             u = 10 + 2 * i
             image[50:56, u - 6 : u + 6] = 30
-            film.write(image)
+            film.write(image, i / RATE)
 
 
 def test_a_film_is_h264_yuv420p_and_reads_back(tmp_path):
@@ -46,13 +47,39 @@ def test_a_film_is_h264_yuv420p_and_reads_back(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
 
 
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".mov"])
+def test_frames_are_shown_at_their_own_times(tmp_path, suffix):
+    """A real rig's clock, which began with the machine; frames that were skipped or came late, and a jump back."""
+    begin, gaps = 7_654_321.098, [0.04, 0.12, 0.04, 0.35, 0.041, 2.0, -0.04, 0.04]
+    times = begin + np.concatenate([[0.0], np.cumsum(gaps)])
+    path = tmp_path / f"a{suffix}"
+    with FilmWriter(path, RATE) as film:
+        film.epoch = datetime(2024, 2, 29, 23, 59, 58, tzinfo=UTC) - timedelta(seconds=begin)
+        for t in times:
+            film.write(np.zeros((48, 64, 3), np.uint8), t)
+    with Film(path) as film:
+        shown = np.array([frame.t for frame in film])
+    whole = [0, 1, 2, 3, 4, 5, 6]
+    np.testing.assert_allclose(shown[whole], times[whole] - begin, atol=1e-3)  # a millisecond is Matroska's tick
+    assert shown[6] < shown[7] < shown[8] < shown[6] + 0.05
+    with av.open(str(path)) as container:
+        assert container.metadata.get("creation_time", "").startswith("2024-02-29T23:59:58")
+        assert container.duration == pytest.approx(1e6 * (shown[-1] + 1 / RATE), abs=2e3)
+
+
+def test_a_film_of_no_time_of_day_says_none(tmp_path):
+    bird_film(tmp_path / "a.mp4", 2)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert "creation_time" not in container.metadata
+
+
 def test_a_film_that_failed_leaves_the_old_one(tmp_path):
     path = tmp_path / "a.mp4"
     path.write_bytes(b"old")
 
     def fail():
         with FilmWriter(path, RATE) as film:
-            film.write(np.zeros((20, 20, 3), np.uint8))
+            film.write(np.zeros((20, 20, 3), np.uint8), 0.0)
             raise RuntimeError
 
     with pytest.raises(RuntimeError):

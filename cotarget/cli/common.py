@@ -154,6 +154,36 @@ def _choice_of(options: argparse.Namespace, recorded: "TargetChoice | None") -> 
     return TargetChoice(POLICIES[0]) if recorded in (None, ANY_TARGET) else recorded
 
 
+class SkippedFrames:
+    """Count of the fixed camera's frames that a run did not work on, by the times of those that it did.
+
+    Attributes:
+        count: frames that were skipped so far.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        """Start to count frames of a camera of this rate [Hz]."""
+        self._rate_hz, self._steps, self.count = rate_hz, 0, 0
+        self._last: float | None = None
+
+    def see(self, step: "Step") -> None:
+        """Count the frames between the last step's and this one's."""
+        if self._last is not None:
+            self.count += max(0, round((step.fixed.t - self._last) * self._rate_hz) - 1)
+        self._last = step.fixed.t
+        self._steps += 1
+
+    @property
+    def warning(self) -> str:
+        """One line if many frames were skipped; empty otherwise."""
+        frames = self._steps + self.count
+        if self.count < max(FEW, SOME * frames):
+            return ""
+        return (
+            f"{self.count} of {frames} frames of the fixed camera were not worked on: the machine or the line is slow"
+        )
+
+
 # Reasons of the steps, counted over a run
 
 NUMBER = re.compile(r"-?\d+(\.\d+)?(e-?\d+)?")

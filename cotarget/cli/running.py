@@ -8,12 +8,14 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import (
     Choice,
     Reasons,
+    SkippedFrames,
     check_outputs,
     check_shown,
     nothing,
@@ -252,37 +254,53 @@ def _follow(
 
     However it ends, the head is halted first. The files are completed afterwards, with the steps up to then.
     """
+    from cotarget.backends import describe
     from cotarget.detection import make_detector
     from cotarget.drawing import side_by_side
     from cotarget.pipeline import FollowSettings, State, follow
-    from cotarget.recording.recorder import StepTable
+    from cotarget.recording.recorder import StepTable, utc_text
     from cotarget.recording.replay import until_end
     from cotarget.video import FilmWriter
 
     target = config.target(name)
-    detector = make_detector(target, config.rate_hz)
+    spec = describe(config)
+    detector = make_detector(target, spec.fixed.rate_hz)
     settings = FollowSettings.of(config, policy=choice.policy)
     states: dict[str, int] = dict.fromkeys(State, 0)
-    reasons = Reasons()
-    expected = math.ceil(seconds * config.rate_hz) if frames is None else frames
+    reasons, skipped = Reasons(), SkippedFrames(spec.fixed.rate_hz)
+    expected = math.ceil(seconds * spec.fixed.rate_hz) if frames is None else frames
+    is_live, first_t = config.backend == "hardware" and frames is None, None
     with (
         StepTable(options.csv, keep=True) as table,
-        FilmWriter(options.video, config.rate_hz, keep=True) if options.video else nothing() as film,
+        FilmWriter(options.video, spec.fixed.rate_hz, keep=True) if options.video else nothing() as film,
         progress_bar() as progress,
         opened() as rig,
     ):
+        epoch = datetime.now(UTC) - timedelta(seconds=rig.clock.now()) if is_live else None
+        table.epoch = epoch
+        if film is not None:
+            film.epoch = epoch
         for step in until_end(follow(rig, calibration, target, detector, seconds=seconds, settings=settings)):
             table.write(step)
             choice.see(step)
             reasons.see(step)
+            skipped.see(step)
             see(step)
+            first_t = step.fixed.t if first_t is None else first_t
             states[step.state] += 1
             if film is not None:
-                film.write(side_by_side(step, name))
+                film.write(side_by_side(step, name, step.fixed.t - first_t), step.fixed.t)
             progress(f"following: {name}: {step.state}", min(step.index + 1, expected), expected)
-    for line in filter(None, (choice.unmet, reasons.warning and f"cotarget {options.command}: {reasons.warning}")):
-        print(line, file=sys.stderr)
-    return {"steps": sum(states.values()), "states": states, "reasons": reasons.table}
+    for line in filter(None, (choice.unmet, reasons.warning, skipped.warning)):
+        print(f"cotarget {options.command}: {line}", file=sys.stderr)
+    started = None if epoch is None or first_t is None else utc_text(epoch, first_t)
+    return {
+        "steps": sum(states.values()),
+        "skipped": skipped.count,
+        "states": states,
+        "reasons": reasons.table,
+        "started": started,
+    }
 
 
 def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int], choice: Choice) -> None:

@@ -15,7 +15,7 @@ import platform
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -392,12 +392,22 @@ class RecordingRig:
 COLUMNS = (
     "index", "t_s", "t_fixed_s", "t_zoom_s", "state", "reason", "track", "u_px", "v_px", "width_px", "height_px",
     "depth_m", "range_m", "pan_commanded_deg", "tilt_commanded_deg", "focal_commanded_px", "pan_deg", "tilt_deg",
-    "focal_px",
+    "focal_px", "utc",
 )  # fmt: skip
 
 
+def utc_text(epoch: datetime, t: float) -> str:
+    """Format the wall-clock time of a time on a clock that showed 0 at ``epoch``."""
+    return (epoch + timedelta(seconds=t)).isoformat(timespec="milliseconds")
+
+
 class StepTable:
-    """CSV table of Steps, one line each, which appears under its name when complete; a context manager."""
+    """CSV table of Steps, one line each, which appears under its name when complete; a context manager.
+
+    Attributes:
+        epoch: wall-clock time at which the rig's clock showed 0, from which the column ``utc`` is made; None if the
+            rig's time is simulated, and the column stays empty.
+    """
 
     def __init__(self, path: Path | None, *, keep: bool = False) -> None:
         """Prepare to write to ``path``, or nowhere if it is None.
@@ -409,6 +419,7 @@ class StepTable:
         Raises:
             ConfigError: the file cannot be written.
         """
+        self.epoch: datetime | None = None
         self._file = None if path is None else CsvFile(path, COLUMNS, keep=keep)
 
     def write(self, step: Step) -> None:
@@ -426,6 +437,7 @@ class StepTable:
             + (["", ""] if aim is None else [aim.depth, aim.range])
             + [math.degrees(pan), math.degrees(tilt), focal]
             + [math.degrees(step.head.pan), math.degrees(step.head.tilt), step.lens.focal_px]
+            + ["" if self.epoch is None else utc_text(self.epoch, step.fixed.t)]
         )
         self._file.write(cell + 0.0 if isinstance(cell, float) else cell for cell in row)  # no -0.0
 

@@ -67,8 +67,8 @@ def side_by_side(step: ct.Step) -> Image:
         center, half = (box.center_px + 0.5) * scale - 0.5, box.size_px * scale / 2 + BOX_MARGIN_PX
         (left, top), (right, bottom) = np.round([center - half, center + half]).astype(int).tolist()
         cv2.rectangle(fixed, (left, top), (right, bottom), BOX_COLOR, 2)
-    write_text(fixed, "fixed camera", (10, 20), 0.5)
-    write_text(zoom, "zoom camera", (10, 20), 0.5)
+    write_text(fixed, "fixed camera", (10, 22))
+    write_text(zoom, "zoom camera", (10, 22))
     return np.hstack([fixed, zoom])
 
 

@@ -1,8 +1,11 @@
 """What commands keep when they end early, and what they say of a run in which much went wrong."""
 
+import csv
 import json
 from dataclasses import replace
+from datetime import UTC, datetime
 
+import av
 import numpy as np
 import pytest
 
@@ -112,7 +115,7 @@ def test_a_replay_keeps_what_was_seen(folder, capsys, monkeypatch):
 def test_detect_keeps_what_was_found(folder, capsys, monkeypatch):
     with FilmWriter(folder / "film.mp4", 25.0) as film:
         for index in range(2 * FRAMES):
-            film.write(ToyRig().fixed.expose(index))
+            film.write(ToyRig().fixed.expose(index), index / 25)
     seen = []
 
     def detect(self, frame, plain=Bright.detect):
@@ -144,6 +147,58 @@ def test_what_went_wrong_is_told_at_the_end_and_in_json(folder, capsys, monkeypa
     assert line.startswith("cotarget follow: ")
     assert f"{count} of {told['steps']} frames: the point needs pan " in line
     assert "beyond the limits pan -1 to 1," in line
+
+
+HARDWARE = """
+backend = "hardware"
+[hardware.head]
+port = "/dev/none"
+[hardware.fixed]
+url = "http://camera"
+[safety]
+stop_file = "stop"
+"""
+
+
+class SlowRig(ToyRig):
+    """Works on every third frame of 25 Hz: each takes 100 ms more."""
+
+    def count(self, what):
+        super().count(what)
+        if what == "fixed.read":
+            self.t += 0.1
+
+
+@pytest.mark.parametrize("backend", ["sim", "hardware"])
+def test_frames_that_were_skipped_are_counted_and_leave_their_time_in_table_and_film(
+    folder, capsys, monkeypatch, backend
+):
+    if backend == "hardware":
+        (folder / "rig.toml").write_text(HARDWARE)
+    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: SlowRig())
+    status, out, err = call(capsys, *FOLLOW, "--seconds", "3")
+    told = json.loads(out)
+    with (folder / "out.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    times = np.array([float(row["t_fixed_s"]) for row in rows])
+    frames = round((times[-1] - times[0]) * 25) + 1
+    assert (status, told["skipped"]) == (0, frames - len(rows))
+    assert frames > 2 * len(rows) > 50
+    assert f"cotarget follow: {told['skipped']} of {frames} frames of the fixed camera were not worked on" in err
+    with Film(folder / "out.mp4") as film:
+        assert [frame.t for frame in film] == pytest.approx(list(times - times[0]), abs=1e-3)
+    with av.open(str(folder / "out.mp4")) as film:
+        created = film.metadata.get("creation_time")
+    if backend == "sim":
+        assert (told["started"], created) == (None, None)
+        assert {row["utc"] for row in rows} == {""}
+        return
+    by_the_wall = [datetime.fromisoformat(row["utc"]) for row in rows]
+    seconds = [(each - by_the_wall[0]).total_seconds() for each in by_the_wall]
+    assert seconds == pytest.approx(list(times - times[0]), abs=2e-3)  # written in milliseconds
+    assert (by_the_wall[0] - datetime.fromisoformat(told["started"])).total_seconds() == 0
+    assert abs((datetime.now(UTC) - by_the_wall[0]).total_seconds()) < 60
+    assert abs((datetime.fromisoformat(created) - by_the_wall[0]).total_seconds()) < 1.01  # in whole seconds
 
 
 @pytest.mark.parametrize(("reason", "name"), [
@@ -200,17 +255,16 @@ def test_the_table_counts_every_frame():
 
 
 def test_the_film_shows_the_reason():
-    """At the foot of the wide view, in more lines for more words."""
+    """At the foot of the fixed camera's image, in more lines for more words."""
     bright = np.full((480, 640, 3), 255, np.uint8)
     plain = step(0.0)
     plain = replace(plain, fixed=replace(plain.fixed, image=bright), zoom=replace(plain.zoom, image=bright))
-    without = side_by_side(plain, "bird").astype(int)
+    without = side_by_side(plain, "bird", 0.0).astype(int)
 
     def rows(reason):
         """Which rows of which view show anything else."""
-        changed = np.any(side_by_side(replace(plain, reason=reason), "bird").astype(int) != without, axis=2)
+        changed = np.any(side_by_side(replace(plain, reason=reason), "bird", 0.0).astype(int) != without, axis=2)
         assert not changed[:, 640:].any()
-        assert not changed[:, 630:].any()
         return np.flatnonzero(changed.any(axis=1))
 
     short, long = rows("zoom: unsure"), rows("the head points 1.3 degrees beside " * 4)

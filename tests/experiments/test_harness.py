@@ -232,8 +232,8 @@ def test_a_pipeline_that_is_too_slow_is_missed():
 def test_a_film_that_is_too_short_is_told_before_any_work(tmp_path, monkeypatch):
     path = tmp_path / "film.mp4"
     with FilmWriter(path, 25.0) as film:
-        for _ in range(10):
-            film.write(np.zeros((48, 64, 3), np.uint8))
+        for number in range(10):
+            film.write(np.zeros((48, 64, 3), np.uint8), number / 25)
     monkeypatch.setattr(pipeline_speed, "FILM", path)
     settings = replace(pipeline_speed.SETTINGS, frames=10, untimed=2)
     assert pipeline_speed.needs(settings) == ""

@@ -270,7 +270,7 @@ def test_v010_recording_is_replayed(old, capsys):
     assert differences["largest_deg"] < SAME
     assert differences["largest_px"] < 1e3 * SAME
     keys = keys_in(now) - {key for key in keys_in(now) if key.startswith("reasons.")}
-    assert keys == keys_in(then) - {key for key in keys_in(then) if key.startswith("reasons.")}
+    assert keys == keys_in(then) - {key for key in keys_in(then) if key.startswith("reasons.")} | NEW_KEYS
     assert_listed("printed.txt", {f"replay: {key}" for key in keys} | {"replay: reasons"}, begins="replay:")
     assert set(now["states"]) == set(columns("state"))
     with av.open(str(old / "now.mp4")) as film:
@@ -307,6 +307,10 @@ def test_a_recording_is_written_with_the_listed_keys(old, capsys):
     assert_is_recording(old / "now")
     assert header(old / "now.csv") == columns("follow.csv")
     assert read(old / "now" / "recording.json")["whom"] == {"policy": "most-served"}
+
+
+NEW_KEYS = {"skipped", "started"}  # of follow and replay, which v0.1.0 did not print
+NEW_COLUMNS = ["utc"]  # of follow.csv
 
 
 class Fake:
@@ -554,7 +558,7 @@ def test_v010_tables_are_read():
     assert label.center_px == pytest.approx([24.5, 54.5])
     assert header(OLD / "labels.csv") == columns("labels.csv")
     assert header(OLD / "tracks.csv") == columns("tracks.csv")
-    assert header(OLD / "follow.csv") == columns("follow.csv")
+    assert [*header(OLD / "follow.csv"), *NEW_COLUMNS] == columns("follow.csv")
 
 
 def test_v010_steps_give_the_same_scores(tmp_path):

@@ -123,7 +123,7 @@ def test_a_table_on_a_full_disk_is_named(tmp_path, steps):
         fill(path, steps)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-    with full_disk(), pytest.raises(KeyboardInterrupt):
+    with full_disk(), pytest.raises(ConfigError):
         fill_and_fail(path)
     assert list(tmp_path.iterdir()) == [path]
 
