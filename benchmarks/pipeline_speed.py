@@ -22,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
-from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetConfig
+from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetProfile
 from cotarget.control.selection import FirstCome
 from cotarget.detection import Detector, make_detector
 from cotarget.errors import ConfigError
@@ -31,7 +31,7 @@ from cotarget.fusion import TargetFusion
 from cotarget.rig import Frame, PanTiltLimits
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim
-from cotarget.tracking.track import settings_for
+from cotarget.tracking.track import tracker_settings
 from cotarget.tracking.tracker import Tracker
 from cotarget.video import Film
 from experiments.engine.harness import Experiment, Row, Settings
@@ -73,10 +73,10 @@ class Pipeline:
             kind: name of the detector.
             film: film that gives size and rate.
         """
-        self.target: TargetConfig = replace(DEFAULT_TARGETS["bird"], detector=kind)  # type: ignore[arg-type]
+        self.target: TargetProfile = replace(DEFAULT_TARGETS["bird"], detector=kind)  # type: ignore[arg-type]
         self.detector: Detector = make_detector(self.target, film.rate_hz)
         self.calibration = calibration_of(film.size)
-        self.tracker, self.policy = Tracker(settings_for(self.target), film.size), FirstCome()
+        self.tracker, self.policy = Tracker(tracker_settings(self.target), film.size), FirstCome()
         self.fusion = TargetFusion(self.calibration, self.target, film.size)
         config = RigConfig()
         pan, tilt = config.head_limits

@@ -5,7 +5,7 @@ from .calibration.handeye import HandEye as HandEye
 from .calibration.handeye import solve_hand_eye as solve_hand_eye
 from .config import RigConfig as RigConfig
 from .config import SimConfig as SimConfig
-from .config import TargetConfig as TargetConfig
+from .config import TargetProfile as TargetProfile
 from .config import load_config as load_config
 from .detection import Detection as Detection
 from .detection import ExternalDetector as ExternalDetector
@@ -48,7 +48,7 @@ __all__ = [
     "SimWorld",
     "State",
     "Step",
-    "TargetConfig",
+    "TargetProfile",
     "WantedSize",
     "aim",
     "calibrate",

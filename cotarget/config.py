@@ -50,6 +50,7 @@ def check_config(config: "RigConfig", recorded: bool = False) -> None:
     }
     for name, target in config.targets.items():
         positive |= {f"targets.{name}.size": target.size, f"targets.{name}.wanted_px": target.wanted_px}
+        positive[f"targets.{name}.shape"] = 1.0 if target.shape is None else target.shape
     for where, value in positive.items():
         if value <= 0:
             raise ConfigError(f"{where}: {value:g} is not greater than zero")
@@ -900,18 +901,18 @@ class BoardConfig:
 
 
 @dataclass(frozen=True)
-class TargetConfig:
-    """A target profile: what is known of a target before it is seen.
+class TargetProfile:
+    """What is known of a target before it is seen.
 
     Attributes:
         size: true size of the dimension below [m].
-        dimension: the dimension that ``size`` gives.
+        dimension: the dimension that ``size`` gives; a wingspan is the larger side of the target's box.
         wanted_px: size of that dimension in the close-up [px].
         detector: how the fixed camera's images are searched: "colour" matches a template, "motion" subtracts the
             background, "speck" finds targets of a few pixels, "mog2" is the paper's plain background subtraction.
         template: picture of the target, cut to its outline, for the detector "colour"; relative to rig.toml.
-        motion: motion model; by default "standing" for the detector "colour", "flying" for a wingspan, "walking" for
-            all others.
+        motion: motion model; "general" covers anything that moves by itself.
+        shape: expected width over height of the target's box; none if it is unknown or changes.
     """
 
     size: float
@@ -919,14 +920,41 @@ class TargetConfig:
     wanted_px: float
     detector: Literal["colour", "motion", "speck", "mog2"]
     template: Path | None = None
-    motion: Literal["standing", "walking", "flying"] | None = None
+    motion: Literal["standing", "walking", "flying", "general"] = "general"
+    shape: float | None = None
+
+    @property
+    def matcher(self) -> Literal["box", "upright", "outline"]:
+        """What gives the point of the body that both cameras measure: the detector's box or the target's outline.
+
+        The box of a matched template is exact. Of an upright target, narrower than high, the outline gives the middle
+        across and the box the middle in height; of any other target, the outline gives both.
+        """
+        if self.detector == "colour":
+            return "box"
+        return "upright" if self.shape is not None and self.shape < 1 else "outline"
+
+    @property
+    def largest_over_time(self) -> bool:
+        """Whether the dimension shows as the largest size over some time, as a wingspan does over a wing beat."""
+        return self.dimension == "wingspan"
+
+    def is_vertical(self, width: float = 1.0, height: float = 1.0) -> bool:
+        """Whether the dimension is the height of a box of a given width and height, and not its width."""
+        return self.dimension == "height" or (self.dimension == "wingspan" and height > width)
+
+    def sides(self, shape: float) -> tuple[float, float]:
+        """Width and height of a box of a given width over height, relative to the dimension."""
+        return (shape, 1.0) if self.is_vertical(shape) else (1.0, 1 / shape)
 
 
-DEFAULT_TARGETS: Mapping[str, TargetConfig] = types.MappingProxyType(
+DEFAULT_TARGETS: Mapping[str, TargetProfile] = types.MappingProxyType(
     {
-        "book": TargetConfig(0.234, "width", 160.0, "colour", assets_dir() / "textures" / "book_front.png"),
-        "person": TargetConfig(1.75, "height", 300.0, "motion"),
-        "bird": TargetConfig(0.8, "wingspan", 160.0, "speck"),
+        "book": TargetProfile(
+            0.234, "width", 160.0, "colour", assets_dir() / "textures" / "book_front.png", "standing", 1.38
+        ),
+        "person": TargetProfile(1.75, "height", 300.0, "motion", motion="walking", shape=0.4),
+        "bird": TargetProfile(0.8, "wingspan", 160.0, "speck", motion="flying"),
     }
 )
 
@@ -973,7 +1001,7 @@ class RigConfig:
     recording: Path | None = None
     board: BoardConfig = field(default_factory=BoardConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
-    targets: Mapping[str, TargetConfig] = field(default_factory=lambda: dict(DEFAULT_TARGETS))
+    targets: Mapping[str, TargetProfile] = field(default_factory=lambda: dict(DEFAULT_TARGETS))
 
     @property
     def head_limits(self) -> tuple[Pair, Pair]:
@@ -1033,7 +1061,7 @@ class RigConfig:
         """Time from a command to the start of the lens's motion, as configured [s]."""
         return self.command_delay_s if self.backend == "sim" else self.hardware.zoom.command_delay_s
 
-    def target(self, name: str) -> TargetConfig:
+    def target(self, name: str) -> TargetProfile:
         """Look up a target profile by name; a further one of a kind, such as ``bird2``, defaults to that kind's.
 
         Raises:
@@ -1134,7 +1162,7 @@ def parse_config(table: Mapping[str, Any], *, recorded: bool = False) -> RigConf
     given = table.pop("targets", {})
     expect_table(given, "targets")
     for name, values in given.items():
-        targets[name] = build(TargetConfig, values, f"targets.{name}", base=_of_kind(targets, name))
+        targets[name] = build(TargetProfile, values, f"targets.{name}", base=_of_kind(targets, name))
     sim_table = table.get("sim")
     if isinstance(sim_table, Mapping) and isinstance(sim_table.get("effects"), Mapping):
         table["sim"] = {**sim_table, "effects": expand_all(sim_table["effects"])}
@@ -1144,7 +1172,7 @@ def parse_config(table: Mapping[str, Any], *, recorded: bool = False) -> RigConf
     return config
 
 
-def _of_kind(targets: Mapping[str, TargetConfig], name: str) -> TargetConfig | None:
+def _of_kind(targets: Mapping[str, TargetProfile], name: str) -> TargetProfile | None:
     """Return the target of that name, or of its kind without the number."""
     return targets.get(name) or targets.get(split_name(name)[0])
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cotarget.config import TargetConfig
+from cotarget.config import TargetProfile
 from cotarget.detection import make_detector
 from cotarget.drawing import draw_box
 from cotarget.errors import CotargetError
 from cotarget.files import CsvFile
 from cotarget.geometry import Array
 from cotarget.rig import Image
-from cotarget.tracking.track import Track, settings_for
+from cotarget.tracking.track import Track, tracker_settings
 from cotarget.tracking.tracker import Tracker
 from cotarget.video import Film, FilmWriter
 
@@ -52,7 +52,7 @@ class FilmSummary:
 
 def run_on_film(
     video: Path,
-    target: TargetConfig,
+    target: TargetProfile,
     csv_path: Path,
     drawn: Path | None = None,
     progress: Progress | None = None,
@@ -92,7 +92,7 @@ def run_on_film(
 
 def _run(
     film: Film,
-    target: TargetConfig,
+    target: TargetProfile,
     write_row: Callable[[list[str]], object],
     write_image: Callable[[Image, float], None] | None,
     progress: Progress | None,
@@ -100,7 +100,7 @@ def _run(
 ) -> FilmSummary:
     """Process the film once."""
     detector = make_detector(target, film.rate_hz, template)
-    tracker = Tracker(settings_for(target), film.size)
+    tracker = Tracker(tracker_settings(target), film.size)
     trails = Trails()
     numbers: set[int] = set()
     times = []

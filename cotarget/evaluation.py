@@ -16,7 +16,7 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.config import TARGETS, TargetConfig, split_name
+from cotarget.config import TARGETS, TargetProfile, split_name
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError, UnreachableError
 from cotarget.estimation.zoom_matching import GATE_SIGMAS, CloseupFinder, Expected, ZoomMeasurement
@@ -176,7 +176,7 @@ class TruthFinder:
     def __init__(
         self,
         calibration: Calibration,
-        target: TargetConfig,
+        target: TargetProfile,
         truth: Appearances,
         name: str,
         seed: int,
@@ -228,7 +228,7 @@ SEARCH_PX = 8.0  # ... plus this, for motion blur and the windows of the marker 
 ENLARGED = 2  # magnification for the marker detector, which needs some eight pixels per cell where four are readable
 
 
-def add_row(rows: list[Row], step: Step, truth: Truth, name: str, target: TargetConfig) -> None:
+def add_row(rows: list[Row], step: Step, truth: Truth, name: str, target: TargetProfile) -> None:
     """Append a Step's row, unless its zoom frame has a row already.
 
     A zoom camera slower than the fixed one has no new frame in some Steps; those frames would count twice.
@@ -244,7 +244,7 @@ def add_row(rows: list[Row], step: Step, truth: Truth, name: str, target: Target
         rows.append(observe(step, truth, name, target))
 
 
-def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
+def observe(step: Step, truth: Truth, name: str, target: TargetProfile) -> Row:
     """Compare a Step with the ground truth: its zoom frame and its fixed frame, each at its own time.
 
     Args:
@@ -293,7 +293,7 @@ def observe(step: Step, truth: Truth, name: str, target: TargetConfig) -> Row:
     )
 
 
-def closeup_of(truth: Appearances, name: str, target: TargetConfig, t: float) -> Closeup:
+def closeup_of(truth: Appearances, name: str, target: TargetProfile, t: float) -> Closeup:
     """Ground truth of a target in the zoom camera at a time.
 
     Args:
@@ -305,15 +305,17 @@ def closeup_of(truth: Appearances, name: str, target: TargetConfig, t: float) ->
     return _closeup(truth, name, target, t, truth.silhouette(name, "zoom", t))
 
 
-def _closeup(truth: Appearances, name: str, target: TargetConfig, t: float, outline: Silhouette | None) -> Closeup:
+def _closeup(truth: Appearances, name: str, target: TargetProfile, t: float, outline: Silhouette | None) -> Closeup:
     """Compute the close-up from the target's outline in the zoom image; None for a target behind the camera."""
     lens = truth.lens("zoom", t)
     u, v = truth.center_px(name, "zoom", t).tolist()
     size = math.nan
     if outline is not None:
         width, height = outline.size_px.tolist()
-        sides = {"width": width, "height": height}
-        size = sides[target.dimension] if target.dimension in sides else truth.largest_side_px(name, "zoom", t)
+        if target.largest_over_time:
+            size = truth.largest_side_px(name, "zoom", t)
+        else:
+            size = height if target.is_vertical() else width
     longest = size * truth.longest_px / lens.focal_px[0]
     return Closeup(
         u_px=u,

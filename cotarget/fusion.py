@@ -15,11 +15,11 @@ from functools import partial
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import TargetConfig
+from cotarget.config import TargetProfile
 from cotarget.control.selection import Candidate, leaves_in
 from cotarget.control.zoom import is_seen_well, shape_of
 from cotarget.detection import Detection
-from cotarget.estimation import Appearance, Estimate, TargetFilter, estimation_settings_for
+from cotarget.estimation import Appearance, Estimate, TargetFilter, filter_settings
 from cotarget.estimation.motion_model import PAN, TILT, K, L
 from cotarget.estimation.zoom_matching import LATEST_S, CloseupFinder, Expected, Finder, ZoomMeasurement
 from cotarget.geometry import Array
@@ -131,7 +131,7 @@ NEAR = 3.0
 JUST_SEEN_S = 0.2
 # Most zoom frames that wait for a fixed frame of their time; beyond it the oldest are dropped.
 MOST_WAITING = 30
-MakeFinder = Callable[[Calibration, TargetConfig], Finder]
+MakeFinder = Callable[[Calibration, TargetProfile], Finder]
 
 
 class TargetFusion:
@@ -148,7 +148,7 @@ class TargetFusion:
     def __init__(
         self,
         calibration: Calibration,
-        target: TargetConfig,
+        target: TargetProfile,
         size: tuple[int, int],
         *,
         closed_loop: bool = True,
@@ -156,7 +156,7 @@ class TargetFusion:
     ) -> None:
         self._calibration, self._target, self._size = calibration, target, size
         self._closed_loop, self._make_finder = closed_loop, finder
-        self._assumed = estimation_settings_for(target, calibration)
+        self._assumed = filter_settings(target, calibration)
         self._filters: dict[int, TargetFilter] = {}
         self._seen_s: dict[int, float] = {}
         self._unlikely: set[int] = set()
@@ -216,7 +216,7 @@ class TargetFusion:
                 sight = self._finder.update_fixed(frame, box, mask)
                 if sight is not None:  # the same body point that the zoom image measures
                     box, sigma_px = replace(box, center_px=sight.body_px), sight.body_sigma_px
-            size_px = track.larger_side_px if self._target.dimension == "wingspan" else None
+            size_px = track.larger_side_px if self._target.largest_over_time else None
             found.update_fixed(box, frame.t, sigma_px=sigma_px, size_px=size_px)
 
     def update_zoom(self, frame: Frame | None, wide_t: float) -> ZoomMeasurement | None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig, TargetConfig
+from cotarget.config import RigConfig, TargetProfile
 from cotarget.control.controller import Controller, ControllerSettings, Predict
 from cotarget.control.selection import FirstCome, Policy
 from cotarget.control.zoom import shape_of
@@ -27,7 +27,7 @@ from cotarget.fusion import MakeFinder, TargetFusion
 from cotarget.rig import Camera, Clock, Frame, Image, PanTiltState, Rig, ZoomState, opened_from
 from cotarget.safety.safe_rig import FUTURE_S
 from cotarget.targeting import Aim
-from cotarget.tracking.track import Track, settings_for
+from cotarget.tracking.track import Track, tracker_settings
 from cotarget.tracking.tracker import Tracker
 
 # Longest wait for a zoom frame, except for the first [s].
@@ -263,7 +263,7 @@ class Step:
 def follow(
     rig: Rig,
     calibration: Calibration,
-    target: TargetConfig | str,
+    target: TargetProfile | str,
     detector: Detector | None = None,
     *,
     seconds: float = math.inf,
@@ -307,10 +307,10 @@ class _Loop:
     """State of one run of `follow`."""
 
     def __init__(
-        self, rig: Rig, calibration: Calibration, target: TargetConfig, detector: Detector, settings: FollowSettings
+        self, rig: Rig, calibration: Calibration, target: TargetProfile, detector: Detector, settings: FollowSettings
     ) -> None:
         self._rig, self._detector, self._settings = rig, detector, settings
-        self._tracker = Tracker(settings_for(target), rig.fixed.size)
+        self._tracker = Tracker(tracker_settings(target), rig.fixed.size)
         self._fusion = TargetFusion(
             calibration, target, rig.fixed.size, closed_loop=settings.closed_loop, finder=settings.finder
         )

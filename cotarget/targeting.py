@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from cotarget.calibration import Calibration, predicted_pointing
 from cotarget.camera import depth_from_size, focal_for_size
-from cotarget.config import TargetConfig
+from cotarget.config import TargetProfile
 from cotarget.errors import ConfigError, UnreachableError, choices
 from cotarget.geometry import FARTHEST_M, Array
 from cotarget.pantilt import Pointing, nearest, shortcut, solve
@@ -87,7 +87,7 @@ class Aim:
 
 
 def depth_of(
-    calibration: Calibration, target: TargetConfig, size_px: float, center_px: Array, *, upright: bool = False
+    calibration: Calibration, target: TargetProfile, size_px: float, center_px: Array, *, upright: bool = False
 ) -> float:
     """Estimate a target's depth from its apparent size: z = f x_size / u_measured.
 
@@ -98,7 +98,7 @@ def depth_of(
         center_px: centre of the target in the fixed image, (2,) [px].
         upright: for a wingspan, whether the larger side of the box is its height.
     """
-    vertical = target.dimension == "height" or (target.dimension == "wingspan" and upright)
+    vertical = target.is_vertical(height=2.0 if upright else 1.0)
     return depth_from_size(calibration.fixed, target.size, size_px, np.asarray(center_px, float), vertical=vertical)
 
 

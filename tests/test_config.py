@@ -151,7 +151,7 @@ def test_offsets_and_targets_are_taken(tmp_path):
         ("[safety]\nstop_file = 1", "safety.stop_file: 1 is not a text"),
         (
             '[targets.book]\nmotion = "rolling"',
-            "targets.book.motion: 'rolling' is not one of: flying, standing, walking",
+            "targets.book.motion: 'rolling' is not one of: flying, general, standing, walking",
         ),
         (
             "[safety]\nwatchdog = 1",

@@ -16,7 +16,7 @@ from cotarget.errors import CalibrationError, ConfigError
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
-    from cotarget.config import TargetConfig
+    from cotarget.config import TargetProfile
 
 
 SMALL_PX = 10.0  # smaller sizes are printed with two digits, others as whole pixels
@@ -57,7 +57,7 @@ def aim(options: argparse.Namespace) -> None:
         shortest = calibration.zoom.nominal_px[0]
     reach = Reach(*config.head_limits, (shortest, max(shortest, longest)), step=config.head_step)
     wanted_size = (
-        WantedSize(target.size, options.wanted_px, target.dimension == "height")
+        WantedSize(target.size, options.wanted_px, target.is_vertical())
         if target and options.wanted_px is not None
         else None
     )
@@ -123,13 +123,13 @@ def aim(options: argparse.Namespace) -> None:
     )
 
 
-def _fits_from(calibration: "Calibration", targets: Mapping[str, "TargetConfig"]) -> Iterator[tuple[float, str]]:
+def _fits_from(calibration: "Calibration", targets: Mapping[str, "TargetProfile"]) -> Iterator[tuple[float, str]]:
     """Give each target's least depth [m] at which it fits into the fixed view, and its name.
 
     A depth below that is implausible.
     """
     for name, target in targets.items():
-        axis = 1 if target.dimension == "height" else 0
+        axis = int(target.is_vertical())
         yield calibration.fixed.focal_px[axis] * target.size / calibration.fixed.size[axis], name
 
 

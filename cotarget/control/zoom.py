@@ -102,15 +102,10 @@ def expect(
 
 def _expected(estimate: Estimate, seen: Appearance, shape: float) -> ExpectedTarget:
     focal = seen.focal_px
-    sides = {
-        "height": (shape, 1.0),
-        "width": (1.0, 1 / shape),
-        "wingspan": (min(shape, 1.0), min(1 / shape, 1.0)),
-    }[estimate.target.dimension]
     return ExpectedTarget(
         seen.offset_px / focal,
         seen.covariance / (focal[:, None] * focal),
-        0.5 * seen.size_px / focal * np.array(sides),
+        0.5 * seen.size_px / focal * np.array(estimate.target.sides(shape)),
         seen.size_sigma,
     )
 

@@ -9,8 +9,8 @@ function from an image to boxes.
 import cv2
 import numpy as np
 
-from cotarget.config import TargetConfig
-from cotarget.detection.background import BIRD, PERSON, BackgroundDetector, BackgroundSettings, plain
+from cotarget.config import TargetProfile
+from cotarget.detection.background import BIRD, GENERAL, PERSON, BackgroundDetector, BackgroundSettings, plain
 from cotarget.detection.base import Detection, Detector, ExternalDetector
 from cotarget.detection.color_template import ColorTemplateDetector
 from cotarget.detection.small_target import SmallTargetDetector
@@ -19,6 +19,7 @@ from cotarget.rig import Image
 
 __all__ = [
     "BIRD",
+    "GENERAL",
     "PERSON",
     "BackgroundDetector",
     "BackgroundSettings",
@@ -32,7 +33,7 @@ __all__ = [
 ]
 
 
-def make_detector(target: TargetConfig, rate_hz: float, template: Image | None = None) -> Detector:
+def make_detector(target: TargetProfile, rate_hz: float, template: Image | None = None) -> Detector:
     """Make the detector that a target profile names.
 
     Args:
@@ -47,7 +48,8 @@ def make_detector(target: TargetConfig, rate_hz: float, template: Image | None =
     if kind == "speck":
         return SmallTargetDetector()
     if kind in ("motion", "mog2"):
-        settings = BIRD if target.dimension == "wingspan" else PERSON
+        upright = target.matcher == "upright"
+        settings = BIRD if target.motion == "flying" else PERSON if upright else GENERAL
         return BackgroundDetector(plain(settings) if kind == "mog2" else settings, rate_hz)
     if template is None:
         if target.template is None:

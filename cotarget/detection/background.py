@@ -107,6 +107,8 @@ PERSON = BackgroundSettings(
     largest=0.9,
     flat=0.1,
 )
+# A target of unknown shape may be as wide as it likes, so it may be a patch of light on the ground.
+GENERAL = replace(PERSON, bridge_px=(9, 9), smallest_px=(6, 6), smallest_area_px=40, widest=np.inf, flat=0.0)
 
 
 def plain(settings: BackgroundSettings) -> BackgroundSettings:

@@ -19,7 +19,7 @@ from cotarget.config import (
     SimConfig,
     SimEffects,
     Size,
-    TargetConfig,
+    TargetProfile,
     Waypoint,
     check_config,
     load_config,
@@ -395,7 +395,7 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         """Exposure times of the newest frames of the fixed and the zoom camera [s]."""
         raise NotImplementedError
 
-    def told_of(self, name: str) -> TargetConfig:
+    def told_of(self, name: str) -> TargetProfile:
         """Target profile for the pipeline; its detector is the default one, as all detections come from the truth."""
         return replace(self.config.target(name), detector=DEFAULT_TARGETS[name].detector)
 

@@ -4,14 +4,14 @@ The comparison of motion models: docs/design-notes.md.
 """
 
 from cotarget.estimation.measurement_model import Appearance, Estimate
-from cotarget.estimation.motion_model import EstimationSettings, MotionSettings, estimation_settings_for
+from cotarget.estimation.motion_model import FilterSettings, MotionSettings, filter_settings
 from cotarget.estimation.target_filter import TargetFilter
 
 __all__ = [
     "Appearance",
     "Estimate",
-    "EstimationSettings",
+    "FilterSettings",
     "MotionSettings",
     "TargetFilter",
-    "estimation_settings_for",
+    "filter_settings",
 ]

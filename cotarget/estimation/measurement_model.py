@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import TargetConfig
+from cotarget.config import TargetProfile
 from cotarget.estimation.motion_model import PAN, SEEN, STATES, TILT, A, B, G, K, L
 from cotarget.geometry import Array
 from cotarget.pantilt import HeadGeometry
@@ -147,7 +147,7 @@ class Estimate:
     carried: bool
     size_prior: float
     bias_prior: float
-    target: TargetConfig
+    target: TargetProfile
     calibration: Calibration
     sights: Sights
 
@@ -186,7 +186,7 @@ class Estimate:
     def wanted_size(self) -> WantedSize:
         """Wanted size of the target for `aim`, from its present apparent size, foreshortened or not."""
         apparent = self.target.size * math.exp(self.state[K] + self.state[G])
-        return WantedSize(apparent, self.target.wanted_px, self.target.dimension == "height")
+        return WantedSize(apparent, self.target.wanted_px, self.target.is_vertical())
 
     def appearance(self, pan: float, tilt: float, nominal_px: float) -> Appearance | None:
         """Predict where and how large the target appears in the zoom image, head bias included.
@@ -211,7 +211,7 @@ class Estimate:
             # Distortion is neglected; near the image's centre, where the target should be, it is small.
             offset_px=focal * tangent + np.array(lens.center_px) - lens.image_center_px,
             covariance=J @ P[_SEEN_TWICE] @ J.T,
-            size_px=size * float(focal[1 if self.target.dimension == "height" else 0]),
+            size_px=size * float(focal[int(self.target.is_vertical())]),
             size_sigma=math.sqrt(max(float(_BY_SIZE @ P @ _BY_SIZE), 0.0)),
             focal_px=focal,
         )

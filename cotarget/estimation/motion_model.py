@@ -12,18 +12,20 @@ The fixed camera measures a, b and the size l - k - g, all linearly. The depth i
 only scales the noise, so bearings alone can never pretend to have measured it (modified spherical coordinates of
 Stallard, 1987, in tangents). The acceleration decays after Singer (1970): c' = -c / tau + white noise.
 
-`EstimationSettings` holds what is assumed before anything is measured, for each kind of target. The comparison of
+`FilterSettings` holds what is assumed before anything is measured, for each kind of target. The comparison of
 motion models and the choice of the numbers: docs/design-notes.md.
 """
 
 import functools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from cotarget.calibration import Calibration, predicted_pointing
-from cotarget.config import TargetConfig
+from cotarget.config import TargetProfile
 from cotarget.geometry import Array
 
 # Bias left by the head's rounding and play and by the centre of a box, whatever the calibration says [rad].
@@ -92,7 +94,7 @@ class MotionSettings:
 
 
 @dataclass(frozen=True)
-class EstimationSettings:
+class FilterSettings:
     """Motion and measurement noise of a target, and the treatment of measurements that do not fit.
 
     Attributes:
@@ -166,59 +168,45 @@ class EstimationSettings:
 
 # A hand that reaches for something speeds up and brakes within about a second.
 HAND = Jump(acceleration=5.0, seconds=1.25, by_hand_s=0.15)
-BOOK = EstimationSettings(
-    MotionSettings(0.5, 0.5, 0.7, 0.01, attitude_sigma=0.01, attitude_s=2.0, jump=HAND),
-    noise_px=0.2,
-    noise_of_size=0.01,
-    noise_s=0.0,
-    size_noise=0.01,
-    size_noise_px=0.3,
-    misses=2,
-)
-PERSON = EstimationSettings(MotionSettings(0.8, 0.7, 1.2, 0.04))
-# The larger side of a bird's box varies from its body's length to its wingspan.
-BIRD = EstimationSettings(
-    MotionSettings(6.5, 2.5, 7.0, 0.075, attitude_mean=-0.35, attitude_sigma=0.3, attitude_s=1.0),
-    noise_of_size=0.06,
-    noise_s=0.1,  # half a wing beat
-    size_noise=0.1,
-    size_s=0.06,  # a quarter of a wing beat
-)
-# Motion by the target profile's `motion`; a standing target may still be carried elsewhere.
-KINDS = {"standing": BOOK, "walking": PERSON, "flying": BIRD}
+# Motion by the target profile's `motion`. A standing target may still be carried elsewhere. The larger side of what
+# flies varies from its body's length to its wingspan. Of a target of which nothing is known, motion and attitude lie
+# between a walking and a flying one's.
+MOTIONS = {
+    "standing": MotionSettings(0.5, 0.5, 0.7, 0.01, attitude_sigma=0.01, attitude_s=2.0, jump=HAND),
+    "walking": MotionSettings(0.8, 0.7, 1.2, 0.04),
+    "flying": MotionSettings(6.5, 2.5, 7.0, 0.075, attitude_mean=-0.35, attitude_sigma=0.3, attitude_s=1.0),
+    "general": MotionSettings(2.5, 1.0, 3.0, 0.075, attitude_sigma=0.2, attitude_s=1.0),
+}
+# Measurement noise that differs from the defaults, by the target profile's `matcher`. The errors of an outline last
+# half a wing beat, those of its size a quarter of one.
+NOISE: Mapping[str, Mapping[str, Any]] = {
+    "box": {
+        "noise_px": 0.2,
+        "noise_of_size": 0.01,
+        "noise_s": 0.0,
+        "size_noise": 0.01,
+        "size_noise_px": 0.3,
+        "misses": 2,
+    },
+    "upright": {},
+    "outline": {"noise_of_size": 0.06, "noise_s": 0.1, "size_noise": 0.1, "size_s": 0.06},
+}
 
 
-def estimation_settings_for(target: TargetConfig, calibration: Calibration | None = None) -> EstimationSettings:
-    """Choose the settings for a target's kind, with the head's bias from the calibration's covariance.
-
-    Measurement noise and attitude follow from detector and dimension. So does the motion, unless the profile names one.
+def filter_settings(target: TargetProfile, calibration: Calibration | None = None) -> FilterSettings:
+    """Choose the settings for a target profile, with the head's bias from the calibration's covariance.
 
     Args:
-        target: target profile.
+        target: target profile; its motion model and its matcher decide.
         calibration: calibration of the rig; None, or one without covariance, leaves the usual bias.
     """
-    settings = PERSON
-    if target.detector == "colour":
-        settings = BOOK
-    elif target.dimension == "wingspan":
-        settings = BIRD
-    told = settings.motion if target.motion is None else KINDS[target.motion].motion
-    motion = replace(
-        settings.motion,
-        acceleration=told.acceleration,
-        manoeuvre_s=told.manoeuvre_s,
-        speed=told.speed,
-        jump=told.jump,
-        nearest=NEAREST_SIZES * target.size,
-    )
-    settings = replace(settings, motion=motion)
-    if calibration is None or calibration.covariance is None:
-        return settings
-    middle = calibration.fixed.image_center_px
-    sigma = float(predicted_pointing(calibration, middle, USUAL_DEPTH)) / math.sqrt(2)  # along one axis
-    if not np.isfinite(sigma):
-        return settings
-    return replace(settings, motion=replace(settings.motion, bias_sigma=math.hypot(LEAST_BIAS, sigma)))
+    motion = replace(MOTIONS[target.motion], nearest=NEAREST_SIZES * target.size)
+    if calibration is not None and calibration.covariance is not None:
+        middle = calibration.fixed.image_center_px
+        sigma = float(predicted_pointing(calibration, middle, USUAL_DEPTH)) / math.sqrt(2)  # along one axis
+        if np.isfinite(sigma):
+            motion = replace(motion, bias_sigma=math.hypot(LEAST_BIAS, sigma))
+    return FilterSettings(motion, **NOISE[target.matcher])
 
 
 STATES = 13

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import TargetConfig
+from cotarget.config import TargetProfile
 from cotarget.estimation.measurement_model import Estimate, SightLine, Sights
 from cotarget.estimation.motion_model import (
     PAN,
@@ -26,13 +26,13 @@ from cotarget.estimation.motion_model import (
     A,
     B,
     C,
-    EstimationSettings,
+    FilterSettings,
     G,
     Jump,
     K,
     L,
     W,
-    estimation_settings_for,
+    filter_settings,
     propagate,
 )
 from cotarget.geometry import Array
@@ -144,7 +144,7 @@ class ZoomSeen:
         return self.t, 1
 
 
-def begin(seen: WideSeen, settings: EstimationSettings) -> Node:
+def begin(seen: WideSeen, settings: FilterSettings) -> Node:
     """Initialise the state from the first measurement.
 
     `wide_t` stays unset, so that the second measurement counts fully: an error that both share does not change the
@@ -166,7 +166,7 @@ def begin(seen: WideSeen, settings: EstimationSettings) -> Node:
     return _size(Node(seen.t, x, P), seen.size, settings)
 
 
-def correct_wide(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node:
+def correct_wide(node: Node, seen: WideSeen, settings: FilterSettings) -> Node:
     """Correct a node with a centre and a size in the fixed image."""
     if seen.size is None or seen.size.bound:
         node = _slowed(node, settings)
@@ -190,7 +190,7 @@ def correct_wide(node: Node, seen: WideSeen, settings: EstimationSettings) -> No
     return _size(node, seen.size, settings)
 
 
-def correct_zoom(node: Node, seen: ZoomSeen, settings: EstimationSettings) -> Node:
+def correct_zoom(node: Node, seen: ZoomSeen, settings: FilterSettings) -> Node:
     """Correct a node with a centre in the zoom image, iterated because the depth enters nonlinearly."""
     if node.missed_zoom >= settings.zoom_misses or math.hypot(*node.mean_innovation) > settings.most_mean_innovation:
         node = replace(node, P=_inflated(node.P, settings), missed_zoom=0, mean_innovation=(0.0, 0.0))
@@ -218,7 +218,7 @@ def correct_zoom(node: Node, seen: ZoomSeen, settings: EstimationSettings) -> No
     return _with_noise_scale(replace(node, x=x, P=P, missed_zoom=0, mean_innovation=mean_innovation), nis, settings)
 
 
-def _size(node: Node, size: SizeSeen | None, settings: EstimationSettings) -> Node:
+def _size(node: Node, size: SizeSeen | None, settings: FilterSettings) -> Node:
     """Correct a node with an apparent size, which measures l - k - g."""
     if size is None:
         return node
@@ -246,7 +246,7 @@ def _size(node: Node, size: SizeSeen | None, settings: EstimationSettings) -> No
     return replace(node, x=x, P=P, missed_size=0, size_t=node.size_t if size.bound else node.t)
 
 
-def _slowed(node: Node, settings: EstimationSettings) -> Node:
+def _slowed(node: Node, settings: FilterSettings) -> Node:
     """Let the velocity along the axis fade while no size measures it."""
     if math.isinf(node.size_t):
         return node
@@ -261,7 +261,7 @@ def _slowed(node: Node, settings: EstimationSettings) -> Node:
     return replace(node, x=x, P=P)
 
 
-def _with_noise_scale(node: Node, nis: float, settings: EstimationSettings) -> Node:
+def _with_noise_scale(node: Node, nis: float, settings: FilterSettings) -> Node:
     """Update the mean NIS and scale the process noise with it: a target beyond prediction manoeuvres harder."""
     mean = node.nis + settings.nis_gain * (nis / 2 - node.nis)
     noise_scale = min(max(mean, 1.0), settings.most_noise_scale)
@@ -270,7 +270,7 @@ def _with_noise_scale(node: Node, nis: float, settings: EstimationSettings) -> N
     return replace(node, nis=mean, noise_scale=noise_scale)
 
 
-def _mean_innovation(node: Node, S: Array, innovation: Array, settings: EstimationSettings) -> tuple[float, float]:
+def _mean_innovation(node: Node, S: Array, innovation: Array, settings: FilterSettings) -> tuple[float, float]:
     """Average the zoom image's innovations; a mean far from zero shows a bias, however small it is."""
     if node.nis >= settings.consistent_nis:  # the target manoeuvres, so its innovation shows nothing of the head
         return 0.0, 0.0
@@ -282,7 +282,7 @@ def _mean_innovation(node: Node, S: Array, innovation: Array, settings: Estimati
     )
 
 
-def _elsewhere(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node:
+def _elsewhere(node: Node, seen: WideSeen, settings: FilterSettings) -> Node:
     """Restart position and motion at the measured place after a jump; size and head bias stay."""
     motion = settings.motion
     nearness = math.exp(-node.x[L])
@@ -311,7 +311,7 @@ def _elsewhere(node: Node, seen: WideSeen, settings: EstimationSettings) -> Node
     )
 
 
-def _inflated(P: Array, settings: EstimationSettings) -> Array:
+def _inflated(P: Array, settings: FilterSettings) -> Array:
     """Inflate size, depth and head bias after zoom images that contradict them."""
     P = P.copy()
     # Size and depth are inflated together, because the fixed image keeps their ratio known.
@@ -340,9 +340,7 @@ class TargetFilter:
     the later ones are repeated, so the result is the same as if all had come in order.
     """
 
-    def __init__(
-        self, calibration: Calibration, target: TargetConfig, settings: EstimationSettings | None = None
-    ) -> None:
+    def __init__(self, calibration: Calibration, target: TargetProfile, settings: FilterSettings | None = None) -> None:
         """Create a filter without measurements.
 
         Args:
@@ -355,7 +353,7 @@ class TargetFilter:
         """
         self._calibration = calibration
         self._target = target
-        self._settings = settings or estimation_settings_for(target, calibration)
+        self._settings = settings or filter_settings(target, calibration)
         self._sights = Sights(calibration)
         self._base: Node | None = None  # state before the first kept measurement
         self._seen: list[WideSeen | ZoomSeen] = []
@@ -388,7 +386,7 @@ class TargetFilter:
         else:
             part = math.hypot(settings.noise_of_size, 0.5 if detection.clipped else 0.0)
             sigma_u, sigma_v = math.hypot(settings.noise_px, part * width), math.hypot(settings.noise_px, part * height)
-        vertical = self._vertical(width, height)
+        vertical = self._target.is_vertical(width, height)
         side = height if vertical else width
         if size_px is not None and not detection.clipped:
             side = size_px
@@ -469,11 +467,6 @@ class TargetFilter:
         self._run()
         node = next((node for node in reversed(self._nodes) if node is not None and node.t <= t), self._base)
         return None if node is None or node.t > t else node
-
-    def _vertical(self, width: float, height: float) -> bool:
-        """Whether the known dimension is the box's height."""
-        dimension = self._target.dimension
-        return dimension == "height" or (dimension == "wingspan" and height > width)
 
     def _size(self, size_px: float, tangent_per_px: float, *, bound: bool) -> SizeSeen | None:
         """Convert a size in the image [px], or a lower bound of it, to a size measurement."""

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.calibration import Calibration
-from cotarget.config import TargetConfig
+from cotarget.config import TargetProfile
 from cotarget.detection import Detection
 from cotarget.estimation.correlation import Likeness, Samples, correlate, resample, summit
 from cotarget.geometry import Array
@@ -36,11 +36,11 @@ STANDS_OUT = 3.0  # standard deviations of the surroundings' colours
 # Least standard deviation of the background's colours [grey levels], and fewest pixels from which it is computed.
 LEAST_SPREAD, LEAST_BACKGROUND = 10.0, 12
 # Standard deviation of the body's centre along u and v, in parts of the box's sides, measured on simulated targets: of
-# the box alone, of upright bodies (median of the foreground across), of flying ones (median), and by colour.
+# the box alone, of upright bodies (median of the foreground across), of others (median both ways), and of templates.
 BOX_SIGMA = np.array([0.08, 0.18])
 UPRIGHT_SIGMA = np.array([0.03, 0.006])
-FLYING_SIGMA = np.array([0.05, 0.12])
-COLOUR_SIGMA = np.array([0.01, 0.01])
+OUTLINE_SIGMA = np.array([0.05, 0.12])
+TEMPLATE_SIGMA = np.array([0.01, 0.01])
 Pixels = npt.NDArray[np.bool_]
 
 
@@ -107,14 +107,14 @@ class FixedView:
         return template, weight if inside is None else weight * inside, -first
 
 
-def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetConfig) -> FixedView | None:
+def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetProfile) -> FixedView | None:
     """Cut the target out of a fixed-camera frame.
 
     Args:
         frame: frame of the fixed camera.
         detection: detection of the target in it.
         mask: foreground of the detector, (H, W), or None.
-        target: target profile; its detector and dimension decide where the centre of the body is.
+        target: target profile; its matcher decides where the centre of the body is.
 
     Returns:
         The cut-out; None if the box holds no pixel of the frame.
@@ -141,14 +141,14 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetC
         foreground = _stands_out(patch, in_box)
     masked = _is_outline(foreground, in_box)
     body, sigma = center, BOX_SIGMA * size
-    if target.detector == "colour":
-        sigma = COLOUR_SIGMA * size
+    if target.matcher == "box":
+        sigma = TEMPLATE_SIGMA * size
     elif masked:
         rows, columns = foreground.nonzero()
         middle = np.array([np.median(u[columns]), np.median(v[rows])], dtype=float)
-        upright = target.dimension == "height"
+        upright = target.matcher == "upright"
         body = np.array([middle[0], center[1]]) if upright else middle
-        sigma = (UPRIGHT_SIGMA if upright else FLYING_SIGMA) * size
+        sigma = (UPRIGHT_SIGMA if upright else OUTLINE_SIGMA) * size
     if not masked:
         du, dv = (2 * (each + side / 2) / side for each, side in zip(beyond, size, strict=True))
         foreground = du**2 + dv**2 <= 1
@@ -413,7 +413,7 @@ class Finder(Protocol):
 class CloseupFinder:
     """Register the fixed camera's detections of one target in the zoom image."""
 
-    def __init__(self, calibration: Calibration, target: TargetConfig) -> None:
+    def __init__(self, calibration: Calibration, target: TargetProfile) -> None:
         """Create a finder without cut-outs.
 
         Args:

@@ -8,14 +8,14 @@ numbers, and every track has two of them in every frame. Users of the tracker se
 import math
 import statistics
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Protocol, TypeVar
 
 import numpy as np
 
-from cotarget.config import TargetConfig
+from cotarget.config import TargetProfile
 from cotarget.geometry import Array
 
 
@@ -295,20 +295,40 @@ class TrackerSettings:
     beat_s: float = 0.5
 
 
-def settings_for(target: TargetConfig) -> TrackerSettings:
-    """Choose the tracker's settings for a target profile.
+# Part of a box's side by which its centre jitters with limbs and wings, by the target's motion model; and the settings
+# that differ from the defaults, by the detector. A small target may hover, so its score decides and not its travel.
+JITTER = {"standing": 0.04, "walking": 0.04, "flying": 0.2, "general": 0.06}
+FLYING_ACCELERATION_PX = 250.0
+BY_DETECTOR: Mapping[str, Mapping[str, float]] = {
+    "colour": {"noise_px": 0.2, "noise_of_size": 0.01},
+    "speck": {
+        "acceleration_px": FLYING_ACCELERATION_PX,
+        "noise_of_size": 0.2,
+        "confirm_score": 0.5,
+        "doubt_score": 0.2,
+    },
+    "motion": {"confirm_travel": 0.5},
+    "mog2": {"confirm_travel": 0.5},
+}
 
-    A colour is located to a fraction of a pixel. Detections by motion jitter with limbs and wings, and the track must
-    travel before it is confirmed; a person who walks straight towards the camera is confirmed after moving sideways.
+
+def tracker_settings(target: TargetProfile, *, external: bool = False) -> TrackerSettings:
+    """Choose the tracker's settings for a target profile and a detector.
+
+    A colour is located to a fraction of a pixel. What moves need not be the target, so tracks by motion must travel
+    before they are confirmed; a person who walks straight towards the camera is confirmed after moving sideways.
+    Detections of an external detector are confirmed by their number alone.
+
+    Args:
+        target: target profile.
+        external: whether the detections come from an external detector, and not from the one that the profile names.
     """
-    detector: str = target.detector
-    if detector == "colour":
-        return TrackerSettings(noise_px=0.2, noise_of_size=0.01)
-    if detector == "speck":  # a small target may hover, so its score decides and not its travel
-        return TrackerSettings(acceleration_px=250.0, noise_of_size=0.2, confirm_score=0.5, doubt_score=0.2)
-    if target.dimension == "wingspan":
-        return TrackerSettings(acceleration_px=250.0, noise_of_size=0.2, confirm_travel=0.5)
-    return TrackerSettings(confirm_travel=0.5, noise_of_size=0.04)
+    by_motion = {"noise_of_size": JITTER[target.motion]}
+    if target.motion == "flying":
+        by_motion["acceleration_px"] = FLYING_ACCELERATION_PX
+    if not external:
+        by_motion.update(BY_DETECTOR.get(target.detector, {}))
+    return TrackerSettings(**by_motion)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,10 @@ from cotarget.tracking.track import (
     TrackerSettings,
     center_variance,
     missing,
-    settings_for,
+    tracker_settings,
 )
 
-__all__ = ["Measurement", "Track", "Tracker", "TrackerSettings", "settings_for"]
+__all__ = ["Measurement", "Track", "Tracker", "TrackerSettings", "tracker_settings"]
 # Cost of pairs that must not be matched; no assignment inside the gate reaches it.
 IMPOSSIBLE = 1e6
 # Gate: 99.9 % of a chi-square with three degrees of freedom, two of place and one of size.

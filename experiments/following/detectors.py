@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
-from cotarget.config import RigConfig, TargetConfig
+from cotarget.config import RigConfig, TargetProfile
 from cotarget.detection import make_detector
 from cotarget.evaluation import off_target, on_target
 from cotarget.geometry import Array
@@ -29,7 +29,7 @@ from cotarget.rig import Frame
 from cotarget.sim.targets.random_paths import GROUPED, SECONDS
 from cotarget.sim.truth import Silhouette
 from cotarget.sim.world import SimWorld
-from cotarget.tracking.track import settings_for
+from cotarget.tracking.track import tracker_settings
 from cotarget.tracking.tracker import Tracker
 from experiments.engine.checks import check_above, check_ways
 from experiments.engine.harness import Experiment, Row, Settings, seeds_of
@@ -93,7 +93,7 @@ class Watch:
     kind: str
     name: str
     camera: str
-    target: TargetConfig
+    target: TargetProfile
     config: RigConfig
     on: list[list[tuple[int, str]]] = field(default_factory=list)
     off: list[tuple[float, list[int]]] = field(default_factory=list)
@@ -101,7 +101,7 @@ class Watch:
 
     def __post_init__(self) -> None:
         self._detector = make_detector(self.target, self.config.rate_hz)
-        self._tracker = Tracker(settings_for(self.target), self.config.sim.fixed.size)
+        self._tracker = Tracker(tracker_settings(self.target), self.config.sim.fixed.size)
 
     def see(self, frame: Frame, shift: Array, outlines: Mapping[str, Silhouette | None]) -> None:
         """Search a frame with a shift (du, dv) [px], and judge the tracks."""

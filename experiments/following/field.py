@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from cotarget.calibration import Calibration
 from cotarget.calibration.calibrate import calibrate
-from cotarget.config import RigConfig, TargetConfig
+from cotarget.config import RigConfig, TargetProfile
 from cotarget.detection import Detector, make_detector
 from cotarget.evaluation import add_row, true_calibration
 from cotarget.metrics import BACKGROUND_S
@@ -105,7 +105,7 @@ def held(
 def watched(
     calibration: Calibration,
     config: RigConfig,
-    target: TargetConfig,
+    target: TargetProfile,
     seconds: float,
     settings: FollowSettings | None = None,
     view: WideView | None = None,
@@ -123,7 +123,7 @@ def watched_in(
     world: SimWorld,
     detector: Detector,
     calibration: Calibration,
-    target: TargetConfig,
+    target: TargetProfile,
     seconds: float,
     settings: FollowSettings,
     how: Follow = follow,
@@ -135,7 +135,7 @@ def watched_in(
             yield step, truth
 
 
-def target_of(config: RigConfig, name: str) -> TargetConfig:
+def target_of(config: RigConfig, name: str) -> TargetProfile:
     """Give a target's settings in the field; a bird is found by `speck`, because clutter hides it from others."""
     target = config.target(name)
-    return dataclasses.replace(target, detector="speck") if target.dimension == "wingspan" else target
+    return dataclasses.replace(target, detector="speck") if target.motion == "flying" else target

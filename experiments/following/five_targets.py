@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig, TargetConfig
+from cotarget.config import RigConfig, TargetProfile
 from cotarget.control.selection import POLICIES
 from cotarget.evaluation import closeup_of
 from cotarget.metrics import SERVED_S
@@ -77,7 +77,7 @@ def one(calibration: Calibration, settings: FiveSettings, seed: int) -> list[Row
 def good_seconds(
     calibration: Calibration,
     config: RigConfig,
-    target: TargetConfig,
+    target: TargetProfile,
     seconds: float,
     how: FollowSettings,
     view: WideView,

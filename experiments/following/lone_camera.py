@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import TargetConfig
+from cotarget.config import TargetProfile
 from cotarget.control.controller import NO_CHANGE
 from cotarget.control.head import HeadController
 from cotarget.control.zoom import ExpectedTarget, ZoomController
@@ -25,7 +25,7 @@ from cotarget.geometry import Array
 from cotarget.pantilt import base_head, nearest, solve
 from cotarget.rig import Angles, Frame, Rig
 from cotarget.sim.truth import Truth
-from cotarget.tracking.track import settings_for
+from cotarget.tracking.track import tracker_settings
 from cotarget.tracking.tracker import Tracker
 from experiments.following.lone_course import SEARCH_S, Course, Sighting
 
@@ -48,7 +48,7 @@ class LoneCamera:
         rig: Rig,
         truth: Truth,
         calibration: Calibration,
-        target: TargetConfig,
+        target: TargetProfile,
         detector: Detector,
         delay_s: float,
         noise_px: float,
@@ -74,7 +74,7 @@ class LoneCamera:
         self._shortest, longest = (self._zoom.at(f).focal_px[0] for f in rig.zoom.focal_range)
         self._policy = ZoomController((self._shortest, longest), rig.zoom.size)
         self._head_controller = HeadController(rig.head.limits)
-        self._course, self._tracker = Course(target, noise_px, lasts_s), Tracker(settings_for(target))
+        self._course, self._tracker = Course(target, noise_px, lasts_s), Tracker(tracker_settings(target))
         self._focal = rig.zoom.zoom(rig.zoom.focal_range[0])
         self._next, self._round, self._set_out = 0, self._field, -math.inf
         self.mode = ""

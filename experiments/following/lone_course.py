@@ -5,17 +5,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cotarget.config import TargetConfig
-from cotarget.estimation.motion_model import estimation_settings_for
+from cotarget.config import TargetProfile
+from cotarget.estimation.motion_model import filter_settings
 from cotarget.rig import Angles
 from cotarget.tracking.track import AxisFilter
 
 SEARCH_S = 3.0  # longest search around the prediction [s]
 SIZES_S = 0.5  # window of the size estimate, a wing beat or a step [s]
-# Duration of a manoeuvre as white acceleration [s], by the target's dimension. The choice is in docs/design-notes.md
+# Duration of a manoeuvre as white acceleration [s], by the target's motion model. The choice is in docs/design-notes.md
 # (Experiments). It is the setting lasts_s of `experiments.following.single_ptz`. A book that is carried accelerates
 # more than its motion model says.
-LASTS_S = {"width": 2.0, "height": 0.25, "wingspan": 0.1}
+LASTS_S = {"standing": 2.0, "walking": 0.25, "flying": 0.1}
 CLIPPED = 9.0  # factor on the variance of a centre that the image's border cuts
 
 
@@ -41,17 +41,17 @@ class Sighting:
 class Course:
     """Target's pan and tilt, each filtered with constant velocity."""
 
-    def __init__(self, target: TargetConfig, noise_px: float, lasts_s: float | None = None) -> None:
+    def __init__(self, target: TargetProfile, noise_px: float, lasts_s: float | None = None) -> None:
         """Start without a sighting.
 
         Args:
             target: configuration of the target.
             noise_px: standard deviation of a detection's centre [px].
-            lasts_s: duration of a manoeuvre as white acceleration [s]; by default LASTS_S of the target's dimension.
+            lasts_s: duration of a manoeuvre as white acceleration [s]; by default that of the target's motion model.
         """
         self._target, self._noise_px = target, noise_px
-        self._lasts_s = LASTS_S[target.dimension] if lasts_s is None else lasts_s
-        self._settings = estimation_settings_for(target)
+        self._lasts_s = LASTS_S[target.motion] if lasts_s is None else lasts_s
+        self._settings = filter_settings(target)
         self._axes: list[AxisFilter] = []
         self._sizes: list[Sighting] = []
         self.seen_t = -math.inf
@@ -66,14 +66,14 @@ class Course:
     def sides(self) -> tuple[float, float]:
         """Width and height as tangents: the largest of the window for wings, else the median."""
         sides = np.array([each.sides for each in self._sizes])
-        w, h = sides.max(axis=0) if self._target.dimension == "wingspan" else np.median(sides, axis=0)
+        w, h = sides.max(axis=0) if self._target.largest_over_time else np.median(sides, axis=0)
         return float(w), float(h)
 
     @property
     def size(self) -> float:
         """The dimension with a known size, as a tangent."""
         w, h = self.sides
-        return {"width": w, "height": h}.get(self._target.dimension, max(w, h))
+        return h if self._target.is_vertical(w, h) else w
 
     @property
     def range(self) -> float:

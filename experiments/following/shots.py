@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig, TargetConfig
+from cotarget.config import RigConfig, TargetProfile
 from cotarget.control.controller import reach_of
 from cotarget.control.selection import FirstCome
 from cotarget.detection import make_detector
@@ -30,7 +30,7 @@ from cotarget.safety import SafeRig
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Aim, Reach, aim
-from cotarget.tracking.track import Track, settings_for
+from cotarget.tracking.track import Track, tracker_settings
 from cotarget.tracking.tracker import Tracker
 
 # Head and lens that reach any pose within a millisecond.
@@ -99,7 +99,7 @@ def quick(config: RigConfig) -> RigConfig:
 
 
 def fire(
-    calibration: Calibration, config: RigConfig, name: str, target: TargetConfig, seconds: float
+    calibration: Calibration, config: RigConfig, name: str, target: TargetProfile, seconds: float
 ) -> list[Fired | None]:
     """Shoot at a target repeatedly, each time from the fixed camera alone.
 
@@ -157,10 +157,10 @@ class _Lookout:
 
     frame: Frame
 
-    def __init__(self, rig: Rig, calibration: Calibration, config: RigConfig, target: TargetConfig) -> None:
+    def __init__(self, rig: Rig, calibration: Calibration, config: RigConfig, target: TargetProfile) -> None:
         self._rig, self._config, self._calibration = rig, config, calibration
         self._detector = make_detector(target, config.rate_hz)
-        self._tracker = Tracker(settings_for(target), rig.fixed.size)
+        self._tracker = Tracker(tracker_settings(target), rig.fixed.size)
         self._wide = TargetFusion(calibration, target, rig.fixed.size)  # never updated from the zoom camera
         self._both: TargetFusion | None = None
         self._policy = FirstCome()

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig, TargetConfig
+from cotarget.config import RigConfig, TargetProfile
 from cotarget.evaluation import TruthDetector, TruthFinder, closeup_of, counted, true_calibration
 from cotarget.metrics import BACKGROUND_S, ROUNDING_S, WHOLLY_VISIBLE
 from cotarget.metrics import Row as Judged
@@ -32,7 +32,7 @@ def config_of(name: str, seed: int) -> RigConfig:
     config = replace(config, sim=replace(config.sim, effects=replace(config.sim.effects, clutter=False)))
     target = config.target(name)
     # With `motion`, a target must move some way before it is confirmed, which a single camera cannot measure.
-    looks = target if target.detector == "colour" else replace(target, detector="speck")
+    looks = target if target.matcher == "box" else replace(target, detector="speck")
     return replace(config, targets={**config.targets, name: looks})
 
 
@@ -88,7 +88,7 @@ def begun(rows: Sequence[Judged]) -> bool:
 def by_pair(
     rig: Rig,
     calibration: Calibration,
-    target: TargetConfig,
+    target: TargetProfile,
     outlines: Outlines,
     name: str,
     seed: int,
@@ -98,7 +98,7 @@ def by_pair(
 ) -> Iterator[float]:
     """Run the project's pipeline with both cameras; yield the times of the zoom frames, with repetitions."""
 
-    def finder(calibration: Calibration, target: TargetConfig) -> TruthFinder:
+    def finder(calibration: Calibration, target: TargetProfile) -> TruthFinder:
         return TruthFinder(calibration, target, outlines, name, seed, shaken.misses)
 
     settings = FollowSettings(command_delay_s=delay_s, finder=finder)
@@ -107,7 +107,7 @@ def by_pair(
         yield step.zoom.t
 
 
-def judge(outlines: Outlines, name: str, target: TargetConfig, t: float) -> Judged:
+def judge(outlines: Outlines, name: str, target: TargetProfile, t: float) -> Judged:
     """Make the row of a zoom frame from ground truth; fields of commands and tracks are placeholders."""
     closeup = closeup_of(outlines, name, target, t)
     wide = outlines.silhouette(name, "fixed", t)

@@ -12,7 +12,7 @@ from tempfile import TemporaryFile
 
 import numpy as np
 
-from cotarget.config import RigConfig, TargetConfig
+from cotarget.config import RigConfig, TargetProfile
 from cotarget.detection import Detection, make_detector
 from cotarget.evaluation import microseconds
 from cotarget.rig import Camera, Frame, Image
@@ -97,7 +97,7 @@ class WideView:
         return self.frames[microseconds(t)]
 
 
-def record(config: RigConfig, target: TargetConfig, seconds: float) -> WideView:
+def record(config: RigConfig, target: TargetProfile, seconds: float) -> WideView:
     """Read the fixed camera alone, and run the detector on each frame.
 
     Args:

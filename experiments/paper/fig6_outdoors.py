@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig, TargetConfig, Waypoint
+from cotarget.config import RigConfig, TargetProfile, Waypoint
 from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
 from cotarget.errors import ConfigError, choices
@@ -149,7 +149,7 @@ class Watch:
     _last: tuple[Step, str] | None = None
     _since: float = 0.0
 
-    def see(self, step: Step, truth: Truth, target: TargetConfig) -> None:
+    def see(self, step: Step, truth: Truth, target: TargetProfile) -> None:
         """Process a Step."""
         t, t_zoom = step.fixed.t, step.zoom.t
         outlines = {name: truth.silhouette(name, "fixed", t) for name in truth.targets}

@@ -10,14 +10,14 @@ things open, which are this project's: the calibration, and the association of c
 from collections.abc import Callable, Iterator, Mapping
 
 from cotarget.calibration import Calibration
-from cotarget.config import TargetConfig
+from cotarget.config import TargetProfile
 from cotarget.control.controller import reach_of
 from cotarget.detection import Detector
 from cotarget.errors import UnreachableError
 from cotarget.pipeline import FollowSettings, FrameSource, State, Step, follow
 from cotarget.rig import Rig
 from cotarget.targeting import Aim, Method, WantedSize, aim, depth_of, point_at
-from cotarget.tracking.track import Track, settings_for
+from cotarget.tracking.track import Track, tracker_settings
 from cotarget.tracking.tracker import Tracker
 
 METHOD: Method = "paper-table"  # depth as in Table 1
@@ -27,7 +27,7 @@ Follow = Callable[..., Iterator[Step]]  # takes the arguments of `follow`
 def follow_as_the_paper(
     rig: Rig,
     calibration: Calibration,
-    target: TargetConfig,
+    target: TargetProfile,
     detector: Detector,
     *,
     seconds: float,
@@ -39,7 +39,7 @@ def follow_as_the_paper(
     started.
     """
     calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
-    eyes, tracker = FrameSource(rig.fixed, rig.zoom, rig.clock), Tracker(settings_for(target), rig.fixed.size)
+    eyes, tracker = FrameSource(rig.fixed, rig.zoom, rig.clock), Tracker(tracker_settings(target), rig.fixed.size)
     head = rig.head.state()
     commanded = (head.pan, head.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
     mine: Track | None = None
@@ -86,9 +86,9 @@ def _first(tracks: list[Track], before: Track | None) -> Track | None:
     return confirmed[min(confirmed)] if confirmed else None
 
 
-def _aim(calibration: Calibration, target: TargetConfig, track: Track, rig: Rig) -> Aim | None:
+def _aim(calibration: Calibration, target: TargetProfile, track: Track, rig: Rig) -> Aim | None:
     """Aim by the track's last box alone; None where the shortcut has no reachable solution."""
-    vertical = target.dimension == "height"
+    vertical = target.is_vertical()
     size_px, center_px = float(track.box.size_px[int(vertical)]), track.box.center_px
     try:
         x_fixed = point_at(calibration, center_px, depth_of(calibration, target, size_px, center_px))

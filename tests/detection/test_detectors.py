@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.config import DEFAULT_TARGETS, TargetConfig
+from cotarget.config import DEFAULT_TARGETS, TargetProfile
 from cotarget.detection import (
     BackgroundDetector,
     ColorTemplateDetector,
@@ -343,5 +343,5 @@ def test_who_walks_is_seen_again_soon_after_the_whole_picture_has_changed(what):
 def test_the_kind_of_detector_follows_the_target():
     assert isinstance(motion("bird"), BackgroundDetector)
     assert isinstance(make_detector(DEFAULT_TARGETS["bird"], RATE), SmallTargetDetector)
-    red = TargetConfig(0.2, "width", 160.0, "colour")
+    red = TargetProfile(0.2, "width", 160.0, "colour")
     assert isinstance(make_detector(red, RATE, cover()), ColorTemplateDetector)

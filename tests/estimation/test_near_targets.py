@@ -8,7 +8,7 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
-from cotarget.estimation import TargetFilter, estimation_settings_for
+from cotarget.estimation import TargetFilter, filter_settings
 from cotarget.pipeline import FollowSettings, State, follow
 from experiments.calibration.synthetic.rig import SIZE, Truth
 from tests.moving_targets import calibration_of
@@ -93,7 +93,7 @@ def test_a_velocity_along_the_axis_that_no_size_measures_is_as_uncertain_as_at_f
     for i in range(100):
         estimator.update_fixed(box if i < 25 else replace(box, clipped=True), i / RATE)
     found = estimator.at(99 / RATE)
-    speed = estimation_settings_for(target).motion.speed
+    speed = filter_settings(target).motion.speed
     assert found.depth * math.sqrt(found.state_covariance[5, 5]) == pytest.approx(speed, rel=USUAL_SPEED)
 
 

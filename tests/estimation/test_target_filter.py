@@ -13,12 +13,12 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.errors import CalibrationError
-from cotarget.estimation import TargetFilter, estimation_settings_for
+from cotarget.estimation import TargetFilter, filter_settings
 from cotarget.estimation.measurement_model import Sights
-from cotarget.estimation.motion_model import BIRD, PERSON, STATES, USUAL_BIAS, MotionSettings, propagate
+from cotarget.estimation.motion_model import MOTIONS, STATES, USUAL_BIAS, MotionSettings, propagate
 from cotarget.geometry import RigidTransform
 from cotarget.targeting import Reach, aim, depth_of, point_at
-from cotarget.tracking.track import ImageFilter, settings_for
+from cotarget.tracking.track import ImageFilter, tracker_settings
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth
 from tests.moving_targets import APART, RATE, Flight, calibration_of, magnified, show
 
@@ -90,7 +90,7 @@ def baselines(flight):
         if seen is None:
             continue
         if state is None:
-            state = ImageFilter(1, seen, t, settings_for(flight.target))
+            state = ImageFilter(1, seen, t, tracker_settings(flight.target))
         else:
             state.predict(t)
             state.correct(seen)
@@ -161,13 +161,13 @@ def test_the_covariance_is_carried_by_the_motions_own_derivative():
     zero = np.zeros((STATES, STATES))
 
     def moved(x):
-        return propagate(x, zero, 0.3, BIRD.motion)[0]
+        return propagate(x, zero, 0.3, MOTIONS["flying"])[0]
 
     steps = DIFFERENCE * np.eye(STATES)
     F = np.stack([(moved(x + s) - moved(x - s)) / (2 * DIFFERENCE) for s in steps], axis=1)
     P = np.diag(np.linspace(1e-6, 3e-6, STATES))
-    _, grown = propagate(x, P, 0.3, BIRD.motion)
-    noise = propagate(x, zero, 0.3, BIRD.motion)[1]
+    _, grown = propagate(x, P, 0.3, MOTIONS["flying"])
+    noise = propagate(x, zero, 0.3, MOTIONS["flying"])[1]
     # The noise itself is larger where the depth is uncertain, by twice that variance.
     np.testing.assert_allclose(grown - noise, F @ P @ F.T, atol=1e-6 * DERIVATIVE + 4 * P[2, 2] * np.abs(noise).max())
 
@@ -176,8 +176,8 @@ def test_two_short_predictions_are_one_long_one():
     rng = np.random.default_rng(0)
     x = np.array([0.1, -0.1, 2.3, 0.2, -0.1, 0.0, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
     root = rng.normal(size=(STATES, STATES)) * 1e-3
-    once = propagate(x, root @ root.T, 0.5, PERSON.motion)
-    twice = propagate(*propagate(x, root @ root.T, 0.2, PERSON.motion), 0.3, PERSON.motion)
+    once = propagate(x, root @ root.T, 0.5, MOTIONS["walking"])
+    twice = propagate(*propagate(x, root @ root.T, 0.2, MOTIONS["walking"]), 0.3, MOTIONS["walking"])
     np.testing.assert_allclose(twice[0], once[0], atol=2e-3)  # the depth's fading velocity is applied at the end
     # Noise is scaled by the depth, and by how uncertain that is, at the end of each.
     np.testing.assert_allclose(np.diag(twice[1]), np.diag(once[1]), rtol=SPLIT)
@@ -228,7 +228,7 @@ def test_attitude_and_bias_return_to_what_is_assumed_of_them():
 def test_the_covariance_is_honest_where_targets_move_as_assumed():
     """Squared errors of (a, b, l, velocity) average 6 over 30 random targets that accelerate as Singer's."""
     rng = np.random.default_rng(3)
-    motion, dt, squared = PERSON.motion, 1 / RATE, []
+    motion, dt, squared = MOTIONS["walking"], 1 / RATE, []
     tau = motion.manoeuvre_s
     for seed in range(30):
         x, v, c = np.array([0.0, 0.0, 10.0]), rng.normal(0, 0.7, 3), rng.normal(0, motion.acceleration, 3)
@@ -238,7 +238,9 @@ def test_the_covariance_is_honest_where_targets_move_as_assumed():
             c = c * math.exp(-dt / tau) + rng.normal(0, motion.acceleration * math.sqrt(2 * dt / tau), 3)
             x, v = x + v * dt, v + c * dt
         flight = Flight("person", 100 + seed, 2.4, path=CubicSpline(np.arange(90) * dt, np.array(way)))
-        *_, (t, estimates) = run(flight, delays=(0.0,), settings=replace(PERSON, noise_s=0.0, size_s=0.0))
+        *_, (t, estimates) = run(
+            flight, delays=(0.0,), settings=replace(filter_settings(DEFAULT_TARGETS["person"]), noise_s=0.0, size_s=0.0)
+        )
         off = estimates[0.0].state[:6] - state_of(flight, t)
         squared.append(off @ np.linalg.solve(estimates[0.0].state_covariance[:6, :6], off))
     # The mean of 30 chi-squares with 6 degrees of freedom has a standard deviation of 0.63; that the target's
@@ -526,7 +528,7 @@ def test_two_sights_tell_a_velocity_and_a_third_that_errs_alike_hardly_more(else
     estimator.update_fixed(seen, t)
     if elsewhere:
         seen = replace(seen, center_px=seen.center_px + JUMP_PX)
-        for _ in range(BIRD.misses):
+        for _ in range(filter_settings(DEFAULT_TARGETS["bird"]).misses):
             t += dt
             estimator.update_fixed(seen, t)
     first = np.sqrt(middle_variance(estimator, t))
@@ -534,7 +536,7 @@ def test_two_sights_tell_a_velocity_and_a_third_that_errs_alike_hardly_more(else
     estimator.update_fixed(seen, t)
     found = estimator.at(t).state_covariance
     assert (np.sqrt(np.diag(found))[3:5] < AS_TWO * math.sqrt(2.0) * first / dt).all()
-    t += SOON * BIRD.noise_s
+    t += SOON * filter_settings(DEFAULT_TARGETS["bird"]).noise_s
     estimator.update_fixed(seen, t)
     assert (middle_variance(estimator, t) > HARDLY * np.diag(found)[:2]).all()
 
@@ -567,22 +569,21 @@ def test_a_measurement_that_is_none_is_as_good_as_not_made():
 def test_a_target_that_flies_is_led_however_it_is_found():
     """A red drone: told that it flies, it is predicted far better than as something that stands."""
     misses = {}
-    for motion in (None, "flying"):
+    for motion in ("standing", "flying"):
         flight = Flight("book", 1, path=Flight("bird", 1).path)
         flight.target = replace(flight.target, motion=motion)
         misses[motion] = np.median(errors(flight)[0][:, DELAYS.index(0.2)])
-    assert misses["flying"] < CLEARLY * misses[None]
+    assert misses["flying"] < CLEARLY * misses["standing"]
     book = DEFAULT_TARGETS["book"]
-    assert estimation_settings_for(replace(book, motion="standing")) == estimation_settings_for(book)
-    assert estimation_settings_for(replace(book, motion="walking")).noise_px == estimation_settings_for(book).noise_px
+    assert filter_settings(replace(book, motion="walking")).noise_px == filter_settings(book).noise_px
 
 
 def test_a_calibrations_own_doubt_is_the_prior_of_the_heads_bias():
     calibration = calibration_of(Truth())
     person = DEFAULT_TARGETS["person"]
-    assert estimation_settings_for(person, calibration).motion.bias_sigma == USUAL_BIAS
+    assert filter_settings(person, calibration).motion.bias_sigma == USUAL_BIAS
     doubtful = replace(calibration, covariance=Covariance(("zoom[0].cx",), np.array([[4.0]])))  # 2 px of 692
-    sigma = estimation_settings_for(person, doubtful).motion.bias_sigma
+    sigma = filter_settings(person, doubtful).motion.bias_sigma
     assert sigma == pytest.approx(math.hypot(5e-4, 2 / 692 / math.sqrt(2)), rel=0.02)
     with pytest.raises(CalibrationError):
         TargetFilter(replace(calibration, T_head_zoom=None), person)

@@ -18,7 +18,7 @@ from cotarget.estimation.zoom_matching import LONGEST_APART_S, CloseupFinder, Zo
 from cotarget.fusion import MOST_FILTERS, MOST_WAITING, UNFOUND_S, TargetFusion
 from cotarget.geometry import pose
 from cotarget.rig import Frame, PanTiltState, ZoomState
-from cotarget.tracking.track import Track, settings_for
+from cotarget.tracking.track import Track, tracker_settings
 from cotarget.tracking.tracker import Tracker
 
 SIZE, CENTER, FOCAL, ZOOMED = (640, 480), (319.5, 239.5), 700.0, 3000.0
@@ -129,7 +129,7 @@ class Learner:
 
 def test_who_crosses_another_is_predicted_as_before():
     """While both are one box neither is where its own last box was, 6 px a frame ago and more."""
-    tracker, fusion = Tracker(settings_for(PERSON), SIZE), TargetFusion(CALIBRATION, PERSON, SIZE)
+    tracker, fusion = Tracker(tracker_settings(PERSON), SIZE), TargetFusion(CALIBRATION, PERSON, SIZE)
     fusion.follow(1)
     fusion._finder, merged, worst = Learner(), [], 0.0
     for i in range(100):
