@@ -162,7 +162,7 @@ def held_unrendered(calibration: Calibration, seconds: float, seed: int) -> Iter
     """Follow the bird with nothing rendered, and so without correction from the zoom view."""
     config = hold_config(TARGET, seed)
     world = SimWorld(config, rendered=())
-    settings = FollowSettings.of(config, closed_loop=False)
+    settings = FollowSettings(closed_loop=False)
     detector = TruthDetector(world.truth(), seed)
     return watched_in(world, detector, calibration, target_of(config, TARGET), SETTLED_S + seconds, settings)
 

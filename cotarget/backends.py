@@ -1,5 +1,6 @@
 """Open the rig that a configuration describes; the only module that imports backends."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,14 +9,16 @@ from cotarget.rig import Rig, RigSpec
 
 if TYPE_CHECKING:
     from cotarget.config import RigConfig
-    from cotarget.safety import SafeRig
+    from cotarget.recording.format import Recording
 
 
-def open_rig(config: "RigConfig | Path | str") -> "SafeRig":
+def open_rig(config: "RigConfig | Path | str", guarded: bool = True) -> Rig:
     """Open a rig with the safety layer in front of it: limits, watchdog and stop file.
 
     Args:
         config: a configuration, or the path of a rig.toml.
+        guarded: whether the safety layer is in front; without it, a caller can put a recorder between the two and call
+            `cotarget.safety.safe_rig.guard` itself.
 
     Raises:
         ConfigError: the configuration is malformed, or does not say enough of that rig.
@@ -23,52 +26,83 @@ def open_rig(config: "RigConfig | Path | str") -> "SafeRig":
         EmergencyStopError: the stop file exists.
     """
     from cotarget.config import load_config
-    from cotarget.safety import SafeRig
+    from cotarget.safety.safe_rig import guard
 
     if isinstance(config, str | Path):
         config = load_config(Path(config))
-    return SafeRig(open_devices(config), config.safety)
+    rig = OPENERS[config.backend](config)
+    return guard(rig, config.safety) if guarded else rig
 
 
-def open_devices(config: "RigConfig") -> Rig:
-    """Open the same rig without the safety layer, for callers that put a recorder or a test between the two.
+def _open_simulation(config: "RigConfig") -> Rig:
+    from cotarget.sim.world import SimWorld
+
+    return SimWorld(config).rig
+
+
+def _open_hardware(config: "RigConfig") -> Rig:
+    from cotarget.drivers.rig import open_hardware
+
+    return open_hardware(config)
+
+
+def _open_replay(config: "RigConfig") -> Rig:
+    from cotarget.recording.replay import Replay
+
+    return Replay(open_recording(_recording_of(config))).rig
+
+
+# By the backend's name, functions that open its rig without the safety layer.
+OPENERS: dict[str, Callable[["RigConfig"], Rig]] = {
+    "sim": _open_simulation,
+    "hardware": _open_hardware,
+    "replay": _open_replay,
+}
+
+
+def open_recording(directory: Path) -> "Recording":
+    """Read a recording up to where it is whole; images must exist, but are not read.
 
     Raises:
-        ConfigError: the configuration does not say enough of that rig.
-        DeviceError: a device could not be opened.
+        ConfigError: the folder is no recording, has another schema, or holds nothing that can be replayed.
     """
-    match config.backend:
-        case "sim":
-            from cotarget.sim.world import SimWorld
+    from cotarget.recording.format import read_recording
 
-            return SimWorld(config).rig
-        case "hardware":
-            from cotarget.drivers.rig import open_hardware
+    return read_recording(directory, _described)
 
-            return open_hardware(config)
-        case "replay":
-            from cotarget.recording.format import open_recording
-            from cotarget.recording.replay import ReplayRig
 
-            if config.recording is None:
-                raise ConfigError("recording: is missing; backend 'replay' needs the folder of a recording")
-            return ReplayRig(open_recording(config.recording))
+def _recording_of(config: "RigConfig") -> Path:
+    if config.recording is None:
+        raise ConfigError("recording: is missing; backend 'replay' needs the folder of a recording")
+    return config.recording
 
 
 def describe(config: "RigConfig") -> RigSpec:
     """Describe the configured rig without opening a device: sizes, rates, delays, and limits within the soft ones.
 
     Raises:
-        ConfigError: the soft limits leave nothing of the head's range.
+        ConfigError: the soft limits leave nothing of the head's range, or a recording cannot be read.
     """
     from dataclasses import replace
 
     from cotarget.safety.safe_rig import soft_limits
 
+    spec = _described(config)
+    return replace(spec, head=replace(spec.head, limits=soft_limits(spec.head.limits, config.safety)))
+
+
+def _described(config: "RigConfig") -> RigSpec:
+    """Describe the configured rig within its own limits."""
     match config.backend:
         case "sim":
-            from cotarget.sim.devices import rig_spec as spec_of
-        case _:
-            from cotarget.drivers.rig import rig_spec as spec_of
-    spec = spec_of(config)
-    return replace(spec, head=replace(spec.head, limits=soft_limits(spec.head.limits, config.safety)))
+            from cotarget.sim.devices import rig_spec
+
+            return rig_spec(config)
+        case "hardware":
+            from cotarget.drivers.rig import rig_spec
+
+            return rig_spec(config)
+        case "replay":
+            from cotarget.recording.format import read_spec
+
+            return read_spec(_recording_of(config), _described)

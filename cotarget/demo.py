@@ -27,7 +27,7 @@ from cotarget.evaluation import add_row, pointing_errors
 from cotarget.metrics import Row, Score, score, write_rows
 from cotarget.parallel import Report, run_side_by_side
 from cotarget.pipeline import FollowSettings, follow
-from cotarget.safety import SafeRig
+from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
 from cotarget.video import FilmWriter, join_films
 
@@ -117,7 +117,7 @@ def finished_together(out: Path) -> Iterator[Path]:
 def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> tuple[Calibration, dict[str, float]]:
     """Calibrate from rendered boards, evaluate the calibration by the ground truth, and draw the rig."""
     world = SimWorld(config)
-    with SafeRig(world.rig, config.safety) as rig:
+    with guard(world.rig, config.safety) as rig:
         calibration = calibrate(
             rig,
             config.board,
@@ -157,10 +157,10 @@ def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, repo
     world = SimWorld(config)
     truth = world.truth()
     rows: list[Row] = []
-    with SafeRig(world.rig, config.safety) as rig, FilmWriter(work / f"{name}.mp4", rate_hz) as film:
+    with guard(world.rig, config.safety) as rig, FilmWriter(work / f"{name}.mp4", rate_hz) as film:
         stages = TargetStages(rig.zoom.focal_range[0])
         detector = make_detector(target, rate_hz)
-        settings = FollowSettings.of(config)
+        settings = FollowSettings()
         frames = round(RUN_S[name] * rate_hz)
         for step in follow(rig, calibration, target, detector, seconds=RUN_S[name], settings=settings):
             stages.see(step)

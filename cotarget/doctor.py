@@ -142,7 +142,7 @@ def _gphoto_cameras(needed: bool) -> Finding:
 
 def _emergency_stop(config: "RigConfig") -> Finding:
     """Check whether an operator has stopped the head."""
-    from cotarget.safety import refuse_if_stopped
+    from cotarget.safety.stop_file import refuse_if_stopped
 
     name, path = "emergency stop", config.safety.stop_file
     if path is None:

@@ -1,7 +1,7 @@
 """Write files atomically: a file gets its name only when it is complete, and one run at a time writes it.
 
-`PartFile` locks and replaces a file, `HeldSignals` defers signals meanwhile, and `CsvFile` writes tables. `assets_dir`
-finds the files that are installed with cotarget.
+`PartFile` locks and replaces a file, and `CsvFile` writes tables. `assets_dir` finds the files that are installed with
+cotarget.
 """
 
 import contextlib
@@ -9,15 +9,13 @@ import csv
 import fcntl
 import io
 import os
-import signal
-import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any
+from types import TracebackType
 
 from cotarget.errors import CalibrationError, ConfigError, CotargetError
+from cotarget.safety.signals import DeferredSignals
 
 
 def assets_dir() -> Path:
@@ -37,58 +35,6 @@ def write_atomically(path: Path, data: bytes) -> None:
         write_whole(path, data)
     except ConfigError as error:
         raise CalibrationError(str(error)) from None
-
-
-# Deferred signals
-
-# Signals that end the process at once: a request, a closed terminal or connection, and Ctrl-\.
-ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name))
-HELD = (signal.SIGINT, *ENDING)
-# Number of signals that end even a critical section, once that is allowed: a wait for devices or disks without answer.
-IMPATIENCE = 3
-
-
-class HeldSignals:
-    """Defer SIGINT, SIGTERM and other ending signals during a critical section, and deliver them after it.
-
-    Only the main thread receives signals, so in other threads there is nothing to defer.
-    """
-
-    def __init__(self) -> None:
-        self.pending: list[int] = []
-        self._previous: dict[int, Any] = {}
-        self._may_hurry = False
-
-    def hold(self) -> None:
-        """Start to defer signals; may be called again if a signal interrupted it."""
-        if threading.current_thread() is not threading.main_thread():
-            return
-        for number in HELD:
-            previous = signal.getsignal(number)
-            if number not in self._previous and previous not in (None, signal.SIG_IGN, self._note):
-                self._previous[number] = previous
-                signal.signal(number, self._note)
-
-    def let_hurry(self) -> None:
-        """From now on let `IMPATIENCE` signals end the critical section, for example after the head was halted."""
-        self._may_hurry = True
-
-    def restore(self) -> None:
-        """Restore the previous handlers."""
-        while self._previous:
-            number, previous = self._previous.popitem()
-            if signal.getsignal(number) == self._note:
-                signal.signal(number, previous)
-
-    def deliver(self) -> None:
-        """Raise the first deferred signal, if there was one."""
-        if self.pending:
-            signal.raise_signal(self.pending[0])
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self.pending.append(number)
-        if self._may_hurry and len(self.pending) >= IMPATIENCE:
-            raise KeyboardInterrupt
 
 
 # Longest wait for another run that is writing a small file [s]; writing takes less.
@@ -165,10 +111,10 @@ class PartFile:
             CotargetError: the file could not be completed, for example on a full disk; after an error it only gets a
                 note.
         """
-        kept, held = False, HeldSignals()
-        held.let_hurry()
+        kept, deferred = False, DeferredSignals()
+        deferred.let_hurry()
         try:
-            held.hold()
+            deferred.defer()
             yield
             if keep:
                 self.path.replace(self._final)
@@ -186,9 +132,9 @@ class PartFile:
             with contextlib.suppress(OSError):
                 fcntl.flock(self._lock, fcntl.LOCK_UN)  # a child process may hold the descriptor too
             os.close(self._lock)
-            held.restore()
+            deferred.restore()
         if error is None:
-            held.deliver()
+            deferred.deliver()
 
 
 def check_writable(path: Path) -> None:

@@ -9,12 +9,11 @@ import enum
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig, TargetProfile
+from cotarget.config import TargetProfile
 from cotarget.control.controller import Controller, ControllerSettings, Predict
 from cotarget.control.selection import FirstCome, Policy
 from cotarget.control.zoom import shape_of
@@ -24,8 +23,7 @@ from cotarget.errors import DeviceError, StaleFrameError, UnreachableError
 from cotarget.estimation import Estimate
 from cotarget.estimation.zoom_matching import CloseupFinder, ZoomMeasurement
 from cotarget.fusion import MakeFinder, TargetFusion
-from cotarget.rig import Camera, Clock, Frame, Image, PanTiltState, Rig, ZoomState, opened_from
-from cotarget.safety.safe_rig import FUTURE_S
+from cotarget.rig import FUTURE_S, PATIENCE_S, Camera, Clock, Frame, Image, PanTiltState, Rig, ZoomState, opened_from
 from cotarget.targeting import Aim
 from cotarget.tracking.track import Track, tracker_settings
 from cotarget.tracking.tracker import Tracker
@@ -35,8 +33,6 @@ ZOOM_WAIT_S = 2e-3
 # Frames of the fixed camera may repeat, or jump in time, for this long, and are read again this often [s]. They are
 # not acted on, and the watchdog halts a moving head meanwhile.
 REPEATED_S, AGAIN_S = 0.5, 5e-3
-# Longest wait of a camera for its next frame [s]; later none will come.
-PATIENCE_S = 1.0
 # Time after which a zoom camera that repeats a frame is reported [s].
 BLIND_S = 0.5
 # Time after which it is an error [s]: longer than the 5 s for which a driver tries to reconnect to its camera.
@@ -208,11 +204,6 @@ class FollowSettings(ControllerSettings):
     finder: MakeFinder = CloseupFinder
     policy: Callable[[], Policy] = FirstCome
 
-    @classmethod
-    def of(cls, config: RigConfig, **changes: Any) -> "FollowSettings":
-        """Make the settings for a rig, with the command delays of its head and lens, and given changes by name."""
-        return cls(command_delay_s=config.command_delay_s, lens_delay_s=config.lens_delay_s, **changes)
-
 
 @dataclass(frozen=True)
 class Step:
@@ -280,7 +271,7 @@ def follow(
         target: target profile, or its name in the rig's configuration.
         detector: detector for the fixed camera's images; by default the one that the target profile names.
         seconds: duration on the rig's clock [s].
-        settings: settings of the run; by default with the delays of the rig's configuration.
+        settings: settings of the run.
 
     Raises:
         CalibrationError: the calibration has no T.
@@ -293,9 +284,9 @@ def follow(
     calibration.hand_eye()  # raises with the first step, not when the first target is seen
     wanted = opened_from(rig).target(target) if isinstance(target, str) else target
     if detector is None:
-        detector = make_detector(wanted, opened_from(rig).rate_hz)
+        detector = make_detector(wanted, rig.spec.fixed.rate_hz)
     if settings is None:
-        settings = FollowSettings.of(opened_from(rig))
+        settings = FollowSettings()
     fitting = calibration.for_streams(rig.fixed.size, rig.zoom.size)
     loop = _Loop(rig, fitting, wanted, detector, settings)
     end = rig.clock.now() + seconds

@@ -4,6 +4,7 @@ A rig is the MuJoCo simulation, real devices, or a recording; the pipeline canno
 advances the rig's own clock, which is simulated time in the simulation.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
@@ -21,6 +22,11 @@ if TYPE_CHECKING:
 Image = npt.NDArray[np.uint8]
 Angles = tuple[float, float]  # pan and tilt [rad]
 Speed = float | tuple[float, float]  # one speed for both axes of a head, or one each for pan and tilt [rad/s]
+
+# Longest wait of a camera for its next frame [s]; later none will come.
+PATIENCE_S = 1.0
+# A frame cannot be from the future; this tolerance allows for a configured latency that is too long [s].
+FUTURE_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -156,7 +162,7 @@ class Camera(Protocol):
     def size(self) -> tuple[int, int]:
         """(width, height) [px]."""
 
-    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
+    def read(self, newer_than: float | None = None, timeout: float = PATIENCE_S) -> Frame:
         """Wait for the newest frame; with ``newer_than`` [s], for one exposed after that time.
 
         Raises:
@@ -229,51 +235,109 @@ class Board(Protocol):
         """Request the board to swing to and fro along its x axis about a pose, until the next request."""
 
 
-class Rig(Protocol):
-    """Two cameras, a head, a clock and a board. A context manager that halts, then closes."""
+class Guard(Protocol):
+    """The safety layer of a guarded rig."""
+
+    def stop(self, reason: str) -> None:
+        """Halt the head, and refuse every move until `clear`; may be called from any thread."""
+
+    def clear(self) -> str | None:
+        """End the emergency stop; return its reason."""
 
     @property
-    def fixed(self) -> Camera:
-        """The fixed camera."""
+    def stopped(self) -> str | None:
+        """Reason of the emergency stop; None if there is none."""
+
+    def close_after(self, error: BaseException) -> None:
+        """Halt the head, then release the devices; a failure does not hide the error that led here."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Two cameras, a head, a clock and a board. A context manager that halts, then closes.
+
+    A rig with other devices is made by `dataclasses.replace`; closing either closes both.
+
+    Attributes:
+        fixed: the fixed camera.
+        zoom: the zoom camera on the head.
+        head: the pan-tilt head.
+        clock: the rig's clock.
+        board: the calibration board's holder.
+        spec: what the devices know of themselves.
+        release: halts the head and releases the devices; may be called again.
+        config: the configuration that the rig was opened from; None if it was made in another way.
+        guard: the safety layer, see `cotarget.safety.safe_rig.guard`; None for a rig without.
+    """
+
+    fixed: Camera
+    zoom: ZoomCamera
+    head: PanTilt
+    clock: Clock
+    board: Board
+    spec: RigSpec
+    release: Callable[[], None]
+    config: "RigConfig | None" = None
+    guard: Guard | None = None
+
+    def stop(self, reason: str) -> None:
+        """Emergency stop: halt the head, and refuse every move until `clear`; may be called from any thread.
+
+        Raises:
+            DeviceError: the rig has no safety layer, so the head was halted and may be moved again.
+        """
+        if self.guard is None:
+            self.head.halt()
+            raise DeviceError(f"the head was halted, but nothing keeps it from moving again: {UNGUARDED} ({reason})")
+        self.guard.stop(reason)
+
+    def clear(self) -> str | None:
+        """End the emergency stop, which only an operator may decide; return its reason, None if there was none.
+
+        Raises:
+            EmergencyStopError: a stop file exists.
+        """
+        return None if self.guard is None else self.guard.clear()
 
     @property
-    def zoom(self) -> ZoomCamera:
-        """The zoom camera on the head."""
-
-    @property
-    def head(self) -> PanTilt:
-        """The pan-tilt head."""
-
-    @property
-    def clock(self) -> Clock:
-        """The rig's clock."""
-
-    @property
-    def board(self) -> Board:
-        """The calibration board's holder."""
+    def stopped(self) -> str | None:
+        """Reason of the emergency stop; None if there is none."""
+        return None if self.guard is None else self.guard.stopped
 
     def close(self) -> None:
-        """Halt the head and release the devices."""
+        """Halt the head, then release the devices; may be called again.
+
+        Raises:
+            Exception: as the device raised it when it could not be halted, or closed.
+        """
+        self.release()
 
     def __enter__(self) -> "Rig":
         """Return the rig itself."""
+        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Halt, then close."""
+        if self.guard is None or error is None:
+            self.release()
+        else:
+            self.guard.close_after(error)
+
+
+UNGUARDED = "the rig is not guarded; open it by cotarget.open_rig, or guard it by cotarget.safety.safe_rig.guard"
 
 
 def opened_from(rig: Rig) -> "RigConfig":
-    """Return the configuration that a rig was opened from, its attribute ``config``.
+    """Return the configuration that a rig was opened from.
 
     Raises:
         ConfigError: the rig was made in another way and has none.
     """
-    config: RigConfig | None = getattr(rig, "config", None)
-    if config is None:
+    if rig.config is None:
         raise ConfigError(
-            f"a {type(rig).__name__} has no configuration: open the rig by cotarget.open_rig, or pass the board, or "
-            "the target's table, a detector and settings"
+            "the rig has no configuration: open it by cotarget.open_rig, or pass the board, or the target's table, a "
+            "detector and settings"
         )
-    return config
+    return rig.config

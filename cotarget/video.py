@@ -18,8 +18,9 @@ import cv2
 import numpy as np
 
 from cotarget.errors import CotargetError
-from cotarget.files import HeldSignals, PartFile, write_all
+from cotarget.files import PartFile, write_all
 from cotarget.rig import Frame, Image
+from cotarget.safety.signals import DeferredSignals
 
 # Codecs in which a packet without a frame is normal.
 HIDES_FRAMES = ("vp8",)
@@ -319,8 +320,8 @@ class FilmWriter:
         height, width = image.shape[:2]
         if height % 2 or width % 2:
             image = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE).astype(np.uint8)
-        held = HeldSignals()  # an exception while the file is written would be lost in FFmpeg
-        held.hold()
+        deferred = DeferredSignals()  # an exception while the file is written would be lost in FFmpeg
+        deferred.defer()
         try:
             if self._stream is None:
                 self._stream, self._begin = self._begun(image, t), t
@@ -334,8 +335,8 @@ class FilmWriter:
         except (av.error.FFmpegError, ValueError) as error:
             self._file.refuse(error)
         finally:
-            held.restore()
-        held.deliver()
+            deferred.restore()
+        deferred.deliver()
         if self._file.failure is not None:
             raise self._said(self._file.failure)
 

@@ -22,7 +22,7 @@ from cotarget.geometry import pose
 from cotarget.pipeline import FollowSettings, follow
 from cotarget.recording.recorder import Recorder
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
-from cotarget.safety import SafeRig
+from tests.rigs import guarded, rig_of
 
 SIZE = (96, 72)
 RATE_HZ, ZOOM_RATE_HZ = 25.0, 10.0
@@ -33,10 +33,10 @@ SPEED = math.radians(149)
 LIMITS = PanTiltLimits((-2.7, 2.7), (-0.8, 0.5), SPEED, math.radians(206), STEP)
 FOCALS = (100.0, 1200.0)
 CONFIG = RigConfig(targets={"bird": replace(DEFAULT_TARGETS["bird"], wanted_px=30.0)})
-SETTINGS = FollowSettings(command_delay_s=0.04)
+SETTINGS = FollowSettings()
 
 
-class ToyRig:
+class ToyDevices:
     """A bright bird on a noisy sky; a head and a lens that go straight to where they are sent."""
 
     def __init__(self, failing=None, real_time=False):
@@ -63,11 +63,10 @@ class ToyRig:
     def close(self):
         self.closed = True
 
-    def __enter__(self):
-        return self
 
-    def __exit__(self, *_):
-        self.close()
+def toy_rig(failing=None, real_time=False):
+    """The rig of such devices."""
+    return rig_of(ToyDevices(failing, real_time))
 
 
 class ToyCamera:
@@ -181,21 +180,21 @@ def calibration_file(folder: Path) -> Path:
 
 def run(rig, calibration, seconds=2.0, settings=SETTINGS):
     """The pipeline as the commands run it."""
-    with SafeRig(rig, CONFIG.safety) as safe:
+    with guarded(rig, CONFIG.safety) as safe:
         yield from follow(safe, calibration, CONFIG.target("bird"), Bright(), seconds=seconds, settings=settings)
 
 
 def record(folder: Path, calibration: Path, rig=None, **options):
     """Record a run; its steps."""
     with Recorder(folder, CONFIG, calibration, "bird") as recorder:
-        return list(run(recorder.wrap(rig or ToyRig()), load_calibration(calibration), **options))
+        return list(run(recorder.wrap(rig_of(rig or ToyDevices())), load_calibration(calibration), **options))
 
 
 def main():
     folder = Path(sys.argv[1])
     path = calibration_file(folder)
     with Recorder(folder / "recording", CONFIG, path, "bird") as recorder:
-        for index, _ in zip(itertools.count(), run(recorder.wrap(ToyRig()), load_calibration(path), math.inf)):
+        for index, _ in zip(itertools.count(), run(recorder.wrap(toy_rig()), load_calibration(path), math.inf)):
             while recorder.waiting:  # this rig is faster than any real one, and than the disk
                 time.sleep(0.001)
             print(index, flush=True)

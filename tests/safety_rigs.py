@@ -64,7 +64,7 @@ class NotingHead(SimPanTilt):
         return [t for what, t in self.log if what == "halt"]
 
 
-class SimulatedRig:
+class SimulatedDevices:
     """Time passes inside calls only."""
 
     def __init__(self):
@@ -109,7 +109,7 @@ class RealHead:
         assert self.halted.wait(DEADLINE_S)
 
 
-class RealRig:
+class RealDevices:
     """Real time; the thread watches."""
 
     real_time = True

@@ -20,7 +20,6 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import TypeVar
 
 import numpy as np
@@ -71,12 +70,9 @@ from cotarget.errors import CalibrationError, CotargetError, HaltedError, StaleF
 from cotarget.geometry import Array, RigidTransform, Rotation, pose_dict
 from cotarget.pantilt import base_head, solve
 from cotarget.rig import (
-    Board,
-    Camera,
     Clock,
     Frame,
     Image,
-    PanTilt,
     PanTiltLimits,
     PanTiltState,
     Rig,
@@ -831,8 +827,14 @@ def _seen(lens: Intrinsics, x_zoom: Array) -> Array:
 
 
 def with_stills(rig: Rig) -> Rig:
-    """Wrap a rig so that its zoom camera takes full stills; return it as it is where stills have the stream's size."""
-    return rig if rig.zoom.still_size == rig.zoom.size else _StillsRig(rig)
+    """Return a rig whose zoom camera takes full stills; the rig itself where stills have the stream's size."""
+    if rig.zoom.still_size == rig.zoom.size:
+        return rig
+    zoom, factor = StillCamera(rig.zoom, rig.clock), rig.zoom.still_size[0] / rig.zoom.size[0]
+    spec = replace(
+        rig.spec.zoom, size=zoom.size, focal_range=zoom.focal_range, pitch_mm=rig.spec.zoom.pitch_mm / factor
+    )
+    return replace(rig, zoom=zoom, spec=replace(rig.spec, zoom=spec))
 
 
 class StillCamera:
@@ -882,33 +884,6 @@ class StillCamera:
     def capture(self) -> Frame:
         """Take a still."""
         return self._camera.capture()
-
-
-class _StillsRig:
-    """Rig whose zoom camera is replaced by a `StillCamera`."""
-
-    def __init__(self, rig: Rig) -> None:
-        self._rig = rig
-        self.config: RigConfig | None = getattr(rig, "config", None)
-        self.fixed: Camera = rig.fixed
-        self.zoom: ZoomCamera = StillCamera(rig.zoom, rig.clock)
-        self.head: PanTilt = rig.head
-        self.clock: Clock = rig.clock
-        self.board: Board = rig.board
-
-    def close(self) -> None:
-        """Close the rig."""
-        self._rig.close()
-
-    def __enter__(self) -> "_StillsRig":
-        """Return the rig."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the rig."""
-        self.close()
 
 
 # The session

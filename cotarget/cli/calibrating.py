@@ -30,7 +30,7 @@ def calibrate(options: argparse.Namespace) -> None:
     from cotarget.calibration.calibrate import calibrate as calibrate_rig
     from cotarget.calibration.session import SETTLE, SETTLE_LONG, with_stills
     from cotarget.config import BoardConfig, load_config
-    from cotarget.safety import refuse_if_stopped
+    from cotarget.safety.stop_file import refuse_if_stopped
 
     config = None if options.rig is None else load_config(options.rig)
     inputs = _photos(options) if config is None else rig_files(options.rig, config)

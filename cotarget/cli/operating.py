@@ -215,11 +215,11 @@ ACCURACY_S = 0.01
 
 def latency(options: argparse.Namespace) -> None:
     """Run `cotarget latency`: measure the latencies of cameras, head and lens, and print them as keys of rig.toml."""
-    from cotarget.backends import open_rig
+    from cotarget.backends import describe, open_rig
     from cotarget.calibration import load_calibration
     from cotarget.config import load_config
     from cotarget.latency import measure_fixed, measure_head, measure_lens
-    from cotarget.safety import refuse_if_stopped
+    from cotarget.safety.stop_file import refuse_if_stopped
 
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
@@ -228,7 +228,8 @@ def latency(options: argparse.Namespace) -> None:
     calibration = None if options.calibration is None else load_calibration(options.calibration)
     if calibration is not None:  # refused before the head moves
         calibration.hand_eye()
-        calibration.for_streams(*config.stream_sizes)
+        spec = describe(config)
+        calibration.for_streams(spec.fixed.size, spec.zoom.size)
         check_board_is_told(options.rig, config)
     tables = config.sim if config.backend == "sim" else config.hardware
     where = "sim" if config.backend == "sim" else "hardware"
@@ -272,7 +273,7 @@ def point(options: argparse.Namespace) -> None:
     from cotarget.calibration.captures import write_image
     from cotarget.calibration.session import wait_for_lens
     from cotarget.config import load_config
-    from cotarget.safety import refuse_if_stopped
+    from cotarget.safety.stop_file import refuse_if_stopped
 
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
@@ -290,9 +291,9 @@ def point(options: argparse.Namespace) -> None:
                 low, high = map(math.degrees, bounds)
                 check_within(option, angle, (low, high), "the head's {} degrees", math.degrees(limits.step))
         if options.focal_mm is not None:
-            shortest, longest = (focal * config.pitch_mm for focal in rig.zoom.focal_range)
+            shortest, longest = (focal * rig.spec.zoom.pitch_mm for focal in rig.zoom.focal_range)
             check_within("--focal-mm", options.focal_mm, (shortest, longest), "the lens's {} mm")
-            rig.zoom.zoom(options.focal_mm / config.pitch_mm)
+            rig.zoom.zoom(options.focal_mm / rig.spec.zoom.pitch_mm)
         now = rig.head.state()
         pan, tilt = (
             here if wanted is None else math.radians(wanted)
@@ -309,7 +310,7 @@ def point(options: argparse.Namespace) -> None:
         {
             "pan_deg": math.degrees(head.pan),
             "tilt_deg": math.degrees(head.tilt),
-            "focal_mm": lens.focal_px * config.pitch_mm,
+            "focal_mm": lens.focal_px * rig.spec.zoom.pitch_mm,
             "pictures": {name: str(path) for name, path in shots.items()},
         }
     )
@@ -317,7 +318,7 @@ def point(options: argparse.Namespace) -> None:
 
 def stop(options: argparse.Namespace) -> None:
     """Run `cotarget stop`: write the stop file."""
-    from cotarget.safety import write_stop_file
+    from cotarget.safety.stop_file import write_stop_file
 
     path = _stop_file(options.rig)
     write_stop_file(path, options.reason)
@@ -326,7 +327,7 @@ def stop(options: argparse.Namespace) -> None:
 
 def clear(options: argparse.Namespace) -> None:
     """Run `cotarget clear`: remove the stop file."""
-    from cotarget.safety import clear_stop_file
+    from cotarget.safety.stop_file import clear_stop_file
 
     path = _stop_file(options.rig)
     reason = clear_stop_file(path)
@@ -339,7 +340,8 @@ def reset_head(options: argparse.Namespace) -> None:
     from cotarget.drivers.clock import MonotonicClock
     from cotarget.drivers.interlock import PositionLostMarker
     from cotarget.drivers.ptu_d46 import reset
-    from cotarget.safety import StopLook, end_politely, refuse_if_stopped
+    from cotarget.safety.signals import end_politely
+    from cotarget.safety.stop_file import StopLook, refuse_if_stopped
 
     config = load_config(options.rig)
     head = config.hardware.head

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from cotarget.metrics import Label, Tracked
     from cotarget.pipeline import Step
     from cotarget.rig import Rig
-    from cotarget.safety import SafeRig
     from cotarget.sim.truth import Truth
     from cotarget.sim.viewer.scene import Snapshot
     from cotarget.sim.world import SimWorld
@@ -121,10 +120,10 @@ def _sights(
 ) -> "Iterator[Snapshot]":
     """Give the snapshots: of the pipeline following a target, or of the rig at rest without one."""
     from cotarget.evaluation import true_calibration
-    from cotarget.safety import SafeRig
+    from cotarget.safety.safe_rig import guard
 
     seconds = math.inf if options.seconds is None else options.seconds
-    with SafeRig(world.rig, config.safety) as rig:
+    with guard(world.rig, config.safety) as rig:
         if options.target is None:
             yield from _at_rest(rig, world.truth(), seconds)
         else:
@@ -147,16 +146,13 @@ def _at_rest(rig: "Rig", truth: "Truth", seconds: float) -> "Iterator[Snapshot]"
 def _followed(
     name: str, config: "RigConfig", calibration: "Calibration", world: "SimWorld", rig: "Rig", seconds: float
 ) -> "Iterator[Snapshot]":
-    from cotarget.detection import make_detector
     from cotarget.drawing import draw_wide, draw_zoom
-    from cotarget.pipeline import FollowSettings, follow
+    from cotarget.pipeline import follow
     from cotarget.sim.viewer.scene import Snapshot, frusta_of
 
     truth = world.truth()
     target = config.target(name)
-    settings = FollowSettings.of(config)
-    detector = make_detector(target, config.rate_hz)
-    for step in follow(rig, calibration, target, detector, seconds=seconds, settings=settings):
+    for step in follow(rig, calibration, target, seconds=seconds):
         depths = {} if step.aim is None else {"zoom": step.aim.range}
         caption = f"t = {step.t:.1f} s   {name}: {step.state}"
         pictures = {"fixed": draw_wide(step), "zoom": draw_zoom(step)}
@@ -175,11 +171,12 @@ def demo(options: argparse.Namespace) -> None:
 
 def follow(options: argparse.Namespace) -> None:
     """Run `cotarget follow`: follow a target with the rig, and record it on request."""
-    from cotarget.backends import open_devices
+    from cotarget.backends import describe, open_rig
     from cotarget.calibration import load_calibration
     from cotarget.config import load_config
     from cotarget.recording.recorder import Recorder
-    from cotarget.safety import SafeRig, refuse_if_stopped
+    from cotarget.safety.safe_rig import guard
+    from cotarget.safety.stop_file import refuse_if_stopped
 
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
@@ -188,28 +185,31 @@ def follow(options: argparse.Namespace) -> None:
     check_shown(config, options.target, options.rig)
     inputs = [*rig_files(options.rig, config), options.calibration]
     check_outputs([options.csv, options.video], inputs, options.record)
-    choice = Choice(options, config.stream_sizes[0])
+    spec = describe(config)
+    choice = Choice(options, spec.fixed.size)
     with (
         Recorder(options.record, config, options.calibration, options.target, choice.target_choice)
         if options.record
         else nothing() as recorder
     ):
 
-        def opened() -> SafeRig:
-            return SafeRig(recorder.wrap(open_devices(config)) if recorder else open_devices(config), config.safety)
+        def opened() -> "Rig":
+            rig = open_rig(config, guarded=False)
+            return guard(recorder.wrap(rig) if recorder else rig, config.safety)
 
-        states = _follow(opened, calibration, config, options, options.target, choice, options.seconds)
+        rate_hz = spec.fixed.rate_hz
+        states = _follow(opened, calibration, config, rate_hz, options, options.target, choice, options.seconds)
     _tell_if_nothing_was_seen("follow", options.target, states["states"], choice)
     print_json(states)
 
 
 def replay(options: argparse.Namespace) -> int:
     """Run `cotarget replay`: run the pipeline on a recording and compare its commands; return the exit status."""
+    from cotarget.backends import open_recording
     from cotarget.calibration import load_calibration
     from cotarget.metrics import Tracked, read_labels
-    from cotarget.recording.format import open_recording
-    from cotarget.recording.replay import ReplayRig
-    from cotarget.safety import SafeRig
+    from cotarget.recording.replay import Replay
+    from cotarget.safety.safe_rig import guard
 
     recording = open_recording(options.recording)
     for note in recording.notes:
@@ -224,14 +224,16 @@ def replay(options: argparse.Namespace) -> int:
         number = pictures[step.fixed.t]
         tracks.extend(Tracked(number, step.fixed.t, each.id, each.center_px) for each in step.tracks if each.confirmed)
 
-    played = ReplayRig(recording)
-    choice = Choice(options, played.fixed.size, recording.target_choice)
+    played, rate_hz = Replay(recording), recording.spec.fixed.rate_hz
+    choice = Choice(options, recording.spec.fixed.size, recording.target_choice)
     config, name, steps = recording.config, recording.target, recording.steps
-    states = _follow(
-        lambda: SafeRig(played, config.safety), calibration, config, options, name, choice, math.inf, steps, see
-    )
+
+    def opened() -> "Rig":
+        return guard(played.rig, config.safety)
+
+    states = _follow(opened, calibration, config, rate_hz, options, name, choice, math.inf, steps, see)
     _tell_if_nothing_was_seen("replay", recording.target, states["states"], choice)
-    scores = _scores(options, tracks, labels, config.rate_hz, max(pictures.values(), default=-1) + 1)
+    scores = _scores(options, tracks, labels, rate_hz, max(pictures.values(), default=-1) + 1)
     differences = played.differences
     print_json(states | {"differences": dataclasses.asdict(differences)} | scores)
     if not differences.same:
@@ -240,9 +242,10 @@ def replay(options: argparse.Namespace) -> int:
 
 
 def _follow(
-    opened: "Callable[[], SafeRig]",
+    opened: "Callable[[], Rig]",
     calibration: "Calibration",
     config: "RigConfig",
+    rate_hz: float,
     options: argparse.Namespace,
     name: str,
     choice: Choice,
@@ -254,7 +257,6 @@ def _follow(
 
     However it ends, the head is halted first. The files are completed afterwards, with the steps up to then.
     """
-    from cotarget.backends import describe
     from cotarget.detection import make_detector
     from cotarget.drawing import side_by_side
     from cotarget.pipeline import FollowSettings, State, follow
@@ -263,16 +265,15 @@ def _follow(
     from cotarget.video import FilmWriter
 
     target = config.target(name)
-    spec = describe(config)
-    detector = make_detector(target, spec.fixed.rate_hz)
-    settings = FollowSettings.of(config, policy=choice.policy)
+    detector = make_detector(target, rate_hz)
+    settings = FollowSettings(policy=choice.policy)
     states: dict[str, int] = dict.fromkeys(State, 0)
-    reasons, skipped = Reasons(), SkippedFrames(spec.fixed.rate_hz)
-    expected = math.ceil(seconds * spec.fixed.rate_hz) if frames is None else frames
+    reasons, skipped = Reasons(), SkippedFrames(rate_hz)
+    expected = math.ceil(seconds * rate_hz) if frames is None else frames
     is_live, first_t = config.backend == "hardware" and frames is None, None
     with (
         StepTable(options.csv, keep=True) as table,
-        FilmWriter(options.video, spec.fixed.rate_hz, keep=True) if options.video else nothing() as film,
+        FilmWriter(options.video, rate_hz, keep=True) if options.video else nothing() as film,
         progress_bar() as progress,
         opened() as rig,
     ):

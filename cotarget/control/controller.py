@@ -28,15 +28,11 @@ class ControllerSettings:
     """Settings of the controller.
 
     Attributes:
-        command_delay_s: time from a command to the start of the head's motion [s].
-        lens_delay_s: time from a command to the start of the lens's motion [s]; by default that of the head.
         predict: whether to predict the target's motion; without it the head goes to where the target was seen.
         head_controller: settings of the head controller.
         zoom: settings of the zoom controller.
     """
 
-    command_delay_s: float = 0.0
-    lens_delay_s: float | None = None
     predict: bool = True
     head_controller: HeadSettings = field(default_factory=HeadSettings)
     zoom: ZoomSettings = field(default_factory=ZoomSettings)
@@ -109,8 +105,8 @@ class Controller:
         course = self._course(predict, seen_t, interval)
         self._command_head(course, interval)
         pan, tilt, focal = self.commanded
-        now, lens_delay_s = self._rig.clock.now(), self._settings.lens_delay_s
-        exposed = interval + (course.effect_t if lens_delay_s is None else now + lens_delay_s)
+        now = self._rig.clock.now()
+        exposed = interval + (now + self._rig.spec.zoom.delay_s)
         (pan_then, _), (tilt_then, _) = self._head_controller.head.at(exposed)
         then = predict(exposed if self._settings.predict else seen_t)
         choice = self._zoom.choose(
@@ -153,7 +149,7 @@ class Controller:
     def _course(self, predict: Predict, seen_t: float, interval: float) -> _Course:
         """Compute the wanted motion of the head. Raises as `drive` does."""
         now = self._rig.clock.now()
-        effect = now + self._settings.command_delay_s
+        effect = now + self._rig.spec.head.delay_s
         times = (effect, effect + interval) if self._settings.predict else (seen_t, seen_t)
         at_effect, then = (predict(t) for t in times)
         if at_effect is None or then is None:

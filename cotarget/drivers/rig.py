@@ -3,7 +3,7 @@
 import contextlib
 import math
 import sys
-from types import TracebackType
+from dataclasses import replace
 
 from cotarget.config import RigConfig
 from cotarget.drivers.axis import AxisCamera
@@ -13,46 +13,12 @@ from cotarget.drivers.gphoto_camera import GphotoCamera
 from cotarget.drivers.interlock import rig_lock
 from cotarget.drivers.polled_head import D46Head
 from cotarget.errors import ConfigError
-from cotarget.rig import Board, CameraSpec, HeadSpec, PanTiltLimits, RigSpec, ZoomSpec
+from cotarget.rig import CameraSpec, HeadSpec, PanTiltLimits, Rig, RigSpec, ZoomSpec
 
 # Python's thread switch interval [s], instead of 5 ms: a driver's thread that waits for its turn delays every command.
 # Measurements: docs/design-notes.md.
 SWITCH_INTERVAL = 5e-4
 NEEDED = (("head", "port", "/dev/ttyUSB0"), ("fixed", "url", "http://192.168.0.90"), ("zoom", "port", "usb:"))
-
-
-class HardwareRig:
-    """The real rig: open devices, and the stack that closes them."""
-
-    real_time = True  # time passes without calls: the safety layer's watchdog needs a thread
-
-    def __init__(
-        self,
-        fixed: AxisCamera,
-        zoom: GphotoCamera,
-        head: D46Head,
-        clock: MonotonicClock,
-        board: Board,
-        opened: contextlib.ExitStack,
-        config: RigConfig,
-    ) -> None:
-        self.config = config
-        self.fixed, self.zoom, self.head, self.clock, self.board = fixed, zoom, head, clock, board
-        self._opened = opened
-
-    def close(self) -> None:
-        """Halt the head and release the devices; may be called again."""
-        self._opened.close()
-
-    def __enter__(self) -> "HardwareRig":
-        """Return the rig itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Halt, then close."""
-        self.close()
 
 
 def rig_spec(config: RigConfig) -> RigSpec:
@@ -81,7 +47,7 @@ def rig_spec(config: RigConfig) -> RigSpec:
     )
 
 
-def open_hardware(config: RigConfig) -> HardwareRig:
+def open_hardware(config: RigConfig) -> Rig:
     """Open the devices of a configuration; the head comes last and does not move where another device is missing.
 
     Shortens the thread switch interval of this process (`SWITCH_INTERVAL`).
@@ -104,4 +70,11 @@ def open_hardware(config: RigConfig) -> HardwareRig:
         fixed = opened.enter_context(contextlib.closing(AxisCamera(hardware.fixed, clock)))
         zoom = opened.enter_context(contextlib.closing(GphotoCamera(hardware.zoom, clock)))
         head = opened.enter_context(contextlib.closing(D46Head(hardware.head, clock, config.safety)))
-        return HardwareRig(fixed, zoom, head, clock, board, opened.pop_all(), config)
+        spec = rig_spec(config)
+        reported = RigSpec(
+            fixed=replace(spec.fixed, size=fixed.size),
+            zoom=replace(spec.zoom, size=zoom.size, focal_range=zoom.focal_range, still_size=zoom.still_size),
+            head=replace(spec.head, limits=head.limits),
+            real_time=True,
+        )
+        return Rig(fixed, zoom, head, clock, board, reported, opened.pop_all().close, config)

@@ -27,8 +27,7 @@ from cotarget.config import (
 from cotarget.errors import ConfigError, choices
 from cotarget.evaluation import TruthDetector, TruthNoise, counted, true_calibration
 from cotarget.geometry import Array
-from cotarget.pipeline import PATIENCE_S
-from cotarget.rig import PanTiltState, ZoomState
+from cotarget.rig import PATIENCE_S, PanTiltState, ZoomState
 from cotarget.sim.model import has_clutter
 from cotarget.sim.render.pictures import SizedPictures
 from cotarget.sim.targets.random_paths import SECONDS, in_view

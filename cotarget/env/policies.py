@@ -10,6 +10,7 @@ goal at which the head, at full speed, is by the next step where the pipeline's 
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -23,14 +24,18 @@ from cotarget.env.follow import Follow
 from cotarget.env.schedule import Schedule
 from cotarget.errors import ConfigError
 from cotarget.pipeline import FollowSettings, Step, follow
-from cotarget.rig import Board, Clock, Frame, Image, PanTiltLimits, PanTiltState, Speed
+from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, Speed
 from cotarget.safety.safe_rig import clipped
 
 NEAR = 1e-6  # tolerance of an angle [rad]
 
 
 class Desk:
-    """A rig and a detector for `cotarget.pipeline.follow` that read an environment's last step."""
+    """A rig and a detector for `cotarget.pipeline.follow` that read an environment's last step.
+
+    Attributes:
+        rig: the rig; the environment owns its devices.
+    """
 
     mask: Image | None = None
 
@@ -41,11 +46,10 @@ class Desk:
             env: the environment; its episode provides the rig.
         """
         rig = env.episode.rig
-        self._env, self._interval = env, 1 / env.config.rate_hz
-        self.clock: Clock = rig.clock
-        self.board: Board = rig.board
-        self.fixed = Eye(lambda: env.wide, rig.fixed.size)
-        self.head, self.zoom = WishedHead(rig.head.limits, rig.head.state), WishedLens(env)
+        self._env, self._interval = env, 1 / rig.spec.fixed.rate_hz
+        self._head, self._zoom = WishedHead(rig.head.limits, rig.head.state), WishedLens(env)
+        fixed = Eye(lambda: env.wide, rig.fixed.size)
+        self.rig = replace(rig, fixed=fixed, zoom=self._zoom, head=self._head, release=lambda: None)
         self._model = HeadModel(rig.head.limits)
 
     def detect(self, frame: Frame) -> list[Detection]:
@@ -54,19 +58,19 @@ class Desk:
 
     def command(self) -> Command:
         """Compute the command that carries out the pipeline's requests."""
-        state, wish = self.head.state(), self.head.wish
+        state, wish = self._head.state(), self._head.wish
         self._model.saw(state)
         if wish is None:
-            return *clipped(state.pan, state.tilt, self.head.limits), self.zoom.wish
+            return *clipped(state.pan, state.tilt, self._head.limits), self._zoom.wish
         pan, tilt = wish.pan, wish.tilt
-        effect = self.clock.now() + self._env.config.command_delay_s
+        effect = self.rig.clock.now() + self.rig.spec.head.delay_s
         if wish.speed is not None:
-            speeds = self.head.limits.capped(wish.speed)
+            speeds = self._head.limits.capped(wish.speed)
             axes = zip(self._model.at(effect), (pan, tilt), speeds, strict=True)
             pan, tilt = (self._hurried(x, v, goal, speed) for (x, v), goal, speed in axes)
-            pan, tilt = clipped(pan, tilt, self.head.limits)
+            pan, tilt = clipped(pan, tilt, self._head.limits)
         self._model.obeys(effect, HeadCommand(pan, tilt, None))
-        return pan, tilt, self.zoom.wish
+        return pan, tilt, self._zoom.wish
 
     def _hurried(self, x: float, v: float, goal: float, speed: float) -> float:
         """Find the goal that at full speed brings an axis as far by the next step as a slower command would [rad].
@@ -77,7 +81,7 @@ class Desk:
             goal: goal of the slower command [rad].
             speed: speed of the slower command [rad/s].
         """
-        limits, interval = self.head.limits, self._interval
+        limits, interval = self._head.limits, self._interval
         there, _ = axis_at(interval, x, v, goal, speed, limits.acceleration)
 
         def beyond(end: float) -> float:
@@ -87,16 +91,6 @@ class Desk:
         if beyond(x - far) >= 0 or beyond(x + far) <= 0:
             return goal
         return float(brentq(beyond, x - far, x + far, xtol=NEAR))
-
-    def close(self) -> None:
-        """Do nothing: the environment owns the devices."""
-
-    def __enter__(self) -> "Desk":
-        """Return the rig itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing: the environment owns the devices."""
 
 
 class Eye:
@@ -171,9 +165,9 @@ class PipelinePolicy:
         env = self._env
         if env.episode is not self._episode:
             self._episode, self._desk = env.episode, Desk(env)
-            settings = FollowSettings.of(env.config, closed_loop=False)
+            settings = FollowSettings(closed_loop=False)
             self._steps: Iterator[Step] = follow(
-                self._desk, env.calibration, env.target, self._desk, seconds=math.inf, settings=settings
+                self._desk.rig, env.calibration, env.target, self._desk, seconds=math.inf, settings=settings
             )
         if env.wide is not self._seen:
             next(self._steps)

@@ -170,11 +170,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
         paths = group_paths(self.kind, seed)
         episode, self._asked = self._open(paths, seed), Asked()
         asked = self._asked
-        settings = FollowSettings.of(
-            self.config,
-            closed_loop=False,
-            policy=lambda: asked,
-        )
+        settings = FollowSettings(closed_loop=False, policy=lambda: asked)
         self._steps: Iterator[Step] = follow(
             episode.rig, self.calibration, self.target, episode.detector, seconds=math.inf, settings=settings
         )

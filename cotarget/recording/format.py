@@ -14,8 +14,10 @@ The last line of a run that ended in order, or by an error, is an `end`. `open_r
 import dataclasses
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,8 @@ from typing import Any
 from cotarget.config import RigConfig, expect_table, parse_config
 from cotarget.control.selection import TargetChoice, parse_choice
 from cotarget.errors import ConfigError, choices
-from cotarget.rig import PanTiltLimits, Speed
+from cotarget.geometry import RigidTransform
+from cotarget.rig import CameraSpec, Frame, HeadSpec, PanTiltLimits, PanTiltState, RigSpec, ZoomSpec, ZoomState
 
 SCHEMA = 1
 META, LOG, CALIBRATION, TEMPLATE = "recording.json", "log.jsonl", "calibration.json", "template"
@@ -60,6 +63,7 @@ class Event:
         image: file of a frame's image; None if the image was not stored.
         size_bytes: size of that file [bytes].
         error: the exception's name and message if the call failed.
+        error_class: name of its nearest base class in `cotarget.errors`, for an exception of another module.
         aside: whether another thread than the run's own called, such as a watchdog.
     """
 
@@ -70,33 +74,36 @@ class Event:
     image: str | None = None
     size_bytes: int = 0
     error: tuple[str, str] | None = None
+    error_class: str = ""
     aside: bool = False
 
 
-@dataclass(frozen=True)
-class RigFacts:
-    """Constant properties of a rig.
-
-    Attributes:
-        fixed_size: (width, height) of the fixed camera's frames [px].
-        zoom_size: (width, height) of the zoom camera's frames [px].
-        still_size: (width, height) of the zoom camera's stills [px].
-        focal_range: shortest and longest nominal focal length [px].
-        limits: of the head.
-        real_time: whether time passes without calls; the safety layer needs to know.
-    """
-
-    fixed_size: tuple[int, int]
-    zoom_size: tuple[int, int]
-    still_size: tuple[int, int]
-    focal_range: tuple[float, float]
-    limits: PanTiltLimits
-    real_time: bool
+def argument_numbers(call: str, arguments: Sequence[Any]) -> tuple[Number, ...]:
+    """Flatten the arguments of a call, in the order of its signature, as an event has them."""
+    if call == "board.present" and arguments[0] is None:
+        return ()
+    return tuple(number for each in arguments for number in ((None,) if each is None else _numbers_of(each)))
 
 
-def move_args(pan: float, tilt: float, speed: Speed | None, wait: bool) -> tuple[Number, ...]:
-    """Flatten the arguments of `head.move` as an event has them."""
-    return (pan, tilt, *(speed if isinstance(speed, tuple) else (speed,)), wait)
+def result_numbers(result: Any) -> tuple[Number, ...]:
+    """Flatten the result of a call as an event has it; a frame's image is stored apart."""
+    match result:
+        case None:
+            return ()
+        case Frame():
+            return (result.t,)
+        case ZoomState() | PanTiltState():
+            return dataclasses.astuple(result)
+    return _numbers_of(result)
+
+
+def _numbers_of(value: Any) -> tuple[Number, ...]:
+    match value:
+        case tuple():
+            return value
+        case RigidTransform():
+            return tuple(float(v) for v in (*value.translation, *value.rotation.as_rotvec()))
+    return (value,)
 
 
 def event_line(event: Event) -> str:
@@ -110,6 +117,8 @@ def event_line(event: Event) -> str:
         row |= {"image": event.image, "bytes": event.size_bytes}
     if event.error is not None:
         row["error"] = list(event.error)
+        if event.error_class:
+            row["error_class"] = event.error_class
     if event.aside:
         row["aside"] = True
     return json.dumps(row, allow_nan=False)
@@ -140,32 +149,44 @@ def parse_event(row: Mapping[str, Any]) -> Event:
     at = float(row["at"])
     if not math.isfinite(at):
         raise ValueError("at is not finite")
-    return Event(call, at, args, result, image, size, error, row.get("aside") is True)
+    return Event(call, at, args, result, image, size, error, str(row.get("error_class", "")), row.get("aside") is True)
 
 
-def facts_table(facts: RigFacts) -> dict[str, Any]:
-    """Write the facts of a rig as a JSON object."""
-    limits = facts.limits
+def spec_table(spec: RigSpec) -> dict[str, Any]:
+    """Write what a rig knows of itself as a JSON object."""
+    fixed, zoom, limits = spec.fixed, spec.zoom, spec.head.limits
     return {
-        "fixed_size": list(facts.fixed_size),
-        "zoom_size": list(facts.zoom_size),
-        "still_size": list(facts.still_size),
-        "focal_range_px": [_plain(value) for value in facts.focal_range],
+        "fixed_size": list(fixed.size),
+        "zoom_size": list(zoom.size),
+        "still_size": list(zoom.still_size),
+        "focal_range_px": [_plain(value) for value in zoom.focal_range],
         "pan": [_plain(value) for value in limits.pan],
         "tilt": [_plain(value) for value in limits.tilt],
         "speed": _plain(limits.speed),
         "acceleration": _plain(limits.acceleration),
         "step": _plain(limits.step),
-        "real_time": facts.real_time,
+        "real_time": spec.real_time,
+        "fixed_rate_hz": _plain(fixed.rate_hz),
+        "fixed_latency_s": _plain(fixed.latency_s),
+        "zoom_rate_hz": _plain(zoom.rate_hz),
+        "zoom_latency_s": _plain(zoom.latency_s),
+        "zoom_pitch_mm": _plain(zoom.pitch_mm),
+        "zoom_delay_s": _plain(zoom.delay_s),
+        "head_delay_s": _plain(spec.head.delay_s),
     }
 
 
-def parse_facts(table: Mapping[str, Any]) -> RigFacts:
-    """Parse the facts of a rig.
+def parse_spec(table: Mapping[str, Any], described: Callable[[], RigSpec]) -> RigSpec:
+    """Parse what a rig knows of itself.
+
+    Args:
+        table: the JSON object.
+        described: gives rates, latencies and delays, which an earlier version did not record, by the configuration.
 
     Raises:
         KeyError: a key is missing.
         TypeError, ValueError: a value has the wrong type.
+        ConfigError: as ``described`` raises it.
     """
 
     def pair(key: str) -> tuple[float, float]:
@@ -178,16 +199,22 @@ def parse_facts(table: Mapping[str, Any]) -> RigFacts:
             raise ValueError(f"{key} is not greater than zero")
         return width, height
 
-    return RigFacts(
-        size("fixed_size"),
-        size("zoom_size"),
-        size("still_size"),
-        pair("focal_range_px"),
-        PanTiltLimits(
-            pair("pan"), pair("tilt"), float(table["speed"]), float(table["acceleration"]), float(table["step"])
-        ),
-        bool(table["real_time"]),
+    fixed_size, zoom_size, still_size = size("fixed_size"), size("zoom_size"), size("still_size")
+    focal_range = pair("focal_range_px")
+    limits = PanTiltLimits(
+        pair("pan"), pair("tilt"), float(table["speed"]), float(table["acceleration"]), float(table["step"])
     )
+    if "head_delay_s" in table:
+        fixed = CameraSpec(fixed_size, float(table["fixed_rate_hz"]), float(table["fixed_latency_s"]))
+        rates = {key: float(table[f"zoom_{key}"]) for key in ("rate_hz", "latency_s", "pitch_mm", "delay_s")}
+        zoom = ZoomSpec(size=zoom_size, focal_range=focal_range, still_size=still_size, **rates)
+        head = HeadSpec(limits, float(table["head_delay_s"]))
+    else:
+        spec = described()
+        fixed = replace(spec.fixed, size=fixed_size)
+        zoom = replace(spec.zoom, size=zoom_size, focal_range=focal_range, still_size=still_size)
+        head = replace(spec.head, limits=limits)
+    return RigSpec(fixed, zoom, head, bool(table["real_time"]))
 
 
 def read_json(path: Path) -> Mapping[str, Any]:
@@ -252,7 +279,7 @@ class Recording:
         calibration: path of the run's calibration.json.
         target: name of the target that was followed.
         target_choice: which of several targets; the default in recordings of older versions.
-        facts: constant properties of the rig.
+        spec: what the rig knew of itself; its head's limits are the device's own.
         events: every call on the rig, in order.
         ending: "complete", the error that ended the run, or where a truncated log breaks off.
         truncated: whether the log has no end; then the last step, which may be incomplete, is left out.
@@ -264,7 +291,7 @@ class Recording:
     calibration: Path
     target: str
     target_choice: TargetChoice
-    facts: RigFacts
+    spec: RigSpec
     events: tuple[Event, ...]
     ending: str
     truncated: bool
@@ -287,8 +314,12 @@ class Recording:
         return self.events[-1].at - self.events[0].at if self.events else 0.0
 
 
-def open_recording(directory: Path) -> Recording:
+def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) -> Recording:
     """Read a recording up to where it is whole; images must exist, but are not read.
+
+    Args:
+        directory: folder of the recording.
+        describe: gives the spec of a configured rig, for what an earlier version did not record.
 
     Raises:
         ConfigError: the folder is no recording, has another schema, or holds nothing that can be replayed.
@@ -299,19 +330,19 @@ def open_recording(directory: Path) -> Recording:
     target, target_choice, config = _parse_meta(directory, meta)
     if not (directory / CALIBRATION).is_file():
         raise ConfigError(f"{directory / CALIBRATION}: no such file; the recording is not whole")
-    facts, rows, ending = None, [], ""
+    spec, rows, ending = None, [], ""
     stop = "the run stopped without an end"
     try:
         for number, row in _rows(directory / LOG):
             if "rig" in row:
-                facts = _facts(row["rig"], number)
+                spec = _spec(row["rig"], number, partial(describe, config))
             elif "end" in row:
                 ending = str(row["end"])
             else:
                 rows.append(_whole(directory, _event(row, number)))
     except _DamageError as damage:
         stop = str(damage)
-    if facts is None:
+    if spec is None:
         raise ConfigError(f"{directory}: holds nothing to replay: {stop}")
     notes = []
     if truncated := not ending:
@@ -331,12 +362,26 @@ def open_recording(directory: Path) -> Recording:
         directory / CALIBRATION,
         target,
         target_choice,
-        facts,
+        spec,
         tuple(rows),
         ending or stop,
         truncated,
         tuple(notes),
     )
+
+
+def read_spec(directory: Path, describe: Callable[[RigConfig], RigSpec]) -> RigSpec:
+    """Read only what the recorded rig knew of itself; the arguments are those of `read_recording`.
+
+    Raises:
+        ConfigError: the folder is no recording, has another schema, or does not say it.
+    """
+    _, _, config = _parse_meta(directory, read_json(directory / META))
+    with suppress(_DamageError):
+        for number, row in _rows(directory / LOG):
+            if "rig" in row:
+                return _spec(row["rig"], number, partial(describe, config))
+    raise ConfigError(f"{directory}: does not say what the recorded rig was")
 
 
 class _DamageError(Exception):
@@ -394,9 +439,9 @@ def _event(row: Mapping[str, Any], number: int) -> Event:
         raise _DamageError(f"line {number} of {LOG} is damaged: {_words(error)}") from None
 
 
-def _facts(table: Any, number: int) -> RigFacts:
+def _spec(table: Any, number: int, described: Callable[[], RigSpec]) -> RigSpec:
     try:
-        return parse_facts(table)
+        return parse_spec(table, described)
     except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise _DamageError(f"line {number} of {LOG} is damaged: {_words(error)}") from None
 

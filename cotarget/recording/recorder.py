@@ -1,13 +1,14 @@
 """Record a run: a table of its Steps, and every call on its rig with the result.
 
-`StepTable` writes the CSV. `Recorder` makes the folder of a recording and wraps the rig in a `RecordingRig`, which logs
-calls and results in order and changes neither. `RecordWriter` writes log and images on a thread of its own, so that the
+`StepTable` writes the CSV. `Recorder` makes the folder of a recording and gives the rig devices that log calls and
+results in order and change neither. `RecordWriter` writes log and images on a thread of its own, so that the
 run does not wait for the disk.
 """
 
 import collections
 import contextlib
 import dataclasses
+import inspect
 import json
 import logging
 import math
@@ -19,19 +20,20 @@ from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
 
+import cotarget.errors
 from cotarget.config import RigConfig, config_table
 from cotarget.control.selection import ANY_TARGET, TargetChoice, choice_table
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile
-from cotarget.geometry import RigidTransform
 from cotarget.pipeline import Step
 from cotarget.recording.format import (
     CALIBRATION,
+    CALLS,
     COMPLETE,
     FIXED,
     LOG,
@@ -40,26 +42,12 @@ from cotarget.recording.format import (
     TEMPLATE,
     ZOOM,
     Event,
-    Number,
-    RigFacts,
+    argument_numbers,
     event_line,
-    facts_table,
-    move_args,
+    result_numbers,
+    spec_table,
 )
-from cotarget.rig import (
-    Board,
-    Camera,
-    Clock,
-    Frame,
-    Image,
-    PanTilt,
-    PanTiltLimits,
-    PanTiltState,
-    Rig,
-    Speed,
-    ZoomCamera,
-    ZoomState,
-)
+from cotarget.rig import Board, Camera, Clock, Frame, Image, PanTilt, Rig, ZoomCamera
 
 log = logging.getLogger(__name__)
 # The log and its images
@@ -213,178 +201,71 @@ class RecordWriter:
 
 # The recorded rig
 
-T = TypeVar("T")
+PROTOCOLS = {"fixed": Camera, "zoom": ZoomCamera, "head": PanTilt, "clock": Clock, "board": Board}
 
 
-class _Notebook:
+class _CallLog:
     """Log of the calls on all devices of a rig; the thread that makes it is the run's own."""
 
     def __init__(self, clock: Clock, writer: RecordWriter) -> None:
         self._clock, self._writer, self._thread = clock, writer, threading.get_ident()
 
-    def ask(
-        self, call: str, args: tuple[Number, ...], answer: Callable[[], T], numbers: Callable[[T], tuple[Number, ...]]
-    ) -> T:
-        """Call a device, and log the result or the error."""
-        return self._ask(call, args, answer, lambda given: (numbers(given), "", None))
-
-    def look(self, call: str, camera: str, args: tuple[Number, ...], answer: Callable[[], Frame]) -> Frame:
-        """Read a frame, and log it with its image."""
-        return self._ask(call, args, answer, lambda frame: ((frame.t,), camera, frame))
-
-    def _ask(
-        self,
-        call: str,
-        args: tuple[Number, ...],
-        answer: Callable[[], T],
-        parts: Callable[[T], tuple[tuple[Number, ...], str, Frame | None]],
-    ) -> T:
+    def call(self, name: str, method: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        """Call a device, and log the result or the error; a frame is logged with its image."""
         aside = threading.get_ident() != self._thread
-        if aside and call == "clock.now":  # a watchdog reads the clock all the time
-            return answer()
+        if aside and name == "clock.now":  # a watchdog reads the clock all the time
+            return method()
+        args = argument_numbers(name, arguments)
         try:
-            given = answer()
+            answer = method(*arguments)
         except Exception as error:
             failure = (type(error).__name__, str(error))
-            self._writer.put(Event(call, self._clock.now(), args, error=failure, aside=aside))
+            event = Event(name, self._clock.now(), args, error=failure, error_class=known_class(error), aside=aside)
+            self._writer.put(event)
             raise
-        result, camera, frame = parts(given)
-        at = float(result[0] or 0.0) if call == "clock.now" else self._clock.now()
-        event = Event(call, at, args, result, aside=aside)
-        self._writer.put(event, camera, None if frame is None else frame.image)
-        return given
+        result = result_numbers(answer)
+        at = answer if name == "clock.now" else self._clock.now()
+        image = answer.image if isinstance(answer, Frame) else None
+        self._writer.put(Event(name, at, args, result, aside=aside), name.split(".")[0], image)
+        return answer
 
 
-class _Camera:
-    def __init__(self, camera: Camera, notes: _Notebook, name: str) -> None:
-        self._camera, self._notes, self._name = camera, notes, name
+class _LoggedDevice:
+    """A device whose calls in `CALLS` are logged; everything else is the device's own."""
 
-    @property
-    def size(self) -> tuple[int, int]:
-        return self._camera.size
+    def __init__(self, name: str, device: Any, log: _CallLog) -> None:
+        self._device = device
+        for call in CALLS:
+            of, method = call.split(".")
+            if of == name:
+                setattr(self, method, self._logged(call, method, log))
 
-    def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        args = (newer_than, timeout)
-        return self._notes.look(f"{self._name}.read", self._name, args, lambda: self._camera.read(newer_than, timeout))
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._device, name)
 
+    def _logged(self, call: str, method: str, log: _CallLog) -> Callable[..., Any]:
+        signature = inspect.signature(getattr(PROTOCOLS[call.split(".")[0]], method))
 
-class _ZoomCamera(_Camera):
-    def __init__(self, camera: ZoomCamera, notes: _Notebook) -> None:
-        super().__init__(camera, notes, ZOOM)
-        self._lens = camera
+        def logged(*args: Any, **kwargs: Any) -> Any:
+            bound = signature.bind(self, *args, **kwargs)
+            bound.apply_defaults()
+            return log.call(call, getattr(self._device, method), bound.args[1:])
 
-    @property
-    def still_size(self) -> tuple[int, int]:
-        return self._lens.still_size
-
-    @property
-    def focal_range(self) -> tuple[float, float]:
-        return self._lens.focal_range
-
-    def zoom(self, focal_px: float) -> float:
-        return self._notes.ask("zoom.zoom", (focal_px,), lambda: self._lens.zoom(focal_px), lambda reached: (reached,))
-
-    def state(self) -> ZoomState:
-        return self._notes.ask(
-            "zoom.state", (), self._lens.state, lambda state: (state.focal_px, state.moving, state.t)
-        )
-
-    def capture(self) -> Frame:
-        return self._notes.look("zoom.capture", ZOOM, (), self._lens.capture)
+        return logged
 
 
-class _Head:
-    def __init__(self, head: PanTilt, notes: _Notebook) -> None:
-        self._head, self._notes = head, notes
-
-    @property
-    def limits(self) -> PanTiltLimits:
-        return self._head.limits
-
-    def state(self) -> PanTiltState:
-        return self._notes.ask(
-            "head.state", (), self._head.state, lambda state: (state.pan, state.tilt, state.moving, state.t)
-        )
-
-    def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
-        args = move_args(pan, tilt, speed, wait)
-        return self._notes.ask("head.move", args, lambda: self._head.move(pan, tilt, speed, wait), lambda both: both)
-
-    def halt(self) -> None:
-        self._notes.ask("head.halt", (), self._head.halt, lambda _: ())
+def known_class(error: Exception) -> str:
+    """Return the name of an error's nearest base class in `cotarget.errors`; empty if there is none, or it is there."""
+    known = next((kind for kind in type(error).__mro__ if getattr(cotarget.errors, kind.__name__, None) is kind), None)
+    return "" if known in (None, type(error)) else known.__name__
 
 
-class _Clock:
-    def __init__(self, clock: Clock, notes: _Notebook) -> None:
-        self._clock, self._notes = clock, notes
-
-    def now(self) -> float:
-        return self._notes.ask("clock.now", (), self._clock.now, lambda t: (t,))
-
-    def sleep_until(self, t: float) -> None:
-        self._notes.ask("clock.sleep_until", (t,), lambda: self._clock.sleep_until(t), lambda _: ())
-
-
-class _Board:
-    def __init__(self, board: Board, notes: _Notebook) -> None:
-        self._board, self._notes = board, notes
-
-    @property
-    def patience(self) -> float:
-        return self._board.patience
-
-    def present(self, T_fixed_board: RigidTransform | None) -> None:
-        args = () if T_fixed_board is None else _numbers(T_fixed_board)
-        self._notes.ask("board.present", args, lambda: self._board.present(T_fixed_board), lambda _: ())
-
-    def swing(self, T_fixed_board: RigidTransform) -> None:
-        args = _numbers(T_fixed_board)
-        self._notes.ask("board.swing", args, lambda: self._board.swing(T_fixed_board), lambda _: ())
-
-
-def _numbers(T: RigidTransform) -> tuple[float, ...]:
-    return tuple(float(v) for v in (*T.translation, *T.rotation.as_rotvec()))
-
-
-class RecordingRig:
-    """A rig that logs every call on its devices and their results.
-
-    It belongs below the safety layer, next to the devices, so that the log holds the commands that they received.
-    """
-
-    def __init__(self, rig: Rig, writer: RecordWriter) -> None:
-        self._rig = rig
-        try:
-            zoom = rig.zoom
-            self.real_time = bool(getattr(rig, "real_time", False))
-            self.config: RigConfig | None = getattr(rig, "config", None)
-            facts = RigFacts(
-                rig.fixed.size, zoom.size, zoom.still_size, zoom.focal_range, rig.head.limits, self.real_time
-            )
-            writer.put({"rig": facts_table(facts)})
-        except BaseException:
-            rig.close()
-            raise
-        notes = _Notebook(rig.clock, writer)
-        self.fixed: Camera = _Camera(rig.fixed, notes, FIXED)
-        self.zoom: ZoomCamera = _ZoomCamera(rig.zoom, notes)
-        self.head: PanTilt = _Head(rig.head, notes)
-        self.clock: Clock = _Clock(rig.clock, notes)
-        self.board: Board = _Board(rig.board, notes)
-
-    def close(self) -> None:
-        """Close the rig, which halts its head."""
-        self._rig.close()
-
-    def __enter__(self) -> "RecordingRig":
-        """Return the rig itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Halt, then close."""
-        self.close()
+def _logged(rig: Rig, writer: RecordWriter) -> Rig:
+    """Return the rig with devices that log every call and its result."""
+    writer.put({"rig": spec_table(rig.spec)})
+    calls = _CallLog(rig.clock, writer)
+    devices: dict[str, Any] = {name: _LoggedDevice(name, getattr(rig, name), calls) for name in PROTOCOLS}
+    return replace(rig, **devices)
 
 
 # Steps and the recording's folder
@@ -462,8 +343,8 @@ class Recorder:
 
     Wrap the rig below the safety layer, and close it before the recorder:
 
-        with Recorder(folder, config, calibration, target) as recorder: with
-            SafeRig(recorder.wrap(open_devices(config)), config.safety) as rig: ...
+        with Recorder(folder, config, calibration, target) as recorder:
+            with guard(recorder.wrap(open_rig(config, guarded=False)), config.safety) as rig: ...
     """
 
     def __init__(
@@ -515,10 +396,24 @@ class Recorder:
         return self._writer.waiting
 
     def wrap(self, rig: Rig) -> Rig:
-        """Wrap the one rig of this recording; closing it closes the rig, as does a failure here."""
+        """Return the one rig of this recording with devices that log every call, and its result, and change neither.
+
+        Closing it closes the rig, as does a failure here.
+
+        Raises:
+            ConfigError: the rig is guarded; the log must hold the commands that the devices receive.
+        """
         assert not self._wrapped, "a recording is of one rig"
+        if rig.guard is not None:
+            raise ConfigError(
+                "a guarded rig is not recorded: open it by open_rig(..., guarded=False), and guard what wrap returns"
+            )
         self._wrapped = True
-        return RecordingRig(rig, self._writer)
+        try:
+            return _logged(rig, self._writer)
+        except BaseException:
+            rig.close()
+            raise
 
     def __enter__(self) -> "Recorder":
         """Return the recorder itself."""

@@ -13,8 +13,8 @@ from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from types import TracebackType
 from typing import TypeVar
 
 import cv2
@@ -23,20 +23,8 @@ import numpy as np
 import cotarget.errors
 from cotarget.errors import CotargetError, DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
-from cotarget.recording.format import COMPLETE, Event, Recording, move_args
-from cotarget.rig import (
-    Board,
-    Camera,
-    Clock,
-    Frame,
-    Image,
-    PanTilt,
-    PanTiltLimits,
-    PanTiltState,
-    Speed,
-    ZoomCamera,
-    ZoomState,
-)
+from cotarget.recording.format import COMPLETE, Event, Recording, argument_numbers
+from cotarget.rig import Frame, Image, PanTiltLimits, PanTiltState, Rig, Speed, ZoomState
 
 COMMANDS = ("head.move", "zoom.zoom", "head.halt")
 
@@ -133,7 +121,7 @@ class _Span:
         self._waiting[call].clear()
 
 
-class Tape:
+class Replay:
     """A recording during its replay.
 
     Attributes:
@@ -153,6 +141,21 @@ class Tape:
         self._thread = threading.get_ident()
         self.differences = Differences()
         self.now = recording.events[0].at if recording.events else 0.0
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The recording as a rig, see the module's docstring; there is nothing to release."""
+        recording = self._recording
+        return Rig(
+            fixed=_FixedCamera(self, recording.directory, recording.spec.fixed.size),
+            zoom=_ZoomCamera(self, recording),
+            head=_Head(self, recording),
+            clock=_Clock(self),
+            board=_Board(),
+            spec=recording.spec,
+            release=lambda: None,
+            config=recording.config,
+        )
 
     @property
     def is_aside(self) -> bool:
@@ -186,7 +189,7 @@ class Tape:
         """
         self.pass_to(event.at)
         if event.error is not None:
-            raise _recorded_error(*event.error)
+            raise _recorded_error(*event.error, event.error_class)
         return event
 
     def answer(self, call: str) -> Event | None:
@@ -310,9 +313,9 @@ def _cut(events: Sequence[Event]) -> tuple[list[_Span], list[Event]]:
     return spans, frames
 
 
-def _recorded_error(name: str, message: str) -> CotargetError:
-    """Make the recorded exception; one of another package becomes a DeviceError."""
-    kind = getattr(cotarget.errors, name, None)
+def _recorded_error(name: str, message: str, error_class: str) -> CotargetError:
+    """Make the recorded exception, by its nearest class in `cotarget.errors`; without one it is a DeviceError."""
+    kind = getattr(cotarget.errors, error_class or name, None)
     if isinstance(kind, type) and issubclass(kind, CotargetError):
         return kind(message)
     return DeviceError(f"{name}: {message}")
@@ -322,7 +325,7 @@ T = TypeVar("T")
 
 
 def until_end(steps: Iterable[T]) -> Iterator[T]:
-    """Yield the steps of a run on a `ReplayRig`, until the recording ends."""
+    """Yield the steps of a run on a replayed rig, until the recording ends."""
     with suppress(RecordingEndedError):
         yield from steps
 
@@ -330,8 +333,8 @@ def until_end(steps: Iterable[T]) -> Iterator[T]:
 class _Camera:
     """Common part of both cameras: frames from files, with the same image object for the same file."""
 
-    def __init__(self, tape: Tape, directory: Path, size: tuple[int, int]) -> None:
-        self._tape, self._directory, self._size = tape, directory, size
+    def __init__(self, replay: Replay, directory: Path, size: tuple[int, int]) -> None:
+        self._replay, self._directory, self._size = replay, directory, size
         self._newest: tuple[str, Image] | None = None
 
     @property
@@ -355,14 +358,14 @@ class _Camera:
 
 class _FixedCamera(_Camera):
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        event = self._tape.next_frame(newer_than, timeout)
+        event = self._replay.next_frame(newer_than, timeout)
         return self._frame(event, event.image)
 
 
 class _ZoomCamera(_Camera):
-    def __init__(self, tape: Tape, recording: Recording) -> None:
-        super().__init__(tape, recording.directory, recording.facts.zoom_size)
-        self._facts = recording.facts
+    def __init__(self, replay: Replay, recording: Recording) -> None:
+        super().__init__(replay, recording.directory, recording.spec.zoom.size)
+        self._spec = recording.spec.zoom
         self._frames = [e for e in recording.events if e.call == "zoom.read" and e.error is None]
         self._kept = [e for e in self._frames if e.image is not None]
         states = [e for e in recording.events if e.call == "zoom.state" and e.error is None]
@@ -370,27 +373,27 @@ class _ZoomCamera(_Camera):
 
     @property
     def still_size(self) -> tuple[int, int]:
-        return self._facts.still_size
+        return self._spec.still_size
 
     @property
     def focal_range(self) -> tuple[float, float]:
-        return self._facts.focal_range
+        return self._spec.focal_range
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
-        event = self._tape.answer("zoom.read")
+        event = self._replay.answer("zoom.read")
         if event is None or (newer_than is not None and time_of(event) <= newer_than):
             event = self._by_time(newer_than, timeout)
         return self._frame(event, event.image or self._stand_in(event))
 
     def capture(self) -> Frame:
-        event = self._tape.answer("zoom.capture") or self._by_time(None, 1.0)
+        event = self._replay.answer("zoom.capture") or self._by_time(None, 1.0)
         return self._frame(event, event.image or self._stand_in(event))
 
     def zoom(self, focal_px: float) -> float:
-        recorded = self._tape.take("zoom.zoom")
-        self._tape.compare("zoom.zoom", recorded, (focal_px,))
+        recorded = self._replay.take("zoom.zoom")
+        self._replay.compare("zoom.zoom", recorded, (focal_px,))
         if recorded is not None:
-            self._tape.play(recorded)
+            self._replay.play(recorded)
             if recorded.args == (focal_px,):
                 return float(recorded.result[0] or 0.0)
         if not 0 < focal_px < math.inf:
@@ -398,22 +401,22 @@ class _ZoomCamera(_Camera):
         return min(max(focal_px, self.focal_range[0]), self.focal_range[1])
 
     def state(self) -> ZoomState:
-        event = self._tape.answer("zoom.state")
+        event = self._replay.answer("zoom.state")
         if event is None:
-            (focal,), moving = self._states.at(self._tape.now, "lens")
-            return ZoomState(focal, moving, self._tape.now)
+            (focal,), moving = self._states.at(self._replay.now, "lens")
+            return ZoomState(focal, moving, self._replay.now)
         then = event.result
         return ZoomState(float(then[0] or 0.0), bool(then[1]), float(then[2] or 0.0))
 
     def _by_time(self, newer_than: float | None, timeout: float) -> Event:
         """Return the newest frame read by now, or the first one within ``timeout``."""
         fresh = [e for e in self._frames if newer_than is None or time_of(e) > newer_than]
-        if before := [e for e in fresh if e.at <= self._tape.now]:
+        if before := [e for e in fresh if e.at <= self._replay.now]:
             return before[-1]
-        if fresh and fresh[0].at <= self._tape.now + timeout:
-            self._tape.pass_to(fresh[0].at)
+        if fresh and fresh[0].at <= self._replay.now + timeout:
+            self._replay.pass_to(fresh[0].at)
             return fresh[0]
-        self._tape.pass_to(self._tape.now + timeout)
+        self._replay.pass_to(self._replay.now + timeout)
         raise StaleFrameError(f"no frame of the zoom camera within {timeout:g} s")
 
     def _stand_in(self, event: Event) -> str | None:
@@ -423,8 +426,8 @@ class _ZoomCamera(_Camera):
 
 
 class _Head:
-    def __init__(self, tape: Tape, recording: Recording) -> None:
-        self._tape, self._limits = tape, recording.facts.limits
+    def __init__(self, replay: Replay, recording: Recording) -> None:
+        self._replay, self._limits = replay, recording.spec.head.limits
         self._states = _Track([e for e in recording.events if e.call == "head.state" and e.error is None])
 
     @property
@@ -432,19 +435,19 @@ class _Head:
         return self._limits
 
     def state(self) -> PanTiltState:
-        event = self._tape.answer("head.state")
+        event = self._replay.answer("head.state")
         if event is None:
-            (pan, tilt), moving = self._states.at(self._tape.now, "head")
-            return PanTiltState(pan, tilt, moving, self._tape.now)
+            (pan, tilt), moving = self._states.at(self._replay.now, "head")
+            return PanTiltState(pan, tilt, moving, self._replay.now)
         then = event.result
         return PanTiltState(float(then[0] or 0.0), float(then[1] or 0.0), bool(then[2]), float(then[3] or 0.0))
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
-        recorded = self._tape.take("head.move")
-        args = move_args(pan, tilt, speed, wait)
-        self._tape.compare("head.move", recorded, args)
+        recorded = self._replay.take("head.move")
+        args = argument_numbers("head.move", (pan, tilt, speed, wait))
+        self._replay.compare("head.move", recorded, args)
         if recorded is not None:
-            self._tape.play(recorded)
+            self._replay.play(recorded)
             if recorded.args == args:
                 return float(recorded.result[0] or 0.0), float(recorded.result[1] or 0.0)
         if not (math.isfinite(pan) and math.isfinite(tilt)):
@@ -452,7 +455,7 @@ class _Head:
         return self._possible(pan, self._limits.pan), self._possible(tilt, self._limits.tilt)
 
     def halt(self) -> None:
-        self._tape.answer("head.halt")
+        self._replay.answer("head.halt")
 
     def _possible(self, angle: float, limits: tuple[float, float]) -> float:
         step = self._limits.step
@@ -463,16 +466,16 @@ class _Head:
 
 
 class _Clock:
-    def __init__(self, tape: Tape) -> None:
-        self._tape = tape
+    def __init__(self, replay: Replay) -> None:
+        self._replay = replay
 
     def now(self) -> float:
-        event = self._tape.answer("clock.now")
-        return self._tape.now if event is None else float(event.result[0] or 0.0)
+        event = self._replay.answer("clock.now")
+        return self._replay.now if event is None else float(event.result[0] or 0.0)
 
     def sleep_until(self, t: float) -> None:
-        if self._tape.answer("clock.sleep_until") is None and not self._tape.is_aside:
-            self._tape.pass_to(t)
+        if self._replay.answer("clock.sleep_until") is None and not self._replay.is_aside:
+            self._replay.pass_to(t)
 
 
 class _Board:
@@ -500,35 +503,3 @@ class _Track:
         before = max(int(np.searchsorted(times, t, side="right")) - 1, 0)
         values = [float(np.interp(t, times, column)) for column in self._rows[:, :-2].T]
         return values, bool(self._rows[before, -2])
-
-
-class ReplayRig:
-    """A recording as a rig, see the module's docstring; wrap it in the layers that the recorded rig had."""
-
-    def __init__(self, recording: Recording) -> None:
-        self._tape = Tape(recording)
-        self.real_time = recording.facts.real_time
-        self.config = recording.config
-        self.fixed: Camera = _FixedCamera(self._tape, recording.directory, recording.facts.fixed_size)
-        self.zoom: ZoomCamera = _ZoomCamera(self._tape, recording)
-        self.head: PanTilt = _Head(self._tape, recording)
-        self.clock: Clock = _Clock(self._tape)
-        self.board: Board = _Board()
-
-    @property
-    def differences(self) -> Differences:
-        """Comparison of the commands so far with the recorded ones."""
-        return self._tape.differences
-
-    def close(self) -> None:
-        """Do nothing; there is nothing to release."""
-
-    def __enter__(self) -> "ReplayRig":
-        """Return the rig itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the rig."""
-        self.close()

@@ -9,13 +9,11 @@ import dataclasses
 import logging
 import math
 from collections.abc import Callable
-from types import TracebackType
 
-from cotarget.config import RigConfig, SafetyConfig
+from cotarget.config import SafetyConfig
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError
-from cotarget.files import HeldSignals
 from cotarget.rig import (
-    Board,
+    FUTURE_S,
     Camera,
     Clock,
     Frame,
@@ -27,14 +25,12 @@ from cotarget.rig import (
     ZoomCamera,
     ZoomState,
 )
-from cotarget.safety.signals import end_politely
+from cotarget.safety.signals import DeferredSignals, end_politely
 from cotarget.safety.stop_file import refuse_if_stopped
-from cotarget.safety.watchdog import Guard, Watcher
+from cotarget.safety.watchdog import Watchdog, Watcher
 
 log = logging.getLogger(__name__)
 
-# A frame cannot be from the future; this tolerance allows for a configured latency that is too long [s].
-FUTURE_S = 0.05
 # A loaded unit may take longer than its speed and acceleration give, by this factor.
 SLOWNESS = 1.5
 FINE = 1e-9  # rounding error of an angle [rad]
@@ -43,8 +39,8 @@ FINE = 1e-9  # rounding error of an angle [rad]
 class SafeHead:
     """A head that keeps the soft limits and the speed cap, and does not move while stopped."""
 
-    def __init__(self, head: PanTilt, limits: PanTiltLimits, guard: Guard) -> None:
-        self._head, self._limits, self._guard = head, limits, guard
+    def __init__(self, head: PanTilt, limits: PanTiltLimits, watchdog: Watchdog) -> None:
+        self._head, self._limits, self._watchdog = head, limits, watchdog
 
     @property
     def limits(self) -> PanTiltLimits:
@@ -53,9 +49,9 @@ class SafeHead:
 
     def state(self) -> PanTiltState:
         """Return the head's state now."""
-        self._guard.on_call()
+        self._watchdog.on_call()
         state = self._head.state()
-        self._guard.saw(state, self._limits.step)
+        self._watchdog.saw(state, self._limits.step)
         return state
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
@@ -70,17 +66,17 @@ class SafeHead:
         asked: Speed | None = speeds
         if speeds[0] == speeds[1]:
             asked = None if math.isinf(speeds[0]) else speeds[0]
-        motion = self._guard.begin((pan, tilt), self._patience((pan, tilt), min(speeds)) if wait else 0.0)
+        motion = self._watchdog.begin((pan, tilt), self._patience((pan, tilt), min(speeds)) if wait else 0.0)
         try:
             said = self._head.move(pan, tilt, asked, wait)
         except BaseException as error:
-            if self._guard.end(motion, arrived=False) and isinstance(error, Exception):
-                self._guard.refuse_if_stopped()  # the halt made the device fail
+            if self._watchdog.end(motion, arrived=False) and isinstance(error, Exception):
+                self._watchdog.refuse_if_stopped()  # the halt made the device fail
             raise
-        if self._guard.end(motion, arrived=wait):
-            self._guard.refuse_if_stopped()
+        if self._watchdog.end(motion, arrived=wait):
+            self._watchdog.refuse_if_stopped()
         if not (_inside(said[0], self._limits.pan, self._limits) and _inside(said[1], self._limits.tilt, self._limits)):
-            self._guard.halt()
+            self._watchdog.halt()
             raise DeviceError(
                 f"the head was sent to pan {math.degrees(pan):.3f}, tilt {math.degrees(tilt):.3f} degrees and says "
                 f"that it goes to {math.degrees(said[0]):.3f}, {math.degrees(said[1]):.3f}, beyond the limits"
@@ -89,7 +85,7 @@ class SafeHead:
 
     def halt(self) -> None:
         """Stop both axes at once."""
-        self._guard.halt()
+        self._watchdog.halt()
 
     def _patience(self, goal: tuple[float, float], speed: float) -> float:
         """Estimate how long the device may wait for the head to arrive [s]."""
@@ -113,8 +109,8 @@ def _inside(angle: float, bounds: tuple[float, float], limits: PanTiltLimits) ->
 class SafeCamera:
     """A camera that refuses frames that are too old to act on, or from the future."""
 
-    def __init__(self, camera: Camera, clock: Clock, guard: Guard, max_age_s: float, name: str) -> None:
-        self._camera, self._clock, self._guard = camera, clock, guard
+    def __init__(self, camera: Camera, clock: Clock, watchdog: Watchdog, max_age_s: float, name: str) -> None:
+        self._camera, self._clock, self._watchdog = camera, clock, watchdog
         self._max_age_s, self._name = max_age_s, name
         self._newest = -math.inf
 
@@ -152,21 +148,21 @@ class SafeCamera:
             raise StaleFrameError(
                 f"the {self._name} camera's frame is from {ahead:.2f} s in the future; mind the clock"
             )
-        self._guard.on_call()
+        self._watchdog.on_call()
         if frame.t > self._newest:
             self._newest = frame.t
-            self._guard.alive(now)
+            self._watchdog.alive(now)
 
     def _read(self, newer_than: float | None, timeout: float) -> Frame:
-        if self._guard.threaded:
+        if self._watchdog.threaded:
             return self._camera.read(newer_than, timeout)
-        self._guard.watch()
-        deadline = self._guard.deadline()
+        self._watchdog.watch()
+        deadline = self._watchdog.deadline()
         if deadline is not None and 0 < (first := deadline - self._clock.now()) < timeout:
             try:
                 return self._camera.read(newer_than, first)
             except StaleFrameError:
-                self._guard.watch()
+                self._watchdog.watch()
                 timeout -= first
         return self._camera.read(newer_than, timeout)
 
@@ -225,8 +221,8 @@ class SafeZoomCamera:
 class SafeClock:
     """A simulation's clock that runs the watchdog when it is due during a sleep."""
 
-    def __init__(self, clock: Clock, guard: Guard) -> None:
-        self._clock, self._guard = clock, guard
+    def __init__(self, clock: Clock, watchdog: Watchdog) -> None:
+        self._clock, self._watchdog = clock, watchdog
 
     def now(self) -> float:
         """Return the time on the rig's clock [s]."""
@@ -234,10 +230,10 @@ class SafeClock:
 
     def sleep_until(self, t: float) -> None:
         """Sleep until the clock shows ``t`` [s]."""
-        deadline = self._guard.deadline()
+        deadline = self._watchdog.deadline()
         if deadline is not None and deadline < t:
             self._clock.sleep_until(deadline)
-            self._guard.watch()
+            self._watchdog.watch()
         self._clock.sleep_until(t)
 
 
@@ -304,63 +300,83 @@ def _outermost(limits: tuple[float, float], step: float) -> tuple[float, float]:
 # The guarded rig
 
 
-class SafeRig:
-    """A rig whose head keeps the limits, is watched, and can be stopped; closing it halts the head first.
+def guard(rig: Rig, config: SafetyConfig) -> Rig:
+    """Put the safety layer in front of a rig: its head keeps the limits, is watched, and can be stopped.
 
-    A rig whose attribute ``real_time`` is true is watched by a thread; its head must accept a halt from any thread at
-    any time. Time of any other rig passes only inside calls, and each call runs the watchdog.
+    A rig in real time is watched by a thread; its head must accept a halt from any thread at any time. Time of any
+    other rig passes only inside calls, and each call runs the watchdog. Closing the guarded rig halts the head, then
+    closes the other.
+
+    Args:
+        rig: a rig without a safety layer; if this fails for another reason than having one, it is closed.
+        config: limits, times and stop file.
+
+    Raises:
+        ConfigError: the rig is guarded already, or the soft limits leave nothing of the device's range.
+        EmergencyStopError: a stop file exists.
     """
+    if rig.guard is not None:
+        raise ConfigError("the rig is guarded already; open it by open_rig(..., guarded=False) to guard it here")
+    behind = _Guard(rig, config)
+    try:
+        refuse_if_stopped(config.stop_file)
+        limits = soft_limits(rig.head.limits, config)
+        watchdog = behind.watchdog
+
+        def checked(camera: Camera, name: str) -> SafeCamera:
+            return SafeCamera(camera, rig.clock, watchdog, config.max_frame_age_s, name)
+
+        guarded = dataclasses.replace(
+            rig,
+            fixed=checked(rig.fixed, "fixed"),
+            zoom=SafeZoomCamera(rig.zoom, checked(rig.zoom, "zoom"), rig.clock),
+            head=SafeHead(rig.head, limits, watchdog),
+            clock=rig.clock if rig.spec.real_time else SafeClock(rig.clock, watchdog),
+            spec=dataclasses.replace(rig.spec, head=dataclasses.replace(rig.spec.head, limits=limits)),
+            release=behind.close,
+            guard=behind,
+        )
+        behind.begin()
+    except BaseException:
+        behind.leave()
+        rig.close()
+        raise
+    return guarded
+
+
+class _Guard:
+    """The guard behind a rig: its emergency stop, and its closing with threads, signal handlers and exit hook."""
 
     def __init__(self, rig: Rig, config: SafetyConfig) -> None:
-        """Take over a rig and guard it; if that fails, the rig is closed.
-
-        Raises:
-            ConfigError: the soft limits leave nothing of the device's range.
-            EmergencyStopError: a stop file exists.
-        """
         self._rig = rig
-        self.config: RigConfig | None = getattr(rig, "config", None)  # the configuration that the rig was opened from
+        self.watchdog = Watchdog(rig.head, rig.clock, config, threaded=rig.spec.real_time)
         self._closed = False
         self._watcher: Watcher | None = None
         self._undo_signals: Callable[[], None] = lambda: None
-        try:
-            refuse_if_stopped(config.stop_file)
-            real_time = bool(getattr(rig, "real_time", False))
-            self._guard = Guard(rig.head, rig.clock, config, threaded=real_time)
-            self.head: PanTilt = SafeHead(rig.head, soft_limits(rig.head.limits, config), self._guard)
 
-            def guarded(camera: Camera, name: str) -> SafeCamera:
-                return SafeCamera(camera, rig.clock, self._guard, config.max_frame_age_s, name)
-
-            self.fixed: Camera = guarded(rig.fixed, "fixed")
-            self.zoom: ZoomCamera = SafeZoomCamera(rig.zoom, guarded(rig.zoom, "zoom"), rig.clock)
-            self.clock: Clock = rig.clock if real_time else SafeClock(rig.clock, self._guard)
-            self.board: Board = rig.board
-            atexit.register(self.close)  # for a rig that the program does not close
-            if real_time:
-                self._undo_signals = end_politely(self._guard.halt)
-                self._watcher = Watcher(self._guard)
-        except BaseException:
-            self._leave()
-            rig.close()
-            raise
+    def begin(self) -> None:
+        """Watch a rig in real time, and halt the head of any rig at the program's exit."""
+        atexit.register(self.close)  # for a rig that the program does not close
+        if self._rig.spec.real_time:
+            self._undo_signals = end_politely(self.watchdog.halt)
+            self._watcher = Watcher(self.watchdog)
 
     def stop(self, reason: str) -> None:
-        """Emergency stop: halt the head, and refuse every move until `clear`; may be called from any thread."""
-        self._guard.stop(reason)
+        """Halt the head, and refuse every move until `clear`; may be called from any thread."""
+        self.watchdog.stop(reason)
 
     def clear(self) -> str | None:
-        """End the emergency stop, which only an operator may decide; return its reason.
+        """End the emergency stop; return its reason.
 
         Raises:
             EmergencyStopError: a stop file exists.
         """
-        return self._guard.clear()
+        return self.watchdog.clear()
 
     @property
     def stopped(self) -> str | None:
         """Reason of the emergency stop; None if there is none."""
-        return self._guard.reason
+        return self.watchdog.reason
 
     def close(self) -> None:
         """Halt the head, then close the rig; signals are deferred until that is done.
@@ -370,26 +386,17 @@ class SafeRig:
         """
         self._close(deliver=True)
 
-    def __enter__(self) -> "SafeRig":
-        """Return the rig itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Halt, then close; a failure does not hide the error that led here."""
-        if error is None:
-            self.close()
-            return
-        log.info("halting the head: %s", kind.__name__ if kind else error)
+    def close_after(self, error: BaseException) -> None:
+        """Halt the head, then close the rig; a failure does not hide the error that led here."""
+        log.info("halting the head: %s", type(error).__name__)
         try:
             self._close(deliver=isinstance(error, Exception))  # after Ctrl-C a second one adds nothing
         except Exception as failure:
-            self._tell(failure)
+            self._report(failure)
 
-    def _tell(self, failure: BaseException) -> None:
+    def _report(self, failure: BaseException) -> None:
         """Log why the rig could not be closed, unless that is logged already."""
-        if str(failure) == self._guard.told:
+        if str(failure) == self.watchdog.logged:
             log.error("the head could not be halted to the end")
         else:
             log.error("the rig could not be closed: %s", failure)
@@ -397,37 +404,37 @@ class SafeRig:
     def _close(self, deliver: bool) -> None:
         if self._closed:
             return
-        held = HeldSignals()
+        deferred = DeferredSignals()
         interrupt: BaseException | None = None
         while True:
             try:
-                held.hold()
+                deferred.defer()
                 break
             except (KeyboardInterrupt, SystemExit) as error:  # a signal just before the deferral
                 interrupt = error
         errors: list[BaseException] = []
         self._closed = True
-        for act in (self._guard.shut, held.let_hurry, self._leave, self._rig.close):
+        for act in (self.watchdog.shut, deferred.let_hurry, self.leave, self._rig.close):
             try:
                 act()
             except BaseException as error:
                 errors.append(error)
-        held.restore()
+        deferred.restore()
         for failure in errors[1:]:
             log.info("while the rig was closed: %s", failure)
-        if deliver and errors and (interrupt is not None or held.pending):
-            self._tell(errors[0])  # the signal that ends the program now hides this error
+        if deliver and errors and (interrupt is not None or deferred.pending):
+            self._report(errors[0])  # the signal that ends the program now hides this error
         if deliver and interrupt is not None:
             raise interrupt
         if deliver:
-            held.deliver()
+            deferred.deliver()
         if errors:
             raise next((e for e in errors if not isinstance(e, Exception)), errors[0])
 
-    def _leave(self) -> None:
+    def leave(self) -> None:
         """Remove this layer's threads, signal handlers and exit hook."""
         if self._watcher is not None:
             self._watcher.close()
-            self._guard.close()
+            self.watchdog.close()
         self._undo_signals()
         atexit.unregister(self.close)

@@ -1,4 +1,4 @@
-"""Handle signals that end or suspend the process, so that the head is halted first."""
+"""Handle signals that end or suspend the process: the head is halted first, and files are completed."""
 
 import logging
 import os
@@ -7,11 +7,12 @@ import sys
 import threading
 from collections.abc import Callable
 from types import FrameType
-
-from cotarget.files import ENDING
+from typing import Any
 
 log = logging.getLogger(__name__)
 
+# Signals that end the process at once: a request, a closed terminal or connection, and Ctrl-\.
+ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name))
 # Signals that suspend the process with its watchdog: Ctrl-Z, and use of a terminal that another program has.
 FREEZING = tuple(getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTTOU") if hasattr(signal, name))
 SHELL_STATUS = 128  # a shell's exit status for a signal is this plus its number
@@ -57,3 +58,50 @@ def end_politely(halt: Callable[[], None] | None = None) -> Callable[[], None]:
                     signal.signal(number, signal.SIG_DFL)
 
     return undo
+
+
+# Number of signals that end even a critical section, once that is allowed: a wait for devices or disks without answer.
+IMPATIENCE = 3
+
+
+class DeferredSignals:
+    """Defer SIGINT, SIGTERM and other ending signals during a critical section, and deliver them after it.
+
+    Only the main thread receives signals, so in other threads there is nothing to defer.
+    """
+
+    def __init__(self) -> None:
+        self.pending: list[int] = []
+        self._previous: dict[int, Any] = {}
+        self._may_hurry = False
+
+    def defer(self) -> None:
+        """Start to defer signals; may be called again if a signal interrupted it."""
+        if threading.current_thread() is not threading.main_thread():
+            return
+        for number in (signal.SIGINT, *ENDING):
+            previous = signal.getsignal(number)
+            if number not in self._previous and previous not in (None, signal.SIG_IGN, self._note):
+                self._previous[number] = previous
+                signal.signal(number, self._note)
+
+    def let_hurry(self) -> None:
+        """From now on let `IMPATIENCE` signals end the critical section, for example after the head was halted."""
+        self._may_hurry = True
+
+    def restore(self) -> None:
+        """Restore the previous handlers."""
+        while self._previous:
+            number, previous = self._previous.popitem()
+            if signal.getsignal(number) == self._note:
+                signal.signal(number, previous)
+
+    def deliver(self) -> None:
+        """Raise the first deferred signal, if there was one."""
+        if self.pending:
+            signal.raise_signal(self.pending[0])
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.pending.append(number)
+        if self._may_hurry and len(self.pending) >= IMPATIENCE:
+            raise KeyboardInterrupt

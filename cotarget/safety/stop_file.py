@@ -1,7 +1,10 @@
 """Emergency stop across processes: while a certain file exists, the head does not move; the file holds the reason."""
 
+import math
 import os
+import threading
 from pathlib import Path
+from time import monotonic
 
 from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
 
@@ -100,3 +103,88 @@ def clear_stop_file(path: Path) -> str | None:
     reason = stop_reason(taken)
     taken.unlink(missing_ok=True)
     return reason
+
+
+# Reading the file from a program that must not wait for it
+
+LOOK_POLL_S = 0.05  # reading the stop file takes well below 1 ms; the answer is awaited in slices of this time [s]
+# After this number of slices without an answer the file counts as a stop. Slices are counted and not timed, so that a
+# suspended machine does not count as an unreadable file.
+MOST_MISSED = 6
+# A command uses an answer no older than this without waiting for a new one; the watchdog halts the head for a file
+# that appears after it [s].
+RECENT_S = 2 * LOOK_POLL_S
+LOOK_JOIN_S = 0.2  # time limit for the thread to end, which a hanging file may block [s]
+
+
+class StopLook:
+    """Reader of the stop file, with a time limit that does not depend on the file system.
+
+    Args:
+        path: of the stop file; None for none, which never stops.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._changed = threading.Condition()
+        self._asked = self._answered = self._missed = 0
+        self._reason: str | None = None
+        self._looked_at = -math.inf
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    def reason(self, longest: float | None = None) -> str | None:
+        """Read the stop file, beginning now; return the reason of a stop, or None.
+
+        A file that does not answer counts as a stop.
+
+        Args:
+            longest: how long to wait for a new answer before the last one is returned [s]; None to wait for it.
+        """
+        if self._path is None or self._closed:
+            return self._reason
+        with self._changed:
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="cotarget-stop-file", daemon=True)
+                self._thread.start()
+            self._asked += 1
+            question = self._asked
+            self._changed.notify_all()
+            while True:
+                wait = LOOK_POLL_S if longest is None else min(longest, LOOK_POLL_S)
+                if self._changed.wait_for(lambda: self._answered >= question, wait):
+                    return self._reason
+                self._missed += wait == LOOK_POLL_S
+                if self._missed >= MOST_MISSED:
+                    return f"the stop file cannot be looked at: no answer within {MOST_MISSED * LOOK_POLL_S:g} s"
+                if longest is not None:
+                    return self._reason
+
+    def is_clear(self) -> bool:
+        """Return at once whether a recent answer found no stop."""
+        with self._changed:
+            return self._path is None or (self._reason is None and monotonic() - self._looked_at <= RECENT_S)
+
+    def close(self) -> None:
+        """End the thread; a thread that the file blocks ends when the file answers."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        if self._thread is not None:
+            self._thread.join(LOOK_JOIN_S)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._asked > self._answered)
+                if self._closed:
+                    return
+                question = self._asked
+            begun = monotonic()
+            try:
+                reason = stop_reason(self._path)
+            except Exception as error:  # an unreadable file counts as a stop
+                reason = f"the file cannot be read: {error}"
+            with self._changed:
+                self._answered, self._reason, self._missed, self._looked_at = question, reason, 0, begun
+                self._changed.notify_all()

@@ -1,7 +1,7 @@
 """The watchdog of a rig: decide whether the head may move, and halt it when it may not.
 
-`Guard` keeps the state. Devices, the watchdog's thread (`Watcher`) and the operator call it, each from a thread of its
-own. Its lock is held for bookkeeping only, never during a call of a device, so that a hanging device cannot keep
+`Watchdog` keeps the state. Devices, the watchdog's thread (`Watcher`) and the operator call it, each from a thread of
+its own. Its lock is held for bookkeeping only, never during a call of a device, so that a hanging device cannot keep
 another thread from halting the head. `StopLook` reads the stop file on a thread of its own for the same reason: a file
 system may hang.
 """
@@ -10,98 +10,13 @@ import logging
 import math
 import threading
 from dataclasses import dataclass, replace
-from pathlib import Path
-from time import monotonic
 
 from cotarget.config import SafetyConfig
 from cotarget.errors import DeviceError, EmergencyStopError
 from cotarget.rig import Clock, PanTilt, PanTiltState
-from cotarget.safety.stop_file import stop_reason, stopped_by_file
+from cotarget.safety.stop_file import StopLook, stop_reason, stopped_by_file
 
 log = logging.getLogger(__name__)
-
-LOOK_POLL_S = 0.05  # reading the stop file takes well below 1 ms; the answer is awaited in slices of this time [s]
-# After this number of slices without an answer the file counts as a stop. Slices are counted and not timed, so that a
-# suspended machine does not count as an unreadable file.
-MOST_MISSED = 6
-# A command uses an answer no older than this without waiting for a new one; the watchdog halts the head for a file
-# that appears after it [s].
-RECENT_S = 2 * LOOK_POLL_S
-LOOK_JOIN_S = 0.2  # time limit for the thread to end, which a hanging file may block [s]
-
-
-class StopLook:
-    """Reader of the stop file, with a time limit that does not depend on the file system.
-
-    Args:
-        path: of the stop file; None for none, which never stops.
-    """
-
-    def __init__(self, path: Path | None) -> None:
-        self._path = path
-        self._changed = threading.Condition()
-        self._asked = self._answered = self._missed = 0
-        self._reason: str | None = None
-        self._looked_at = -math.inf
-        self._thread: threading.Thread | None = None
-        self._closed = False
-
-    def reason(self, longest: float | None = None) -> str | None:
-        """Read the stop file, beginning now; return the reason of a stop, or None.
-
-        A file that does not answer counts as a stop.
-
-        Args:
-            longest: how long to wait for a new answer before the last one is returned [s]; None to wait for it.
-        """
-        if self._path is None or self._closed:
-            return self._reason
-        with self._changed:
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="cotarget-stop-file", daemon=True)
-                self._thread.start()
-            self._asked += 1
-            question = self._asked
-            self._changed.notify_all()
-            while True:
-                wait = LOOK_POLL_S if longest is None else min(longest, LOOK_POLL_S)
-                if self._changed.wait_for(lambda: self._answered >= question, wait):
-                    return self._reason
-                self._missed += wait == LOOK_POLL_S
-                if self._missed >= MOST_MISSED:
-                    return f"the stop file cannot be looked at: no answer within {MOST_MISSED * LOOK_POLL_S:g} s"
-                if longest is not None:
-                    return self._reason
-
-    def is_clear(self) -> bool:
-        """Return at once whether a recent answer found no stop."""
-        with self._changed:
-            return self._path is None or (self._reason is None and monotonic() - self._looked_at <= RECENT_S)
-
-    def close(self) -> None:
-        """End the thread; a thread that the file blocks ends when the file answers."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        if self._thread is not None:
-            self._thread.join(LOOK_JOIN_S)
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._asked > self._answered)
-                if self._closed:
-                    return
-                question = self._asked
-            begun = monotonic()
-            try:
-                reason = stop_reason(self._path)
-            except Exception as error:  # an unreadable file counts as a stop
-                reason = f"the file cannot be read: {error}"
-            with self._changed:
-                self._answered, self._reason, self._missed, self._looked_at = question, reason, 0, begun
-                self._changed.notify_all()
-
 
 # State of the watchdog
 
@@ -126,7 +41,7 @@ class Motion:
     on_its_way: bool = True
 
 
-class Guard:
+class Watchdog:
     """State of a rig's watchdog and emergency stop.
 
     The head may be moving from a command until a halt, until the device has waited for its arrival, or until a state
@@ -140,11 +55,11 @@ class Guard:
         threaded: whether a thread calls `watch`; otherwise each call on the rig must.
 
     Attributes:
-        told: why the head could not be halted, as already logged; empty if it could.
+        logged: why the head could not be halted, as already logged; empty if it could.
     """
 
     def __init__(self, head: PanTilt, clock: Clock, config: SafetyConfig, *, threaded: bool) -> None:
-        self.threaded, self.told = threaded, ""
+        self.threaded, self.logged = threaded, ""
         self._head, self._clock = head, clock
         self._timeout_s, self._stop_file = config.watchdog_s, config.stop_file
         self._look = StopLook(config.stop_file)  # unused without a watching thread: time passes only inside calls then
@@ -334,7 +249,7 @@ class Guard:
             with self._lock:
                 first, self._owed = self._owed is None, str(error)
             if first and not self._shut:
-                self.told = str(error)
+                self.logged = str(error)
                 log.error("the head could not be halted and will be halted again: %s", error)
             return
         self._rests(motion)
@@ -376,10 +291,10 @@ JOIN_S = 2.0  # time limit for the thread to end: longer than a halt takes [s]
 
 
 class Watcher:
-    """Thread of a rig in real time that calls `Guard.watch` when a sign of life is due, and every `POLL_S`."""
+    """Thread of a rig in real time that calls `Watchdog.watch` when a sign of life is due, and every `POLL_S`."""
 
-    def __init__(self, guard: Guard) -> None:
-        self._guard = guard
+    def __init__(self, watchdog: Watchdog) -> None:
+        self._watchdog = watchdog
         self._leave = threading.Event()
         self._thread = threading.Thread(target=self._run, name="cotarget-watchdog", daemon=True)
         self._thread.start()
@@ -396,9 +311,9 @@ class Watcher:
         pause = 0.0
         while not self._leave.wait(pause):
             try:
-                self._guard.watch()
-                pause = self._guard.pause(POLL_S)
+                self._watchdog.watch()
+                pause = self._watchdog.pause(POLL_S)
             except Exception as error:  # such as a failing clock: without a watchdog nothing may move
                 pause = POLL_S
-                if self._guard.reason is None:
-                    self._guard.stop(f"the watchdog failed: {error}")
+                if self._watchdog.reason is None:
+                    self._watchdog.stop(f"the watchdog failed: {error}")

@@ -6,14 +6,12 @@ advances it.
 
 import math
 from collections.abc import Callable
-from types import TracebackType
 from typing import NoReturn
 
 from cotarget.config import RigConfig, SimCamera, SimEffects, SimHead, SimZoomCamera
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import (
-    Camera,
     CameraSpec,
     Clock,
     Frame,
@@ -285,44 +283,3 @@ class SimBoard:
     def swing(self, T_fixed_board: RigidTransform) -> None:
         """Swing the board about a pose from now on."""
         self._place(T_fixed_board, True)
-
-
-class SimRig:
-    """Simulated rig: both cameras, head, clock and board."""
-
-    def __init__(
-        self,
-        fixed: SimStream,
-        zoom: SimZoomStream,
-        head: SimPanTilt,
-        clock: Clock,
-        board: SimBoard,
-        release: Callable[[], None],
-        config: RigConfig,
-    ) -> None:
-        self.config = config
-        self.fixed: Camera = fixed
-        self.zoom, self.head, self.clock, self.board = zoom, head, clock, board
-        self._of_world = (fixed, zoom, board)  # released by `leave`, also where a caller has replaced the attributes
-        self._release = release
-
-    def close(self) -> None:
-        """Halt the head and release the renderer; safe to call more than once."""
-        self.head.halt()
-        self._release()
-
-    def leave(self) -> None:
-        """Release the world: no more images and board, while head and clock go on working."""
-        for part in self._of_world:
-            part.leave()
-        self._release = lambda: None
-
-    def __enter__(self) -> "SimRig":
-        """Return the rig itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Halt the head, then close."""
-        self.close()

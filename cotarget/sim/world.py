@@ -1,6 +1,7 @@
 """Simulated world: poses and images as functions of time, the rig's devices, and ground truth."""
 
 from collections.abc import Collection
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 
@@ -8,16 +9,16 @@ import numpy as np
 
 from cotarget.config import RigConfig, SimCamera, split_name
 from cotarget.geometry import RigidTransform
-from cotarget.rig import Clock, Image
+from cotarget.rig import Clock, Image, Rig
 from cotarget.sim.devices import (
     SimBoard,
     SimClock,
     SimPanTilt,
-    SimRig,
     SimStream,
     SimZoomStream,
     head_drive,
     lens_drive,
+    rig_spec,
 )
 from cotarget.sim.model import base_pose, build_model, has_clutter, mount_pose
 from cotarget.sim.render.optics import TrueLens, covering_size
@@ -82,22 +83,21 @@ class SimWorld:
             self._views()
         ahead = ahead and is_allowed() and "zoom" in self._rendered
         self._ahead = Ahead(self._views().apart) if ahead else None
-        # The lens has the same command delay as the head.
-        delay = sim.head.command_delay_s if effects.command_delay else 0.0
         self._black = {name: _black(self._camera(name)) for name in CAMERAS}
         streams = {"fixed": FIXED_NOISE, "zoom": ZOOM_NOISE}
         self._sensors = {
             name: Sensor(self._camera(name), effects, (sim.seed, streams[name])) for name in self._rendered
         }
-        self.rig = SimRig(
-            SimStream(sim.fixed, effects, self._clock, partial(self.expose, "fixed")),
-            SimZoomStream(sim.zoom, effects, self._clock, self._expose_zoom, self.lens_drive, delay),
-            SimPanTilt(sim.head, effects, self._clock, self.head_drive),
-            self._clock,
-            SimBoard(self._place_board),
-            self.close,
-            config,
-        )
+        spec = rig_spec(config)
+        fixed = SimStream(sim.fixed, effects, self._clock, partial(self.expose, "fixed"))
+        zoom = SimZoomStream(sim.zoom, effects, self._clock, self._expose_zoom, self.lens_drive, spec.zoom.delay_s)
+        head = SimPanTilt(sim.head, effects, self._clock, self.head_drive)
+        board = SimBoard(self._place_board)
+        self._of_world = (fixed, zoom, board)
+        self._release = ExitStack()
+        self._release.callback(self.close)
+        self._release.callback(head.halt)
+        self.rig = Rig(fixed, zoom, head, self._clock, board, spec, self._release.close, config)
 
     def truth(self) -> Truth:
         """Give the ground truth, for tests and experiments only."""
@@ -158,7 +158,10 @@ class SimWorld:
             self._ahead.close()
         if self._opened is not None:
             self._opened.close()
-        self.rig.leave()  # breaks a reference cycle that would keep the model's memory until a garbage collection
+        # Breaks reference cycles that would keep the model's memory until a garbage collection.
+        for device in self._of_world:
+            device.leave()
+        self._release.pop_all()
 
     def _views(self) -> Views:
         """Give the renderer of both cameras, opened on first use."""

@@ -25,7 +25,7 @@ from cotarget.config import RigConfig, SimConfig
 from cotarget.control.controller import reach_of
 from cotarget.evaluation import pointing_errors
 from cotarget.geometry import RigidTransform, pose
-from cotarget.safety import SafeRig
+from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Method
 from experiments.engine.harness import Experiment, Row, seeds_of
@@ -74,7 +74,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
             else settings.config("indoor", (), seed)
         )
         world = SimWorld(config)
-        with SafeRig(world.rig, config.safety) as opened:
+        with guard(world.rig, config.safety) as opened:
             calibration = calibrate(opened, config.board, seed=seed)
             reach = reach_of(opened)
             for model, (method, ignoring) in MODELS.items():

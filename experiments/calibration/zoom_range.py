@@ -27,7 +27,7 @@ from cotarget.config import RigConfig, SimConfig, SimEffects
 from cotarget.control.controller import reach_of
 from cotarget.evaluation import pointing_errors, true_calibration
 from cotarget.geometry import RigidTransform, angle_between
-from cotarget.safety import SafeRig
+from cotarget.safety.safe_rig import guard
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments.engine import harness
@@ -67,7 +67,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
         sim = SimConfig(scene="indoor", seed=seed, effects=SimEffects(steps=HEADS[head]))
         config = RigConfig(sim=sim)
         world = SimWorld(config)
-        with SafeRig(world.rig, config.safety) as rig:
+        with guard(world.rig, config.safety) as rig:
             calibration = calibrate(rig, config.board, seed=seed)
             reach, truth, exact = reach_of(rig), world.truth(), true_calibration(world, stops=FOCAL_LENGTHS)
             for i, nominal in enumerate(np.geomspace(*reach.focal_px, FOCAL_LENGTHS)):

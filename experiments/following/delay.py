@@ -64,7 +64,7 @@ def one(calibration: Calibration, settings: DelaySettings, seed: int) -> list[Ro
         view = record(config, target_of(config, name), settings.seconds)
         for delay, predict, closed_loop in cases:
             late = delayed(config, delay)
-            how = FollowSettings.of(late, predict=predict, closed_loop=closed_loop)
+            how = FollowSettings(predict=predict, closed_loop=closed_loop)
             found = score(held(calibration, late, name, settings.seconds, how, view))
             rows.append(
                 {

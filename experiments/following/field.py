@@ -16,7 +16,7 @@ from cotarget.evaluation import add_row, true_calibration
 from cotarget.metrics import BACKGROUND_S
 from cotarget.metrics import Row as Judged
 from cotarget.pipeline import FollowSettings, Step, follow
-from cotarget.safety import SafeRig
+from cotarget.safety.safe_rig import guard
 from cotarget.sim.targets.random_paths import SECONDS
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
@@ -70,7 +70,7 @@ def _calibrated(from_boards: bool, seed: int, rig: RigText) -> Calibration:
     if not from_boards:
         return true_calibration(SimWorld(config, rendered=()))
     world = SimWorld(config)
-    with SafeRig(world.rig, config.safety) as safe:
+    with guard(world.rig, config.safety) as safe:
         return calibrate(safe, config.board, pitch_mm=config.pitch_mm, seed=config.sim.seed)
 
 
@@ -111,7 +111,7 @@ def watched(
     view: WideView | None = None,
 ) -> Iterator[tuple[Step, Truth]]:
     """Follow a target of a simulated rig; yield each Step with the ground truth. Arguments as for `held`."""
-    settings = settings or FollowSettings.of(config)
+    settings = settings or FollowSettings()
     if view is None:
         world, detector = SimWorld(config), make_detector(target, config.rate_hz)
     else:
@@ -130,7 +130,7 @@ def watched_in(
 ) -> Iterator[tuple[Step, Truth]]:
     """Follow a target in an open world with a given detector and loop; yield each Step with the ground truth."""
     truth = world.truth()
-    with SafeRig(world.rig, world.config.safety) as rig:
+    with guard(world.rig, world.config.safety) as rig:
         for step in how(rig, calibration, target, detector, seconds=seconds, settings=settings):
             yield step, truth
 

@@ -59,7 +59,7 @@ def one(calibration: Calibration, settings: FiveSettings, seed: int) -> list[Row
         target = target_of(config, kind)
         view = record(config, target, settings.seconds)
         for policy, make in POLICIES.items():
-            how = FollowSettings.of(config, policy=make, closed_loop=settings.closed_loop)
+            how = FollowSettings(policy=make, closed_loop=settings.closed_loop)
             seconds = good_seconds(calibration, config, target, settings.seconds, how, view)
             rows.append(
                 {

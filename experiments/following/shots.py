@@ -26,7 +26,7 @@ from cotarget.geometry import Array
 from cotarget.metrics import Row as Judged
 from cotarget.pipeline import State, Step
 from cotarget.rig import Frame, Rig, to_step
-from cotarget.safety import SafeRig
+from cotarget.safety.safe_rig import guard
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Aim, Reach, aim
@@ -119,7 +119,7 @@ def fire(
     world = SimWorld(config)
     truth, exact = world.truth(), true_calibration(world, stops=config.sim.zoom.lens_steps)
     fired: list[Fired | None] = []
-    with SafeRig(world.rig, config.safety) as rig:
+    with guard(world.rig, config.safety) as rig:
         lookout = _Lookout(rig, calibration, config, target)
         begin = BEGIN_S
         while rig.clock.now() < seconds:

@@ -14,7 +14,7 @@ from cotarget.metrics import Row as Judged
 from cotarget.pantilt import towards
 from cotarget.pipeline import FollowSettings, follow
 from cotarget.rig import Rig
-from cotarget.safety import SafeRig
+from cotarget.safety.safe_rig import guard
 from cotarget.sim.truth import Outlines
 from cotarget.sim.world import SimWorld
 from experiments.following.field_scenes import hold_config
@@ -52,15 +52,15 @@ def held(way: str, name: str, seed: int, seconds: float, miss: float, lasts_s: f
     outlines = Outlines(world.truth(), still=True)
     shaken = Shaken(outlines, world.truth(), seed, miss)
     rows: list[Judged] = []
-    with SafeRig(world.rig, world.config.safety) as rig:
+    with guard(world.rig, world.config.safety) as rig:
         rig.head.move(*any_pose(rig, calibration, seed))
         last = None
         while not begun(rows) and rig.clock.now() < seconds:
             last = rig.zoom.read(newer_than=last).t
             rows.append(judge(outlines, name, target, last))
-        left, delay_s = seconds - rig.clock.now(), world.config.command_delay_s
+        left, delay_s = seconds - rig.clock.now(), rig.spec.head.delay_s
         if way == PAIR:
-            times = by_pair(rig, calibration, target, outlines, name, seed, shaken, left, delay_s)
+            times = by_pair(rig, calibration, target, outlines, name, seed, shaken, left)
         else:
             field = scan_of(rig, calibration)
             lone = (rig, world.truth(), calibration, target, shaken, delay_s, NOISE.center_px, field, lasts_s)
@@ -94,14 +94,13 @@ def by_pair(
     seed: int,
     shaken: Shaken,
     seconds: float,
-    delay_s: float,
 ) -> Iterator[float]:
     """Run the project's pipeline with both cameras; yield the times of the zoom frames, with repetitions."""
 
     def finder(calibration: Calibration, target: TargetProfile) -> TruthFinder:
         return TruthFinder(calibration, target, outlines, name, seed, shaken.misses)
 
-    settings = FollowSettings(command_delay_s=delay_s, finder=finder)
+    settings = FollowSettings(finder=finder)
     detector = TruthDetector(outlines, seed, NOISE, numbers=counted)
     for step in follow(rig, calibration, target, detector, seconds=seconds, settings=settings):
         yield step.zoom.t

@@ -7,7 +7,7 @@ camera only, or nothing in open-loop runs.
 import os
 import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from tempfile import TemporaryFile
 
 import numpy as np
@@ -127,7 +127,7 @@ def open_on(view: WideView, config: RigConfig, *, closed_loop: bool) -> tuple[Si
     assert view.pictures or not closed_loop, "the zoom view is searched for what the wide view shows"
     world = SimWorld(config, rendered=CLOSE if closed_loop else ())
     if view.pictures:  # a body's centre is estimated from image and mask in open loop too
-        world.rig.fixed = _RecordedCamera(world.rig.fixed, view)
+        world.rig = replace(world.rig, fixed=_RecordedCamera(world.rig.fixed, view))
     return world, RecordedDetector(view)
 
 

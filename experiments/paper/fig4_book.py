@@ -26,7 +26,7 @@ from cotarget.errors import ConfigError
 from cotarget.evaluation import observe
 from cotarget.metrics import Row as Judged
 from cotarget.pipeline import FollowSettings, Step
-from cotarget.safety import SafeRig
+from cotarget.safety.safe_rig import guard
 from cotarget.sim.targets.random_paths import BOOK_MOVED_AT, BOOK_TAKES, lone_path
 from cotarget.sim.world import SimWorld
 from experiments.engine.harness import Experiment, Row, seeds_of
@@ -100,13 +100,13 @@ def _shown(
     """Give a row per place, and the Steps of the last place by stage."""
     config = settings.config("indoor", (NAME,), seed)
     config = dataclasses.replace(config, sim=dataclasses.replace(config.sim, paths=lone_path(NAME, seed)))
-    target, how = config.target(NAME), FollowSettings.of(config)
+    target, how = config.target(NAME), FollowSettings()
     speck = dataclasses.replace(target, wanted_px=SPECK_PX)
     world = SimWorld(config)
     truth = world.truth()
     rows: list[Row] = []
     shown: dict[str, Step] = {}
-    with SafeRig(world.rig, config.safety) as rig:
+    with guard(world.rig, config.safety) as rig:
         for place, arrives in enumerate(ARRIVES_S[: settings.places]):
             rig.head.move(0.0, 0.0, wait=True)
             rig.zoom.zoom(rig.zoom.focal_range[0])

@@ -102,7 +102,7 @@ def _followed(calibration: Calibration, settings: PersonSettings, seed: int, way
     config = settings.config("indoor", (NAME,), seed)
     found_by = settings.detector if way == OURS else "mog2"
     target = dataclasses.replace(config.target(NAME), detector=found_by)
-    how = FollowSettings.of(config)
+    how = FollowSettings()
     judged: list[Judged] = []
     moments: list[Step] = []
     # The last step comes a frame before the end, or later.

@@ -100,7 +100,7 @@ class OutdoorSettings(OwnRigInField):
 def one(calibration: Calibration, settings: OutdoorSettings, seed: int) -> Pictured:
     """Follow the persons by each method; give a row per method, and pictures of the first seed."""
     config = outdoors(settings, seed)
-    how = FollowSettings.of(config)  # its policy is first-come
+    how = FollowSettings()  # its policy is first-come
     rows: list[Row] = []
     pictures: dict[str, bytes] = {}
     for way in settings.ways:

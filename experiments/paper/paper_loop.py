@@ -56,7 +56,7 @@ def follow_as_the_paper(
             found = _aim(calibration, target, mine, rig)
         if found is not None:
             commanded = (*rig.head.move(found.pan, found.tilt), rig.zoom.zoom(found.nominal_px))
-            begun, sent = now + settings.command_delay_s + eyes.interval, sent + 1
+            begun, sent = now + rig.spec.head.delay_s + eyes.interval, sent + 1
         yield Step(
             index=index,
             t=now,

@@ -24,7 +24,7 @@ from cotarget.calibration import Calibration
 from cotarget.calibration.calibrate import calibrate
 from cotarget.geometry import Array, RigidTransform, pose
 from cotarget.report.text import value_and_sigma
-from cotarget.safety import SafeRig
+from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
 from experiments.engine.harness import Experiment, Row, seeds_of
 from experiments.engine.texts import rms, table
@@ -64,7 +64,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
     """Calibrate the rig once; give a row per parameter."""
     config = settings.config("indoor", (), seed)
     world = SimWorld(config)
-    with SafeRig(world.rig, config.safety) as rig:
+    with guard(world.rig, config.safety) as rig:
         calibration = calibrate(rig, config.board, placements=settings.placements, stops=1, seed=seed)
     truth = world.truth()
     lenses = {"fixed": truth.fixed_lens, "zoom": truth.zoom_lens_for(truth.focal_range[0])}

@@ -6,16 +6,16 @@ times.
 
 import bisect
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from cotarget.backends import open_devices
+from cotarget.backends import open_rig
 from cotarget.config import RigConfig
 from cotarget.detection import Detection, Detector, make_detector
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.pipeline import FollowSettings, follow
+from cotarget.pipeline import follow
 from cotarget.rig import Camera, Clock, Frame, Image, PanTilt, PanTiltLimits, PanTiltState, Rig, Speed
-from cotarget.safety import SafeRig
+from cotarget.safety.safe_rig import guard
 from experiments.engine.harness import Row
 from experiments.wire.rig import EmulatedRig, Tap, exact_calibration, load, tapped
 
@@ -106,14 +106,6 @@ class TimedDetector:
         return found
 
 
-class TimedRig:
-    """Rig whose fixed camera and head record their calls; its owner closes it."""
-
-    def __init__(self, rig: Rig, notes: Notes) -> None:
-        self.fixed, self.head = TimedCamera(rig.fixed, notes), TimedHead(rig.head, notes)
-        self.zoom, self.clock, self.board = rig.zoom, rig.clock, rig.board
-
-
 def run(folder: Path, targets: tuple[str, ...], seconds: float) -> list[Row]:
     """Follow targets and give a row per command that was sent."""
     rows = []
@@ -127,22 +119,20 @@ def run(folder: Path, targets: tuple[str, ...], seconds: float) -> list[Row]:
 def _follow(emulated: EmulatedRig, name: str, seconds: float) -> list[Row]:
     config = emulated.config()
     taps: list[Tap] = []
-    with SafeRig(open_tapped(config, taps), config.safety) as rig:
+    with guard(open_tapped(config, taps), config.safety) as rig:
         notes = Notes(rig.clock, config.hardware.fixed.latency_s)
         target = config.target(name)
-        detector = TimedDetector(make_detector(target, config.rate_hz), notes)
-        settings = FollowSettings.of(config)
-        timed, calibration = TimedRig(rig, notes), exact_calibration(emulated.sim)
-        steps = follow(timed, calibration, target, detector, seconds=seconds, settings=settings)  # type: ignore[arg-type]
-        for _ in steps:
+        detector = TimedDetector(make_detector(target, rig.spec.fixed.rate_hz), notes)
+        timed = replace(rig, fixed=TimedCamera(rig.fixed, notes), head=TimedHead(rig.head, notes))
+        for _ in follow(timed, exact_calibration(emulated.sim), target, detector, seconds=seconds):
             pass
     return [row | {"load": load()} for row in _parts(notes.turns, taps[0])]
 
 
 def open_tapped(config: RigConfig, taps: list[Tap]) -> Rig:
-    """Open a rig with a tap on the line to its head."""
+    """Open a rig, not guarded, with a tap on the line to its head."""
     with tapped(MonotonicClock()) as found:
-        rig = open_devices(config)
+        rig = open_rig(config, guarded=False)
     taps += found
     return rig
 

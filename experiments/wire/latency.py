@@ -9,14 +9,14 @@ last byte was on the wire, plus the configured delay.
 import bisect
 import math
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from cotarget.latency import measure_fixed, measure_head
-from cotarget.rig import Frame, Rig, Speed, ZoomCamera, ZoomState
-from cotarget.safety import SafeRig
+from cotarget.rig import Camera, Frame, Speed
+from cotarget.safety.safe_rig import guard
 from experiments.engine.harness import Row
 from experiments.wire.command import ORDER, Notes, TimedHead, Turn, open_tapped
 from experiments.wire.polls import BYTES_S
@@ -72,7 +72,7 @@ class Watcher:
 class NotedCamera:
     """Camera that records the times of its frames."""
 
-    def __init__(self, camera: ZoomCamera) -> None:
+    def __init__(self, camera: Camera) -> None:
         self._camera = camera
         self.times: set[float] = set()
 
@@ -84,18 +84,6 @@ class NotedCamera:
         frame = self._camera.read(newer_than, timeout)
         self.times.add(frame.t)
         return frame
-
-    def state(self) -> ZoomState:
-        """Give the camera's zoom state."""
-        return self._camera.state()
-
-
-class NotedRig:
-    """Rig whose cameras and head record their calls; its owner closes it."""
-
-    def __init__(self, rig: Rig, notes: Notes) -> None:
-        self.fixed, self.zoom = NotedCamera(rig.fixed), NotedCamera(rig.zoom)  # type: ignore[arg-type]
-        self.head, self.clock, self.board = NotedHead(rig.head, notes), rig.clock, rig.board
 
 
 class NotedHead(TimedHead):
@@ -114,16 +102,17 @@ def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
         config = emulated.config()
         hardware = config.hardware
         taps: list[Tap] = []
-        with SafeRig(open_tapped(config, taps), config.safety) as rig:
+        with guard(open_tapped(config, taps), config.safety) as rig:
             notes = Notes(rig.clock, 0.0)
-            noted = NotedRig(rig, notes)
-            found = measure_head(noted, head_seconds)  # type: ignore[arg-type]
+            cameras = {"fixed": NotedCamera(rig.fixed), "zoom": NotedCamera(rig.zoom)}
+            noted = replace(rig, **cameras, head=NotedHead(rig.head, notes))  # type: ignore[arg-type]
+            found = measure_head(noted, head_seconds)
             orders = _commands(notes, taps[0], emulated.sim.sim.head.command_delay_s)
             calibration = exact_calibration(emulated.sim)
-            swing, _ = measure_fixed(noted, calibration, config.board, board_seconds)  # type: ignore[arg-type]
+            swing, _ = measure_fixed(noted, calibration, config.board, board_seconds)
         truth = {
-            "fixed": _truth(noted.fixed, hardware.fixed.latency_s, watcher.exposures["fixed"]),
-            "zoom": _truth(noted.zoom, hardware.zoom.latency_s, watcher.exposures["zoom"]),
+            "fixed": _truth(cameras["fixed"], hardware.fixed.latency_s, watcher.exposures["fixed"]),
+            "zoom": _truth(cameras["zoom"], hardware.zoom.latency_s, watcher.exposures["zoom"]),
             "command": orders,
         }
     measured = {

@@ -12,11 +12,10 @@ import numpy as np
 from cotarget.backends import open_rig
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
-from cotarget.detection import make_detector
 from cotarget.emulators.world import paced
-from cotarget.pipeline import FollowSettings, follow
+from cotarget.pipeline import follow
 from cotarget.rig import Rig
-from cotarget.safety import SafeRig
+from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
 from experiments.engine.harness import Row
 from experiments.wire.rig import LONGEST_S, MOUNT, EmulatedRig, exact_calibration, load
@@ -50,7 +49,7 @@ def _one(folder: Path, number: int, at: tuple[float, float, float], seconds: flo
             wire = _aims(rig, config, calibration, seconds)
         step = np.radians(emulated.sim.sim.head.step_deg)
         world = SimWorld(paced(emulated.sim))
-        with SafeRig(world.rig, emulated.sim.safety) as rig:
+        with guard(world.rig, emulated.sim.safety) as rig:
             rig.clock.sleep_until(begins)
             direct = _aims(rig, emulated.sim, calibration, seconds)
     row = {"figure": "parity", "place": number, "x": at[0], "y": at[1], "z": at[2], "load": load()}
@@ -63,7 +62,5 @@ def _one(folder: Path, number: int, at: tuple[float, float, float], seconds: flo
 def _aims(rig: Rig, config: RigConfig, calibration: Calibration, seconds: float) -> np.ndarray:
     """Follow the book; give pan and tilt of the head at the end, (n, 2) [rad]."""
     target = config.target(NAME)
-    detector = make_detector(target, config.rate_hz)
-    settings = FollowSettings.of(config)
-    steps = list(follow(rig, calibration, target, detector, seconds=seconds, settings=settings))
+    steps = list(follow(rig, calibration, target, seconds=seconds))
     return np.array([(s.head.pan, s.head.tilt) for s in steps if s.t >= steps[-1].t - SETTLED_S])

@@ -1,6 +1,6 @@
 """A rig that looks by full stills: the same lens and the same time, in larger pixels."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +9,7 @@ import pytest
 from cotarget.calibration.session import with_stills
 from cotarget.errors import StaleFrameError
 from cotarget.rig import Frame, ZoomState
+from tests.rigs import rig_of
 
 FACTOR = 10.2  # 3264 over 320: the PowerShot S5 IS
 EXPOSED_AFTER = 0.3  # from asking for a still to its exposure [s]
@@ -51,18 +52,11 @@ class FakeCamera:
         return Frame(np.zeros((*self.still_size[::-1], 3), np.uint8), self.clock.t)
 
 
-class FakeRig(SimpleNamespace):
-    closed = 0
-
-    def close(self):
-        self.closed += 1
-
-
 @pytest.fixture
 def rig():
     clock = FakeClock()
     zoom = FakeCamera(clock, (3264, 2448))
-    return FakeRig(fixed=object(), zoom=zoom, head=object(), clock=clock, board=object())
+    return rig_of(SimpleNamespace(fixed=object(), zoom=zoom, head=object(), clock=clock, board=object()))
 
 
 def test_a_rig_whose_stills_are_its_stream_stays_what_it_is(rig):
@@ -71,16 +65,20 @@ def test_a_rig_whose_stills_are_its_stream_stays_what_it_is(rig):
 
 
 def test_everything_else_is_the_rig_s_own(rig):
+    closed = []
+    rig = replace(rig, release=lambda: closed.append(True))
     stills = with_stills(rig)
     assert (stills.fixed, stills.head, stills.clock, stills.board) == (rig.fixed, rig.head, rig.clock, rig.board)
     with stills as entered:
         assert entered is stills
-        assert rig.closed == 0
-    assert rig.closed == 1
+        assert not closed
+    assert closed == [True]
 
 
 def test_focal_lengths_are_in_the_still_s_pixels(rig):
-    zoom = with_stills(rig).zoom
+    stills = with_stills(rig)
+    zoom, spec = stills.zoom, stills.spec.zoom
+    assert (spec.size, spec.focal_range) == (zoom.size, zoom.focal_range)
     assert zoom.size == zoom.still_size == (3264, 2448)
     assert zoom.focal_range == pytest.approx((334.0 * FACTOR, 4013.0 * FACTOR))
     assert zoom.zoom(6800.0) == pytest.approx(6800.0 + FACTOR)  # the lens really reaches one pixel more

@@ -9,13 +9,15 @@ import av
 import numpy as np
 import pytest
 
+from cotarget.backends import OPENERS
 from cotarget.cli.common import FEW, MANY, Reasons, folded
 from cotarget.drawing import side_by_side
 from cotarget.errors import DeviceError
 from cotarget.pipeline import State, follow
 from cotarget.video import Film, FilmWriter
 from tests.cli.test_commands import OLD, call
-from tests.recorded_run import Bright, ToyRig, calibration_file, record
+from tests.recorded_run import Bright, ToyDevices, calibration_file, record, toy_rig
+from tests.rigs import rig_of
 from tests.test_drawing import step
 
 FOLLOW = ("follow", "--rig", "rig.toml", "--calibration", "rig_calibration.json", "--target", "bird",
@@ -24,7 +26,7 @@ EARLY = "; out.mp4 holds what there was until then; out.csv holds what there was
 FRAMES = 9  # before it ends
 
 
-class WatchedRig(ToyRig):
+class WatchedRig(ToyDevices):
     """Notes what was written when the head was halted and the rig was closed."""
 
     def __init__(self, folder, failing):
@@ -67,7 +69,7 @@ def test_follow_keeps_what_was_seen_until_it_ended_and_halts_the_head_first(
 ):
     error.__dict__.pop("__notes__", None)
     rig = WatchedRig(folder, {("fixed.read", FRAMES + 1): error})
-    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: rig)
+    monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(rig))
     assert call(capsys, *FOLLOW) == (status, "", f"cotarget follow: {said}{EARLY}")
     assert rig.written == [OLD]
     assert rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") == FRAMES
@@ -75,13 +77,13 @@ def test_follow_keeps_what_was_seen_until_it_ended_and_halts_the_head_first(
 
 
 def test_an_emergency_stop_keeps_what_was_seen(folder, capsys, monkeypatch):
-    class Stopped(ToyRig):
+    class Stopped(ToyDevices):
         def count(self, what):
             super().count(what)
             if self.calls["fixed.read"] == FRAMES:
                 (folder / "stop").write_text("the cat\n")
 
-    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: Stopped())
+    monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(Stopped()))
     status, out, err = call(capsys, *FOLLOW)
     assert (status, out) == (1, "")
     assert "emergency stop: the cat" in err
@@ -90,9 +92,7 @@ def test_an_emergency_stop_keeps_what_was_seen(folder, capsys, monkeypatch):
 
 
 def test_a_run_that_ends_before_its_first_step_leaves_the_old_table(folder, capsys, monkeypatch):
-    monkeypatch.setattr(
-        "cotarget.backends.open_devices", lambda config: ToyRig({("fixed.read", 1): DeviceError("gone")})
-    )
+    monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig({("fixed.read", 1): DeviceError("gone")}))
     assert call(capsys, *FOLLOW) == (1, "", "cotarget follow: gone\n")
     assert (folder / "out.csv").read_text() == OLD
     assert not (folder / "out.mp4").exists()
@@ -115,7 +115,7 @@ def test_a_replay_keeps_what_was_seen(folder, capsys, monkeypatch):
 def test_detect_keeps_what_was_found(folder, capsys, monkeypatch):
     with FilmWriter(folder / "film.mp4", 25.0) as film:
         for index in range(2 * FRAMES):
-            film.write(ToyRig().fixed.expose(index), index / 25)
+            film.write(ToyDevices().fixed.expose(index), index / 25)
     seen = []
 
     def detect(self, frame, plain=Bright.detect):
@@ -136,7 +136,7 @@ def test_what_went_wrong_is_told_at_the_end_and_in_json(folder, capsys, monkeypa
     """A head that may hardly turn: the bird, 10 to 15 degrees off the axis, is beyond its limits."""
     with (folder / "rig.toml").open("a") as file:
         file.write("pan_deg = [-1, 1]\n")
-    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: ToyRig())
+    monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig())
     status, out, err = call(capsys, *FOLLOW, "--seconds", "1")
     assert status == 0
     told = json.loads(out)
@@ -160,7 +160,7 @@ stop_file = "stop"
 """
 
 
-class SlowRig(ToyRig):
+class SlowDevices(ToyDevices):
     """Works on every third frame of 25 Hz: each takes 100 ms more."""
 
     def count(self, what):
@@ -175,7 +175,7 @@ def test_frames_that_were_skipped_are_counted_and_leave_their_time_in_table_and_
 ):
     if backend == "hardware":
         (folder / "rig.toml").write_text(HARDWARE)
-    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: SlowRig())
+    monkeypatch.setitem(OPENERS, backend, lambda config: rig_of(SlowDevices()))
     status, out, err = call(capsys, *FOLLOW, "--seconds", "3")
     told = json.loads(out)
     with (folder / "out.csv").open(newline="") as file:

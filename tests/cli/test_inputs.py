@@ -5,11 +5,12 @@ import os
 import cv2
 import pytest
 
+from cotarget.backends import OPENERS
 from cotarget.calibration import save_calibration
 from cotarget.config import RigConfig
 from cotarget.files import PartFile
 from tests.cli.test_commands import OLD, call, draw_photo, true_calibration, write_index
-from tests.recorded_run import ToyRig, calibration_file, record
+from tests.recorded_run import calibration_file, record, toy_rig
 from tests.test_video import bird_film
 
 RIG = """
@@ -53,7 +54,7 @@ def made(tmp_path_factory):
 def folder(made, monkeypatch):
     """It is the working folder, and nothing in it has changed afterwards."""
     monkeypatch.chdir(made)
-    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: ToyRig())
+    monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig())
     before = contents(made)
     yield made
     assert contents(made) == before
@@ -192,7 +193,7 @@ def test_a_calibration_takes_the_place_of_no_photo_and_of_nothing_in_an_index(fo
 
 
 def test_a_calibration_that_could_not_be_written_is_told_before_the_session(folder, capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: pytest.fail("opened"))
+    monkeypatch.setitem(OPENERS, "sim", lambda config: pytest.fail("opened"))
     out = tmp_path / "c.json"
     writing = PartFile(out)
     try:

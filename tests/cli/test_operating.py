@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from cotarget import cli, doctor
+from cotarget.backends import OPENERS
 from cotarget.calibration import save_calibration
 from cotarget.config import BoardConfig, RigConfig, parse_config
 from cotarget.doctor import Finding
@@ -20,9 +21,10 @@ from cotarget.drivers import ptu_d46
 from cotarget.emulators.emulation import copied_tables
 from cotarget.errors import EmergencyStopError
 from cotarget.latency import Delay, HeadLatency
-from cotarget.safety import refuse_if_stopped
+from cotarget.safety.stop_file import refuse_if_stopped
 from tests.cli.test_commands import call, true_calibration
-from tests.safety_rigs import SimulatedRig
+from tests.rigs import rig_of
+from tests.safety_rigs import SimulatedDevices
 
 NOBODY = "/dev/nobody-is-here"
 HARDWARE = f"""
@@ -202,7 +204,7 @@ def test_a_latency_that_cannot_be_is_refused(folder, capsys, monkeypatch, delay,
     """Frames of the default simulation are dated by 60 ms; less than zero by what is measured inaccurately is zero."""
     found = HeadLatency(Delay(delay, 0.99), command=0.04, frames=100)
     monkeypatch.setattr("cotarget.latency.measure_head", lambda rig: found)
-    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: SimulatedRig())
+    monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(SimulatedDevices()))
     status, out, err = call(capsys, "latency", "--rig", "sim.toml")
     if configured is None:
         assert (status, out) == (1, "")

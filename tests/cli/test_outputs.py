@@ -9,12 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
+from cotarget.backends import OPENERS
 from cotarget.cli.common import previous_kept, print_json, progress_bar
 from cotarget.config import RigConfig
 from cotarget.errors import CalibrationError, DeviceError
 from cotarget.rig import Frame, ZoomState
 from tests.cli.test_commands import OLD, call, true_calibration
-from tests.safety_rigs import SimulatedRig
+from tests.rigs import rig_of
+from tests.safety_rigs import SimulatedDevices
 
 
 @pytest.fixture
@@ -87,9 +89,9 @@ class Session:
 @pytest.fixture
 def sessions(monkeypatch):
     """Lets `calibrate --rig` open a rig without a world; its session is what a test says."""
-    rig = SimulatedRig()
+    rig = SimulatedDevices()
     rig.zoom.still_size, rig.zoom.focal_range = rig.zoom.size, RigConfig().focal_range_px  # 12 x zoom
-    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: rig)
+    monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(rig))
     return lambda error=None: monkeypatch.setattr("cotarget.calibration.calibrate.calibrate", Session(error))
 
 
@@ -188,7 +190,7 @@ def test_zeros_have_no_sign(capsys):
 @pytest.fixture
 def pointed(folder, monkeypatch):
     """A rig for `point`, with pictures and a lens of 6 to 72 mm."""
-    rig = SimulatedRig()
+    rig = SimulatedDevices()
     image = np.zeros((2, 2, 3), np.uint8)
     range_px = RigConfig().focal_range_px
     rig.zoom = SimpleNamespace(
@@ -198,7 +200,7 @@ def pointed(folder, monkeypatch):
         capture=lambda: Frame(image, rig.clock.now()),
         zoom=lambda focal: rig.head.log.append(("zoom", focal)),
     )
-    monkeypatch.setattr("cotarget.backends.open_devices", lambda config: rig)
+    monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(rig))
     return rig
 
 

@@ -19,9 +19,9 @@ from tests.safety_rigs import DEADLINE_S
 # A program with a rig in real time that says what its devices are told; a halt waits for a line on stdin.
 PROGRAM = """
 import sys, time
-from tests.safety_rigs import RealRig
+from tests.safety_rigs import RealDevices
 from cotarget.config import SafetyConfig
-from cotarget.safety import SafeRig
+from tests.rigs import guarded
 
 def say(word):
     print(word, flush=True)
@@ -31,12 +31,12 @@ def halt():
     sys.stdin.readline()
     say("halted")
 
-rig = RealRig()
+rig = RealDevices()
 rig.head.halt = halt
 rig.close = lambda: say("closed")
 """
 WORK = """
-with SafeRig(rig, SafetyConfig(watchdog_s=1000.0)) as safe:
+with guarded(rig, SafetyConfig(watchdog_s=1000.0)) as safe:
     safe.head.move(0.5, 0.0)
     say("working")
     time.sleep(1000)
@@ -45,7 +45,8 @@ with SafeRig(rig, SafetyConfig(watchdog_s=1000.0)) as safe:
 FOLLOW = """
 import sys
 from cotarget import cli
-from cotarget.sim.devices import SimPanTilt, SimRig
+from cotarget.sim.devices import SimPanTilt
+from cotarget.sim.world import SimWorld
 
 def noted(cls, name, before, after, wait=False):
     act = getattr(cls, name)
@@ -60,7 +61,7 @@ def noted(cls, name, before, after, wait=False):
 
 noted(SimPanTilt, "move", "moving", "moved")
 noted(SimPanTilt, "halt", "halting", "halted", wait=True)
-noted(SimRig, "close", "closing", "closed")
+noted(SimWorld, "close", "closing", "closed")
 sys.exit(cli.main(["follow", "--rig", "rig.toml", "--calibration", "good.json", "--target", "book",
                    "--seconds", "1000", "--csv", "steps.csv"]))
 """
@@ -182,7 +183,7 @@ def test_a_program_whose_head_cannot_be_halted_is_not_suspended(start):
 
 
 def test_a_signal_while_a_good_end_halts_the_head_acts_afterwards(start):
-    child = start(PROGRAM + "with SafeRig(rig, SafetyConfig()):\n    pass\nsay('never')")
+    child = start(PROGRAM + "with guarded(rig, SafetyConfig()):\n    pass\nsay('never')")
     child.wait_for("halting")
     child.signal(signal.SIGTERM)
     returned, lines, _ = child.finish()
@@ -209,7 +210,7 @@ def test_devices_that_do_not_let_go_do_not_hold_the_program_for_ever(start):
 
 
 def test_a_rig_that_nobody_closes_is_halted_at_the_end(start):
-    child = start(PROGRAM + "safe = SafeRig(rig, SafetyConfig(watchdog_s=1000.0))\nsafe.head.move(0.5, 0.0)")
+    child = start(PROGRAM + "safe = guarded(rig, SafetyConfig(watchdog_s=1000.0))\nsafe.head.move(0.5, 0.0)")
     returned, lines, err = child.finish()
     assert (returned, lines, err) == (0, ["halting", "halted", "closed"], "")
 
@@ -242,8 +243,8 @@ def test_following_is_ended_by_a_signal_with_the_head_halted(start, tmp_path, nu
     returned, lines, err = child.finish()
     last = len(lines) - lines[::-1].index("moving") if "moving" in lines else 0
     assert lines[last:] in (
-        ["moved", "halting", "halted", "closing", "halting", "halted", "closed"],
-        ["halting", "halted", "closing", "halting", "halted", "closed"],  # ended in the middle of a command
+        ["moved", "halting", "halted", "halting", "halted", "closing", "closed"],
+        ["halting", "halted", "halting", "halted", "closing", "closed"],  # ended in the middle of a command
     )
     assert (returned, err) == (status, f"cotarget follow: {said}; steps.csv holds what there was until then\n")
     assert len((tmp_path / "steps.csv").read_text().splitlines()) > 1

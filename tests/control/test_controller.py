@@ -1,7 +1,7 @@
 """From an estimate to commands, on a rig whose cameras and axes all meet in one point: every angle is an arctangent."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,6 +19,7 @@ from cotarget.geometry import pose
 from cotarget.rig import PanTiltLimits, PanTiltState, ZoomState
 from cotarget.sim.motion import Axis
 from cotarget.targeting import WantedSize
+from tests.rigs import rig_of
 
 SIZE, CENTER = (640, 480), (319.5, 239.5)
 SHORTEST, LONGEST = 700.0, 7000.0
@@ -114,7 +115,7 @@ def still(x, **known):
 
 
 def controller(rig, **settings):
-    return Controller(rig, CALIBRATION, ControllerSettings(command_delay_s=DELAY, **settings))
+    return Controller(rig_of(rig, delay_s=DELAY), CALIBRATION, ControllerSettings(**settings))
 
 
 def test_the_lens_starts_at_its_shortest_and_the_head_where_it_is():
@@ -259,15 +260,17 @@ def test_a_lost_target_of_which_too_little_is_known_is_waited_for():
 
 
 def test_the_lens_has_a_delay_of_its_own():
-    for delay, exposed in ((None, DELAY), (0.5, 0.5), (0.0, 0.0)):
+    for delay in (0.5, 0.0):
         rig, asked = Rig(t=2.0), []
 
         def predict(t, asked=asked):
             asked.append(t)
             return Known(np.array([0.5, -1.0, 10.0]), t)
 
-        controller(rig, lens_delay_s=delay).drive(predict, 1.9, FRAME)
-        assert asked == pytest.approx([2.0 + DELAY, 2.0 + DELAY + FRAME, 2.0 + exposed + FRAME])
+        made = rig_of(rig, delay_s=DELAY)
+        slow = replace(made, spec=replace(made.spec, zoom=replace(made.spec.zoom, delay_s=delay)))
+        Controller(slow, CALIBRATION).drive(predict, 1.9, FRAME)
+        assert asked == pytest.approx([2.0 + DELAY, 2.0 + DELAY + FRAME, 2.0 + delay + FRAME])
 
 
 def test_a_narrow_target_may_be_larger():

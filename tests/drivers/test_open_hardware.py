@@ -6,12 +6,13 @@ import sys
 
 import pytest
 
-from cotarget.backends import open_devices
+from cotarget.backends import open_rig
 from cotarget.config import HardwareConfig, HardwareHead, RigConfig, parse_config
 from cotarget.drivers import rig as rig_module
 from cotarget.drivers.ptu_d46 import probe
 from cotarget.drivers.rig import open_hardware
 from cotarget.errors import ConfigError, DeviceError
+from cotarget.rig import PanTiltLimits
 
 ORDER = ("board", "fixed", "zoom", "head")
 CONFIG = parse_config(
@@ -26,6 +27,9 @@ CONFIG = parse_config(
 )
 
 
+LIMITS = PanTiltLimits((-2.0, 2.0), (-0.5, 0.5), 2.0, 3.0, 0.001)
+
+
 @pytest.fixture
 def devices(monkeypatch):
     """Devices that note what happens to them; name one in ``missing`` to have it fail."""
@@ -33,6 +37,8 @@ def devices(monkeypatch):
 
     def maker(name):
         class Device:
+            size, still_size, focal_range, limits = (640, 480), (3264, 2448), (300.0, 4000.0), LIMITS
+
             def __init__(self, *arguments):
                 if name in missing:
                     log.append(f"no {name}")
@@ -72,14 +78,16 @@ def test_a_device_that_is_not_named_is_asked_for_before_any_is_opened(devices, t
 
 def test_a_rig_toml_with_a_sim_section_only_is_no_real_rig():
     with pytest.raises(ConfigError, match=r"hardware\.head\.port: is missing"):
-        open_devices(RigConfig(backend="hardware", hardware=HardwareConfig()))
+        open_rig(RigConfig(backend="hardware", hardware=HardwareConfig()), guarded=False)
 
 
 def test_the_head_comes_last_and_is_let_go_first(devices):
     log, *_ = devices
-    with open_devices(CONFIG) as rig:
+    with open_rig(CONFIG, guarded=False) as rig:
         assert log == [f"open {name}" for name in ORDER]
-        assert rig.real_time
+        assert rig.spec.real_time
+        assert (rig.spec.zoom.still_size, rig.spec.zoom.focal_range) == ((3264, 2448), (300.0, 4000.0))
+        assert (rig.spec.head.limits, rig.spec.zoom.delay_s) == (LIMITS, CONFIG.hardware.zoom.command_delay_s)
         assert rig.head.arguments == (CONFIG.hardware.head, rig.clock, CONFIG.safety)
         assert rig.fixed.arguments == (CONFIG.hardware.fixed, rig.clock)
         assert rig.zoom.arguments == (CONFIG.hardware.zoom, rig.clock)

@@ -9,10 +9,11 @@ import pytest
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.estimation import TargetFilter, filter_settings
-from cotarget.pipeline import FollowSettings, State, follow
+from cotarget.pipeline import State, follow
 from experiments.calibration.synthetic.rig import SIZE, Truth
 from tests.moving_targets import calibration_of
-from tests.pipeline.test_follow import CALIBRATION, DELAY, PLAIN, Rig
+from tests.pipeline.test_follow import CALIBRATION, PLAIN, Rig
+from tests.rigs import rig_of
 
 RATE = 15.0
 LAST = np.array(SIZE) - 0.5  # right and lower edge of the image [px]
@@ -118,9 +119,8 @@ def test_a_box_that_is_cut_brings_a_target_nearer_and_never_moves_it_away():
 @pytest.mark.parametrize("speed", [1.0, 1.4])
 def test_the_head_stands_before_a_person_who_has_come_close(speed):
     way, rig = Approach("person", speed, waits_s=3.0), Rig()
-    settings = FollowSettings(command_delay_s=DELAY)
     poses = []
-    for step in follow(rig, CALIBRATION, way.target, way, seconds=25.0, settings=settings):
+    for step in follow(rig_of(rig), CALIBRATION, way.target, way, seconds=25.0):
         poses.append((step.t, *rig.pose(rig.t)))
         assert step.state in (State.FOLLOWING, State.SEARCHING)
     t, pan, tilt = np.array(poses).T

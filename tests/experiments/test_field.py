@@ -136,7 +136,6 @@ def offsets_of_who_stops(exact, delay_s, closed_loop):
     truth = world.truth()
     detector = TruthDetector(truth, 0, TruthNoise(0.5, 0.04, 0.05))
     how = FollowSettings(
-        command_delay_s=config.command_delay_s,
         closed_loop=closed_loop,
         finder=lambda calibration, target: TruthFinder(calibration, target, truth, "person", 0),
     )
@@ -170,7 +169,7 @@ def test_the_whole_loop_does_not_oscillate_however_late_it_is(exact, delay_s):
 # ---------------------------------------------------------------- five targets
 def test_good_seconds_are_those_that_rows_tell(exact):
     config = hold_config("person", 1)
-    target, how = config.target("person"), FollowSettings(command_delay_s=0.08, closed_loop=False)
+    target, how = config.target("person"), FollowSettings(closed_loop=False)
     view = seen_well(config, target, 4.0)
     found = five_targets.good_seconds(exact, config, target, 4.0, how, view)
     rows = field.held(exact, config, "person", 4.0, how, view)

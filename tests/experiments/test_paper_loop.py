@@ -31,7 +31,7 @@ def run():
     config = parse_config({"sim": sim})
     world = SimWorld(config, rendered=())
     detector = TruthDetector(world.truth(), 0, TruthNoise(0.0, 0.0, 0.0))
-    known, how = true_calibration(world), FollowSettings(command_delay_s=config.command_delay_s)
+    known, how = true_calibration(world), FollowSettings()
     with world.rig as rig:
         steps = list(follow_as_the_paper(rig, known, config.target("person"), detector, seconds=6.0, settings=how))
     return known, steps

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import sim_speed
 from cotarget.pipeline import State
-from cotarget.safety import SafeRig
+from cotarget.safety.safe_rig import guard
 from experiments.following import field
 from experiments.following.field_scenes import hold_config
 
@@ -66,7 +66,7 @@ def test_what_is_timed_is_how_a_bird_is_held(monkeypatch):
     config = hold_config("bird", 3)
     assert asked == [(calibration, config, field.target_of(config, "bird"), sim_speed.SETTLED_S + 2.0)]
     guarded = []
-    monkeypatch.setattr(field, "SafeRig", lambda rig, safety: guarded.append(safety) or SafeRig(rig, safety))
+    monkeypatch.setattr(field, "guard", lambda rig, safety: guarded.append(safety) or guard(rig, safety))
     steps = [step for step, _ in sim_speed.held_unrendered(calibration, 1.0, 3)]
     assert steps[-1].t == pytest.approx(2.0, abs=0.2)
     assert State.FOLLOWING in {step.state for step in steps}

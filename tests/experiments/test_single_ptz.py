@@ -102,7 +102,7 @@ def looked(world, until, seconds):
     """Where a camera's head was sent that sees its book until a time, by what it was doing; and its focal lengths."""
     truth, calibration = world.truth(), true_calibration(world)
     detector = Blind(Outlines(truth, still=True), until)
-    delay = world.config.command_delay_s
+    delay = world.rig.spec.head.delay_s
     field = scan_of(world.rig, calibration)
     camera = LoneCamera(world.rig, truth, calibration, BOOK, detector, delay, 0.5, field)
     sent, move = [], world.rig.head.move
@@ -193,7 +193,7 @@ def test_what_is_seen_once_is_not_believed(world):
     truth, calibration = world.truth(), true_calibration(world)
     field = scan_of(world.rig, calibration)
     detector = Once(Outlines(truth, still=True))
-    camera = LoneCamera(world.rig, truth, calibration, BOOK, detector, world.config.command_delay_s, 0.5, field)
+    camera = LoneCamera(world.rig, truth, calibration, BOOK, detector, world.rig.spec.head.delay_s, 0.5, field)
     modes = [camera.mode for _ in camera.run(3.0)]
     assert modes[0] == "waiting"
     assert set(modes) == {"waiting", "scanning"}

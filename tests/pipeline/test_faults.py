@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from cotarget.backends import open_recording
 from cotarget.calibration import load_calibration
 from cotarget.config import RigConfig as Config
 from cotarget.config import SafetyConfig, SimConfig
@@ -20,10 +21,8 @@ from cotarget.errors import CotargetError, DeviceError, StaleFrameError
 from cotarget.evaluation import TruthDetector, true_calibration
 from cotarget.fusion import MOST_FILTERS
 from cotarget.pipeline import BLIND_S, FROZEN_S, GONE_S, ZOOM_WAIT_S, FollowSettings, State, follow
-from cotarget.recording.format import open_recording
-from cotarget.recording.replay import ReplayRig, until_end
+from cotarget.recording.replay import Replay, until_end
 from cotarget.rig import Frame
-from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
 from tests.pipeline.test_follow import (
     BOOK,
@@ -42,8 +41,9 @@ from tests.pipeline.test_follow import (
     spans,
     still,
 )
-from tests.recorded_run import ToyRig, calibration_file, record
+from tests.recorded_run import ToyDevices, calibration_file, record
 from tests.recorded_run import run as recorded
+from tests.rigs import guarded, rig_of
 
 FRAME_S = 1 / RATE_HZ
 FAULT = 1.5  # when it happens [s]; by then the target is followed
@@ -76,16 +76,12 @@ def attempt(rig, seer, seconds, **settings):
     """Follow until an error; the Steps before it, and the error."""
     steps, error = [], None
     try:
-        for step in follow(rig, CALIBRATION, BOOK, seer, seconds=seconds, settings=settings_of(**settings)):
+        for step in follow(rig_of(rig), CALIBRATION, BOOK, seer, seconds=seconds, settings=FollowSettings(**settings)):
             steps.append(step)
     except CotargetError as raised:
         error = raised
     assert "\n" not in str(error)
     return steps, error
-
-
-def settings_of(**settings):
-    return FollowSettings(command_delay_s=DELAY, **settings)
 
 
 def assert_it_comes_to_rest(rig, since):
@@ -167,7 +163,7 @@ def test_a_frame_that_repeats_or_jumps_is_passed_over_and_told(spoil, told, safe
     if safe:
         rig.head.halt = lambda: [axis.halt(rig.t) for axis in (rig.pan, rig.tilt)]
         rig.board, rig.close = None, lambda: None
-        with SafeRig(rig, SafetyConfig()) as each:
+        with guarded(rig, SafetyConfig()) as each:
             steps, error = attempt(each, Seer(crossing), 3.0)
     else:
         steps, error = attempt(rig, Seer(crossing), 3.0)
@@ -279,7 +275,7 @@ def test_a_zoom_camera_that_is_blind_for_a_while_stops_nothing(waits):
     """The wide view alone keeps the head on the target, and every Step says what is missing."""
     rig = blind(Rig(), FAULT, FAULT + 1.0, waits)
     steps, errors = [], []
-    for step in follow(rig, CALIBRATION, BOOK, Seer(crossing), seconds=3.5, settings=settings_of()):
+    for step in follow(rig_of(rig), CALIBRATION, BOOK, Seer(crossing), seconds=3.5, settings=FollowSettings()):
         steps.append(step)
         errors.append(off(rig, crossing, step.t))
     without = [s for s in steps if FAULT <= s.t - waits * ZOOM_WAIT_S < FAULT + 1.0]
@@ -374,10 +370,9 @@ def test_a_zoom_frame_that_is_there_costs_no_time():
     config = Config(sim=SimConfig(scene="indoor", targets=("book",)))
     world = SimWorld(config, rendered=())
     truth, target = world.truth(), config.target("book")
-    with SafeRig(world.rig, config.safety) as rig:
-        settings = FollowSettings(command_delay_s=config.command_delay_s)
+    with guarded(world.rig, config.safety) as rig:
         detector = TruthDetector(truth, 0)
-        steps = list(follow(rig, true_calibration(world), target, detector, seconds=1.0, settings=settings))
+        steps = list(follow(rig, true_calibration(world), target, detector, seconds=1.0))
     assert [step.t - step.fixed.t for step in steps] == pytest.approx([config.sim.fixed.latency_s] * len(steps))
     assert all(step.zoom.t == pytest.approx(step.fixed.t) for step in steps)
 
@@ -386,10 +381,10 @@ def test_a_zoom_camera_that_was_blind_is_so_in_the_replay(tmp_path):
     """Though the errors came one by one, not one of them ended the run."""
     path = calibration_file(tmp_path)
     failing = {("zoom.read", n): StaleFrameError("it is lost") for n in range(9, 20)}
-    steps = record(tmp_path / "run", path, ToyRig(failing))
+    steps = record(tmp_path / "run", path, ToyDevices(failing))
     recording = open_recording(tmp_path / "run")
-    played = ReplayRig(recording)
-    again = list(until_end(recorded(played, load_calibration(recording.calibration), seconds=math.inf)))
+    played = Replay(recording)
+    again = list(until_end(recorded(played.rig, load_calibration(recording.calibration), seconds=math.inf)))
     assert sum("it is lost" in step.reason for step in steps) == 11
     assert [step.reason for step in again] == [step.reason for step in steps]
     assert [step.zoom.t for step in again] == [step.zoom.t for step in steps]
@@ -521,7 +516,7 @@ def test_frames_that_repeat_end_a_run_behind_the_safety_layer_too():
     rig.fixed = Faulty(rig.fixed, again([]))
     rig.head.halt = lambda: [axis.halt(rig.t) for axis in (rig.pan, rig.tilt)]
     rig.board, rig.close = None, lambda: None
-    with SafeRig(rig, SafetyConfig()) as safe:
+    with guarded(rig, SafetyConfig()) as safe:
         steps, error = attempt(safe, Seer(crossing), 5.0)
     assert isinstance(error, StaleFrameError)
     assert_it_comes_to_rest(rig, steps[-1].t)

@@ -18,6 +18,7 @@ from cotarget.pipeline import FollowSettings, State, follow
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
 from cotarget.sim.motion import Axis
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
+from tests.rigs import rig_of
 
 RATE_HZ = 24.0  # neither 0.4 s nor 0.8 s is a whole number of frames
 LATENCY = 0.06
@@ -164,8 +165,8 @@ def off(rig, path, t):
 
 
 def run(rig, seer, seconds, **settings):
-    settings = FollowSettings(**{"command_delay_s": DELAY, **settings})
-    return list(follow(rig, CALIBRATION, BOOK, seer, seconds=seconds, settings=settings))
+    settings = FollowSettings(**settings)
+    return list(follow(rig_of(rig), CALIBRATION, BOOK, seer, seconds=seconds, settings=settings))
 
 
 def spans(steps):
@@ -234,9 +235,8 @@ def test_the_head_goes_on_with_the_target_while_it_is_lost():
     rig = Rig()
     offs = []
     steps = []
-    settings = FollowSettings(command_delay_s=DELAY)
     seer = Seer(crossing, lambda t: t < 1.5 or t > 2.1)
-    for step in follow(rig, CALIBRATION, BOOK, seer, seconds=3.0, settings=settings):
+    for step in follow(rig_of(rig), CALIBRATION, BOOK, seer, seconds=3.0):
         steps.append(step)
         offs.append(off(rig, crossing, step.t))
     lost = [i for i, step in enumerate(steps) if step.state is State.LOST]
@@ -307,8 +307,8 @@ def test_runs_with_the_same_settings_do_not_steer_each_other():
     same = FollowSettings()
 
     pairs = zip(
-        follow(Rig(), CALIBRATION, BOOK, seen(1.0), seconds=3.0, settings=same),
-        follow(Rig(), CALIBRATION, BOOK, seen(9.0), seconds=3.0, settings=same),
+        follow(rig_of(Rig()), CALIBRATION, BOOK, seen(1.0), seconds=3.0, settings=same),
+        follow(rig_of(Rig()), CALIBRATION, BOOK, seen(9.0), seconds=3.0, settings=same),
         strict=False,
     )
     followed = [[step.target and step.target.id for step in pair] for pair in pairs]
@@ -328,8 +328,8 @@ def test_a_policy_is_told_how_long_a_target_was_seen_well():
 
     policy = Noting()
     rig, true = Rig(lens_speed=1.5), 0
-    settings = FollowSettings(command_delay_s=DELAY, policy=lambda: policy)
-    for _ in follow(rig, CALIBRATION, BOOK, Seer(still), seconds=4.0, settings=settings):
+    settings = FollowSettings(policy=lambda: policy)
+    for _ in follow(rig_of(rig), CALIBRATION, BOOK, Seer(still), seconds=4.0, settings=settings):
         wanted = 160 * np.linalg.norm(still(0)) / 0.234 * 667 / 692
         off_px = off(rig, still, rig.t) * rig.lens(rig.t)
         true += rig.lens(rig.t) / wanted > 0.8 and off_px < 140  # half the height without half the book's
@@ -345,10 +345,11 @@ def test_why_the_lens_is_not_as_close_as_wanted_is_told():
     assert set(followed) <= {"", "zoom: unsure", "zoom: settling", "zoom: about to be lost"}
 
 
-def mean_off(**settings):
+def mean_off(delay_s):
+    """With a rig that says that its head has a delay."""
     rig = Rig()
     errors = []
-    for step in follow(rig, CALIBRATION, BOOK, Seer(crossing), seconds=3.0, settings=FollowSettings(**settings)):
+    for step in follow(rig_of(rig, delay_s=delay_s), CALIBRATION, BOOK, Seer(crossing), seconds=3.0):
         if step.t > 1.5:
             errors += [off(rig, crossing, t) for t in (step.t, step.t - 0.5 / RATE_HZ)]
     return float(np.mean(errors))
@@ -356,7 +357,7 @@ def mean_off(**settings):
 
 def test_the_head_keeps_up_with_a_constant_speed():
     """At 0.2 rad/s, a delay of 0.04 s that nobody allows for is a lag of 8 mrad."""
-    led, not_led = mean_off(command_delay_s=DELAY), mean_off(command_delay_s=0.0)
+    led, not_led = mean_off(DELAY), mean_off(0.0)
     print(f"mean pointing error: {1000 * led:.2f} mrad led, {1000 * not_led:.2f} mrad not led")
     # A head that hurries to every goal and brakes there runs ahead by a quarter of the way between two commands (it
     # speeds up for one half of the interval and brakes for the other); besides, goals are rounded to steps.

@@ -14,8 +14,8 @@ from cotarget.errors import CotargetError
 from cotarget.geometry import pose
 from cotarget.pipeline import FollowSettings, State, follow
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, Rig, ZoomState
-from cotarget.safety import SafeRig
 from tests.cli.test_commands import true_calibration
+from tests.rigs import guarded
 
 pytestmark = pytest.mark.render
 TABLE = {"sim": {"scene": "indoor", "targets": ["book"], "seed": 3}}
@@ -183,12 +183,12 @@ def test_the_book_is_followed_through_the_protocols_alone(line):
     config = parse_config(TABLE)
     target = config.target("book")
     proxy: Rig = ProxyRig(line)
-    settings = FollowSettings(command_delay_s=config.command_delay_s)
+    settings = FollowSettings()
     calibration, detector = true_calibration(config), make_detector(target, config.sim.fixed.rate_hz)
     proxy.board.present(pose([-0.4, -0.25, 3.0], [10, -15, 4]))
     assert find_corners(proxy.fixed.read(proxy.clock.now()).image, config.board) is not None
     proxy.board.present(None)
-    with SafeRig(proxy, config.safety) as rig:
+    with guarded(proxy, config.safety) as rig:
         steps = list(follow(rig, calibration, target, detector, seconds=SECONDS, settings=settings))
     assert {device for device, _ in line.spoken} == {"fixed", "zoom", "head", "clock", "board"}
     assert line.spoken[-2:] == [("head", "halt")] * 2  # the safety layer's and the rig's own

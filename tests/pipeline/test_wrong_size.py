@@ -41,7 +41,7 @@ def told(name, seed, wrong):
     target = config.target(name)
     target = replace(target, size=wrong * target.size)
     detector = TruthDetector(truth, seed, NOISE[name])
-    settings = FollowSettings(command_delay_s=config.command_delay_s, finder=finder)
+    settings = FollowSettings(finder=finder)
     with world.rig as rig:
         seconds = SECONDS[name]
         return list(follow(rig, true_calibration(world), target, detector, seconds=seconds, settings=settings)), truth

@@ -12,20 +12,22 @@ import cv2
 import numpy as np
 import pytest
 
+from cotarget.backends import open_recording
 from cotarget.calibration import load_calibration
 from cotarget.config import DEFAULT_TARGETS, RigConfig, config_table, parse_config
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.pipeline import State, Step
 from cotarget.recording import recorder as recorder_module
-from cotarget.recording.format import CALLS, Event, event_line, open_recording, parse_event
+from cotarget.recording.format import CALLS, Event, event_line, parse_event
 from cotarget.recording.recorder import COLUMNS, Recorder, StepTable
-from cotarget.recording.replay import ReplayRig
+from cotarget.recording.replay import Replay
 from cotarget.rig import Frame, PanTiltState, ZoomState
 from cotarget.targeting import Aim
 from cotarget.tracking.track import Track
 from tests.full_disk import SAID, full_disk
-from tests.recorded_run import CONFIG, SIZE, ToyRig, calibration_file, record, run
+from tests.recorded_run import CONFIG, SIZE, ToyDevices, calibration_file, record, run, toy_rig
+from tests.rigs import guarded, rig_of
 
 PICTURE = np.zeros((4, 4, 3), np.uint8)
 IMAGE_BYTES = SIZE[0] * SIZE[1] * 3
@@ -211,7 +213,7 @@ def test_a_config_comes_back(table):
 def test_no_password_is_recorded(tmp_path, calibration_path):
     table = {"backend": "hardware", "hardware": {"fixed": {"url": "http://me:secret@10.0.0.1/", "password": "secret"}}}
     with Recorder(tmp_path / "run", parse_config(table), calibration_path, "bird") as recorder:
-        list(run(recorder.wrap(ToyRig()), load_calibration(calibration_path), seconds=0.1))
+        list(run(recorder.wrap(toy_rig()), load_calibration(calibration_path), seconds=0.1))
     assert not [path for path in (tmp_path / "run").iterdir() if path.is_file() and b"secret" in path.read_bytes()]
     assert open_recording(tmp_path / "run").config.hardware.fixed.url == "http://10.0.0.1/"
 
@@ -221,7 +223,7 @@ def test_the_targets_picture_comes_along(tmp_path, calibration_path):
     cv2.imwrite(str(picture), np.full((4, 5, 3), 99, np.uint8))
     book = dataclasses.replace(DEFAULT_TARGETS["book"], template=picture)
     with Recorder(tmp_path / "run", RigConfig(targets={"book": book}), calibration_path, "book") as recorder:
-        list(run(recorder.wrap(ToyRig()), load_calibration(calibration_path), seconds=0.1))
+        list(run(recorder.wrap(toy_rig()), load_calibration(calibration_path), seconds=0.1))
     picture.unlink()
     moved = (tmp_path / "run").rename(tmp_path / "elsewhere")
     template = open_recording(moved).config.target("book").template
@@ -289,13 +291,23 @@ def test_a_rig_that_cannot_be_opened_leaves_room_for_the_next_try(tmp_path, cali
 
 
 def test_a_rig_that_says_nothing_of_itself_is_closed(tmp_path, calibration_path):
-    rig = ToyRig()
-    rig.head = None
+    devices = ToyDevices()
+    rig = dataclasses.replace(rig_of(devices), spec=None)
     with pytest.raises(AttributeError), Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
         recorder.wrap(rig)
-    assert rig.closed
+    assert devices.closed
     with pytest.raises(ConfigError, match="run: holds nothing to replay"):
         open_recording(tmp_path / "run")
+
+
+def test_a_guarded_rig_is_not_recorded(tmp_path, calibration_path):
+    """The log would lack what the guard commands."""
+    devices = ToyDevices()
+    with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
+        with guarded(devices, CONFIG.safety) as safe, pytest.raises(ConfigError, match="guarded"):
+            recorder.wrap(safe)
+        assert devices.closed
+    assert not (tmp_path / "run").exists()
 
 
 class Jammed:
@@ -319,7 +331,7 @@ def test_a_slow_disk_costs_closeups_and_says_how_many(tmp_path, calibration_path
     monkeypatch.setattr(recorder_module, "ZOOM_ROOM", 4 * IMAGE_BYTES)
     steps = []
     with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
-        for step in run(recorder.wrap(ToyRig()), load_calibration(calibration_path), seconds=2.0):
+        for step in run(recorder.wrap(toy_rig()), load_calibration(calibration_path), seconds=2.0):
             steps.append(step)
         dropped = recorder.dropped
         disk.free.set()
@@ -331,10 +343,10 @@ def test_a_slow_disk_costs_closeups_and_says_how_many(tmp_path, calibration_path
     recording = open_recording(tmp_path / "run")
     assert recording.steps == len(steps)
     assert "frames of the zoom camera lack their image" in recording.notes[0]
-    rig = ReplayRig(recording)
-    again = list(run(rig, load_calibration(calibration_path), seconds=2.0))
+    played = Replay(recording)
+    again = list(run(played.rig, load_calibration(calibration_path), seconds=2.0))
     assert [step.commanded for step in again] == [step.commanded for step in steps]
-    assert rig.differences.same
+    assert played.differences.same
 
 
 def test_a_run_waits_for_a_disk_that_has_no_room_for_the_fixed_cameras_images(tmp_path, calibration_path, monkeypatch):
@@ -345,7 +357,7 @@ def test_a_run_waits_for_a_disk_that_has_no_room_for_the_fixed_cameras_images(tm
 
     def work():
         with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
-            for step in run(recorder.wrap(ToyRig()), load_calibration(calibration_path), seconds=0.5):
+            for step in run(recorder.wrap(toy_rig()), load_calibration(calibration_path), seconds=0.5):
                 steps.append(step)
 
     thread = threading.Thread(target=work, daemon=True)
@@ -373,7 +385,7 @@ def test_a_full_disk_does_not_stop_the_run_but_is_told(tmp_path, calibration_pat
 
     def work():
         with Recorder(tmp_path / "run", CONFIG, calibration_path, "bird") as recorder:
-            steps.extend(run(recorder.wrap(ToyRig()), load_calibration(calibration_path), seconds=2.0))
+            steps.extend(run(recorder.wrap(toy_rig()), load_calibration(calibration_path), seconds=2.0))
 
     with pytest.raises(CotargetError, match=r"run: the recording is cut short: No space left on device"):
         work()

@@ -17,35 +17,39 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cotarget.backends import describe, open_recording, open_rig
 from cotarget.calibration import load_calibration
 from cotarget.calibration.file import save_calibration
 from cotarget.cli.main import main
-from cotarget.config import parse_config
+from cotarget.config import RigConfig, SafetyConfig, parse_config
 from cotarget.control.selection import Chosen, TargetChoice, choice_table, parse_choice
 from cotarget.detection import make_detector
-from cotarget.errors import ConfigError, CotargetError, DeviceError, StaleFrameError
+from cotarget.errors import ConfigError, CotargetError, DeviceError, HaltedError, StaleFrameError
 from cotarget.estimation import Estimate
 from cotarget.pipeline import FollowSettings, State, follow
-from cotarget.recording.format import COMPLETE, Event, open_recording
+from cotarget.recording.format import COMPLETE, Event
 from cotarget.recording.recorder import Recorder
-from cotarget.recording.replay import Differences, RecordingEndedError, ReplayRig, Tape, until_end
+from cotarget.recording.replay import Differences, RecordingEndedError, Replay, until_end
 from cotarget.rig import PanTiltState
-from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
 from tests.cli.test_commands import true_calibration
 from tests.recorded_run import (
     CONFIG,
+    FOCALS,
+    LIMITS,
     RATE_HZ,
     SETTINGS,
     SIZE,
     STEP,
     Bright,
-    ToyRig,
+    ToyDevices,
     calibration,
     calibration_file,
     record,
     run,
+    toy_rig,
 )
+from tests.rigs import guarded
 
 SECONDS = 2.0
 DEADLINE_S = 60.0  # for what should come at once
@@ -72,10 +76,10 @@ def assert_same(then, now, where="step"):
 def replay(folder, change=lambda rig: rig, **options):
     """The steps of a replay until the recording ends, and how its commands differ."""
     recording = open_recording(folder)
-    rig = ReplayRig(recording)
+    played = Replay(recording)
     options = {"seconds": math.inf} | options
-    steps = list(until_end(run(change(rig), load_calibration(recording.calibration), **options)))
-    return steps, rig.differences
+    steps = list(until_end(run(change(played.rig), load_calibration(recording.calibration), **options)))
+    return steps, played.differences
 
 
 @pytest.fixture(scope="module")
@@ -116,23 +120,21 @@ def test_the_same_pipeline_sees_and_commands_the_same_to_the_last_bit(recorded):
 def test_a_rig_in_real_time_is_replayed_as_such(tmp_path):
     """Its watchdog, a thread of its own, looks at the clock all the time and changes nothing."""
     path = calibration_file(tmp_path)
-    steps = record(tmp_path / "run", path, ToyRig(real_time=True), seconds=0.5)
+    steps = record(tmp_path / "run", path, ToyDevices(real_time=True), seconds=0.5)
     again, differences = replay(tmp_path / "run")
     assert_same(steps, again)
     assert differences.same
 
 
-class Curious(SimpleNamespace):
+def curious(rig):
     """A rig whose pipeline looks at the clock twice where it did once."""
-
-    def __init__(self, rig):
-        clock = SimpleNamespace(now=lambda: rig.clock.now() and rig.clock.now(), sleep_until=rig.clock.sleep_until)
-        super().__init__(fixed=rig.fixed, zoom=rig.zoom, head=rig.head, board=rig.board, close=rig.close, clock=clock)
+    clock = SimpleNamespace(now=lambda: rig.clock.now() and rig.clock.now(), sleep_until=rig.clock.sleep_until)
+    return dataclasses.replace(rig, clock=clock)
 
 
 def test_more_looks_at_the_clock_move_the_time_by_no_more_than_they_take(recorded):
     """The bird flies 0.7 px a frame at 100 px focal length, 10 degrees/s; a few ticks of 0.1 ms are 0.005 degrees."""
-    again, _ = replay(recorded[0], Curious)
+    again, _ = replay(recorded[0], curious)
     aims = [(then.aim, now.aim) for then, now in zip(recorded[1], again, strict=True)]
     assert [then is None for then, _ in aims] == [now is None for _, now in aims]
     apart = [math.hypot(then.pan - now.pan, then.tilt - now.tilt) for then, now in aims if then is not None]
@@ -142,15 +144,12 @@ def test_more_looks_at_the_clock_move_the_time_by_no_more_than_they_take(recorde
     assert_same([step.head for step in recorded[1]], [step.head for step in again])
 
 
-class Shifted:
+def shifted(rig, pan=0.0, focal_px=0.0, every=1):
     """A rig whose pipeline wants something else of the head and the lens than before."""
-
-    def __init__(self, rig, pan=0.0, focal_px=0.0, every=1):
-        self.fixed, self.clock, self.board = rig.fixed, rig.clock, rig.board
-        self.zoom, self.head = Proxy(rig.zoom), Proxy(rig.head)
-        self.zoom.zoom = lambda wanted: rig.zoom.zoom(wanted + focal_px)
-        count = itertools.count(1)
-        self.head.move = lambda p, t, speed=None: (p, t) if next(count) % every else rig.head.move(p + pan, t, speed)
+    zoom, head, count = Proxy(rig.zoom), Proxy(rig.head), itertools.count(1)
+    zoom.zoom = lambda wanted: rig.zoom.zoom(wanted + focal_px)
+    head.move = lambda p, t, speed=None: (p, t) if next(count) % every else rig.head.move(p + pan, t, speed)
+    return dataclasses.replace(rig, zoom=zoom, head=head)
 
 
 class Proxy:
@@ -163,12 +162,12 @@ class Proxy:
 
 def differences_of(folder, **change):
     recording = open_recording(folder)
-    rig = ReplayRig(recording)
+    played = Replay(recording)
     calibration, bird = load_calibration(recording.calibration), CONFIG.target("bird")
-    with SafeRig(rig, CONFIG.safety) as safe:
-        steps = follow(Shifted(safe, **change), calibration, bird, Bright(), seconds=math.inf, settings=SETTINGS)
+    with guarded(played.rig, CONFIG.safety) as safe:
+        steps = follow(shifted(safe, **change), calibration, bird, Bright(), seconds=math.inf, settings=SETTINGS)
         assert list(until_end(steps))
-    return rig.differences
+    return played.differences
 
 
 def test_commands_that_differ_are_counted_and_measured(recorded):
@@ -209,11 +208,9 @@ def of_track_2(tmp_path_factory):
     """A recording of a run that follows nobody but the second track, which comes late, as the command runs it."""
     folder = tmp_path_factory.mktemp("of_track_2")
     path = calibration_file(folder)
-    settings = FollowSettings(
-        command_delay_s=CONFIG.command_delay_s, lens_delay_s=CONFIG.lens_delay_s, policy=partial(Chosen, number=2)
-    )
+    settings = FollowSettings(policy=partial(Chosen, number=2))
     with Recorder(folder / "run", CONFIG, path, "bird", TargetChoice(track=2)) as recorder:
-        steps = list(run(recorder.wrap(ToyRig()), load_calibration(path), SECONDS, settings))
+        steps = list(run(recorder.wrap(toy_rig()), load_calibration(path), SECONDS, settings))
     assert {step.target.id for step in steps if step.target} == {2}
     return folder / "run"
 
@@ -319,18 +316,19 @@ def by_hand(copy):
     def write(rows, end="complete"):
         sizes = [{"bytes": (copy / row["image"]).stat().st_size} if "image" in row else {} for row in rows]
         write_log(copy, [row | size for row, size in zip(rows, sizes, strict=True)], end)
-        return ReplayRig(open_recording(copy))
+        return Replay(open_recording(copy))
 
     return write
 
 
 def test_what_was_not_asked_then_is_answered_by_time(by_hand):
-    rig = by_hand([
+    played = by_hand([
         head_at(10.0, 0.0), fixed(10.0, 0), zoomed(10.02, 0), head_at(10.1, 0.1, True),
         {"call": "zoom.state", "at": 10.0, "result": [100.0, False, 10.0]},
         {"call": "zoom.state", "at": 11.0, "result": [200.0, False, 11.0]},
         fixed(10.2, 1), zoomed(10.22, 1), fixed(10.3, 2), head_at(10.5, 0.5), fixed(11.0, 3), fixed(11.1, 4),
     ])  # fmt: skip
+    rig = played.rig
     assert rig.fixed.read().t == pytest.approx(9.94)
     assert rig.clock.now() == 10.0
     assert rig.head.state() == PanTiltState(0.1, -0.1, True, 10.1)  # as recorded, though not asked yet
@@ -351,7 +349,7 @@ def test_what_was_not_asked_then_is_answered_by_time(by_hand):
     assert rig.zoom.zoom(5000.0) == 1200.0
     assert rig.fixed.size == rig.zoom.still_size == SIZE
     assert rig.board.patience == 0
-    assert (rig.differences.extra, rig.differences.missing) == (2, 0)
+    assert (played.differences.extra, played.differences.missing) == (2, 0)
     rig.fixed.read()
     with pytest.raises(RecordingEndedError, match=r"copy: the recording ends here, at 11\.10 s") as caught:
         rig.fixed.read()
@@ -365,20 +363,67 @@ def test_what_was_not_asked_then_is_answered_by_time(by_hand):
     (["choices", "a function of that module"], DeviceError, "^choices: a function"),
 ])  # fmt: skip
 def test_what_failed_then_fails_again(by_hand, error, kind, message):
-    rig = by_hand([
+    played = by_hand([
         {"call": "head.state", "at": 1.0, "error": error},
         {"call": "head.move", "at": 1.1, "args": [0.1, 0.2, None, False], "error": error},
         {"call": "fixed.read", "at": 1.2, "args": [None, 1.0], "error": error},
     ], end="an accident")  # fmt: skip
+    rig = played.rig
     with pytest.raises(kind, match=message):
         rig.head.state()
     with pytest.raises(kind, match=message):
         rig.head.move(0.1, 0.2)
     with pytest.raises(kind, match=message):
         rig.fixed.read()
-    assert (rig.differences.moves, rig.differences.same) == (1, True)
+    assert (played.differences.moves, played.differences.same) == (1, True)
     with pytest.raises(RecordingEndedError):
         rig.head.state()  # the run broke off here
+
+
+class GarbledError(HaltedError):
+    """An error of a driver of its own."""
+
+
+def test_an_error_that_no_version_knows_is_replayed_as_the_nearest_known_one(tmp_path):
+    path, failing = calibration_file(tmp_path), {("head.move", 1): GarbledError("it was halted on its way")}
+    with Recorder(tmp_path / "run", CONFIG, path, "bird") as recorder, recorder.wrap(toy_rig(failing)) as rig:
+        rig.fixed.read()
+        with pytest.raises(GarbledError):
+            rig.head.move(0.1, 0.2, wait=True)
+    (row,) = [json.loads(line) for line in lines(tmp_path / "run") if b"error" in line]
+    assert (row["error"], row["error_class"]) == (["GarbledError", "it was halted on its way"], "HaltedError")
+    rig = Replay(open_recording(tmp_path / "run")).rig
+    rig.fixed.read()
+    with pytest.raises(HaltedError, match=r"^it was halted on its way$"):
+        rig.head.move(0.1, 0.2, wait=True)
+
+
+def test_a_replay_answers_with_what_was_recorded_of_the_rig(tmp_path):
+    """And not with what its configuration says, nor with defaults."""
+    path, rig = calibration_file(tmp_path), toy_rig(real_time=True)
+    other = dataclasses.replace(rig.spec.head, delay_s=0.3)
+    rig = dataclasses.replace(rig, spec=dataclasses.replace(rig.spec, head=other))
+    record(tmp_path / "run", path, rig, seconds=0.2)
+    assert Replay(open_recording(tmp_path / "run")).rig.spec == rig.spec
+    config = RigConfig(backend="replay", recording=tmp_path / "run", safety=SafetyConfig(pan_deg=(-10.0, 10.0)))
+    limits = dataclasses.replace(LIMITS, pan=(math.radians(-10.0), math.radians(10.0)))
+    spec = dataclasses.replace(rig.spec, head=dataclasses.replace(other, limits=limits))
+    assert describe(config) == spec
+    with open_rig(config) as played:
+        assert played.spec == spec
+
+
+def test_what_an_older_recording_lacks_of_the_rig_is_that_of_its_configuration(copy):
+    log = copy / "log.jsonl"
+    first, rest = log.read_bytes().split(b"\n", 1)
+    old = ("fixed_size", "zoom_size", "still_size", "focal_range_px", "pan", "tilt", "speed", "acceleration", "step")
+    facts = {key: json.loads(first)["rig"][key] for key in (*old, "real_time")}
+    log.write_bytes(json.dumps({"rig": facts}).encode() + b"\n" + rest)
+    edit("config", {"sim": {"fixed": {"rate_hz": 20.0}, "head": {"command_delay_s": 0.08}}})(copy)
+    spec = open_recording(copy).spec
+    assert (spec.fixed.rate_hz, spec.zoom.rate_hz) == (20.0, 25.0)
+    assert (spec.head.delay_s, spec.zoom.delay_s) == (0.08, 0.08)
+    assert (spec.fixed.size, spec.zoom.focal_range, spec.head.limits) == (SIZE, FOCALS, LIMITS)
 
 
 def collect(steps, into):
@@ -397,24 +442,24 @@ def test_an_accident_happens_again(tmp_path, failing):
     error = next(iter(failing.values()))
     steps = []
     with pytest.raises(type(error)), Recorder(tmp_path / "run", CONFIG, path, "bird") as recorder:
-        collect(run(recorder.wrap(ToyRig(failing, real_time=True)), load_calibration(path)), steps)
+        collect(run(recorder.wrap(toy_rig(failing, real_time=True)), load_calibration(path)), steps)
     recording = open_recording(tmp_path / "run")
     assert not recording.truncated
     assert recording.ending == f"{type(error).__name__}: {error}".removesuffix(": ")
     assert recording.ending in recording.notes[0]
-    rig, again = ReplayRig(recording), []
+    played, again = Replay(recording), []
     expected = error if isinstance(error, CotargetError) else CotargetError()
     with pytest.raises(type(expected), match=str(error) or "the recording ends here"):
-        collect(run(rig, load_calibration(path)), again)
+        collect(run(played.rig, load_calibration(path)), again)
     assert_same(steps, again)
-    assert rig.differences.same
+    assert played.differences.same
 
 
 def test_a_watchdogs_halt_is_noted_and_leaves_the_replay_alone(tmp_path):
     path = calibration_file(tmp_path)
     steps = []
     with Recorder(tmp_path / "run", CONFIG, path, "bird") as recorder:
-        rig = recorder.wrap(ToyRig())
+        rig = recorder.wrap(toy_rig())
         for step in run(rig, load_calibration(path), seconds=0.5):
             steps.append(step)
             watchdog = threading.Thread(target=lambda: rig.clock.now() and rig.head.halt())
@@ -436,7 +481,8 @@ def asked_aside(rig):
 
 
 def test_what_another_thread_asks_takes_nothing_from_the_run(by_hand):
-    rig = by_hand([head_at(10.0, 0.0), fixed(10.0), head_at(10.1, 0.1), {"call": "head.halt", "at": 10.1}])
+    played = by_hand([head_at(10.0, 0.0), fixed(10.0), head_at(10.1, 0.1), {"call": "head.halt", "at": 10.1}])
+    rig = played.rig
     rig.fixed.read()
     assert asked_aside(rig) == [10.0, PanTiltState(0.0, 0.0, False, 10.0), None]
     assert rig.head.state().pan == 0.1
@@ -556,7 +602,7 @@ def test_differences_take_no_longer_the_more_there_are():
             pytest.fail("goes through all")
 
     events = tuple(Event("fixed.read", 0.1 * i, (None, 1.0), (0.1 * i,), f"fixed/{i:06d}.png") for i in range(50))
-    tape = Tape(SimpleNamespace(directory=Path("run"), events=events, truncated=False, ending=COMPLETE))
+    tape = Replay(SimpleNamespace(directory=Path("run"), events=events, truncated=False, ending=COMPLETE))
     tape._differing = Unwalked()
     for i in range(50):
         tape.next_frame(None, 1.0)
@@ -625,7 +671,7 @@ def test_no_damage_ends_in_anything_but_one_of_our_errors(copy):
             outcomes["several lines" if "\n" in str(error) else "refused"] += 1
         else:
             try:
-                list(until_end(run(ReplayRig(recording), calibration())))
+                list(until_end(run(Replay(recording).rig, calibration())))
                 outcomes["replayed"] += 1
             except CotargetError:
                 outcomes["ended"] += 1
@@ -661,22 +707,22 @@ def test_a_run_that_is_killed_replays_up_to_shortly_before(tmp_path, steps):
 @pytest.mark.render
 def test_a_simulated_run_is_replayed_to_the_last_bit(tmp_path):
     config = parse_config({"sim": {"scene": "indoor", "targets": ["book"], "seed": 3}})
-    target, settings = config.target("book"), FollowSettings(command_delay_s=config.command_delay_s)
+    target, settings = config.target("book"), FollowSettings()
     path = tmp_path / "exact.json"
     save_calibration(path, true_calibration(config))
 
     def steps(rig, config, calibration, target, seconds):
-        detector = make_detector(target, config.rate_hz)
-        with SafeRig(rig, config.safety) as safe:
+        detector = make_detector(target, rig.spec.fixed.rate_hz)
+        with guarded(rig, config.safety) as safe:
             yield from follow(safe, calibration, target, detector, seconds=seconds, settings=settings)
 
     with Recorder(tmp_path / "run", config, path, "book") as recorder:
         rig = recorder.wrap(SimWorld(config).rig)
         then = list(steps(rig, config, load_calibration(path), target, 1.2))
     recording = open_recording(tmp_path / "run")
-    known, again = recording.config, ReplayRig(recording)
+    known, again = recording.config, Replay(recording)
     calibration = load_calibration(recording.calibration)
-    now = list(until_end(steps(again, known, calibration, known.target(recording.target), math.inf)))
+    now = list(until_end(steps(again.rig, known, calibration, known.target(recording.target), math.inf)))
     assert State.FOLLOWING in {step.state for step in then}
     assert_same(then, now)
     assert again.differences.same

@@ -10,8 +10,9 @@ import pytest
 
 from cotarget.config import SafetyConfig
 from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
-from cotarget.safety import SafeRig, clear_stop_file, refuse_if_stopped, stop_reason, write_stop_file
-from tests.safety_rigs import RealRig, SimulatedRig
+from cotarget.safety.stop_file import clear_stop_file, refuse_if_stopped, stop_reason, write_stop_file
+from tests.rigs import guarded
+from tests.safety_rigs import RealDevices, SimulatedDevices
 
 FAR = math.radians(100)
 DEADLINE_S = 10.0  # for a thread that should end at once; a machine may be busy
@@ -19,7 +20,7 @@ DEADLINE_S = 10.0  # for a thread that should end at once; a machine may be busy
 
 @pytest.fixture
 def rig():
-    return SimulatedRig()
+    return SimulatedDevices()
 
 
 @pytest.fixture
@@ -36,7 +37,7 @@ def names(folder):
 
 
 def test_a_stopped_head_does_not_move_until_it_is_cleared(rig):
-    with SafeRig(rig, SafetyConfig()) as safe:
+    with guarded(rig, SafetyConfig()) as safe:
         safe.head.move(FAR, 0.0)
         safe.stop("somebody is on the roof")
         assert safe.stopped == "somebody is on the roof"
@@ -56,7 +57,7 @@ def test_a_stopped_head_does_not_move_until_it_is_cleared(rig):
 
 def test_a_stop_outlasts_a_halt_that_fails(rig, caplog):
     rig.head.broken = 1
-    with SafeRig(rig, SafetyConfig()) as safe:
+    with guarded(rig, SafetyConfig()) as safe:
         safe.head.move(FAR, 0.0)
         safe.stop("smoke")
         assert "could not be halted" in caplog.text
@@ -67,8 +68,8 @@ def test_a_stop_outlasts_a_halt_that_fails(rig, caplog):
 
 def test_a_stop_while_a_command_is_on_its_way_halts_after_it():
     """Another thread, or a signal's handler, stops between the command's begin and its end."""
-    rig = RealRig()
-    with SafeRig(rig, SafetyConfig()) as safe:
+    rig = RealDevices()
+    with guarded(rig, SafetyConfig()) as safe:
         rig.head.hang = lambda: safe.stop("smoke")
         with pytest.raises(EmergencyStopError, match="smoke"):
             safe.head.move(0.5, 0.0)
@@ -80,8 +81,8 @@ def test_a_stop_while_a_command_is_on_its_way_halts_after_it():
     (KeyboardInterrupt, KeyboardInterrupt),
 ])  # fmt: skip
 def test_a_command_that_a_stop_breaks_off_tells_of_the_stop_but_hides_no_ctrl_c(raised, seen):
-    rig = RealRig()
-    with SafeRig(rig, SafetyConfig()) as safe:
+    rig = RealDevices()
+    with guarded(rig, SafetyConfig()) as safe:
 
         def hang():
             safe.stop("smoke")
@@ -94,7 +95,7 @@ def test_a_command_that_a_stop_breaks_off_tells_of_the_stop_but_hides_no_ctrl_c(
 
 
 def test_the_file_stops_every_command_and_ends_by_its_removal(rig, file):
-    with SafeRig(rig, SafetyConfig(stop_file=file)) as safe:
+    with guarded(rig, SafetyConfig(stop_file=file)) as safe:
         safe.head.move(FAR, 0.0)
         write_stop_file(file, "somebody is on the roof")
         assert safe.stopped == "somebody is on the roof"
@@ -113,7 +114,7 @@ def test_the_file_stops_every_command_and_ends_by_its_removal(rig, file):
 
 
 def test_looking_at_the_rig_in_simulated_time_sees_the_file(rig, file):
-    with SafeRig(rig, SafetyConfig(stop_file=file)) as safe:
+    with guarded(rig, SafetyConfig(stop_file=file)) as safe:
         safe.head.move(FAR, 0.0)
         file.touch()
         safe.fixed.read()
@@ -123,7 +124,7 @@ def test_looking_at_the_rig_in_simulated_time_sees_the_file(rig, file):
 def test_a_rig_is_not_opened_while_there_is_a_stop_file(rig, file):
     write_stop_file(file, "smoke")
     with pytest.raises(EmergencyStopError, match="emergency stop: smoke; when it is safe to move, run") as caught:
-        SafeRig(rig, SafetyConfig(stop_file=file))
+        guarded(rig, SafetyConfig(stop_file=file))
     assert "\n" not in str(caught.value)
     assert rig.closed
     assert not rig.head.log
@@ -131,8 +132,8 @@ def test_a_rig_is_not_opened_while_there_is_a_stop_file(rig, file):
 
 @pytest.mark.wire
 def test_the_file_halts_a_head_in_motion_whatever_the_program_does(file):
-    rig = RealRig()
-    with SafeRig(rig, SafetyConfig(stop_file=file, watchdog_s=1000.0)) as safe:
+    rig = RealDevices()
+    with guarded(rig, SafetyConfig(stop_file=file, watchdog_s=1000.0)) as safe:
         safe.head.move(0.5, 0.0)
         begun = time.monotonic()
         write_stop_file(file, "smoke")
@@ -147,8 +148,8 @@ def test_the_file_halts_a_head_in_motion_whatever_the_program_does(file):
 def test_stops_from_many_threads_leave_no_command_behind_them():
     """However commands and stops interleave, the head has been told to halt last, and nothing moves it."""
     for _ in range(50):
-        rig = RealRig()
-        with SafeRig(rig, SafetyConfig()) as safe:
+        rig = RealDevices()
+        with guarded(rig, SafetyConfig()) as safe:
             ready = threading.Barrier(3)
 
             def command(safe=safe, ready=ready):
@@ -250,13 +251,13 @@ def test_a_stop_file_whose_folder_is_not_there_is_told_and_no_folder_made(rig, t
         write_stop_file(file, "smoke")
     assert "\n" not in str(caught.value)
     with pytest.raises(ConfigError, match="nobody could stop the head by this file: there is no folder"):
-        SafeRig(rig, SafetyConfig(stop_file=file))
+        guarded(rig, SafetyConfig(stop_file=file))
     assert rig.closed
     assert names(tmp_path) == ["a file"]
 
 
 def test_a_stop_is_logged_once(rig, file, caplog):
-    with SafeRig(rig, SafetyConfig(stop_file=file)) as safe:
+    with guarded(rig, SafetyConfig(stop_file=file)) as safe:
         write_stop_file(file, "smoke")
         for _ in range(3):
             safe.fixed.read()

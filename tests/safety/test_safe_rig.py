@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from cotarget.config import SafetyConfig
 from cotarget.errors import ConfigError, DeviceError, StaleFrameError
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState
-from cotarget.safety import SafeRig
+from tests.rigs import guarded, rig_of
 
 STEP = math.radians(0.0514286)
 SPEED = math.radians(149.0)
@@ -39,7 +40,7 @@ class Head:
         self.log.append("halt")
 
 
-class Rig:
+class Devices:
     """The rest: a camera whose newest frame is as old as wanted."""
 
     def __init__(self, head=None, age=0.06):
@@ -75,7 +76,7 @@ def test_no_command_leaves_the_limits_or_exceeds_the_cap(step, soft):
         low, high = wanted or device
         allowed.append((math.radians(max(low, device[0])), math.radians(min(high, device[1]))))
     cap = math.radians(min(soft.speed_deg_s or 149.0, 149.0))
-    safe = SafeRig(Rig(head), soft).head
+    safe = guarded(Devices(head), soft).head
     edges = [e + d for limits in allowed for e in limits for d in (-1e-3, -1e-12, 0.0, 1e-12, 1e-3)]
     commands = [*rng.uniform(-7, 7, (3000, 2)), *((p, t) for p in edges for t in edges), (math.inf, -math.inf)]
     for pan, tilt in commands:
@@ -106,7 +107,7 @@ SPEEDS = [None, 5e-324, 1e-9, math.radians(40.0), SPEED, 1e300, math.inf, 0.0, -
 @pytest.mark.parametrize("step", [STEP, 0.0])
 def test_every_command_is_done_within_the_limits_or_refused(step):
     head = Head(PanTiltLimits(LIMITS.pan, LIMITS.tilt, SPEED, 3.6, step))
-    safe = SafeRig(Rig(head), SafetyConfig(pan_deg=(-90.0, 45.0), speed_deg_s=30.0)).head
+    safe = guarded(Devices(head), SafetyConfig(pan_deg=(-90.0, 45.0), speed_deg_s=30.0)).head
     pan_limits, cap = (math.radians(-90.0), math.radians(45.0)), math.radians(30.0)
     for pan, tilt in itertools.product(AWKWARD, AWKWARD):
         for speed in SPEEDS:
@@ -126,10 +127,10 @@ def test_every_command_is_done_within_the_limits_or_refused(step):
 
 @pytest.mark.parametrize("said", [(1.9, 0.0), (0.0, -1.5), (math.nan, 0.0)])
 def test_a_head_that_says_it_goes_beyond_the_limits_is_halted(said):
-    rig = Rig()
+    rig = Devices()
     rig.head.move = lambda *a: said
     with pytest.raises(DeviceError, match=r"was sent to pan 28\.648.* beyond the limits") as caught:
-        SafeRig(rig, SafetyConfig(pan_deg=(-90.0, 90.0))).head.move(0.5, 0.1)
+        guarded(rig, SafetyConfig(pan_deg=(-90.0, 90.0))).head.move(0.5, 0.1)
     assert rig.head.log == ["halt"]
     assert "\n" not in str(caught.value)
 
@@ -138,29 +139,29 @@ def test_a_head_that_says_it_goes_beyond_the_limits_is_halted(said):
 def test_what_is_not_a_number_never_reaches_the_head(angles):
     head = Head(PanTiltLimits((-1.0, 1.0), (-1.0, 1.0), 1.0, 1.0, 0.0))
     with pytest.raises(DeviceError, match="cannot go to"):
-        SafeRig(Rig(head), SafetyConfig()).head.move(*angles)
+        guarded(Devices(head), SafetyConfig()).head.move(*angles)
     assert not head.log
 
 
 def test_a_head_of_unlimited_speed_is_not_told_infinity():
     head = Head(PanTiltLimits((-1.0, 1.0), (-1.0, 1.0), math.inf, math.inf, 0.0))
-    SafeRig(Rig(head), SafetyConfig()).head.move(0.1, 0.1)
+    guarded(Devices(head), SafetyConfig()).head.move(0.1, 0.1)
     assert head.log == [(0.1, 0.1, None, False)]
 
 
 def test_waiting_is_passed_on():
-    rig = Rig()
-    SafeRig(rig, SafetyConfig()).head.move(0.0, 0.0, wait=True)
+    rig = Devices()
+    guarded(rig, SafetyConfig()).head.move(0.0, 0.0, wait=True)
     assert rig.head.log[-1][3] is True
 
 
 def test_a_stale_frame_is_refused():
     config = SafetyConfig(max_frame_age_s=0.5)
-    fresh = SafeRig(Rig(age=0.49), config).fixed
+    fresh = guarded(Devices(age=0.49), config).fixed
     assert fresh.read().t == pytest.approx(4.51)
     assert fresh.size == (2, 2)
     with pytest.raises(StaleFrameError, match=r"the newest frame is 0\.51 s old; at most 0\.5 s") as caught:
-        SafeRig(Rig(age=0.51), config).fixed.read()
+        guarded(Devices(age=0.51), config).fixed.read()
     assert "\n" not in str(caught.value)
 
 
@@ -175,17 +176,17 @@ def test_a_stale_frame_is_refused():
     (4.8, 4.9, r"the CAMERA camera gave a frame of 4\.800 s for one after that time"),
 ])  # fmt: skip
 def test_neither_camera_gives_a_frame_that_cannot_be_acted_on(camera, t, newer_than, message):
-    rig = Rig()
+    rig = Devices()
     reader = SimpleNamespace(size=(2, 2), read=lambda *a: Frame(np.zeros((2, 2, 3), np.uint8), t))
     setattr(rig, camera, reader)
-    safe = SafeRig(rig, SafetyConfig(max_frame_age_s=0.5))
+    safe = guarded(rig, SafetyConfig(max_frame_age_s=0.5))
     with pytest.raises(StaleFrameError, match=message.replace("CAMERA", camera)) as caught:
         getattr(safe, camera).read(newer_than)
     assert "\n" not in str(caught.value)
 
 
 def test_a_still_may_be_old_when_it_arrives_but_not_older_than_its_request():
-    rig, now = Rig(), [5.0]
+    rig, now = Devices(), [5.0]
     rig.clock.now = lambda: now[0]
 
     def capture():
@@ -193,7 +194,7 @@ def test_a_still_may_be_old_when_it_arrives_but_not_older_than_its_request():
         return Frame(np.zeros((2, 2, 3), np.uint8), exposed)
 
     rig.zoom = SimpleNamespace(capture=capture)
-    safe = SafeRig(rig, SafetyConfig(max_frame_age_s=0.5))
+    safe = guarded(rig, SafetyConfig(max_frame_age_s=0.5))
     exposed = 5.4
     assert safe.zoom.capture().t == 5.4
     exposed = 5.4  # once more the same, 2.6 s before it was asked for
@@ -202,28 +203,28 @@ def test_a_still_may_be_old_when_it_arrives_but_not_older_than_its_request():
 
 
 def test_the_zoom_camera_is_otherwise_passed_on():
-    rig, told = Rig(), []
+    rig, told = Devices(), []
     rig.zoom = SimpleNamespace(
         size=(320, 240), still_size=(3264, 2448), focal_range=(300.0, 4000.0), state=lambda: "state",
         zoom=lambda f: told.append(f) or 512.0,
     )  # fmt: skip
-    safe = SafeRig(rig, SafetyConfig()).zoom
+    safe = guarded(rig, SafetyConfig()).zoom
     assert (safe.size, safe.still_size, safe.focal_range) == ((320, 240), (3264, 2448), (300.0, 4000.0))
     assert (safe.state(), safe.zoom(500.0), told) == ("state", 512.0, [500.0])
 
 
 def test_what_a_frame_is_asked_for_is_passed_on():
-    rig = Rig()
-    SafeRig(rig, SafetyConfig()).fixed.read(3.0, 0.2)
+    rig = Devices()
+    guarded(rig, SafetyConfig()).fixed.read(3.0, 0.2)
     assert rig.asked == [(3.0, 0.2)]
 
 
 @pytest.mark.parametrize("error", [None, ValueError, KeyboardInterrupt, SystemExit])
 def test_the_head_halts_before_the_rig_closes_on_every_way_out(error):
-    rig = Rig()
+    rig = Devices()
 
     def work():
-        with SafeRig(rig, SafetyConfig()) as safe:
+        with guarded(rig, SafetyConfig()) as safe:
             safe.head.move(0.5, 0.1)
             if error is not None:
                 raise error
@@ -241,9 +242,9 @@ def broken(*_):
 
 
 def test_a_head_that_cannot_halt_does_not_keep_the_rig_open():
-    rig = Rig()
+    rig = Devices()
     rig.head.halt = broken
-    with pytest.raises(OSError, match="cable"), SafeRig(rig, SafetyConfig()):
+    with pytest.raises(OSError, match="cable"), guarded(rig, SafetyConfig()):
         pass
     assert rig.closed
 
@@ -251,29 +252,63 @@ def test_a_head_that_cannot_halt_does_not_keep_the_rig_open():
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
 @pytest.mark.parametrize("failing", ["halt", "close"])
 def test_what_fails_on_the_way_out_does_not_hide_why(error, failing, caplog):
-    rig = Rig()
+    rig = Devices()
     setattr(rig.head if failing == "halt" else rig, failing, broken)
-    with pytest.raises(error, match="why"), SafeRig(rig, SafetyConfig()):
+    with pytest.raises(error, match="why"), guarded(rig, SafetyConfig()):
         raise error("why")
     assert rig.closed or failing == "close"
     assert "cable" in caplog.text
 
 
 def test_a_halt_that_fails_once_is_tried_again_before_the_rig_closes():
-    rig, tries = Rig(), iter([broken, lambda: rig.head.log.append("halt")])
+    rig, tries = Devices(), iter([broken, lambda: rig.head.log.append("halt")])
     rig.head.halt = lambda: next(tries)()
-    SafeRig(rig, SafetyConfig()).close()
+    guarded(rig, SafetyConfig()).close()
     assert rig.head.log == ["halt", "close"]
 
 
 def test_closing_twice_is_closing_once_and_nothing_moves_afterwards():
-    rig = Rig()
-    with SafeRig(rig, SafetyConfig()) as safe:
+    rig = Devices()
+    with guarded(rig, SafetyConfig()) as safe:
         safe.close()
     assert rig.head.log == ["halt", "close"]
     with pytest.raises(DeviceError, match="the rig is closed"):
         safe.head.move(0.1, 0.1)
     assert rig.head.log == ["halt", "close"]
+
+
+def test_a_guarded_rig_knows_its_soft_limits():
+    spec = guarded(Devices(), SafetyConfig(pan_deg=(-90.0, 45.0), speed_deg_s=30.0)).spec
+    assert spec.head.limits.pan == pytest.approx((math.radians(-90.0), math.radians(45.0)))
+    assert (spec.head.limits.tilt, spec.head.limits.speed) == (LIMITS.tilt, pytest.approx(math.radians(30.0)))
+
+
+def test_a_guarded_rig_is_not_guarded_again_and_stays_open():
+    devices = Devices()
+    with guarded(devices, SafetyConfig()) as safe:
+        with pytest.raises(ConfigError, match="guarded already"):
+            guarded(replace(safe, zoom=object()), SafetyConfig())
+        assert safe.head.move(0.0, 0.0) == (0.0, 0.0)
+    assert devices.closed
+
+
+def test_a_rig_with_another_device_is_stopped_and_closed_with_the_first():
+    devices = Devices()
+    safe = guarded(devices, SafetyConfig())
+    with replace(safe, zoom=object()) as other:
+        other.stop("smoke")
+        assert (safe.stopped, other.stopped) == ("smoke", "smoke")
+        assert (other.clear(), safe.stopped) == ("smoke", None)
+    assert devices.head.log == ["halt", "halt", "close"]
+
+
+def test_stopping_an_unguarded_rig_halts_its_head_and_says_that_it_may_move_again():
+    devices = Devices()
+    rig = rig_of(devices)
+    with pytest.raises(DeviceError, match="the rig is not guarded"):
+        rig.stop("smoke")
+    assert devices.head.log == ["halt"]
+    assert (rig.stopped, rig.clear()) == (None, None)
 
 
 @pytest.mark.parametrize(("soft", "message"), [
@@ -283,5 +318,5 @@ def test_closing_twice_is_closing_once_and_nothing_moves_afterwards():
 ])  # fmt: skip
 def test_soft_limits_that_leave_nothing_are_refused(soft, message):
     with pytest.raises(ConfigError, match=message) as caught:
-        SafeRig(Rig(), SafetyConfig(**soft))
+        guarded(Devices(), SafetyConfig(**soft))
     assert "\n" not in str(caught.value)

@@ -12,8 +12,9 @@ import pytest
 from cotarget.config import SafetyConfig, SimHead
 from cotarget.errors import DeviceError, EmergencyStopError, StaleFrameError
 from cotarget.rig import Frame, PanTiltState
-from cotarget.safety import SafeRig, stop_file, watchdog
-from tests.safety_rigs import DEADLINE_S, IMAGE, RealRig, SimulatedRig
+from cotarget.safety import stop_file, watchdog
+from tests.rigs import guarded
+from tests.safety_rigs import DEADLINE_S, IMAGE, RealDevices, SimulatedDevices
 
 WATCHDOG_S = 0.35  # the default
 FAR = math.radians(100)
@@ -24,20 +25,20 @@ TIMELY_S = 1.0  # beyond the watchdog's time, for a thread of a busy machine to 
 
 @pytest.fixture
 def rig():
-    return SimulatedRig()
+    return SimulatedDevices()
 
 
 @pytest.fixture
 def safe(rig):
-    with SafeRig(rig, SafetyConfig()) as opened:
+    with guarded(rig, SafetyConfig()) as opened:
         yield opened
 
 
 @pytest.fixture
 def real():
     """A rig in real time, and its safe one with a short watchdog."""
-    rig = RealRig()
-    with SafeRig(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
+    rig = RealDevices()
+    with guarded(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
         yield rig, safe
         rig.head.failing = 0
     assert "cotarget-watchdog" not in {thread.name for thread in threading.enumerate()}
@@ -169,10 +170,10 @@ def test_time_that_passes_behind_its_back_counts(rig, safe):
 
 
 def test_a_clock_that_runs_backwards_halts_the_head(caplog):
-    rig = SimulatedRig()
+    rig = SimulatedDevices()
     now = [100.0]
     rig.clock = SimpleNamespace(now=lambda: now[0], sleep_until=lambda t: None)
-    with SafeRig(rig, SafetyConfig()) as safe:
+    with guarded(rig, SafetyConfig()) as safe:
         safe.head.move(FAR, 0.0)
         now[0] = 40.0
         safe.head.state()
@@ -216,11 +217,11 @@ def test_a_halt_of_the_program_that_fails_is_tried_again(rig, safe):
 @pytest.mark.parametrize("where", ["reading", "commanding", "computing"])
 def test_a_program_that_hangs_ends_in_a_halted_head(where, caplog):
     """With the default watchdog; what hangs goes on hanging until the head is halted."""
-    rig = RealRig()
+    rig = RealDevices()
     halted_at = []
     halt = rig.head.halt
     rig.head.halt = lambda: (halted_at.append(time.monotonic()), halt())
-    with SafeRig(rig, SafetyConfig()) as safe:
+    with guarded(rig, SafetyConfig()) as safe:
         if where == "commanding":
             rig.head.hang = rig.head.wait_for_halt
         if where == "reading":
@@ -259,8 +260,8 @@ def test_somebody_who_looks_at_the_head_does_not_end_the_watch_over_a_command_on
 @pytest.mark.wire
 def test_a_wait_is_watched_for_no_longer_than_the_way_takes():
     """1 rad at 4 rad/s with ramps of 0.1 s takes 0.35 s: the device may wait for that, half as long again, and some."""
-    rig = RealRig()
-    with SafeRig(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
+    rig = RealDevices()
+    with guarded(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
         rig.head.hang = rig.head.wait_for_halt
         begun = time.monotonic()
         safe.head.move(1.0, 0.0, wait=True)
@@ -283,10 +284,10 @@ TICK_S = 0.001  # between looks at a head that never arrives
 def test_a_device_may_wait_half_as_long_again_as_the_way_takes(goal, speed, moving, way_s):
     """On a clock that the waiting device itself turns."""
     now = [0.0]
-    rig = RealRig(SimpleNamespace(now=lambda: now[0], sleep_until=lambda t: None))
+    rig = RealDevices(SimpleNamespace(now=lambda: now[0], sleep_until=lambda t: None))
     rig.real_time = False  # so that calls watch, and no thread
     rig.head.state = lambda: PanTiltState(0.0, 0.0, moving, now[0])
-    with SafeRig(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
+    with guarded(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
 
         def wait():
             while not rig.head.halted.is_set():
@@ -313,10 +314,10 @@ def test_the_thread_halts_until_the_head_obeys(real, caplog):
 @pytest.mark.parametrize("why", [None, ValueError])
 def test_a_head_that_cannot_be_halted_is_told_of_once(caplog, why):
     """By the log when it happens, and by whatever ends the program; not by each that tries again."""
-    rig = RealRig()
+    rig = RealDevices()
     rig.head.failing = 1000
     ends = pytest.raises(OSError, match="cable") if why is None else pytest.raises(why)
-    with ends, SafeRig(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
+    with ends, guarded(rig, SafetyConfig(watchdog_s=SHORT_S)) as safe:
         safe.head.move(1.0, 0.0)
         deadline = time.monotonic() + DEADLINE_S
         while not any("will be halted again" in record.getMessage() for record in caplog.records):
@@ -336,8 +337,8 @@ def test_a_clock_that_fails_stops_the_head():
         return time.monotonic()
 
     broken = []
-    rig = RealRig(SimpleNamespace(now=now, sleep_until=lambda t: None))
-    with SafeRig(rig, SafetyConfig()) as safe:
+    rig = RealDevices(SimpleNamespace(now=now, sleep_until=lambda t: None))
+    with guarded(rig, SafetyConfig()) as safe:
         safe.head.move(1.0, 0.0)
         broken.append(True)
         rig.head.wait_for_halt()
@@ -358,7 +359,7 @@ class Hung:
             assert self._answers.wait(DEADLINE_S)
             return look(path)
 
-        for module in (watchdog, watchdog, stop_file):
+        for module in (watchdog, stop_file):
             monkeypatch.setattr(module, "stop_reason", stop_reason)
 
     def hang(self):
@@ -377,8 +378,8 @@ def hung(monkeypatch):
 
 @pytest.mark.wire
 def test_a_stop_file_that_cannot_be_looked_at_does_not_keep_the_watchdog_from_halting(hung, tmp_path, caplog):
-    rig = RealRig()
-    with SafeRig(rig, SafetyConfig(watchdog_s=SHORT_S, stop_file=tmp_path / "stop")) as safe:
+    rig = RealDevices()
+    with guarded(rig, SafetyConfig(watchdog_s=SHORT_S, stop_file=tmp_path / "stop")) as safe:
         safe.head.move(1.0, 0.0)
         hung.hang()
         assert rig.head.halted.wait(SHORT_S + TIMELY_S)
@@ -390,15 +391,15 @@ def test_a_stop_file_that_cannot_be_looked_at_does_not_keep_the_watchdog_from_ha
 def test_a_command_waits_for_no_look_where_a_recent_one_found_no_stop(hung, tmp_path, monkeypatch):
     """Nobody but the test watches here, and the clock by which a look is recent goes on when the test says."""
     now = 5.0
-    monkeypatch.setattr(watchdog, "monotonic", lambda: now)
-    head = RealRig().head
-    watched = watchdog.Guard(head, RealRig().clock, SafetyConfig(stop_file=tmp_path / "stop"), threaded=True)
+    monkeypatch.setattr(stop_file, "monotonic", lambda: now)
+    head = RealDevices().head
+    watched = watchdog.Watchdog(head, RealDevices().clock, SafetyConfig(stop_file=tmp_path / "stop"), threaded=True)
     watched.watch()
     hung.hang()
-    now += watchdog.RECENT_S / 2
+    now += stop_file.RECENT_S / 2
     watched.begin((1.0, 0.0))
     assert head.log == []
-    now += watchdog.RECENT_S
+    now += stop_file.RECENT_S
     with pytest.raises(EmergencyStopError, match="cannot be looked at"):
         watched.begin((1.0, 0.0))
     assert head.log == ["halt"]
@@ -409,7 +410,9 @@ def test_a_command_waits_for_no_look_where_a_recent_one_found_no_stop(hung, tmp_
 @pytest.mark.wire
 def test_a_stop_that_was_seen_is_looked_at_again_before_the_next_command(tmp_path):
     """What the operator has cleared keeps nobody waiting for the next look of the thread."""
-    watched = watchdog.Guard(RealRig().head, RealRig().clock, SafetyConfig(stop_file=tmp_path / "stop"), threaded=True)
+    watched = watchdog.Watchdog(
+        RealDevices().head, RealDevices().clock, SafetyConfig(stop_file=tmp_path / "stop"), threaded=True
+    )
     watched.watch()
     (tmp_path / "stop").touch()
     watched.watch()
@@ -422,8 +425,8 @@ def test_a_stop_that_was_seen_is_looked_at_again_before_the_next_command(tmp_pat
 
 @pytest.mark.wire
 def test_it_counts_as_a_stop_until_it_answers(hung, tmp_path):
-    rig = RealRig()
-    with SafeRig(rig, SafetyConfig(watchdog_s=1000.0, stop_file=tmp_path / "stop")) as safe:
+    rig = RealDevices()
+    with guarded(rig, SafetyConfig(watchdog_s=1000.0, stop_file=tmp_path / "stop")) as safe:
         safe.head.move(1.0, 0.0)
         hung.hang()
         assert rig.head.halted.wait(TIMELY_S)
@@ -442,8 +445,8 @@ def test_it_counts_as_a_stop_until_it_answers(hung, tmp_path):
 
 @pytest.mark.wire
 def test_a_pipe_in_the_stop_files_place_stops(tmp_path):
-    rig = RealRig()
-    with SafeRig(rig, SafetyConfig(watchdog_s=1000.0, stop_file=tmp_path / "stop")) as safe:
+    rig = RealDevices()
+    with guarded(rig, SafetyConfig(watchdog_s=1000.0, stop_file=tmp_path / "stop")) as safe:
         safe.head.move(1.0, 0.0)
         os.mkfifo(tmp_path / "stop")
         rig.head.wait_for_halt()

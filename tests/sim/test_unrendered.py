@@ -6,8 +6,8 @@ import pytest
 from cotarget.config import SafetyConfig, parse_config
 from cotarget.errors import DeviceError
 from cotarget.geometry import pose
-from cotarget.safety import SafeRig
 from cotarget.sim.world import SimWorld
+from tests.rigs import guarded
 
 
 def drive(w):
@@ -58,7 +58,7 @@ def test_no_opengl_is_opened_for_no_picture(monkeypatch):
 
 def test_a_closed_rig_shows_nothing_more_and_can_be_closed_again():
     w = SimWorld(config(), rendered=())
-    with SafeRig(w.rig, SafetyConfig()) as rig:
+    with guarded(w.rig, SafetyConfig()) as rig:
         rig.head.move(0.1, 0.0)
         seen = rig.fixed.read()
     for _ in range(2):
