@@ -1,34 +1,30 @@
 """The fixed camera on an Axis video server, read over HTTP.
 
-`AxisCamera` drains the MJPEG stream on its own thread and keeps the newest image. A consumer that read the stream
-itself would fall behind: unread images wait in buffers and grow old. `VideoServer` speaks the server's HTTP interface,
-`WebDevice` any device's HTTP with basic or digest authentication.
+`AxisCamera` drains the MJPEG stream on its own thread into a `FrameBuffer`. `VideoServer` speaks the server's HTTP
+interface, `WebDevice` any device's HTTP with basic or digest authentication.
 
 Sources: Axis' VAPIX HTTP API, versions 2 and 3, and the manual of the 241Q.
 """
 
 import contextlib
-import logging
 import os
 import re
 import socket
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
 from cotarget.config import HardwareFixed
-from cotarget.drivers.mjpeg import JpegDecoder, JpegPicture, MultipartReader, boundary_of
-from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
-from cotarget.rig import Clock, Frame, Image
+from cotarget.drivers.frame_buffer import BusyError, FrameBuffer, FrameCounts, RefusedError
+from cotarget.drivers.mjpeg import MultipartReader, StreamDecoder, boundary_of
+from cotarget.errors import ConfigError, DeviceError, MissingPackageError
+from cotarget.rig import Clock, Frame
 
 if TYPE_CHECKING:
     import httpx
-
-log = logging.getLogger(__name__)
-
 
 # Environment variable of the password, where rig.toml has none.
 PASSWORD_VARIABLE = "COTARGET_PASSWORD"
@@ -38,14 +34,6 @@ STATUS_PATH = "/axis-cgi/videostatus.cgi"
 STREAM_PATH = "/axis-cgi/mjpg/video.cgi"
 # A stream has stalled after this time without a byte [s], or after this many frame periods where that is longer.
 SILENCE_S, SILENCE_PICTURES = 2.0, 3.0
-
-
-class BusyError(DeviceError):
-    """The server has no capacity at the moment; try again later."""
-
-
-class RefusedError(DeviceError):
-    """The server refuses this stream."""
 
 
 class LoginError(RefusedError):
@@ -441,41 +429,16 @@ def _import_httpx() -> ModuleType:
 
 # Time limit for the first image; a busy server is asked again until then [s].
 OPEN_S = 5.0
-# Pauses before the stream is opened again: shortest, after a stream that worked; longest; after a refusal, because
-# repeated logins may lock the user out [s].
-SHORTEST_PAUSE_S, LONGEST_PAUSE_S, REFUSED_PAUSE_S = 0.05, 0.4, 2.0
 # Images of a live camera differ by their noise; a stream that repeats one image for this time is frozen [s].
 FROZEN_S = 1.0
-# Error messages name the stream's silence as the cause from this time without a byte on [s].
-QUIET_S = 0.2
 # A stream that brings bytes but no whole image is opened again after this multiple of `silence_s`.
 FRUITLESS_SILENCES = 2.0
-# Time limit for the thread to end [s]; only a connection being made, or a slow server, delays it.
-JOIN_S = 10.0
-
-
-@dataclass(frozen=True)
-class Counters:
-    """Frame counts of a stream.
-
-    Attributes:
-        frames: new whole images.
-        repeated: images equal, byte for byte, to the one before.
-        broken: images that were cut short or failed to decode; only images that are read are decoded.
-        reconnects: number of times that the stream was opened again.
-    """
-
-    frames: int = 0
-    repeated: int = 0
-    broken: int = 0
-    reconnects: int = 0
 
 
 class AxisCamera:
     """The fixed camera on an Axis video server; close it after use.
 
-    A frame's time is the arrival of its first byte, less the configured latency. An image is decoded when it is read: a
-    slow consumer decodes only the images that it uses, and never holds up the stream.
+    A frame's time is the arrival of its first byte, less the configured latency.
 
     Args:
         config: address of the server, and the expected image size, rate and latency.
@@ -490,26 +453,21 @@ class AxisCamera:
         self._config, self._clock = config, clock
         self._server = VideoServer(config)
         self._api = ""
-        self._closing = threading.Event()
-        self._decoder, self._decoding = JpegDecoder(), threading.Lock()
-        self._decoded: tuple[JpegPicture, Image] | None = None
-        # Guards everything below, which is shared with the thread.
-        self._new = threading.Condition()
-        self._counters = Counters()
-        self._picture: JpegPicture | None = None  # the newest
-        self._last = b""  # its bytes, kept even if it cannot be decoded
-        self._fresh = self._heard = clock.now()  # arrival of the newest image, and of the last byte
-        self._spoilt = self._frozen = False  # since the newest image: broken ones, repeated ones
-        self._trouble = ""  # why there is no stream; empty while one is open
-        self._refused: DeviceError | None = None  # why no stream could ever be opened
-        self._failed = ""  # why the thread has ended
-        self._asked = False  # whether the server was asked for its video signal since the newest image
-        self._video: bool | None = None  # its answer: whether the input has a signal
-        self._thread = threading.Thread(target=self._run, name="axis", daemon=True)
+        self._open = False
+        self._asked: int | None = None  # number of frames when the server was asked for its video signal
+        name = f"the fixed camera at {self._server.name}"
+        self._frames = FrameBuffer(
+            name, clock, config.size, config.latency_s, self._server.silence_s, StreamDecoder().decode
+        )
         try:
             self._api = self._server.check()
-            self._thread.start()
-            self._await_first()
+            self._frames.start(lambda: self._frames.keep_open(self._stream, self._ask_for_video), "axis")
+            width, height = self._frames.first(OPEN_S)
+            if (width, height) != config.size:
+                raise ConfigError(
+                    f"hardware.fixed.size: {list(config.size)} is not what {self._server.name} sends: write size = "
+                    f"[{width}, {height}], or ask for another hardware.fixed.resolution than '{config.resolution}'"
+                )
         except BaseException:
             self.close()
             raise
@@ -520,10 +478,9 @@ class AxisCamera:
         return self._config.size
 
     @property
-    def counters(self) -> Counters:
+    def counts(self) -> FrameCounts:
         """Frame counts of the stream so far."""
-        with self._new:
-            return self._counters
+        return self._frames.counts
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
         """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
@@ -532,184 +489,56 @@ class AxisCamera:
             StaleFrameError: no such frame arrived within ``timeout`` [s]; the message says why.
             DeviceError: the image size changed, the camera is closed, or its driver failed.
         """
-        deadline = self._clock.now() + timeout
-        # A frame from before a stall does not show the present scene.
-        oldest = deadline - timeout - self._config.latency_s - self._server.silence_s
-        after = oldest if newer_than is None else max(oldest, newer_than)
-        while True:
-            with self._new:
-                self._new.wait_for(lambda: self._ready(after), max(deadline - self._clock.now(), 0.0))
-                if self._closing.is_set():
-                    raise DeviceError("the fixed camera is closed")
-                if self._failed:
-                    raise DeviceError(self._failed)
-                picture = self._picture
-                if picture is not None and picture.size != self.size:
-                    raise DeviceError(self._other_size(picture.size))
-                if picture is None or not self._ready(after):
-                    raise StaleFrameError(self._why(timeout))
-            image = self._decode(picture)
-            if image is not None:
-                return Frame(image, self._time(picture))
+        return self._frames.read(newer_than, timeout)
 
     def close(self) -> None:
         """End the stream and the thread; may be called again."""
-        self._closing.set()
+        self._frames.close()
         self._server.end()
-        with self._new:
-            self._new.notify_all()
-        if self._thread.is_alive():
-            self._thread.join(JOIN_S)
-        if not self._thread.is_alive():
+        if self._frames.join():
             self._server.close()
 
-    def _await_first(self) -> None:
-        with self._new:
-            self._new.wait_for(lambda: self._picture is not None or self._refused is not None, OPEN_S)
-            if self._refused is not None:
-                raise self._refused
-            if self._picture is None:
-                raise DeviceError(self._trouble or f"{self._server.name} has sent no whole picture in {OPEN_S:g} s")
-            width, height = self._picture.size
-        if (width, height) != self.size:
-            raise ConfigError(
-                f"hardware.fixed.size: {list(self.size)} is not what {self._server.name} sends: write size = "
-                f"[{width}, {height}], or ask for another hardware.fixed.resolution than '{self._config.resolution}'"
-            )
-
-    def _time(self, picture: JpegPicture) -> float:
-        return picture.t - self._config.latency_s
-
-    def _ready(self, after: float) -> bool:
-        """Return whether `read` can return or raise: a newer image, one of another size, a failure, or the end."""
-        picture = self._picture
-        told = picture is not None and (self._time(picture) > after or picture.size != self.size)
-        return told or bool(self._failed) or self._closing.is_set()
-
-    def _decode(self, picture: JpegPicture) -> Image | None:
-        """Decode an image, read-only; None if it is damaged, which is counted."""
-        with self._decoding:
-            if self._decoded is not None and self._decoded[0] is picture:
-                return self._decoded[1]
-            image = self._decoder.decode(picture.jpeg)
-            if image is not None:
-                self._decoded = (picture, image)
-                return image
-        with self._new:
-            if self._picture is picture:
-                self._picture, self._spoilt = None, True
-            self._counters = replace(self._counters, broken=self._counters.broken + 1)
-        return None
-
-    def _other_size(self, size: tuple[int, int]) -> str:
-        was, now = (f"{width}x{height}" for width, height in (self.size, size))
-        return f"{self._server.name} now sends {now} where it sent {was}: set its resolution back, or open it anew"
-
-    def _why(self, timeout: float) -> str:
-        """Explain why there is no newer image."""
-        now, name = self._clock.now(), self._server.name
-        if self._trouble:
-            reason = f"{self._trouble}; reconnecting"
-        elif now - self._heard > QUIET_S:
-            reason = f"{name} has sent nothing for {now - self._heard:.1f} s"
-        elif self._frozen:
-            reason = f"{name} repeats the same picture"
-        elif self._spoilt:
-            return f"the pictures of {name} are broken, {self._counters.broken} so far"
-        else:
-            return f"{name} sent no newer picture within {timeout:g} s"
-        video = f"; its input {self._config.camera} has no video" if self._video is False else ""
-        return f"no new picture for {now - self._fresh:.1f} s: {reason}{video}"
-
-    def _run(self) -> None:
-        """Run the thread."""
-        try:
-            self._keep_open()
-        except Exception as error:  # readers must learn that the thread has ended
-            log.debug("the driver of the fixed camera failed", exc_info=True)
-            with self._new:
-                self._failed = f"the driver of the fixed camera failed: {error!r}"
-                self._refused = DeviceError(self._failed)
-                self._new.notify_all()
-
-    def _keep_open(self) -> None:
-        """Open the stream, and open it again whenever it ends, until the camera is closed."""
-        pause = 0.0
-        while not self._closing.wait(pause):
-            frames = self._counters.frames
-            error, opened = self._stream()
-            with self._new:
-                self._trouble = str(error)
-                worked, lost = self._counters.frames > frames, self._clock.now() - self._fresh > FROZEN_S
-                ask = opened and lost and not self._asked
-                if not (worked or opened or self._counters.frames or isinstance(error, BusyError)):
-                    self._refused = error
-                self._new.notify_all()
-            pause = SHORTEST_PAUSE_S if worked else min(max(2 * pause, SHORTEST_PAUSE_S), LONGEST_PAUSE_S)
-            if isinstance(error, RefusedError):
-                pause = REFUSED_PAUSE_S
-            if ask and not self._closing.is_set():
-                self._ask_for_video()
-
-    def _stream(self) -> tuple[DeviceError, bool]:
-        """Open the stream and take its images until it ends; return why it ended, and whether it was open."""
-        opened = False
-        try:
-            with self._server.stream(self._api) as stream:
-                opened = True
-                self._drain(stream)
-        except DeviceError as error:
-            return error, opened
-        return DeviceError(f"{self._server.name} has closed the stream"), opened
+    def _stream(self) -> None:
+        """Open the stream and take its images until it ends."""
+        self._open = False
+        with self._server.stream(self._api) as stream:
+            self._open = True
+            self._frames.opened()
+            self._drain(stream)
 
     def _drain(self, stream: Stream) -> None:
         reader, broken = MultipartReader(stream.boundary), 0
         fruitful = self._clock.now()
-        with self._new:
-            again = 1 if self._trouble else 0
-            self._counters = replace(self._counters, reconnects=self._counters.reconnects + again)
-            self._heard, self._trouble = fruitful, ""
         try:
             for piece in stream.pieces:
                 now = self._clock.now()
+                self._frames.heard()
                 pictures = reader.feed(piece, now)
-                frozen = self._take(pictures, reader.broken - broken, now)
+                for picture in pictures:
+                    self._frames.put(picture.jpeg, picture.t)
+                self._frames.refuse(reader.broken - broken)
                 broken = reader.broken
                 fruitful = now if pictures else fruitful
                 if now - fruitful > FRUITLESS_SILENCES * self._server.silence_s:
                     raise DeviceError(f"{self._server.name} sends no whole pictures")
-                if frozen and not self._asked:
+                if self._frames.frozen_s > FROZEN_S and self._asked != self.counts.frames:
                     # The server is asked for its signal after this stream is closed: a stream that is not drained
                     # meanwhile would give the next image a wrong time.
                     raise DeviceError(f"{self._server.name} repeats the same picture")
         finally:
-            self._take([], reader.broken - broken + reader.unfinished, None)
-
-    def _take(self, pictures: list[JpegPicture], broken: int, now: float | None) -> bool:
-        """Record images and broken ones; return whether the stream is frozen."""
-        with self._new:
-            self._heard = self._heard if now is None else now
-            counters = replace(self._counters, broken=self._counters.broken + broken)
-            self._spoilt = self._spoilt or broken > 0
-            for picture in pictures:
-                if picture.jpeg == self._last:
-                    counters = replace(counters, repeated=counters.repeated + 1)
-                    self._frozen = True
-                    continue
-                counters = replace(counters, frames=counters.frames + 1)
-                self._picture, self._last, self._fresh = picture, picture.jpeg, picture.t
-                self._frozen = self._spoilt = self._asked = False
-                self._video = None
-                self._new.notify_all()
-            self._counters = counters
-            return self._frozen and now is not None and now - self._fresh > FROZEN_S
+            self._frames.refuse(reader.broken - broken + reader.unfinished)
 
     def _ask_for_video(self) -> None:
+        """Ask once, where a stream has ended and images have not come for a while, whether the input has a signal."""
+        frames = self.counts.frames
+        if not self._open or self._frames.waited_s <= FROZEN_S or self._asked == frames:
+            return
         video = None
         with contextlib.suppress(DeviceError):  # the stream's own error is reported already
             video = self._server.has_video()
-        with self._new:
-            self._asked, self._video = True, video
+        self._asked = frames
+        if video is False:
+            self._frames.remark(f"its input {self._config.camera} has no video")
 
 
 def probe(config: HardwareFixed) -> str:

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from cotarget.config import HardwareZoom
+from cotarget.drivers.frame_buffer import FrameBuffer, FrameCounts
 from cotarget.drivers.gphoto import (
     BAD_PARAMETERS,
     CAMERA_BUSY,
@@ -29,8 +30,8 @@ from cotarget.drivers.gphoto import (
     shortened,
 )
 from cotarget.drivers.lens import LensMotion, LensTable
-from cotarget.drivers.mjpeg import JpegDecoder
-from cotarget.errors import ConfigError, CotargetError, DeviceError, StaleFrameError
+from cotarget.drivers.mjpeg import DamagedError, decode_jpeg
+from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.rig import Clock, Frame, Image, ZoomState
 
 log = logging.getLogger(__name__)
@@ -42,8 +43,7 @@ class SharedState:
 
     Attributes:
         changed: notified at every change.
-        frame: the newest viewfinder frame.
-        arrived: arrival of that frame [s].
+        frames: viewfinder frames; its lock is apart from ``changed``.
         wanted: commanded lens position.
         order: sequence number of the lens command.
         standing: whether the lens has reached the last command.
@@ -51,14 +51,10 @@ class SharedState:
         lens_trouble: why the lens does not follow its command; empty if it does.
         called: whether the camera's thread has a new command.
         still: future of the still that a caller waits for.
-        trouble: why no frames come; empty while they come.
-        dropped: number of frames that were broken, late or of another size.
-        gone: why the camera cannot be used any more; empty while it can.
     """
 
+    frames: FrameBuffer
     changed: threading.Condition = field(default_factory=threading.Condition)
-    frame: Frame | None = None
-    arrived: float = -math.inf
     wanted: int = 0
     order: int = 0
     standing: bool = True
@@ -66,14 +62,17 @@ class SharedState:
     lens_trouble: str = ""
     called: bool = False
     still: "Future[Frame] | None" = None
-    trouble: str = ""
-    dropped: int = 0
-    gone: str = ""
+
+    @property
+    def gone(self) -> str:
+        """Why the camera cannot be used any more; empty while it can."""
+        return self.frames.gone
 
     def dismiss(self, why: str) -> None:
         """Mark the camera as unusable, and end every wait for it."""
+        self.frames.fail(why)
         with self.changed:
-            self.gone, self.called = self.gone or why, True
+            self.called = True
             still, self.still = self.still, None
             self.changed.notify_all()
         if still is not None and not still.done():
@@ -351,7 +350,6 @@ class StillJob:
         self._future: Future[Frame] | None = None
         self._due = -math.inf
         self._patience = Patience(clock)
-        self._decoder = JpegDecoder()
 
     def due(self) -> float:
         """Return when the next attempt is due [s]."""
@@ -390,9 +388,11 @@ class StillJob:
         begin = self._clock.now()
         still = self._link.shoot()
         end = self._clock.now()
-        image = self._decoder.decode(self._link.fetch(still))
-        if image is None:
-            raise DeviceError(f"the zoom camera's still '{still[1]}' is damaged, or no JPEG; set it to take JPEGs")
+        try:
+            image = decode_jpeg(self._link.fetch(still))
+        except DamagedError:
+            reason = f"the zoom camera's still '{still[1]}' is damaged, or no JPEG; set it to take JPEGs"
+            raise DeviceError(reason) from None
         size, wanted = size_of(image), self._config.still_size
         if size != wanted:
             raise ConfigError(
@@ -414,12 +414,10 @@ class StillJob:
 class ViewJob:
     """Fetch viewfinder frames and publish the newest."""
 
-    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, shared: SharedState) -> None:
-        self._config, self._clock, self._link, self._shared = config, clock, link, shared
+    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, frames: FrameBuffer) -> None:
+        self._config, self._clock, self._link, self._frames = config, clock, link, frames
         self._due = -math.inf
-        self._data, self._renewed = b"", -math.inf
         self._patience = Patience(clock)
-        self._decoder = JpegDecoder()
 
     def begin(self) -> None:
         """Wait for the first frame of a camera just opened.
@@ -432,27 +430,30 @@ class ViewJob:
         while True:
             data = patiently(self._clock, self._link.preview)
             arrived = self._clock.now()
-            image = self._decoder.decode(data)
-            if image is not None:
+            try:
+                width, height = size_of(decode_jpeg(data))
                 break
-            if arrived > deadline:
-                raise DeviceError(f"the camera at '{self._config.port}' shows no frame of its viewfinder")
+            except DamagedError:
+                if arrived > deadline:
+                    reason = f"the camera at '{self._config.port}' shows no frame of its viewfinder"
+                    raise DeviceError(reason) from None
             self._clock.sleep_until(arrived + BUSY_PAUSE_S)
-        (width, height), wanted = size_of(image), self._config.size
+        wanted = self._config.size
         if (width, height) != wanted:
             raise ConfigError(
                 f"hardware.zoom.size: the viewfinder's frames are {width} x {height}, not {wanted[0]} x {wanted[1]}; "
                 f"write size = [{width}, {height}], and pitch_mm for it"
             )
         self._due = arrived + 1 / self._config.rate_hz
-        self._publish(data, image, arrived)
+        self._frames.opened()
+        self._frames.put(data, arrived)
 
     def due(self) -> float:
         """Return when the next frame is to be fetched [s]."""
         return self._due
 
     def run(self) -> None:
-        """Fetch a frame; publish it if it is new, whole, in time and of the configured size."""
+        """Fetch a frame; publish it if it is new."""
         begin = self._clock.now()
         try:
             data = self._link.preview()
@@ -460,39 +461,15 @@ class ViewJob:
             due = self._patience.next_try(error)
             if due is None:
                 raise
-            with self._shared.changed:
-                self._shared.trouble = str(error)
+            self._frames.remark(str(error))
             self._due = due
             return
-        arrived = self._clock.now()
-        took, late = arrived - begin, arrived - begin > freshness(self._config)
+        arrived, period = self._clock.now(), 1 / self._config.rate_hz
         self._patience.reset()
-        period = 1 / self._config.rate_hz
-        if data == self._data:
-            self._due = arrived + (REPEAT_PAUSE_S if arrived < self._renewed + REPEAT_LIMIT_S else period)
-            return
-        self._due = max(self._due + period, begin)
-        image = self._decoder.decode(data)
-        if image is not None and size_of(image) == self._config.size and not late:
-            self._publish(data, image, arrived)
-            return
-        if image is None:
-            trouble = "its frames are broken"
-        elif size_of(image) != self._config.size:
-            trouble = "its frames are {} x {} now".format(*size_of(image))
+        if self._frames.put(data, arrived, took=arrived - begin):
+            self._due = max(self._due + period, begin)
         else:
-            trouble = f"its frames take {took:.2g} s to come"
-            self._data = data  # a repetition that comes in time must not count as new
-        with self._shared.changed:
-            self._shared.dropped += 1
-            self._shared.trouble = trouble
-
-    def _publish(self, data: bytes, image: Image, arrived: float) -> None:
-        self._data, self._renewed = data, arrived
-        with self._shared.changed:
-            self._shared.frame, self._shared.arrived = Frame(image, arrived - self._config.latency_s), arrived
-            self._shared.trouble = ""
-            self._shared.changed.notify_all()
+            self._due = arrived + (REPEAT_PAUSE_S if self._frames.waited_s < REPEAT_LIMIT_S else period)
 
 
 def freshness(config: HardwareZoom) -> float:
@@ -527,7 +504,7 @@ class Shooting:
         self._config, self._clock, self._link, self._shared = config, clock, link, shared
         self._lens = LensJob(config, clock, link, shared)
         self._still = StillJob(config, clock, link, shared)
-        self._view = ViewJob(config, clock, link, shared)
+        self._view = ViewJob(config, clock, link, shared.frames)
         self._connected = False
         self._lost_at = self._attempt = 0.0
         self._pause = FIRST_PAUSE_S
@@ -622,8 +599,7 @@ class Shooting:
 
     def _wait(self, error: Exception) -> None:
         self._attempt, self._pause = self._clock.now() + self._pause, 2 * self._pause
-        with self._shared.changed:
-            self._shared.trouble = f"looking for the camera again, {error}"
+        self._shared.frames.lose(error)
 
     def _give_up(self, error: CotargetError | LinkError) -> None:
         why = f"the zoom camera at '{self._config.port}' is gone: {error}"
@@ -665,7 +641,9 @@ class GphotoCamera:
 
     def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink | None = None) -> None:
         self._config, self._clock = config, clock
-        self._shared = SharedState()
+        self._name = f"the zoom camera at '{config.port}'"
+        self._frames = FrameBuffer(self._name, clock, config.size, config.latency_s, freshness(config))
+        self._shared = SharedState(self._frames)
         self._still_turn = threading.Lock()
         link = GphotoLink(config.port, config.model) if link is None else link
         opened: Future[ZoomSetting] = Future()
@@ -697,36 +675,18 @@ class GphotoCamera:
         return self._lens.focal_range
 
     @property
-    def dropped(self) -> int:
-        """Number of frames dropped because they were broken, late or of another size."""
-        with self._shared.changed:
-            return self._shared.dropped
+    def counts(self) -> FrameCounts:
+        """Frame counts of the viewfinder so far."""
+        return self._frames.counts
 
     def read(self, newer_than: float | None = None, timeout: float = 1.0) -> Frame:
         """Wait for the newest frame; with ``newer_than`` [s] for one exposed after that time.
 
         Raises:
-            StaleFrameError: no such frame arrived within ``timeout`` [s].
-            DeviceError: the camera is gone.
+            StaleFrameError: no such frame arrived within ``timeout`` [s]; the message says why.
+            DeviceError: the frames' size has changed, or the camera is gone.
         """
-        shared = self._shared
-        fresh = freshness(self._config)
-
-        def there() -> bool:
-            if shared.gone:
-                return True
-            new = shared.frame is not None and (newer_than is None or shared.frame.t > newer_than)
-            return new and self._clock.now() - shared.arrived <= fresh
-
-        with shared.changed:
-            came = shared.changed.wait_for(there, timeout)
-            self._check()
-            if came and shared.frame is not None:
-                return shared.frame
-            which = "frame" if newer_than is None else f"frame newer than {newer_than:.3f} s"
-            raise StaleFrameError(
-                f"no {which} from the zoom camera within {timeout:g} s{shared.trouble and f': {shared.trouble}'}"
-            )
+        return self._frames.read(newer_than, timeout)
 
     def zoom(self, focal_px: float) -> float:
         """Start the lens moving; return at once the nominal focal length [px] of the position that it will reach.
@@ -786,10 +746,10 @@ class GphotoCamera:
 
     def close(self) -> None:
         """End the thread and release the camera; may be called again."""
-        self._shared.dismiss("the zoom camera is closed")
+        self._shared.dismiss(f"{self._name} is closed")
         self._thread.join(CLOSE_LIMIT_S)
         if self._thread.is_alive():
-            log.warning("the zoom camera at '%s' does not answer; it is left as it is", self._config.port)
+            log.warning("%s does not answer; it is left as it is", self._name)
 
     def _check(self) -> None:
         if self._shared.gone:
@@ -807,7 +767,7 @@ class GphotoCamera:
                 self._rest_until(work.work())
         except Exception as error:  # callers must learn that the thread has ended
             log.debug("the driver of the zoom camera failed", exc_info=True)
-            self._shared.dismiss(f"the driver of the zoom camera failed: {error!r}")
+            self._shared.dismiss(f"the driver of {self._name} failed: {error!r}")
         finally:
             with contextlib.suppress(Exception):
                 work.close()

@@ -1,6 +1,6 @@
 """Read and decode JPEG images from a multipart/x-mixed-replace stream.
 
-`Walk` finds the parts of a JPEG by its markers (ITU-T T.81, annex B). `JpegDecoder` decodes whole images and refuses
+`Walk` finds a JPEG's end and size by its markers (ITU-T T.81, annex B). `decode_jpeg` decodes whole images and refuses
 damaged ones. `MultipartReader` takes the stream's bytes and returns whole images. Nothing here does I/O.
 
 Servers differ in how they write the boundary, Content-Length may be missing or wrong, bytes may follow an image, and
@@ -8,22 +8,18 @@ parts are cut short. An image is therefore taken from its first marker to its la
 image was cut. Waiting for the boundary after an image would also cost a frame period.
 """
 
-import itertools
-import math
 import re
 import threading
 from collections import deque
 from dataclasses import dataclass
+from types import ModuleType
 
-import av
-import cv2
-import numpy as np
-
+from cotarget.errors import MissingPackageError
 from cotarget.rig import Image
 
 # Within compressed data 0xff is followed by a zero, a restart marker or another 0xff; any other byte makes a marker.
 MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
-EOI, SOS, DRI = 0xD9, 0xDA, 0xDD
+EOI, SOS = 0xD9, 0xDA
 # Frame headers, which hold the size: C0 to CF except tables (C4, CC) and a reserved marker (C8).
 SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 # Markers that are followed by a length: frame headers, tables, scans, application data and comments.
@@ -40,9 +36,6 @@ class Walk:
         end: index after the last byte, once that has arrived.
         broken: whether the data are no JPEG.
         size: (width, height) [px].
-        frame: index of the frame header's marker.
-        scans: (begin, end) of the compressed data of each scan.
-        restarts: whether an interval between restart markers is defined.
     """
 
     def __init__(self) -> None:
@@ -50,9 +43,6 @@ class Walk:
         self.end: int | None = None
         self.broken = False
         self.size = (0, 0)
-        self.frame = 0
-        self.scans: list[tuple[int, int]] = []
-        self.restarts = False
         self._in_scan = False
 
     def advance(self, data: bytes | bytearray) -> None:
@@ -69,7 +59,6 @@ class Walk:
             self.position = max(len(data) - 1, self.position)
             return False
         self.position = match.start()
-        self.scans[-1] = self.scans[-1][0], self.position
         if data[self.position + 1] == EOI:
             self.end = self.position + 2
         self._in_scan = False
@@ -92,16 +81,13 @@ class Walk:
         if len(data) < start + 2 + length:
             return False
         if marker in SIZED:
-            self.frame = start
             # A sequential or progressive JPEG has one frame header, with a height.
             again, self.size = self.size != (0, 0), _size(data[start + 4 : start + 2 + length])
             self.broken = again or 0 in self.size
         self.position = start + 2 + length
-        self.restarts = self.restarts or marker == DRI
         if marker == SOS:
             self.broken = 0 in self.size
             self._in_scan = True
-            self.scans.append((self.position, self.position))
         return True
 
 
@@ -114,124 +100,99 @@ def _size(header: bytes | bytearray) -> tuple[int, int]:
 
 # Decoding
 
-START_OF_IMAGE, END_OF_IMAGE = b"\xff\xd8", b"\xff\xd9"
-# Frame headers of sequential JPEGs with Huffman coding, which hold block after block in their only scan.
-SEQUENTIAL = (0xC0, 0xC1)
-BLOCK = 8  # side [px]
-LONGEST_SIDE = 65535  # that a frame header can express [px]
-# Some cameras put further bytes before an image's last marker (github.com/ros-drivers/axis_camera, issue 51: 651 of
-# them). Excess bytes are accepted once they are usual: after `USUAL` images with them, at most.
-USUAL = 5
-# More bytes than a unit's blocks take if all their bits are zero.
-ZEROS = bytes(4096)
+# Some cameras put further bytes before every image's last marker (github.com/ros-drivers/axis_camera, issue 51: about
+# 650 of them). Such images are accepted once so many in a row had them: a few where no other image came before, and
+# many where an exact one shows that this camera usually sends none.
+USUAL, USUAL_AFTER_EXACT = 5, 100
+# libjpeg-turbo's warning of such bytes; it comes after all blocks are decoded.
+EXCESS = re.compile("extraneous bytes before marker 0xd9")
+# Largest image [px]; a damaged header may ask for far more memory than a machine has.
+MOST_PIXELS = 100_000_000
 
 
-class JpegDecoder:
-    """Decoder of JPEG images that refuses damaged ones; safe to use from any thread.
+class DamagedError(ValueError):
+    """An image is damaged, cut short or no JPEG."""
 
-    OpenCV decodes what is left of a damaged image and only prints to stderr. FFmpeg's decoder therefore checks the
-    image first. With err_detect=explode it refuses invalid codes, and data that end before a unit (of some blocks,
-    T.81, A.2) begins. After most damage the codes become valid again soon, but the number of units changes. The image
-    is therefore checked under a header with one unit more. Its data must suffice to begin that unit, and must not
-    without their last byte, unless this camera usually sends excess bytes. Progressive images, and those with restart
-    markers, are only decoded as they are.
+
+class ExcessError(DamagedError):
+    """An image has further bytes before its last marker, and is whole apart from that."""
+
+
+def import_simplejpeg() -> ModuleType:
+    """Import the decoder's library, which is optional.
+
+    Raises:
+        MissingPackageError: it is not installed.
+    """
+    try:
+        import simplejpeg
+    except ImportError:
+        raise MissingPackageError("JPEG cameras need simplejpeg: pip install 'cotarget[hardware]'") from None
+    return simplejpeg
+
+
+def decode_jpeg(jpeg: bytes, excess: bool = False) -> Image:
+    """Decode an image, (H, W, 3) BGR and read-only, and refuse one that libjpeg-turbo warns of.
+
+    Bytes after the image's end are ignored, and so is its EXIF orientation: the image stays as the sensor has it.
+
+    Args:
+        jpeg: bytes of the image.
+        excess: whether to accept further bytes before the last marker.
+
+    Raises:
+        ExcessError: there are such bytes, and they are not accepted.
+        DamagedError: the image is damaged otherwise, or larger than `MOST_PIXELS`.
+        MissingPackageError: simplejpeg is not installed.
+    """
+    library = import_simplejpeg()
+    try:
+        height, width, *_ = library.decode_jpeg_header(jpeg)
+        if height * width > MOST_PIXELS:
+            raise DamagedError(f"its header says {width} x {height}")
+        image: Image = library.decode_jpeg(jpeg, "BGR")
+    except ValueError as error:
+        if EXCESS.search(str(error)) is None:
+            raise DamagedError(str(error)) from None
+        if not excess:
+            raise ExcessError(str(error)) from None
+        image = library.decode_jpeg(jpeg, "BGR", strict=False)
+    image.flags.writeable = False
+    return image
+
+
+class StreamDecoder:
+    """Decoder of one camera's images, which learns whether the camera usually sends excess bytes.
+
+    Safe to use from any thread.
+
+    Raises:
+        MissingPackageError: simplejpeg is not installed.
     """
 
     def __init__(self) -> None:
-        self._checker = av.CodecContext.create("mjpeg", "r")
-        self._checker.options = {"err_detect": "explode"}
-        self._checker.thread_count = 1  # with more threads an image comes out only with the next one
-        self._exact = 0  # recent images without excess bytes less those with some, 0 to USUAL
+        import_simplejpeg()
         self._lock = threading.Lock()
+        self._run, self._needed = 0, USUAL  # images with excess bytes in a row, and how many make them usual
 
-    def decode(self, jpeg: bytes) -> Image | None:
-        """Decode an image, (H, W, 3) BGR and read-only; None if it is damaged, cut short or no JPEG.
+    def decode(self, jpeg: bytes) -> Image:
+        """Decode an image as `decode_jpeg` does.
 
-        Args:
-            jpeg: bytes of the image; bytes after its end are ignored.
+        Raises:
+            DamagedError: the image is damaged, or has excess bytes that are not usual for this camera.
         """
-        walk = Walk()
-        walk.advance(jpeg)
-        if not jpeg.startswith(START_OF_IMAGE) or walk.end is None or walk.broken:
-            return None
-        jpeg = jpeg[: walk.end]
+        try:
+            image = decode_jpeg(jpeg)
+        except ExcessError:
+            with self._lock:
+                self._run += 1
+                usual = self._run > self._needed
+            if not usual:
+                raise
+            return decode_jpeg(jpeg, excess=True)
         with self._lock:
-            if not self._whole(jpeg, walk):
-                return None
-        try:
-            # The EXIF orientation is ignored: the image must stay as the sensor has it.
-            flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-            image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), flags)
-        except cv2.error:
-            return None
-        if image is None or image.shape != (walk.size[1], walk.size[0], 3):
-            return None
-        image.flags.writeable = False
+            self._run, self._needed = 0, USUAL_AFTER_EXACT
         return image
-
-    def _whole(self, jpeg: bytes, walk: Walk) -> bool:
-        """Return whether an image has the data that its blocks need, neither less nor more."""
-        unit = _unit(jpeg, walk)
-        if unit is None:
-            return self._decodes(jpeg)
-        units = math.prod(math.ceil(side / each) for side, each in zip(walk.size, unit, strict=True))
-        # The header with one unit more: one row of units if a side can be that long. For large stills, the next
-        # number of units that fills whole rows.
-        count, size = next((n, size) for n in itertools.count(units + 1) if (size := _sides(n, unit)))
-        header, data = _resized(jpeg[: walk.scans[0][0]], walk.frame, size), _data(jpeg, walk)
-        if count > units + 1:
-            enough = self._decodes(jpeg)
-        else:
-            # FFmpeg reads zeros beyond the end. Where these are no valid unit, whole data fail the first check too.
-            enough = self._decodes(header + data + END_OF_IMAGE) or (
-                self._decodes(jpeg) and not self._decodes(header + data + ZEROS + END_OF_IMAGE)
-            )
-        return enough and self._usual(exact=not self._decodes(header + data[:-1] + END_OF_IMAGE))
-
-    def _usual(self, exact: bool) -> bool:
-        """Record whether an image has no excess bytes; return whether that is acceptable for this camera."""
-        usual = exact or self._exact == 0
-        self._exact = min(self._exact + 1, USUAL) if exact else max(self._exact - 1, 0)
-        return usual
-
-    def _decodes(self, jpeg: bytes) -> bool:
-        try:
-            return len(self._checker.decode(av.Packet(jpeg))) == 1
-        except (av.error.FFmpegError, ValueError):
-            return False
-
-
-def _unit(jpeg: bytes, walk: Walk) -> tuple[int, int] | None:
-    """Find (width, height) of a unit of the image's only scan [px]; None for another kind of JPEG."""
-    # FFmpeg does not notice missing data where it looks for a restart marker.
-    if jpeg[walk.frame + 1] not in SEQUENTIAL or len(walk.scans) != 1 or walk.restarts:
-        return None
-    # Frame header: marker, length, precision, height, width, then the number of components and 3 bytes for each.
-    components = jpeg[walk.frame + 9]
-    sampling = jpeg[walk.frame + 11 : walk.frame + 10 + 3 * components : 3]
-    if components == 1:
-        return BLOCK, BLOCK
-    across, down = (max((each >> 4 for each in sampling), default=0), max((each & 15 for each in sampling), default=0))
-    return (BLOCK * across, BLOCK * down) if across and down else None
-
-
-def _sides(units: int, unit: tuple[int, int]) -> tuple[int, int] | None:
-    """Find the widest size [px] that has this number of units; None if there is none."""
-    columns, rows = (LONGEST_SIDE // each for each in unit)
-    fewest = math.ceil(units / columns)
-    found = next((n for n in range(fewest, rows + 1) if units % n == 0), None)
-    return None if found is None else (units // found * unit[0], found * unit[1])
-
-
-def _resized(header: bytes, frame: int, size: tuple[int, int]) -> bytes:
-    """Replace the size in an image's header."""
-    return header[: frame + 5] + size[1].to_bytes(2) + size[0].to_bytes(2) + header[frame + 9 :]
-
-
-def _data(jpeg: bytes, walk: Walk) -> bytes:
-    """Cut out a scan's compressed data, without the fill bytes before its last marker."""
-    start, end = walk.scans[0]
-    return jpeg[start:end].rstrip(b"\xff")
 
 
 # The stream

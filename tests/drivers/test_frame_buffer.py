@@ -1,0 +1,200 @@
+"""The newest frame, handed from a camera's thread to its callers; mostly in simulated time."""
+
+import math
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from cotarget.drivers import frame_buffer
+from cotarget.drivers.clock import MonotonicClock
+from cotarget.drivers.frame_buffer import BusyError, FrameBuffer, RefusedError
+from cotarget.errors import DeviceError, StaleFrameError
+from tests.simulated_clock import SimClock
+
+SIZE, LATENCY_S, FRESH_S = (32, 24), 0.1, 0.5
+PATIENCE_S = 10.0  # for what should happen at once
+
+
+def image(grey, size=SIZE):
+    return np.full((size[1], size[0], 3), grey, np.uint8)
+
+
+def jpeg(grey, size=SIZE):
+    return cv2.imencode(".jpg", image(grey, size))[1].tobytes()
+
+
+class Bench:
+    def __init__(self, clock=None, fresh_s=FRESH_S):
+        self.clock = clock or SimClock()
+        self.frames = FrameBuffer("the camera", self.clock, SIZE, LATENCY_S, fresh_s)
+
+    def put(self, data, later=0.04, **more):
+        self.clock.t += later
+        return self.frames.put(data, self.clock.t, **more)
+
+    def read(self, newer_than=None):
+        return self.frames.read(newer_than, 0.0)
+
+    def why(self, newer_than=math.inf):
+        with pytest.raises(StaleFrameError) as error:
+            self.read(newer_than)
+        return str(error.value)
+
+
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+@pytest.mark.parametrize("encode", [image, jpeg])
+def test_the_newest_frame_is_read_with_the_time_of_its_exposure(bench, encode):
+    for grey in (10, 20, 30):
+        assert bench.put(encode(grey))
+    frame = bench.read()
+    np.testing.assert_array_equal(frame.image, image(30))
+    assert frame.t == pytest.approx(bench.clock.t - LATENCY_S)
+    assert bench.read().t == frame.t
+    assert bench.why(frame.t) == "the camera sent no newer picture within 0 s"
+    assert (bench.frames.counts.frames, bench.frames.counts.skipped) == (3, 2)
+
+
+@pytest.mark.parametrize("encode", [image, jpeg])
+def test_a_repeated_frame_is_no_new_one(bench, encode):
+    bench.put(encode(10))
+    t = bench.read().t
+    for _ in range(20):
+        assert not bench.put(encode(10))
+    assert bench.frames.counts.repeated == 20
+    assert bench.frames.frozen_s == pytest.approx(20 * 0.04)
+    assert bench.why(t) == "no new picture for 0.8 s: the camera repeats the same picture"
+    bench.put(encode(11))
+    assert bench.read(t).t > t
+    assert bench.frames.frozen_s == 0.0
+
+
+def test_an_old_frame_is_none():
+    bench = Bench(fresh_s=0.3)
+    bench.put(image(10))
+    bench.clock.t += 0.29
+    bench.read()
+    bench.clock.t += 0.02
+    assert bench.why(None) == "no new picture for 0.3 s: the camera has sent nothing for 0.3 s"
+
+
+def test_damaged_frames_are_refused_when_they_are_read_and_the_next_is_taken(bench):
+    bench.put(jpeg(10))
+    t = bench.read().t
+    bench.put(jpeg(20)[:-20])
+    assert bench.why(t) == "no new picture for 0.0 s: the pictures of the camera are broken, 1 so far"
+    bench.frames.refuse(2)
+    assert bench.frames.counts.refused == 3
+    bench.put(jpeg(30))
+    np.testing.assert_array_equal(bench.read(t).image, image(30))
+
+
+def test_a_frame_that_took_too_long_is_refused_and_its_repetition_too(bench):
+    bench.put(image(10))
+    t = bench.read().t
+    bench.put(image(20), took=2 * FRESH_S)
+    assert bench.why(t) == "no new picture for 0.0 s: its frames take 1 s to come, 1 so far"
+    bench.put(image(20))
+    bench.why(t)
+    bench.put(image(30))
+    assert bench.read(t).t > t
+
+
+def test_another_size_is_an_error_until_it_is_set_back(bench):
+    bench.put(image(10, (64, 48)))
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="the camera now sends 64x48 where it sent 32x24: set its resolution"):
+            bench.read()
+    bench.put(image(10))
+    assert bench.read().image.shape == (24, 32, 3)
+
+
+def test_what_else_is_known_is_told_until_the_next_frame(bench):
+    bench.put(image(10))
+    bench.frames.remark("its input has no video")
+    assert bench.why() == "no new picture for 0.0 s: its input has no video"
+    bench.clock.t += 0.3
+    said = "no new picture for 0.3 s: the camera has sent nothing for 0.3 s"
+    assert bench.why() == f"{said}; its input has no video"
+    bench.frames.heard()
+    assert "nothing" not in bench.why()
+    bench.put(image(20))
+    assert "video" not in bench.why()
+
+
+def test_a_lost_camera_says_why_until_it_is_open_again(bench):
+    bench.frames.opened()
+    bench.put(image(10))
+    bench.frames.lose(DeviceError("its cable is unplugged"))
+    assert bench.why() == "no new picture for 0.0 s: its cable is unplugged; reconnecting"
+    bench.frames.opened()
+    assert bench.why() == "the camera sent no newer picture within 0 s"
+    assert bench.frames.counts.reconnects == 1
+
+
+def test_the_first_frame_is_waited_for(bench):
+    with pytest.raises(DeviceError, match=r"the camera has sent no whole picture in 0 s"):
+        bench.frames.first(0.0)
+    bench.put(jpeg(10)[:-20])
+    with pytest.raises(DeviceError, match=r"the pictures of the camera are broken"):
+        bench.frames.first(0.0)
+    bench.put(jpeg(10, (64, 48)))
+    assert bench.frames.first(0.0) == (64, 48)  # its owner says what to write
+
+
+# On a thread.
+def test_a_stream_is_opened_again_until_the_buffer_is_closed(monkeypatch):
+    monkeypatch.setattr(frame_buffer, "LONGEST_PAUSE_S", 0.01)
+    frames, tries, after = FrameBuffer("the camera", MonotonicClock(), SIZE, 0.0, PATIENCE_S), [], threading.Event()
+
+    def stream():
+        tries.append(0)
+        if len(tries) < 3:
+            raise BusyError("it is busy")
+        frames.opened()
+        frames.put(image(len(tries)), MonotonicClock().now())
+        if len(tries) > 5:
+            raise DeviceError("it is unplugged")
+
+    frames.start(lambda: frames.keep_open(stream, after.set), "camera")
+    assert frames.first(PATIENCE_S) == SIZE
+    t = frames.read(timeout=PATIENCE_S).t
+    for _ in range(4):
+        t = frames.read(t, PATIENCE_S).t
+    assert after.wait(PATIENCE_S)
+    frames.close()
+    assert frames.join()
+    assert frames.counts.reconnects >= 4
+    with pytest.raises(DeviceError, match="the camera is closed"):
+        frames.read()
+
+
+@pytest.mark.parametrize("error", [RefusedError, DeviceError])
+def test_a_stream_that_cannot_be_opened_is_an_error_at_once(error):
+    frames = FrameBuffer("the camera", MonotonicClock(), SIZE, 0.0, PATIENCE_S)
+
+    def stream():
+        raise error("there is no such stream")
+
+    frames.start(lambda: frames.keep_open(stream), "camera")
+    with pytest.raises(error, match="there is no such stream"):
+        frames.first(PATIENCE_S)
+    frames.close()
+    assert frames.join()
+
+
+def test_a_reader_learns_at_once_that_the_driver_has_failed():
+    frames = FrameBuffer("the camera", MonotonicClock(), SIZE, 0.0, PATIENCE_S)
+
+    def stream():
+        raise ValueError("a mistake")
+
+    frames.start(lambda: frames.keep_open(stream), "camera")
+    with pytest.raises(DeviceError, match=r"the driver of the camera failed: ValueError\('a mistake'\)"):
+        frames.read(timeout=PATIENCE_S)
+    assert frames.join()
