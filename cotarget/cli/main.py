@@ -7,6 +7,7 @@ status.
 import argparse
 import contextlib
 import logging
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -58,10 +59,15 @@ INTERRUPTED = 130  # a shell's exit status for Ctrl-C
 TERMINATED = 143  # for SIGTERM
 HUNG_UP = 129  # for SIGHUP, from a closed terminal or a broken connection
 KINDS = ("chessboard", "charuco")  # kinds of calibration board
+# The matrices here are small: a second thread of linear algebra only waits for the first, up to a hundred times longer
+# than the work takes where other programs use the cores. Read when numpy is loaded; OPENBLAS_NUM_THREADS, if a user has
+# set it, goes before it.
+ONE_THREAD = ("OMP_NUM_THREADS", "1")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit status."""
+    os.environ.setdefault(*ONE_THREAD)
     parser = _parser()
     options = parser.parse_args(arguments)
     # SIGTERM and SIGHUP raise SystemExit, so that the rig halts and files are completed, as on Ctrl-C.
