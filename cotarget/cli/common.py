@@ -263,7 +263,7 @@ def progress_bar(now: Callable[[], float] = time.monotonic) -> Iterator[Any]:
         now: gives the time [s].
 
     Yields:
-        A function of (text, done, total) that updates the progress.
+        A function of (text, done, total) that updates the progress; total is None where no end is known.
     """
     if not sys.stderr.isatty():
         yield _remarks(now)
@@ -272,24 +272,25 @@ def progress_bar(now: Callable[[], float] = time.monotonic) -> Iterator[Any]:
 
     with tqdm(total=None, leave=False, bar_format="{desc} |{bar:30}| {percentage:3.0f}% {elapsed}") as bar:
 
-        def show(text: str, done: int, total: int) -> None:
-            bar.total, bar.n = total, done
+        def show(text: str, done: int, total: int | None) -> None:
+            bar.total, bar.n = total, done if total is None else min(done, total)
             bar.set_description_str(text)
 
         yield show
 
 
-def _remarks(now: Callable[[], float]) -> Callable[[str, int, int], None]:
+def _remarks(now: Callable[[], float]) -> Callable[[str, int, int | None], None]:
     """Print progress as lines, at most one every half a minute, so that short work prints nothing."""
     begin = last = now()
 
-    def remark(text: str, done: int, total: int) -> None:
+    def remark(text: str, done: int, total: int | None) -> None:
         nonlocal last
         if (t := now()) - last < REMARK_S:
             return
         last = t
         with contextlib.suppress(OSError):  # the reader of stderr may be closed; the work goes on
-            print(f"{text} ({100 * done / max(total, 1):.0f} %, {t - begin:.0f} s)", file=sys.stderr, flush=True)
+            part = "" if total is None else f"{100 * min(done / max(total, 1), 1):.0f} %, "
+            print(f"{text} ({part}{t - begin:.0f} s)", file=sys.stderr, flush=True)
 
     return remark
 
@@ -458,6 +459,11 @@ def positive(text: str) -> float:
     if value <= 0:
         raise argparse.ArgumentTypeError(f"{text} is not greater than zero")
     return value
+
+
+def duration(text: str) -> float:
+    """Parse a number of seconds greater than zero; inf for no end."""
+    return math.inf if text == "inf" else positive(text)
 
 
 def not_negative(text: str) -> int:

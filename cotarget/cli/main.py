@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cotarget.cli import calibrating, operating, running
-from cotarget.cli.common import add_choice, corners, count, not_negative, number, port, positive
+from cotarget.cli.common import add_choice, corners, count, duration, not_negative, number, port, positive
 from cotarget.errors import CotargetError
 
 USAGE = 2  # argparse's own exit status
@@ -209,7 +209,7 @@ def _parser() -> argparse.ArgumentParser:
     follow.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
     follow.add_argument("--target", required=True, metavar="NAME", help="a target of rig.toml")
     add_choice(follow)
-    follow.add_argument("--seconds", type=positive, default=20.0, metavar="S", help="duration [s] (20)")
+    follow.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
     follow.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
     follow.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
     follow.add_argument("--record", type=Path, metavar="DIR", help="record everything, for cotarget replay")
@@ -292,7 +292,7 @@ def _parser() -> argparse.ArgumentParser:
         help="fault to be on from the start, one of those below; the control socket switches faults later",
     )
     emulate.more = operating.fault_names
-    emulate.add_argument("--seconds", type=positive, metavar="S", help="duration [s] (until Ctrl-C)")
+    emulate.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
 
     view = command("view", running.view, "show the simulated scene, both cameras' frusta and their images")
     view.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml of the simulated rig (the default rig)")
@@ -302,7 +302,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     view.add_argument("--browser", action="store_true", help="serve a page for a web browser on this machine")
     view.add_argument("--port", type=port, metavar="P", help=f"port of the page; 0: any free one ({running.PORT})")
-    view.add_argument("--seconds", type=positive, metavar="S", help="duration [s] (until it is closed, or Ctrl-C)")
+    view.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until it is closed, or Ctrl-C)")
 
     detect = command("detect", running.detect, "run the fixed camera's detector and tracker on any video")
     detect.add_argument("film", type=Path, metavar="VIDEO", help="video to search")

@@ -169,8 +169,11 @@ def demo(options: argparse.Namespace) -> None:
     print(f"pictures, video and metrics.json are in {options.out} ({metrics['wall_s']:.0f} s)")
 
 
-def follow(options: argparse.Namespace) -> None:
-    """Run `cotarget follow`: follow a target with the rig, and record it on request."""
+NOBODY_FOLLOWED = 4  # exit status of `follow`
+
+
+def follow(options: argparse.Namespace) -> int:
+    """Run `cotarget follow`: follow a target with the rig, and record it on request; return the exit status."""
     from cotarget.backends import describe, open_rig
     from cotarget.calibration import load_calibration
     from cotarget.config import load_config
@@ -197,10 +200,12 @@ def follow(options: argparse.Namespace) -> None:
             rig = open_rig(config, guarded=False)
             return guard(recorder.wrap(rig) if recorder else rig, config.safety)
 
-        rate_hz = spec.fixed.rate_hz
-        states = _follow(opened, calibration, config, rate_hz, options, options.target, choice, options.seconds)
-    _tell_if_nothing_was_seen("follow", options.target, states["states"], choice)
-    print_json(states)
+        run = _follow(opened, calibration, config, spec.fixed.rate_hz, options, options.target, choice, options.seconds)
+        _tell_if_nothing_was_seen("follow", options.target, run.counts["states"], choice)
+        print_json(run.counts)
+        if run.interrupted is not None:
+            raise run.interrupted
+    return 0 if run.followed else NOBODY_FOLLOWED
 
 
 def replay(options: argparse.Namespace) -> int:
@@ -231,14 +236,25 @@ def replay(options: argparse.Namespace) -> int:
     def opened() -> "Rig":
         return guard(played.rig, config.safety)
 
-    states = _follow(opened, calibration, config, rate_hz, options, name, choice, math.inf, steps, see)
-    _tell_if_nothing_was_seen("replay", recording.target, states["states"], choice)
+    run = _follow(opened, calibration, config, rate_hz, options, name, choice, None, steps, see)
+    if run.interrupted is not None:
+        raise run.interrupted
+    _tell_if_nothing_was_seen("replay", recording.target, run.counts["states"], choice)
     scores = _scores(options, tracks, labels, rate_hz, max(pictures.values(), default=-1) + 1)
     differences = played.differences
-    print_json(states | {"differences": dataclasses.asdict(differences)} | scores)
+    print_json(run.counts | {"differences": dataclasses.asdict(differences)} | scores)
     if not differences.same:
         print(f"cotarget replay: {differences}", file=sys.stderr)
     return 1 if options.check and not differences.same else 0
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """Result of following: what is printed as JSON, whether a target was followed, and the Ctrl-C that cut it short."""
+
+    counts: dict[str, Any]
+    followed: bool
+    interrupted: KeyboardInterrupt | None = None
 
 
 def _follow(
@@ -249,13 +265,14 @@ def _follow(
     options: argparse.Namespace,
     name: str,
     choice: Choice,
-    seconds: float,
+    seconds: float | None,
     frames: int | None = None,
     see: "Callable[[Step], None]" = lambda _: None,
-) -> dict[str, Any]:
-    """Follow a target with progress and outputs; return counts of steps, states and reasons.
+) -> _Run:
+    """Follow a target with progress and outputs.
 
-    However it ends, the head is halted first. The files are completed afterwards, with the steps up to then.
+    However it ends, the head is halted first. The files are completed afterwards, with the steps up to then. A run
+    without a length, in seconds or frames, ends by Ctrl-C.
     """
     from cotarget.detection import make_detector
     from cotarget.drawing import side_by_side
@@ -269,39 +286,51 @@ def _follow(
     settings = FollowSettings(policy=choice.policy)
     states: dict[str, int] = dict.fromkeys(State, 0)
     reasons, skipped = Reasons(), SkippedFrames(rate_hz)
-    expected = math.ceil(seconds * rate_hz) if frames is None else frames
-    is_live, first_t = config.backend == "hardware" and frames is None, None
-    with (
-        StepTable(options.csv, keep=True) as table,
-        FilmWriter(options.video, rate_hz, keep=True) if options.video else nothing() as film,
-        progress_bar() as progress,
-        opened() as rig,
-    ):
-        epoch = datetime.now(UTC) - timedelta(seconds=rig.clock.now()) if is_live else None
-        table.epoch = epoch
-        if film is not None:
-            film.epoch = epoch
-        for step in until_end(follow(rig, calibration, target, detector, seconds=seconds, settings=settings)):
-            table.write(step)
-            choice.see(step)
-            reasons.see(step)
-            skipped.see(step)
-            see(step)
-            first_t = step.fixed.t if first_t is None else first_t
-            states[step.state] += 1
+    limit = math.inf if seconds is None else seconds
+    expected = frames if math.isinf(limit) else math.ceil(limit * rate_hz)
+    is_live, first_t, epoch = config.backend == "hardware" and frames is None, None, None
+    interrupted: KeyboardInterrupt | None = None
+    try:
+        with (
+            StepTable(options.csv, keep=True) as table,
+            FilmWriter(options.video, rate_hz, keep=True) if options.video else nothing() as film,
+            progress_bar() as progress,
+            opened() as rig,
+        ):
+            epoch = datetime.now(UTC) - timedelta(seconds=rig.clock.now()) if is_live else None
+            table.epoch = epoch
             if film is not None:
-                film.write(side_by_side(step, name, step.fixed.t - first_t), step.fixed.t)
-            progress(f"following: {name}: {step.state}", min(step.index + 1, expected), expected)
+                film.epoch = epoch
+            try:
+                for step in until_end(follow(rig, calibration, target, detector, seconds=limit, settings=settings)):
+                    table.write(step)
+                    for each in (choice, reasons, skipped):
+                        each.see(step)
+                    see(step)
+                    first_t = step.fixed.t if first_t is None else first_t
+                    states[step.state] += 1
+                    if film is not None:
+                        film.write(side_by_side(step, name, step.fixed.t - first_t), step.fixed.t)
+                    progress(f"following: {name}: {step.state}", step.index + 1, expected)
+            except KeyboardInterrupt:
+                if expected is not None or first_t is None:
+                    raise
+    except KeyboardInterrupt as end:
+        if first_t is None:
+            raise
+        interrupted = end
     for line in filter(None, (choice.unmet, reasons.warning, skipped.warning)):
         print(f"cotarget {options.command}: {line}", file=sys.stderr)
-    started = None if epoch is None or first_t is None else utc_text(epoch, first_t)
-    return {
+    counts = {
         "steps": sum(states.values()),
         "skipped": skipped.count,
         "states": states,
         "reasons": reasons.table,
-        "started": started,
+        "started": None if epoch is None or first_t is None else utc_text(epoch, first_t),
     }
+    return _Run(
+        counts, any(states[each] for each in State if each not in (State.SEARCHING, State.UNREACHABLE)), interrupted
+    )
 
 
 def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int], choice: Choice) -> None:

@@ -59,21 +59,48 @@ def rows_of(path):
     return len(path.read_text().splitlines()) - 1
 
 
-@pytest.mark.parametrize(("error", "status", "said"), [
-    (KeyboardInterrupt(), 130, "interrupted"),
-    (SystemExit(143), 143, "terminated"),
-    (DeviceError("the camera is gone"), 1, "the camera is gone"),
+LIMIT = ("--seconds", "20")
+
+
+@pytest.mark.parametrize(("error", "more", "status", "said"), [
+    (KeyboardInterrupt(), LIMIT, 130, f"cotarget follow: interrupted{EARLY}"),
+    (KeyboardInterrupt(), (), 0, ""),  # which is how a run without a length ends
+    (KeyboardInterrupt(), ("--seconds", "inf"), 0, ""),
+    (SystemExit(143), (), 143, f"cotarget follow: terminated{EARLY}"),
+    (DeviceError("the camera is gone"), (), 1, f"cotarget follow: the camera is gone{EARLY}"),
 ])  # fmt: skip
 def test_follow_keeps_what_was_seen_until_it_ended_and_halts_the_head_first(
-    folder, capsys, monkeypatch, error, status, said
+    folder, capsys, monkeypatch, error, more, status, said
 ):
     error.__dict__.pop("__notes__", None)
     rig = WatchedRig(folder, {("fixed.read", FRAMES + 1): error})
     monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(rig))
-    assert call(capsys, *FOLLOW) == (status, "", f"cotarget follow: {said}{EARLY}")
+    ended, out, err = call(capsys, *FOLLOW, *more)
+    assert (ended, err) == (status, said)
+    if isinstance(error, KeyboardInterrupt):
+        assert json.loads(out)["steps"] == FRAMES
+    else:
+        assert out == ""
     assert rig.written == [OLD]
     assert rows_of(folder / "out.csv") == frames_of(folder / "out.mp4") == FRAMES
     assert not [path for path in folder.iterdir() if ".part" in path.name]
+
+
+def test_ctrl_c_ends_a_recorded_run_that_can_be_replayed(folder, capsys, monkeypatch):
+    monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig({("fixed.read", 2 * FRAMES): KeyboardInterrupt()}))
+    assert call(capsys, *FOLLOW, "--record", "run")[0] == 0
+    status, out, err = call(capsys, "replay", "run", "--check")
+    assert (status, err) == (0, "")
+    assert json.loads(out)["steps"] == 2 * FRAMES - 1
+
+
+def test_ctrl_c_does_not_hide_a_head_that_cannot_be_halted(folder, capsys, monkeypatch):
+    failing = {("fixed.read", FRAMES): KeyboardInterrupt()}
+    failing |= {("head.halt", number): DeviceError("the head is gone") for number in range(1, 50)}
+    monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig(failing))
+    status, out, err = call(capsys, *FOLLOW)
+    assert (status, out) == (1, "")
+    assert "the head is gone" in err
 
 
 def test_an_emergency_stop_keeps_what_was_seen(folder, capsys, monkeypatch):
@@ -133,12 +160,12 @@ def test_detect_keeps_what_was_found(folder, capsys, monkeypatch):
 
 
 def test_what_went_wrong_is_told_at_the_end_and_in_json(folder, capsys, monkeypatch):
-    """A head that may hardly turn: the bird, 10 to 15 degrees off the axis, is beyond its limits."""
+    """A head that may hardly turn: the bird, 10 to 15 degrees off the axis, is beyond its limits and never followed."""
     with (folder / "rig.toml").open("a") as file:
         file.write("pan_deg = [-1, 1]\n")
     monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig())
     status, out, err = call(capsys, *FOLLOW, "--seconds", "1")
-    assert status == 0
+    assert status == 4
     told = json.loads(out)
     assert list(told["reasons"].values()) == sorted(told["reasons"].values(), reverse=True)
     [line] = err.splitlines()

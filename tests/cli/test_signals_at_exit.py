@@ -1,6 +1,7 @@
 """A program that is ended by signals, at its end or by surprise: the head is halted, and the devices are released."""
 
 import contextlib
+import json
 import os
 import selectors
 import signal
@@ -241,6 +242,10 @@ def test_following_is_ended_by_a_signal_with_the_head_halted(start, tmp_path, nu
     child.signal(number)
     assert not (tmp_path / "steps.csv").exists()
     returned, lines, err = child.finish()
+    if number == signal.SIGINT:  # the run's JSON comes last, and its counts are those of the table
+        at = lines.index("{")
+        lines, told = lines[:at], json.loads("\n".join(lines[at:]))
+        assert told["steps"] == len((tmp_path / "steps.csv").read_text().splitlines()) - 1
     last = len(lines) - lines[::-1].index("moving") if "moving" in lines else 0
     assert lines[last:] in (
         ["moved", "halting", "halted", "halting", "halted", "closing", "closed"],

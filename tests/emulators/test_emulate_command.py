@@ -54,7 +54,7 @@ def test_a_run_that_saw_nothing_says_what_would_be_right(folder, capsys):
     """Nobody is in the wide view in the first seconds of a person's way."""
     wanted = ("follow", "--rig", "person.toml", "--calibration", "true.json", "--target", "person", "--seconds", "0.3")
     status, out, err = call(capsys, *wanted)
-    assert status == 0
+    assert status == 4
     told = json.loads(out)
     assert told["states"]["searching"] == told["steps"] > 0
     assert err.startswith(f"cotarget follow: no person was seen in {told['steps']} frames; what --target names has to ")
