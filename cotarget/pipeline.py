@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cotarget.calibration import Calibration
+from cotarget.calibration.plausibility import check_plausible
 from cotarget.config import TargetProfile
 from cotarget.control.controller import Controller, ControllerSettings, Predict
 from cotarget.control.selection import FirstCome, Policy
@@ -259,6 +260,7 @@ def follow(
     *,
     seconds: float = math.inf,
     settings: FollowSettings | None = None,
+    insist: bool = False,
 ) -> Iterator[Step]:
     """Follow a target and yield one Step for each frame of the fixed camera.
 
@@ -272,9 +274,10 @@ def follow(
         detector: detector for the fixed camera's images; by default the one that the target profile names.
         seconds: duration on the rig's clock [s].
         settings: settings of the run.
+        insist: whether to accept an implausible calibration, see `check_plausible`.
 
     Raises:
-        CalibrationError: the calibration has no T.
+        CalibrationError: the calibration has no T, or is implausible or another rig's.
         ConfigError: the target is unknown, the rig has no configuration to take it from, or the calibration has another
             aspect ratio than the rig's streams.
         StaleFrameError: frames of the fixed camera stopped coming, came too late to act on, or repeated; or the zoom
@@ -282,6 +285,7 @@ def follow(
         DeviceError: a device failed, or its frames changed their size.
     """
     calibration.hand_eye()  # raises with the first step, not when the first target is seen
+    check_plausible(calibration, rig.spec, insist=insist)
     wanted = opened_from(rig).target(target) if isinstance(target, str) else target
     if detector is None:
         detector = make_detector(wanted, rig.spec.fixed.rate_hz)

@@ -117,13 +117,13 @@ class Calibration:
         Raises:
             ConfigError: the aspect ratio of a stream differs from that calibrated.
         """
+        factors = {"fixed": fixed_size[0] / self.fixed.size[0], "zoom": zoom_size[0] / self.zoom.size[0]}
         covariance = self.covariance
         if covariance is not None:
-            s_fixed, s_zoom = fixed_size[0] / self.fixed.size[0], zoom_size[0] / self.zoom.size[0]
             in_pixels = ("fx", "fy", "cx", "cy")
             covariance = covariance.scaled(
-                {f"fixed.{k}": s_fixed for k in in_pixels}
-                | {f"zoom[{i}].{k}": s_zoom for i in range(len(self.zoom.stops)) for k in in_pixels}
+                {f"fixed.{k}": factors["fixed"] for k in in_pixels}
+                | {f"zoom[{i}].{k}": factors["zoom"] for i in range(len(self.zoom.stops)) for k in in_pixels}
             )
         pitch_mm = self.pitch_mm and self.pitch_mm * self.zoom.size[0] / zoom_size[0]  # a larger pixel, where binned
         return replace(
@@ -132,6 +132,7 @@ class Calibration:
             zoom=self.zoom.resized(zoom_size),
             covariance=covariance,
             pitch_mm=pitch_mm,
+            views=tuple(view.scaled(factors[view.camera]) for view in self.views),
         )
 
     @classmethod

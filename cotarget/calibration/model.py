@@ -1,7 +1,7 @@
 """Data of a calibration: captures, views, options, the rig's model, residuals and covariance."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -67,6 +67,13 @@ class View:
     def seen(self) -> npt.NDArray[np.bool_]:
         """True for corners that are seen, (N,)."""
         return np.isfinite(self.corners_px[:, 0])
+
+    def scaled(self, factor: float) -> "View":
+        """Return the view in an image scaled by a factor."""
+        if factor == 1.0:
+            return self
+        focal_px = self.focal_px and self.focal_px * factor
+        return replace(self, corners_px=(self.corners_px + 0.5) * factor - 0.5, focal_px=focal_px)
 
     @property
     def name(self) -> str:

@@ -9,7 +9,15 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cotarget.cli.common import check_board_is_told, check_outputs, previous_kept, print_json, progress_bar, rig_files
+from cotarget.cli.common import (
+    check_board_is_told,
+    check_outputs,
+    load_plausible,
+    previous_kept,
+    print_json,
+    progress_bar,
+    rig_files,
+)
 from cotarget.errors import CalibrationError, ConfigError
 from cotarget.files import behind_link, check_writable
 
@@ -197,11 +205,10 @@ def summary(found: "Calibration", path: Path) -> dict[str, Any]:
 
 def report(options: argparse.Namespace) -> None:
     """Run `cotarget report`: write the report page of a calibration."""
-    from cotarget.calibration import load_calibration
     from cotarget.report.page import write_report
 
     check_outputs([options.out], [options.calibration])
-    calibration = load_calibration(options.calibration)
+    calibration = load_plausible(options.calibration, insist=options.insist)
     page = behind_link(options.out)
     print(write_report(page, calibration, options.calibration.name).text)
     print(f"the page is {page}, and its pictures are in {page.stem}_pictures beside it")

@@ -20,13 +20,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cotarget.errors import ConfigError, choices
+from cotarget.errors import CalibrationError, ConfigError, choices
 from cotarget.files import behind_link, write_atomically
 
 if TYPE_CHECKING:
+    from cotarget.calibration import Calibration
     from cotarget.config import RigConfig
     from cotarget.control.selection import Policy, TargetChoice
     from cotarget.pipeline import Step
+    from cotarget.rig import RigSpec
 
 
 # Names of `cotarget.control.selection`, which --help does not import; the paper's first.
@@ -52,6 +54,32 @@ def add_choice(parser: argparse.ArgumentParser, default: str = POLICIES[0]) -> N
     which.add_argument(
         "--track", type=count, metavar="N", help="follow only the track with this id, as in video and table"
     )
+
+
+def add_insist(parser: argparse.ArgumentParser) -> None:
+    """Add the option that accepts an implausible calibration."""
+    parser.add_argument("--insist", action="store_true", help="accept what is far outside of anything plausible")
+
+
+def load_plausible(path: Path, spec: "RigSpec | None" = None, *, insist: bool) -> "Calibration":
+    """Load a calibration and refuse an implausible one.
+
+    Args:
+        path: calibration.json.
+        spec: description of the rig in use; None where there is none.
+        insist: whether to accept it all the same.
+
+    Raises:
+        CalibrationError: the file is malformed or implausible; the message names the file and the key.
+        ConfigError: a stream has another aspect ratio than that calibrated.
+    """
+    from cotarget.calibration import load_calibration
+    from cotarget.calibration.plausibility import implausibility
+
+    calibration = load_calibration(path)
+    if not insist and (text := implausibility(calibration, spec)):
+        raise CalibrationError(f"{path}: {text}; --insist uses it all the same")
+    return calibration
 
 
 def check_shown(config: "RigConfig", name: str, rig: Path) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cotarget.cli import calibrating, operating, running
-from cotarget.cli.common import add_choice, corners, count, duration, not_negative, number, port, positive
+from cotarget.cli.common import add_choice, add_insist, corners, count, duration, not_negative, number, port, positive
 from cotarget.errors import CotargetError
 
 USAGE = 2  # argparse's own exit status
@@ -180,6 +180,8 @@ def _parser() -> argparse.ArgumentParser:
         "--out", type=Path, default=Path("report.html"), metavar="PAGE", help="file to write (report.html)"
     )
 
+    add_insist(report)
+
     aim = command(
         "aim",
         operating.aim,
@@ -203,6 +205,7 @@ def _parser() -> argparse.ArgumentParser:
         default="exact",
         help="inverse kinematics: exact, or a reading of the paper's shortcut (exact)",
     )
+    add_insist(aim)
 
     follow = command("follow", running.follow, "follow a target with a calibrated rig")
     follow.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
@@ -213,6 +216,7 @@ def _parser() -> argparse.ArgumentParser:
     follow.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
     follow.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
     follow.add_argument("--record", type=Path, metavar="DIR", help="record everything, for cotarget replay")
+    add_insist(follow)
 
     replay = command("replay", running.replay, "run the pipeline again on a recording of follow --record")
     replay.add_argument("recording", type=Path, metavar="DIR", help="folder of the recording")

@@ -11,7 +11,15 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cotarget.cli.common import check_board_is_told, check_outputs, check_within, previous_kept, print_json, rig_files
+from cotarget.cli.common import (
+    check_board_is_told,
+    check_outputs,
+    check_within,
+    load_plausible,
+    previous_kept,
+    print_json,
+    rig_files,
+)
 from cotarget.errors import CalibrationError, ConfigError
 
 if TYPE_CHECKING:
@@ -26,7 +34,7 @@ def aim(options: argparse.Namespace) -> None:
     """Run `cotarget aim`: print pan, tilt and focal length for one pixel of the fixed camera."""
     import numpy as np
 
-    from cotarget.calibration import load_calibration
+    from cotarget.backends import describe
     from cotarget.calibration.joint import SAME_FOCAL
     from cotarget.config import RigConfig, load_config
     from cotarget.targeting import Reach, WantedSize, depth_of, error_budget, point_at
@@ -35,7 +43,8 @@ def aim(options: argparse.Namespace) -> None:
     config = RigConfig() if options.rig is None else load_config(options.rig)
     if config.backend == "replay":
         raise ConfigError(f"{options.rig}: backend is 'replay'; give the rig.toml of the rig that was recorded")
-    calibration = load_calibration(options.calibration)
+    spec = None if options.rig is None else describe(config)
+    calibration = load_plausible(options.calibration, spec, insist=options.insist)
     if options.rig is not None:
         calibration = calibration.for_streams(*config.stream_sizes)
     target = None if options.target is None else config.target(options.target)

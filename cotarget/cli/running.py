@@ -18,6 +18,7 @@ from cotarget.cli.common import (
     SkippedFrames,
     check_outputs,
     check_shown,
+    load_plausible,
     nothing,
     print_json,
     progress_bar,
@@ -175,7 +176,6 @@ NOBODY_FOLLOWED = 4  # exit status of `follow`
 def follow(options: argparse.Namespace) -> int:
     """Run `cotarget follow`: follow a target with the rig, and record it on request; return the exit status."""
     from cotarget.backends import describe, open_rig
-    from cotarget.calibration import load_calibration
     from cotarget.config import load_config
     from cotarget.recording.recorder import Recorder
     from cotarget.safety.safe_rig import guard
@@ -184,11 +184,11 @@ def follow(options: argparse.Namespace) -> int:
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
     config.target(options.target)  # refuse an unknown target before the long work
-    calibration = load_calibration(options.calibration)
+    spec = describe(config)
+    calibration = load_plausible(options.calibration, spec, insist=options.insist)
     check_shown(config, options.target, options.rig)
     inputs = [*rig_files(options.rig, config), options.calibration]
     check_outputs([options.csv, options.video], inputs, options.record)
-    spec = describe(config)
     choice = Choice(options, spec.fixed.size)
     with (
         Recorder(options.record, config, options.calibration, options.target, choice.target_choice)
@@ -302,7 +302,9 @@ def _follow(
             if film is not None:
                 film.epoch = epoch
             try:
-                for step in until_end(follow(rig, calibration, target, detector, seconds=limit, settings=settings)):
+                # `follow` has checked the calibration; a recorded run is replayed with whatever it had.
+                followed = follow(rig, calibration, target, detector, seconds=limit, settings=settings, insist=True)
+                for step in until_end(followed):
                     table.write(step)
                     for each in (choice, reasons, skipped):
                         each.see(step)

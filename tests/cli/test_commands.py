@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,7 @@ from cotarget import cli
 from cotarget.calibration import Calibration, draw_board, save_calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig, RigConfig
-from cotarget.geometry import pose
+from cotarget.geometry import RigidTransform, pose
 from cotarget.pantilt import HeadGeometry
 from experiments.calibration.synthetic.rig import NOMINAL_PX, Truth, undistorted
 from tests.synthetic_rig import draw, fourfold, pixel_rays, zoomed
@@ -62,6 +63,9 @@ def folder(tmp_path, monkeypatch):
     save_calibration(tmp_path / "good.json", true_calibration(RigConfig()))
     save_calibration(tmp_path / "wide.json", true_calibration(RigConfig(), zoom_size=(640, 360)))
     save_calibration(tmp_path / "headless.json", true_calibration(RigConfig(), with_head=False))
+    good = true_calibration(RigConfig())
+    wide_apart = RigidTransform.from_components(1000 * good.T_zoom0_fixed.translation, good.T_zoom0_fixed.rotation)
+    save_calibration(tmp_path / "millimetres.json", replace(good, T_zoom0_fixed=wide_apart))
     (tmp_path / "broken.json").write_text('{"schema": 2, "fixed": {')
     (tmp_path / "empty.json").write_text('{"schema": 2}')
     for name in ("out.json", "out.csv", "out.mp4"):
@@ -152,6 +156,12 @@ MISTAKES = {
     "another aspect ratio in aim": ([*AIM, "--depth", "5", "--rig", "other_shape.toml"], ["640x360", "640x480"]),
     "no hand-eye part": (changed([*AIM, "--depth", "5"], "--calibration", "headless.json"),
                           ["T_head_zoom", "on a rig"]),
+    "aim in millimetres": (changed([*AIM, "--depth", "5"], "--calibration", "millimetres.json"),
+                           ["millimetres.json: T_zoom0_fixed", "metres", "--insist"]),
+    "a report of millimetres": (["report", "millimetres.json", "--out", "page.html"],
+                                ["millimetres.json: T_zoom0_fixed", "metres", "--insist"]),
+    "follow in millimetres": (changed(FOLLOW, "--calibration", "millimetres.json"),
+                              ["millimetres.json: T_zoom0_fixed", "metres", "--insist"]),
     # photos and captures
     "photos without a board": ([*FROM, "grey", *PHOTOS], ["grey: no picture shows", "9x6 inner corners"]),
     "a single photo of each": ([*FROM, "single", *PHOTOS], ["1 usable views of the board; at least 3"]),

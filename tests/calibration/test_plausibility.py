@@ -1,0 +1,109 @@
+"""What no rig is like is refused, with the key that is wrong; any rig that can be built passes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cotarget.backends import describe
+from cotarget.board import board_points
+from cotarget.calibration import Calibration
+from cotarget.calibration.plausibility import check_plausible
+from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.config import BoardConfig, RigConfig, SimConfig
+from cotarget.errors import CalibrationError
+from cotarget.geometry import RigidTransform
+from cotarget.pantilt import HeadGeometry
+from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth, other_rig
+from experiments.calibration.synthetic.views import synthetic_views
+
+SPEC = describe(RigConfig(sim=SimConfig()))
+NOISE_PX = 0.1
+
+
+def calibration_of(truth, *, with_views=True):
+    """The exact calibration of a synthetic rig, with corners that it was made from."""
+
+    def intrinsics(lens):
+        return Intrinsics(SIZE, (lens.fx, lens.fy), (lens.cx, lens.cy), lens.distortion)
+
+    board = BoardConfig()
+    views = synthetic_views(truth, board_points(board), np.random.default_rng(1), boards=6, noise_px=NOISE_PX)
+    return Calibration(
+        fixed=intrinsics(truth.fixed),
+        zoom=ZoomLens((NOMINAL_PX,), (intrinsics(truth.zoom),)),
+        T_zoom0_fixed=truth.gamma,
+        T_head_zoom=truth.hand,
+        head=HeadGeometry(truth.dz, truth.eps),
+        board=board,
+        views=tuple(views) if with_views else (),
+    )
+
+
+GOOD = calibration_of(Truth())
+PLAIN = calibration_of(Truth(), with_views=False)
+
+
+def in_mm(T):
+    return RigidTransform.from_components(1000 * T.translation, T.rotation)
+
+
+def exchanged(calibration):
+    return replace(calibration, T_head_zoom=calibration.T_zoom0_fixed, T_zoom0_fixed=calibration.T_head_zoom)
+
+
+def with_lens(calibration, **changed):
+    return replace(calibration, fixed=replace(calibration.fixed, **changed))
+
+
+IMPLAUSIBLE = {
+    "a baseline in millimetres": (replace(PLAIN, T_zoom0_fixed=in_mm(PLAIN.T_zoom0_fixed)), "T_zoom0_fixed: .* metres"),
+    "a lever in millimetres": (replace(PLAIN, T_head_zoom=in_mm(PLAIN.T_head_zoom)), "T_head_zoom: .* metres"),
+    "an axis offset in millimetres": (replace(PLAIN, head=HeadGeometry(5.0)), "head.axis_offset: .* metres"),
+    "a square in millimetres": (replace(PLAIN, board=BoardConfig(square=25.0)), "board.square: .* metres"),
+    "T and Gamma exchanged": (exchanged(GOOD), "exchanged"),
+    "T and Gamma exchanged, without views": (exchanged(PLAIN), "exchanged"),
+    "a lever of 2 mm in millimetres": (
+        replace(GOOD, T_head_zoom=RigidTransform.from_components([0.0, 0.0, 2.0], GOOD.T_head_zoom.rotation)),
+        "miss the corners",
+    ),
+    "a focal length in millimetres": (with_lens(PLAIN, focal_px=(6.0, 6.0)), "fixed.fx: .* pixels"),
+    "one focal length in millimetres": (with_lens(PLAIN, focal_px=(686.0, 6.0)), "fixed.fy: "),
+}
+
+
+@pytest.mark.parametrize("name", IMPLAUSIBLE)
+def test_what_no_rig_is_like_is_refused_unless_insisted_on(name):
+    calibration, wanted = IMPLAUSIBLE[name]
+    with pytest.raises(CalibrationError, match=wanted):
+        check_plausible(calibration)
+    check_plausible(calibration, insist=True)
+
+
+@pytest.mark.parametrize("with_views", [True, False])
+@pytest.mark.parametrize("truth", [Truth(), other_rig()])
+def test_rigs_of_another_build_pass(truth, with_views):
+    check_plausible(calibration_of(truth, with_views=with_views))
+
+
+def test_a_calibration_for_smaller_streams_passes():
+    check_plausible(GOOD.for_streams((320, 240), (320, 240)))
+
+
+def test_another_lens_is_another_rig():
+    own = list(SPEC.zoom.focal_range)
+    check_plausible(replace(GOOD, provenance={"focal_range_px": own}), SPEC)
+    check_plausible(GOOD, SPEC)  # captures of another program do not say what the lens can do
+    for focal_range in ([own[0] / 2, own[1]], [own[0], own[1] / 2]):
+        with pytest.raises(CalibrationError, match="another rig's"):
+            check_plausible(replace(GOOD, provenance={"focal_range_px": focal_range}), SPEC)
+    farther = replace(GOOD, zoom=ZoomLens((2 * own[1],), GOOD.zoom.stops))
+    with pytest.raises(CalibrationError, match="another rig's"):
+        check_plausible(farther, SPEC)
+
+
+def test_a_calibration_of_stills_fits_the_stream_of_the_same_lens():
+    # Focal lengths of a still twice as large as the stream are twice as long.
+    twice = [2 * focal for focal in SPEC.zoom.focal_range]
+    large = GOOD.for_streams(GOOD.fixed.size, (1280, 960))
+    check_plausible(replace(large, provenance={"focal_range_px": twice}), SPEC)
