@@ -7,8 +7,8 @@ import bisect
 import itertools
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, lru_cache
+from typing import Any, Literal
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -323,9 +323,10 @@ class ZoomLens:
         if len(self.stops) < FEW_STOPS:
             near, far = np.sort(away)[:2] if len(self.stops) > 1 else (0.0, 1.0)
             return np.full(2, WANDER * self.size[0] * float(near * far / (near + far)))
-        x = math.log(nominal_px)
-        straight = CubicSpline(self._curve.x, self._curve(self._curve.x), bc_type="natural")
-        return np.abs(straight(x) - self._curve(x))[CENTER]
+        centers = self._samples[:, CENTER]
+        i, x = self._piece(nominal_px)
+        a, b, c, d = (_spline_pieces(self.nominal_px, "natural")[i] - _spline_pieces(self.nominal_px)[i]) @ centers
+        return np.abs(((a * x + b) * x + c) * x + d)
 
     def nominal_for(self, focal_px: float) -> float:
         """Convert a true horizontal focal length [px] to the nominal one that is sent to the lens."""
@@ -366,8 +367,8 @@ class ZoomLens:
 
     @cached_property
     def _pieces(self) -> Array:
-        """Polynomials of the spline, highest power first, (n - 1, 4, 10); scipy's call is slow."""
-        return np.ascontiguousarray(np.moveaxis(self._curve.c, 1, 0))
+        """Polynomials of the spline, highest power first, (n - 1, 4, 10)."""
+        return _spline_pieces(self.nominal_px) @ self._samples
 
     @cached_property
     def _ratios(self) -> list[list[float]]:
@@ -375,19 +376,29 @@ class ZoomLens:
         return self._pieces[:, :, 0].tolist()
 
     @cached_property
-    def _curve(self) -> CubicSpline:
-        nominal = np.array(self.nominal_px)
-        m = nominal / nominal[0]
+    def _samples(self) -> Array:
+        """What the spline interpolates, at each zoom sample, (n, 10); see `_values`."""
+        first = self.nominal_px[0]
         rows = [
             [
                 *np.log(np.array(stop.focal_px) / n),
                 *stop.center_px,
-                *(np.array(stop.distortion) / distortion_growth(g)),
+                *(np.array(stop.distortion) / distortion_growth(n / first)),
                 pupil,
             ]
-            for stop, n, g, pupil in zip(self.stops, nominal, m, self.pupil, strict=True)
+            for stop, n, pupil in zip(self.stops, self.nominal_px, self.pupil, strict=True)
         ]
-        return CubicSpline(np.log(nominal), np.array(rows))
+        return np.array(rows)
+
+
+@lru_cache(maxsize=64)
+def _spline_pieces(nominal_px: tuple[float, ...], ends: Literal["not-a-knot", "natural"] = "not-a-knot") -> Array:
+    """Compute the polynomials of cubic splines through unit samples, highest power first, (n - 1, 4, n).
+
+    A spline is linear in its samples, so that one solution serves all lenses with zoom samples at the same places.
+    """
+    unit = CubicSpline(np.log(nominal_px), np.eye(len(nominal_px)), bc_type=ends)
+    return np.ascontiguousarray(np.moveaxis(unit.c, 1, 0))
 
 
 def distortion_growth(magnified: float) -> Array:

@@ -11,7 +11,7 @@ Measurements: docs/design-notes.md.
 """
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -246,7 +246,7 @@ def predicted_pointing(
     depth: Array | float,
     *,
     pan_tilt: tuple[Array | float, Array | float] | None = None,
-    nominal_px: float | None = None,
+    nominal_px: Array | float | None = None,
 ) -> Array:
     """Predict the rms pointing error [rad], (...), the root of the trace of `line_of_sight_covariance`."""
     covariance = line_of_sight_covariance(calibration, pixel, depth, pan_tilt=pan_tilt, nominal_px=nominal_px)
@@ -259,7 +259,7 @@ def line_of_sight_covariance(
     depth: Array | float,
     *,
     pan_tilt: tuple[Array | float, Array | float] | None = None,
-    nominal_px: float | None = None,
+    nominal_px: Array | float | None = None,
 ) -> Array:
     """Predict the covariance of the pointing error: the miss between the zoom camera's line of sight and a target.
 
@@ -276,7 +276,7 @@ def line_of_sight_covariance(
         pixel: pixel of the target in the fixed image, taken as exact, (..., 2).
         depth: depth of the target along the fixed camera's axis, taken as exact [m], (...).
         pan_tilt: commanded pan and tilt [rad], (...) each; None for the exact solution that faces forward.
-        nominal_px: nominal focal length of the zoom camera [px]; None for the shortest calibrated one.
+        nominal_px: nominal focal length of the zoom camera [px], (...); None for the shortest calibrated one.
 
     Returns:
         Covariance along right and down in the zoom image [rad^2], (..., 2, 2); nan where the target cannot be reached.
@@ -292,20 +292,22 @@ def line_of_sight_covariance(
     known = parameter_names(EVERY_BLOCK, model.stops)
     if unknown := [name for name in covariance.parameters if name not in known]:
         raise CalibrationError(f"covariance.parameters: '{unknown[0]}' is no parameter; they are: {', '.join(known)}")
-    nominal = calibration.zoom.nominal_px[0] if nominal_px is None else nominal_px
+    nominal = np.asarray(calibration.zoom.nominal_px[0] if nominal_px is None else nominal_px, dtype=float)
     depth = np.asarray(depth, dtype=float)
-    shape = np.broadcast_shapes(np.shape(pixel)[:-1], depth.shape)
+    shape = np.broadcast_shapes(np.shape(pixel)[:-1], depth.shape, nominal.shape)
     pixels = np.array(np.broadcast_to(pixel, (*shape, 2)), dtype=float).reshape(-1, 2)
-    depths = np.array(np.broadcast_to(depth, shape)).ravel()
+    depths, nominals = (np.array(np.broadcast_to(each, shape)).ravel() for each in (depth, nominal))
     turned = None
     if pan_tilt is not None:
         pan, tilt = (np.array(np.broadcast_to(angle, shape), dtype=float).ravel() for angle in pan_tilt)
         turned = pan, tilt
-    by_parameter, by_turn = miss_derivatives(model, covariance.parameters, pixels, depths, nominal, turned)
+    by_parameter, by_turn = miss_derivatives(model, covariance.parameters, pixels, depths, nominals, turned)
     found = by_parameter @ covariance.matrix @ by_parameter.swapaxes(-1, -2)
     found = found + calibration.jitter**2 * by_turn @ by_turn.swapaxes(-1, -2)
-    doubt = calibration.zoom.center_doubt_px(nominal) / np.array(calibration.zoom.at(nominal).focal_px)
-    return np.asarray(found + np.diag(doubt**2)).reshape(*shape, 2, 2)
+    doubt = _at_each(
+        nominals, lambda f: calibration.zoom.center_doubt_px(f) / np.array(calibration.zoom.at(f).focal_px)
+    )
+    return np.asarray(found + doubt[:, None] ** 2 * np.eye(2)).reshape(*shape, 2, 2)
 
 
 def miss_derivatives(
@@ -313,7 +315,7 @@ def miss_derivatives(
     parameters: Sequence[str],
     pixels: Array,
     depths: Array,
-    nominal_px: float,
+    nominal_px: Array | float,
     pan_tilt: tuple[Array, Array] | None = None,
 ) -> tuple[Array, Array]:
     """Compute the derivatives of the miss m of `line_of_sight_covariance`, by central differences.
@@ -323,27 +325,25 @@ def miss_derivatives(
         parameters: names of the k parameters.
         pixels: pixels of the targets in the fixed image, (n, 2).
         depths: depths of the targets along the fixed camera's axis [m], (n,).
-        nominal_px: nominal focal length of the zoom camera [px].
+        nominal_px: nominal focal length of the zoom camera [px], (n,), or one for all.
         pan_tilt: pan and tilt of the head [rad], (n,) each; None for the exact solution that faces forward.
 
     Returns:
         Derivatives by the parameters, (n, 2, k), and by pan and tilt, (n, 2, 2); nan for targets out of reach.
     """
     assert model.fixed is not None
-    assert model.zoom is not None
+    nominals = np.broadcast_to(nominal_px, depths.shape)
+    x_fixed = model.fixed.ray(pixels) * depths[:, None]
     if pan_tilt is None:
-        lens = model.zoom.at(nominal_px)
-        x_base = (model.hand * model.gamma).apply(model.fixed.ray(pixels) * depths[:, None])
-        hand = model.hand * model.zoom.to_pupil(nominal_px)
-        found = solve(x_base, hand, model.head, lens.ray(lens.image_center_px))
-        pan_tilt = found.pan[:, 0], found.tilt[:, 0]
+        pan_tilt = _pointed(model, x_fixed, nominals)
     pan, tilt = pan_tilt
-    across = _across(_line_of_sight(model, nominal_px))
+    across = _at_each(nominals, lambda f: _across(_line_of_sight(model, f)))
     model = replace(model, boards={})
-    x_zoom = _moved_targets(model, pixels, depths, pan, tilt)
+    x_zoom = _moved_targets(model, x_fixed, pan, tilt)
 
     def miss(at: RigModel, x_zoom: Array) -> Array:
-        return (_directions(at, x_zoom, nominal_px) - _line_of_sight(at, nominal_px)) @ across
+        off = _directions(at, x_zoom, nominals) - _at_each(nominals, lambda f: _line_of_sight(at, f))
+        return np.einsum("ni,nij->nj", off, across)
 
     names = {block: parameter_names((block,), model.stops) for block in EVERY_BLOCK}
     block_of = {name: block for block, own in names.items() for name in own}
@@ -352,14 +352,41 @@ def miss_derivatives(
         block = block_of[name]
         steps = step * np.array([name == other for other in names[block]], dtype=float)
         at = stepped(model, steps, np.empty((0, POSE_PARAMETERS)), (block,))
-        return miss(at, x_zoom if block in LENS_BLOCKS else _moved_targets(at, pixels, depths, pan, tilt))
+        if block in LENS_BLOCKS:
+            return miss(at, x_zoom)
+        assert at.fixed is not None
+        moved = x_fixed if at.fixed is model.fixed else at.fixed.ray(pixels) * depths[:, None]
+        return miss(at, _moved_targets(at, moved, pan, tilt))
 
     def turned(pan_step: float, tilt_step: float) -> Array:
-        return miss(model, _moved_targets(model, pixels, depths, pan + pan_step, tilt + tilt_step))
+        return miss(model, _moved_targets(model, x_fixed, pan + pan_step, tilt + tilt_step))
 
-    by_parameter = [(beside(name, STEP) - beside(name, -STEP)) / (2 * STEP) for name in parameters]
+    by_parameter = np.empty((len(depths), 2, len(parameters)))
+    for i, name in enumerate(parameters):
+        by_parameter[..., i] = (beside(name, STEP) - beside(name, -STEP)) / (2 * STEP)
     by_turn = [(turned(*step) - turned(*-step)) / (2 * STEP) for step in STEP * np.eye(2)]
-    return np.stack(by_parameter, axis=-1), np.stack(by_turn, axis=-1)
+    return by_parameter, np.stack(by_turn, axis=-1)
+
+
+def _at_each(nominals: Array, compute: Callable[[float], Array]) -> Array:
+    """Compute something for each nominal focal length, (n, ...), once for equal ones."""
+    if len(nominals) == 1:
+        return compute(float(nominals[0]))[None]
+    focals, which = np.unique(nominals, return_inverse=True)
+    return np.array([compute(float(focal)) for focal in focals])[which]
+
+
+def _pointed(model: RigModel, x_fixed: Array, nominals: Array) -> tuple[Array, Array]:
+    """Solve pan and tilt that show targets in the middle of the zoom image, facing forward, (n,) each [rad]."""
+    assert model.zoom is not None
+    x_base, zoom = (model.hand * model.gamma).apply(x_fixed), model.zoom
+    angles = np.empty((2, len(nominals)))
+    for nominal in np.unique(nominals):
+        these = nominals == nominal
+        hand = model.hand * zoom.to_pupil(nominal)
+        found = solve(x_base[these], hand, model.head, _line_of_sight(model, nominal))
+        angles[:, these] = found.pan[:, 0], found.tilt[:, 0]
+    return angles[0], angles[1]
 
 
 def model_of(calibration: Calibration) -> RigModel:
@@ -376,18 +403,18 @@ def model_of(calibration: Calibration) -> RigModel:
     )
 
 
-def _moved_targets(model: RigModel, pixels: Array, depths: Array, pan: Array, tilt: Array) -> Array:
+def _moved_targets(model: RigModel, x_fixed: Array, pan: Array, tilt: Array) -> Array:
     """Compute the targets in the moved zoom camera's frame at the first zoom sample [m], (n, 3) (Eq. 2)."""
-    assert model.fixed is not None
-    x_base = (model.hand * model.gamma).apply(model.fixed.ray(pixels) * depths[:, None])
+    x_base = (model.hand * model.gamma).apply(x_fixed)
     R, t, _ = base_heads(model.head, pan, tilt)
     return model.hand.inv().apply(np.einsum("vji,vj->vi", R, x_base - t))
 
 
-def _directions(model: RigModel, x_zoom: Array, nominal_px: float) -> Array:
-    """Compute unit vectors from the pupil at a nominal focal length to the targets of `_moved_targets`, (n, 3)."""
+def _directions(model: RigModel, x_zoom: Array, nominals: Array) -> Array:
+    """Compute unit vectors from the pupil at nominal focal lengths (n,) to the targets of `_moved_targets`, (n, 3)."""
     assert model.zoom is not None
-    return _unit(x_zoom - np.array([0.0, 0.0, model.zoom.pupil_at(nominal_px)]))
+    zoom = model.zoom
+    return _unit(x_zoom - _at_each(nominals, lambda f: np.array([0.0, 0.0, zoom.pupil_at(f)])))
 
 
 def _line_of_sight(model: RigModel, nominal_px: float) -> Array:

@@ -203,13 +203,11 @@ def pointing(calibration: Calibration, nominal_px: Sequence[float] | None = None
     Returns:
         One result per focal length, nan where the head reaches no target; empty where nothing can be predicted.
     """
-    if not can_point(calibration):
+    nominals = calibration.zoom.nominal_px if nominal_px is None else nominal_px
+    if not can_point(calibration) or not nominals:
         return ()
-    found = []
-    for nominal in calibration.zoom.nominal_px if nominal_px is None else nominal_px:
-        focal = float(np.mean(calibration.zoom.at(nominal).focal_px))
-        found.append(AtFocal(nominal, focal, _over_the_view(calibration, nominal)))
-    return tuple(found)
+    focals = [float(np.mean(calibration.zoom.at(nominal).focal_px)) for nominal in nominals]
+    return tuple(itertools.starmap(AtFocal, zip(nominals, focals, _over_the_view(calibration, nominals), strict=True)))
 
 
 def placements(calibration: Calibration) -> int:
@@ -219,10 +217,8 @@ def placements(calibration: Calibration) -> int:
 
 def what_stays(calibration: Calibration, at: AtFocal) -> float:
     """Compute the error that more placements do not reduce [rad]: jitter, and the doubt between zoom samples."""
-    covariance = calibration.covariance
-    assert covariance is not None
-    known = replace(covariance, matrix=np.zeros_like(covariance.matrix))
-    return _over_the_view(replace(calibration, covariance=known), at.nominal_px)
+    exact = Covariance((), np.empty((0, 0)))
+    return _over_the_view(replace(calibration, covariance=exact), [at.nominal_px])[0]
 
 
 def with_more_placements(calibration: Calibration, at: AtFocal, more: int = MORE_PLACEMENTS) -> float:
@@ -241,12 +237,12 @@ def between_stops(calibration: Calibration) -> list[float]:
     return [float(n) for a, b in itertools.pairwise(stops) for n in np.geomspace(a, b, each + 2)[1:-1]]
 
 
-def _over_the_view(calibration: Calibration, nominal_px: float) -> float:
-    """Compute the rms of the predicted error over all pixels and depths within reach [rad]."""
-    pixels, depths = sample_pixels(calibration), sample_depths()
-    errors = predicted_pointing(calibration, pixels[None], depths[:, None], nominal_px=nominal_px)
-    reached = errors[np.isfinite(errors)]
-    return float(np.sqrt(np.mean(reached**2))) if len(reached) else np.nan
+def _over_the_view(calibration: Calibration, nominal_px: Sequence[float]) -> list[float]:
+    """Compute the rms of the predicted error over all pixels and depths within reach [rad], at each focal length."""
+    pixels, depths, nominals = sample_pixels(calibration), sample_depths(), np.array(nominal_px)
+    errors = predicted_pointing(calibration, pixels, depths[:, None], nominal_px=nominals[:, None, None])
+    reached = [each[np.isfinite(each)] for each in errors]
+    return [float(np.sqrt(np.mean(each**2))) if len(each) else np.nan for each in reached]
 
 
 def corner_errors(calibration: Calibration, nominal_px: float) -> tuple[float, dict[str, float]]:

@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
@@ -100,14 +101,11 @@ def depth_figure(calibration: Calibration, at: AtFocal, boards: Array | None) ->
     corners = np.array([(0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)], dtype=float)
     with styled(3.0) as figure:
         ax = figure.subplots()
-        middle = calibration.fixed.image_center_px
-        for pixels, label, colour in (
-            (middle[None], "middle of the wide view", BLUE),
-            (corners, "its worst corner", ORANGE),
-        ):
-            error = predicted_pointing(calibration, pixels[None], depths[:, None], nominal_px=at.nominal_px)
-            worst = np.fmax.reduce(error, axis=1)  # nan only where no corner is reached
-            ax.plot(depths, np.degrees(worst), color=colour, lw=1.6, label=label)
+        pixels = np.vstack([calibration.fixed.image_center_px, corners])
+        error = np.degrees(predicted_pointing(calibration, pixels, depths[:, None], nominal_px=at.nominal_px))
+        worst = np.fmax.reduce(error[:, 1:], axis=1)  # nan only where no corner is reached
+        ax.plot(depths, error[:, 0], color=BLUE, lw=1.6, label="middle of the wide view")
+        ax.plot(depths, worst, color=ORANGE, lw=1.6, label="its worst corner")
         ax.set_ylim(bottom=0)
         ax.axvspan(*DEPTHS, color=BLUE, alpha=0.06, lw=0, label="range of the verdict")
         boards = np.empty(0) if boards is None else boards[(boards > depths[0]) & (boards < depths[-1])]
@@ -159,6 +157,7 @@ class Plot:
 INK, BLUE, ORANGE, RED, GREY, PALE = "#22303c", "#1f6f8b", "#c8702a", "#b5403a", "#8a97a3", "#e3e8ec"
 WIDTH = 8.6  # inches: the page's column
 PNG_DPI = 170
+SVG_DPI = 72  # a unit of SVG is a point
 HEAT = "viridis"
 STYLE = {
     "font.size": 9,
@@ -190,17 +189,20 @@ BINS = 60
 def styled(height: float, width: float = WIDTH) -> Iterator[Figure]:
     """Make an empty figure of a size in inches, and apply the report's style within the context."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        FigureCanvasAgg(figure)
-        yield figure
+        yield Figure(figsize=(width, height), layout="constrained")
 
 
 def as_bytes(figure: Figure, kind: str, dpi: int = PNG_DPI) -> bytes:
     """Render a figure as "png" or "svg", reproducibly to the byte."""
     buffer = io.BytesIO()
-    metadata = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
     with matplotlib.rc_context(STYLE):
-        figure.savefig(buffer, format=kind, dpi=dpi, metadata=metadata)
+        # By the canvas itself, because `savefig` draws a figure with a layout twice.
+        if kind == "svg":
+            figure.set_dpi(SVG_DPI)
+            FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
+        else:
+            figure.set_dpi(dpi)
+            FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
         figure.set_layout_engine("none")  # the layout stays for a second rendering
     return buffer.getvalue()
 

@@ -141,6 +141,11 @@ def test_many_targets_at_once_and_out_of_reach():
     assert together.shape == (1, 3)
     alone = [float(predicted_pointing(calibration, p, z)) for p, z in zip(pixels[0], depths[0], strict=True)]
     assert np.allclose(together[0], alone, rtol=1e-9)
+    zoomed = np.array([500.0, 2000.0])[:, None]
+    longer = predicted_pointing(calibration, pixels[0], depths[0], nominal_px=zoomed)
+    assert longer.shape == (2, 3)
+    each = [predicted_pointing(calibration, pixels[0], depths[0], nominal_px=f) for f in zoomed.ravel()]
+    assert np.allclose(longer, each, rtol=1e-9)
     lever = RigidTransform.from_translation([0.0, 0.5, 0.0])  # with the fixed camera where the axes cross
     calibration = replace(calibration, T_head_zoom=lever, T_zoom0_fixed=lever.inv())
     near_and_far = predicted_pointing(calibration, pixels[0, 0], [0.1, 10.0])
