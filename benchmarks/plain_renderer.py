@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from cotarget.config import Size
+from cotarget.schema import Size
 from cotarget.sim.model import RENDER_PITCH, RIG, build_model
 from cotarget.sim.render.opengl import make_renderer, mujoco
 from cotarget.sim.state import WorldState

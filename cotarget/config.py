@@ -4,8 +4,8 @@ Values keep the units of the file, because people edit it: metres and degrees, a
 defaults of [sim] are the rig for which the project's figures are stated; those of [hardware] are a PTU-D46-17.5 as it
 leaves the factory, an Axis 241Q, and a Canon PowerShot S5 IS.
 
-`build` turns a table into a dataclass by the types of its fields. `check_config` then refuses values of the right type
-that make no sense.
+The types of the fields say what a value may be, see `cotarget.schema`. `check_config` then refuses combinations of
+values that make no sense.
 """
 
 import dataclasses
@@ -14,46 +14,51 @@ import math
 import re
 import tomllib
 import types
-import typing
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
 import numpy as np
+from annotated_types import Ge, Gt, Interval, Le
 
 from cotarget.camera import Intrinsics
 from cotarget.errors import ConfigError, choices
 from cotarget.files import assets_dir
-from cotarget.geometry import RigidTransform, pose, pose_dict
+from cotarget.geometry import pose
+from cotarget.schema import (
+    ASCENDING,
+    Check,
+    FilePath,
+    Limits,
+    NotNegative,
+    OneOf,
+    Pair,
+    Pose,
+    Positive,
+    Size,
+    as_table,
+    model,
+    validate,
+)
 
 FEWEST_CORNERS, MOST_CORNERS = 3, 100  # corners along a side of a board
 
 
-def check_config(config: "RigConfig", recorded: bool = False) -> None:
-    """Refuse values of the right type that make no sense.
-
-    Args:
-        config: configuration of a rig.
-        recorded: whether it belongs to a recording, see `parse_config`.
+def check_config(config: "RigConfig") -> None:
+    """Check a configuration that was made in Python as one that is read from a file.
 
     Raises:
         ConfigError: a value is refused; the message names the key.
     """
-    check_numbers(config.sim) if recorded else check_sim(config.sim)
-    check_hardware(config.hardware)
-    positive: dict[str, float] = {
-        "board.square": config.board.square,
-        "safety.max_frame_age_s": config.safety.max_frame_age_s,
-        "safety.watchdog_s": config.safety.watchdog_s,
-    }
-    for name, target in config.targets.items():
-        positive |= {f"targets.{name}.size": target.size, f"targets.{name}.wanted_px": target.wanted_px}
-        positive[f"targets.{name}.shape"] = 1.0 if target.shape is None else target.shape
-    for where, value in positive.items():
-        if value <= 0:
-            raise ConfigError(f"{where}: {value:g} is not greater than zero")
+    validate(RigConfig, as_table(config), "")
+    _check_combinations(config)
+
+
+def _check_combinations(config: "RigConfig", recorded: bool = False) -> None:
+    if not recorded:
+        check_sim(config.sim)
     _check_safety(config.safety, config.rate_hz)
     check_corners(config.board)
 
@@ -77,28 +82,19 @@ def check_corners(board: "BoardConfig") -> None:
 
 
 def _check_safety(safety: "SafetyConfig", rate_hz: float) -> None:
-    """Refuse empty ranges, a watchdog that halts between two frames, and a stop file without a name."""
-    for where, limits in (("safety.pan_deg", safety.pan_deg), ("safety.tilt_deg", safety.tilt_deg)):
-        if limits is not None and limits[0] >= limits[1]:
-            raise ConfigError(f"{where}: {list(limits)} is not [lowest, highest]")
-    if safety.speed_deg_s is not None and safety.speed_deg_s <= 0:
-        raise ConfigError(f"safety.speed_deg_s: {safety.speed_deg_s:g} is not greater than zero")
+    """Refuse a watchdog that halts between two frames."""
     if safety.watchdog_s * rate_hz <= 1:
         raise ConfigError(
             f"safety.watchdog_s: {safety.watchdog_s:g} s would halt the head between any two frames of the "
             f"fixed camera, of which {rate_hz:g} come a second"
         )
-    if safety.stop_file is not None and safety.stop_file.name in ("", ".."):
-        raise ConfigError(f"safety.stop_file: '{safety.stop_file}' is a folder; name a file in it, as 'stop'")
 
 
 # The [sim] tables
 
-# The text of an annotation describes the numbers of a list in error messages.
-Pair = tuple[float, float]
-Limits = Annotated[Pair, "[lowest, highest]"]
-Size = Annotated[tuple[int, int], "[width, height]"]
-Focal = Annotated[Pair, "[fx, fy]"]
+# Largest values [mm, degrees, Hz, grey levels]; beyond them another unit was meant.
+MOST_AXIS_OFFSET_MM, MOST_SQUARENESS_DEG, MOST_RATE_HZ, MOST_NOISE = 1000.0, 45.0, 1000.0, 255.0
+Focal = Annotated[tuple[Positive, Positive], "[fx, fy]"]
 Center = Annotated[Pair, "[u, v]"]
 Distortion = Annotated[tuple[float, float, float, float, float], "[k1, k2, p1, p2, k3]"]
 Waypoint = Annotated[tuple[float, float, float, float], "[t, x, y, z]"]
@@ -107,7 +103,7 @@ Curve = Annotated[tuple[float, ...], "[of s, of s^2, ...]"]
 TARGETS = ("book", "person", "bird")  # targets with a model in the simulation
 
 
-@dataclass(frozen=True)
+@model
 class SimCamera:
     """The simulated fixed camera: true intrinsics, sensor and link.
 
@@ -128,11 +124,11 @@ class SimCamera:
     focal_px: Focal = (686.0, 684.0)
     center_px: Center = (325.0, 239.0)
     distortion: Distortion = (-0.2, 0.0, 0.0, 0.0, 0.0)
-    noise: float = 2.0
-    rate_hz: float = 25.0
-    latency_s: float = 0.06
-    exposure_s: float = 0.0
-    jpeg_quality: int = 90
+    noise: Annotated[NotNegative, Le(MOST_NOISE)] = 2.0
+    rate_hz: Annotated[Positive, Le(MOST_RATE_HZ)] = 25.0
+    latency_s: NotNegative = 0.06
+    exposure_s: NotNegative = 0.0
+    jpeg_quality: Annotated[int, Interval(ge=1, le=100)] = 90
 
     def fitted(self, size: Size, focal_px: Focal | None) -> dict[str, Any]:
         """Scale focal length and principal point to an image size [px]; without a focal length, keep the view."""
@@ -150,7 +146,7 @@ class SimCamera:
         return size[0] / self.size[0] if focal_px is None else focal_px[0] / self.focal_px[0]
 
 
-@dataclass(frozen=True)
+@model
 class ZoomOptics:
     """Optics of a zoom lens at one focal length; ``pupil`` is the forward movement of its entrance pupil [m]."""
 
@@ -160,7 +156,7 @@ class ZoomOptics:
     pupil: float
 
 
-@dataclass(frozen=True)
+@model
 class SimZoomCamera(SimCamera):
     """The simulated zoom camera; ``focal_px``, ``center_px`` and ``distortion`` hold at the shortest focal length.
 
@@ -182,10 +178,10 @@ class SimZoomCamera(SimCamera):
     focal_px: Focal = (692.0, 693.0)
     center_px: Center = (326.0, 235.0)
     distortion: Distortion = (-0.1, 0.0, 0.0, 0.0, 0.0)
-    focal_mm: Limits = (6.0, 72.0)
-    pitch_mm: float = 0.009
-    lens_steps: int = 129
-    lens_speed: float = 129.0
+    focal_mm: Annotated[tuple[Positive, Positive], "[lowest, highest]", ASCENDING] = (6.0, 72.0)
+    pitch_mm: Positive = 0.009
+    lens_steps: Annotated[int, Ge(2)] = 129
+    lens_speed: Positive = 129.0
     focal_curve: Curve = (0.13, 0.14, -1.76, 2.39, -0.91)
     center_drift_px: tuple[Curve, Curve] = ((27.0, 85.0, -322.0, 268.0, -62.0), (-7.0, -4.0, -92.0, 195.0, -102.0))
     distortion_drift: Curve = (0.4, 0.04, -0.88, 0.62, -0.05)
@@ -226,7 +222,7 @@ def _along(curve: Curve, s: float) -> float:
     return value
 
 
-@dataclass(frozen=True)
+@model
 class SimHead:
     """The simulated pan-tilt head; the defaults are a stock PTU-D46-17.5 with the geometry of a real, imperfect unit.
 
@@ -242,18 +238,18 @@ class SimHead:
         backlash_deg: play of each axis [degrees].
     """
 
-    step_deg: float = 0.0514286
+    step_deg: NotNegative = 0.0514286
     pan_deg: Limits = (-158.9, 158.9)
     tilt_deg: Limits = (-46.6, 31.1)
-    speed_deg_s: float = 149.0
-    accel_deg_s2: float = 206.0
-    command_delay_s: float = 0.04
-    axis_offset_mm: float = 5.0
-    squareness_deg: float = 0.1
-    backlash_deg: float = 0.0
+    speed_deg_s: Positive = 149.0
+    accel_deg_s2: Positive = 206.0
+    command_delay_s: NotNegative = 0.04
+    axis_offset_mm: Annotated[float, Interval(ge=-MOST_AXIS_OFFSET_MM, le=MOST_AXIS_OFFSET_MM)] = 5.0
+    squareness_deg: Annotated[float, Interval(ge=-MOST_SQUARENESS_DEG, le=MOST_SQUARENESS_DEG)] = 0.1
+    backlash_deg: NotNegative = 0.0
 
 
-@dataclass(frozen=True)
+@model
 class SimEffects:
     """Switches of the effects by which the simulation departs from an ideal rig.
 
@@ -303,7 +299,7 @@ DEFAULT_GAMMA = pose([-0.40, 0.03, 0.06], [0.8, -1.9, 0.6])
 DEFAULT_T = pose([0.02, -0.08, 0.05], [0.7, -1.4, 0.5])
 
 
-@dataclass(frozen=True)
+@model
 class SimConfig:
     """The simulated world.
 
@@ -325,15 +321,15 @@ class SimConfig:
     """
 
     scene: str = "outdoor"
-    seed: int = 0
+    seed: Annotated[int, Ge(0)] = 0
     targets: tuple[str, ...] = ()
-    T_zoom0_fixed: RigidTransform = DEFAULT_GAMMA
-    T_head_zoom: RigidTransform = DEFAULT_T
+    T_zoom0_fixed: Pose = DEFAULT_GAMMA
+    T_head_zoom: Pose = DEFAULT_T
     fixed: SimCamera = SimCamera()
     zoom: SimZoomCamera = SimZoomCamera()
     head: SimHead = SimHead()
     effects: SimEffects = SimEffects()
-    models: Mapping[str, Path] = field(default_factory=dict)
+    models: Mapping[str, FilePath] = field(default_factory=dict)
     paths: Mapping[str, tuple[Waypoint, ...]] = field(default_factory=dict)
 
 
@@ -369,8 +365,6 @@ def fit_sizes(sim: SimConfig, given: Mapping[str, Any]) -> SimConfig:
     """
     cameras: dict[str, SimCamera] = {}
     for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
-        if min(*camera.size, *camera.focal_px) <= 0:
-            continue  # check_numbers refuses it
         said = given.get(name, {})
         # Nothing changes if size and focal length are the defaults.
         follows = type(camera)().fitted(camera.size, camera.focal_px if "focal_px" in said else None)
@@ -392,7 +386,36 @@ SOCKET = re.compile(r"socket://(\[[0-9A-Fa-f:.]+\]|[^:/\s]+):(\d+)/?")
 S5_IS_LENS = ((0, 6.0), (11, 6.4), (41, 12.1), (64, 21.3), (86, 41.6), (105, 61.4), (128, 72.0))
 
 
-@dataclass(frozen=True)
+def socket_address(url: str) -> tuple[str, int] | None:
+    """Parse host and port of "socket://host:port"; None for anything else."""
+    match = SOCKET.fullmatch(url)
+    return None if match is None else (match[1].strip("[]"), int(match[2]))
+
+
+def _web_address(url: str) -> str:
+    try:
+        parts = urlsplit(url)
+        valid = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # an invalid address in brackets, or an invalid port
+        valid = False
+    if url and not valid:
+        raise ValueError(f"'{url}' is not like http://192.168.0.90")
+    return url
+
+
+def _lens_table(lens: tuple[tuple[int, float], ...]) -> tuple[tuple[int, float], ...]:
+    if len(lens) < 2 or any(b[0] <= a[0] or b[1] <= a[1] for a, b in itertools.pairwise(lens)):
+        raise ValueError("needs two or more [position, mm], both of them increasing")
+    return lens
+
+
+def _presenter(presenter: str) -> str:
+    if presenter != "person" and socket_address(presenter) is None:
+        raise ValueError(f"'{presenter}' is neither person nor like socket://host:port")
+    return presenter
+
+
+@model
 class HardwareHead:
     """A Directed Perception PTU-D46.
 
@@ -409,17 +432,17 @@ class HardwareHead:
     """
 
     port: str = ""
-    baud: int = 9600
-    step_deg: float = 0.0514286
+    baud: Annotated[int, OneOf(*BAUDS)] = 9600
+    step_deg: Positive = 0.0514286
     pan_deg: Limits = (-158.9, 158.9)
     tilt_deg: Limits = (-46.6, 31.1)
-    pan_sign: Literal[1, -1] = -1
-    tilt_sign: Literal[1, -1] = 1
-    speed_deg_s: float = 149.0
-    command_delay_s: float = 0.04
+    pan_sign: Annotated[int, OneOf(-1, 1)] = -1
+    tilt_sign: Annotated[int, OneOf(-1, 1)] = 1
+    speed_deg_s: Positive = 149.0
+    command_delay_s: NotNegative = 0.04
 
 
-@dataclass(frozen=True)
+@model
 class HardwareFixed:
     """The fixed camera, on an Axis video server or network camera.
 
@@ -435,18 +458,18 @@ class HardwareFixed:
         latency_s: time from light to a frame's first byte, as measured [s].
     """
 
-    url: str = ""
-    camera: int = 1
+    url: Annotated[str, Check(_web_address)] = ""
+    camera: Annotated[int, Gt(0)] = 1
     user: str = ""
     password: str = ""
     size: Size = (704, 576)
     resolution: str = "4CIF"
-    rate_hz: float = 25.0
-    compression: int = 30
-    latency_s: float = 0.1
+    rate_hz: Positive = 25.0
+    compression: Annotated[int, Interval(ge=0, le=100)] = 30
+    latency_s: NotNegative = 0.1
 
 
-@dataclass(frozen=True)
+@model
 class HardwareZoom:
     """The zoom camera, by gphoto2.
 
@@ -470,17 +493,17 @@ class HardwareZoom:
     model: str = ""
     settings: Mapping[str, str] = field(default_factory=dict)
     zoom_key: str = "zoom"
-    lens: tuple[Annotated[tuple[int, float], "[position, mm]"], ...] = S5_IS_LENS
-    lens_speed: float = 60.0
+    lens: Annotated[tuple[Annotated[tuple[int, Positive], "[position, mm]"], ...], Check(_lens_table)] = S5_IS_LENS
+    lens_speed: Positive = 60.0
     size: Size = (320, 240)
     still_size: Size = (3264, 2448)
-    pitch_mm: float = 0.01794
-    rate_hz: float = 15.0
-    latency_s: float = 0.1
-    command_delay_s: float = 0.05
+    pitch_mm: Positive = 0.01794
+    rate_hz: Positive = 15.0
+    latency_s: NotNegative = 0.1
+    command_delay_s: NotNegative = 0.05
 
 
-@dataclass(frozen=True)
+@model
 class HardwareBoard:
     """How the calibration board is presented.
 
@@ -488,10 +511,10 @@ class HardwareBoard:
         presenter: "person", who is asked on the terminal to hold it, or a program at "socket://host:port".
     """
 
-    presenter: str = "person"
+    presenter: Annotated[str, Check(_presenter)] = "person"
 
 
-@dataclass(frozen=True)
+@model
 class HardwareConfig:
     """The real devices."""
 
@@ -501,76 +524,12 @@ class HardwareConfig:
     board: HardwareBoard = HardwareBoard()
 
 
-def socket_address(url: str) -> tuple[str, int] | None:
-    """Parse host and port of "socket://host:port"; None for anything else."""
-    match = SOCKET.fullmatch(url)
-    return None if match is None else (match[1].strip("[]"), int(match[2]))
-
-
-def check_hardware(hardware: HardwareConfig) -> None:
-    """Refuse values of [hardware] that make no sense; a device without an address is no error yet.
-
-    Raises:
-        ConfigError: a value is refused; the message names the key.
-    """
-    head, fixed, zoom = hardware.head, hardware.fixed, hardware.zoom
-    if head.baud not in BAUDS:
-        raise ConfigError(f"hardware.head.baud: {head.baud} is not one of: {', '.join(map(str, BAUDS))}")
-    for name, limits in (("pan_deg", head.pan_deg), ("tilt_deg", head.tilt_deg)):
-        if limits[0] >= limits[1]:
-            raise ConfigError(f"hardware.head.{name}: {list(limits)} is not [lowest, highest]")
-    if fixed.url and not _is_web_address(fixed.url):
-        raise ConfigError(f"hardware.fixed.url: '{fixed.url}' is not like http://192.168.0.90")
-    if not 0 <= fixed.compression <= 100:
-        raise ConfigError(f"hardware.fixed.compression: {fixed.compression} is not within 0 to 100")
-    if len(zoom.lens) < 2 or any(b[0] <= a[0] or b[1] <= a[1] for a, b in itertools.pairwise(zoom.lens)):
-        raise ConfigError("hardware.zoom.lens: needs two or more [position, mm], both of them increasing")
-    presenter = hardware.board.presenter
-    if presenter != "person" and socket_address(presenter) is None:
-        raise ConfigError(f"hardware.board.presenter: '{presenter}' is neither person nor like socket://host:port")
-    positive: dict[str, tuple[float, ...]] = {
-        "head.step_deg": (head.step_deg,),
-        "head.speed_deg_s": (head.speed_deg_s,),
-        "fixed.camera": (fixed.camera,),
-        "fixed.size": fixed.size,
-        "fixed.rate_hz": (fixed.rate_hz,),
-        "zoom.size": zoom.size,
-        "zoom.still_size": zoom.still_size,
-        "zoom.lens": (zoom.lens[0][1],),
-        "zoom.lens_speed": (zoom.lens_speed,),
-        "zoom.pitch_mm": (zoom.pitch_mm,),
-        "zoom.rate_hz": (zoom.rate_hz,),
-    }
-    not_negative = {
-        "head.command_delay_s": head.command_delay_s,
-        "fixed.latency_s": fixed.latency_s,
-        "zoom.latency_s": zoom.latency_s,
-        "zoom.command_delay_s": zoom.command_delay_s,
-    }
-    for where, values in positive.items():
-        if min(values) <= 0:
-            raise ConfigError(f"hardware.{where}: {min(values):g} is not greater than zero")
-    for where, value in not_negative.items():
-        if value < 0:
-            raise ConfigError(f"hardware.{where}: {value:g} is negative")
-
-
-def _is_web_address(url: str) -> bool:
-    try:
-        parts = urlsplit(url)
-        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
-    except ValueError:  # an invalid address in brackets, or an invalid port
-        return False
-
-
 # Checks of the [sim] tables
 
 # Number of focal lengths at which the zoom lens's curves are checked.
 CHECKED_FOCALS = 33
 # Largest movement of an entrance pupil, longer than any lens; beyond it millimetres were given [m].
 FARTHEST_PUPIL = 1.0
-# Largest values [mm, degrees, Hz, grey levels]; beyond them another unit was meant.
-MOST_AXIS_OFFSET_MM, MOST_SQUARENESS_DEG, MOST_RATE_HZ, MOST_NOISE = 1000.0, 45.0, 1000.0, 255.0
 MODEL_SUFFIXES = (".obj", ".stl", ".xml")  # files of a user's own target models
 
 
@@ -580,7 +539,6 @@ def check_sim(sim: SimConfig) -> None:
     Raises:
         ConfigError: a value is refused; the message names the key.
     """
-    check_numbers(sim)
     for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
         _check_center(f"sim.{name}", camera)
         _check_frame_time(f"sim.{name}", camera)
@@ -597,64 +555,6 @@ def check_sim(sim: SimConfig) -> None:
             raise ConfigError(
                 f"sim.targets: a {name} of your own needs a way: [sim.paths] {name} = [[t, x, y, z], ...]"
             )
-
-
-def check_numbers(sim: SimConfig) -> None:
-    """Refuse sizes, rates and limits that are impossible for a simulated or a recorded rig.
-
-    Raises:
-        ConfigError: a value is refused; the message names the key.
-    """
-    positive: dict[str, tuple[float, ...]] = {
-        "sim.zoom.pitch_mm": (sim.zoom.pitch_mm,),
-        "sim.zoom.lens_speed": (sim.zoom.lens_speed,),
-        "sim.head.speed_deg_s": (sim.head.speed_deg_s,),
-        "sim.head.accel_deg_s2": (sim.head.accel_deg_s2,),
-    }
-    not_negative: dict[str, tuple[float, ...]] = {
-        "sim.seed": (sim.seed,),
-        "sim.head.step_deg": (sim.head.step_deg,),
-        "sim.head.command_delay_s": (sim.head.command_delay_s,),
-        "sim.head.backlash_deg": (sim.head.backlash_deg,),
-    }
-    for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
-        positive[f"sim.{name}.size"] = camera.size
-        positive[f"sim.{name}.focal_px"] = camera.focal_px
-        positive[f"sim.{name}.rate_hz"] = (camera.rate_hz,)
-        not_negative[f"sim.{name}.noise"] = (camera.noise,)
-        not_negative[f"sim.{name}.latency_s"] = (camera.latency_s,)
-        not_negative[f"sim.{name}.exposure_s"] = (camera.exposure_s,)
-        if not 1 <= camera.jpeg_quality <= 100:
-            raise ConfigError(f"sim.{name}.jpeg_quality: {camera.jpeg_quality} is not within 1 to 100")
-    for where, values in positive.items():
-        if min(values) <= 0:
-            raise ConfigError(f"{where}: {min(values):g} is not greater than zero")
-    for where, values in not_negative.items():
-        if min(values) < 0:
-            raise ConfigError(f"{where}: {min(values):g} is negative")
-    at_most: dict[str, tuple[float, float]] = {
-        "sim.head.axis_offset_mm": (abs(sim.head.axis_offset_mm), MOST_AXIS_OFFSET_MM),
-        "sim.head.squareness_deg": (abs(sim.head.squareness_deg), MOST_SQUARENESS_DEG),
-        "sim.fixed.rate_hz": (sim.fixed.rate_hz, MOST_RATE_HZ),
-        "sim.zoom.rate_hz": (sim.zoom.rate_hz, MOST_RATE_HZ),
-        "sim.fixed.noise": (sim.fixed.noise, MOST_NOISE),
-        "sim.zoom.noise": (sim.zoom.noise, MOST_NOISE),
-    }
-    for where, (value, most) in at_most.items():
-        if value > most:
-            raise ConfigError(f"{where}: {value:g} is more than {most:g}")
-    ranges = {
-        "sim.head.pan_deg": sim.head.pan_deg,
-        "sim.head.tilt_deg": sim.head.tilt_deg,
-        "sim.zoom.focal_mm": sim.zoom.focal_mm,
-    }
-    for where, limits in ranges.items():
-        if limits[0] >= limits[1]:
-            raise ConfigError(f"{where}: {list(limits)} is not [lowest, highest]")
-    if sim.zoom.focal_mm[0] <= 0:
-        raise ConfigError(f"sim.zoom.focal_mm: {sim.zoom.focal_mm[0]:g} is not greater than zero")
-    if sim.zoom.lens_steps < 2:
-        raise ConfigError(f"sim.zoom.lens_steps: {sim.zoom.lens_steps} is fewer than 2")
 
 
 def known_targets(own: Iterable[str] = ()) -> str:
@@ -690,7 +590,7 @@ def _check_targets(sim: SimConfig) -> None:
 
 def _check_frame_time(where: str, camera: SimCamera) -> None:
     """Refuse an exposure that is longer than a frame's interval."""
-    if camera.rate_hz > 0 and camera.exposure_s * camera.rate_hz > 1:
+    if camera.exposure_s * camera.rate_hz > 1:
         raise ConfigError(
             f"{where}.exposure_s: {camera.exposure_s:g} s is longer than the {1 / camera.rate_hz:g} s from one frame "
             f"to the next, of which {camera.rate_hz:g} come a second"
@@ -700,7 +600,7 @@ def _check_frame_time(where: str, camera: SimCamera) -> None:
 def _check_center(where: str, camera: SimCamera) -> None:
     """Refuse a principal point outside the image, such as one meant for a larger image."""
     (u, v), (width, height) = camera.center_px, camera.size
-    if min(camera.size) > 0 and not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
         raise ConfigError(
             f"{where}.center_px: ({u:g}, {v:g}) is not in the {width}x{height} image; give one near its middle, or none"
         )
@@ -715,8 +615,6 @@ def _sees_nothing(lens: Intrinsics) -> bool:
 
 def _check_lens(where: str, camera: SimCamera) -> None:
     """Refuse a distortion that leaves a part of the image without rays."""
-    if min(*camera.size, *camera.focal_px) <= 0:
-        return  # check_numbers refuses it
     if _sees_nothing(Intrinsics(camera.size, camera.focal_px, camera.center_px, camera.distortion)):
         raise ConfigError(
             f"{where}.distortion: {list(camera.distortion)} folds back inside the image, so that parts of it see "
@@ -747,144 +645,10 @@ def _check_optics(zoom: SimZoomCamera) -> None:
             )
 
 
-# Tables of TOML to dataclasses
-
-KINDS = {int: "whole numbers", float: "numbers", str: "texts"}  # elements of lists, for messages
-
-
-def expect_table(value: Any, where: str) -> None:
-    """Refuse a value that is no table."""
-    if not isinstance(value, Mapping):
-        raise ConfigError(f"{where}: {value!r} is not a table")
-
-
-def build(cls: type[Any], table: Any, where: str, base: Any = None) -> Any:
-    """Make a dataclass from a table.
-
-    Args:
-        cls: the dataclass; the types of its fields say what each value must be.
-        table: table of values; missing keys keep their defaults.
-        where: dotted name of the table, for messages.
-        base: an instance whose values are the defaults instead.
-
-    Raises:
-        ConfigError: an unknown key with the valid ones, a missing key, or a value of the wrong kind.
-    """
-    expect_table(table, where or "the file")
-    hints = typing.get_type_hints(cls, include_extras=True)
-    unknown = sorted(set(table) - set(hints))
-    if unknown:
-        raise ConfigError(f"unknown key '{_join(where, unknown[0])}'; valid here: {choices(hints)}")
-    values = {name: _convert(hints[name], value, _join(where, name)) for name, value in table.items()}
-    if base is not None:
-        return dataclasses.replace(base, **values)
-    required = {
-        f.name
-        for f in dataclasses.fields(cls)
-        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-    }
-    missing = sorted(required - set(values))
-    if missing:
-        raise ConfigError(f"{where}: missing key '{missing[0]}'; needed here: {choices(required)}")
-    return cls(**values)
-
-
-def _join(where: str, name: str) -> str:
-    return f"{where}.{name}" if where else name
-
-
-def _convert(hint: Any, value: Any, where: str) -> Any:
-    """Check a value against its field's type and convert it."""
-    hint, form = _parts(hint)
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (types.UnionType, typing.Union):  # the only unions are "or None", and TOML has no None
-        return _convert(args[0], value, where)
-    if origin is Literal:
-        if value not in args or isinstance(value, bool):
-            raise ConfigError(f"{where}: {value!r} is not one of: {choices(map(str, args))}")
-        return value
-    if hint is Path:
-        if not _convert(str, value, where):
-            raise ConfigError(f"{where}: is empty; give a path, or leave it out")
-        return Path(value)
-    if hint is RigidTransform:
-        return _convert_pose(value, where)
-    if dataclasses.is_dataclass(hint):
-        return build(typing.cast(type[Any], hint), value, where)
-    if origin is tuple:
-        return _convert_tuple(args, value, where, form)
-    if origin is Mapping or (isinstance(origin, type) and issubclass(origin, Mapping)):
-        expect_table(value, where)
-        return {key: _convert(args[1], item, _join(where, key)) for key, item in value.items()}
-    if hint is float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ConfigError(f"{where}: {value!r} is not a finite number")
-        return float(value)
-    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
-        kinds = {int: "a whole number", str: "a text", bool: "true or false"}
-        raise ConfigError(f"{where}: {value!r} is not {kinds[hint]}")
-    return value
-
-
-def _parts(hint: Any) -> tuple[Any, str]:
-    """Split `Annotated[type, words]` into the type and the words; the words of other types are empty."""
-    if typing.get_origin(hint) is Annotated:
-        hint, form = typing.get_args(hint)
-        return hint, form
-    return hint, ""
-
-
-def _convert_tuple(args: tuple[Any, ...], value: Any, where: str, form: str = "") -> tuple[Any, ...]:
-    several = args[-1] is Ellipsis
-    if several and not form and (one := _parts(args[0])[1]):
-        form = f"[{one}, ...]"
-    form = form and f", {form}"
-    if not isinstance(value, list):
-        kinds = [kind for kind in args if kind is not Ellipsis]
-        kind = KINDS.get(kinds[0] if len(set(kinds)) == 1 else float, "lists")
-        raise ConfigError(f"{where}: {value!r} is not a list of {'' if several else f'{len(args)} '}{kind}{form}")
-    if several:
-        return tuple(_convert(args[0], item, f"{where}[{i}]") for i, item in enumerate(value))
-    if len(value) != len(args):
-        raise ConfigError(f"{where}: has {len(value)} values where {len(args)} are wanted{form}")
-    return tuple(_convert(a, item, f"{where}[{i}]") for i, (a, item) in enumerate(zip(args, value, strict=True)))
-
-
-def _convert_pose(value: Any, where: str) -> RigidTransform:
-    expect_table(value, where)
-    keys = {"translation", "rotvec_deg"}
-    if set(value) != keys:
-        wrong = sorted(set(value) ^ keys)[0]
-        raise ConfigError(
-            f"{where}: {'unknown' if wrong in value else 'missing'} key '{wrong}'; needed: {choices(keys)}"
-        )
-    triple = (float, float, float)
-    translation = _convert_tuple(triple, value["translation"], f"{where}.translation", "[x, y, z]")
-    rotvec_deg = _convert_tuple(triple, value["rotvec_deg"], f"{where}.rotvec_deg", "[rx, ry, rz]")
-    try:
-        return pose(translation, rotvec_deg)
-    except ValueError as error:
-        raise ConfigError(f"{where}.{error}") from None
-
-
-def _as_tables(value: Any) -> Any:
-    """Convert dataclasses to tables, without values of None, which TOML does not have."""
-    if isinstance(value, RigidTransform):
-        return pose_dict(value)
-    if dataclasses.is_dataclass(value):
-        parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-        return {name: _as_tables(part) for name, part in parts.items() if part is not None}
-    if isinstance(value, Mapping):
-        return {key: _as_tables(part) for key, part in value.items()}
-    if isinstance(value, tuple):
-        return [_as_tables(part) for part in value]
-    return str(value) if isinstance(value, Path) else value
-
-
 ENCODING = "utf-8-sig"  # UTF-8 with or without the byte order mark that some editors write
 
 
-@dataclass(frozen=True)
+@model
 class BoardConfig:
     """The calibration board.
 
@@ -897,10 +661,10 @@ class BoardConfig:
 
     kind: Literal["chessboard", "charuco"] = "chessboard"
     corners: Annotated[tuple[int, int], "[columns, rows]"] = (9, 6)
-    square: float = 0.1
+    square: Positive = 0.1
 
 
-@dataclass(frozen=True)
+@model
 class TargetProfile:
     """What is known of a target before it is seen.
 
@@ -915,13 +679,13 @@ class TargetProfile:
         shape: expected width over height of the target's box; none if it is unknown or changes.
     """
 
-    size: float
+    size: Positive
     dimension: Literal["width", "height", "wingspan"]
-    wanted_px: float
+    wanted_px: Positive
     detector: Literal["colour", "motion", "speck", "mog2"]
-    template: Path | None = None
+    template: FilePath | None = None
     motion: Literal["standing", "walking", "flying", "general"] = "general"
-    shape: float | None = None
+    shape: Positive | None = None
 
     @property
     def matcher(self) -> Literal["box", "upright", "outline"]:
@@ -959,7 +723,13 @@ DEFAULT_TARGETS: Mapping[str, TargetProfile] = types.MappingProxyType(
 )
 
 
-@dataclass(frozen=True)
+def _file_name(path: Path) -> Path:
+    if path.name in ("", ".."):
+        raise ValueError(f"'{path}' is a folder; name a file in it, as 'stop'")
+    return path
+
+
+@model
 class SafetyConfig:
     """Soft limits of the head, within the device's own, and when the head is halted.
 
@@ -975,13 +745,13 @@ class SafetyConfig:
 
     pan_deg: Limits | None = None
     tilt_deg: Limits | None = None
-    speed_deg_s: float | None = None
-    max_frame_age_s: float = 1.0
-    watchdog_s: float = 0.35
-    stop_file: Path | None = None
+    speed_deg_s: Positive | None = None
+    max_frame_age_s: Positive = 1.0
+    watchdog_s: Positive = 0.35
+    stop_file: Annotated[FilePath, Check(_file_name)] | None = None
 
 
-@dataclass(frozen=True)
+@model
 class RigConfig:
     """All tables of rig.toml.
 
@@ -998,7 +768,7 @@ class RigConfig:
     backend: Literal["sim", "hardware", "replay"] = "sim"
     sim: SimConfig = field(default_factory=SimConfig)
     hardware: HardwareConfig = field(default_factory=HardwareConfig)
-    recording: Path | None = None
+    recording: FilePath | None = None
     board: BoardConfig = field(default_factory=BoardConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     targets: Mapping[str, TargetProfile] = field(default_factory=lambda: dict(DEFAULT_TARGETS))
@@ -1160,15 +930,16 @@ def parse_config(table: Mapping[str, Any], *, recorded: bool = False) -> RigConf
     table = dict(table)
     targets = dict(DEFAULT_TARGETS)
     given = table.pop("targets", {})
-    expect_table(given, "targets")
+    if not isinstance(given, Mapping):
+        raise ConfigError(f"targets: {given!r} is not a table")
     for name, values in given.items():
-        targets[name] = build(TargetProfile, values, f"targets.{name}", base=_of_kind(targets, name))
+        targets[name] = validate(TargetProfile, values, f"targets.{name}", base=_of_kind(targets, name))
     sim_table = table.get("sim")
     if isinstance(sim_table, Mapping) and isinstance(sim_table.get("effects"), Mapping):
         table["sim"] = {**sim_table, "effects": expand_all(sim_table["effects"])}
-    config = build(RigConfig, table, "")
+    config = validate(RigConfig, table, "")
     config = dataclasses.replace(config, targets=targets, sim=fit_sizes(config.sim, table.get("sim", {})))
-    check_config(config, recorded)
+    _check_combinations(config, recorded)
     return config
 
 
@@ -1189,7 +960,7 @@ def config_table(config: RigConfig) -> dict[str, Any]:
 
     Passwords are left out, and so is what would keep a replay from running, such as the stop file.
     """
-    table: dict[str, Any] = _as_tables(dataclasses.replace(config, recording=None))
+    table: dict[str, Any] = as_table(dataclasses.replace(config, recording=None))
     table["safety"].pop("stop_file", None)
     fixed = table["hardware"]["fixed"]
     fixed["password"] = ""

@@ -22,9 +22,10 @@ from cotarget.cli.main import _parser
 from cotarget.config import DEFAULT_TARGETS, RigConfig, parse_config
 from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, pose_dict
+from cotarget.schema import bare, form_of
 
 MARK = "<!-- made from the code -->"
-KINDS = {bool: "boolean", int: "integer", float: "number", str: "string", Path: "path", RigidTransform: "pose"}
+KINDS = {bool: "boolean", int: "integer", float: "number", str: "string", Path: "path"}
 UNITS = {"deg_s2": "degrees/s^2", "deg_s": "degrees/s", "deg": "degrees", "px": "px", "mm": "mm", "hz": "Hz", "s": "s"}
 UNIT_IN_TEXT = re.compile(r" \[(m|s|px|mm|degrees|degrees/s|degrees/s\^2|grey levels)\]")
 
@@ -51,16 +52,17 @@ def _tables(where: str, cls: type[Any]) -> Iterator[str]:
     hints, rows, inner = typing.get_type_hints(cls, include_extras=True), list[tuple[str, ...]](), list[Any]()
     for field in dataclasses.fields(cls):
         key, hint = f"{where}.{field.name}".lstrip("."), hints[field.name]
-        held = (typing.get_args(hint) or (hint,))[-1]  # of a Mapping, what it holds
+        by_name = typing.get_origin(bare(hint)) is Mapping
+        held = typing.get_args(bare(hint))[1] if by_name else bare(hint)
         if dataclasses.is_dataclass(held):
-            inner.append((key if held is hint else f"{key}.NAME", held))
+            inner.append((f"{key}.NAME" if by_name else key, held))
             continue
         default = field.default_factory() if callable(field.default_factory) else field.default
         meaning = meanings.get(field.name, "")
         if not meaning:  # a warning, and `mkdocs build --strict` fails
             logging.getLogger("mkdocs.hooks").warning("%s: 'Attributes:' has no %s", cls.__name__, field.name)
-        by_name = [unit for end, unit in UNITS.items() if field.name.endswith(f"_{end}")]
-        unit, meaning = (UNIT_IN_TEXT.findall(meaning) or by_name or [""])[0], UNIT_IN_TEXT.sub("", meaning)
+        by_suffix = [unit for end, unit in UNITS.items() if field.name.endswith(f"_{end}")]
+        unit, meaning = (UNIT_IN_TEXT.findall(meaning) or by_suffix or [""])[0], UNIT_IN_TEXT.sub("", meaning)
         rows.append((f"`{field.name}`", _kind(hint), unit, _toml(default), _range(key, hint, default), meaning))
     yield f"## {f'`[{where}]`' if where else 'Outside of the tables'} {{ #{where or 'backend'} }}\n"
     yield (cls.__doc__ or "").partition("Attributes:")[0].replace("\n    ", "\n").strip() + "\n"
@@ -72,8 +74,10 @@ def _tables(where: str, cls: type[Any]) -> Iterator[str]:
 def _kind(hint: Any) -> str:
     """Name a type."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if form := form_of(hint):
+        return f"`{form}`"
     if origin is Annotated:
-        return f"`{args[1]}`"
+        return "pose" if args[0] is RigidTransform else _kind(args[0])
     if origin is Literal:
         return ", ".join(f"`{json.dumps(each)}`" for each in args)
     if origin is tuple:
@@ -95,9 +99,9 @@ def _toml(value: Any) -> str:
 
 def _range(key: str, hint: Any, default: Any) -> str:
     """Find by trying which numbers are accepted while all other keys have their defaults."""
-    if hint not in (int, float, float | None):
+    number: Any = bare(hint)
+    if number not in (int, float):
         return ""
-    number: Any = int if hint is int else float
     usual = default if isinstance(default, int | float) else 1.0
     if choices := _refusal(key, usual + 1).partition("is not one of: ")[2]:
         return choices

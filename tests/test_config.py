@@ -137,7 +137,7 @@ def test_offsets_and_targets_are_taken(tmp_path):
             "sim.T_zoom0_fixed.translation: [1e+300, 0.0, 0.0] is farther than 1e+06 m",
         ),
         ("[sim.fixed]\nrate_hz = 1e9", "sim.fixed.rate_hz: 1e+09 is more than 1000"),
-        ("[sim.head]\nsquareness_deg = -90", "sim.head.squareness_deg: 90 is more than 45"),
+        ("[sim.head]\nsquareness_deg = -90", "sim.head.squareness_deg: -90 is not within -45 to 45"),
         ("[board]\ncorners = [201, 400]", "board.corners: 201x400 has more than 100 corners a side"),
         ("[board]\ncorners = [8, 6]", "one count must be odd and the other even, like 8x7"),
         ("[safety]\nstop_file = '.'", "safety.stop_file: '.' is a folder; name a file in it, as 'stop'"),

@@ -18,7 +18,6 @@ from cotarget.config import (
     RigConfig,
     SimConfig,
     SimEffects,
-    Size,
     TargetProfile,
     Waypoint,
     check_config,
@@ -28,6 +27,7 @@ from cotarget.errors import ConfigError, choices
 from cotarget.evaluation import TruthDetector, TruthNoise, counted, true_calibration
 from cotarget.geometry import Array
 from cotarget.rig import PATIENCE_S, PanTiltState, ZoomState
+from cotarget.schema import Size
 from cotarget.sim.model import has_clutter
 from cotarget.sim.render.pictures import SizedPictures
 from cotarget.sim.targets.random_paths import SECONDS, in_view

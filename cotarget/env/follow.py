@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig, Size
+from cotarget.config import RigConfig
 from cotarget.detection import Detection
 from cotarget.env.common import (
     DETECTOR_NOISE,
@@ -27,6 +27,7 @@ from cotarget.env.common import (
 )
 from cotarget.evaluation import TruthNoise, closeup_of
 from cotarget.metrics import Closeup
+from cotarget.schema import Size
 from cotarget.sim.targets.random_paths import LONE, SECONDS, lone_path
 from cotarget.tracking.track import tracker_settings
 from cotarget.tracking.tracker import Tracker

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig, Size
+from cotarget.config import RigConfig
 from cotarget.control.selection import LOOK_S, Candidate
 from cotarget.env.common import (
     DETECTOR_NOISE,
@@ -32,6 +32,7 @@ from cotarget.geometry import Array
 from cotarget.metrics import ROUNDING_S, SERVED_S
 from cotarget.pipeline import FollowSettings, Step, follow
 from cotarget.rig import PanTiltLimits
+from cotarget.schema import Size
 from cotarget.sim.targets.random_paths import GROUPED, SECONDS, group_paths
 from cotarget.tracking.track import Track
 

@@ -22,7 +22,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from cotarget.config import RigConfig, expect_table, parse_config
+from cotarget.config import RigConfig, parse_config
 from cotarget.control.selection import TargetChoice, parse_choice
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform
@@ -395,7 +395,8 @@ def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, TargetCh
     try:
         if not isinstance(name, str):
             raise ConfigError("target: is not a text")
-        expect_table(table, "config")
+        if not isinstance(table, Mapping):
+            raise ConfigError(f"config: {table!r} is not a table")
         config = parse_config(table, recorded=True)
         target = config.target(name)
         target_choice = parse_choice(meta.get("whom", {}))

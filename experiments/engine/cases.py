@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cotarget.config import build
 from cotarget.errors import ConfigError, choices
+from cotarget.schema import validate
 from experiments.engine.harness import Experiment, Settings
 from experiments.engine.results import identity
 
@@ -141,7 +141,7 @@ def choose(
         mine, already = values.get(name, {}), list[Settings]()
         for picked in itertools.product(*([(key, text) for text in texts] for key, texts in mine.items())):
             tables = {key: _value(text) for key, text in picked}
-            settings = build(type(base), tables, name, base=base)
+            settings = validate(type(base), tables, name, base=base)
             for key in tables:
                 _check(settings, key, f"{name}.{key}")
             if settings in already:  # the same values in another spelling

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cotarget.config import build
 from cotarget.errors import ConfigError
 from cotarget.files import write_whole
+from cotarget.schema import validate
 from experiments.engine.results import code_version
 from experiments.engine.versions import versions
 
@@ -116,7 +116,7 @@ def sessions(folder: Path) -> list[Session]:
 
 def _read(told: Any) -> Session | None:
     try:
-        session: Session = build(Session, told, SESSIONS)
+        session: Session = validate(Session, told, SESSIONS)
     except ConfigError:
         return None
     return session
