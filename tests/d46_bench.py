@@ -2,7 +2,7 @@
 
 from cotarget.config import HardwareHead
 from cotarget.drivers.polled_head import Halt, Loop, Move
-from cotarget.drivers.ptu_d46 import connect
+from cotarget.drivers.ptu_d46 import D46Link
 from cotarget.drivers.ptu_protocol import Line
 from tests.d46_peer import SimPort, Unit
 from tests.simulated_clock import SimClock
@@ -20,13 +20,14 @@ class Bench:
         self.port = SimPort(self.unit, self.clock)
         self.numbers = iter(range(1, 1000000))
 
-    def connect(self, config=CONFIG):
+    def connect(self):
         self.line = Line(self.port, "PORT", 9600, self.clock)
-        return connect(self.line, config)
+        self.link = D46Link(self.line)
+        return self.link.unit
 
-    def start(self, config=CONFIG):
-        facts = self.connect(config)
-        self.loop = Loop(self.line, facts, self.clock, config.command_delay_s)
+    def start(self):
+        self.connect()
+        self.loop = Loop(self.link, self.clock, CONFIG.command_delay_s)
         self.until(lambda: not self.loop.snapshot.moving)
         return self.loop
 

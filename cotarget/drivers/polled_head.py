@@ -1,9 +1,10 @@
-"""The pan-tilt unit PTU-D46 behind the Rig's `PanTilt` Protocol.
+"""A pan-tilt unit that is polled on a thread of its own, behind the Rig's `PanTilt` Protocol.
 
-`D46Head` is the head that the pipeline sees. A thread of its own runs `Loop`, the only user of the serial line: it
-polls both axes all the time and sends the commands of other threads. One turn of the loop is one exchange with the
-unit, or the few exchanges of one move. Other threads only append requests to queues and read the newest `Snapshot`,
-without locks, so that a signal handler may halt the head whatever code it interrupted.
+`PolledHead` is the head that the pipeline sees; a driver gives it a `HeadLink`, which speaks the unit's protocol. A
+thread runs `Loop`, the only user of the link: it polls both axes all the time and sends the commands of other threads.
+One turn of the loop is one exchange with the unit, or the few exchanges of one move. Other threads only append requests
+to queues and read the newest `Snapshot`, without locks, so that a signal handler may halt the head whatever code it
+interrupted.
 """
 
 import atexit
@@ -13,44 +14,156 @@ import logging
 import math
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
-from cotarget.config import HardwareHead, SafetyConfig
-from cotarget.drivers import ptu_protocol
+from cotarget.config import SafetyConfig
 from cotarget.drivers.interlock import PositionLostError, PositionLostMarker
-from cotarget.drivers.ptu_d46 import (
-    HALT_NOW,
-    HALT_TRIES,
-    AxisFacts,
-    UnitInfo,
-    connect,
-    halt_outright,
-    refuse_events,
-    restarted,
-)
-from cotarget.drivers.ptu_protocol import (
-    QUICK_S,
-    AxisName,
-    Line,
-    LostError,
-    RefusedError,
-    ReplyError,
-    RestartedError,
-    SilentError,
-    command,
-    open_line,
-)
+from cotarget.drivers.serial_line import LostError, RefusedError, SilentError
 from cotarget.errors import ConfigError, DeviceError, HaltedError
 from cotarget.rig import Clock, PanTiltLimits, PanTiltState, Speed
 
 log = logging.getLogger(__name__)
 
-# Axis positions from polls
+# What a driver provides
 
-# An axis stands when it has stayed at one step for longer than the slowest speed, 31 steps/s, takes for a step [s].
-STILL_S = 0.035
+
+@dataclass(frozen=True)
+class AxisFacts:
+    """What a unit reports about one of its axes.
+
+    Attributes:
+        step: size of a step [rad].
+        lowest: position [steps].
+        highest: position [steps].
+        slowest: speed [steps/s].
+        fastest: speed [steps/s].
+        acceleration: [steps/s^2].
+        still_s: an axis stands when it has stayed at one step for this time [s]; longer than the slowest speed takes
+            for a step.
+    """
+
+    step: float
+    lowest: int
+    highest: int
+    slowest: int
+    fastest: int
+    acceleration: int
+    still_s: float
+
+    def degrees(self, sign: int) -> tuple[float, float]:
+        """Convert the limits to degrees with rig.toml's sign of the axis: lowest, highest."""
+        a, b = (sign * end * math.degrees(self.step) for end in (self.lowest, self.highest))
+        return min(a, b), max(a, b)
+
+
+class Poll(NamedTuple):
+    """Position [steps] of an axis, 0 for pan and 1 for tilt, and the time at which the unit read it [s]."""
+
+    axis: int
+    position: int
+    t: float
+
+
+class CutError(DeviceError):
+    """The unit was silent, and the link halted it before it answered again."""
+
+
+class HeadLink(Protocol):
+    """The protocol of an opened pan-tilt unit; `PolledHead` makes one call at a time.
+
+    The link repeats what may be repeated, and ends each call in a bounded time. Besides the errors named below every
+    method but `close` may raise LostError where the port failed, SilentError where the unit does not answer any more,
+    PositionLostError where its position may be lost, or another DeviceError where it cannot be used; the head is then
+    halted and closed for good.
+
+    Attributes:
+        name: of the port, for messages.
+        hurry: set by `PolledHead`; returns whether a halt waits, so that the answer in flight gets little time.
+    """
+
+    name: str
+    hurry: Callable[[], bool]
+
+    @property
+    def axes(self) -> tuple[AxisFacts, AxisFacts]:
+        """Facts of pan and tilt, as the unit reported them when it was opened."""
+
+    def poll(self) -> Sequence[Poll]:
+        """Ask for the position of one axis, in turn, or of both.
+
+        Raises:
+            CutError: the unit was halted because it was silent.
+        """
+
+    def move(self, goals: tuple[int, int], speeds: tuple[int, int], proceed: Callable[[], None]) -> None:
+        """Send pan and tilt to positions [steps] at speeds [steps/s]; return when the unit has taken the command.
+
+        Args:
+            goals: within the limits of `axes`.
+            speeds: within the limits of `axes`.
+            proceed: to be called before each message, also a repeated one; raises where a more urgent request waits,
+                and the rest must not be sent.
+
+        Raises:
+            RefusedError: the unit refused the command.
+            CutError: the unit was halted because it was silent.
+        """
+
+    def halt(self, patience: float) -> None:
+        """Stop both axes; return when the unit has acknowledged it, which takes ``patience`` [s] at most."""
+
+    def halt_last(self, patience: float) -> None:
+        """Stop both axes as `halt` does, in whatever state unit and line are; no other command follows."""
+
+    def send_halt(self) -> None:
+        """Send the halt and wait for no answer."""
+
+    def check(self) -> None:
+        """Raise PositionLostError if the unit has reported by itself that its position may be lost."""
+
+    def close(self) -> None:
+        """Release the port; never raises."""
+
+
+class HeadSettings(Protocol):
+    """The settings in [hardware.head] that every polled head has."""
+
+    @property
+    def port(self) -> str:
+        """Port of the unit."""
+
+    @property
+    def step_deg(self) -> float:
+        """Size of a step."""
+
+    @property
+    def pan_deg(self) -> tuple[float, float]:
+        """Lowest and highest pan."""
+
+    @property
+    def tilt_deg(self) -> tuple[float, float]:
+        """Lowest and highest tilt."""
+
+    @property
+    def pan_sign(self) -> int:
+        """1 where the unit's positive pan turns right, -1 where it turns left."""
+
+    @property
+    def tilt_sign(self) -> int:
+        """1 where the unit's positive tilt turns up, -1 where it turns down."""
+
+    @property
+    def speed_deg_s(self) -> float:
+        """Highest speed."""
+
+    @property
+    def command_delay_s(self) -> float:
+        """Time from a command to the start of motion."""
+
+
+# Axis positions from polls
 
 
 @dataclass(frozen=True)
@@ -71,13 +184,11 @@ class Snapshot:
 
 
 class AxisTrack:
-    """Position, goal and rest of one axis, from its polls and commands."""
+    """Position and rest of one axis, from its polls."""
 
-    def __init__(self, name: AxisName, facts: AxisFacts) -> None:
-        self.name, self.facts = name, facts
+    def __init__(self, facts: AxisFacts) -> None:
+        self.facts = facts
         self.polls: deque[tuple[float, int]] = deque(maxlen=2)
-        self.goal: int | None = None  # of the last command [steps]; None after a halt
-        self.speed: int | None = None  # of the last command [steps/s]
         self._valid = -float("inf")
         self._since: float | None = None
 
@@ -99,8 +210,8 @@ class AxisTrack:
         self._valid, self._since = t, None
 
     def stands(self) -> bool:
-        """Return whether the axis has stayed at one step for `STILL_S`."""
-        return self._since is not None and self.polls[-1][0] - self._since >= STILL_S
+        """Return whether the axis has stayed at one step for as long as its facts ask for."""
+        return self._since is not None and self.polls[-1][0] - self._since >= self.facts.still_s
 
     def at(self, t: float) -> float:
         """Interpolate the position [steps] at a time [s] between the last two polls."""
@@ -116,10 +227,6 @@ Request = TypeVar("Request")
 
 class DroppedError(HaltedError):
     """A move ended early because of a halt, a newer move, or the end of the driver."""
-
-
-class CutError(DeviceError):
-    """A move ended early because the line was silent and the head was halted."""
 
 
 @dataclass(eq=False)
@@ -172,20 +279,18 @@ def drained(queue: deque[Request]) -> list[Request]:
     return [queue.popleft() for _ in range(len(queue))]
 
 
-# The thread that owns the line
+# The thread that owns the link
 
-Meaning = TypeVar("Meaning")
-TRIES = 3  # of one exchange; the line is synchronised again before each but the first
+TRIES = 3  # of a move, and of polls in a row, that end because the unit was silent
 PATIENCE_S = 2.0  # for a move, beyond its travel and its acceleration [s]
 LOOP_HALT_S = 0.3  # for the answer to a halt, beyond the time to brake: a unit may answer only when it stands [s]
 
 
 class Loop:
-    """Poll the unit and send requests; the only user of the serial line.
+    """Poll the unit and send requests; the only user of the link.
 
     Args:
-        line: to a unit that `connect` has made ready.
-        unit: what the unit reported about itself.
+        link: to an opened unit.
         clock: the rig's clock.
         delay: time from a command to the start of motion [s].
 
@@ -194,29 +299,30 @@ class Loop:
         halts: requests to stop; they come before moves.
         halted: number of the newest halt that was taken out of the queue.
         closing: set when no more requests will come.
-        braking_s: longest time to stop the axes [s].
+        braking_s: longest time to stop the axes from their highest speed [s].
         rests: whether the unit acknowledged the last halt, after which nothing more is sent.
         errors: failure of a move without a waiting caller; the next call raises it.
         snapshot: the newest positions.
     """
 
-    def __init__(self, line: Line, unit: UnitInfo, clock: Clock, delay: float) -> None:
-        self._line, self._clock, self._delay = line, clock, delay
-        self._tracks = (AxisTrack("P", unit.pan), AxisTrack("T", unit.tilt))
-        self._next = 0  # the axis to poll
+    def __init__(self, link: HeadLink, clock: Clock, delay: float) -> None:
+        self._link, self._clock, self._delay = link, clock, delay
+        pan, tilt = (AxisTrack(facts) for facts in link.axes)
+        self._tracks = (pan, tilt)
         self._polled = True  # since the last move: moves in quick succession must not displace the polls
+        self._cuts = 0  # in a row, without a poll between them
         self._active: Move | None = None
         self.moves: deque[Move] = deque()
         self.halts: deque[Halt] = deque()
         self.halted = 0
         self.closing = False
-        self.braking_s = unit.braking_s
+        self.braking_s = max(axis.fastest / axis.acceleration for axis in link.axes)
         self.rests = False
         self.errors: deque[DeviceError] = deque(maxlen=1)
-        for _ in self._tracks:
+        while not all(track.polls for track in self._tracks):
             self._poll_position()
         self.snapshot = self._look()
-        line.hurry = lambda: self.closing or bool(self.halts)
+        link.hurry = lambda: self.closing or bool(self.halts)
 
     def turn(self) -> None:
         """Do the most urgent exchange: a halt, then a move, then a poll.
@@ -235,10 +341,13 @@ class Loop:
         except DroppedError as dropped:
             self._abandon(dropped)
         except CutError as cut:
-            self._take_up_again(cut)
-        except RestartedError as error:
-            raise restarted(self._line) from error
-        refuse_events(self._line)
+            self._cuts += 1
+            self._expect_motion()
+            if self._active is not None:
+                self._take_up_again(self._active, cut)
+            elif self._cuts == TRIES:
+                raise
+        self._link.check()
 
     def stop_for_good(self, reason: DeviceError) -> None:
         """Halt the head a last time, and end all requests with an error."""
@@ -251,12 +360,11 @@ class Loop:
             halt.done.set()
 
     def _halt_at_last(self, patience: float) -> None:
-        # A unit that was switched off and on echoes commands again, and late answers may come first.
         try:
-            halt_outright(self._line, patience)
+            self._link.halt_last(patience)
             self.rests = True
         except DeviceError as error:
-            log.warning("%s: the pan-tilt unit did not acknowledge the last halt: %s", self._line.name, error)
+            log.warning("%s: the pan-tilt unit did not acknowledge the last halt: %s", self._link.name, error)
 
     def _halt(self) -> None:
         requests = drained(self.halts)
@@ -273,19 +381,11 @@ class Loop:
 
     def _stop(self) -> None:
         """Send the halt and wait for its answer."""
-        for track in self._tracks:
-            track.goal = None
-        for left in reversed(range(HALT_TRIES)):
-            try:
-                self._exchange(HALT_NOW, ptu_protocol.done, patience=LOOP_HALT_S + self.braking_s)
-                break
-            except RefusedError:
-                if not left:
-                    raise
+        self._link.halt(LOOP_HALT_S + self.braking_s)
         self._expect_motion()
 
     def _move(self) -> None:
-        # The snapshot must say moving before the request leaves the queue: D46Head.state reads both.
+        # The snapshot must say moving before the request leaves the queue: PolledHead.state reads both.
         self.snapshot = Snapshot(self.snapshot.pan, self.snapshot.tilt, True, self.snapshot.t)
         requests = drained(self.moves)
         fresh = [request for request in requests if request.number > self.halted]
@@ -304,15 +404,7 @@ class Loop:
             self._give_up(move, error)
 
     def _send(self, move: Move) -> None:
-        for track, speed in zip(self._tracks, move.speeds, strict=True):
-            if speed != track.speed:
-                self._order(track.name + "S", speed)
-                track.speed = speed
-        for track, goal in zip(self._tracks, move.goals, strict=True):
-            if goal != track.goal:
-                track.goal = None
-                self._order(track.name + "P", goal)
-                track.goal = goal
+        self._link.move(move.goals, move.speeds, self._proceed)
         self._expect_motion()
         ways = zip(self._tracks, move.goals, move.speeds, strict=True)
         longest = max(
@@ -320,16 +412,13 @@ class Loop:
         )
         move.deadline = self._clock.now() + longest + self._delay + PATIENCE_S
 
-    def _order(self, name: str, value: int) -> None:
-        if reason := self._other_request():
-            raise DroppedError(reason)
-        self._exchange(command(name, value), ptu_protocol.done, self._other_request)
-
-    def _other_request(self) -> str:
-        """Return why the move under way must not be sent any further; empty if it may."""
-        if self.halts or self.closing or self._line.events:
-            return "the move was halted"
-        return "another move took this one's place" if self.moves else ""
+    def _proceed(self) -> None:
+        """Raise if the move under way must not be sent any further."""
+        self._link.check()
+        if self.halts or self.closing:
+            raise DroppedError("the move was halted")
+        if self.moves:
+            raise DroppedError("another move took this one's place")
 
     def _expect_motion(self) -> None:
         for track in self._tracks:
@@ -340,7 +429,7 @@ class Loop:
         self._polled = True
         move = self._active
         if move is not None and move.deadline is not None:
-            if self._stand() and all(track.position == track.goal for track in self._tracks):
+            if self._stand() and not self._astray(move):
                 self._active = None
                 self.snapshot = self._look()
                 move.finish()
@@ -349,47 +438,9 @@ class Loop:
         self.snapshot = self._look()
 
     def _poll_position(self) -> None:
-        track = self._tracks[self._next]
-        for attempt in range(TRIES):
-            try:
-                position, t = self._exchange(command(track.name + "P"), ptu_protocol.bare_integer)
-                break
-            except RefusedError:  # the query itself may have been garbled on its way
-                if attempt == TRIES - 1:
-                    raise
-        track.add(t, position)
-        self._next = 1 - self._next
-
-    def _exchange(
-        self,
-        order: bytes,
-        understand: Callable[[str], Meaning],
-        unless: Callable[[], str] = lambda: "",
-        patience: float = QUICK_S,
-    ) -> tuple[Meaning, float]:
-        """Send one command and read its answer; repeat after an error.
-
-        Each repetition comes after the line is synchronised, unless ``unless`` returns a reason to stop.
-
-        Returns:
-            The answer's meaning, and its time [s].
-        """
-        for attempt in range(TRIES):
-            try:
-                answer = self._line.ask(order, patience)
-                return understand(answer.text), answer.t
-            except (SilentError, ReplyError) as error:
-                if self._line.resync(error):
-                    for track in self._tracks:
-                        track.goal = None
-                    self._expect_motion()
-                    if self._active is not None:
-                        raise CutError(f"{error}, and the head was halted") from error
-                if reason := unless():
-                    raise DroppedError(reason) from error
-                if attempt == TRIES - 1:
-                    raise self._line.nonsense(error) from error
-        raise AssertionError("unreachable")
+        for axis, position, t in self._link.poll():
+            self._tracks[axis].add(t, position)
+        self._cuts = 0
 
     def _give_up(self, move: Move, error: DeviceError) -> None:
         """Halt a move that failed; its waiting caller, or the next call of the head, gets the error."""
@@ -405,10 +456,9 @@ class Loop:
             self._active.finish(reason)
             self._active = None
 
-    def _take_up_again(self, cut: CutError) -> None:
+    def _take_up_again(self, move: Move, cut: CutError) -> None:
         """Queue a cut move again if its caller waits for it; other callers send a new move or read the state."""
-        move, self._active = self._active, None
-        assert move is not None
+        self._active = None
         if not move.wait or move.cuts == TRIES:
             move.finish(cut)
             return
@@ -416,19 +466,21 @@ class Loop:
         move.deadline = None
         self.moves.appendleft(move)  # a newer move in the queue replaces it, a halt drops it
 
+    def _astray(self, move: Move) -> bool:
+        """Return whether the newest poll of an axis is off the move's goal."""
+        return any(track.position != goal for track, goal in zip(self._tracks, move.goals, strict=True))
+
     def _late(self, move: Move, deadline: float) -> bool:
         """Return whether a poll after the deadline shows an axis off its goal; a late thread alone does not count."""
-        tracks = zip(self._tracks, move.goals, strict=True)
-        seen = min(track.polls[-1][0] for track in self._tracks)
-        return seen > deadline and any(track.position != goal for track, goal in tracks)
+        return min(track.polls[-1][0] for track in self._tracks) > deadline and self._astray(move)
 
     def _stalled(self, move: Move) -> PositionLostError:
-        stands = ", ".join(f"{ptu_protocol.AXIS_WORDS[axis.name]} {axis.position}" for axis in self._tracks)
+        pan, tilt = (track.position for track in self._tracks)
         wanted = ", ".join(map(str, move.goals))
         return PositionLostError(
-            self._line.name,
-            f"did not arrive in time: {stands} steps, where {wanted} were commanded; it was halted, and its position "
-            "may be lost by something in its way or a weak motor supply",
+            self._link.name,
+            f"did not arrive in time: pan {pan}, tilt {tilt} steps, where {wanted} were commanded; it was halted, and "
+            "its position may be lost by something in its way or a weak motor supply",
         )
 
     def _stand(self) -> bool:
@@ -448,18 +500,22 @@ HALT_S = 1.0  # time limit for the answer to a halt, beyond braking; synchronisi
 CLOSE_S = 5.0  # time limit for the thread to end [s]
 LOOK_S = 0.2  # a caller that waits for a move checks with this period whether the thread still runs [s]
 NOTHING_SAID = SafetyConfig()
+# Limits differ by a few steps from unit to unit and from reset to reset; a larger difference is another unit's.
+LIMITS_DEG = 3.0
+STEP_SHARE = 2e-3  # tolerance relative to the step, which the unit and rig.toml round
 ROUNDING = 1e-9  # relative; keeps a speed of whole steps/s from being rounded down after its conversion from degrees
 
 
-class D46Head:
-    """A PTU-D46 that is open, checked against the configuration, and standing.
+class PolledHead:
+    """A pan-tilt unit that is open, checked against the configuration, and standing.
 
     A thread polls the positions and sends commands. The next call of any method raises an error that occurred there. If
     the position may be lost, the error is permanent: a marker file keeps every program from opening the head until
     `cotarget reset-head`. Nothing here resets the unit.
 
     Args:
-        config: port, baud rate, limits, step and signs that the unit must report.
+        open_link: opens the unit, halts it, and raises CotargetError where it cannot be used.
+        config: port, limits, step and signs that the unit must report.
         clock: the rig's clock.
         safety: speed cap, which the unit must be able to keep, and stop file, beside which the marker file lies.
 
@@ -468,29 +524,40 @@ class D46Head:
         DeviceError: there is no unit, or it cannot be used in its state.
     """
 
-    def __init__(self, config: HardwareHead, clock: Clock, safety: SafetyConfig = NOTHING_SAID) -> None:
+    def __init__(
+        self,
+        open_link: Callable[[], HeadLink],
+        config: HeadSettings,
+        clock: Clock,
+        safety: SafetyConfig = NOTHING_SAID,
+    ) -> None:
         self._lost = PositionLostMarker(config.port, safety.stop_file)
         self._lost.refuse()
-        self._line = open_line(config.port, config.baud, clock)
         self._signs = (config.pan_sign, config.tilt_sign)
         self._numbers = itertools.count(1)
         self._dead: DeviceError | None = None
         self._closed = False
         try:
-            self.unit: UnitInfo = connect(self._line, config)
+            self._link = open_link()
+        except BaseException as error:
+            self._remember(error)
+            raise
+        self.axes = self._link.axes
+        try:
+            compare(config, self.axes)
             for key, cap in (
                 ("hardware.head.speed_deg_s", config.speed_deg_s),
                 ("safety.speed_deg_s", safety.speed_deg_s),
             ):
-                _refuse_too_slow(key, cap, self.unit, config.port)
-            self._limits = _limits(self.unit, config)
-            self._loop = Loop(self._line, self.unit, clock, config.command_delay_s)
+                _refuse_too_slow(key, cap, self.axes, config.port)
+            self._limits = _limits(self.axes, config)
+            self._loop = Loop(self._link, clock, config.command_delay_s)
             self._wait_until_it_stands(clock)
         except BaseException as error:
             self._remember(error)
-            self._line.close()
+            self._link.close()
             raise
-        self._thread = threading.Thread(target=self._run, name=f"PTU-D46 at {config.port}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"head at {config.port}", daemon=True)
         self._thread.start()
         atexit.register(self.close)  # a program that ends without closing the head must not leave it turning
 
@@ -533,7 +600,7 @@ class D46Head:
         if not (math.isfinite(pan) and math.isfinite(tilt)):
             raise DeviceError(f"the head cannot go to pan {pan}, tilt {tilt}")
         fastest = self._limits.capped(speed)
-        axes = (self.unit.pan, self.unit.tilt)
+        axes = self.axes
         a, b = (
             min(max(round(sign * angle / axis.step), axis.lowest), axis.highest)
             for sign, angle, axis in zip(self._signs, (pan, tilt), axes, strict=True)
@@ -562,10 +629,10 @@ class D46Head:
             return
         if not self._thread.is_alive() and not isinstance(self._dead, LostError):
             with contextlib.suppress(DeviceError):
-                self._line.write(HALT_NOW)
+                self._link.send_halt()
         if self._dead is not None:
             raise DeviceError(str(self._dead)) from self._dead
-        raise DeviceError(f"the pan-tilt unit at {self._line.name} did not acknowledge a halt: it does not answer")
+        raise DeviceError(f"the pan-tilt unit at {self._link.name} did not acknowledge a halt: it does not answer")
 
     def close(self) -> None:
         """Halt, end the thread and release the port; never raises, and may be called again."""
@@ -574,12 +641,12 @@ class D46Head:
         self._closed = self._loop.closing = True
         self._thread.join(CLOSE_S)
         if self._thread.is_alive():
-            log.warning("%s: the thread of the pan-tilt unit does not end", self._line.name)
-        self._line.close()
+            log.warning("%s: the thread of the pan-tilt unit does not end", self._link.name)
+        self._link.close()
         atexit.unregister(self.close)
 
     def _run(self) -> None:
-        reason: DeviceError = DroppedError(f"the pan-tilt unit at {self._line.name} is closed")
+        reason: DeviceError = DroppedError(f"the pan-tilt unit at {self._link.name} is closed")
         try:
             while not self._loop.closing:
                 self._loop.turn()
@@ -599,11 +666,11 @@ class D46Head:
 
     def _angles(self, pan: float, tilt: float) -> tuple[float, float]:
         """Convert steps of the unit to angles [rad]."""
-        return self._signs[0] * pan * self.unit.pan.step, self._signs[1] * tilt * self.unit.tilt.step
+        return self._signs[0] * pan * self.axes[0].step, self._signs[1] * tilt * self.axes[1].step
 
     def _raise_what_happened(self) -> None:
         if self._closed:
-            raise DeviceError(f"the pan-tilt unit at {self._line.name} is closed")
+            raise DeviceError(f"the pan-tilt unit at {self._link.name} is closed")
         if self._dead is not None:
             raise DeviceError(str(self._dead)) from self._dead
         with contextlib.suppress(IndexError):
@@ -621,13 +688,44 @@ class D46Head:
         deadline = clock.now() + STANDS_S
         while self._loop.snapshot.moving:
             if clock.now() > deadline:
-                raise DeviceError(f"the pan-tilt unit at {self._line.name} goes on turning though it was halted")
+                raise DeviceError(f"the pan-tilt unit at {self._link.name} goes on turning though it was halted")
             self._loop.turn()
 
 
-def _limits(unit: UnitInfo, config: HardwareHead) -> PanTiltLimits:
+def compare(config: HeadSettings, axes: tuple[AxisFacts, AxisFacts]) -> None:
+    """Compare the unit's steps and limits with rig.toml.
+
+    Raises:
+        ConfigError: they differ; the message has both, and what to write.
+    """
+    for word, axis in zip(("pan", "tilt"), axes, strict=True):
+        own = math.degrees(axis.step)
+        if abs(own - config.step_deg) > STEP_SHARE * config.step_deg:
+            raise ConfigError(
+                f"hardware.head.step_deg: the {word} of the unit at {config.port} has steps of {own:.6g} degrees, "
+                f"not {config.step_deg:.6g}; write step_deg = {own:.6g}, or change the unit's step mode"
+            )
+    for word, axis, expected, sign in (
+        ("pan", axes[0], config.pan_deg, config.pan_sign),
+        ("tilt", axes[1], config.tilt_deg, config.tilt_sign),
+    ):
+        found = axis.degrees(sign)
+        if not _alike(found, expected):
+            turned = f", or {word}_sign = {-sign}" if _alike(axis.degrees(-sign), expected) else ""
+            raise ConfigError(
+                f"hardware.head.{word}_deg: the unit at {config.port} goes from {found[0]:.1f} to {found[1]:.1f} "
+                f"degrees, not from {expected[0]:g} to {expected[1]:g}; write {word}_deg = "
+                f"[{found[0]:.1f}, {found[1]:.1f}]{turned}"
+            )
+
+
+def _alike(found: tuple[float, float], expected: tuple[float, float]) -> bool:
+    return max(abs(a - b) for a, b in zip(found, expected, strict=True)) <= LIMITS_DEG
+
+
+def _limits(axes: tuple[AxisFacts, AxisFacts], config: HeadSettings) -> PanTiltLimits:
     """Convert the unit's limits to radians with the signs of rig.toml."""
-    (pan, tilt), step = (unit.pan, unit.tilt), unit.pan.step
+    (pan, tilt), step = axes, axes[0].step
     return PanTiltLimits(
         pan=_radians(pan.degrees(config.pan_sign)),
         tilt=_radians(tilt.degrees(config.tilt_sign)),
@@ -646,13 +744,13 @@ def _steps(speed: float, axis: AxisFacts) -> int:
     return min(max(math.floor(speed / axis.step * (1 + ROUNDING)), axis.slowest, 1), axis.fastest)
 
 
-def _refuse_too_slow(key: str, cap_deg_s: float | None, unit: UnitInfo, port: str) -> None:
+def _refuse_too_slow(key: str, cap_deg_s: float | None, axes: tuple[AxisFacts, AxisFacts], port: str) -> None:
     """Refuse a speed cap below the unit's lowest speed.
 
     Raises:
         ConfigError: the cap is too low; the message names the lowest speed.
     """
-    slowest = max(max(axis.slowest, 1) * math.degrees(axis.step) for axis in (unit.pan, unit.tilt))
+    slowest = max(max(axis.slowest, 1) * math.degrees(axis.step) for axis in axes)
     if cap_deg_s is not None and cap_deg_s * (1 + ROUNDING) < slowest:
         least = math.ceil(100 * slowest) / 100
         raise ConfigError(

@@ -1,74 +1,46 @@
-"""Connection to a PTU-D46: identify the unit, compare it with rig.toml, and reset it.
+"""The pan-tilt unit PTU-D46: identify it, move it, and reset it.
 
-`connect` prepares a unit for `D46Head`. `probe` queries a unit without a rig. `reset` turns the unit through its whole
-range to find its limits; an operator must have consented to it.
+`D46Head` is the head of a rig, and `D46Link` its protocol as `PolledHead` asks for it. `connect` prepares a unit for
+both. `probe` queries a unit without a rig. `reset` turns the unit through its whole range to find its limits; an
+operator must have consented to it.
 """
 
 import contextlib
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
-from cotarget.config import HardwareHead
+from cotarget.config import HardwareHead, SafetyConfig
 from cotarget.drivers import ptu_protocol
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import PositionLostError, PositionLostMarker, rig_lock
+from cotarget.drivers.polled_head import NOTHING_SAID, AxisFacts, CutError, Poll, PolledHead
 from cotarget.drivers.ptu_protocol import (
+    AXES,
     DELIMITER,
     HALT,
     PATIENCE_S,
+    QUICK_S,
     AxisName,
     Line,
-    RefusedError,
-    ReplyError,
     RestartedError,
-    SilentError,
     command,
     open_line,
 )
-from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
+from cotarget.drivers.serial_line import RefusedError, ReplyError, SilentError
+from cotarget.errors import DeviceError, EmergencyStopError
 from cotarget.rig import Clock
 
 log = logging.getLogger(__name__)
-TRIES = 2  # to greet a unit that was interrupted in the middle of an exchange
+Meaning = TypeVar("Meaning")
+GREETINGS = 2  # to a unit that was interrupted in the middle of an exchange
+TRIES = 3  # of one exchange; the line is synchronised again before each but the first
 GREETING_QUIET_S, GREETING_MOST_S = 0.25, 1.5  # [s]; at open the unit's last command is unknown
-# Limits differ by a few steps from unit to unit and from reset to reset; a larger difference is another unit's.
-LIMITS_DEG = 3.0
-STEP_SHARE = 2e-3  # tolerance relative to the resolution, which the unit and rig.toml round
+STILL_S = 0.035  # longer than the slowest speed, 31 steps/s, takes for a step [s]
 # A delimiter before the halt ends what noise may have left at the unit; the unit refuses that and not the halt.
 HALT_NOW, HALT_TRIES = DELIMITER + HALT, 2
-
-
-@dataclass(frozen=True)
-class AxisFacts:
-    """What a unit reports about one of its axes.
-
-    Attributes:
-        arcseconds: size of a step [seconds of arc].
-        lowest: position [steps].
-        highest: position [steps].
-        slowest: speed [steps/s].
-        fastest: speed [steps/s].
-        acceleration: [steps/s^2].
-    """
-
-    arcseconds: float
-    lowest: int
-    highest: int
-    slowest: int
-    fastest: int
-    acceleration: int
-
-    @property
-    def step(self) -> float:
-        """Size of a step [rad]."""
-        return math.radians(self.arcseconds / ptu_protocol.ARCSECONDS)
-
-    def degrees(self, sign: int) -> tuple[float, float]:
-        """Convert the limits to degrees with rig.toml's sign of the axis: lowest, highest."""
-        a, b = (sign * end * self.arcseconds / ptu_protocol.ARCSECONDS for end in (self.lowest, self.highest))
-        return min(a, b), max(a, b)
 
 
 @dataclass(frozen=True)
@@ -93,11 +65,10 @@ class UnitInfo:
         return max(axis.fastest / axis.acceleration for axis in (self.pan, self.tilt))
 
 
-def connect(line: Line, config: HardwareHead) -> UnitInfo:
-    """Greet the unit, halt it, check it against rig.toml, and set it to take positions.
+def connect(line: Line) -> UnitInfo:
+    """Greet the unit, identify it, halt it, and set it to take positions.
 
     Raises:
-        ConfigError: rig.toml describes another unit.
         PositionLostError: the unit's position may be lost.
         DeviceError: there is no unit, or it cannot be used in its state.
     """
@@ -105,7 +76,6 @@ def connect(line: Line, config: HardwareHead) -> UnitInfo:
     try:
         unit = identify(line)
         refuse_uncalibrated(line.name, unit)
-        compare(line.name, unit, config)
         _halt(line, PATIENCE_S + unit.braking_s)
         line.query(command("I"), ptu_protocol.done, PATIENCE_S)
         _make_independent(line)
@@ -113,6 +83,153 @@ def connect(line: Line, config: HardwareHead) -> UnitInfo:
         raise restarted(line) from error
     refuse_events(line)
     return unit
+
+
+class D46Link:
+    """The protocol of a PTU-D46 that `connect` has made ready, a `HeadLink`.
+
+    Attributes:
+        name: of the port.
+        hurry: returns whether a halt waits.
+        unit: what the unit reported about itself.
+    """
+
+    def __init__(self, line: Line) -> None:
+        self._line, self.name = line, line.name
+        self.unit: UnitInfo = connect(line)
+        self._next = 0  # the axis to poll
+        self._goals: list[int | None] = [None, None]  # that the unit has [steps]; None after a halt
+        self._speeds: list[int | None] = [None, None]  # that the unit has [steps/s]
+        self.hurry: Callable[[], bool] = lambda: False
+        line.hurry = lambda: self.hurry()
+
+    @property
+    def axes(self) -> tuple[AxisFacts, AxisFacts]:
+        """Facts of pan and tilt."""
+        return self.unit.pan, self.unit.tilt
+
+    def poll(self) -> Sequence[Poll]:
+        """Ask for the position of one axis, in turn."""
+        axis = self._next
+        for left in reversed(range(TRIES)):
+            try:
+                position, t = self._exchange(command(AXES[axis] + "P"), ptu_protocol.bare_integer)
+                break
+            except RefusedError:  # the query itself may have been garbled on its way
+                if not left:
+                    raise
+        self._next = 1 - axis
+        return [Poll(axis, position, t)]
+
+    def move(self, goals: tuple[int, int], speeds: tuple[int, int], proceed: Callable[[], None]) -> None:
+        """Send the speeds and positions that have changed."""
+        for axis, speed in enumerate(speeds):
+            if speed != self._speeds[axis]:
+                self._order(AXES[axis] + "S", speed, proceed)
+                self._speeds[axis] = speed
+        for axis, goal in enumerate(goals):
+            if goal != self._goals[axis]:
+                self._goals[axis] = None
+                self._order(AXES[axis] + "P", goal, proceed)
+                self._goals[axis] = goal
+
+    def halt(self, patience: float) -> None:
+        """Stop both axes; return when the unit has acknowledged it."""
+        self._goals = [None, None]
+        for left in reversed(range(TRIES)):
+            try:
+                self._exchange(HALT_NOW, ptu_protocol.done, patience=patience)
+                return
+            except RefusedError:
+                if not left:
+                    raise
+            except CutError as error:
+                if not left:
+                    raise DeviceError(str(error)) from error
+
+    def halt_last(self, patience: float) -> None:
+        """Stop both axes of a unit that may have been switched off and on, and may still send old answers."""
+        halt_outright(self._line, patience)
+
+    def send_halt(self) -> None:
+        """Send the halt and wait for no answer."""
+        self._line.write(HALT_NOW)
+
+    def check(self) -> None:
+        """Raise if the unit has reported a limit or a cable event."""
+        refuse_events(self._line)
+
+    def close(self) -> None:
+        """Release the port."""
+        self._line.close()
+
+    def _order(self, name: str, value: int, proceed: Callable[[], None]) -> None:
+        proceed()
+        self._exchange(command(name, value), ptu_protocol.done, proceed)
+
+    def _exchange(
+        self,
+        order: bytes,
+        understand: Callable[[str], Meaning],
+        proceed: Callable[[], None] = lambda: None,
+        patience: float = QUICK_S,
+    ) -> tuple[Meaning, float]:
+        """Send one command and read its answer; repeat after an error, once the line is synchronised.
+
+        Returns:
+            The answer's meaning, and its time [s].
+        """
+        for left in reversed(range(TRIES)):
+            try:
+                answer = self._line.ask(order, patience)
+                return understand(answer.text), answer.t
+            except (SilentError, ReplyError) as error:
+                self._synchronise(error)
+                proceed()
+                if not left:
+                    raise self._line.nonsense(error) from error
+        raise AssertionError("unreachable")
+
+    def _synchronise(self, error: DeviceError) -> None:
+        """Synchronise with the unit after an error.
+
+        Raises:
+            CutError: the unit was silent and was halted.
+            PositionLostError: the unit was switched off and on.
+        """
+        try:
+            halted = self._line.resync(error)
+        except RestartedError as found:
+            raise restarted(self._line) from found
+        if halted:
+            self._goals = [None, None]
+            raise CutError(f"{error}, and the head was halted") from error
+
+
+class D46Head(PolledHead):
+    """A PTU-D46 at a serial port.
+
+    Args:
+        config: port, baud rate, limits, step and signs that the unit must report.
+        clock: the rig's clock.
+        safety: speed cap and stop file.
+
+    Raises:
+        ConfigError: the unit differs from the configuration.
+        DeviceError: there is no unit, or it cannot be used in its state.
+    """
+
+    def __init__(self, config: HardwareHead, clock: Clock, safety: SafetyConfig = NOTHING_SAID) -> None:
+        super().__init__(lambda: _open_link(config, clock), config, clock, safety)
+
+
+def _open_link(config: HardwareHead, clock: Clock) -> D46Link:
+    line = open_line(config.port, config.baud, clock)
+    try:
+        return D46Link(line)
+    except BaseException:
+        line.close()
+        raise
 
 
 def refuse_events(line: Line) -> None:
@@ -153,7 +270,7 @@ def greet(line: Line) -> None:
     Raises:
         DeviceError: there is no unit.
     """
-    for _ in range(TRIES):
+    for _ in range(GREETINGS):
         line.write(DELIMITER)
         line.drain(GREETING_QUIET_S, GREETING_MOST_S)
         line.events.clear()  # from before the line was opened, as after a reset or a start
@@ -192,32 +309,6 @@ def refuse_uncalibrated(name: str, unit: UnitInfo) -> None:
             )
 
 
-def compare(name: str, unit: UnitInfo, config: HardwareHead) -> None:
-    """Compare the unit's steps and limits with rig.toml.
-
-    Raises:
-        ConfigError: they differ; the message has both, and what to write.
-    """
-    for word, axis in (("pan", unit.pan), ("tilt", unit.tilt)):
-        own = axis.arcseconds / ptu_protocol.ARCSECONDS
-        if abs(own - config.step_deg) > STEP_SHARE * config.step_deg:
-            raise ConfigError(
-                f"hardware.head.step_deg: the {word} of the unit at {name} has steps of {own:.6g} degrees, "
-                f"not {config.step_deg:.6g}; write step_deg = {own:.6g}, or change the unit's step mode"
-            )
-    for word, axis, expected, sign in (
-        ("pan", unit.pan, config.pan_deg, config.pan_sign),
-        ("tilt", unit.tilt, config.tilt_deg, config.tilt_sign),
-    ):
-        found = axis.degrees(sign)
-        if not _alike(found, expected):
-            turned = f", or {word}_sign = {-sign}" if _alike(axis.degrees(-sign), expected) else ""
-            raise ConfigError(
-                f"hardware.head.{word}_deg: the unit at {name} goes from {found[0]:.1f} to {found[1]:.1f} degrees, not "
-                f"from {expected[0]:g} to {expected[1]:g}; write {word}_deg = [{found[0]:.1f}, {found[1]:.1f}]{turned}"
-            )
-
-
 def probe(port: str, baud: int) -> str:
     """Query version and network number of the unit at a port; nothing is changed.
 
@@ -241,7 +332,8 @@ def _axis(line: Line, axis: AxisName) -> AxisFacts:
         return line.query(command(axis + what), ptu_protocol.integer, PATIENCE_S)[0]
 
     arcseconds, _ = line.query(command(axis + "R"), ptu_protocol.arcseconds, PATIENCE_S)
-    facts = AxisFacts(arcseconds, number("N"), number("X"), number("L"), number("U"), number("A"))
+    step = math.radians(arcseconds / ptu_protocol.ARCSECONDS)
+    facts = AxisFacts(step, number("N"), number("X"), number("L"), number("U"), number("A"), STILL_S)
     if not 0 <= facts.slowest <= facts.fastest or min(facts.fastest, facts.acceleration) <= 0:
         raise DeviceError(
             f"the pan-tilt unit at {line.name} tells for {ptu_protocol.AXIS_WORDS[axis]} speeds "
@@ -281,10 +373,6 @@ def _make_independent(line: Line) -> None:
         line.query(command("CI"), ptu_protocol.done, PATIENCE_S)
     except RefusedError:
         log.info("%s: the firmware has no control modes", line.name)
-
-
-def _alike(found: tuple[float, float], expected: tuple[float, float]) -> bool:
-    return max(abs(a - b) for a, b in zip(found, expected, strict=True)) <= LIMITS_DEG
 
 
 def _stranger(line: Line) -> DeviceError:

@@ -9,32 +9,24 @@ Answers are read leniently, because firmware versions differ in wording, but a l
 Sources: Directed Perception's PTU-D46 manual 2.14.0 (2006) and Command Reference Manual 3.00D (2008).
 """
 
-import contextlib
 import logging
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
-from cotarget.drivers.serial_line import Port, open_port
+from cotarget.drivers.serial_line import (
+    Port,
+    RefusedError,
+    ReplyError,
+    SerialLine,
+    SilentError,
+    open_port,
+)
 from cotarget.errors import DeviceError
 from cotarget.rig import Clock
 
 log = logging.getLogger(__name__)
-
-NO_DATA = "returned no data"  # pyserial's text for a port that has disappeared
-
-
-class SilentError(DeviceError):
-    """The unit did not answer in time."""
-
-
-class LostError(DeviceError):
-    """The port itself failed: unplugged, or closed by the other side."""
-
-    def __init__(self, name: str, error: OSError) -> None:
-        why = "unplugged, or another program reads there too" if NO_DATA in str(error) else error
-        super().__init__(f"the line to the pan-tilt unit at {name} is lost ({why}); plug it in and open it again")
 
 
 class RestartedError(DeviceError):
@@ -72,14 +64,6 @@ AxisName = Literal["P", "T"]
 AXES: tuple[AxisName, AxisName] = ("P", "T")
 AXIS_WORDS = {"P": "pan", "T": "tilt"}
 EVENT_WORDS = {"P": "pan hit its limit (!P)", "T": "tilt hit its limit (!T)", "D": "its cable came off (!D)"}
-
-
-class ReplyError(DeviceError):
-    """What arrived is no answer of a PTU-D46 to the command."""
-
-
-class RefusedError(DeviceError):
-    """The unit understood a command and refused it."""
 
 
 @dataclass(frozen=True)
@@ -239,11 +223,9 @@ LAST_TRIES = 10  # queries to a silent unit before it counts as dead
 HURRY_S = 0.05  # for the answer in flight when the head is to be halted
 QUIET_S = 0.03  # of silence, after which an old answer counts as complete
 DRAIN_S = 0.15  # for draining, where a device never stops sending
-BITS = 10  # per byte on the wire, 8N1
 WORDY_ANSWER = 100  # longest answer with words and echo [bytes]
 TERSE_ANSWER = 40  # longest answer but the version's, with echo and words off [bytes]
 MOST_LINES = 64  # skipped in search of one answer
-HEARD = 200  # received bytes kept for error messages
 
 
 @dataclass(frozen=True)
@@ -254,14 +236,8 @@ class Answer:
     t: float
 
 
-class Line:
-    """Exchange of one command at a time with a unit; used by one thread at a time.
-
-    Args:
-        port: an open port whose reads return empty after a short while.
-        name: name of the port, for error messages.
-        baud: baud rate, also of the serial line behind a terminal server.
-        clock: the rig's clock.
+class Line(SerialLine):
+    """Exchange of one command at a time with a unit.
 
     Attributes:
         events: "P", "T" and "D" as the unit sent them; the user of the line removes them.
@@ -270,20 +246,12 @@ class Line:
     """
 
     def __init__(self, port: Port, name: str, baud: int, clock: Clock) -> None:
-        self._port, self._clock = port, clock
-        self.name, self.baud = name, baud
-        self._byte_s = BITS / baud
+        super().__init__(port, name, baud, clock)
         self._buffer = b""
         self._strange = b""  # the last line that was no answer
-        self._heard = b""
         self.events: list[str] = []
         self.strict = False
         self.hurry: Callable[[], bool] = lambda: False
-
-    @property
-    def heard(self) -> bytes:
-        """The last received bytes, of any kind."""
-        return self._heard
 
     def ask(self, order: bytes, patience: float = QUICK_S, skipping: bool = False) -> Answer:
         """Send one command and wait for its answer.
@@ -308,7 +276,7 @@ class Line:
             raise RefusedError(f"the pan-tilt unit at {self.name} refused {what}: {reply.text}")
         # The unit reads the value between the command's last byte and the answer's first. These are in the wrong
         # order where the line is faster than its baud rate.
-        start, end = sent + len(order) * self._byte_s, first - self._byte_s
+        start, end = sent + len(order) * self.byte_s, first - self.byte_s
         return Answer(reply.text, (start + end) / 2 if start <= end else (sent + first) / 2)
 
     def query(
@@ -371,32 +339,8 @@ class Line:
 
     def drain(self, quiet_s: float, most_s: float) -> bytes:
         """Read until ``quiet_s`` of silence or for ``most_s`` [s]; return the bytes without events."""
-        start = last = self._clock.now()
         data, self._buffer = self._buffer, b""
-        while (now := self._clock.now()) - last < quiet_s and now - start < most_s:
-            if more := self._read():
-                data, last = data + more, self._clock.now()
-        return self._without_events(data)
-
-    def write(self, data: bytes) -> None:
-        """Send bytes without waiting for an answer.
-
-        Raises:
-            LostError: the port failed.
-        """
-        try:
-            self._port.write(data)
-        except OSError as error:  # pyserial's exceptions are of this kind too
-            raise LostError(self.name, error) from error
-
-    def close(self) -> None:
-        """Release the port."""
-        # pyserial leaves a socket open if the other side closed first.
-        socket = getattr(self._port, "_socket", None)
-        with contextlib.suppress(OSError):
-            self._port.close()
-        if socket is not None:
-            socket.close()
+        return self._without_events(data + self.read_until_quiet(quiet_s, most_s))
 
     def nonsense(self, error: DeviceError) -> DeviceError:
         """Make the error for a unit whose answers stayed invalid or absent."""
@@ -406,11 +350,11 @@ class Line:
 
     def _deadline(self, order: bytes, patience: float) -> float:
         answer = TERSE_ANSWER if self.strict else WORDY_ANSWER
-        return self._clock.now() + patience + (len(order) + answer) * self._byte_s
+        return self._clock.now() + patience + (len(order) + answer) * self.byte_s
 
     def _expect_nothing(self) -> None:
         """Check bytes that came without a query: events are kept, any other text is an error."""
-        self._buffer += self._read(wait=False)
+        self._buffer += self.read(wait=False)
         if self._buffer:
             rest = self._without_events(self._buffer).strip()
             self._buffer = b""
@@ -445,7 +389,7 @@ class Line:
         while b"\n" not in self._buffer:
             now = self._clock.now()
             late = now > deadline  # a thread that slept too long still reads what has arrived
-            data = self._read(wait=not late)
+            data = self.read(wait=not late)
             if data and not begun:
                 first, begun = self._clock.now(), True
             self._buffer += data
@@ -485,16 +429,6 @@ class Line:
         rest, events = split_events(data)
         self.events += events
         return rest
-
-    def _read(self, wait: bool = True) -> bytes:
-        """Read the bytes that have arrived; if there are none, wait for the first one until the port's timeout."""
-        try:
-            there = self._port.in_waiting
-            data = self._port.read(max(there, 1)) if there or wait else b""
-        except OSError as error:  # in_waiting raises the system's errors, read and write pyserial's
-            raise LostError(self.name, error) from error
-        self._heard = (self._heard + data)[-HEARD:]
-        return data
 
 
 def open_line(name: str, baud: int, clock: Clock) -> Line:

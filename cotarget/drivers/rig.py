@@ -11,7 +11,7 @@ from cotarget.drivers.board import make_board
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.gphoto_camera import GphotoCamera
 from cotarget.drivers.interlock import rig_lock
-from cotarget.drivers.polled_head import D46Head
+from cotarget.drivers.ptu_d46 import D46Head
 from cotarget.errors import ConfigError
 from cotarget.rig import CameraSpec, HeadSpec, PanTiltLimits, Rig, RigSpec, ZoomSpec
 

@@ -1,12 +1,20 @@
-"""Serial ports by pyserial: list and open them, and name in one line why a port cannot be opened."""
+"""Serial lines by pyserial: list and open ports, exchange bytes, and name in one line why that fails.
 
+`SerialLine` is what all protocols share: bytes to and from a port, in a bounded time. A protocol adds its messages.
+"""
+
+import contextlib
 import errno
 from typing import Protocol
 
 from cotarget.errors import ConfigError, DeviceError
+from cotarget.rig import Clock
 
 SLICE_S = 0.01  # timeout of one read; a longer wait checks its deadline with this period [s]
 WRITE_S = 0.5  # a line that takes no bytes for this time is dead [s]
+BITS = 10  # per byte on the wire, 8N1
+HEARD = 200  # received bytes kept for error messages
+NO_DATA = "returned no data"  # pyserial's text for a port that has disappeared
 
 
 class InUseError(DeviceError):
@@ -15,6 +23,26 @@ class InUseError(DeviceError):
 
 class NoPermissionError(DeviceError):
     """This user has no permission to use the device."""
+
+
+class SilentError(DeviceError):
+    """The unit did not answer in time."""
+
+
+class ReplyError(DeviceError):
+    """What arrived is no answer of the unit to the command."""
+
+
+class RefusedError(DeviceError):
+    """The unit understood a command and refused it."""
+
+
+class LostError(DeviceError):
+    """The port itself failed: unplugged, or closed by the other side."""
+
+    def __init__(self, name: str, error: OSError) -> None:
+        why = "unplugged, or another program reads there too" if NO_DATA in str(error) else error
+        super().__init__(f"the line to the pan-tilt unit at {name} is lost ({why}); plug it in and open it again")
 
 
 class Port(Protocol):
@@ -32,6 +60,74 @@ class Port(Protocol):
 
     def close(self) -> None:
         """Release the port."""
+
+
+class SerialLine:
+    """Bytes to and from a unit; used by one thread at a time.
+
+    Args:
+        port: an open port whose reads return empty after a short while.
+        name: name of the port, for error messages.
+        baud: baud rate, also of the serial line behind a terminal server.
+        clock: the rig's clock.
+
+    Attributes:
+        byte_s: time of one byte on the wire [s].
+        heard: the last received bytes, of any kind.
+    """
+
+    def __init__(self, port: Port, name: str, baud: int, clock: Clock) -> None:
+        self._port, self._clock = port, clock
+        self.name, self.baud = name, baud
+        self.byte_s = BITS / baud
+        self.heard = b""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes without waiting for an answer.
+
+        Raises:
+            LostError: the port failed.
+        """
+        try:
+            self._port.write(data)
+        except OSError as error:  # pyserial's exceptions are of this kind too
+            raise LostError(self.name, error) from error
+
+    def read(self, wait: bool = True) -> bytes:
+        """Read the bytes that have arrived; if there are none, wait for the first one until the port's timeout.
+
+        Raises:
+            LostError: the port failed.
+        """
+        try:
+            there = self._port.in_waiting
+            data = self._port.read(max(there, 1)) if there or wait else b""
+        except OSError as error:  # in_waiting raises the system's errors, read and write pyserial's
+            raise LostError(self.name, error) from error
+        self.heard = (self.heard + data)[-HEARD:]
+        return data
+
+    def read_until_quiet(self, quiet_s: float, most_s: float) -> bytes:
+        """Read until ``quiet_s`` of silence or for ``most_s`` [s].
+
+        Raises:
+            LostError: the port failed.
+        """
+        start = last = self._clock.now()
+        data = b""
+        while (now := self._clock.now()) - last < quiet_s and now - start < most_s:
+            if more := self.read():
+                data, last = data + more, self._clock.now()
+        return data
+
+    def close(self) -> None:
+        """Release the port."""
+        # pyserial leaves a socket open if the other side closed first.
+        socket = getattr(self._port, "_socket", None)
+        with contextlib.suppress(OSError):
+            self._port.close()
+        if socket is not None:
+            socket.close()
 
 
 def ports() -> list[tuple[str, str]]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from cotarget.config import HardwareHead
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.polled_head import D46Head
+from cotarget.drivers.ptu_d46 import D46Head
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.unit import D46_PAPER

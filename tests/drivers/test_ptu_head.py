@@ -10,7 +10,8 @@ import serial
 
 from cotarget.config import HardwareHead, SafetyConfig
 from cotarget.drivers.interlock import PositionLostMarker
-from cotarget.drivers.polled_head import D46Head, Move
+from cotarget.drivers.polled_head import Move
+from cotarget.drivers.ptu_d46 import D46Head
 from cotarget.errors import ConfigError, DeviceError, HaltedError
 from tests.d46_bench import CONFIG, Bench
 
@@ -54,7 +55,7 @@ def opened(bench, monkeypatch, tmp_path):
     yield open_head
     for head in heads:
         head.close()
-    assert not any(thread.name.startswith("PTU-D46") for thread in threading.enumerate())
+    assert not any(thread.name.startswith("head at") for thread in threading.enumerate())
 
 
 def test_limits_are_the_units_in_the_sense_of_the_file(opened, bench):

@@ -1,10 +1,12 @@
 """Getting to know a PTU-D46, or what else is at the port; in simulated time."""
 
+import math
+from dataclasses import replace
+
 import pytest
 import serial
 
-from cotarget.config import HardwareHead
-from cotarget.drivers.ptu_d46 import probe
+from cotarget.drivers.ptu_d46 import D46Head, probe
 from cotarget.drivers.ptu_protocol import open_line
 from cotarget.errors import ConfigError, DeviceError
 from tests.d46_bench import CONFIG, Bench
@@ -37,7 +39,7 @@ def test_the_units_manner_is_learnt(echo, verbose):
     assert facts.mode == "H"
     assert (facts.pan.lowest, facts.pan.highest, facts.tilt.lowest, facts.tilt.highest) == (-3090, 3090, -907, 604)
     assert (facts.pan.slowest, facts.pan.fastest, facts.pan.acceleration) == (31, 2902, 2000)
-    assert facts.pan.arcseconds == 185.1428
+    assert math.degrees(facts.pan.step) * 3600 == pytest.approx(185.1428, rel=1e-12)
     assert not bench.unit.echo
     assert not bench.unit.verbose
 
@@ -85,16 +87,17 @@ MISMATCHES = [
 
 
 @pytest.mark.parametrize(("facts", "config", "said"), MISMATCHES)
-def test_another_unit_than_configured_is_refused(bench, facts, config, said):
-    bench.unit.facts |= facts
+def test_another_unit_than_configured_is_refused(opened, facts, config, said):
+    opened.unit.facts |= facts
     with pytest.raises(ConfigError, match=said):
-        bench.connect(HardwareHead(**{**vars(CONFIG), **config}))
-    assert "H" not in bench.unit.heard
+        D46Head(replace(CONFIG, **config), opened.clock)
+    assert set(opened.unit.heard) <= HARMLESS
+    assert opened.port.closed
 
 
-def test_limits_differ_a_little_from_unit_to_unit(bench):
-    bench.unit.facts |= {"PX": 3091, "TN": -903, "TX": 601}
-    bench.connect()
+def test_limits_differ_a_little_from_unit_to_unit(opened):
+    opened.unit.facts |= {"PX": 3091, "TN": -903, "TX": 601}
+    D46Head(CONFIG, opened.clock).close()
 
 
 def test_an_uncalibrated_unit_waits_for_an_operator(bench):

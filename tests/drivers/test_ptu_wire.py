@@ -15,8 +15,7 @@ import pytest
 from cotarget.config import HardwareHead
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import PositionLostMarker
-from cotarget.drivers.polled_head import D46Head
-from cotarget.drivers.ptu_d46 import probe, reset
+from cotarget.drivers.ptu_d46 import D46Head, probe, reset
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.unit import D46_STOCK, E_SERIES
@@ -173,7 +172,7 @@ def test_it_goes_where_it_is_sent_and_halts(bench):
 
 def test_the_end_of_the_program_stops_it(stock):
     program = (
-        "from cotarget.drivers.clock import MonotonicClock; from cotarget.drivers.polled_head import D46Head\n"
+        "from cotarget.drivers.clock import MonotonicClock; from cotarget.drivers.ptu_d46 import D46Head\n"
         "from cotarget.config import HardwareHead\n"
         f"D46Head(HardwareHead(port='{stock.config.port}'), MonotonicClock()).move(2.5, 0.0, speed=0.5)"
     )
