@@ -1,4 +1,4 @@
-"""A pan-tilt unit of another protocol under `PolledHead`: it reports both axes at once, and takes one message a move."""
+"""A pan-tilt unit of another protocol under `PolledHead`: both axes report at once, and a move is one message."""
 
 import math
 from types import SimpleNamespace
@@ -64,6 +64,11 @@ class CounterLink:
         self.sent.append("closed")
 
 
+def ask_again_and_again(head):
+    for _ in range(100_000):
+        head.state()
+
+
 @pytest.fixture
 def link():
     return CounterLink(SimClock())
@@ -105,7 +110,7 @@ def test_a_halt_is_acknowledged_and_the_last_word_before_the_port_is_free_is_one
 def test_a_refused_move_is_halted_and_told_to_its_caller(opened, link):
     head = opened()
     link.fails = [RefusedError("no")]
-    with pytest.raises(DeviceError, match="^no$"):
+    with pytest.raises(DeviceError, match=r"^no$"):
         head.move(0.1, 0.1, wait=True)
     assert link.sent[-1] == "halt"
     head.move(0.2, 0.2, wait=True)
@@ -122,8 +127,7 @@ def test_silences_without_a_position_between_them_end_it(opened, link):
     head = opened()
     link.polls_fail = CutError("silent again and again")
     with pytest.raises(DeviceError, match="silent again and again"):
-        for _ in range(100_000):
-            head.state()
+        ask_again_and_again(head)
     head.close()
     assert link.sent[-2:] == ["last halt", "closed"]
 

@@ -154,7 +154,7 @@ def test_a_short_run(tmp_path, capsys):
 @pytest.mark.wire
 @pytest.mark.slow
 def test_polls_are_counted_as_they_go_over_the_line():
-    row = wire.wire_polls.poll_alone((0, 0), 1.0)
+    row = wire.polls.poll_alone((0, 0), 1.0)
     # "PP " and "* 0\r\n", and the same for tilt: 16 bytes, but for what the first and the last pair leave over.
     assert row["bytes"] == pytest.approx(16.0, abs=0.5)
     assert SOME < row["share"] <= 1.0 + 1 / 30
