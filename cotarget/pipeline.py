@@ -7,7 +7,7 @@ may fail for a moment, because its lens moves, its line is slow or it reconnects
 
 import enum
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from cotarget.calibration import Calibration
 from cotarget.calibration.plausibility import check_plausible
 from cotarget.config import TargetProfile
 from cotarget.control.controller import Controller, ControllerSettings, Predict
-from cotarget.control.selection import FirstCome, Policy
+from cotarget.control.selection import FirstCome, TargetSelector
 from cotarget.control.zoom import shape_of
 from cotarget.detection import Detection, Detector, make_detector
 from cotarget.detection.base import flood
@@ -197,13 +197,11 @@ class FollowSettings(ControllerSettings):
         zoom_out_after_s: how long a target may be out of sight before the lens zooms out [s].
         closed_loop: whether the target is also registered in the zoom image.
         finder: makes the finder for the zoom image.
-        policy: makes the target selection for a run; first come by default.
     """
 
     zoom_out_after_s: float = 0.4
     closed_loop: bool = True
     finder: MakeFinder = CloseupFinder
-    policy: Callable[[], Policy] = FirstCome
 
 
 @dataclass(frozen=True)
@@ -258,6 +256,7 @@ def follow(
     target: TargetProfile | str,
     detector: Detector | None = None,
     *,
+    selector: TargetSelector | None = None,
     seconds: float = math.inf,
     settings: FollowSettings | None = None,
     insist: bool = False,
@@ -272,6 +271,7 @@ def follow(
         calibration: calibration of that rig.
         target: target profile, or its name in the rig's configuration.
         detector: detector for the fixed camera's images; by default the one that the target profile names.
+        selector: selects the track to follow; by default the first that comes.
         seconds: duration on the rig's clock [s].
         settings: settings of the run.
         insist: whether to accept an implausible calibration, see `check_plausible`.
@@ -292,7 +292,7 @@ def follow(
     if settings is None:
         settings = FollowSettings()
     fitting = calibration.for_streams(rig.fixed.size, rig.zoom.size)
-    loop = _Loop(rig, fitting, wanted, detector, settings)
+    loop = _Loop(rig, fitting, wanted, detector, selector or FirstCome(), settings)
     end = rig.clock.now() + seconds
     while rig.clock.now() < end:
         yield loop.turn()
@@ -302,7 +302,13 @@ class _Loop:
     """State of one run of `follow`."""
 
     def __init__(
-        self, rig: Rig, calibration: Calibration, target: TargetProfile, detector: Detector, settings: FollowSettings
+        self,
+        rig: Rig,
+        calibration: Calibration,
+        target: TargetProfile,
+        detector: Detector,
+        selector: TargetSelector,
+        settings: FollowSettings,
     ) -> None:
         self._rig, self._detector, self._settings = rig, detector, settings
         self._tracker = Tracker(tracker_settings(target), rig.fixed.size)
@@ -312,7 +318,8 @@ class _Loop:
         self._controller = Controller(rig, calibration, settings)
         self._frames = FrameSource(rig.fixed, rig.zoom, rig.clock)
         self._beyond: set[int] = set()  # tracks that could not be aimed at
-        self._policy = settings.policy()
+        self._selector = selector
+        self._selector.start(rig.fixed.size)
         self._seen_t: dict[int, float] = {}  # time at which each track was last seen
         self._index = 0
 
@@ -324,7 +331,7 @@ class _Loop:
         detections = self._detector.detect(frame)
         tracks = self._tracker.update(detections, frame.t)
         self._seen_t = {each.id: self._seen_t.get(each.id, frame.t) if each.missed else frame.t for each in tracks}
-        favoured = {track.id for track in tracks if self._policy.favours(track)}
+        favoured = {track.id for track in tracks if self._selector.favours(track)}
         fusion.update_fixed(frame, tracks, self._detector.mask, favoured)
         self._read_states()
         zoom = self._frames.read_zoom()
@@ -368,7 +375,7 @@ class _Loop:
 
     def _why_searching(self, tracks: list[Track]) -> str:
         """Explain why no track is followed."""
-        if unmet := self._policy.unmet:
+        if unmet := self._selector.unmet:
             return unmet
         if not tracks:
             part = flood(self._detector.mask)
@@ -387,7 +394,7 @@ class _Loop:
             }
             candidates = [replace(each, reachable=each.id not in self._beyond) for each in candidates]
         head = np.array([self._head.pan, self._head.tilt])
-        number = self._policy.select(candidates, head, self._rig.head.limits)
+        number = self._selector.select(candidates, head, self._rig.head.limits)
         self._fusion.follow(number)
         return next((track for track in tracks if track.id == number), None)
 

@@ -178,10 +178,11 @@ def calibration_file(folder: Path) -> Path:
     return path
 
 
-def run(rig, calibration, seconds=2.0, settings=SETTINGS):
+def run(rig, calibration, seconds=2.0, settings=SETTINGS, selector=None):
     """The pipeline as the commands run it."""
     with guarded(rig, CONFIG.safety) as safe:
-        yield from follow(safe, calibration, CONFIG.target("bird"), Bright(), seconds=seconds, settings=settings)
+        target = CONFIG.target("bird")
+        yield from follow(safe, calibration, target, Bright(), selector=selector, seconds=seconds, settings=settings)
 
 
 def record(folder: Path, calibration: Path, rig=None, **options):

@@ -1,6 +1,6 @@
 """Parts that the commands share: argument types, checks of outputs, progress, JSON output.
 
-`Choice` turns the options --policy, --click and --track into a rule of target selection. `Reasons` counts the reasons
+`Selection` turns the options --policy, --click and --track into a `TargetSelector`. `Reasons` counts the reasons
 in a run's steps and picks those that a user must see.
 """
 
@@ -14,9 +14,8 @@ import re
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +25,6 @@ from cotarget.files import behind_link, write_atomically
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig
-    from cotarget.control.selection import Policy, TargetChoice
     from cotarget.pipeline import Step
     from cotarget.rig import RigSpec
 
@@ -35,7 +33,7 @@ if TYPE_CHECKING:
 POLICIES = ("first-come", "nearest-deadline", "most-served")
 
 
-def add_choice(parser: argparse.ArgumentParser, default: str = POLICIES[0]) -> None:
+def add_selection(parser: argparse.ArgumentParser, default: str = POLICIES[0]) -> None:
     """Add the options that select the target to follow; ``default`` is named in the help."""
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
@@ -107,53 +105,45 @@ def check_shown(config: "RigConfig", name: str, rig: Path) -> None:
     )
 
 
-class Choice:
-    """Selection of the target by the options, and whether a matching track ever appeared.
+class Selection:
+    """Selector of the target by the options, and whether a matching track ever appeared.
 
     Attributes:
-        target_choice: the selection as a recording stores it.
-        policy: makes the rule that selects the target.
+        selector: selects the track to follow.
     """
 
     def __init__(
-        self, options: argparse.Namespace, size: tuple[int, int], recorded: "TargetChoice | None" = None
+        self, options: argparse.Namespace, size: tuple[int, int], recorded: "Mapping[str, Any] | None" = None
     ) -> None:
         """Read the options.
 
         Args:
-            options: parsed arguments with the options of `add_choice`.
+            options: parsed arguments with the options of `add_selection`.
             size: (width, height) of the fixed camera's image [px].
-            recorded: selection of a recorded run, used where no option is given.
+            recorded: table of the selector of a recorded run, used where no option is given.
 
         Raises:
             ConfigError: the click is outside the fixed camera's image, or a recording's policy is unknown.
         """
         from cotarget.control.selection import POLICIES as MAKERS
-        from cotarget.control.selection import Chosen
+        from cotarget.control.selection import make_selector
 
-        self._wish = ""
+        self._expected = ""
         self._seen: set[int] = set()
         self._followed = False
-        self.policy: Callable[[], Policy]
-        self.target_choice = _choice_of(options, recorded)
-        if self.target_choice.click is not None:
-            u, v = self.target_choice.click
-            said = "the recorded click" if options.click is None else "--click"
+        named = _selector_table_of(options)
+        is_option, table = bool(named), named or recorded or {}
+        if "click" in table:
+            (u, v), name = table["click"], "--click" if is_option else "the recorded click"
             if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
-                raise ConfigError(f"{said}: ({u:g}, {v:g}) is not in the wide view's {size[0]}x{size[1]} image")
-            self.policy = partial(Chosen, pixel=(u, v), width_px=size[0])
-            self._wish = f"{said}: no track came near ({u:g}, {v:g})"
-        elif self.target_choice.track is not None:
-            self.policy = partial(Chosen, number=self.target_choice.track)
-            said = "the recorded track" if options.track is None else "--track"
-            self._wish = f"{said}: there was no track {self.target_choice.track}"
-        elif self.target_choice.policy is not None and self.target_choice.policy in MAKERS:
-            self.policy = MAKERS[self.target_choice.policy]
-        else:
-            raise ConfigError(
-                f"the recorded policy '{self.target_choice.policy}' is unknown; "
-                f"give --policy, one of: {choices(MAKERS)}"
-            )
+                raise ConfigError(f"{name}: ({u:g}, {v:g}) is not in the wide view's {size[0]}x{size[1]} image")
+            self._expected = f"{name}: no track came near ({u:g}, {v:g})"
+        elif "track" in table:
+            name = "--track" if is_option else "the recorded track"
+            self._expected = f"{name}: there was no track {table['track']}"
+        elif (policy := table.get("policy", POLICIES[0])) not in MAKERS:
+            raise ConfigError(f"the recorded policy '{policy}' is unknown; give --policy, one of: {choices(MAKERS)}")
+        self.selector = make_selector(table)
 
     def see(self, step: "Step") -> None:
         """Record a step's confirmed tracks and whether a target was followed."""
@@ -163,23 +153,17 @@ class Choice:
     @property
     def unmet(self) -> str:
         """Message that no track matched the click or number; empty where one did, and where there were no tracks."""
-        if self._followed or not self._wish or not self._seen:
+        if self._followed or not self._expected or not self._seen:
             return ""
-        return f"{self._wish}; the tracks were: {choices(map(str, self._seen))}"
+        return f"{self._expected}; the tracks were: {choices(map(str, self._seen))}"
 
 
-def _choice_of(options: argparse.Namespace, recorded: "TargetChoice | None") -> "TargetChoice":
-    """Give the selection by the options, else the recorded one, else the default policy by its name.
-
-    The name is recorded, so that a replay does not depend on a later default.
-    """
-    from cotarget.control.selection import ANY_TARGET, TargetChoice
-
+def _selector_table_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Give the table of the selector that the options name, as a recording keeps it; empty without an option."""
     if options.click is not None:
-        return TargetChoice(click=(options.click[0], options.click[1]))
-    if options.track is not None or options.policy is not None:
-        return TargetChoice(options.policy, None, options.track)
-    return TargetChoice(POLICIES[0]) if recorded in (None, ANY_TARGET) else recorded
+        return {"click": [*options.click]}
+    named = {"policy": options.policy, "track": options.track}
+    return {name: value for name, value in named.items() if value is not None}
 
 
 class SkippedFrames:

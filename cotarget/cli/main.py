@@ -16,7 +16,17 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from cotarget.cli import calibrating, operating, running
-from cotarget.cli.common import add_choice, add_insist, corners, count, duration, not_negative, number, port, positive
+from cotarget.cli.common import (
+    add_insist,
+    add_selection,
+    corners,
+    count,
+    duration,
+    not_negative,
+    number,
+    port,
+    positive,
+)
 from cotarget.errors import CotargetError
 
 USAGE = 2  # argparse's own exit status
@@ -211,7 +221,7 @@ def _parser() -> argparse.ArgumentParser:
     follow.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")
     follow.add_argument("--calibration", type=Path, required=True, metavar="FILE", help="calibration.json")
     follow.add_argument("--target", required=True, metavar="NAME", help="a target of rig.toml")
-    add_choice(follow)
+    add_selection(follow)
     follow.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
     follow.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
     follow.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
@@ -220,7 +230,7 @@ def _parser() -> argparse.ArgumentParser:
 
     replay = command("replay", running.replay, "run the pipeline again on a recording of follow --record")
     replay.add_argument("recording", type=Path, metavar="DIR", help="folder of the recording")
-    add_choice(replay, "as in the recorded run")
+    add_selection(replay, "as in the recorded run")
     replay.add_argument(
         "--check",
         action="store_true",

@@ -13,8 +13,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import (
-    Choice,
     Reasons,
+    Selection,
     SkippedFrames,
     check_outputs,
     check_shown,
@@ -189,9 +189,9 @@ def follow(options: argparse.Namespace) -> int:
     check_shown(config, options.target, options.rig)
     inputs = [*rig_files(options.rig, config), options.calibration]
     check_outputs([options.csv, options.video], inputs, options.record)
-    choice = Choice(options, spec.fixed.size)
+    selection = Selection(options, spec.fixed.size)
     with (
-        Recorder(options.record, config, options.calibration, options.target, choice.target_choice)
+        Recorder(options.record, config, options.calibration, options.target, selection.selector)
         if options.record
         else nothing() as recorder
     ):
@@ -200,8 +200,10 @@ def follow(options: argparse.Namespace) -> int:
             rig = open_rig(config, guarded=False)
             return guard(recorder.wrap(rig) if recorder else rig, config.safety)
 
-        run = _follow(opened, calibration, config, spec.fixed.rate_hz, options, options.target, choice, options.seconds)
-        _tell_if_nothing_was_seen("follow", options.target, run.counts["states"], choice)
+        run = _follow(
+            opened, calibration, config, spec.fixed.rate_hz, options, options.target, selection, options.seconds
+        )
+        _tell_if_nothing_was_seen("follow", options.target, run.counts["states"], selection)
         print_json(run.counts)
         if run.interrupted is not None:
             raise run.interrupted
@@ -230,16 +232,16 @@ def replay(options: argparse.Namespace) -> int:
         tracks.extend(Tracked(number, step.fixed.t, each.id, each.center_px) for each in step.tracks if each.confirmed)
 
     played, rate_hz = Replay(recording), recording.spec.fixed.rate_hz
-    choice = Choice(options, recording.spec.fixed.size, recording.target_choice)
+    selection = Selection(options, recording.spec.fixed.size, recording.selector_table)
     config, name, steps = recording.config, recording.target, recording.steps
 
     def opened() -> "Rig":
         return guard(played.rig, config.safety)
 
-    run = _follow(opened, calibration, config, rate_hz, options, name, choice, None, steps, see)
+    run = _follow(opened, calibration, config, rate_hz, options, name, selection, None, steps, see)
     if run.interrupted is not None:
         raise run.interrupted
-    _tell_if_nothing_was_seen("replay", recording.target, run.counts["states"], choice)
+    _tell_if_nothing_was_seen("replay", recording.target, run.counts["states"], selection)
     scores = _scores(options, tracks, labels, rate_hz, max(pictures.values(), default=-1) + 1)
     differences = played.differences
     print_json(run.counts | {"differences": dataclasses.asdict(differences)} | scores)
@@ -264,7 +266,7 @@ def _follow(
     rate_hz: float,
     options: argparse.Namespace,
     name: str,
-    choice: Choice,
+    selection: Selection,
     seconds: float | None,
     frames: int | None = None,
     see: "Callable[[Step], None]" = lambda _: None,
@@ -276,14 +278,13 @@ def _follow(
     """
     from cotarget.detection import make_detector
     from cotarget.drawing import side_by_side
-    from cotarget.pipeline import FollowSettings, State, follow
+    from cotarget.pipeline import State, follow
     from cotarget.recording.recorder import StepTable, utc_text
     from cotarget.recording.replay import until_end
     from cotarget.video import FilmWriter
 
     target = config.target(name)
     detector = make_detector(target, rate_hz)
-    settings = FollowSettings(policy=choice.policy)
     states: dict[str, int] = dict.fromkeys(State, 0)
     reasons, skipped = Reasons(), SkippedFrames(rate_hz)
     limit = math.inf if seconds is None else seconds
@@ -303,10 +304,11 @@ def _follow(
                 film.epoch = epoch
             try:
                 # `follow` has checked the calibration; a recorded run is replayed with whatever it had.
-                followed = follow(rig, calibration, target, detector, seconds=limit, settings=settings, insist=True)
+                selector = selection.selector
+                followed = follow(rig, calibration, target, detector, selector=selector, seconds=limit, insist=True)
                 for step in until_end(followed):
                     table.write(step)
-                    for each in (choice, reasons, skipped):
+                    for each in (selection, reasons, skipped):
                         each.see(step)
                     see(step)
                     first_t = step.fixed.t if first_t is None else first_t
@@ -321,7 +323,7 @@ def _follow(
         if first_t is None:
             raise
         interrupted = end
-    for line in filter(None, (choice.unmet, reasons.warning, skipped.warning)):
+    for line in filter(None, (selection.unmet, reasons.warning, skipped.warning)):
         print(f"cotarget {options.command}: {line}", file=sys.stderr)
     counts = {
         "steps": sum(states.values()),
@@ -335,12 +337,12 @@ def _follow(
     )
 
 
-def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int], choice: Choice) -> None:
+def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int], selection: Selection) -> None:
     """Print a hint where no target was detected in the whole run."""
     from cotarget.pipeline import State
 
     steps = sum(states.values())
-    if steps and states[State.SEARCHING] == steps and not choice.unmet:
+    if steps and states[State.SEARCHING] == steps and not selection.unmet:
         why = {"replay": "the recording has none, or is too short for one to be believed"}.get(
             command, "what --target names has to move in the fixed camera's view"
         )

@@ -1,9 +1,9 @@
-"""Choose which of several tracks to follow: first come, nearest deadline, most served, or the user's choice.
+"""Select which of several tracks to follow: first come, nearest deadline, most served, or the user's choice.
 
-A policy sees the confirmed tracks of the fixed camera, the travel time of the head to each, and how long each was seen
-well so far. The two scheduling policies look at every target for a while and go on to the next. They differ when not
-all can be reached: `nearest-deadline` (after Costello et al. 2004, "Scheduling an active camera to observe people")
-turns to the target that leaves first; `most-served` plans the order that serves most targets.
+A `TargetSelector` sees the confirmed tracks of the fixed camera, the travel time of the head to each, and how long each
+was seen well so far. The two scheduling policies look at every target for a while and go on to the next. They differ
+when not all can be reached: `nearest-deadline` (after Costello et al. 2004, "Scheduling an active camera to observe
+people") turns to the target that leaves first; `most-served` plans the order that serves most targets.
 """
 
 import math
@@ -14,14 +14,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from cotarget.errors import ConfigError, choices
 from cotarget.geometry import Array
 from cotarget.rig import Angles, PanTiltLimits
 from cotarget.tracking.track import Track
 
-# Time for which each target is looked at: a second of good close-up, and some reserve for the plan's errors [s].
-LOOK_S = 1.2
-# Time from the head's arrival to a good close-up: the lens's travel and a frame [s].
-SETTLE_S = 0.6
 # Most targets whose orders are all searched, which takes some 3 ms; of more, those that leave first are taken.
 MOST_PLANNED = 7
 # Time over which a target's angular rate is computed [s].
@@ -30,7 +27,7 @@ RATE_S = 0.1
 
 @dataclass(frozen=True)
 class Candidate:
-    """A confirmed track that a policy may choose; its direction is computed on demand.
+    """A confirmed track that may be selected; its direction is computed on demand.
 
     Attributes:
         track: track in the fixed camera.
@@ -85,6 +82,7 @@ class SelectionState:
         head: pan and tilt now [rad].
         limits: limits of the head.
         look_s: time for which each target is looked at [s].
+        settle_s: time from the head's arrival to a good close-up [s].
     """
 
     waiting: Sequence[Candidate]
@@ -92,6 +90,7 @@ class SelectionState:
     head: Angles
     limits: PanTiltLimits
     look_s: float
+    settle_s: float
 
 
 class Plan(NamedTuple):
@@ -163,70 +162,19 @@ def done_in(candidate: Candidate, state: SelectionState, head: Angles, now: floa
         for _ in range(2):  # the way depends on the arrival; two rounds agree to a few hundredths
             pan, tilt = candidate.after(arrival)
             arrival = now + travel_s((pan - head[0], tilt - head[1]), state.limits)
-        arrival += SETTLE_S
+        arrival += state.settle_s
     return arrival + max(state.look_s - candidate.seen_s, 0.0)
 
 
-# Choice as options and recordings state it
+class TargetSelector(Protocol):
+    """Selects the track to follow, in every frame of a run."""
 
+    def start(self, image_size: tuple[int, int]) -> None:
+        """Begin a run, and forget the run before.
 
-@dataclass(frozen=True)
-class TargetChoice:
-    """Which target a run follows: one of these; with none of them, the first that comes.
-
-    Attributes:
-        policy: name of a policy in `POLICIES`.
-        click: pixel of the fixed image that shows the target (u, v).
-        track: id of a track.
-    """
-
-    policy: str | None = None
-    click: tuple[float, float] | None = None
-    track: int | None = None
-
-
-# No choice: the first target that comes.
-ANY_TARGET = TargetChoice()
-
-
-def choice_table(target_choice: TargetChoice) -> dict[str, Any]:
-    """Convert a choice to a table for a recording."""
-    parts = {
-        "policy": target_choice.policy,
-        "click": target_choice.click and list(target_choice.click),
-        "track": target_choice.track,
-    }
-    return {name: value for name, value in parts.items() if value is not None}
-
-
-def parse_choice(table: Any) -> TargetChoice:
-    """Parse the table of a choice from a recording.
-
-    Raises:
-        ValueError: the table is no choice.
-    """
-    if not isinstance(table, dict) or len(table) > 1 or not table.keys() <= {"policy", "click", "track"}:
-        raise ValueError(f"{table!r} is not one of policy, click and track")
-    policy, click, track = (table.get(name) for name in ("policy", "click", "track"))
-    if not isinstance(policy, str | None) or not (track is None or (type(track) is int and track > 0)):
-        raise ValueError(f"{table!r} is no policy's name or track's number")
-    if click is None:
-        return TargetChoice(policy, None, track)
-    if not (isinstance(click, list) and len(click) == 2 and all(type(x) in (int, float) for x in click)):
-        raise ValueError(f"click {click!r} is no pixel")
-    return TargetChoice(click=(float(click[0]), float(click[1])))
-
-
-# A click selects the target whose box holds it, or one whose centre is within this part of the image's width.
-CLICK_PART = 0.08
-# A chosen target that was lost is searched for this long [s]: a person behind a tree or car, a bird behind a roof. A
-# track that begins meanwhile is the same target if its size differs by no more than this factor and its distance from
-# the extrapolated place is no more than this many sizes plus this part of the way gone meanwhile.
-RETURNS_S, RETURN_SIZES, RETURN_TIMES, RETURN_PART = 3.0, 2.0, 2.0, 0.5
-
-
-class Policy(Protocol):
-    """Chooses the track to follow; called in every frame."""
+        Args:
+            image_size: (width, height) of the fixed image [px].
+        """
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
         """Return the id of the track to follow; None for no track.
@@ -259,8 +207,12 @@ def _eligible(candidates: Sequence[Candidate]) -> Sequence[Candidate]:
 class FirstCome:
     """Follow the first target until it disappears, then the next: the paper's policy."""
 
-    _id: int | None = None
     unmet = ""
+    _id: int | None = field(default=None, init=False)
+
+    def start(self, image_size: tuple[int, int]) -> None:
+        """Begin a run, with no target."""
+        self._id = None
 
     def favours(self, track: Track) -> bool:
         """Favour no track: the first has the lowest id and stays a candidate anyway."""
@@ -274,27 +226,33 @@ class FirstCome:
         return self._id
 
 
-LONGEST_LOOKS = 2.5  # longest time for a target that is not seen, in looks
-
-
 @dataclass
 class Rounds:
     """Look at every target for a while and go on to the next; after all were seen, at the one seen least.
 
-    Turning away costs the way and the time until the lens has settled. So each target is kept for SETTLE_S at least,
+    Turning away costs the way and the time until the lens has settled. So each target is kept for `settle_s` at least,
     unless it is gone or was seen for long enough. After all were seen, each is kept for one look more, and until it is
     a whole look ahead of another or that takes too long, because it may be hidden from the zoom camera alone.
 
     Attributes:
-        next_of: gives the id of the next target; called only while targets wait.
-        look_s: time for which each target is looked at [s].
+        policy: rule for the next target, one of `NEXT`.
+        look_s: time for which each target is looked at: a second of good close-up, and reserve for the plan's errors
+            [s].
+        settle_s: time from the head's arrival to a good close-up: the lens's travel and a frame [s].
+        longest_looks: longest time for a target that is not seen, in looks.
     """
 
-    next_of: Callable[[SelectionState], int]
-    look_s: float = LOOK_S
-    _id: int | None = None
-    _since: float = -math.inf
+    policy: str
+    look_s: float = 1.2
+    settle_s: float = 0.6
+    longest_looks: float = 2.5
     unmet = ""
+    _id: int | None = field(default=None, init=False)
+    _since: float = field(default=-math.inf, init=False)
+
+    def start(self, image_size: tuple[int, int]) -> None:
+        """Begin a run, with no target."""
+        self._id, self._since = None, -math.inf
 
     def favours(self, track: Track) -> bool:
         """Favour no track: whose turn comes next is unknown."""
@@ -306,9 +264,10 @@ class Rounds:
         waiting = sorted((c for c in candidates if c.seen_s < self.look_s), key=lambda c: (c.leaves_in, c.id))
         t = max((c.track.t for c in candidates), default=-math.inf)
         if waiting:
-            if self._id not in {c.id for c in waiting} or not 0 <= t - self._since < SETTLE_S:
+            if self._id not in {c.id for c in waiting} or not 0 <= t - self._since < self.settle_s:
                 pan, tilt = head.tolist()
-                self._turn(self.next_of(SelectionState(waiting, self._id, (pan, tilt), limits, self.look_s)), t)
+                state = SelectionState(waiting, self._id, (pan, tilt), limits, self.look_s, self.settle_s)
+                self._turn(NEXT[self.policy](state), t)
         else:
             self._turn(self._least_seen(candidates, t), t)
         return self._id
@@ -325,10 +284,10 @@ class Rounds:
         if not others:
             return None if current is None else current.id
         least, kept_s = min(others, key=lambda c: (c.seen_s, c.id)), t - self._since
-        if current is None or not 0 <= kept_s < LONGEST_LOOKS * self.look_s:
+        if current is None or not 0 <= kept_s < self.longest_looks * self.look_s:
             return least.id
         behind = current.seen_s < least.seen_s + self.look_s
-        return current.id if behind or kept_s < SETTLE_S + self.look_s else least.id
+        return current.id if behind or kept_s < self.settle_s + self.look_s else least.id
 
 
 def nearest_deadline(state: SelectionState) -> int:
@@ -350,6 +309,13 @@ def most_served(state: SelectionState) -> int:
     return plan(state).first
 
 
+# Rule for the next target while targets wait, by the policy's name.
+NEXT: Mapping[str, Callable[[SelectionState], int]] = {
+    "nearest-deadline": nearest_deadline,
+    "most-served": most_served,
+}
+
+
 @dataclass
 class Chosen:
     """Follow the target that the user chose by id or by a click into the fixed image, and no other.
@@ -357,19 +323,36 @@ class Chosen:
     A target out of sight for longer than its track lives comes back under a new id. A track that begins soon after,
     near where the target would have gone, is taken for it.
 
+    A chosen target that was lost is searched for a while: a person behind a tree or car, a bird behind a roof.
+
     Attributes:
         number: id of the track.
         pixel: pixel of the click (u, v).
-        width_px: width of the fixed image; `CLICK_PART` of it is the largest distance of a click.
+        click_part: a click selects the target whose box holds it, or one whose centre is within this part of the
+            image's width.
+        returns_s: time for which a lost target is searched [s].
+        return_times: largest ratio of the sizes of the new track and of the lost one.
+        return_sizes: largest distance of the new track from the extrapolated place, in sizes of the target ...
+        return_part: ... plus this part of the way gone meanwhile.
     """
 
     number: int | None = None
     pixel: tuple[float, float] | None = None
-    width_px: float = math.inf
+    click_part: float = 0.08
+    returns_s: float = 3.0
+    return_times: float = 2.0
+    return_sizes: float = 2.0
+    return_part: float = 0.5
+    _width_px: float = field(default=math.inf, init=False)
     _found: int | None = field(default=None, init=False)
     _there: bool = field(default=False, init=False)
     _last: Candidate | None = field(default=None, init=False)  # when it was last seen
     _newest: int = field(default=0, init=False)  # largest id of the tracks at that time
+
+    def start(self, image_size: tuple[int, int]) -> None:
+        """Begin a run on images of that size."""
+        self._width_px = image_size[0]
+        self._found, self._there, self._last, self._newest = None, False, None, 0
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
         """Return the chosen target while it is there; None otherwise."""
@@ -408,11 +391,12 @@ class Chosen:
         if self._last is None or track.id <= self._newest:
             return False
         last, gone_s = self._last.track, track.t - self._last.track.t
-        if not 0.0 < gone_s <= min(RETURNS_S, self._last.leaves_in):
+        if not 0.0 < gone_s <= min(self.returns_s, self._last.leaves_in):
             return False
-        room = RETURN_SIZES * last.larger_side_px + RETURN_PART * gone_s * float(np.linalg.norm(last.velocity_px))
+        speed_px = float(np.linalg.norm(last.velocity_px))
+        room = self.return_sizes * last.larger_side_px + self.return_part * gone_s * speed_px
         resized = track.larger_side_px / last.larger_side_px
-        return 1 / RETURN_TIMES <= resized <= RETURN_TIMES and self._off_course(track) <= room
+        return 1 / self.return_times <= resized <= self.return_times and self._off_course(track) <= room
 
     def _off_course(self, track: Track) -> float:
         """Distance of a track from the extrapolated place of the chosen target [px]."""
@@ -430,7 +414,7 @@ class Chosen:
         """Whether a track can be the one chosen, by id or by click."""
         if self.pixel is None:
             return track.id == self.number
-        return self._inside(track) or self._away(track) <= CLICK_PART * self.width_px
+        return self._inside(track) or self._away(track) <= self.click_part * self._width_px
 
     def _inside(self, track: Track) -> bool:
         """Whether the click is in a track's box."""
@@ -456,9 +440,56 @@ def leaves_in(track: Track, size: tuple[int, int]) -> float:
     return float(max(min(times, default=math.inf), 0.0))
 
 
-# Policies by the names that users give.
-POLICIES: Mapping[str, Callable[[], Policy]] = {
+# Selectors by the names of policies that users give.
+POLICIES: Mapping[str, Callable[[], TargetSelector]] = {
     "first-come": FirstCome,
-    "nearest-deadline": partial(Rounds, nearest_deadline),
-    "most-served": partial(Rounds, most_served),
+    **{name: partial(Rounds, name) for name in NEXT},
 }
+
+
+def selector_table(selector: TargetSelector | None) -> dict[str, Any]:
+    """Convert a selector to the table that a recording keeps; empty for None and for a selector of the user's own."""
+    match selector:
+        case FirstCome():
+            return {"policy": "first-come"}
+        case Rounds():
+            return {"policy": selector.policy}
+        case Chosen(pixel=None):
+            return {"track": selector.number}
+        case Chosen(pixel=(u, v)):
+            return {"click": [u, v]}
+    return {}
+
+
+def check_selector_table(table: Any) -> None:
+    """Refuse what is no table of a selector.
+
+    Raises:
+        ValueError: the table is none.
+    """
+    if not isinstance(table, dict) or len(table) > 1 or not table.keys() <= {"policy", "click", "track"}:
+        raise ValueError(f"{table!r} is not one of policy, click and track")
+    policy, click, track = (table.get(name) for name in ("policy", "click", "track"))
+    if not isinstance(policy, str | None) or not (track is None or (type(track) is int and track > 0)):
+        raise ValueError(f"{table!r} is no policy's name or track's number")
+    if click is not None:
+        if not (isinstance(click, list) and len(click) == 2 and all(type(x) in (int, float) for x in click)):
+            raise ValueError(f"click {click!r} is no pixel")
+        list(map(float, click))  # an integer may be too large for it
+
+
+def make_selector(table: Mapping[str, Any]) -> TargetSelector:
+    """Make the selector of a checked table; that of the first target that comes for an empty one.
+
+    Raises:
+        ConfigError: there is no such policy.
+    """
+    if "click" in table:
+        u, v = table["click"]
+        return Chosen(pixel=(float(u), float(v)))
+    if "track" in table:
+        return Chosen(number=table["track"])
+    name = table.get("policy", "first-come")
+    if name not in POLICIES:
+        raise ConfigError(f"policy '{name}' is unknown; give one of: {choices(POLICIES)}")
+    return POLICIES[name]()

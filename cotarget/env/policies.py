@@ -197,5 +197,5 @@ class SchedulingPolicy:
         """Return the slot of the track that the policy selects; the first slot if it selects none."""
         env = self._env
         if env.episode is not self._episode:
-            self._episode, self._policy = env.episode, self._make()
-        return env.slot_of(self._policy.select(env.candidates, env.head, env.limits))
+            self._episode, self._selector = env.episode, self._make()
+        return env.slot_of(self._selector.select(env.candidates, env.head, env.limits))

@@ -10,7 +10,7 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig
-from cotarget.control.selection import LOOK_S, Candidate
+from cotarget.control.selection import Candidate, Rounds
 from cotarget.env.common import (
     DETECTOR_NOISE,
     IMAGE_SIZE,
@@ -55,19 +55,22 @@ CANDIDATE_FEATURES = {
 }
 
 
-class Asked:
-    """Policy for the pipeline that selects the track of the action.
+class ActionSelector:
+    """Select the track of the action in the pipeline.
 
     Attributes:
         candidates: candidates of the newest frame.
         number: id of the track to follow.
     """
 
-    unmet = "nobody is asked for"
+    unmet = "no track is asked for"
 
     def __init__(self) -> None:
         self.candidates: Sequence[Candidate] = ()
         self.number: int | None = None
+
+    def start(self, image_size: tuple[int, int]) -> None:
+        """Do nothing: an environment makes a selector for each episode."""
 
     def select(self, candidates: Sequence[Candidate], head: Array, limits: PanTiltLimits) -> int | None:
         """Return the track of the action, while it is there."""
@@ -149,7 +152,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
     @property
     def candidates(self) -> Sequence[Candidate]:
         """Confirmed tracks, as a policy of the pipeline sees them."""
-        return self._asked.candidates
+        return self._selector.candidates
 
     @property
     def head(self) -> Array:
@@ -169,11 +172,16 @@ class Schedule(RigEnv[dict[str, Any], int]):
         """Begin an episode: a new one each time, the same one after the same seed."""
         seed = self._begin(seed, options)
         paths = group_paths(self.kind, seed)
-        episode, self._asked = self._open(paths, seed), Asked()
-        asked = self._asked
-        settings = FollowSettings(closed_loop=False, policy=lambda: asked)
+        episode, self._selector = self._open(paths, seed), ActionSelector()
+        settings = FollowSettings(closed_loop=False)
         self._steps: Iterator[Step] = follow(
-            episode.rig, self.calibration, self.target, episode.detector, seconds=math.inf, settings=settings
+            episode.rig,
+            self.calibration,
+            self.target,
+            episode.detector,
+            selector=self._selector,
+            seconds=math.inf,
+            settings=settings,
         )
         self._slots: list[int | None] = [None] * SLOTS
         self._index, self._good_s = 0, dict.fromkeys(paths, 0.0)
@@ -189,7 +197,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
         self.episode  # noqa: B018  raises if there is none
         if not self.action_space.contains(action):
             raise ConfigError(f"action: {told(action)} is not the number of a slot, 0 to {SLOTS - 1}")
-        self._asked.number = self._slots[action]
+        self._selector.number = self._slots[action]
         before = self._step.zoom.t
         self._index += 1
         self._turn()
@@ -251,7 +259,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
             tilt,
             *rates,
             candidate.leaves_in / SECONDS,
-            candidate.seen_s / LOOK_S,
+            candidate.seen_s / Rounds.look_s,
             float(candidate.reachable),
         ]
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from cotarget.config import RigConfig, parse_config
-from cotarget.control.selection import TargetChoice, parse_choice
+from cotarget.control.selection import check_selector_table
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import RigidTransform
 from cotarget.rig import CameraSpec, Frame, HeadSpec, PanTiltLimits, PanTiltState, RigSpec, ZoomSpec, ZoomState
@@ -278,7 +278,7 @@ class Recording:
         config: of the recorded rig, with that rig's backend.
         calibration: path of the run's calibration.json.
         target: name of the target that was followed.
-        target_choice: which of several targets; the default in recordings of older versions.
+        selector_table: which of several targets, see `cotarget.control.selection`; empty in older recordings.
         spec: what the rig knew of itself; its head's limits are the device's own.
         events: every call on the rig, in order.
         ending: "complete", the error that ended the run, or where a truncated log breaks off.
@@ -290,7 +290,7 @@ class Recording:
     config: RigConfig
     calibration: Path
     target: str
-    target_choice: TargetChoice
+    selector_table: Mapping[str, Any]
     spec: RigSpec
     events: tuple[Event, ...]
     ending: str
@@ -327,7 +327,7 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
     if not directory.exists():
         raise ConfigError(f"{directory}: no such folder; give the folder of a recording")
     meta = read_json(directory / META)
-    target, target_choice, config = _parse_meta(directory, meta)
+    target, selector_table, config = _parse_meta(directory, meta)
     if not (directory / CALIBRATION).is_file():
         raise ConfigError(f"{directory / CALIBRATION}: no such file; the recording is not whole")
     spec, rows, ending = None, [], ""
@@ -361,7 +361,7 @@ def read_recording(directory: Path, describe: Callable[[RigConfig], RigSpec]) ->
         config,
         directory / CALIBRATION,
         target,
-        target_choice,
+        selector_table,
         spec,
         tuple(rows),
         ending or stop,
@@ -388,8 +388,8 @@ class _DamageError(Exception):
     """The log is not whole from here on."""
 
 
-def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, TargetChoice, RigConfig]:
-    """Parse target name, target choice and configuration; the target's template is the recording's copy."""
+def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, dict[str, Any], RigConfig]:
+    """Parse target name, selector table and configuration; the target's template is the recording's copy."""
     path = directory / META
     name, table = meta["target"], meta["config"]
     try:
@@ -399,7 +399,8 @@ def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, TargetCh
             raise ConfigError(f"config: {table!r} is not a table")
         config = parse_config(table, recorded=True)
         target = config.target(name)
-        target_choice = parse_choice(meta.get("whom", {}))
+        selector_table = meta.get("whom", {})
+        check_selector_table(selector_table)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     except (ValueError, OverflowError) as error:
@@ -409,7 +410,7 @@ def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, TargetCh
     if template is not None and not template.is_file():
         raise ConfigError(f"{template}: no such file; the recording is not whole")
     target = replace(target, template=template)
-    return name, target_choice, dataclasses.replace(config, targets={**config.targets, name: target})
+    return name, selector_table, dataclasses.replace(config, targets={**config.targets, name: target})
 
 
 def _rows(path: Path) -> Iterator[tuple[int, Mapping[str, Any]]]:

@@ -27,7 +27,7 @@ import numpy as np
 
 import cotarget.errors
 from cotarget.config import RigConfig, config_table
-from cotarget.control.selection import ANY_TARGET, TargetChoice, choice_table
+from cotarget.control.selection import TargetSelector, selector_table
 from cotarget.errors import ConfigError, CotargetError
 from cotarget.files import CsvFile
 from cotarget.pipeline import Step
@@ -353,7 +353,7 @@ class Recorder:
         config: RigConfig,
         calibration: Path,
         target: str,
-        target_choice: TargetChoice = ANY_TARGET,
+        selector: TargetSelector | None = None,
     ) -> None:
         """Make the folder, and store configuration, calibration and target.
 
@@ -362,7 +362,7 @@ class Recorder:
             config: of the rig; its passwords are not recorded.
             calibration: path of calibration.json, which is copied.
             target: name of the target that will be followed.
-            target_choice: which of several targets to follow.
+            selector: selects among several targets; None for the first that comes.
 
         Raises:
             ConfigError: the folder is not empty, a file cannot be read or written, or there is no such target.
@@ -377,7 +377,7 @@ class Recorder:
         except OSError as error:
             raise ConfigError(f"{directory}: cannot hold a recording: {error.strerror}") from None
         try:
-            self._write_beginning(config, calibration, target, target_choice)
+            self._write_beginning(config, calibration, target, selector)
             self._writer = RecordWriter(directory)
         except BaseException as error:
             self._remove()
@@ -435,7 +435,9 @@ class Recorder:
         elif self._writer.failure and kind is None:
             raise CotargetError(f"{self._directory}: the recording is cut short: {self._writer.failure}")
 
-    def _write_beginning(self, config: RigConfig, calibration: Path, target: str, target_choice: TargetChoice) -> None:
+    def _write_beginning(
+        self, config: RigConfig, calibration: Path, target: str, selector: TargetSelector | None
+    ) -> None:
         chosen = config.target(target)
         if chosen.template is not None:
             copy = TEMPLATE + chosen.template.suffix
@@ -452,7 +454,7 @@ class Recorder:
             "numpy": np.__version__,
             "when": datetime.now(UTC).isoformat(timespec="seconds"),
             "target": target,
-            "whom": choice_table(target_choice),
+            "whom": selector_table(selector),
             "config": config_table(dataclasses.replace(config, targets={**config.targets, target: chosen})),
         }
         part = self._directory / f"{META}.part"

@@ -7,10 +7,12 @@ import dataclasses
 import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 from cotarget.calibration import Calibration
 from cotarget.calibration.calibrate import calibrate
 from cotarget.config import RigConfig, TargetProfile
+from cotarget.control.selection import TargetSelector
 from cotarget.detection import Detector, make_detector
 from cotarget.evaluation import add_row, true_calibration
 from cotarget.metrics import BACKGROUND_S
@@ -109,14 +111,19 @@ def watched(
     seconds: float,
     settings: FollowSettings | None = None,
     view: WideView | None = None,
+    selector: TargetSelector | None = None,
 ) -> Iterator[tuple[Step, Truth]]:
-    """Follow a target of a simulated rig; yield each Step with the ground truth. Arguments as for `held`."""
+    """Follow a target of a simulated rig; yield each Step with the ground truth.
+
+    Arguments as for `held`; by default the selector takes the first target that comes.
+    """
     settings = settings or FollowSettings()
     if view is None:
         world, detector = SimWorld(config), make_detector(target, config.rate_hz)
     else:
         world, detector = open_on(view, config, closed_loop=settings.closed_loop)
-    yield from watched_in(world, detector, calibration, target, seconds, settings)
+    how = partial(follow, selector=selector)
+    yield from watched_in(world, detector, calibration, target, seconds, settings, how)
 
 
 def watched_in(

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
 from cotarget.config import RigConfig, TargetProfile
-from cotarget.control.selection import POLICIES
+from cotarget.control.selection import POLICIES, TargetSelector
 from cotarget.evaluation import closeup_of
 from cotarget.metrics import SERVED_S
 from cotarget.pipeline import FollowSettings
@@ -59,8 +59,8 @@ def one(calibration: Calibration, settings: FiveSettings, seed: int) -> list[Row
         target = target_of(config, kind)
         view = record(config, target, settings.seconds)
         for policy, make in POLICIES.items():
-            how = FollowSettings(policy=make, closed_loop=settings.closed_loop)
-            seconds = good_seconds(calibration, config, target, settings.seconds, how, view)
+            how = FollowSettings(closed_loop=settings.closed_loop)
+            seconds = good_seconds(calibration, config, target, settings.seconds, how, view, make())
             rows.append(
                 {
                     "seed": seed,
@@ -81,11 +81,12 @@ def good_seconds(
     seconds: float,
     how: FollowSettings,
     view: WideView,
+    selector: TargetSelector,
 ) -> dict[str, float]:
     """Measure for how long each target of a world was well in the close-up, by ground truth [s]."""
     good = dict.fromkeys(config.sim.targets, 0.0)
     last: float | None = None
-    for step, truth in watched(calibration, config, target, seconds, how, view):
+    for step, truth in watched(calibration, config, target, seconds, how, view, selector):
         t = step.zoom.t
         if last is not None and t > last:  # a frame counts for the time since the one before
             for name in good:

@@ -1,4 +1,4 @@
-"""Whom of several targets a command follows, as its options say."""
+"""Which of several targets a command follows, as its options say."""
 
 import argparse
 import json
@@ -9,10 +9,10 @@ import pytest
 
 import cotarget.cli as cli
 from cotarget.calibration import save_calibration
-from cotarget.cli.common import POLICIES, Choice, add_choice
+from cotarget.cli.common import POLICIES, Selection, add_selection
 from cotarget.config import RigConfig
-from cotarget.control import selection
-from cotarget.control.selection import Candidate, TargetChoice
+from cotarget.control import selection as selectors
+from cotarget.control.selection import Candidate
 from cotarget.errors import ConfigError
 from cotarget.evaluation import true_calibration
 from cotarget.rig import PanTiltLimits
@@ -25,8 +25,8 @@ LIMITS = PanTiltLimits((-2.8, 2.8), (-0.8, 0.5), 2.6, 3.6, 0.0)
 
 def chosen(*arguments):
     parser = argparse.ArgumentParser(exit_on_error=False)
-    add_choice(parser)
-    return Choice(parser.parse_args(arguments), SIZE)
+    add_selection(parser)
+    return Selection(parser.parse_args(arguments), SIZE)
 
 
 def track(number, center, confirmed=True):
@@ -34,7 +34,7 @@ def track(number, center, confirmed=True):
     return Track(number, 0.0, confirmed, 0, center, np.zeros(2), size, 30.0, np.eye(4), 1.0, None)
 
 
-def pick(choice, seen=(0.0, 0.0, 0.0)):
+def pick(selection, seen=(0.0, 0.0, 0.0)):
     """Of three: one to the left that stays, one in the middle that leaves in 9 s, one to the right, in 5 s."""
     places = {2: (100, 200), 3: (320, 200), 5: (600, 200)}
     leaves = (np.inf, 9.0, 5.0)
@@ -42,11 +42,12 @@ def pick(choice, seen=(0.0, 0.0, 0.0)):
         Candidate(track(number, at), lambda _, at=at: np.array([(at[0] - 320) / 686, 0.0]), end, done)
         for (number, at), end, done in zip(places.items(), leaves, seen, strict=True)
     ]
-    return choice.policy().select(candidates, np.zeros(2), LIMITS)
+    selection.selector.start(SIZE)
+    return selection.selector.select(candidates, np.zeros(2), LIMITS)
 
 
 def test_the_names_are_those_of_the_policies():
-    assert set(POLICIES) == set(selection.POLICIES)
+    assert set(POLICIES) == set(selectors.POLICIES)
     assert POLICIES[0] == "first-come"
 
 
@@ -62,28 +63,28 @@ def test_whom_the_options_mean():
 
 
 def test_what_was_never_there_is_told():
-    choice = chosen("--track", "4")
-    choice.see(SimpleNamespace(target=None, tracks=[track(2, (1, 1)), track(3, (9, 9), confirmed=False)]))
-    assert choice.unmet == "--track: there was no track 4; the tracks were: 2"
-    choice.see(SimpleNamespace(target=track(4, (1, 1)), tracks=[]))
-    assert choice.unmet == ""
+    selection = chosen("--track", "4")
+    selection.see(SimpleNamespace(target=None, tracks=[track(2, (1, 1)), track(3, (9, 9), confirmed=False)]))
+    assert selection.unmet == "--track: there was no track 4; the tracks were: 2"
+    selection.see(SimpleNamespace(target=track(4, (1, 1)), tracks=[]))
+    assert selection.unmet == ""
     assert chosen("--click", "3", "4").unmet == ""  # nothing was there at all
     assert chosen().unmet == ""
 
 
 def test_what_a_recording_says_is_not_called_an_option():
     parser = argparse.ArgumentParser(exit_on_error=False)
-    add_choice(parser)
+    add_selection(parser)
     plain = parser.parse_args([])
     with pytest.raises(ConfigError, match=r"^the recorded click: \(640, 3\) is not in the wide view's 640x480 image"):
-        Choice(plain, SIZE, TargetChoice(click=(640.0, 3.0)))
-    for target_choice, said in (
-        (TargetChoice(click=(3.0, 4.0)), "the recorded click: no track came near (3, 4)"),
-        (TargetChoice(track=9), "the recorded track: there was no track 9"),
+        Selection(plain, SIZE, {"click": [640.0, 3.0]})
+    for table, said in (
+        ({"click": [3.0, 4.0]}, "the recorded click: no track came near (3, 4)"),
+        ({"track": 9}, "the recorded track: there was no track 9"),
     ):
-        choice = Choice(plain, SIZE, target_choice)
-        choice.see(SimpleNamespace(target=None, tracks=[track(2, (1, 1))]))
-        assert choice.unmet == f"{said}; the tracks were: 2"
+        selection = Selection(plain, SIZE, table)
+        selection.see(SimpleNamespace(target=None, tracks=[track(2, (1, 1))]))
+        assert selection.unmet == f"{said}; the tracks were: 2"
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from benchmarks import sim_speed
 from cotarget.config import parse_config
 from cotarget.control.head import HeadSettings
+from cotarget.control.selection import FirstCome
 from cotarget.evaluation import TruthDetector, TruthFinder, TruthNoise, true_calibration
 from cotarget.geometry import pose
 from cotarget.metrics import score
@@ -171,7 +172,7 @@ def test_good_seconds_are_those_that_rows_tell(exact):
     config = hold_config("person", 1)
     target, how = config.target("person"), FollowSettings(closed_loop=False)
     view = seen_well(config, target, 4.0)
-    found = five_targets.good_seconds(exact, config, target, 4.0, how, view)
+    found = five_targets.good_seconds(exact, config, target, 4.0, how, view, FirstCome())
     rows = field.held(exact, config, "person", 4.0, how, view)
     assert found.keys() == {"person"}
     assert found["person"] == pytest.approx(FRAME_S * sum(row.good_closeup for row in rows[1:]))

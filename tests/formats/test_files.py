@@ -229,9 +229,9 @@ def assert_is_recording(folder, may_lack=()):
     assert_config(meta["config"])
     for key in ("recording", "safety.stop_file"):
         assert key not in keys_in(meta["config"])
-    target_choice = meta.pop("whom")
-    assert len(target_choice) <= 1
-    assert {f"whom.{key}" for key in target_choice} <= listed_keys("recordings.txt", "recording.json ").keys()
+    table = meta.pop("whom")
+    assert len(table) <= 1
+    assert {f"whom.{key}" for key in table} <= listed_keys("recordings.txt", "recording.json ").keys()
     assert_keys("recordings.txt", {**meta, "config": 0}, begins="recording.json ", may_lack=["whom"])
     first, *events, last = read_lines(folder / "log.jsonl")
     assert_keys("recordings.txt", first["rig"], begins="rig ", may_lack=LATER)
@@ -285,11 +285,11 @@ def test_v010_recording_is_replayed(old, capsys):
         )
 
 
-@pytest.mark.parametrize("target_choice", [{}, {"click": [72.0, 78.0]}, {"track": 1}, {"policy": "nearest-deadline"}])
-def test_the_choice_of_a_target_is_read_from_a_recording(target_choice, old, capsys):
+@pytest.mark.parametrize("table", [{}, {"click": [72.0, 78.0]}, {"track": 1}, {"policy": "nearest-deadline"}])
+def test_the_choice_of_a_target_is_read_from_a_recording(table, old, capsys):
     path = old / "recording" / "recording.json"
-    path.write_text(json.dumps(read(path) | {"whom": target_choice}))
-    assert set(target_choice) <= {key.removeprefix("whom.") for key in listed_keys("recordings.txt", "recording.json ")}
+    path.write_text(json.dumps(read(path) | {"whom": table}))
+    assert set(table) <= {key.removeprefix("whom.") for key in listed_keys("recordings.txt", "recording.json ")}
     assert run(capsys, "replay", "recording")["states"]["following"] == 4
 
 

@@ -6,7 +6,6 @@ Nothing ends in a crash, a head that runs away, or a Step that does not say what
 import itertools
 import math
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -72,11 +71,13 @@ class Faulty:
         return self.change(self.camera.read, self.camera.rig.t, newer_than, timeout)
 
 
-def attempt(rig, seer, seconds, **settings):
+def attempt(rig, seer, seconds, selector=None, **settings):
     """Follow until an error; the Steps before it, and the error."""
     steps, error = [], None
     try:
-        for step in follow(rig_of(rig), CALIBRATION, BOOK, seer, seconds=seconds, settings=FollowSettings(**settings)):
+        settings = FollowSettings(**settings)
+        run = follow(rig_of(rig), CALIBRATION, BOOK, seer, selector=selector, seconds=seconds, settings=settings)
+        for step in run:
             steps.append(step)
     except CotargetError as raised:
         error = raised
@@ -429,21 +430,21 @@ def test_whoever_is_chosen_of_a_hundred_is_followed(click):
     """Though there are more tracks than are known in 3D."""
     rig, crowd, number = Rig(), Crowd(), 77
     pixel = tuple(PLAIN.project(crowd.at(number, 0.2))[0])
-    policy = partial(Chosen, pixel=pixel, width_px=100.0) if click else partial(Chosen, number=number + 1)
-    steps = run(rig, crowd, 2.0, policy=policy)
+    selector = Chosen(pixel=pixel, click_part=8 / rig.fixed.size[0]) if click else Chosen(number=number + 1)
+    steps = run(rig, crowd, 2.0, selector=selector)
     assert number > MOST_FILTERS
     assert {step.target.id for step in steps if step.target is not None} == {number + 1}
     assert steps[-1].state is State.FOLLOWING
     assert off(rig, lambda t: crowd.at(number, t), rig.t) < 0.01
 
 
-@pytest.mark.parametrize(("policy", "told"), [
-    (partial(Chosen, number=7), "track 7 is not there"),
-    (partial(Chosen, pixel=(20.0, 30.0), width_px=640.0), "no track at the click (20, 30)"),
+@pytest.mark.parametrize(("selector", "told"), [
+    (Chosen(number=7), "track 7 is not there"),
+    (Chosen(pixel=(20.0, 30.0)), "no track at the click (20, 30)"),
 ])  # fmt: skip
-def test_a_choice_that_meets_nobody_is_told(policy, told):
+def test_a_choice_that_meets_nobody_is_told(selector, told):
     rig = Rig()
-    steps = run(rig, Seer(still), 1.0, policy=policy)
+    steps = run(rig, Seer(still), 1.0, selector=selector)
     assert {(step.state, step.reason) for step in steps} == {(State.SEARCHING, told)}
     assert any(track.confirmed for track in steps[-1].tracks)
     assert not rig.moves
@@ -452,7 +453,7 @@ def test_a_choice_that_meets_nobody_is_told(policy, told):
 def test_a_chosen_target_that_has_gone_is_told():
     rig = Rig()
     pixel = tuple(PLAIN.project(np.array(still(0)))[0].round())
-    steps = run(rig, Seer(still, lambda t: t < 1.0), 3.0, policy=partial(Chosen, pixel=pixel, width_px=640.0))
+    steps = run(rig, Seer(still, lambda t: t < 1.0), 3.0, selector=Chosen(pixel=pixel))
     assert [state for state, _ in spans(steps)] == [
         State.SEARCHING,
         State.FOLLOWING,
@@ -468,15 +469,15 @@ def test_a_chosen_target_that_has_gone_is_told():
 def test_a_chosen_target_that_was_hidden_for_long_is_followed_on():
     """Its track lives for 0.8 s; then it has another number, and is the same target."""
     rig = Rig()
-    hidden = run(rig, Seer(still, lambda t: not 1.0 <= t < 2.5), 5.0, policy=partial(Chosen, number=1))
-    assert [(state, number) for (state, number), _ in itertools.groupby(hidden, key=target_choice)][-2:] == [
+    hidden = run(rig, Seer(still, lambda t: not 1.0 <= t < 2.5), 5.0, selector=Chosen(number=1))
+    assert [(state, number) for (state, number), _ in itertools.groupby(hidden, key=followed)][-2:] == [
         (State.SEARCHING, None),
         (State.FOLLOWING, 2),
     ]
     assert off(rig, still, rig.t) < STEP
 
 
-def target_choice(step):
+def followed(step):
     return step.state, None if step.target is None else step.target.id
 
 
@@ -495,7 +496,7 @@ class Two:
 @pytest.mark.parametrize("policy", sorted(POLICIES))
 def test_a_target_beyond_the_limits_keeps_nobody_from_another(policy):
     rig = Rig(replace(WIDE, pan=(-0.15, 0.15)))
-    steps = run(rig, Two(), 4.0, policy=POLICIES[policy])
+    steps = run(rig, Two(), 4.0, selector=POLICIES[policy]())
     alone = [step for step in steps if 0.3 < step.t < 1.0]
     assert {step.state for step in alone} == {State.UNREACHABLE}
     assert all("beyond the limits" in step.reason for step in alone)
@@ -506,7 +507,7 @@ def test_a_target_beyond_the_limits_keeps_nobody_from_another(policy):
 
 def test_a_chosen_target_beyond_the_limits_is_not_exchanged():
     rig = Rig(replace(WIDE, pan=(-0.15, 0.15)))
-    steps = run(rig, Two(), 3.0, policy=partial(Chosen, number=1))
+    steps = run(rig, Two(), 3.0, selector=Chosen(number=1))
     assert {(step.state, step.target.id) for step in steps if step.t > 0.3} == {(State.UNREACHABLE, 1)}
     assert not rig.moves
 

@@ -164,9 +164,9 @@ def off(rig, path, t):
     return float(np.arctan2(np.linalg.norm(np.cross(middle, x)), middle @ x))
 
 
-def run(rig, seer, seconds, **settings):
+def run(rig, seer, seconds, selector=None, **settings):
     settings = FollowSettings(**settings)
-    return list(follow(rig_of(rig), CALIBRATION, BOOK, seer, seconds=seconds, settings=settings))
+    return list(follow(rig_of(rig), CALIBRATION, BOOK, seer, selector=selector, seconds=seconds, settings=settings))
 
 
 def spans(steps):
@@ -267,6 +267,9 @@ class Switch:
     def __init__(self, rig, at):
         self.rig, self.at = rig, at
 
+    def start(self, image_size):
+        pass
+
     def favours(self, track):
         return False
 
@@ -285,7 +288,7 @@ def test_whoever_was_out_of_sight_before_it_was_chosen_is_lost_at_once():
             return self.near.detect(frame) + self.far.detect(frame)
 
     rig = Rig()
-    steps = run(rig, Two(), 2.25, policy=lambda: Switch(rig, 2.1))
+    steps = run(rig, Two(), 2.25, selector=Switch(rig, 2.1))
     second = [step for step in steps if step.target and step.target.id == 2]
     assert {step.state for step in second} == {State.LOST}
     assert second[0].reason.startswith("out of sight for 0.6 s")
@@ -326,15 +329,14 @@ def test_a_policy_is_told_how_long_a_target_was_seen_well():
             self.told = max([0.0, *(each.seen_s for each in candidates)])
             return super().select(candidates, head, limits)
 
-    policy = Noting()
+    selector = Noting()
     rig, true = Rig(lens_speed=1.5), 0
-    settings = FollowSettings(policy=lambda: policy)
-    for _ in follow(rig_of(rig), CALIBRATION, BOOK, Seer(still), seconds=4.0, settings=settings):
+    for _ in follow(rig_of(rig), CALIBRATION, BOOK, Seer(still), selector=selector, seconds=4.0):
         wanted = 160 * np.linalg.norm(still(0)) / 0.234 * 667 / 692
         off_px = off(rig, still, rig.t) * rig.lens(rig.t)
         true += rig.lens(rig.t) / wanted > 0.8 and off_px < 140  # half the height without half the book's
     assert 1.0 < true / RATE_HZ < 3.0
-    assert policy.told == pytest.approx(true / RATE_HZ, abs=LATENCY + 3 / RATE_HZ)
+    assert selector.told == pytest.approx(true / RATE_HZ, abs=LATENCY + 3 / RATE_HZ)
 
 
 def test_why_the_lens_is_not_as_close_as_wanted_is_told():

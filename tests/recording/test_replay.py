@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 import threading
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +21,7 @@ from cotarget.calibration import load_calibration
 from cotarget.calibration.file import save_calibration
 from cotarget.cli.main import main
 from cotarget.config import RigConfig, SafetyConfig, parse_config
-from cotarget.control.selection import Chosen, TargetChoice, choice_table, parse_choice
+from cotarget.control.selection import Chosen
 from cotarget.detection import make_detector
 from cotarget.errors import ConfigError, CotargetError, DeviceError, HaltedError, StaleFrameError
 from cotarget.estimation import Estimate
@@ -208,9 +207,9 @@ def of_track_2(tmp_path_factory):
     """A recording of a run that follows nobody but the second track, which comes late, as the command runs it."""
     folder = tmp_path_factory.mktemp("of_track_2")
     path = calibration_file(folder)
-    settings = FollowSettings(policy=partial(Chosen, number=2))
-    with Recorder(folder / "run", CONFIG, path, "bird", TargetChoice(track=2)) as recorder:
-        steps = list(run(recorder.wrap(toy_rig()), load_calibration(path), SECONDS, settings))
+    selector = Chosen(number=2)
+    with Recorder(folder / "run", CONFIG, path, "bird", selector) as recorder:
+        steps = list(run(recorder.wrap(toy_rig()), load_calibration(path), SECONDS, selector=selector))
     assert {step.target.id for step in steps if step.target} == {2}
     return folder / "run"
 
@@ -257,7 +256,7 @@ def test_a_recording_that_does_not_say_whom_replays_as_the_first_policy_does(rep
     assert replayed() == then
 
 
-@pytest.mark.parametrize(("target_choice", "said"), [
+@pytest.mark.parametrize(("table", "said"), [
     ({"policy": "by-name"}, "the recorded policy 'by-name' is unknown; give --policy, one of: first-come"),
     ({"click": [500.0, 3.0]}, "the recorded click: (500, 3) is not in the wide view's 96x72 image"),
     ({"click": [float("nan"), 3.0]}, "is not in the wide view"),
@@ -268,20 +267,12 @@ def test_a_recording_that_does_not_say_whom_replays_as_the_first_policy_does(rep
     ({"track": 1, "policy": "first-come"}, "is not one of policy, click and track"),
     (None, "recording.json: whom: None is not one of"),
 ])  # fmt: skip
-def test_whom_nobody_can_follow_is_refused_in_one_line(replayed, target_choice, said):
-    edit("whom", target_choice)(replayed.folder)
+def test_whom_nobody_can_follow_is_refused_in_one_line(replayed, table, said):
+    edit("whom", table)(replayed.folder)
     status, _, err = replayed()
     assert status == 1
     assert said in err
     assert err.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "target_choice",
-    [TargetChoice(), TargetChoice("most-served"), TargetChoice(click=(3.5, 7.0)), TargetChoice(track=4)],
-)
-def test_whom_is_written_and_read(target_choice):
-    assert parse_choice(json.loads(json.dumps(choice_table(target_choice)))) == target_choice
 
 
 def write_log(folder, rows, end="complete"):
