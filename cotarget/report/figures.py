@@ -1,5 +1,6 @@
 """Figures of the calibration report, with their captions: pointing error, residuals, coverage and the zoom lens."""
 
+import base64
 import io
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -152,6 +153,12 @@ class Plot:
     svg: bytes | None
     alt: str
     caption: str
+
+    @property
+    def data_uri(self) -> str:
+        """The figure as a data URI, which an HTML page embeds."""
+        kind, data = ("svg+xml", self.svg) if self.svg is not None else ("png", self.png)
+        return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
 INK, BLUE, ORANGE, RED, GREY, PALE = "#22303c", "#1f6f8b", "#c8702a", "#b5403a", "#8a97a3", "#e3e8ec"

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from cotarget.files import write_whole
-from cotarget.report import page as page_module
 from cotarget.report.figures import Plot
-from cotarget.report.page import STYLE
-from cotarget.report.text import Table, count, digits, listed
+from cotarget.report.page import render
+from cotarget.report.text import Level, Table, count, digits, listed
 from experiments.engine.bounds import WORSE, leaves
 from experiments.engine.outcome import Outcome
 from experiments.engine.sessions import Session
@@ -52,25 +51,30 @@ def write_report(path: Path, run: Run) -> None:
     Raises:
         ConfigError: the page cannot be written.
     """
-    anchored = [(f"case-{i}", outcome) for i, outcome in enumerate(run.outcomes)]
-    links = [(anchor, outcome.case.title) for anchor, outcome in anchored]
-    compared = list(_comparisons(run.outcomes))
-    sections = [
-        page_module.section("summary", "All at a glance", _summary(run)),
-        *(page_module.section(anchor, outcome.case.title, _case(outcome)) for anchor, outcome in anchored),
-        *([page_module.section("compared", "Settings compared", compared)] if compared else []),
-        page_module.section("times", "Times", _times(run)),
-        page_module.section("made", "How this was made", _made(run)),
-    ]
-    more = [("compared", "settings compared")] if compared else []
-    links += [*more, ("times", "times"), ("made", "how this was made")]
-    head = page_module.header("The experiments of cotarget", [run.command]) + "\n" + _verdict(run)
-    body = "\n".join([head, page_module.contents(links), *sections])
-    page = page_module.document("The experiments of cotarget", STYLE.read_text(encoding="utf-8"), body)
+    label, level, text = _verdict(run)
+    page = render(
+        "report.html",
+        Path(__file__).parent,
+        heading="The experiments of cotarget",
+        about=[run.command],
+        verdict={"level": level, "text": text},
+        label=label,
+        summary=_summary(run),
+        too_short=any(outcome.case.quick and outcome.missed for outcome in run.outcomes),
+        skipped=Table("Not run", ("experiment", "why"), tuple(run.skipped.items())),
+        cases=[{"anchor": f"case-{i}"} | _case(outcome) for i, outcome in enumerate(run.outcomes)],
+        compared=list(_comparisons(run.outcomes)),
+        used=used(run),
+        times=_times(run),
+        sessions=_sessions(run),
+        command=run.command,
+        made=_made(run),
+    )
     write_whole(path, page.encode())
 
 
-def _verdict(run: Run) -> str:
+def _verdict(run: Run) -> tuple[str, Level, str]:
+    """Judge a run: label, level and text."""
     failed = sum(len(outcome.failed) for outcome in run.outcomes)
     undone = sum(outcome.undone for outcome in run.outcomes)
     parts = {
@@ -89,17 +93,17 @@ def _verdict(run: Run) -> str:
     others = [outcome.case.title for outcome in run.outcomes if outcome.other_code]
     ran += f"; done by other code than this: {listed(others)}" if others else ""
     if wrong:
-        return page_module.verdict("bad", "Something is wrong", f"{ran}: {'; '.join(wrong)}.")
+        return "Something is wrong", "bad", f"{ran}: {'; '.join(wrong)}."
     if short:
-        return page_module.verdict("care", "Some figures are not what is wanted", f"{ran}: {listed(short)}.")
+        return "Some figures are not what is wanted", "care", f"{ran}: {listed(short)}."
     if not run.outcomes:
-        return page_module.verdict("unknown", "Nothing was run", "There is nothing to tell.")
-    return page_module.verdict("good", "All as it should be", f"{ran}; none failed, no bound is broken.")
+        return "Nothing was run", "unknown", "There is nothing to tell."
+    return "All as it should be", "good", f"{ran}; none failed, no bound is broken."
 
 
-def _summary(run: Run) -> Iterator[str]:
+def _summary(run: Run) -> Table:
     header = ("experiment", "wanted figures", "bounds", "jobs", "failed", "time of all jobs")
-    rows = tuple(
+    rows = (
         (
             outcome.case.title,
             outcome.broken or _wanted(outcome),
@@ -110,11 +114,7 @@ def _summary(run: Run) -> Iterator[str]:
         )
         for outcome in run.outcomes
     )
-    yield page_module.table(Table("", header, rows))
-    if any(outcome.case.quick and outcome.missed for outcome in run.outcomes):
-        yield page_module.paragraph("A quick run is too short for what is wanted; it is held to its bounds.", "note")
-    if run.skipped:
-        yield page_module.table(Table("Not run", ("experiment", "why"), tuple(run.skipped.items())))
+    return Table("", header, tuple(rows))
 
 
 def _wanted(outcome: Outcome) -> str:
@@ -136,53 +136,52 @@ def _named(numbers: Mapping[int, Any]) -> str:
     return f"{text} and {len(numbers) - FEW} more" if len(numbers) > FEW else text or "none"
 
 
-def _case(outcome: Outcome) -> Iterator[str]:
-    case = outcome.case
-    yield page_module.paragraph(case.experiment.purpose)
-    if outcome.broken:
-        yield page_module.paragraph(outcome.broken[:1].upper() + outcome.broken[1:] + ".")
-    if outcome.text:
-        yield page_module.preformatted(outcome.text)
-    for name, png in outcome.pictures.items():
-        caption = f"{name}.png, of seed {outcome.pictured}"
-        yield page_module.figure(Plot(name, png, None, f"{case.experiment.name}: {caption}", caption))
+def _case(outcome: Outcome) -> dict[str, Any]:
+    """Compute what the page says of one experiment."""
+    case, name = outcome.case, outcome.case.experiment.name
+    plots = [
+        Plot(picture, png, None, f"{name}: {caption}", caption)
+        for picture, png in outcome.pictures.items()
+        for caption in [f"{picture}.png, of seed {outcome.pictured}"]
+    ]
     if outcome.picture is not None:
-        name = case.experiment.name
-        yield page_module.figure(Plot(name, outcome.picture, None, f"{name}: {outcome.caption}", outcome.caption))
-    if outcome.missed is not None:
-        lost = outcome.missed
-        yield page_module.subheading("Wanted figures")
-        yield page_module.bullets(lost) if lost else page_module.paragraph("All are met.")
-    if outcome.bounds:
-        yield page_module.subheading("Bounds")
-        rows = tuple(
-            (bound.name, bound.text, _figure(bound.reached), "yes" if bound.kept else "NO") for bound in outcome.bounds
-        )
-        note = f"The best that was reached before; what is up to {WORSE:g} times as bad is kept."
-        yield page_module.table(Table("", ("figure", "bound", "reached", "kept"), rows, note))
-    if outcome.failed:
-        yield page_module.subheading("Failed jobs")
-        why = tuple((str(number), record.failed) for number, record in outcome.failed.items())
-        yield page_module.table(Table("", ("seed", "why"), why, "The next run tries them again."))
-        tracebacks = {record.traceback: number for number, record in reversed(outcome.failed.items())}
-        for text, number in reversed(tracebacks.items()):
-            if text:
-                yield page_module.folded(f"Traceback of seed {number}", page_module.preformatted(text))
-    told = {key: value for key, value in dataclasses.asdict(case.settings).items() if key != "processes"}
-    settings = tuple((key, json.dumps(plain(value))) for key, value in told.items())
+        plots.append(Plot(name, outcome.picture, None, f"{name}: {outcome.caption}", outcome.caption))
+    bounds = (
+        (bound.name, bound.text, _figure(bound.reached), "yes" if bound.kept else "NO") for bound in outcome.bounds
+    )
+    note = f"The best that was reached before; what is up to {WORSE:g} times as bad is kept."
+    failed = ((str(number), record.failed) for number, record in outcome.failed.items())
+    tracebacks = {record.traceback: number for number, record in reversed(outcome.failed.items())}
+    settings = {key: value for key, value in dataclasses.asdict(case.settings).items() if key != "processes"}
     done_by = sorted({record.version for record in outcome.records.values()})
-    facts = (*settings, ("done by cotarget", listed(done_by)))
-    yield page_module.folded("Settings and versions", page_module.table(Table("", ("setting", "value"), facts)))
+    facts = (
+        *((key, json.dumps(plain(value))) for key, value in settings.items()),
+        ("done by cotarget", listed(done_by)),
+    )
+    figures = None
     if outcome.summary is not None:
-        figures = tuple((" / ".join(trail), json.dumps(value)) for trail, value in leaves(plain(outcome.summary)))
-        yield page_module.folded("Every figure", page_module.table(Table("", ("figure", "value"), figures)))
+        leaf = ((" / ".join(trail), json.dumps(value)) for trail, value in leaves(plain(outcome.summary)))
+        figures = Table("", ("figure", "value"), tuple(leaf))
+    return {
+        "title": case.title,
+        "purpose": case.experiment.purpose,
+        "broken": outcome.broken,
+        "text": outcome.text,
+        "plots": plots,
+        "missed": outcome.missed,
+        "bounds": Table("", ("figure", "bound", "reached", "kept"), tuple(bounds), note),
+        "failed": Table("", ("seed", "why"), tuple(failed), "The next run tries them again."),
+        "tracebacks": [(number, text) for text, number in reversed(tracebacks.items()) if text],
+        "facts": Table("", ("setting", "value"), facts),
+        "figures": figures,
+    }
 
 
 def _figure(value: float | None) -> str:
     return "-" if value is None else f"{value:.4g}"
 
 
-def _comparisons(outcomes: Sequence[Outcome]) -> Iterator[str]:
+def _comparisons(outcomes: Sequence[Outcome]) -> Iterator[Table]:
     """Make a table for each experiment that was run with several settings, with its figures side by side."""
     for name in dict.fromkeys(outcome.case.experiment.name for outcome in outcomes):
         mine = [o for o in outcomes if o.case.experiment.name == name and o.summary is not None]
@@ -195,15 +194,14 @@ def _comparisons(outcomes: Sequence[Outcome]) -> Iterator[str]:
             for trail in trails
         )
         header = ("figure", *(", ".join(outcome.case.changes) for outcome in mine))
-        yield page_module.table(Table(name, header, rows))
+        yield Table(name, header, rows)
 
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _times(run: Run) -> Iterator[str]:
-    yield page_module.paragraph(f"In all: {used(run)}.")
+def _times(run: Run) -> Table:
     header = ("experiment", "jobs", "all together", "median", "longest", "shared", "processor", "renders", "alone")
     rows = [
         (
@@ -229,8 +227,11 @@ def _times(run: Run) -> Iterator[str]:
         "Processor time and renders, pictures that MuJoCo drew (a part of one counts as that part), are those of jobs "
         "and of what they share, processes that these start included. Jobs done alone measure times themselves."
     )
-    yield page_module.table(Table("", header, tuple(rows), note))
-    sessions = tuple(
+    return Table("", header, tuple(rows), note)
+
+
+def _sessions(run: Run) -> Table:
+    rows = tuple(
         (
             each.began,
             each.workers,
@@ -248,7 +249,7 @@ def _times(run: Run) -> Iterator[str]:
         "Without what was forgotten or belongs to experiments that are not reported here. Of a session that was killed "
         "the last seconds are missing."
     )
-    yield page_module.table(Table("Sessions", heads, sessions, note))
+    return Table("Sessions", heads, rows, note)
 
 
 def used(run: Run) -> str:
@@ -265,16 +266,16 @@ def used(run: Run) -> str:
     return f"{took}, of {wanted} that a full run may take" + (f": too much {listed(lost)}" if lost else "")
 
 
-def _made(run: Run) -> Iterator[str]:
-    yield page_module.preformatted(run.command)
+def _made(run: Run) -> list[Table]:
+    """Make a table of versions and machine for each set of sessions that have the same."""
     made: dict[tuple[tuple[str, str], ...], list[str]] = {}
     for each in run.sessions:
         facts = {**each.versions, "cotarget": each.cotarget, "machine": each.machine}
         made.setdefault(tuple(facts.items()), []).append(each.began)
-    for rows, began in made.items():
-        yield page_module.table(
-            Table(f"Of the {count(len(began), 'session')} begun {listed(began)}", ("what", "value"), rows)
-        )
+    return [
+        Table(f"Of the {count(len(began), 'session')} begun {listed(began)}", ("what", "value"), rows)
+        for rows, began in made.items()
+    ]
 
 
 def duration(seconds: float) -> str:
