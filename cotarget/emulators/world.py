@@ -27,8 +27,6 @@ from cotarget.sim.world import SimWorld
 
 log = logging.getLogger(__name__)
 
-REMEMBERED = 5.0  # age of the oldest exposure for which axes and lens keep their motion [s]
-
 
 class WallClock:
     """The machine's monotonic clock, from its construction."""
@@ -88,12 +86,10 @@ class EmulatedAxis:
         return self._clock.now() < self._rests
 
     def _begin(self, acceleration: float) -> float:
-        """Return when a command given now takes effect [s]; drop motion older than `REMEMBERED`."""
-        now = self._clock.now()
-        self._axis.forget(now - REMEMBERED)
+        """Return when a command given now takes effect [s]."""
         if math.isfinite(self._axis.acceleration):
             self._axis.acceleration = acceleration * abs(self._step)
-        return now + self._delay
+        return self._clock.now() + self._delay
 
 
 class EmulatedLens:
@@ -112,9 +108,8 @@ class EmulatedLens:
     def command(self, position: int) -> None:
         """Start a move to a position."""
         with self._lock:
-            now = self._clock.now()
-            self._drive.axis.forget(now - REMEMBERED)
-            self._rests = self._drive.axis.command(now + self._delay, float(min(max(position, 0), self.last)))
+            t = self._clock.now() + self._delay
+            self._rests = self._drive.axis.command(t, float(min(max(position, 0), self.last)))
 
     def position(self) -> int:
         """Return the present position."""
@@ -128,7 +123,7 @@ class EmulatedLens:
 # The world
 
 FIXED_HZ, ZOOM_HZ = 15.0, 10.0  # frame rates that one core renders, with a client on another core
-OLDEST = REMEMBERED - 1.0  # age of the oldest exposure that is rendered, after the program was suspended [s]
+OLDEST = 4.0  # age of the oldest exposure that is rendered, after the program was suspended [s]
 STILL_TIMEOUT = 5.0  # [s]
 START_TIMEOUT = 60.0  # time limit to compile the world and open OpenGL on a slow machine [s]
 STILL_INDEX = 1_000_000_000  # first frame index of stills, whose noise must differ from the stream's

@@ -4,11 +4,15 @@ A new command replaces the motion from its time on, also while an axis moves.
 """
 
 import math
-from bisect import bisect_left, bisect_right
-from dataclasses import dataclass, field
+from bisect import bisect_right
+from collections import deque
+from dataclasses import dataclass
 
 # Segment of constant acceleration: start time `t`, position `x`, speed `v` and acceleration `a`.
 Segment = tuple[float, float, float, float]
+# Motion is remembered this long before the newest command [s]. A frame is exposed, and the truth of a step asked for,
+# less than some seconds later.
+HISTORY_S = 60.0
 
 
 def trapezoid(t: float, x: float, v: float, goal: float, speed: float, acceleration: float) -> list[Segment]:
@@ -53,35 +57,63 @@ def trapezoid(t: float, x: float, v: float, goal: float, speed: float, accelerat
     return segments
 
 
-@dataclass
+@dataclass(slots=True)
+class Plan:
+    """Motion from one command on, up to the start of the next plan.
+
+    Attributes:
+        t: time at which the command takes effect [s].
+        segments: the motor's motion, in order of time; the first segment starts at ``t``.
+        driven: position of the driven side at ``t``.
+        before: the plan that this one replaced from ``t`` on; None at the start of the history.
+    """
+
+    t: float
+    segments: list[Segment]
+    driven: float
+    before: "Plan | None"
+
+
 class Axis:
-    """Axis with a history, so that its position is known at every time up to the end of the newest command.
+    """Axis with a history, so that its position is known at every time of the last `HISTORY_S`.
+
+    A command takes the same time and memory however long the history is. One thread may command while others read at
+    times before the newest command takes effect.
 
     Attributes:
         speed: speed limit.
         acceleration: acceleration limit.
-        backlash: play; the driven side lags the motor by up to half of it.
-        position: position before the first command.
     """
 
-    speed: float
-    acceleration: float
-    backlash: float = 0.0
-    position: float = 0.0
-    _segments: list[Segment] = field(default_factory=list)
-    _before: float = 0.0  # position of the driven side at the start of the history
+    def __init__(self, speed: float, acceleration: float, backlash: float = 0.0, position: float = 0.0) -> None:
+        """Make an axis at rest.
 
-    def __post_init__(self) -> None:
-        self._segments = [(-math.inf, self.position, 0.0, 0.0)]
-        self._before = self.position
+        Args:
+            speed: speed limit.
+            acceleration: acceleration limit.
+            backlash: play; the driven side lags the motor by up to half of it.
+            position: position before the first command.
+        """
+        self.speed, self.acceleration = speed, acceleration
+        self._half = backlash / 2
+        self._newest = Plan(-math.inf, [(-math.inf, position, 0.0, 0.0)], position, None)
+        self._kept = deque([self._newest])  # oldest first; readers follow the links in place of it
 
     def command(self, t: float, goal: float, speed: float | None = None) -> float:
         """Replace the motion from time t [s] on; return the time of rest [s]."""
         x, v = self.motor(t)
-        kept = self._segments[: bisect_left(self._segments, (t,))]
         highest = self.speed if speed is None else min(speed, self.speed)
-        self._segments = kept + trapezoid(t, x, v, goal, highest, self.acceleration)
-        return self._segments[-1][0]
+        segments = trapezoid(t, x, v, goal, highest, self.acceleration)
+        kept = self._kept
+        while kept[-1].t >= t:
+            kept.pop()
+        before = kept[-1]
+        self._newest = Plan(t, segments, self._driven(before, t, segments[0][1]), before)
+        kept.append(self._newest)
+        while kept[1].t <= t - HISTORY_S:
+            kept.popleft()
+            kept[0].before = None
+        return segments[-1][0]
 
     def halt(self, t: float) -> float:
         """Brake from time t [s] on at the acceleration limit; return the time of rest [s]."""
@@ -90,24 +122,38 @@ class Axis:
             return self.command(t, x)
         return self.command(t, x + v * abs(v) / (2 * self.acceleration))
 
-    def forget(self, t: float) -> None:
-        """Drop the history before time t [s]; later calls must not ask for earlier times."""
-        first = max(i for i, segment in enumerate(self._segments) if segment[0] <= t)
-        if first:
-            self._before = self.driven(self._segments[first][0])
-            self._segments = self._segments[first:]
-
     def motor(self, t: float) -> tuple[float, float]:
-        """Give position and speed of the motor side at time t [s]."""
-        return _at(self._segments, t)
+        """Give position and speed of the motor side at time t [s].
+
+        Raises:
+            ValueError: the time is before the history.
+        """
+        return _at(self._plan(t).segments, t)
 
     def driven(self, t: float) -> float:
-        """Give the position of the driven side at time t [s]: the motor's, with hysteresis from the backlash."""
-        segments = self._segments  # another thread may replace the list, but does not change it
-        if self.backlash == 0.0:
-            return _at(segments, t)[0]
-        half = self.backlash / 2
-        y = self._before
+        """Give the position of the driven side at time t [s]: the motor's, with hysteresis from the backlash.
+
+        Raises:
+            ValueError: the time is before the history.
+        """
+        plan = self._plan(t)
+        x = _at(plan.segments, t)[0]
+        return self._driven(plan, t, x)
+
+    def _plan(self, t: float) -> Plan:
+        """Find the plan that moves the axis at time t [s]."""
+        plan = self._newest
+        while plan.t > t:
+            if plan.before is None:
+                raise ValueError(f"the motion at {t:g} s is forgotten; an axis remembers the last {HISTORY_S:g} s")
+            plan = plan.before
+        return plan
+
+    def _driven(self, plan: Plan, t: float, x: float) -> float:
+        """Follow the driven side through a plan to time t [s], where the motor is at ``x``."""
+        half, segments, y = self._half, plan.segments, plan.driven
+        if not half:
+            return x
         for i, (start, _, v, a) in enumerate(segments):
             if start > t:
                 break
@@ -115,8 +161,8 @@ class Axis:
             turns = start - v / a if a else math.nan  # time at which the motor reverses within this segment
             for when in (turns, end):
                 if start < when <= end:
-                    x = _at(segments, when)[0]
-                    y = min(max(y, x - half), x + half)
+                    at = x if when == t else _at(segments, when)[0]
+                    y = min(max(y, at - half), at + half)
         return y
 
 

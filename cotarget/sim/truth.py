@@ -219,7 +219,7 @@ class Truth:
             nominal_px: nominal focal length of the zoom lens [px].
             x_world: the point in the world [m], (3,).
         """
-        data = self._copy(self.set_bodies(0.0))
+        data = self._spare_data()
         data.joint(RIG + "pan").qpos[0], data.joint(RIG + "tilt").qpos[0] = pan, tilt
         mujoco.mj_kinematics(self.model, data)
         lens = self.zoom_lens_for(nominal_px)
@@ -279,12 +279,16 @@ class Truth:
 
     def _copy(self, data: "mujoco.MjData") -> "mujoco.MjData":
         """Copy a state to data that may be changed; the world caches its own until another time is requested."""
-        if not self._scratch:
-            self._scratch.append(mujoco.MjData(self.model))
-        copy = self._scratch[0]
+        copy = self._spare_data()
         copy.qpos[:], copy.mocap_pos[:], copy.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
         mujoco.mj_kinematics(self.model, copy)
         return copy
+
+    def _spare_data(self) -> "mujoco.MjData":
+        """Give data that may be changed, in any state."""
+        if not self._scratch:
+            self._scratch.append(mujoco.MjData(self.model))
+        return self._scratch[0]
 
     def _outline(self, name: str, data: "mujoco.MjData", view: tuple[Array, Array], lens: TrueLens) -> Array:
         """Project the points on a target's geoms, in their order, (n, 2) [px]; nan where the camera images none."""

@@ -112,8 +112,10 @@ def test_a_head_that_arrives_early_is_not_sent_again(unit):
 @pytest.mark.parametrize("v", [0.0, 0.5, -0.8])
 def test_an_axis_moves_as_the_simulated_unit(goal, speed, v):
     limit = min(speed, LIMITS.speed)
-    axis = Axis(LIMITS.speed, LIMITS.acceleration)
-    axis._segments = [(-math.inf, -v * 100, 0.0, 0.0), (-100.0, -v * 100, v, 0.0)]
+    # For 100 s at v, it comes from as far as that takes it, less what speeding up cost, and passes 0 at time 0.
+    begin = -100 * v + v * abs(v) / (2 * LIMITS.acceleration)
+    axis = Axis(LIMITS.speed, LIMITS.acceleration, position=begin)
+    axis.command(-100.0, begin + 200 * v, abs(v) or None)
     axis.command(0.0, goal, limit)
     for seconds in (0.0, 0.03, 0.1, 0.3, 1.0, 4.0):
         assert axis_at(seconds, 0.0, v, goal, limit, LIMITS.acceleration) == pytest.approx(

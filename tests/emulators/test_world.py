@@ -13,10 +13,10 @@ from cotarget.emulators.faults import Faults
 from cotarget.emulators.ptu_d46.firmware import D46_FAULTS, make_twins
 from cotarget.emulators.ptu_d46.unit import D46_STOCK
 from cotarget.emulators.serve import JsonLines
-from cotarget.emulators.world import FIXED_HZ, REMEMBERED, ZOOM_HZ, EmulatedAxis, EmulatedLens, LiveWorld, paced
+from cotarget.emulators.world import FIXED_HZ, OLDEST, ZOOM_HZ, EmulatedAxis, EmulatedLens, LiveWorld, paced
 from cotarget.errors import ConfigError, DeviceError
 from cotarget.geometry import pose
-from cotarget.sim.motion import Axis, HeadDrive, LensDrive
+from cotarget.sim.motion import HISTORY_S, Axis, HeadDrive, LensDrive
 
 STEP = math.radians(0.05)  # [rad]
 DELAY = 0.04  # from a command to motion [s]
@@ -105,17 +105,6 @@ def test_a_new_goal_on_the_fly_replaces_the_old_one(clock):
     clock.t = 10.0
     assert plant.position() == 0
     assert not plant.moving()
-
-
-def test_an_axis_remembers_for_the_exposures_and_forgets_the_rest(clock):
-    inner = Axis(1000 * STEP, 2000 * STEP)
-    plant = EmulatedAxis(inner, clock, STEP, DELAY)
-    for i in range(200):
-        clock.t = float(i)
-        plant.command(100 * (i % 2), 1000, 2000)
-    assert inner.driven(195.9) == pytest.approx(100 * STEP)
-    assert inner.driven(196.9) == pytest.approx(0.0)
-    assert len(inner._segments) < 40
 
 
 def test_a_head_without_a_profile_jumps(clock):
@@ -338,7 +327,7 @@ def test_a_world_goes_on_after_the_machine_stood_still(fake):
         world.pan.command(10, 1000, 1000)
         fake.act = act
         assert exposing.wait(DEADLINE_S)
-        world.clock._start -= 4 * REMEMBERED
+        world.clock._start -= 4 * HISTORY_S
         world.pan.command(0, 1000, 1000)
         awake.set()
         after = world.clock.now()
@@ -348,8 +337,8 @@ def test_a_world_goes_on_after_the_machine_stood_still(fake):
             assert time.monotonic() < deadline
             newest = world.feeds["fixed"].newest(after=-1 if newest is None else newest.index, timeout=DEADLINE_S)
         world.check()
-    assert moments[0] < after - REMEMBERED
-    assert not [t for t in moments[1:] if t < after - REMEMBERED]
+    assert moments[0] < after - OLDEST
+    assert not [t for t in moments[1:] if t < after - OLDEST]
 
 
 @pytest.mark.wire

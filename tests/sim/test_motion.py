@@ -1,6 +1,9 @@
 """Head and lens motion against numerical integration and hand-worked moves."""
 
 import math
+import sys
+import tracemalloc
+from bisect import bisect_right
 
 import numpy as np
 import pytest
@@ -8,9 +11,11 @@ import pytest
 from cotarget.config import SimCamera, SimEffects, SimHead, SimZoomCamera
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.sim.devices import SimClock, SimPanTilt, SimStream, SimZoomStream, head_drive, lens_drive
-from cotarget.sim.motion import Axis, trapezoid
+from cotarget.sim.motion import HISTORY_S, Axis, trapezoid
 
 ROUNDING = 1e-9
+A_COMMAND = 4096  # limit on the memory of one command's motion, some 1000 [bytes]
+AGED = 1.05  # memory after ten minutes over that after two; the history's length varies by a command or two
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -156,15 +161,81 @@ def test_the_lens_steps_and_takes_its_time():
     assert math.log(said / shortest, step) == pytest.approx(round(math.log(said / shortest, step)))
 
 
-def test_an_axis_that_forgets_goes_on_as_if_it_remembered():
-    """Also where play hangs on the way it came: up to 1, back by less than the play, forget, then on."""
-    axes = [Axis(1.0, 10.0, backlash=0.1) for _ in range(2)]
-    for t, goal in ((0.0, 1.0), (3.0, 0.95), (5.0, 0.4)):
-        for axis in axes:
-            axis.command(t, goal)
-        if t == 3.0:
-            axes[1].forget(4.5)
-    assert len(axes[1]._segments) < len(axes[0]._segments)
-    for t in (4.6, 5.2, 5.5, 7.0):
-        assert axes[1].driven(t) == axes[0].driven(t)
-        assert axes[1].motor(t) == axes[0].motor(t)
+class Remembering:
+    """An axis with backlash that keeps its whole history in one list, as slow as it is plain."""
+
+    def __init__(self, speed, acceleration, backlash):
+        self.limits, self.half, self.segments = (speed, acceleration), backlash / 2, [(-math.inf, 0.0, 0.0, 0.0)]
+
+    def command(self, t, goal):
+        x, v = self.motor(t)
+        kept = [segment for segment in self.segments if segment[0] < t]
+        self.segments = kept + trapezoid(t, x, v, goal, *self.limits)
+
+    def motor(self, t):
+        start, x, v, a = self.segments[bisect_right(self.segments, t, key=lambda segment: segment[0]) - 1]
+        dt = t - start if v or a else 0.0
+        return x + v * dt + a * dt * dt / 2, v + a * dt
+
+    def driven(self, t):
+        """Let the driven side be pulled along at every turn and at the end of every segment."""
+        y = 0.0
+        for i, (start, _, v, a) in enumerate(self.segments):
+            end = min(t, self.segments[i + 1][0] if i + 1 < len(self.segments) else t)
+            for when in (start - v / a if a else math.nan, end):
+                if start < when <= end:
+                    x = self.motor(when)[0]
+                    y = min(max(y, x - self.half), x + self.half)
+        return y
+
+
+@pytest.mark.parametrize("limits", [(1.0, 10.0), (1.0, math.inf)])
+def test_an_axis_that_forgets_stands_where_one_that_remembers_stands(limits):
+    """Bit by bit, where play hangs on all of the way that it came, and motions are replaced before they begin."""
+    rng = np.random.default_rng(1)
+    axis, whole = Axis(*limits, backlash=0.05), Remembering(*limits, 0.05)
+    t = 0.0
+    for _ in range(200):
+        t += rng.choice([0.01, 0.04, 2.0])
+        goal = rng.uniform(-0.2, 0.2)
+        for each in (axis, whole):
+            each.command(t + 0.04, goal)
+        for age in (0.0, 0.02, 0.5):
+            assert axis.motor(t - age) == whole.motor(t - age)
+            assert axis.driven(t - age) == whole.driven(t - age)
+    assert t > 2 * HISTORY_S
+    with pytest.raises(ValueError, match="the motion at 1 s is forgotten"):
+        axis.driven(1.0)
+
+
+def test_a_command_costs_after_ten_minutes_what_it_costs_after_two():
+    """Calls and memory of a command and a reading at 25 Hz, and the memory of the history."""
+    axis = Axis(1.0, 10.0, backlash=0.01)
+
+    def step(i):
+        axis.command(i / 25 + 0.04, float(i % 2))
+        axis.driven(i / 25)
+
+    def cost(i):
+        calls = []
+        sys.setprofile(lambda frame, event, arg: calls.append(event))
+        step(i)
+        sys.setprofile(None)
+        held = tracemalloc.get_traced_memory()[0]
+        tracemalloc.reset_peak()
+        step(i + 1)
+        return len(calls), tracemalloc.get_traced_memory()[1] - held, held
+
+    costs, minutes = [], 60 * 25
+    tracemalloc.start()
+    try:
+        for begin, end in ((0, 2 * minutes), (2 * minutes, 10 * minutes)):
+            for i in range(begin, end):
+                step(i)
+            costs.append(cost(end))
+    finally:
+        tracemalloc.stop()
+    (calls, more, held), (calls_later, more_later, held_later) = costs
+    assert calls_later <= calls
+    assert max(more, more_later) <= A_COMMAND
+    assert held_later <= AGED * held

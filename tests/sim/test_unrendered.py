@@ -93,3 +93,13 @@ def test_asking_for_a_pointing_miss_leaves_the_world_where_it_was():
         truth.line_of_sight_miss(0.5, 0.2, rig.zoom.focal_range[0], np.array([0.0, 10.0, 2.0]))
         truth.largest_side_px("person", "zoom", 0.0)
         np.testing.assert_array_equal(truth.T_world_camera("zoom", 0.0).as_matrix(), before)
+
+
+def test_a_pointing_miss_can_be_asked_for_however_old_the_world_is():
+    with (w := SimWorld(config(), rendered=())).rig as rig:
+        asked = 0.5, 0.2, rig.zoom.focal_range[0], np.array([0.0, 10.0, 2.0])
+        before = w.truth().line_of_sight_miss(*asked)
+        for t in (100.0, 200.0):
+            rig.clock.sleep_until(t)
+            rig.head.move(0.01 * t, 0.0, wait=True)
+        assert w.truth().line_of_sight_miss(*asked) == before
