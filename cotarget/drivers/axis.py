@@ -11,7 +11,7 @@ import os
 import re
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -276,8 +276,7 @@ class WebDevice:
 
     def __init__(self, url: str, user: str, password: str, silence_s: float) -> None:
         self.url = url
-        self._user, self._password = user, password
-        self._scheme = ""
+        self._password = password
         self._asked: socket.socket | None = None  # of the response that is being read
         self._ended = False
         self._lock = threading.Lock()
@@ -285,6 +284,7 @@ class WebDevice:
         try:
             self._client: httpx.Client = self._httpx.Client(
                 base_url=url,
+                auth=_authentication(user, password) if user else None,
                 timeout=self._httpx.Timeout(silence_s, connect=CONNECT_S),
                 # Loading the machine's certificates takes longer than a connection; http needs none.
                 verify=url.startswith("https:"),
@@ -317,10 +317,8 @@ class WebDevice:
         Raises:
             DeviceError: the device cannot be reached, or does not speak HTTP.
         """
-        response = self._send(path, query)
-        if self._challenged(response):
-            response.close()
-            response = self._send(path, query)
+        with self._understood():
+            response = self._client.send(self._client.build_request("GET", path, params=query), stream=True)
         with contextlib.closing(response), self._held(response):
             yield response
 
@@ -360,23 +358,6 @@ class WebDevice:
         text = " ".join("".join(c if c.isprintable() else " " for c in text).split())
         return text if len(text) <= LONGEST_QUOTE else f"{text[:LONGEST_QUOTE]}..."
 
-    def _send(self, path: str, query: dict[str, str]) -> "httpx.Response":
-        with self._understood():
-            return self._client.send(self._client.build_request("GET", path, params=query), stream=True)
-
-    def _challenged(self, response: "httpx.Response") -> bool:
-        """Choose the authentication that the device demands; return whether to send the request again."""
-        if response.status_code != 401 or not self._user:
-            return False
-        schemes = [line.split(" ")[0].lower() for line in response.headers.get_list("www-authenticate")]
-        scheme = next((known for known in ("digest", "basic") if known in schemes), "")
-        if scheme in ("", self._scheme):
-            return False
-        self._scheme = scheme
-        auth = self._httpx.DigestAuth if scheme == "digest" else self._httpx.BasicAuth
-        self._client.auth = auth(self._user, self._password)
-        return True
-
     @contextlib.contextmanager
     def _held(self, response: "httpx.Response") -> Iterator[None]:
         """Register a response so that `end` can break it off."""
@@ -415,6 +396,40 @@ class WebDevice:
                 return f"broke off ({self.quote(str(error))})"
             case _:
                 return f"does not speak HTTP as it should ({self.quote(str(error))}): {check}"
+
+
+def _authentication(user: str, password: str) -> "httpx.Auth":
+    """Make the authentication by the scheme that the device demands, digest before basic; each is tried once."""
+    import httpx
+
+    class DemandedAuth(httpx.Auth):
+        def __init__(self) -> None:
+            self._schemes = {"digest": httpx.DigestAuth(user, password), "basic": httpx.BasicAuth(user, password)}
+            self._auth = httpx.Auth()  # sends the request as it is
+
+        def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
+            response = yield from _last_response(self._auth.auth_flow(request))
+            lines = response.headers.get_list("www-authenticate") if response.status_code == 401 else []
+            demanded = {line.split(" ")[0].lower() for line in lines}
+            auth = next((auth for scheme, auth in self._schemes.items() if scheme in demanded), self._auth)
+            if auth is not self._auth:
+                self._auth = auth
+                yield from auth.auth_flow(request)
+
+    return DemandedAuth()
+
+
+def _last_response(
+    flow: "Generator[httpx.Request, httpx.Response, None]",
+) -> "Generator[httpx.Request, httpx.Response, httpx.Response]":
+    """Send the requests of a flow, and return the last one's response."""
+    request = next(flow)
+    while True:
+        response = yield request
+        try:
+            request = flow.send(response)
+        except StopIteration:
+            return response
 
 
 def _import_httpx() -> ModuleType:

@@ -326,6 +326,18 @@ def test_authentication_is_what_the_server_asks_for(server, scheme, place, monke
     assert "hunter2" not in caplog.text
 
 
+def test_authentication_may_change_while_the_camera_is_open(server):
+    open_pages = dict(server.pages)
+    guard(server, "basic")
+    with opened(server, user="root", password=PASSWORD) as camera:
+        t = camera.read().t
+        server.pages.update(open_pages)
+        guard(server, "digest")
+        server.viewer().cut()
+        server.viewer().send(part(jpeg(1)))
+        assert camera.read(t, PATIENCE_S).t > t
+
+
 @pytest.mark.parametrize("scheme", CHALLENGES)
 def test_a_wrong_password_is_told_without_telling_it(server, scheme, monkeypatch, caplog):
     caplog.set_level(logging.DEBUG)
