@@ -15,6 +15,7 @@ from cotarget.errors import StaleFrameError
 from cotarget.geometry import RigidTransform
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Lens, Stop, Truth
+from tests.rigs import rig_of
 
 PERIOD = 0.04
 LATENCY = 0.05
@@ -129,6 +130,7 @@ class SyntheticRig:
         self.frames = 0
         self.fixed, self.zoom = _Camera(self, "fixed"), _Zoom(self, "zoom")
         self.head, self.clock, self.board = _Head(self), _Clock(self), _Board(self)
+        self.spec, self.config = rig_of(self).spec, None
 
     def image(self, camera, t):
         self.frames += 1

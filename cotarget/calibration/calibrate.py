@@ -6,6 +6,7 @@ the shortest focal length, and those of each zoom sample until the one before is
 """
 
 import dataclasses
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -25,6 +26,7 @@ from cotarget.calibration.joint import (
     NO_PLACE,
     SAME_FOCAL,
     expected_corners,
+    fewest_stops,
     find_expected,
     fit_stop,
     joint,
@@ -44,12 +46,20 @@ from cotarget.calibration.model import (
     unseen,
 )
 from cotarget.calibration.sequential import sequential
-from cotarget.calibration.session import SETTLE, CaptureRecorder, capture_session, view_of
+from cotarget.calibration.session import (
+    SETTLE,
+    SETTLE_LONG,
+    CaptureRecorder,
+    capture_session,
+    view_of,
+    with_stills,
+)
 from cotarget.config import BoardConfig, RigConfig
 from cotarget.errors import CalibrationError, choices
 from cotarget.geometry import Array
 from cotarget.rig import Rig, opened_from
 
+log = logging.getLogger(__name__)
 NO_BOARD = "no whole board of {}x{} corners is seen"
 TWO_BOARDS = "two boards are in this picture; show one"
 GUESSES = 10  # images searched for another size of board when none shows the configured one
@@ -415,6 +425,25 @@ def _calibrate_images(
     )
 
 
+def _enough_stops(wanted: int, focal_range_px: tuple[float, float]) -> int:
+    """Give the number of zoom samples: as requested, or as many as matching a board across them needs.
+
+    One sample means the shortest focal length alone.
+    """
+    needed = fewest_stops(*focal_range_px)
+    if not 1 < wanted < needed:
+        return wanted
+    leap = (focal_range_px[1] / focal_range_px[0]) ** (1 / (wanted - 1))
+    log.warning(
+        "%d stops of the zoom lens are %.2g times apart, too far to know the board again from one to the next; %d are "
+        "taken",
+        wanted,
+        leap,
+        needed,
+    )
+    return needed
+
+
 def calibrate(
     rig: Rig,
     board: BoardConfig | None = None,
@@ -426,34 +455,41 @@ def calibrate(
     far_placements: int = FAR_PLACEMENTS,
     seed: int = 0,
     pitch_mm: float | None = None,
-    settle: float = SETTLE,
+    settle: float | None = None,
     config: RigConfig | None = None,
     options: Options = DEFAULT_OPTIONS,
 ) -> Calibration:
     """Drive a rig through a capture session, and calibrate it from the views.
 
+    The zoom camera takes full stills where it has them.
+
     Args:
         rig: rig to calibrate; no earlier calibration is needed.
-        board: the board in use; None for the board and `pitch_mm` of the rig's configuration.
+        board: the board in use; None for that of the rig's configuration.
         captures_dir: folder for the images; None to keep none.
         progress: called with the number done, the total, and a text.
-        placements: number of placements of the board at the shortest focal length.
-        stops: number of zoom samples, evenly spread over the logarithm of the lens's range; 1 for the shortest alone.
+        placements: number of placements of the board at the shortest focal length, at least 7.
+        stops: number of zoom samples, evenly spread over the logarithm of the lens's range, and more where they would
+            be too far apart; 1 for the shortest alone.
         far_placements: number of further placements, far away, for the zoom samples beyond the first.
         seed: seed of the choice among possible placements.
-        pitch_mm: pixel size of the zoom camera [mm]; None if unknown.
-        settle: time after head and board stand until an image counts [s].
-        config: configuration of the rig, stored beside the captures.
+        pitch_mm: pixel size of the zoom camera's images [mm]; None for the one that the camera gives.
+        settle: time after head and board stand until an image counts [s]; None for a short one in a simulation, and a
+            long one in real time.
+        config: configuration stored beside the captures; None for that of the rig.
         options: options of the calibration.
 
     Raises:
         CalibrationError: a camera never sees the board, there is no common view, or the head fails.
-        ConfigError: the board looks the same upside down.
+        ConfigError: the board looks the same upside down, or the session is too short.
     """
-    if board is None:
-        opened = opened_from(rig)
-        board, pitch_mm = opened.board, opened.pitch_mm if pitch_mm is None else pitch_mm
-    recorder = CaptureRecorder(rig, board, captures_dir, pitch_mm, settle, config)
+    rig = with_stills(rig)
+    board = opened_from(rig).board if board is None else board
+    pitch_mm = rig.spec.zoom.pitch_mm if pitch_mm is None else pitch_mm
+    if settle is None:
+        settle = SETTLE_LONG if rig.spec.real_time else SETTLE
+    stops = _enough_stops(stops, rig.zoom.focal_range)
+    recorder = CaptureRecorder(rig, board, captures_dir, pitch_mm, settle, config or rig.config)
     rng = np.random.default_rng(seed)
     capture_session(recorder, placements, rng, progress, stops=stops, far_placements=far_placements)
     provenance = {

@@ -41,6 +41,7 @@ from cotarget.calibration.handeye import motions, park_martin
 from cotarget.calibration.initialization import board_pose, place_boards, pose_candidates, rough_intrinsics
 from cotarget.calibration.joint import (
     FEWEST_CORNERS,
+    FEWEST_STOP_PLACEMENTS,
     SAME_FOCAL,
     expected_corners,
     expected_inside,
@@ -66,7 +67,7 @@ from cotarget.calibration.planning import (
 )
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig, RigConfig
-from cotarget.errors import CalibrationError, CotargetError, HaltedError, StaleFrameError
+from cotarget.errors import CalibrationError, ConfigError, CotargetError, HaltedError, StaleFrameError
 from cotarget.geometry import Array, RigidTransform, Rotation, pose_dict
 from cotarget.pantilt import base_head, solve
 from cotarget.rig import (
@@ -893,6 +894,9 @@ MARGIN_GROWTH, WIDEST_MARGIN = 3.0, 0.15  # factor of the margin at every miss, 
 MOVED_VIEWS = 3  # zoom views per placement with the head away from home
 CHOICES = 6  # candidates for the next placement, half of them seen by both cameras at home where possible
 REFIT_ALWAYS, REFIT_EVERY = 8, 6  # refit after each of the first 8 placements, then after every 6th
+# Placements that the rough model takes: one straight ahead, the tilted ones, one that the zoom camera finds, and that
+# one tilted otherwise.
+FEWEST_PLACEMENTS = 1 + LEARNING + 2
 MOST_MISSES = 4  # placements in a row that the fixed camera may miss before the session fails
 
 
@@ -909,8 +913,7 @@ def capture_session(
 
     Args:
         recorder: recorder of a rig that stands still.
-        placements: number of placements of the board. It includes those for the first rough model, which are taken in
-            any case.
+        placements: number of placements of the board at the shortest focal length, with those for the rough model.
         stops: number of zoom samples.
         far_placements: number of further placements for the zoom samples beyond the first.
         rng: random numbers, which choose among possible placements.
@@ -918,8 +921,13 @@ def capture_session(
 
     Raises:
         CalibrationError: a camera never sees the board, or the head or the lens fails.
+        ConfigError: the board looks the same upside down, or there are too few placements or zoom samples.
     """
     check_board(recorder.board)
+    _check_least("placements", placements, FEWEST_PLACEMENTS)
+    _check_least("stops", stops, 1)
+    if stops > 1:
+        _check_least("far_placements", far_placements, FEWEST_STOP_PLACEMENTS)
     nominal = spread_stops(*recorder.rig.zoom.focal_range, stops)
     total = placements + (far_placements if len(nominal) > 1 else 0)
 
@@ -946,6 +954,12 @@ def capture_session(
     recorder.rig.board.present(None)
     if progress is not None:
         progress(total, total, "fitting")
+
+
+def _check_least(name: str, value: int, least: int) -> None:
+    """Refuse a session that is too short to calibrate a rig."""
+    if value < least:
+        raise ConfigError(f"{name}: {value} is too few for a session; it takes {least} at least")
 
 
 def _break_off(recorder: CaptureRecorder) -> None:

@@ -36,7 +36,6 @@ def calibrate(options: argparse.Namespace) -> None:
     from cotarget import calibration as cal
     from cotarget.backends import open_rig
     from cotarget.calibration.calibrate import calibrate as calibrate_rig
-    from cotarget.calibration.session import SETTLE, SETTLE_LONG, with_stills
     from cotarget.config import BoardConfig, load_config
     from cotarget.safety.stop_file import refuse_if_stopped
 
@@ -60,21 +59,13 @@ def calibrate(options: argparse.Namespace) -> None:
             refuse_if_stopped(config.safety.stop_file)
             check_board_is_told(options.rig, config)
             with open_rig(config) as rig:
-                session = {name: getattr(options, name) for name in _given(options, SESSION)}
-                if options.stops is not None:
-                    session["stops"] = _enough_stops(options.stops, rig.zoom.focal_range)
-                finer = rig.zoom.still_size[0] / rig.zoom.size[0]
                 found = calibrate_rig(
-                    with_stills(rig),
-                    config.board,
+                    rig,
                     captures_dir=options.captures,
                     progress=tell,
-                    pitch_mm=config.pitch_mm / finer,
-                    settle=SETTLE if config.backend == "sim" else SETTLE_LONG,
                     seed=config.sim.seed,
-                    config=config,
                     options=how,
-                    **session,
+                    **{name: getattr(options, name) for name in _given(options, SESSION)},
                 )
         elif options.board is not None:
             board = BoardConfig(options.kind or "chessboard", options.board, options.square)
@@ -83,10 +74,21 @@ def calibrate(options: argparse.Namespace) -> None:
             found = cal.calibrate_captures(options.source, options=how, progress=tell)
         with previous_kept(options.out):
             cal.save_calibration(options.out, found)
-    assert found.residuals is not None
-    for rejected in found.residuals.rejected:
-        print(f"not used: {rejected.name}: {rejected.reason}", file=sys.stderr)
-    print_json(summary(found, options.out))
+    _print_result(found, options.out)
+
+
+def _print_result(found: "Calibration", path: Path) -> None:
+    """Print the verdict in a sentence to a terminal, and the whole summary as JSON to anything else."""
+    residuals = found.residuals
+    assert residuals is not None
+    if left_out := len(residuals.rejected):
+        images = left_out + residuals.fixed_views + residuals.zoom_views
+        print(f"not used: {left_out} of {images} images; {path} has the reasons (residuals.rejected)", file=sys.stderr)
+    told = summary(found, path)
+    if sys.stdout.isatty():
+        print(f"{path}: {told['verdict']}")
+    else:
+        print_json(told)
 
 
 def _lists(directory: Path | None) -> list[Path]:
@@ -123,25 +125,6 @@ def _captures_kept(directory: Path | None) -> Iterator[None]:
                     file=sys.stderr,
                 )
         raise
-
-
-def _enough_stops(wanted: int, focal_range_px: tuple[float, float]) -> int:
-    """Give the number of zoom samples: as requested, or as many as matching a board across them needs.
-
-    One sample means the shortest focal length alone.
-    """
-    from cotarget.calibration.joint import fewest_stops
-
-    needed = fewest_stops(*focal_range_px)
-    if not 1 < wanted < needed:
-        return wanted
-    leap = (focal_range_px[1] / focal_range_px[0]) ** (1 / (wanted - 1))
-    print(
-        f"{wanted} stops of the zoom lens are {leap:.2g} times apart, too far to know the board again from one to the "
-        f"next; {needed} are taken",
-        file=sys.stderr,
-    )
-    return needed
 
 
 def _given(options: argparse.Namespace, names: Sequence[str]) -> list[str]:

@@ -163,13 +163,14 @@ def _parser() -> argparse.ArgumentParser:
         "--placements",
         type=count,
         metavar="N",
-        help="with --rig: number of board placements; the first handful is taken in any case (30)",
+        help="with --rig: number of board placements at the shortest focal length, at least 7 (30)",
     )
     calibrate.add_argument(
         "--stops",
         type=count,
         metavar="N",
-        help="with --rig: number of zoom samples, more where they are too far apart; 1: shortest alone (8)",
+        help="with --rig: number of zoom samples, more where they are too far apart; 1: shortest alone, otherwise with "
+        "6 more placements far away (8)",
     )
     calibrate.add_argument(
         "--method",

@@ -426,12 +426,15 @@ def test_photos_are_calibrated(folder, capsys):
     (folder / "photos" / "left99.png").write_bytes((folder / "photos" / "left0.png").read_bytes())
     status, out, err = call(capsys, *FROM, "photos", *PHOTOS)
     assert status == 0
-    assert "not used: left99.png: has no partner" in err
+    assert err.splitlines()[-1] == "not used: 2 of 17 images; out.json has the reasons (residuals.rejected)"
     told = json.loads(out)
     assert told["calibration"] == "out.json"
     assert told["baseline_m"] == pytest.approx(np.linalg.norm(truth.gamma.translation), abs=0.01)
     assert max(told["fixed_rms_px"], told["zoom_rms_px"], told["stereo_rms_px"]) < 0.1
-    assert json.loads((folder / "out.json").read_text())["T_head_zoom"] is None
+    saved = json.loads((folder / "out.json").read_text())
+    assert saved["T_head_zoom"] is None
+    alone = {"name": "left99.png", "reason": "has no partner with the same number"}
+    assert alone in saved["residuals"]["rejected"]
 
 
 def test_photos_of_a_board_with_markers_are_calibrated(folder, capsys):
@@ -513,10 +516,12 @@ def test_the_sequential_method_leaves_other_focal_lengths_alone(folder, capsys, 
     status, out, err = call(capsys, *FROM, directory, "--method", "sequential")
     assert status == 0, err
     assert json.loads(out)["rejected"] == 4
+    assert f"not used: 4 of {len(rows)} images" in err
     far = [row["file"] for row in rows if row["focal_px"] == 2 * NOMINAL_PX]
-    assert err == "".join(
-        f"not used: {name}: taken at 1334 px, not at the shortest focal length, 667 px\n" for name in far
-    )
+    told = json.loads((folder / "out.json").read_text())["residuals"]["rejected"]
+    assert told == [
+        {"name": name, "reason": "taken at 1334 px, not at the shortest focal length, 667 px"} for name in far
+    ]
 
 
 @pytest.mark.render

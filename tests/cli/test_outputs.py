@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import sys
 from types import SimpleNamespace
 
 import cv2
@@ -74,10 +75,9 @@ class Session:
     """A capture session that takes an image and then fails, or not."""
 
     def __init__(self, error=None):
-        self.error, self.told = error, {}
+        self.error = error
 
-    def __call__(self, rig, board, *, captures_dir, **told):
-        self.told = told
+    def __call__(self, rig, *, captures_dir, **_):
         if captures_dir is not None:
             captures_dir.mkdir(exist_ok=True)
             (captures_dir / "index.json").write_text("{}")
@@ -91,7 +91,7 @@ def sessions(monkeypatch):
     """Lets `calibrate --rig` open a rig without a world; its session is what a test says."""
     rig = SimulatedDevices()
     rig.zoom.still_size, rig.zoom.focal_range = rig.zoom.size, RigConfig().focal_range_px  # 12 x zoom
-    monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(rig))
+    monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(rig, config=config))
     return lambda error=None: monkeypatch.setattr("cotarget.calibration.calibrate.calibrate", Session(error))
 
 
@@ -124,7 +124,7 @@ def test_captures_of_another_session_are_not_taken_for_its_own(folder, capsys, s
 @pytest.mark.parametrize(
     ("stops", "taken", "said"),
     [
-        (None, None, None),  # as many as the session has by default
+        (None, 8, None),
         (1, 1, None),
         (2, 4, "2 stops of the zoom lens are 12 times apart"),
         (3, 4, "3 stops of the zoom lens are 3.5 times apart"),
@@ -132,21 +132,38 @@ def test_captures_of_another_session_are_not_taken_for_its_own(folder, capsys, s
         (9, 9, None),
     ],
 )
-def test_stops_that_are_too_far_apart_have_others_between_them(
-    folder, capsys, monkeypatch, sessions, stops, taken, said
-):
+@pytest.mark.usefixtures("folder", "sessions")
+def test_stops_that_are_too_far_apart_have_others_between_them(capsys, caplog, monkeypatch, stops, taken, said):
     """Each at most 2.5 times the one before: from 1 to 12 by 2.29 takes three steps."""
-    sessions()
-    session = Session(CalibrationError("enough"))
-    monkeypatch.setattr("cotarget.calibration.calibrate.calibrate", session)
+    asked = {}
+
+    def session(*_, **told):
+        asked.update(told)
+        raise CalibrationError("enough")
+
+    monkeypatch.setattr("cotarget.calibration.calibrate.capture_session", session)
     status, _, err = call(capsys, "calibrate", "--rig", "rig.toml", *([] if stops is None else ["--stops", stops]))
-    assert status == 1
-    assert session.told.get("stops") == taken
-    lines = err.splitlines()
-    assert lines[-1] == "cotarget calibrate: enough"
-    assert len(lines) == 1 + (said is not None)
-    assert said is None or lines[0].startswith(said)
-    assert said is None or lines[0].endswith("; 4 are taken")
+    assert (status, err.splitlines()[-1]) == (1, "cotarget calibrate: enough")
+    assert asked["stops"] == taken
+    assert len(caplog.messages) == (said is not None)
+    assert said is None or caplog.messages[0].startswith(said)
+    assert said is None or caplog.messages[0].endswith("; 4 are taken")
+
+
+@pytest.mark.parametrize("options", [["--placements", "1"], ["--placements", "6", "--stops", "1"]])
+@pytest.mark.usefixtures("folder", "sessions")
+def test_a_session_of_fewer_boards_than_it_needs_is_refused(capsys, options):
+    said = f"placements: {options[1]} is too few for a session; it takes 7 at least"
+    assert call(capsys, "calibrate", "--rig", "rig.toml", *options) == (1, "", f"cotarget calibrate: {said}\n")
+
+
+@pytest.mark.usefixtures("folder", "sessions")
+def test_a_terminal_is_told_the_verdict_alone(capsys, monkeypatch):
+    monkeypatch.setattr("cotarget.cli.calibrating.summary", lambda found, path: {"verdict": "Points well."})
+    found = _with_residuals(true_calibration(RigConfig()))
+    monkeypatch.setattr("cotarget.calibration.calibrate.calibrate", lambda *_, **__: found)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    assert call(capsys, "calibrate", "--rig", "rig.toml") == (0, "calibration.json: Points well.\n", "")
 
 
 def test_an_earlier_calibration_is_kept(folder, capsys, sessions, monkeypatch):

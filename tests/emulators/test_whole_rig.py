@@ -189,7 +189,7 @@ def test_the_simulation_opened_directly_aims_as_it_does_over_the_wire(rig, capsy
 @pytest.mark.slow
 @stands
 def test_a_rig_is_calibrated_over_the_wire(rig, capsys):
-    check_calibration(rig, capsys, placements=4, stops=1)
+    check_calibration(rig, capsys, placements=7, stops=1)
 
 
 @pytest.mark.slow
