@@ -25,7 +25,9 @@ PACKAGES = (
     "pyserial",
     "av",
     "matplotlib",
-    "tqdm",
+    "pydantic",
+    "jinja2",
+    "rich",
 )
 OLDEST_PYTHON = (3, 11)
 # Rendering is tried in its own process, because a broken OpenGL may crash it.

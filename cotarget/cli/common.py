@@ -280,13 +280,16 @@ def progress_bar(now: Callable[[], float] = time.monotonic) -> Iterator[Any]:
     if not sys.stderr.isatty():
         yield _remarks(now)
         return
-    from tqdm import tqdm
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-    with tqdm(total=None, leave=False, bar_format="{desc} |{bar:30}| {percentage:3.0f}% {elapsed}") as bar:
+    columns = TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
+    # Results go to stdout, past the bar.
+    with Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=False) as bar:
+        task = bar.add_task("", total=None)
 
         def show(text: str, done: int, total: int | None) -> None:
-            bar.total, bar.n = total, done if total is None else min(done, total)
-            bar.set_description_str(text)
+            bar.update(task, description=text, completed=done if total is None else min(done, total), total=total)
 
         yield show
 

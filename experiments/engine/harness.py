@@ -24,9 +24,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from tqdm import tqdm
-
-from cotarget.cli.common import count, not_negative
+from cotarget.cli.common import count, not_negative, progress_bar
 from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, CotargetError, DeviceError
 from cotarget.files import write_whole
@@ -294,10 +292,12 @@ def _tried(one: Callable[[int], Any], number: int) -> Any:
 def _all(engine: Engine, work: Callable[[Any], Any], jobs: Sequence[Any], processes: int) -> list[Any]:
     """Run all jobs and give their results in the order of the jobs."""
     found: dict[int, Any] = {}
-    for number, result in tqdm(engine(work, jobs, processes), total=len(jobs), disable=None, leave=False):
-        if result is Died:
-            raise DeviceError(f"the process of job {number + 1} of {len(jobs)} died; is there memory enough?")
-        found[number] = result
+    with progress_bar() as show:
+        for number, result in engine(work, jobs, processes):
+            if result is Died:
+                raise DeviceError(f"the process of job {number + 1} of {len(jobs)} died; is there memory enough?")
+            found[number] = result
+            show(f"{len(found)} of {len(jobs)} jobs", len(found), len(jobs))
     return [found[number] for number in sorted(found)]
 
 

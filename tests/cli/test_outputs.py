@@ -3,6 +3,8 @@
 import json
 import math
 import os
+import pty
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -193,6 +195,34 @@ def test_progress_is_a_line_now_and_then_where_nobody_looks(capsys):
         for done in range(4):
             progress(f"board {done}", done, 8)
     assert capsys.readouterr().err.splitlines() == ["board 1 (12 %, 31 s)", "board 3 (38 %, 62 s)"]
+
+
+SHOWING = """
+from cotarget.cli.common import progress_bar
+with progress_bar() as progress:
+    progress("board [1]", 1, 8)
+    print("a result")
+    progress("board [8]", 9, 8)
+"""
+
+
+def test_progress_is_a_bar_on_a_terminal_beside_the_results():
+    ours, terminal = pty.openpty()
+    made = subprocess.run([sys.executable, "-c", SHOWING], stdout=subprocess.PIPE, stderr=terminal, check=True)
+    os.close(terminal)
+    shown = b"".join(iter(lambda: _read(ours), b"")).decode()
+    os.close(ours)
+    assert made.stdout == b"a result\n"
+    assert "board [8]" in shown
+    assert "100%" in shown
+    assert shown.endswith("\x1b[2K")  # the line is cleared
+
+
+def _read(terminal):
+    try:
+        return os.read(terminal, 1 << 16)
+    except OSError:  # nothing is left, and the other side is closed
+        return b""
 
 
 def test_zeros_have_no_sign(capsys):
