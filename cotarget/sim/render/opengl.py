@@ -51,13 +51,22 @@ except (ImportError, AttributeError, OSError) as error:
         f"no OpenGL library for rendering without a screen ({BACKEND}): {error}; {INSTALL.get(BACKEND, OTHERWISE)}"
     ) from None
 
+# What mujoco renders with: by the variable's value when mujoco was imported, which may have been before this module.
+IN_USE = getattr(mujoco, "GLContext", str).__module__.rpartition(".")[2]
+
 
 def make_renderer(model: "mujoco.MjModel", width: int, height: int) -> "mujoco.Renderer":
     """Open an offscreen renderer on this thread.
 
     Raises:
-        DeviceError: the machine has no suitable OpenGL, or this process was forked from one that has rendered.
+        DeviceError: the machine has no suitable OpenGL, mujoco was imported without MUJOCO_GL, or this process was
+            forked from one that has rendered.
     """
+    if IN_USE == "glfw" != BACKEND and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise DeviceError(
+            "mujoco was imported before cotarget.sim and renders with GLFW, which needs a display; set "
+            f"MUJOCO_GL={BACKEND} in the environment, or import cotarget.sim.world before mujoco"
+        )
     if _first_process() != os.getpid() and BACKEND != "osmesa":  # it would wait for threads that a fork does not copy
         raise DeviceError(
             "a process that was forked after something was rendered cannot render; start it with the method 'spawn', "
