@@ -19,7 +19,7 @@ from urllib.parse import unquote, urlsplit
 
 from cotarget.config import HardwareFixed
 from cotarget.drivers.frame_buffer import BusyError, FrameBuffer, FrameCounts, RefusedError
-from cotarget.drivers.mjpeg import MultipartReader, StreamDecoder, boundary_of
+from cotarget.drivers.mjpeg import MultipartReader, boundary_of, import_simplejpeg
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError
 from cotarget.rig import Clock, Frame
 
@@ -471,9 +471,8 @@ class AxisCamera:
         self._open = False
         self._asked: int | None = None  # number of frames when the server was asked for its video signal
         name = f"the fixed camera at {self._server.name}"
-        self._frames = FrameBuffer(
-            name, clock, config.size, config.latency_s, self._server.silence_s, StreamDecoder().decode
-        )
+        self._frames = FrameBuffer(name, clock, config.size, config.latency_s, self._server.silence_s)
+        import_simplejpeg()
         try:
             self._api = self._server.check()
             self._frames.start(lambda: self._frames.keep_open(self._stream, self._ask_for_video), "axis")

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cotarget.drivers.mjpeg import DamagedError, decode_jpeg
+from cotarget.drivers.mjpeg import DamagedError, StreamDecoder
 from cotarget.errors import DeviceError, StaleFrameError
 from cotarget.rig import Clock, Frame, Image
 
@@ -79,7 +79,9 @@ class FrameBuffer:
         latency_s: from the exposure of a frame to its arrival [s].
         fresh_s: for how long a frame counts as the newest after its arrival [s]; one that took longer to arrive is
             refused.
-        decode: decoder of frames that are put as bytes; raises DamagedError.
+
+    Attributes:
+        decode: decoder of the camera's JPEGs; raises DamagedError.
     """
 
     def __init__(
@@ -89,10 +91,9 @@ class FrameBuffer:
         size: tuple[int, int],
         latency_s: float,
         fresh_s: float,
-        decode: Callable[[bytes], Image] = decode_jpeg,
     ) -> None:
         self.name, self._clock, self._size = name, clock, size
-        self._latency_s, self._fresh_s, self._decoder = latency_s, fresh_s, decode
+        self._latency_s, self._fresh_s, self.decode = latency_s, fresh_s, StreamDecoder().decode
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._decoding = threading.Lock()
@@ -333,7 +334,7 @@ class FrameBuffer:
         with self._decoding:
             if newest.image is None:
                 try:
-                    newest.image = newest.data if isinstance(newest.data, np.ndarray) else self._decoder(newest.data)
+                    newest.image = newest.data if isinstance(newest.data, np.ndarray) else self.decode(newest.data)
                 except DamagedError as error:
                     log.debug("%s: %s", self.name, error)
                     with self._changed:

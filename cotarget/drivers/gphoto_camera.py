@@ -431,7 +431,7 @@ class ViewJob:
             data = patiently(self._clock, self._link.preview)
             arrived = self._clock.now()
             try:
-                width, height = size_of(decode_jpeg(data))
+                width, height = size_of(self._frames.decode(data))
                 break
             except DamagedError:
                 if arrived > deadline:

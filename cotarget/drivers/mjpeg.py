@@ -165,13 +165,9 @@ class StreamDecoder:
     """Decoder of one camera's images, which learns whether the camera usually sends excess bytes.
 
     Safe to use from any thread.
-
-    Raises:
-        MissingPackageError: simplejpeg is not installed.
     """
 
     def __init__(self) -> None:
-        import_simplejpeg()
         self._lock = threading.Lock()
         self._run, self._needed = 0, USUAL  # images with excess bytes in a row, and how many make them usual
 
@@ -180,6 +176,7 @@ class StreamDecoder:
 
         Raises:
             DamagedError: the image is damaged, or has excess bytes that are not usual for this camera.
+            MissingPackageError: simplejpeg is not installed.
         """
         try:
             image = decode_jpeg(jpeg)

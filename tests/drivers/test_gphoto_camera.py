@@ -451,6 +451,17 @@ def test_zeros_after_a_jpeg_are_padding():
     assert np.abs(bench.newest().image - 50.0).max() <= GREY
 
 
+def test_a_viewfinder_whose_frames_all_have_bytes_too_many_is_taken_as_it_is():
+    def prepare(camera):
+        exact = camera.preview
+        camera.preview = lambda: exact()[:-2] + bytes(651) + b"\xff\xd9"
+
+    bench = Bench(prepare=prepare)
+    bench.run(0.5)
+    assert len(bench.frames) > 1
+    assert bench.buffer.counts.refused == 0
+
+
 def test_images_are_not_turned_as_the_camera_felt_itself_held():
     """Exif with one entry: orientation 6, to be shown turned by a quarter."""
     tiff = bytes.fromhex("4d4d002a 00000008 0001 0112 0003 00000001 0006 0000 00000000")
