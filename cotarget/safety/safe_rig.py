@@ -392,11 +392,11 @@ class _Guard:
         try:
             self._close(deliver=isinstance(error, Exception))  # after Ctrl-C a second one adds nothing
         except Exception as failure:
-            self._report(failure)
+            self._report(failure, error)
 
-    def _report(self, failure: BaseException) -> None:
-        """Log why the rig could not be closed, unless that is logged already."""
-        if str(failure) == self.watchdog.logged:
+    def _report(self, failure: BaseException, error: BaseException | None = None) -> None:
+        """Log why the rig could not be closed, unless that is logged already or is the error that led here."""
+        if str(failure) == self.watchdog.logged or (error is not None and str(failure) == str(error)):
             log.error("the head could not be halted to the end")
         else:
             log.error("the rig could not be closed: %s", failure)

@@ -310,6 +310,14 @@ def test_the_thread_halts_until_the_head_obeys(real, caplog):
     assert [record.levelname for record in caplog.records][:2] == ["WARNING", "ERROR"]
 
 
+def test_the_error_that_ends_a_run_is_not_told_again_by_the_close(caplog):
+    rig = RealDevices()
+    rig.head.failing = 1000
+    with pytest.raises(DeviceError, match="the cable is out"), guarded(rig, SafetyConfig()):
+        raise DeviceError("the cable is out")
+    assert [record.getMessage() for record in caplog.records] == ["the head could not be halted to the end"]
+
+
 @pytest.mark.wire
 @pytest.mark.parametrize("why", [None, ValueError])
 def test_a_head_that_cannot_be_halted_is_told_of_once(caplog, why):
