@@ -41,8 +41,8 @@ def program(*arguments, **options):
 class EmulatedRig:
     """What a user of it has: a folder with both rig.toml and the true calibration; and its control socket."""
 
-    def __init__(self, folder, said):
-        self.folder, self.said = folder, said
+    def __init__(self, folder, said, process):
+        self.folder, self.said, self.process = folder, said, process
         self.sim, self.hardware, self.calibration = (folder / name for name in ("sim.toml", "hw.toml", "true.json"))
         host, port = said["control"].strip().removeprefix("socket://").split(":")
         self._socket = socket.create_connection((host, int(port)), timeout=DEADLINE_S)
@@ -109,7 +109,7 @@ def emulated(folder, table, *options):
             said = dict(process.stdout.readline().split(maxsplit=1) for _ in range(LINES - 1))
             process.stdout.readline()
             late.cancel()
-            with contextlib.closing(EmulatedRig(folder, said)) as rig:
+            with contextlib.closing(EmulatedRig(folder, said, process)) as rig:
                 yield rig
         finally:
             late.cancel()

@@ -11,10 +11,12 @@ import time
 from itertools import pairwise
 from statistics import median
 
+import av
 import numpy as np
 import pytest
 import serial
 
+from cotarget.backends import open_recording
 from cotarget.calibration import load_calibration
 from cotarget.config import RigConfig, load_config
 from cotarget.emulators.emulation import FAULTS
@@ -415,3 +417,33 @@ def test_a_wrong_password_is_told(rig, capsys, monkeypatch):
     assert err.startswith(f"cotarget follow: {url} refuses the user 'viewer' (401): check hardware.fixed.user and the")
     assert len(err.splitlines()) == 1
     assert rig.truth()["pan_deg"] == before["pan_deg"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_all_plugs_pulled_at_once_end_in_one_error_and_whole_files(number, tmp_path):
+    table, options = RIGS["a book that moves"]
+    (tmp_path / "rig").mkdir()
+    film, steps, recording = (tmp_path / name for name in ("film.mp4", "steps.csv", "recording"))
+    with emulated(tmp_path / "rig", table, *options) as rig:
+        process = program(*rig.follow("--seconds", "60", "--video", film, "--csv", steps, "--record", recording))
+        try:
+            rig.wait_until_it_turns()
+            rig.process.send_signal(number)
+            out, err = process.communicate(timeout=DEADLINE_S)
+        finally:
+            process.kill()
+            rig.process.send_signal(signal.SIGCONT)
+    assert (process.returncode, out) == (1, "")
+    assert "Traceback" not in err
+    assert len([line for line in err.splitlines() if line.startswith("cotarget follow: ")]) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["film.mp4", "recording", "rig", "steps.csv"]
+    assert not list(recording.rglob("*.part"))
+    written = rows(steps)
+    assert len(written) > 2
+    assert all(float(row["t_s"]) > 0 and row["focal_px"] for row in written)
+    with av.open(str(film)) as container:
+        assert sum(1 for _ in container.decode(video=0)) == len(written)
+    # The recording ends with the log line that says how.
+    assert json.loads((recording / "log.jsonl").read_text().splitlines()[-1])["end"].startswith("StaleFrameError: ")
+    open_recording(recording)
