@@ -31,7 +31,7 @@ from cotarget.fusion import TargetFusion
 from cotarget.rig import Frame, PanTiltLimits
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim
-from cotarget.tracking.track import tracker_settings
+from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
 from cotarget.video import Film
 from experiments.engine.harness import Experiment, Row, Settings
@@ -76,7 +76,7 @@ class Pipeline:
         self.target: TargetProfile = replace(DEFAULT_TARGETS["bird"], detector=kind)  # type: ignore[arg-type]
         self.detector: Detector = make_detector(self.target, film.rate_hz)
         self.calibration = calibration_of(film.size)
-        self.tracker, self.policy = Tracker(tracker_settings(self.target), film.size), FirstCome()
+        self.tracker, self.policy = Tracker(tracking_settings(self.target), film.size), FirstCome()
         self.fusion = TargetFusion(self.calibration, self.target, film.size)
         config = RigConfig()
         pan, tilt = config.head_limits

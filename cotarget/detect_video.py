@@ -15,7 +15,7 @@ from cotarget.errors import CotargetError
 from cotarget.files import CsvFile
 from cotarget.geometry import Array
 from cotarget.rig import Image
-from cotarget.tracking.track import Track, tracker_settings
+from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker
 from cotarget.video import Film, FilmWriter
 
@@ -100,7 +100,7 @@ def _run(
 ) -> FilmSummary:
     """Process the film once."""
     detector = make_detector(target, film.rate_hz, template)
-    tracker = Tracker(tracker_settings(target), film.size)
+    tracker = Tracker(tracking_settings(target), film.size)
     trails = Trails()
     numbers: set[int] = set()
     times = []

@@ -19,9 +19,9 @@ from cotarget.config import TargetProfile
 from cotarget.control.selection import Candidate, leaves_in
 from cotarget.control.zoom import is_seen_well, shape_of
 from cotarget.detection import Detection
-from cotarget.estimation import Appearance, Estimate, TargetFilter, filter_settings
+from cotarget.estimation import Appearance, Estimate, FilterSettings, TargetFilter, filter_settings
 from cotarget.estimation.motion_model import PAN, TILT, K, L
-from cotarget.estimation.zoom_matching import LATEST_S, CloseupFinder, Expected, Finder, ZoomMeasurement
+from cotarget.estimation.zoom_matching import CloseupFinder, Expected, Finder, MatchingSettings, ZoomMeasurement
 from cotarget.geometry import Array
 from cotarget.pantilt import towards
 from cotarget.rig import Frame, Image, PanTiltState, ZoomState
@@ -113,25 +113,38 @@ def _cubic(times: Array, t: float) -> tuple[Array, Array]:
     return weights, slopes
 
 
-# Most tracks with a filter: more than a dozen moving objects cannot be kept apart anyway.
-MOST_FILTERS = 12
-# Standard deviation of the time between a frame and the states of head and lens [s].
-TIME_SIGMA_S = 2e-3
-# A size or head bias beyond this many prior standard deviations is taken as wrong; a right one comes to 1 or 2.
-WRONG = 4.0
-# A target that both cameras should see and that the zoom image does not show for this long is elsewhere [s]. A bird at
-# the right place was missed for 0.8 s at most, a person or a book for a frame or two.
-UNFOUND_S = 1.5
-# The search is then widened by these standard deviations: logarithm of size and depth together, head bias [rad]. A
-# nominal size twice too large is 0.7.
-INFLATED_SIZE, INFLATED_BIAS = 0.4, 5e-3
-# A registration within this many standard deviations of the expected place agrees with the estimate.
-NEAR = 3.0
-# Longest time since the last measurement for which a target still counts as seen [s].
-JUST_SEEN_S = 0.2
 # Most zoom frames that wait for a fixed frame of their time; beyond it the oldest are dropped.
 MOST_WAITING = 30
 MakeFinder = Callable[[Calibration, TargetProfile], Finder]
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """Which tracks have a filter, and when the zoom image contradicts the estimate.
+
+    Attributes:
+        most_filters: most tracks with a filter: more than a dozen moving objects cannot be kept apart anyway.
+        time_sigma_s: standard deviation of the time between a frame and the states of head and lens [s].
+        contradicted: a size or head bias beyond this many prior standard deviations is taken as wrong; a right one
+            comes to 1 or 2.
+        unfound_s: a target that both cameras should see and that the zoom image does not show for this long is
+            elsewhere [s]. A bird at the right place was missed for 0.8 s at most, a person or a book for a frame or
+            two.
+        inflated_size: standard deviation by which the search is then widened, of the logarithm of size and depth
+            together; a nominal size twice too large is 0.7.
+        inflated_bias: standard deviation by which it is widened, of the head's bias [rad].
+        near: a registration within this many standard deviations of the expected place agrees with the estimate.
+        just_seen_s: longest time since the last measurement for which a target still counts as seen [s].
+    """
+
+    most_filters: int = 12
+    time_sigma_s: float = 2e-3
+    contradicted: float = 4.0
+    unfound_s: float = 1.5
+    inflated_size: float = 0.4
+    inflated_bias: float = 5e-3
+    near: float = 3.0
+    just_seen_s: float = 0.2
 
 
 class TargetFusion:
@@ -142,7 +155,10 @@ class TargetFusion:
         target: profile of the target to follow.
         size: (width, height) of the fixed camera's image [px].
         closed_loop: whether the target is also registered in the zoom image.
-        finder: makes the finder for the zoom image; called once for each followed track.
+        finder: makes the finder for the zoom image, once for each followed track; by default `CloseupFinder`.
+        filter: settings of the target filters; by default those of the target profile.
+        matching: settings of the registration in the zoom image.
+        settings: settings of the fusion.
     """
 
     def __init__(
@@ -152,18 +168,22 @@ class TargetFusion:
         size: tuple[int, int],
         *,
         closed_loop: bool = True,
-        finder: MakeFinder = CloseupFinder,
+        finder: MakeFinder | None = None,
+        filter: FilterSettings | None = None,
+        matching: MatchingSettings | None = None,
+        settings: FusionSettings = FusionSettings(),
     ) -> None:
         self._calibration, self._target, self._size = calibration, target, size
-        self._closed_loop, self._make_finder = closed_loop, finder
-        self._assumed = filter_settings(target, calibration)
+        self._closed_loop, self._matching = closed_loop, matching or MatchingSettings()
+        self._make_finder = finder or partial(CloseupFinder, settings=self._matching)
+        self._assumed, self._settings = filter or filter_settings(target, calibration), settings
         self._filters: dict[int, TargetFilter] = {}
         self._seen_s: dict[int, float] = {}
         self._unlikely: set[int] = set()
         self._followed: int | None = None
         self._zoom_t = math.inf
         self._unfound_s = 0.0
-        self._finder = finder(calibration, target)
+        self._finder = self._make_finder(calibration, target)
         self._waiting: deque[Frame] = deque(maxlen=MOST_WAITING)  # zoom frames without a fixed frame of their time
         self._apart_s = 0.0  # time of the newest zoom frame less that of the newest fixed frame
         self._to_base = calibration.T_base_fixed
@@ -189,7 +209,7 @@ class TargetFusion:
                 track.id not in self._filters,  # a new track must not displace a filter in use
             )
 
-        known = sorted(tracks, key=last)[:MOST_FILTERS]
+        known = sorted(tracks, key=last)[: self._settings.most_filters]
         numbers = {track.id for track in known}
         self._filters = {number: each for number, each in self._filters.items() if number in numbers}
         numbers = {track.id for track in tracks}
@@ -238,7 +258,7 @@ class TargetFusion:
             return None
         due = next((each for each in reversed(self._waiting) if self._finder.sight_at(each.t) is not None), None)
         # Older frames had no sight of the target, or are superseded.
-        done_t = wide_t - LATEST_S if due is None else due.t
+        done_t = wide_t - self._matching.latest_s if due is None else due.t
         while self._waiting and self._waiting[0].t <= done_t:
             self._waiting.popleft()
         return None if due is None else self._look_close(due)
@@ -249,7 +269,7 @@ class TargetFusion:
         pose, estimate = self.states.at(frame.t), self.estimate(self._followed, frame.t)
         if pose is None or estimate is None:
             return None
-        if _contradicted(estimate):
+        if _contradicted(estimate, self._settings):
             self._unlikely.add(self._followed)
         else:
             self._unlikely.discard(self._followed)
@@ -257,7 +277,9 @@ class TargetFusion:
         if seen is None:
             return None
         # With a wrong size or calibration the search would look beside the target for ever, so it is widened.
-        inflated = _inflated(estimate).appearance(pose.pan, pose.tilt, pose.nominal_px) if self._overdue else None
+        inflated = None
+        if self._overdue:
+            inflated = _inflated(estimate, self._settings).appearance(pose.pan, pose.tilt, pose.nominal_px)
         pan, tilt = pose.pan + estimate.bias[0], pose.tilt + estimate.bias[1]
         covariance = (seen if inflated is None else inflated).covariance
         found = self._finder.find(frame, Expected(estimate.x_fixed, covariance, pan, tilt, pose.nominal_px))
@@ -272,27 +294,27 @@ class TargetFusion:
                 pose.tilt,
                 pose.nominal_px,
                 frame.t,
-                head_sigma=math.hypot(self._assumed.head_sigma, pose.speed * TIME_SIGMA_S),
+                head_sigma=math.hypot(self._assumed.head_sigma, pose.speed * self._settings.time_sigma_s),
             )
         return found
 
     @property
     def _overdue(self) -> bool:
         """Whether the zoom image has failed to show the target for too long."""
-        return self._unfound_s > UNFOUND_S
+        return self._unfound_s > self._settings.unfound_s
 
     def _count_unfound(self, frame: Frame, found: ZoomMeasurement | None, seen: Appearance, estimate: Estimate) -> None:
         """Count the time for which the zoom image should have shown the target and did not."""
-        passed, self._zoom_t = min(max(frame.t - self._zoom_t, 0.0), JUST_SEEN_S), frame.t
+        passed, self._zoom_t = min(max(frame.t - self._zoom_t, 0.0), self._settings.just_seen_s), frame.t
         size = np.array(frame.image.shape[1::-1])
         if found is not None:
             off = found.center_px - (size - 1) / 2 - seen.offset_px
             spread = seen.covariance + np.diag(np.square(found.sigma_px) + np.square(found.body_sigma_px))
-            if float(off @ np.linalg.solve(spread, off)) <= NEAR**2:
+            if float(off @ np.linalg.solve(spread, off)) <= self._settings.near**2:
                 self._unfound_s = 0.0
                 return
         wholly = np.all(np.abs(seen.offset_px) + seen.size_px / 2 <= size / 2)
-        if wholly and frame.t - estimate.measured_t <= JUST_SEEN_S:
+        if wholly and frame.t - estimate.measured_t <= self._settings.just_seen_s:
             self._unfound_s += passed
 
     def warnings(self, number: int, t: float) -> list[str]:
@@ -309,9 +331,9 @@ class TargetFusion:
         if estimate is None:
             return []
         found = []
-        if wrong := _contradicted(estimate):
+        if wrong := _contradicted(estimate, self._settings):
             found.append(f"the told size or the calibration seems wrong: {', '.join(wrong)}")
-        if number == self._followed and abs(self._apart_s) > LATEST_S:
+        if number == self._followed and abs(self._apart_s) > self._matching.latest_s:
             later = "zoom" if self._apart_s < 0 else "wide"
             found.append(f"the views are too far apart in time: the {later} one comes {abs(self._apart_s):.2f} s later")
         elif number == self._followed and self._overdue:
@@ -336,7 +358,7 @@ class TargetFusion:
             longest_px: longest nominal focal length of the lens [px].
         """
         pose, estimate = self.states.at(track.t), self.estimate(track.id, track.t)
-        if pose is None or estimate is None or track.t - estimate.measured_t > JUST_SEEN_S:
+        if pose is None or estimate is None or track.t - estimate.measured_t > self._settings.just_seen_s:
             return
         if is_seen_well(estimate, pose.pan, pose.tilt, pose.nominal_px, longest_px, shape=shape_of(track)):
             self._seen_s[track.id] = self._seen_s.get(track.id, 0.0) + seconds
@@ -367,19 +389,19 @@ class TargetFusion:
         return np.array(towards(self._to_base.apply(estimate.x_fixed)))
 
 
-def _contradicted(estimate: Estimate) -> list[str]:
+def _contradicted(estimate: Estimate, settings: FusionSettings) -> list[str]:
     """Describe where size and head bias, as both cameras show them, contradict their priors."""
     wrong = []
-    if abs(estimate.size_deviation) > WRONG:
+    if abs(estimate.size_deviation) > settings.contradicted:
         wrong.append(f"both views make it {estimate.size:.2g} m and not {estimate.target.size:.2g} m")
-    if estimate.bias_deviation > WRONG:
+    if estimate.bias_deviation > settings.contradicted:
         wrong.append(f"the head points {math.degrees(math.hypot(*estimate.bias)):.2g} degrees beside")
     return wrong
 
 
-def _inflated(estimate: Estimate) -> Estimate:
+def _inflated(estimate: Estimate, settings: FusionSettings) -> Estimate:
     """Widen the covariance of size and head bias; the ratio of size to depth, which the fixed camera sees, stays."""
     P = estimate.state_covariance.copy()
-    P[np.ix_([L, K], [L, K])] += INFLATED_SIZE**2
-    P[[PAN, TILT], [PAN, TILT]] += INFLATED_BIAS**2
+    P[np.ix_([L, K], [L, K])] += settings.inflated_size**2
+    P[[PAN, TILT], [PAN, TILT]] += settings.inflated_bias**2
     return replace(estimate, state_covariance=P)

@@ -8,25 +8,26 @@ may fail for a moment, because its lens moves, its line is slow or it reconnects
 import enum
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.calibration.plausibility import check_plausible
 from cotarget.config import TargetProfile
-from cotarget.control.controller import Controller, ControllerSettings, Predict
+from cotarget.control.controller import Controller, Predict
+from cotarget.control.head import HeadSettings
 from cotarget.control.selection import FirstCome, TargetSelector
-from cotarget.control.zoom import shape_of
+from cotarget.control.zoom import ZoomSettings, shape_of
 from cotarget.detection import Detection, Detector, make_detector
 from cotarget.detection.base import flood
 from cotarget.errors import DeviceError, StaleFrameError, UnreachableError
-from cotarget.estimation import Estimate
-from cotarget.estimation.zoom_matching import CloseupFinder, ZoomMeasurement
-from cotarget.fusion import MakeFinder, TargetFusion
+from cotarget.estimation import Estimate, FilterSettings
+from cotarget.estimation.zoom_matching import MatchingSettings, ZoomMeasurement
+from cotarget.fusion import FusionSettings, MakeFinder, TargetFusion
 from cotarget.rig import FUTURE_S, PATIENCE_S, Camera, Clock, Frame, Image, PanTiltState, Rig, ZoomState, opened_from
 from cotarget.targeting import Aim
-from cotarget.tracking.track import Track, tracker_settings
+from cotarget.tracking.track import Track, TrackingSettings, tracking_settings
 from cotarget.tracking.tracker import Tracker
 
 # Longest wait for a zoom frame, except for the first [s].
@@ -190,18 +191,32 @@ class State(enum.StrEnum):
 
 
 @dataclass(frozen=True)
-class FollowSettings(ControllerSettings):
-    """Settings of a run, with those of the controller.
+class FollowSettings:
+    """Settings of a run; each group belongs to one step of the method.
 
     Attributes:
+        predict: whether to predict the target's motion; without it the head goes to where the target was seen.
         zoom_out_after_s: how long a target may be out of sight before the lens zooms out [s].
         closed_loop: whether the target is also registered in the zoom image.
-        finder: makes the finder for the zoom image.
+        finder: makes the finder for the zoom image; by default `CloseupFinder` with `matching`.
+        tracking: image filter, association and life cycle of tracks; by default those of the target profile.
+        filter: motion and measurement noise of the target in 3D; by default those of the target profile.
+        fusion: which tracks have a filter, and when the zoom image contradicts it.
+        matching: registration in the zoom image.
+        head: deadband and speed of the head.
+        zoom: choice of the focal length.
     """
 
+    predict: bool = True
     zoom_out_after_s: float = 0.4
     closed_loop: bool = True
-    finder: MakeFinder = CloseupFinder
+    finder: MakeFinder | None = None
+    tracking: TrackingSettings | None = None
+    filter: FilterSettings | None = None
+    fusion: FusionSettings = field(default_factory=FusionSettings)
+    matching: MatchingSettings = field(default_factory=MatchingSettings)
+    head: HeadSettings = field(default_factory=HeadSettings)
+    zoom: ZoomSettings = field(default_factory=ZoomSettings)
 
 
 @dataclass(frozen=True)
@@ -311,11 +326,20 @@ class _Loop:
         settings: FollowSettings,
     ) -> None:
         self._rig, self._detector, self._settings = rig, detector, settings
-        self._tracker = Tracker(tracker_settings(target), rig.fixed.size)
+        self._tracker = Tracker(settings.tracking or tracking_settings(target), rig.fixed.size)
         self._fusion = TargetFusion(
-            calibration, target, rig.fixed.size, closed_loop=settings.closed_loop, finder=settings.finder
+            calibration,
+            target,
+            rig.fixed.size,
+            closed_loop=settings.closed_loop,
+            finder=settings.finder,
+            filter=settings.filter,
+            matching=settings.matching,
+            settings=settings.fusion,
         )
-        self._controller = Controller(rig, calibration, settings)
+        self._controller = Controller(
+            rig, calibration, head=settings.head, zoom=settings.zoom, predict=settings.predict
+        )
         self._frames = FrameSource(rig.fixed, rig.zoom, rig.clock)
         self._beyond: set[int] = set()  # tracks that could not be aimed at
         self._selector = selector

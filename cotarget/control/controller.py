@@ -7,7 +7,7 @@ probability that the target stays in the image (`cotarget.control.zoom`).
 import dataclasses
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,21 +21,6 @@ from cotarget.targeting import Aim, Reach, aim
 
 NO_CHANGE = 1e-6  # least change of the logarithm of the focal length that is commanded
 Predict = Callable[[float], Estimate | None]
-
-
-@dataclass(frozen=True)
-class ControllerSettings:
-    """Settings of the controller.
-
-    Attributes:
-        predict: whether to predict the target's motion; without it the head goes to where the target was seen.
-        head_controller: settings of the head controller.
-        zoom: settings of the zoom controller.
-    """
-
-    predict: bool = True
-    head_controller: HeadSettings = field(default_factory=HeadSettings)
-    zoom: ZoomSettings = field(default_factory=ZoomSettings)
 
 
 @dataclass(frozen=True)
@@ -78,14 +63,25 @@ class Controller:
     Args:
         rig: rig whose head, lens and clock are used.
         calibration: calibration of that rig, for its streams.
-        settings: settings of the controller.
+        head: settings of the head controller.
+        zoom: settings of the zoom controller.
+        predict: whether to predict the target's motion; without it the head goes to where the target was seen.
     """
 
-    def __init__(self, rig: Rig, calibration: Calibration, settings: ControllerSettings = ControllerSettings()) -> None:
-        self._rig, self._calibration, self._settings = rig, calibration, settings
+    def __init__(
+        self,
+        rig: Rig,
+        calibration: Calibration,
+        *,
+        head: HeadSettings | None = None,
+        zoom: ZoomSettings | None = None,
+        predict: bool = True,
+    ) -> None:
+        head = head or HeadSettings()
+        self._rig, self._calibration, self._ahead_s, self._predict = rig, calibration, head.ahead_s, predict
         shortest, longest = (self._true(nominal) for nominal in rig.zoom.focal_range)
-        self._zoom = ZoomController((shortest, longest), rig.zoom.size, settings.zoom)
-        self._head_controller = HeadController(rig.head.limits, settings.head_controller)
+        self._zoom = ZoomController((shortest, longest), rig.zoom.size, zoom or ZoomSettings())
+        self._head_controller = HeadController(rig.head.limits, head)
         state = rig.head.state()
         self.commanded = (state.pan, state.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
         self.head_commands, self.lens_commands = 0, 1  # number sent so far
@@ -108,7 +104,7 @@ class Controller:
         now = self._rig.clock.now()
         exposed = interval + (now + self._rig.spec.zoom.delay_s)
         (pan_then, _), (tilt_then, _) = self._head_controller.head.at(exposed)
-        then = predict(exposed if self._settings.predict else seen_t)
+        then = predict(exposed if self._predict else seen_t)
         choice = self._zoom.choose(
             None if then is None else expect(then, pan_then, tilt_then, focal, shape=shape),
             course.first.focal_px * course.then.range / course.first.range,
@@ -150,7 +146,7 @@ class Controller:
         """Compute the wanted motion of the head. Raises as `drive` does."""
         now = self._rig.clock.now()
         effect = now + self._rig.spec.head.delay_s
-        times = (effect, effect + interval) if self._settings.predict else (seen_t, seen_t)
+        times = (effect, effect + interval) if self._predict else (seen_t, seen_t)
         at_effect, then = (predict(t) for t in times)
         if at_effect is None or then is None:
             raise UnreachableError("where the target is was not seen yet")
@@ -158,7 +154,7 @@ class Controller:
         self._head_controller.head.saw(state)  # a halted or slow head is not where it was sent
         reach = reach_of(self._rig, state)
         first = self._aim(at_effect, reach)
-        later = predict(effect + self._settings.head_controller.ahead_s) if at_effect.carried else None
+        later = predict(effect + self._ahead_s) if at_effect.carried else None
         goal_sigmas = (0.0, 0.0) if later is None else goal_sigmas_of(later, first)
         return _Course(effect, at_effect, first, self._aim(then, reach, first), goal_sigmas)
 

@@ -18,11 +18,59 @@ from dataclasses import dataclass, replace
 from cotarget.rig import Angles, PanTiltLimits, PanTiltState, Speed, to_step
 
 Motion = tuple[tuple[float, float], tuple[float, float]]  # position and speed of pan and of tilt [rad, rad/s]
-# A report agrees with the model within this many steps plus the angle that the axis turns in this time [s].
-STEPS_OFF, TIMES_OFF_S = 2.0, 0.01
-MODEL_STEP_S = 1e-6  # tolerance for a head without steps [rad]
-# Longest time between two reports from which the speed is computed, after the head contradicts the model [s].
-REPORTS_S = 0.3
+MODEL_STEP = 1e-6  # tolerance for a head without steps [rad]
+
+
+@dataclass(frozen=True)
+class HeadSettings:
+    """Settings of the head controller and of its model of the head.
+
+    Attributes:
+        zone: half-width of the deadband as a part of the image's width; at least one step of the head.
+        deadband: whether there is a deadband; without it, the head gets a command in every frame.
+        ahead_s: how far ahead a goal lies [s]. The head goes on for that long when
+            commands stop: with 0.3 s it follows no better and stops too late after a fault.
+        catch_s: time in which an error of the head is corrected; shorter follows closer, longer is steadier [s].
+        far: error in deadbands from which the head hurries, because it is no noise any more.
+        hurry_s: time in which a far error is corrected [s].
+        still: speed of the target, in deadbands a second, below which it counts as standing.
+        slow: speed along one axis, in deadbands a second, below which the target stands along that axis.
+        back_s: an axis that brings the target back into the deadband within this time is left alone [s].
+        rest_s: least time after the last command before a standing target in the deadband is centred again [s].
+        frames_ahead: least lead of a goal in frames, so that the head does not stop between frames of a slow camera.
+        fine: part of the deadband to which a standing target is centred ...
+        fine_steps: ... but to no less than this part of a step: rounding leaves up to half a step, and without the
+            margin the head would go to and fro.
+        nearer: a distant axis approaches its goal if it will be within this part of its present distance.
+        slow_lead: part of the lead removed from an axis that is slow while the other turns. With the whole lead the
+            head nods with the noise of the speed, without any it lags behind a target that moves slightly aslant.
+        turn_sigmas: while a target is carried by hand, an axis reverses only for more than this many standard
+            deviations of its goal.
+        steps_off: a report agrees with the model of the head within this many steps ...
+        time_off_s: ... plus the angle that the axis turns in this time [s].
+        reports_s: longest time between two reports from which the speed is computed, after the head contradicts the
+            model [s].
+    """
+
+    zone: float = 0.007
+    deadband: bool = True
+    ahead_s: float = 0.2
+    catch_s: float = 0.15
+    far: float = 13.0
+    hurry_s: float = 0.1
+    still: float = 10.5
+    slow: float = 21.0
+    back_s: float = 0.16
+    rest_s: float = 1.0
+    frames_ahead: float = 1.5
+    fine: float = 0.1
+    fine_steps: float = 0.6
+    nearer: float = 0.2
+    slow_lead: float = 0.5
+    turn_sigmas: float = 0.5
+    steps_off: float = 2.0
+    time_off_s: float = 0.01
+    reports_s: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -46,13 +94,14 @@ class _Plan:
 class HeadModel:
     """Predict the head's position from commands and reports."""
 
-    def __init__(self, limits: PanTiltLimits) -> None:
+    def __init__(self, limits: PanTiltLimits, settings: HeadSettings = HeadSettings()) -> None:
         """Create a model; it needs a first report before it is queried.
 
         Args:
             limits: limits of the pan-tilt unit.
+            settings: when a report agrees with the model.
         """
-        self._limits = limits
+        self._limits, self._settings = limits, settings
         self._plans: list[_Plan] = []
         self._last: PanTiltState | None = None
 
@@ -85,9 +134,12 @@ class HeadModel:
 
     def _is_near(self, state: PanTiltState, motion: Motion) -> bool:
         """Whether a report agrees with a predicted position."""
-        coarse = max(STEPS_OFF * self._limits.step, MODEL_STEP_S)
+        coarse = max(self._settings.steps_off * self._limits.step, MODEL_STEP)
         reported = state.pan, state.tilt
-        return all(abs(q - x) <= coarse + TIMES_OFF_S * abs(v) for q, (x, v) in zip(reported, motion, strict=True))
+        return all(
+            abs(q - x) <= coarse + self._settings.time_off_s * abs(v)
+            for q, (x, v) in zip(reported, motion, strict=True)
+        )
 
     def _begin_anew(self, state: PanTiltState) -> None:
         """Restart the model from a report; keep the commands, unless the head stands elsewhere."""
@@ -106,7 +158,7 @@ class HeadModel:
     def _speeds(self, state: PanTiltState) -> Angles:
         """Speeds of both axes from the last two reports [rad/s]; 0 if they are too far apart."""
         last, fastest = self._last, self._limits.speed
-        if last is None or not state.moving or not 0 < state.t - last.t <= REPORTS_S:
+        if last is None or not state.moving or not 0 < state.t - last.t <= self._settings.reports_s:
             return 0.0, 0.0
         pan, tilt = (
             min(max((b - a) / (state.t - last.t), -fastest), fastest)
@@ -169,47 +221,6 @@ def axis_at(seconds: float, x: float, v: float, goal: float, speed: float, accel
 
 
 LEAST_SPEED = 1e-3  # least commanded speed, because a command needs one above zero [rad/s]
-FRAMES_AHEAD = 1.5  # least lead of a goal in frames, so that the head does not stop between frames of a slow camera
-# A standing target is centred to this part of the deadband, but to no less than this part of a step: rounding leaves up
-# to half a step, and without the margin the head would go to and fro.
-FINE, FINE_STEPS = 0.1, 0.6
-# A distant axis approaches its goal if it will be within this part of its present distance.
-NEARER = 0.2
-# Part of the lead removed from an axis that is slow while the other turns: with the whole lead the head nods with the
-# noise of the speed, without any it lags behind a target that moves slightly aslant.
-LEAD_SIGMAS = 0.5
-# While a target is carried by hand, an axis reverses only for more than this many standard deviations of its goal.
-TURN_SIGMAS = 0.5
-
-
-@dataclass(frozen=True)
-class HeadSettings:
-    """Deadband and speed of the head controller.
-
-    Attributes:
-        zone: half-width of the deadband as a part of the image's width; at least one step of the head.
-        deadband: whether there is a deadband; without it, the head gets a command in every frame.
-        ahead_s: how far ahead a goal lies, at least one and a half frames [s]. The head goes on for that long when
-            commands stop: with 0.3 s it follows no better and stops too late after a fault.
-        catch_s: time in which an error of the head is corrected; shorter follows closer, longer is steadier [s].
-        far: error in deadbands from which the head hurries, because it is no noise any more.
-        hurry_s: time in which a far error is corrected [s].
-        still: speed of the target, in deadbands a second, below which it counts as standing.
-        slow: speed along one axis, in deadbands a second, below which the target stands along that axis.
-        back_s: an axis that brings the target back into the deadband within this time is left alone [s].
-        rest_s: least time after the last command before a standing target in the deadband is centred again [s].
-    """
-
-    zone: float = 0.007
-    deadband: bool = True
-    ahead_s: float = 0.2
-    catch_s: float = 0.15
-    far: float = 13.0
-    hurry_s: float = 0.1
-    still: float = 10.5
-    slow: float = 21.0
-    back_s: float = 0.16
-    rest_s: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -241,11 +252,11 @@ class HeadController:
 
         Args:
             limits: limits of the pan-tilt unit.
-            settings: deadband and speed.
+            settings: settings of the controller.
         """
         self._limits = limits
         self._settings = settings
-        self.head = HeadModel(limits)
+        self.head = HeadModel(limits, settings)
         self._turning = (0.0, 0.0)  # sign of the last change of each goal
 
     def decide(
@@ -297,7 +308,7 @@ class HeadController:
         limit = self._settings.slow * zone
         slow = tuple(abs(rate) * scale <= limit for rate, scale in zip(rates, _scales(wanted[1]), strict=True))
         still = _apart(rates, (0.0, 0.0), wanted[1]) <= self._settings.still * zone
-        back_s = lead_s if still else LEAD_SIGMAS * lead_s
+        back_s = lead_s if still else self._settings.slow_lead * lead_s
         pan, tilt = (q - back_s * rate if at_rest else q for q, rate, at_rest in zip(wanted, rates, slow, strict=True))
         pan_rate, tilt_rate = (0.0 if at_rest else rate for rate, at_rest in zip(rates, slow, strict=True))
         return _Way((pan, tilt), (pan_rate, tilt_rate), (slow[0], slow[1]), still)
@@ -311,7 +322,7 @@ class HeadController:
         off_then = _apart(way.after(interval_s), self._at(effect_t + interval_s), way.wanted[1])
         # At rest in place, or on the way there; an axis that overran its goal while following would return too slowly.
         if way.still and off_goal <= zone and (command.speed is None or off_then <= zone):
-            fine = max(FINE_STEPS * self._limits.step, FINE * zone)
+            fine = max(self._settings.fine_steps * self._limits.step, self._settings.fine * zone)
             there = zip(way.after(interval_s), self._at(effect_t + interval_s), strict=True)
             centred = all(abs(q - to_step(x, self._limits.step)) <= fine for q, x in there)
             return centred or effect_t - self.head.commanded_t < self._settings.rest_s
@@ -331,7 +342,7 @@ class HeadController:
         resting = []
         for i, scale in enumerate(_scales(way.wanted[1])):
             most = zone / scale
-            returns = then[i] < now[i] and back[i] <= max(most, NEARER * now[i])
+            returns = then[i] < now[i] and back[i] <= max(most, settings.nearer * now[i])
             resting.append(then[i] <= most or returns)
         return resting
 
@@ -343,7 +354,7 @@ class HeadController:
     def _along(self, effect_t: float, interval_s: float, way: _Way, catch_s: float) -> HeadCommand:
         """Set a goal ahead of each axis, and the target's speed, corrected for the axis's error."""
         limits = self._limits
-        ahead = max(self._settings.ahead_s, FRAMES_AHEAD * interval_s)
+        ahead = max(self._settings.ahead_s, self._settings.frames_ahead * interval_s)
         goals, speeds = [], []
         for w, r, x in zip(way.wanted, way.rates, self._at(effect_t), strict=True):
             v = r + (w - x) / catch_s
@@ -367,7 +378,7 @@ class HeadController:
         kept = []
         for i in range(2):
             turn = news[i][0] - olds[i][0]
-            back = turn * self._turning[i] < 0 and abs(turn) <= TURN_SIGMAS * goal_sigmas[i]
+            back = turn * self._turning[i] < 0 and abs(turn) <= self._settings.turn_sigmas * goal_sigmas[i]
             kept.append(olds[i] if back or (way.slow[i] and resting[i]) else news[i])
         (pan, pan_speed), (tilt, tilt_speed) = kept
         return HeadCommand(pan, tilt, (pan_speed, tilt_speed))

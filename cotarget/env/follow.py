@@ -29,7 +29,7 @@ from cotarget.evaluation import TruthNoise, closeup_of
 from cotarget.metrics import Closeup
 from cotarget.schema import Size
 from cotarget.sim.targets.random_paths import LONE, SECONDS, lone_path
-from cotarget.tracking.track import tracker_settings
+from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
 
 # Features of the target's track, with the range of each; 0 without a track.
@@ -122,7 +122,7 @@ class Follow(RigEnv[Any, Vector]):
         """Begin an episode: a new one each time, the same one after the same seed."""
         seed = self._begin(seed, options)
         rig = self._open(lone_path(self.name, seed), seed).rig
-        self._tracker = Tracker(tracker_settings(self.target), rig.fixed.size)
+        self._tracker = Tracker(tracking_settings(self.target), rig.fixed.size)
         self._index = 0
         state = rig.head.state()
         self._commanded = state.pan, state.tilt, rig.zoom.state().focal_px

@@ -23,25 +23,99 @@ from cotarget.geometry import Array
 from cotarget.pantilt import base_head
 from cotarget.rig import Frame, Image
 
-# Margin around the target's box that counts: this part of its larger side, and at least this many pixels.
-MARGIN, LEAST_MARGIN_PX = 0.2, 2.0
-# Weight of the margin: it shows the outline, but its background appears displaced in the other camera.
-MARGIN_WEIGHT = 0.1
-# Weight of the pixels at the outline: they are partly the target's, and missing from the foreground half of the time.
-RIM_WEIGHT = 0.3
-# Parts of the box that a usable foreground fills: less is none, and more shows the place but not the outline. Otherwise
-# the pixels whose colour differs from the surroundings are used, or else an ellipse.
-LEAST_FOREGROUND, MOST_FOREGROUND = 0.15, 0.9
-STANDS_OUT = 3.0  # standard deviations of the surroundings' colours
-# Least standard deviation of the background's colours [grey levels], and fewest pixels from which it is computed.
-LEAST_SPREAD, LEAST_BACKGROUND = 10.0, 12
+# Fewest pixels from which a background's colours are computed.
+LEAST_BACKGROUND = 12
 # Standard deviation of the body's centre along u and v, in parts of the box's sides, measured on simulated targets: of
 # the box alone, of upright bodies (median of the foreground across), of others (median both ways), and of templates.
 BOX_SIGMA = np.array([0.08, 0.18])
 UPRIGHT_SIGMA = np.array([0.03, 0.006])
 OUTLINE_SIGMA = np.array([0.05, 0.12])
 TEMPLATE_SIGMA = np.array([0.01, 0.01])
+# Step for derivatives, in parts of the depth.
+STEP = 1e-3
 Pixels = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MatchingSettings:
+    """Settings of the registration in the zoom image.
+
+    Attributes:
+        margin: margin around the target's box that counts, as a part of its larger side ...
+        least_margin_px: ... and at least this many pixels [px].
+        margin_weight: weight of the margin: it shows the outline, but its background appears displaced in the other
+            camera.
+        rim_weight: weight of the pixels at the outline: they are partly the target's, and missing from the foreground
+            half of the time.
+        foreground: parts of the box that a usable foreground fills: less is none, and more shows the place but not the
+            outline. Otherwise the pixels whose colour differs from the surroundings are used, or else an ellipse.
+        stands_out: from this many standard deviations of the surroundings' colours a pixel differs from them.
+        least_spread: least standard deviation of the background's colours [grey levels].
+        gate_sigmas: the search covers this many standard deviations around the expected place.
+        coarse_samples: samples along the target's larger side, for the whole search.
+        fine_samples: the same around the coarse result.
+        finest: most samples per pixel of the fixed image, which holds no more detail.
+        widest_search: largest search to each side, in coarse samples.
+        fine_search: the same in fine samples, beyond half a coarse one.
+        blur_px: blur of the fixed camera's lens, pixels and coding, one standard deviation; chosen on rendered books
+            [px].
+        least_lead: least lead of the best place over the next best.
+        least_seen: least part of the target inside the zoom image.
+        gain: range of the contrast in the zoom image over that in the fixed image.
+        prior_weight: penalty on the score, per squared distance from the expected place in standard deviations.
+        one_place: places closer than this part of the target's box are one place.
+        sigma_px: standard deviation of a registration at the usual lack of likeness, in pixels of the fixed image ...
+        sigma_samples: ... plus in samples; both measured on the simulated targets.
+        usual_lack: usual lack of likeness, 1 - score.
+        least_lack: least lack of likeness that counts.
+        longest_apart_s: largest time between the two frames of a registration: limbs and wings move [s].
+        latest_s: largest delay of one camera's frames against the other's; fixed frames are kept for that long [s].
+        least_sigma_px: least standard deviation of the expected place, from lens, head and frame times [px].
+        sure_score: a match is sure with at least this score ...
+        largest_drop: ... and at most this much below the usual score ...
+        fading: ... which fades by this a second.
+        least_score: a weaker match counts with at least this score ...
+        believed_s: ... this soon after a sure one [s] ...
+        longest_gap_s: ... and this soon after the last match [s] ...
+        steady_px: ... if its offset from the expected place has changed by no more than this many pixels of the fixed
+            image ...
+        steady_of_side: ... plus this part of the box.
+    """
+
+    margin: float = 0.2
+    least_margin_px: float = 2.0
+    margin_weight: float = 0.1
+    rim_weight: float = 0.3
+    foreground: tuple[float, float] = (0.15, 0.9)
+    stands_out: float = 3.0
+    least_spread: float = 10.0
+    gate_sigmas: float = 3.0
+    coarse_samples: float = 14.0
+    fine_samples: float = 40.0
+    finest: float = 4.0
+    widest_search: int = 48
+    fine_search: int = 1
+    blur_px: float = 0.7
+    least_lead: float = 0.12
+    least_seen: float = 0.6
+    gain: tuple[float, float] = (0.25, 4.0)
+    prior_weight: float = 0.01
+    one_place: float = 0.5
+    sigma_px: float = 0.08
+    sigma_samples: float = 0.08
+    usual_lack: float = 0.1
+    least_lack: float = 0.04
+    longest_apart_s: float = 0.1
+    latest_s: float = 0.5
+    least_sigma_px: float = 1.0
+    sure_score: float = 0.7
+    largest_drop: float = 0.15
+    fading: float = 0.1
+    least_score: float = 0.55
+    believed_s: float = 0.5
+    longest_gap_s: float = 0.15
+    steady_px: float = 0.5
+    steady_of_side: float = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +131,7 @@ class FixedView:
         corner_px: the patch's top-left pixel in the frame (u, v), (2,).
         foreground: whether each pixel of the patch is the target's, (h, w).
         outside_px: distance of each pixel of the patch from the box, 0 inside it [px], (h, w).
+        settings: settings of the registration.
     """
 
     t: float
@@ -67,6 +142,7 @@ class FixedView:
     corner_px: Array
     foreground: Pixels
     outside_px: Samples
+    settings: MatchingSettings
 
     @property
     def side_px(self) -> float:
@@ -76,8 +152,9 @@ class FixedView:
     @cached_property
     def weight(self) -> Samples:
         """Weight of each pixel of the patch, 0 to 1, (h, w)."""
-        around = MARGIN_WEIGHT * np.clip(1 - self.outside_px / _margin(self.size_px), 0, 1)
-        return np.maximum(np.where(self.foreground, 1.0, RIM_WEIGHT * self._grown), around).astype(np.float32)
+        settings = self.settings
+        around = settings.margin_weight * np.clip(1 - self.outside_px / _margin(self.size_px, settings), 0, 1)
+        return np.maximum(np.where(self.foreground, 1.0, settings.rim_weight * self._grown), around).astype(np.float32)
 
     @cached_property
     def whitening(self) -> Array:
@@ -85,7 +162,7 @@ class FixedView:
 
         The background's own texture then counts for little.
         """
-        return _whitening(self.patch[self._grown == 0])
+        return _whitening(self.patch[self._grown == 0], self.settings)
 
     @cached_property
     def _grown(self) -> Image:
@@ -107,7 +184,13 @@ class FixedView:
         return template, weight if inside is None else weight * inside, -first
 
 
-def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetProfile) -> FixedView | None:
+def look(
+    frame: Frame,
+    detection: Detection,
+    mask: Image | None,
+    target: TargetProfile,
+    settings: MatchingSettings = MatchingSettings(),
+) -> FixedView | None:
     """Cut the target out of a fixed-camera frame.
 
     Args:
@@ -115,6 +198,7 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetP
         detection: detection of the target in it.
         mask: foreground of the detector, (H, W), or None.
         target: target profile; its matcher decides where the centre of the body is.
+        settings: settings of the registration.
 
     Returns:
         The cut-out; None if the box holds no pixel of the frame.
@@ -122,7 +206,7 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetP
     center, size = np.asarray(detection.center_px, dtype=float), np.maximum(detection.size_px, 1.0)
     if not (np.isfinite(center).all() and np.isfinite(size).all()):
         return None
-    margin = _margin(size)
+    margin = _margin(size, settings)
     limit = np.array(frame.image.shape[1::-1])
     low = np.maximum(np.floor(center - size / 2 - margin).astype(int), 0)
     high = np.minimum(np.ceil(center + size / 2 + margin).astype(int) + 1, limit)
@@ -137,9 +221,9 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetP
     if not in_box.any():
         return None
     foreground = np.zeros_like(in_box) if mask is None else (mask[here] > 0) & in_box
-    if not _is_outline(foreground, in_box):
-        foreground = _stands_out(patch, in_box)
-    masked = _is_outline(foreground, in_box)
+    if not _is_outline(foreground, in_box, settings):
+        foreground = _stands_out(patch, in_box, settings)
+    masked = _is_outline(foreground, in_box, settings)
     body, sigma = center, BOX_SIGMA * size
     if target.matcher == "box":
         sigma = TEMPLATE_SIGMA * size
@@ -154,61 +238,39 @@ def look(frame: Frame, detection: Detection, mask: Image | None, target: TargetP
         foreground = du**2 + dv**2 <= 1
     if detection.clipped:  # the hidden part may be as large again
         sigma = np.hypot(sigma, size / 2)
-    return FixedView(frame.t, body, sigma, size, patch, low.astype(float), foreground, outside)
+    return FixedView(frame.t, body, sigma, size, patch, low.astype(float), foreground, outside, settings)
 
 
-def _margin(size: Array) -> float:
+def _margin(size: Array, settings: MatchingSettings) -> float:
     """Width of the margin around a box of a given size [px]."""
-    return max(LEAST_MARGIN_PX, MARGIN * float(size.max()))
+    return max(settings.least_margin_px, settings.margin * float(size.max()))
 
 
-def _is_outline(foreground: Pixels, in_box: Pixels) -> bool:
+def _is_outline(foreground: Pixels, in_box: Pixels, settings: MatchingSettings) -> bool:
     """Whether a foreground shows the target's outline: it fills neither too little nor nearly all of the box."""
     part = np.count_nonzero(foreground) / max(int(np.count_nonzero(in_box)), 1)
-    return bool(LEAST_FOREGROUND < part < MOST_FOREGROUND)
+    least, most = settings.foreground
+    return bool(least < part < most)
 
 
-def _stands_out(patch: Image, in_box: Pixels) -> Pixels:
+def _stands_out(patch: Image, in_box: Pixels, settings: MatchingSettings) -> Pixels:
     """Mark the pixels of the box whose colour differs from the surroundings."""
     background = patch[~in_box]
     if len(background) < LEAST_BACKGROUND or np.ptp(patch) == 0:
         return np.zeros_like(in_box)
-    away = (patch - np.median(background, axis=0)) @ _whitening(background)
-    return np.asarray((np.sum(away**2, axis=2) > STANDS_OUT**2) & in_box)
+    away = (patch - np.median(background, axis=0)) @ _whitening(background, settings)
+    return np.asarray((np.sum(away**2, axis=2) > settings.stands_out**2) & in_box)
 
 
-def _whitening(background: Image) -> Array:
+def _whitening(background: Image, settings: MatchingSettings) -> Array:
     """Compute the transform, (3, 3), that whitens background colours (n, 3)."""
     if len(background) < LEAST_BACKGROUND:
-        return np.eye(3) / LEAST_SPREAD
-    variances, directions = np.linalg.eigh(np.cov(background.T) + LEAST_SPREAD**2 * np.eye(3))
+        return np.eye(3) / settings.least_spread
+    variances, directions = np.linalg.eigh(np.cov(background.T) + settings.least_spread**2 * np.eye(3))
     return (directions / np.sqrt(variances)) @ directions.T
 
 
 # Registration at known scale and rotation
-
-# The search covers this many standard deviations around the expected place.
-GATE_SIGMAS = 3.0
-# Samples along the target's larger side: coarse for the whole search, fine around the coarse result.
-COARSE_SAMPLES, FINE_SAMPLES = 14.0, 40.0
-# Most samples per pixel of the fixed image, which holds no more detail.
-FINEST = 4.0
-# Largest search to each side: in coarse samples; and in fine ones, beyond half a coarse one.
-WIDEST_SEARCH, FINE_SEARCH = 48, 1
-# Blur of the fixed camera's lens, pixels and coding, one standard deviation [px]; chosen on rendered books.
-WIDE_BLUR_PX = 0.7
-# Least lead of the best place over the next best, and least part of the target inside the zoom image.
-LEAST_LEAD, LEAST_SEEN = 0.12, 0.6
-# Range of the contrast in the zoom image over that in the fixed image.
-LOWEST_GAIN, HIGHEST_GAIN = 0.25, 4.0
-# Penalty on the score, per squared distance from the expected place in standard deviations.
-PRIOR_WEIGHT = 0.01
-# Places closer than this part of the target's box are one place.
-ONE_PLACE = 0.5
-# Standard deviation of a registration, in pixels of the fixed image and in samples, at the usual lack of likeness;
-# measured on the simulated targets.
-SIGMA_PX, SIGMA_SAMPLES = 0.08, 0.08
-USUAL_LACK, LEAST_LACK = 0.1, 0.04  # 1 - score
 
 
 @dataclass(frozen=True)
@@ -261,16 +323,19 @@ def register(image: Image, sight: FixedView, view: ZoomView) -> Place | None:
     Returns:
         The place; None if nothing correlates, if two places do, or if the maximum lies beyond the gate.
     """
-    finest = max(1 / FINEST, 1 / view.scale)
-    coarse, fine = (max(sight.side_px / samples, finest) for samples in (COARSE_SAMPLES, FINE_SAMPLES))
+    settings = sight.settings
+    finest = max(1 / settings.finest, 1 / view.scale)
+    coarse, fine = (
+        max(sight.side_px / samples, finest) for samples in (settings.coarse_samples, settings.fine_samples)
+    )
     place = _search(image, sight, view, coarse, view.center_px, None)
-    if place is None or place.lead < LEAST_LEAD:
+    if place is None or place.lead < settings.least_lead:
         return None
-    place = _search(image, sight, view, fine, place.center_px, FINE_SEARCH + math.ceil(coarse / fine / 2))
+    place = _search(image, sight, view, fine, place.center_px, settings.fine_search + math.ceil(coarse / fine / 2))
     if place is None:
         return None
-    lack = max(1 - place.score, LEAST_LACK) / USUAL_LACK
-    return replace(place, sigma_px=(SIGMA_PX + SIGMA_SAMPLES * fine) * math.sqrt(lack) * view.scale)
+    lack = max(1 - place.score, settings.least_lack) / settings.usual_lack
+    return replace(place, sigma_px=(settings.sigma_px + settings.sigma_samples * fine) * math.sqrt(lack) * view.scale)
 
 
 def _search(
@@ -286,18 +351,19 @@ def _search(
         around_px: centre of the search in the zoom image (u, v), (2,).
         reach: samples to each side; None for the whole gate, which then limits the search.
     """
+    settings = sight.settings
     template, weight, middle = sight.at_pitch(pitch)
     step = view.J * pitch  # zoom pixels per sample
     back = np.linalg.inv(step)
     spread = back @ view.covariance @ back.T + np.diag((sight.body_sigma_px / pitch) ** 2)
-    sides = np.full(2, WIDEST_SEARCH if reach is None else reach)
+    sides = np.full(2, settings.widest_search if reach is None else reach)
     if reach is None:
-        sides = np.minimum(np.ceil(GATE_SIGMAS * np.sqrt(np.diag(spread))).astype(int) + 1, sides)
+        sides = np.minimum(np.ceil(settings.gate_sigmas * np.sqrt(np.diag(spread))).astype(int) + 1, sides)
     A = np.column_stack([step, around_px - step @ (middle + sides)])
     width, height = (np.array(weight.shape[::-1]) + 2 * sides).tolist()
     samples, inside = resample(image, A, (width, height))
     if pitch < 1:  # blur the zoom samples as the fixed camera does, where the sampling resolves it
-        samples = cv2.GaussianBlur(samples, (0, 0), WIDE_BLUR_PX / pitch)
+        samples = cv2.GaussianBlur(samples, (0, 0), settings.blur_px / pitch)
     mix = sight.whitening
     likeness = correlate(cv2.transform(samples, mix), inside, cv2.transform(template, mix), weight)
     v, u = np.mgrid[-sides[1] : sides[1] + 1, -sides[0] : sides[0] + 1]
@@ -305,10 +371,13 @@ def _search(
     distance = inverse[0, 0] * u * u + 2 * inverse[0, 1] * u * v + inverse[1, 1] * v * v
     if reach is not None:
         distance = np.zeros_like(distance)
-    return _best(likeness, distance, ONE_PLACE * sight.size_px / pitch, around_px - step @ sides, step)
+    apart = settings.one_place * sight.size_px / pitch
+    return _best(likeness, distance, apart, around_px - step @ sides, step, settings)
 
 
-def _best(likeness: Likeness, distance: Array, apart: Array, origin_px: Array, step: Array) -> Place | None:
+def _best(
+    likeness: Likeness, distance: Array, apart: Array, origin_px: Array, step: Array, settings: MatchingSettings
+) -> Place | None:
     """Choose the best place of a search; None if it is out of bounds or no maximum.
 
     Args:
@@ -317,10 +386,12 @@ def _best(likeness: Likeness, distance: Array, apart: Array, origin_px: Array, s
         apart: least distance of two distinct places along u and v, (2,) [samples].
         origin_px: first place of the search in the zoom image (u, v), (2,).
         step: from one place to the next, (2, 2) [px].
+        settings: settings of the registration.
     """
-    allowed = (likeness.gain > LOWEST_GAIN) & (likeness.gain < HIGHEST_GAIN)
-    allowed &= (likeness.seen >= LEAST_SEEN) & (distance <= GATE_SIGMAS**2)
-    score = np.where(allowed, likeness.score - PRIOR_WEIGHT * distance, -1.0)
+    lowest, highest = settings.gain
+    allowed = (likeness.gain > lowest) & (likeness.gain < highest)
+    allowed &= (likeness.seen >= settings.least_seen) & (distance <= settings.gate_sigmas**2)
+    score = np.where(allowed, likeness.score - settings.prior_weight * distance, -1.0)
     row, column = (int(i) for i in np.unravel_index(int(np.argmax(score)), score.shape))
     # The prior may have moved the best place by one sample. A score that still rises beyond the gate is another object.
     top = summit(likeness.score, (row, column))
@@ -336,23 +407,6 @@ def _best(likeness: Likeness, distance: Array, apart: Array, origin_px: Array, s
         lead=best - max(float(score.max()), 0.0),
         seen=float(likeness.seen[row, column]),
     )
-
-
-# Largest time between the two frames of a registration: limbs and wings move [s].
-LONGEST_APART_S = 0.1
-# Largest delay of one camera's frames against the other's [s]; fixed frames are kept for that long.
-LATEST_S = 0.5
-# Step for derivatives, in parts of the depth.
-STEP = 1e-3
-# Least standard deviation of the expected place, from lens, head and frame times [px].
-LEAST_SIGMA_PX = 1.0
-# A match is sure with at least this score, and at most this much below the usual score, which fades by this a second.
-SURE_SCORE, LARGEST_DROP, FADING = 0.7, 0.15, 0.1
-# A weaker match counts with at least this score, this soon after a sure one [s], and this soon after the last match
-# [s], if its offset from the expected place has changed by no more than this many pixels of the fixed image plus this
-# part of the box.
-LEAST_SCORE, BELIEVED_S, LONGEST_GAP_S = 0.55, 0.5, 0.15
-STEADY_PX, STEADY_OF_SIDE = 0.5, 0.15
 
 
 @dataclass(frozen=True)
@@ -413,12 +467,15 @@ class Finder(Protocol):
 class CloseupFinder:
     """Register the fixed camera's detections of one target in the zoom image."""
 
-    def __init__(self, calibration: Calibration, target: TargetProfile) -> None:
+    def __init__(
+        self, calibration: Calibration, target: TargetProfile, settings: MatchingSettings = MatchingSettings()
+    ) -> None:
         """Create a finder without cut-outs.
 
         Args:
             calibration: calibration of the rig, for the streams in use.
             target: target profile.
+            settings: settings of the registration.
 
         Raises:
             CalibrationError: the calibration has no T.
@@ -426,7 +483,7 @@ class CloseupFinder:
         self._calibration = calibration
         self._T_base_fixed = calibration.T_base_fixed
         self._T_zoom_head = calibration.hand_eye().inv()
-        self._target = target
+        self._target, self._settings = target, settings
         self._sights: deque[FixedView] = deque()
         self._usual_score, self._sure_t = 0.0, -math.inf
         self._last_t = -math.inf
@@ -443,17 +500,18 @@ class CloseupFinder:
         Returns:
             The cut-out, with the centre of the body; None if the box holds no pixel of the frame.
         """
-        sight = look(frame, detection, mask, self._target)
+        sight = look(frame, detection, mask, self._target, self._settings)
         if sight is not None:
             self._sights.append(sight)
-            while self._sights[0].t < sight.t - LATEST_S - LONGEST_APART_S:
+            kept_s = self._settings.latest_s + self._settings.longest_apart_s
+            while self._sights[0].t < sight.t - kept_s:
                 self._sights.popleft()
         return sight
 
     def sight_at(self, t: float) -> FixedView | None:
-        """Return the stored cut-out nearest to time t [s]; None if none is within `LONGEST_APART_S`."""
+        """Return the stored cut-out nearest to time t [s]; None if none is within `longest_apart_s`."""
         near = min(self._sights, key=lambda sight: abs(sight.t - t), default=None)
-        return None if near is None or abs(near.t - t) > LONGEST_APART_S else near
+        return None if near is None or abs(near.t - t) > self._settings.longest_apart_s else near
 
     def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
         """Find the target in a zoom frame.
@@ -484,13 +542,15 @@ class CloseupFinder:
     def _believes(self, place: Place, sight: FixedView, view: ZoomView, t: float) -> bool:
         """Decide whether a match is sure, or weaker but continuous with the last ones; store it if so."""
         offset = np.asarray(np.linalg.solve(view.J, place.center_px - view.center_px), dtype=float)
-        usual = self._usual_score - FADING * abs(t - self._sure_t)
-        if place.score >= max(SURE_SCORE, usual - LARGEST_DROP):
+        settings = self._settings
+        usual = self._usual_score - settings.fading * abs(t - self._sure_t)
+        if place.score >= max(settings.sure_score, usual - settings.largest_drop):
             self._usual_score, self._sure_t = max(place.score, usual), t
         else:
-            recent = abs(t - self._sure_t) <= BELIEVED_S and abs(t - self._last_t) <= LONGEST_GAP_S
-            steady = np.linalg.norm(offset - self._last_offset) <= STEADY_PX + STEADY_OF_SIDE * sight.side_px
-            if not (place.score >= LEAST_SCORE and recent and steady):
+            recent = abs(t - self._sure_t) <= settings.believed_s and abs(t - self._last_t) <= settings.longest_gap_s
+            most = settings.steady_px + settings.steady_of_side * sight.side_px
+            steady = np.linalg.norm(offset - self._last_offset) <= most
+            if not (place.score >= settings.least_score and recent and steady):
                 return False
         self._last_t, self._last_offset = t, offset
         return True
@@ -511,4 +571,4 @@ class CloseupFinder:
         if not (np.isfinite(zoom).all() and np.isfinite(wide).all()):
             return None
         J = (zoom[1:3] - zoom[3:5]).T @ np.linalg.inv((wide[1:3] - wide[3:5]).T)
-        return ZoomView(zoom[0], covariance + LEAST_SIGMA_PX**2 * np.eye(2), J)
+        return ZoomView(zoom[0], covariance + self._settings.least_sigma_px**2 * np.eye(2), J)

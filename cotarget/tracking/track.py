@@ -255,8 +255,8 @@ class Measurement(Protocol):
 
 
 @dataclass(frozen=True)
-class TrackerSettings:
-    """Settings of the image filter and of a track's life cycle.
+class TrackingSettings:
+    """Settings of the image filter, of a track's life cycle and of the association.
 
     Attributes:
         acceleration_px: typical acceleration in the image [px/s^2].
@@ -275,6 +275,22 @@ class TrackerSettings:
         drop_s: time without a detection after which an unconfirmed track ends [s].
         size_s: window of the size's median [s].
         beat_s: window of the largest size, some two wing beats [s].
+        gate: gate on the squared Mahalanobis distance of place and size, 99.9 % of a chi-square with three degrees of
+            freedom.
+        size_sigma: standard deviation of the logarithm of a box's side: wings, limbs and occluders make it half or
+            twice as large. A twig that appears where a bird has gone behind a tree is smaller still.
+        least_score: scores below 0.5 count as a likelihood ratio, down to this score.
+        newcomers_hz: rate of new objects anywhere in the image [1/s]. A detection must more likely be the missing
+            target than a new object, because after 0.8 s the gate reaches over 250 px. Real films of birds and people
+            have up to 4 a second; below 1, tracks jump to other targets, and from 8 on, hidden birds are not found
+            again.
+        overlap_enough: overlap from which a box may belong to a track even outside the gate: the target merged with
+            something else.
+        overlap_bonus: reduction of the cost for perfect overlap, in squared Mahalanobis distance.
+        covered: a detection that covers this part of a track's predicted box explains the track, even if another has
+            won it.
+        most_detections: most detections of a frame that are used: snow, rain or flicker must not delay the next frame.
+            Real films of birds and of a dozen people have up to 10.
     """
 
     acceleration_px: float = 150.0
@@ -293,6 +309,14 @@ class TrackerSettings:
     drop_s: float = 0.13
     size_s: float = 0.6
     beat_s: float = 0.5
+    gate: float = 16.3
+    size_sigma: float = 0.5
+    least_score: float = 0.01
+    newcomers_hz: float = 2.0
+    overlap_enough: float = 0.3
+    overlap_bonus: float = 4.0
+    covered: float = 0.6
+    most_detections: int = 100
 
 
 # Part of a box's side by which its centre jitters with limbs and wings, by the target's motion model; and the settings
@@ -312,7 +336,7 @@ BY_DETECTOR: Mapping[str, Mapping[str, float]] = {
 }
 
 
-def tracker_settings(target: TargetProfile, *, external: bool = False) -> TrackerSettings:
+def tracking_settings(target: TargetProfile, *, external: bool = False) -> TrackingSettings:
     """Choose the tracker's settings for a target profile and a detector.
 
     A colour is located to a fraction of a pixel. What moves need not be the target, so tracks by motion must travel
@@ -328,7 +352,7 @@ def tracker_settings(target: TargetProfile, *, external: bool = False) -> Tracke
         by_motion["acceleration_px"] = FLYING_ACCELERATION_PX
     if not external:
         by_motion.update(BY_DETECTOR.get(target.detector, {}))
-    return TrackerSettings(**by_motion)  # type: ignore[arg-type]
+    return TrackingSettings(**by_motion)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -372,7 +396,7 @@ class ImageFilter:
         number: int,
         detection: Measurement,
         t: float,
-        settings: TrackerSettings,
+        settings: TrackingSettings,
         image_size: tuple[int, int] | None = None,
     ) -> None:
         self.number = number
@@ -514,7 +538,7 @@ def room_inside(around: Array, size: Array) -> Array:
     return np.maximum(0.0, (around - size) / 2)
 
 
-def center_variance(settings: TrackerSettings, size: Sides, part: Sides, lacks: Sides) -> Sides:
+def center_variance(settings: TrackingSettings, size: Sides, part: Sides, lacks: Sides) -> Sides:
     """Variance of a box's centre [px^2], (..., 2), or along one axis.
 
     Args:

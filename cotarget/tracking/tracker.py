@@ -18,36 +18,17 @@ from cotarget.tracking.track import (
     ImageFilter,
     Measurement,
     Track,
-    TrackerSettings,
+    TrackingSettings,
     center_variance,
     missing,
-    tracker_settings,
+    tracking_settings,
 )
 
-__all__ = ["Measurement", "Track", "Tracker", "TrackerSettings", "tracker_settings"]
+__all__ = ["Measurement", "Track", "Tracker", "TrackingSettings", "tracking_settings"]
 # Cost of pairs that must not be matched; no assignment inside the gate reaches it.
 IMPOSSIBLE = 1e6
-# Gate: 99.9 % of a chi-square with three degrees of freedom, two of place and one of size.
-GATE_CHI2 = 16.3
-# Standard deviation of the logarithm of a box's side: wings, limbs and occluders make it half or twice as large. A twig
-# that appears where a bird has gone behind a tree is smaller still.
-SIZE_SIGMA = 0.5
-# Scores below 0.5 count as a likelihood ratio, down to this score.
-LEAST_SCORE = 0.01
-# Rate of new objects anywhere in an image of that area [1/s]; a smaller image has no more per pixel. A detection must
-# more likely be the missing target than a new object, because after 0.8 s the gate reaches over 250 px. Real films of
-# birds and people have up to 4 a second; below 1, tracks jump to other targets, and from 8 on, hidden birds are not
-# found again.
-NEWCOMERS_HZ, LEAST_AREA_PX = 2.0, 640 * 512
-# Overlap from which a box may belong to a track even outside the gate: the target merged with something else.
-OVERLAP_ENOUGH = 0.3
-# Reduction of the cost for perfect overlap, in squared Mahalanobis distance.
-OVERLAP_BONUS = 4.0
-# A detection that covers this part of a track's predicted box explains the track, even if another has won it.
-COVERED = 0.6
-# Most detections of a frame that are used: snow, rain or flicker must not delay the next frame. Real films of birds and
-# of a dozen people have up to 10.
-MOST_DETECTIONS = 100
+# Area of an image in which new objects appear at `newcomers_hz`; a smaller image has no more per pixel [px^2].
+LEAST_AREA_PX = 640 * 512
 # Intervals whose median is the usual time between frames, and its value before the second frame [s].
 INTERVALS, FIRST_INTERVAL_S = 5, 1.0
 
@@ -55,14 +36,14 @@ INTERVALS, FIRST_INTERVAL_S = 5, 1.0
 class Tracker:
     """Turn each frame's detections into tracks with ids that are never reused."""
 
-    def __init__(self, settings: TrackerSettings | None = None, image_size: tuple[int, int] | None = None) -> None:
+    def __init__(self, settings: TrackingSettings | None = None, image_size: tuple[int, int] | None = None) -> None:
         """Create a tracker without tracks.
 
         Args:
             settings: settings of filters and life cycle.
             image_size: (width, height) [px]; with it, a track ends when it leaves the image.
         """
-        self._settings = settings or TrackerSettings()
+        self._settings = settings or TrackingSettings()
         self._image_size = image_size
         self._tracks: list[ImageFilter] = []
         self._next_id = 1
@@ -78,7 +59,7 @@ class Tracker:
         """Update the tracks with one frame's detections.
 
         Args:
-            detections: detections, best first. Of more than MOST_DETECTIONS, those next to confirmed tracks are used,
+            detections: detections, best first. Of more than `most_detections`, those next to confirmed tracks are used,
                 then the best.
             t: exposure time of the frame [s]. A frame that is not newer than the last one is ignored; after a clock
                 that jumped back by more than a track lives, tracking restarts.
@@ -128,24 +109,27 @@ class Tracker:
         self._t = t
 
     def _worth(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
-        """Select at most MOST_DETECTIONS detections, in their order."""
-        if len(detections) <= MOST_DETECTIONS:
+        """Select at most `most_detections` detections, in their order."""
+        most = self._settings.most_detections
+        if len(detections) <= most:
             return detections
         distance = np.full(len(detections), np.inf)
         confirmed = [state for state in self._tracks if state.confirmed]
         if confirmed:
             pairs = _Pairs(confirmed, detections, self._image_size)
-            distance = np.where(pairs.possible | (pairs.covered > COVERED), pairs.distance, np.inf).min(axis=0)
-        return [detections[j] for j in sorted(np.argsort(distance, kind="stable")[:MOST_DETECTIONS].tolist())]
+            explained = pairs.possible | (pairs.covered > self._settings.covered)
+            distance = np.where(explained, pairs.distance, np.inf).min(axis=0)
+        return [detections[j] for j in sorted(np.argsort(distance, kind="stable")[:most].tolist())]
 
     def _bear(self, detections: Sequence[Measurement], t: float) -> None:
         """Start a track at each detection that does not cover an existing one."""
         if not detections:
             return
+        covered = self._settings.covered
         at, size = _boxes_of(self._tracks)
         center, extent = _boxes(detections)
-        free = np.all(_shared(at, size, center, extent) <= COVERED * _area(size)[:, None], axis=0)
-        covers = _shared(center, extent, center, extent) > COVERED * _area(extent)[:, None]
+        free = np.all(_shared(at, size, center, extent) <= covered * _area(size)[:, None], axis=0)
+        covers = _shared(center, extent, center, extent) > covered * _area(extent)[:, None]
         for j, detection in enumerate(detections):
             if free[j]:  # detections that cover this new track are no further target
                 free &= ~covers[j]
@@ -161,6 +145,7 @@ class _Pairs:
         log_volume: logarithm of the determinant of the innovation covariance.
         covered: part of the track's box that the detection covers, 0 to 1.
         overlap: intersection over union of the boxes, 0 to 1.
+        settings: settings of the tracker.
         confirmed: whether each track is confirmed.
         possible: whether each detection may belong to each track.
     """
@@ -177,24 +162,24 @@ class _Pairs:
         spread = np.array([state.place_variance for state in states])[:, None]
         cut = np.array([detection.clipped for detection in detections], dtype=bool)
         lacks = missing(size[:, None], extent)
-        settings = states[0].settings
+        self.settings = settings = states[0].settings
         spread = spread + center_variance(settings, extent, np.where(cut, CUT, settings.noise_of_size)[:, None], lacks)
         own, other = _area(size)[:, None], _area(extent)
-        resized = np.log(other / own) / 2 / SIZE_SIGMA
+        resized = np.log(other / own) / 2 / settings.size_sigma
         # A clipped box may be larger than it shows, and a track last seen clipped is of unknown size.
         known = np.array([[not state.detection.clipped] for state in states])
         resized = np.where(cut, np.where(known, np.maximum(resized, 0.0), 0.0), resized)
         off = (center - at[:, None]) ** 2 / spread
         self.distance: Array = off[..., 0] + off[..., 1] + resized**2
-        score = np.array([min(max(detection.score, LEAST_SCORE), 0.5) for detection in detections])
+        score = np.array([min(max(detection.score, settings.least_score), 0.5) for detection in detections])
         self.distance += 2 * np.log((1 - score) / score)
         self.log_volume: Array = np.log(_area(spread))
         shared = _shared(at, size, center, extent)
         self.covered: Array = shared / own
         self.overlap: Array = shared / (own + other - shared)
         # A target whose box merged with another still overlaps its track.
-        near = (self.distance <= GATE_CHI2) & (self.distance + self.log_volume <= _least_likely(states, image_size))
-        self.possible = near | (self.overlap > OVERLAP_ENOUGH)
+        near = (self.distance <= settings.gate) & (self.distance + self.log_volume <= _least_likely(states, image_size))
+        self.possible = near | (self.overlap > settings.overlap_enough)
 
 
 def _least_likely(states: Sequence[ImageFilter], image_size: tuple[int, int] | None) -> Array:
@@ -205,7 +190,7 @@ def _least_likely(states: Sequence[ImageFilter], image_size: tuple[int, int] | N
     """
     limits = np.full((len(states), 1), np.inf)
     if image_size is not None:
-        density = NEWCOMERS_HZ / max(math.prod(image_size), LEAST_AREA_PX)
+        density = states[0].settings.newcomers_hz / max(math.prod(image_size), LEAST_AREA_PX)
         for i, state in enumerate(states):
             if state.missed:
                 limits[i] = -2 * math.log(2 * math.pi * density * (state.t - state.seen))
@@ -236,7 +221,7 @@ def _belongs(state: ImageFilter, detection: Measurement, image_size: tuple[int, 
 
     If the boxes overlap enough, they match whatever their distance is.
     """
-    if _overlap(state, detection) > OVERLAP_ENOUGH:
+    if _overlap(state, detection) > state.settings.overlap_enough:
         return True
     return bool(_Pairs([state], [detection], image_size).possible[0, 0])
 
@@ -262,7 +247,8 @@ def _assign(pairs: _Pairs) -> dict[int, int]:
     Confirmed tracks are matched first: a coasting track knows its target's place badly, and a new track begun there
     meanwhile knows it well, yet the detection is the old target, found again.
     """
-    cost = np.where(pairs.possible, pairs.distance + pairs.log_volume - OVERLAP_BONUS * pairs.overlap, IMPOSSIBLE)
+    bonus = pairs.settings.overlap_bonus * pairs.overlap
+    cost = np.where(pairs.possible, pairs.distance + pairs.log_volume - bonus, IMPOSSIBLE)
     matches: dict[int, int] = {}
     for confirmed in (True, False):
         group = [i for i, each in enumerate(pairs.confirmed) if each == confirmed]
@@ -280,7 +266,7 @@ def _crowds(pairs: _Pairs, matches: dict[int, int]) -> dict[int, int]:
     crowds: dict[int, int] = {}
     if sum(pairs.confirmed) < 2:
         return crowds
-    inside = (pairs.covered > COVERED) & np.array(pairs.confirmed)[:, None]
+    inside = (pairs.covered > pairs.settings.covered) & np.array(pairs.confirmed)[:, None]
     for j in np.flatnonzero(np.count_nonzero(inside, axis=0) > 1):
         covered = [int(i) for i in np.flatnonzero(inside[:, j]) if matches.get(int(i), j) == j]
         if len(covered) > 1:

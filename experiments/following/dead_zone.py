@@ -52,8 +52,8 @@ def one(calibration: Calibration, settings: DeadZoneSettings, seed: int) -> list
     for name in settings.targets:
         config = hold_config(name, seed)
         view = record(config, target_of(config, name), settings.seconds)
-        for way, head_controller in WAYS.items():
-            how = FollowSettings(head_controller=head_controller, closed_loop=settings.closed_loop)
+        for way, head in WAYS.items():
+            how = FollowSettings(head=head, closed_loop=settings.closed_loop)
             found = score(held(calibration, config, name, settings.seconds, how, view))
             rows.append({"seed": seed, "target": name, "way": way} | {key: getattr(found, key) for key in FIGURES})
     return rows

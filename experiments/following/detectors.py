@@ -29,7 +29,7 @@ from cotarget.rig import Frame
 from cotarget.sim.targets.random_paths import GROUPED, SECONDS
 from cotarget.sim.truth import Silhouette
 from cotarget.sim.world import SimWorld
-from cotarget.tracking.track import tracker_settings
+from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
 from experiments.engine.checks import check_above, check_ways
 from experiments.engine.harness import Experiment, Row, Settings, seeds_of
@@ -101,7 +101,7 @@ class Watch:
 
     def __post_init__(self) -> None:
         self._detector = make_detector(self.target, self.config.rate_hz)
-        self._tracker = Tracker(tracker_settings(self.target), self.config.sim.fixed.size)
+        self._tracker = Tracker(tracking_settings(self.target), self.config.sim.fixed.size)
 
     def see(self, frame: Frame, shift: Array, outlines: Mapping[str, Silhouette | None]) -> None:
         """Search a frame with a shift (du, dv) [px], and judge the tracks."""

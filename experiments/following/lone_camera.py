@@ -25,7 +25,7 @@ from cotarget.geometry import Array
 from cotarget.pantilt import base_head, nearest, solve
 from cotarget.rig import Angles, Frame, Rig
 from cotarget.sim.truth import Truth
-from cotarget.tracking.track import tracker_settings
+from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
 from experiments.following.lone_course import SEARCH_S, Course, Sighting
 
@@ -74,7 +74,7 @@ class LoneCamera:
         self._shortest, longest = (self._zoom.at(f).focal_px[0] for f in rig.zoom.focal_range)
         self._policy = ZoomController((self._shortest, longest), rig.zoom.size)
         self._head_controller = HeadController(rig.head.limits)
-        self._course, self._tracker = Course(target, noise_px, lasts_s), Tracker(tracker_settings(target))
+        self._course, self._tracker = Course(target, noise_px, lasts_s), Tracker(tracking_settings(target))
         self._focal = rig.zoom.zoom(rig.zoom.focal_range[0])
         self._next, self._round, self._set_out = 0, self._field, -math.inf
         self.mode = ""

@@ -30,7 +30,7 @@ from cotarget.safety.safe_rig import guard
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Aim, Reach, aim
-from cotarget.tracking.track import Track, tracker_settings
+from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker
 
 # Head and lens that reach any pose within a millisecond.
@@ -160,7 +160,7 @@ class _Lookout:
     def __init__(self, rig: Rig, calibration: Calibration, config: RigConfig, target: TargetProfile) -> None:
         self._rig, self._config, self._calibration = rig, config, calibration
         self._detector = make_detector(target, config.rate_hz)
-        self._tracker = Tracker(tracker_settings(target), rig.fixed.size)
+        self._tracker = Tracker(tracking_settings(target), rig.fixed.size)
         self._wide = TargetFusion(calibration, target, rig.fixed.size)  # never updated from the zoom camera
         self._both: TargetFusion | None = None
         self._policy = FirstCome()

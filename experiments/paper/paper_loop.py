@@ -17,7 +17,7 @@ from cotarget.errors import UnreachableError
 from cotarget.pipeline import FollowSettings, FrameSource, State, Step, follow
 from cotarget.rig import Rig
 from cotarget.targeting import Aim, Method, WantedSize, aim, depth_of, point_at
-from cotarget.tracking.track import Track, tracker_settings
+from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker
 
 METHOD: Method = "paper-table"  # depth as in Table 1
@@ -39,7 +39,7 @@ def follow_as_the_paper(
     started.
     """
     calibration = calibration.for_streams(rig.fixed.size, rig.zoom.size)
-    eyes, tracker = FrameSource(rig.fixed, rig.zoom, rig.clock), Tracker(tracker_settings(target), rig.fixed.size)
+    eyes, tracker = FrameSource(rig.fixed, rig.zoom, rig.clock), Tracker(tracking_settings(target), rig.fixed.size)
     head = rig.head.state()
     commanded = (head.pan, head.tilt, rig.zoom.zoom(rig.zoom.focal_range[0]))
     mine: Track | None = None

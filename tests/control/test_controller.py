@@ -10,7 +10,7 @@ import pytest
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
-from cotarget.control.controller import Controller, ControllerSettings, reach_of
+from cotarget.control.controller import Controller, reach_of
 from cotarget.control.head import HeadSettings
 from cotarget.control.zoom import ZoomSettings
 from cotarget.errors import UnreachableError
@@ -115,7 +115,7 @@ def still(x, **known):
 
 
 def controller(rig, **settings):
-    return Controller(rig_of(rig, delay_s=DELAY), CALIBRATION, ControllerSettings(**settings))
+    return Controller(rig_of(rig, delay_s=DELAY), CALIBRATION, **settings)
 
 
 def test_the_lens_starts_at_its_shortest_and_the_head_where_it_is():
@@ -129,7 +129,7 @@ def test_whatever_is_sent_is_counted():
     rig = Rig(t=2.0)
     move, goal = rig.head.move, (0.05, 0.1)
     rig.head.move = lambda *command: move(*command) and goal
-    driver = controller(rig, head_controller=HeadSettings(deadband=False))
+    driver = controller(rig, head=HeadSettings(deadband=False))
     for i in range(20):
         driver.drive(still(0.5 + 1e-4 * (i % 2)), rig.t, FRAME)
         assert driver.commanded[:2] == goal
@@ -291,7 +291,7 @@ def test_what_can_be_reached():
 
 def test_every_frame_has_its_command_without_a_dead_zone():
     rig = Rig()
-    driver = controller(rig, head_controller=HeadSettings(deadband=False))
+    driver = controller(rig, head=HeadSettings(deadband=False))
     for i in range(10):
         rig.t = i * FRAME
         driver.drive(moving(1.0), rig.t, FRAME)

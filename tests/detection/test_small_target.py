@@ -19,7 +19,7 @@ from cotarget.detection.small_target import (
 )
 from cotarget.errors import CotargetError
 from cotarget.rig import Frame
-from cotarget.tracking.track import tracker_settings
+from cotarget.tracking.track import tracking_settings
 from cotarget.tracking.tracker import Tracker
 
 RATE = 25.0
@@ -61,7 +61,7 @@ def watch(pictures, detector=None):
 
 def follow(pictures):
     """Confirmed tracks of each frame."""
-    tracker = Tracker(tracker_settings(SPECK), (WIDTH, HEIGHT))
+    tracker = Tracker(tracking_settings(SPECK), (WIDTH, HEIGHT))
     found = watch(pictures)
     return [[t for t in tracker.update(boxes, i / RATE) if t.confirmed] for i, boxes in enumerate(found)]
 
@@ -317,7 +317,7 @@ def test_pictures_too_small_dark_or_bright_are_no_error():
 def test_a_hundred_moving_things_keep_their_numbers():
     rng = np.random.default_rng(11)
     start = np.stack(np.meshgrid(np.linspace(20, 280, 10), np.linspace(20, 200, 10)), axis=-1).reshape(-1, 2)
-    tracker = Tracker(tracker_settings(dataclasses.replace(SPECK, detector="mog2")))
+    tracker = Tracker(tracking_settings(dataclasses.replace(SPECK, detector="mog2")))
 
     @dataclasses.dataclass
     class Seen:

@@ -18,7 +18,7 @@ from cotarget.estimation.measurement_model import Sights
 from cotarget.estimation.motion_model import MOTIONS, STATES, USUAL_BIAS, MotionSettings, propagate
 from cotarget.geometry import RigidTransform
 from cotarget.targeting import Reach, aim, depth_of, point_at
-from cotarget.tracking.track import ImageFilter, tracker_settings
+from cotarget.tracking.track import ImageFilter, tracking_settings
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth
 from tests.moving_targets import APART, RATE, Flight, calibration_of, magnified, show
 
@@ -90,7 +90,7 @@ def baselines(flight):
         if seen is None:
             continue
         if state is None:
-            state = ImageFilter(1, seen, t, tracker_settings(flight.target))
+            state = ImageFilter(1, seen, t, tracking_settings(flight.target))
         else:
             state.predict(t)
             state.correct(seen)

@@ -18,7 +18,7 @@ from cotarget.control.selection import POLICIES, Chosen
 from cotarget.detection import Detection
 from cotarget.errors import CotargetError, DeviceError, StaleFrameError
 from cotarget.evaluation import TruthDetector, true_calibration
-from cotarget.fusion import MOST_FILTERS
+from cotarget.fusion import FusionSettings
 from cotarget.pipeline import BLIND_S, FROZEN_S, GONE_S, ZOOM_WAIT_S, FollowSettings, State, follow
 from cotarget.recording.replay import Replay, until_end
 from cotarget.rig import Frame
@@ -432,7 +432,7 @@ def test_whoever_is_chosen_of_a_hundred_is_followed(click):
     pixel = tuple(PLAIN.project(crowd.at(number, 0.2))[0])
     selector = Chosen(pixel=pixel, click_part=8 / rig.fixed.size[0]) if click else Chosen(number=number + 1)
     steps = run(rig, crowd, 2.0, selector=selector)
-    assert number > MOST_FILTERS
+    assert number > FusionSettings.most_filters
     assert {step.target.id for step in steps if step.target is not None} == {number + 1}
     assert steps[-1].state is State.FOLLOWING
     assert off(rig, lambda t: crowd.at(number, t), rig.t) < 0.01

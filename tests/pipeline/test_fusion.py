@@ -14,11 +14,11 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.control.selection import RATE_S
 from cotarget.detection import Detection
-from cotarget.estimation.zoom_matching import LONGEST_APART_S, CloseupFinder, ZoomMeasurement
-from cotarget.fusion import MOST_FILTERS, MOST_WAITING, UNFOUND_S, TargetFusion
+from cotarget.estimation.zoom_matching import CloseupFinder, MatchingSettings, ZoomMeasurement
+from cotarget.fusion import MOST_WAITING, FusionSettings, TargetFusion
 from cotarget.geometry import pose
 from cotarget.rig import Frame, PanTiltState, ZoomState
-from cotarget.tracking.track import Track, tracker_settings
+from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker
 
 SIZE, CENTER, FOCAL, ZOOMED = (640, 480), (319.5, 239.5), 700.0, 3000.0
@@ -84,7 +84,7 @@ def test_of_a_hundred_tracks_only_the_first_have_filters():
     tracks = [track(n, box_at(0.05 * n, 0.0, 10.0)) for n in range(1, 101)]
     fusion.update_fixed(Frame(PICTURE, 0.0), tracks, None)
     known = [n for n in range(1, 101) if fusion.estimate(n, 0.0) is not None]
-    assert known == list(range(1, MOST_FILTERS + 1))
+    assert known == list(range(1, FusionSettings.most_filters + 1))
 
 
 def test_a_birds_wingspan_is_the_largest_side_over_a_beat():
@@ -129,7 +129,7 @@ class Learner:
 
 def test_who_crosses_another_is_predicted_as_before():
     """While both are one box neither is where its own last box was, 6 px a frame ago and more."""
-    tracker, fusion = Tracker(tracker_settings(PERSON), SIZE), TargetFusion(CALIBRATION, PERSON, SIZE)
+    tracker, fusion = Tracker(tracking_settings(PERSON), SIZE), TargetFusion(CALIBRATION, PERSON, SIZE)
     fusion.follow(1)
     fusion._finder, merged, worst = Learner(), [], 0.0
     for i in range(100):
@@ -327,10 +327,10 @@ def test_whoever_is_known_stays_known_when_elder_ones_are_believed():
 def test_the_followed_and_the_favoured_are_known_before_others():
     fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
     fusion.update_fixed(Frame(PICTURE, 0.0), crowd(range(1, 101)), None, favoured={90})
-    assert known(fusion) == {*range(1, MOST_FILTERS), 90}
+    assert known(fusion) == {*range(1, FusionSettings.most_filters), 90}
     fusion.follow(5)
     fusion.update_fixed(Frame(PICTURE, FRAME_S), crowd(range(1, 101), FRAME_S), None, favoured=set(range(20, 60)))
-    assert known(fusion, FRAME_S) == {5, *range(20, 20 + MOST_FILTERS - 1)}
+    assert known(fusion, FRAME_S) == {5, *range(20, 20 + FusionSettings.most_filters - 1)}
 
 
 def test_whoever_is_believed_is_known_before_whoever_is_not():
@@ -338,7 +338,7 @@ def test_whoever_is_believed_is_known_before_whoever_is_not():
     fusion.update_fixed(Frame(PICTURE, 0.0), crowd(range(1, 51), confirmed=False), None)
     tracks = crowd(range(51, 101), FRAME_S) + crowd(range(1, 51), FRAME_S, confirmed=False)
     fusion.update_fixed(Frame(PICTURE, FRAME_S), tracks, None)
-    assert known(fusion, FRAME_S) == set(range(51, 51 + MOST_FILTERS))
+    assert known(fusion, FRAME_S) == set(range(51, 51 + FusionSettings.most_filters))
 
 
 class Gated(Finder):
@@ -353,7 +353,7 @@ class Gated(Finder):
 def test_what_is_not_found_where_it_should_be_is_said_and_then_looked_for_farther_around():
     """Its size is told 15 % too small: at 10 m, 0.4 m beside, that is 21 px of 3000."""
     x = (BASELINE + 0.05, 0.0, 10.0)
-    frames = int(UNFOUND_S / FRAME_S) + 2
+    frames = int(FusionSettings.unfound_s / FRAME_S) + 2
     fusion, found = followed(x, 1.15, frames, Gated(x))
     t = (frames - 1) * FRAME_S
     assert found[:-2] == [None] * (frames - 2)
@@ -372,7 +372,7 @@ def test_what_is_not_found_where_it_should_be_is_said_and_then_looked_for_farthe
 def test_who_is_not_what_was_told_is_an_unlikely_candidate():
     x = (BASELINE + 0.05, 0.0, 10.0)
     for wrong, likely in ((1.0, True), (1.15, False)):
-        frames = int(UNFOUND_S / FRAME_S) + 32
+        frames = int(FusionSettings.unfound_s / FRAME_S) + 32
         fusion, _ = followed(x, wrong, frames, Gated(x))
         (seen_so,) = fusion.candidates([track(1, box_at(*x, wrong=wrong))], (frames - 1) * FRAME_S)
         assert seen_so.likely is likely
@@ -423,7 +423,7 @@ def apart(by, frames=60):
             fusion.states.add(PanTiltState(0.0, 0.0, False, when), ZoomState(ZOOMED, False, when))
         found.append(fusion.update_zoom(Frame(PICTURE, t + by), t))
         if found[-1] is not None:
-            assert abs(found[-1].t - t) <= max(LONGEST_APART_S, -by) + 1e-9
+            assert abs(found[-1].t - t) <= max(MatchingSettings.longest_apart_s, -by) + 1e-9
             assert fusion.estimate(1, t).measured_t == pytest.approx(max(t, found[-1].t) if found[-1].t <= t else t)
     return found, fusion.warnings(1, t)
 
@@ -453,7 +453,7 @@ def test_a_zoom_frame_without_a_wide_view_of_its_time_is_not_one_without_the_tar
         fusion.update_fixed(Frame(PICTURE, t), [track(1, box_at(*x), t, missed=i % 25)], None)
         fusion.states.add(PanTiltState(0.0, 0.0, False, t), ZoomState(ZOOMED, False, t))
         fusion.update_zoom(Frame(PICTURE, t), t)
-    assert len(fusion._finder.asked) <= 4 * 2 * LONGEST_APART_S / FRAME_S + 1
+    assert len(fusion._finder.asked) <= 4 * 2 * MatchingSettings.longest_apart_s / FRAME_S + 1
     assert len(fusion._waiting) <= MOST_WAITING
     assert fusion.warnings(1, t) == []
 

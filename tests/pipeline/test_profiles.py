@@ -9,7 +9,7 @@ from cotarget.config import DEFAULT_TARGETS, TargetProfile, parse_config
 from cotarget.detection import make_detector
 from cotarget.estimation import filter_settings
 from cotarget.rig import Frame
-from cotarget.tracking.track import tracker_settings
+from cotarget.tracking.track import tracking_settings
 
 RATE = 25.0
 CAR = TargetProfile(4.2, "width", 200.0, "motion")
@@ -41,8 +41,8 @@ def test_a_wide_target_is_detected_unless_its_profile_says_that_it_is_upright(sh
 @pytest.mark.parametrize("name", DEFAULT_TARGETS)
 def test_tracks_of_an_external_detector_are_confirmed_alike_whatever_detector_the_profile_names(name, detector):
     profile = DEFAULT_TARGETS[name]
-    settings = tracker_settings(replace(profile, detector=detector), external=True)
-    assert settings == tracker_settings(profile, external=True)
+    settings = tracking_settings(replace(profile, detector=detector), external=True)
+    assert settings == tracking_settings(profile, external=True)
     assert (settings.confirm_travel, settings.confirm_score, settings.doubt_score) == (0.0, 0.0, 0.0)
 
 

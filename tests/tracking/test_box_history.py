@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cotarget.detection import Detection
-from cotarget.tracking.track import ImageFilter, SizeHistory, TrackerSettings, Trail
+from cotarget.tracking.track import ImageFilter, SizeHistory, TrackingSettings, Trail
 
 DT = 0.04
 
@@ -87,7 +87,7 @@ def test_sizes_are_those_that_the_border_does_not_cut():
 def confirmed_after(speed, size, seconds=20.0, flicker=0.1):
     """When a thing of a size [px] that moves steadily [px/s] is believed [s], its outline flickering; None if never."""
     rng = np.random.default_rng(0)
-    settings = TrackerSettings(confirm_travel=0.5)
+    settings = TrackingSettings(confirm_travel=0.5)
     found = None
     for i in range(round(seconds / DT)):
         low, high = np.array([100 + speed * i * DT, 100]), np.array([100 + speed * i * DT, 100]) + size

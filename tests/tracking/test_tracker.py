@@ -8,14 +8,14 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.tracking import tracker as tracker_module
-from cotarget.tracking.track import CUT, ImageFilter, TrackerSettings, center_variance, missing, tracker_settings
-from cotarget.tracking.tracker import MOST_DETECTIONS, Tracker
+from cotarget.tracking.track import CUT, ImageFilter, TrackingSettings, center_variance, missing, tracking_settings
+from cotarget.tracking.tracker import Tracker
 
 RATE = 25.0
 SIZE = (640, 480)
 MOVING_BIRD = replace(DEFAULT_TARGETS["bird"], detector="motion")
-NOISE_PX = 0.4  # what TrackerSettings tells the filter, with boxes whose own part is switched off below
-PLAIN = TrackerSettings(noise_px=NOISE_PX, noise_of_size=0.0)
+NOISE_PX = 0.4  # what TrackingSettings tells the filter, with boxes whose own part is switched off below
+PLAIN = TrackingSettings(noise_px=NOISE_PX, noise_of_size=0.0)
 # The filter's own steady state for white acceleration q and noise R every dt: the variance of the velocity is
 # sqrt(2) q^(3/4) (R dt)^(1/4), here (18 px/s)^2; half of it is noise where the target does not accelerate.
 SPEED_TOLERANCE = 2 * 18.0 / 2**0.5
@@ -180,7 +180,9 @@ def test_of_a_thousand_flashes_most_are_left_out_and_the_targets_are_not():
     for i in range(20, 40):
         t = i / RATE
         tracks = tracker.update([*flashes(rng), *targets(t)], t)
-        assert len([track for track in tracks if track.missed == 0]) <= MOST_DETECTIONS + 1  # of a box two have a share
+        assert (
+            len([track for track in tracks if track.missed == 0]) <= TrackingSettings.most_detections + 1
+        )  # of a box two have a share
         known = [track for track in tracks if track.id <= 3]
         assert [(track.id, track.missed) for track in known] == [(1, 0), (2, 0), (3, 0)]
         assert np.linalg.norm(known[0].center_px - (50 + 100 * t, 100)) < 5
@@ -190,7 +192,7 @@ def test_where_nobody_is_confirmed_the_best_are_taken():
     rng = np.random.default_rng(4)
     found = sorted((replace(each, score=rng.uniform()) for each in flashes(rng)), key=lambda each: -each.score)
     tracks = Tracker(PLAIN, SIZE).update(found, 0.0)
-    assert min(track.score for track in tracks) >= found[MOST_DETECTIONS - 1].score
+    assert min(track.score for track in tracks) >= found[TrackingSettings.most_detections - 1].score
 
 
 def test_comparing_everything_with_everything_is_done_once_a_frame(monkeypatch):
@@ -225,7 +227,7 @@ def test_a_flash_is_never_confirmed():
 
 def test_what_trembles_on_the_spot_is_no_bird():
     rng = np.random.default_rng(2)
-    tracker = Tracker(tracker_settings(MOVING_BIRD))
+    tracker = Tracker(tracking_settings(MOVING_BIRD))
     for i in range(100):
         tracks = tracker.update([seen(*(np.array([200, 200]) + rng.uniform(-2, 2, 2)), 12, 12)], i / RATE)
     assert not any(t.confirmed for t in tracks)
@@ -328,7 +330,7 @@ def test_who_is_found_again_is_no_newcomer():
 @pytest.mark.parametrize(("off_px", "number"), [(30, 1), (50, 1), (110, None), (150, None)])
 def test_of_two_who_pass_one_vanishes_and_his_track_does_not_jump_on(off_px, number):
     """0.7 s later the filter knows his place to 35 px, and four times that are in its gate: it is somebody else."""
-    tracker = Tracker(tracker_settings(DEFAULT_TARGETS["person"]), SIZE)
+    tracker = Tracker(tracking_settings(DEFAULT_TARGETS["person"]), SIZE)
     ids = {}
     for i in range(80):
         t = i / RATE
@@ -344,7 +346,7 @@ def test_of_two_who_pass_one_vanishes_and_his_track_does_not_jump_on(off_px, num
 @pytest.mark.parametrize(("size", "taken"), [((50, 70), False), ((8, 6), True)])
 def test_what_the_border_cuts_is_at_least_as_large_as_it_looks(size, taken):
     """A post that rises from the lower border is no bird; a part of a bird may be one."""
-    tracker = Tracker(tracker_settings(MOVING_BIRD))
+    tracker = Tracker(tracking_settings(MOVING_BIRD))
     for i in range(40):
         tracker.update([seen(300 + i, 450, 9, 7)], i / RATE)
     for i in range(40, 50):
@@ -355,7 +357,7 @@ def test_what_the_border_cuts_is_at_least_as_large_as_it_looks(size, taken):
 
 def test_who_enters_at_a_corner_is_one_although_the_next_box_is_far_larger():
     """Of 3 by 10 px that the border left, 38 by 60 are no other."""
-    tracker = Tracker(tracker_settings(DEFAULT_TARGETS["person"]), SIZE)
+    tracker = Tracker(tracking_settings(DEFAULT_TARGETS["person"]), SIZE)
     for i, (width, height) in enumerate([(3, 10), (38, 60), (40, 62), (40, 64)]):
         tracks = tracker.update([seen(width / 2, height / 2, width, height, clipped=True)], i / RATE)
         assert [(track.id, track.missed) for track in tracks] == [(1, 0)]
@@ -365,7 +367,7 @@ def test_who_enters_at_a_corner_is_one_although_the_next_box_is_far_larger():
 @pytest.mark.parametrize("turn", [-0.9, 0.9])
 def test_a_bird_that_turns_behind_foliage_is_found_again(gap_s, turn):
     """At 25 m it flies at 10 m/s, 280 px/s, and turns by 0.9 rad/s, with 9 m/s^2: newcomers are not that near."""
-    tracker = Tracker(tracker_settings(MOVING_BIRD), SIZE)
+    tracker = Tracker(tracking_settings(MOVING_BIRD), SIZE)
     rng = np.random.default_rng(5)
     place, heading = np.array([120.0, 240.0]), 0.0
     for i in range(int((1.2 + gap_s) * RATE)):
@@ -387,13 +389,13 @@ def test_a_lone_pair_is_matched_as_any_other(monkeypatch, name):
         found = shortcut(state, detection, image_size)
         assert tracker_module._overlap(state, detection) == pairs.overlap[0, 0]
         assert (matches, tracker_module._crowds(pairs, matches)) == ({0: 0} if found else {}, {})
-        ways[found, bool(pairs.overlap[0, 0] > tracker_module.OVERLAP_ENOUGH), state.missed > 0] += 1
+        ways[found, bool(pairs.overlap[0, 0] > TrackingSettings.overlap_enough), state.missed > 0] += 1
         return found
 
     monkeypatch.setattr(tracker_module, "_belongs", both)
     rng = np.random.default_rng(5)
     for _ in range(30):
-        tracker = Tracker(PLAIN if name is None else tracker_settings(DEFAULT_TARGETS[name]), SIZE)
+        tracker = Tracker(PLAIN if name is None else tracking_settings(DEFAULT_TARGETS[name]), SIZE)
         for i in range(40):
             place = np.array([100 + 6 * i, 200]) + rng.normal(0, 4, 2) * rng.choice([1, 4], p=[0.7, 0.3])
             box = Seen(place, rng.uniform(8, 30, 2), rng.uniform(0.005, 1.0), bool(rng.random() < 0.1))
@@ -404,7 +406,7 @@ def test_a_lone_pair_is_matched_as_any_other(monkeypatch, name):
 
 def test_a_boxs_variance_is_the_same_in_floats_and_for_many():
     rng = np.random.default_rng(3)
-    for settings in (PLAIN, *map(tracker_settings, DEFAULT_TARGETS.values())):
+    for settings in (PLAIN, *map(tracking_settings, DEFAULT_TARGETS.values())):
         state = ImageFilter(1, Seen(np.zeros(2), np.array([20.0, 12.0])), 0.0, settings)
         boxes = [Seen(np.zeros(2), rng.uniform(3, 40, 2), clipped=bool(rng.random() < 0.3)) for _ in range(50)]
         sides = np.array([box.size_px for box in boxes])
