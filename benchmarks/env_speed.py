@@ -55,7 +55,7 @@ class EnvSpeedSettings(Settings):
     def __post_init__(self) -> None:
         """Refuse values that the environments refuse, and runs too short to time."""
         super().__post_init__()
-        check_least(BLOCK / RigConfig().rate_hz, self, "seconds")
+        check_least(BLOCK / RigConfig().sim.fixed.rate_hz, self, "seconds")
         check_above(0, self, "seconds_seen")
         check_ways(self, "seconds", "seconds_seen")
 
@@ -72,7 +72,7 @@ class Alone:
             times: times of its frames [s].
         """
         self._model, self._data = model, mujoco.MjData(model)
-        self._steps = round(1 / world.config.rate_hz / model.opt.timestep)
+        self._steps = round(1 / world.config.sim.fixed.rate_hz / model.opt.timestep)
         truth = world.truth()
         poses = (truth.set_bodies(t) for t in times)
         self._poses = [(data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy()) for data in poses]

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
+from cotarget import backends
 from cotarget.calibration import Calibration
 from cotarget.config import DEFAULT_TARGETS, RigConfig, TargetProfile
 from cotarget.control.selection import FirstCome
@@ -78,9 +79,9 @@ class Pipeline:
         self.calibration = calibration_of(film.size)
         self.tracker, self.policy = Tracker(tracking_settings(self.target), film.size), FirstCome()
         self.fusion = TargetFusion(self.calibration, self.target, film.size)
-        config = RigConfig()
-        pan, tilt = config.head_limits
-        self.reach = Reach(pan, tilt, config.focal_range_px)
+        spec = backends.describe(RigConfig())
+        pan, tilt = spec.head.limits.pan, spec.head.limits.tilt
+        self.reach = Reach(pan, tilt, spec.zoom.focal_range)
         self.limits = PanTiltLimits(pan, tilt, math.inf, math.inf, 0.0)
 
     def __call__(self, frame: Frame) -> Row:

@@ -81,7 +81,7 @@ def resident_mb() -> float:
 def aged(loop: str, minutes: int) -> list[tuple[float, float]]:
     """Run a loop; give the median of a step's processor time [ms] and the memory [MB] for each minute."""
     world = SimWorld(config(), rendered=())
-    a_minute = round(60 * world.config.rate_hz)
+    a_minute = round(60 * world.config.sim.fixed.rate_hz)
     found: list[tuple[float, float]] = []
     took: list[float] = []
     steps = LOOPS[loop](world, 60.0 * minutes + 1.0)

@@ -48,7 +48,7 @@ def fitted(settings: SweepSpeedSettings, number: int) -> list[Row]:
 def rendered(settings: SweepSpeedSettings, number: int) -> list[Row]:
     """Run a job that renders: both cameras of the field search a person; give the detections of each frame."""
     config = hold_config("person", number)
-    detector, rows = make_detector(config.target("person"), config.rate_hz), []
+    detector, rows = make_detector(config.target("person"), config.sim.fixed.rate_hz), []
     with SimWorld(config).rig as rig:
         t: float | None = None
         while t is None or t < settings.seconds:

@@ -1,3 +1,4 @@
+from .backends import load_config as load_config
 from .backends import open_rig as open_rig
 from .calibration.calibrate import calibrate as calibrate
 from .calibration.file import Calibration as Calibration
@@ -6,7 +7,6 @@ from .calibration.handeye import solve_hand_eye as solve_hand_eye
 from .config import RigConfig as RigConfig
 from .config import SimConfig as SimConfig
 from .config import TargetProfile as TargetProfile
-from .config import load_config as load_config
 from .detection import Detection as Detection
 from .detection import ExternalDetector as ExternalDetector
 from .errors import CalibrationError as CalibrationError

@@ -1,4 +1,4 @@
-"""Open the rig that a configuration describes; the only module that imports backends."""
+"""Read, check and open the rig that a rig.toml describes; the only module that imports backends."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +10,43 @@ from cotarget.rig import Rig, RigSpec
 if TYPE_CHECKING:
     from cotarget.config import RigConfig
     from cotarget.recording.format import Recording
+
+
+def load_config(path: Path | str, text: str | None = None) -> "RigConfig":
+    """Read rig.toml and check all of it.
+
+    Args:
+        path: path of the file; relative paths in it are relative to its folder.
+        text: text of the file; by default it is read.
+
+    Raises:
+        ConfigError: the file is missing or malformed, or has an unknown key or an impossible value.
+    """
+    from cotarget.config import config_of, read_text
+
+    path = Path(path)
+    config = config_of(read_text(path) if text is None else text, path)
+    try:
+        check(config)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    return config
+
+
+def check(config: "RigConfig") -> None:
+    """Check what the backends know of a configuration: [hardware] by its drivers; no device is opened.
+
+    Raises:
+        ConfigError: a value is refused; the message names the key.
+    """
+    from cotarget.drivers.rig import check_hardware
+
+    check_hardware(config.hardware)
+    if config.backend != "replay" and config.safety.watchdog_s * (rate_hz := _described(config).fixed.rate_hz) <= 1:
+        raise ConfigError(
+            f"safety.watchdog_s: {config.safety.watchdog_s:g} s would halt the head between any two frames of the "
+            f"fixed camera, of which {rate_hz:g} come a second"
+        )
 
 
 def open_rig(config: "RigConfig | Path | str", guarded: bool = True) -> Rig:
@@ -25,7 +62,6 @@ def open_rig(config: "RigConfig | Path | str", guarded: bool = True) -> Rig:
         DeviceError: a device could not be opened.
         EmergencyStopError: the stop file exists.
     """
-    from cotarget.config import load_config
     from cotarget.safety.safe_rig import guard
 
     if isinstance(config, str | Path):

@@ -21,19 +21,19 @@ from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
 import numpy as np
-from annotated_types import Ge, Gt, Interval, Le
+from annotated_types import Ge, Interval, Le
 
 from cotarget.camera import Intrinsics
 from cotarget.errors import ConfigError, choices
 from cotarget.files import assets_dir
 from cotarget.geometry import pose
+from cotarget.plugins import locate
 from cotarget.schema import (
     ASCENDING,
     Check,
     FilePath,
     Limits,
     NotNegative,
-    OneOf,
     Pair,
     Pose,
     Positive,
@@ -59,7 +59,6 @@ def check_config(config: "RigConfig") -> None:
 def _check_combinations(config: "RigConfig", recorded: bool = False) -> None:
     if not recorded:
         check_sim(config.sim)
-    _check_safety(config.safety, config.rate_hz)
     check_corners(config.board)
 
 
@@ -78,15 +77,6 @@ def check_corners(board: "BoardConfig") -> None:
         raise ConfigError(
             f"board.corners: {columns}x{rows} looks the same upside down; "
             f"one count must be odd and the other even, like {columns}x{rows + 1}"
-        )
-
-
-def _check_safety(safety: "SafetyConfig", rate_hz: float) -> None:
-    """Refuse a watchdog that halts between two frames."""
-    if safety.watchdog_s * rate_hz <= 1:
-        raise ConfigError(
-            f"safety.watchdog_s: {safety.watchdog_s:g} s would halt the head between any two frames of the "
-            f"fixed camera, of which {rate_hz:g} come a second"
         )
 
 
@@ -380,148 +370,24 @@ def split_name(name: str) -> tuple[str, int]:
 
 # The [hardware] tables
 
-BAUDS = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
-SOCKET = re.compile(r"socket://(\[[0-9A-Fa-f:.]+\]|[^:/\s]+):(\d+)/?")
-# Positions of the S5 IS's lens and their focal lengths [mm], as measured by the CHDK project.
-S5_IS_LENS = ((0, 6.0), (11, 6.4), (41, 12.1), (64, 21.3), (86, 41.6), (105, 61.4), (128, 72.0))
-
-
-def socket_address(url: str) -> tuple[str, int] | None:
-    """Parse host and port of "socket://host:port"; None for anything else."""
-    match = SOCKET.fullmatch(url)
-    return None if match is None else (match[1].strip("[]"), int(match[2]))
-
-
-def _web_address(url: str) -> str:
-    try:
-        parts = urlsplit(url)
-        valid = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
-    except ValueError:  # an invalid address in brackets, or an invalid port
-        valid = False
-    if url and not valid:
-        raise ValueError(f"'{url}' is not like http://192.168.0.90")
-    return url
-
-
-def _lens_table(lens: tuple[tuple[int, float], ...]) -> tuple[tuple[int, float], ...]:
-    if len(lens) < 2 or any(b[0] <= a[0] or b[1] <= a[1] for a, b in itertools.pairwise(lens)):
-        raise ValueError("needs two or more [position, mm], both of them increasing")
-    return lens
-
-
-def _presenter(presenter: str) -> str:
-    if presenter != "person" and socket_address(presenter) is None:
-        raise ValueError(f"'{presenter}' is neither person nor like socket://host:port")
-    return presenter
-
-
-@model
-class HardwareHead:
-    """A Directed Perception PTU-D46.
-
-    Attributes:
-        port: serial port such as "/dev/ttyUSB0", or "socket://host:port".
-        baud: baud rate of the serial line.
-        step_deg: step size that the unit is expected to report [degrees].
-        pan_deg: range of pan that the unit is expected to report, with positive pan to the right [degrees].
-        tilt_deg: range of tilt that the unit is expected to report, with positive tilt up [degrees].
-        pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left, as in the D46's manual.
-        tilt_sign: 1 where the unit's positive tilt goes up, -1 where it goes down.
-        speed_deg_s: speed of moves, at most the unit's own [degrees/s].
-        command_delay_s: time from a command to the start of motion, as measured [s].
-    """
-
-    port: str = ""
-    baud: Annotated[int, OneOf(*BAUDS)] = 9600
-    step_deg: Positive = 0.0514286
-    pan_deg: Limits = (-158.9, 158.9)
-    tilt_deg: Limits = (-46.6, 31.1)
-    pan_sign: Annotated[int, OneOf(-1, 1)] = -1
-    tilt_sign: Annotated[int, OneOf(-1, 1)] = 1
-    speed_deg_s: Positive = 149.0
-    command_delay_s: NotNegative = 0.04
-
-
-@model
-class HardwareFixed:
-    """The fixed camera, on an Axis video server or network camera.
-
-    Attributes:
-        url: address of the server, such as "http://192.168.0.90".
-        camera: number of the camera on the server, from 1.
-        user: user name; empty where the server asks for none.
-        password: password; empty where the environment variable COTARGET_PASSWORD holds it.
-        size: image size that is expected [px].
-        resolution: the server's name of the resolution, such as "4CIF"; empty for its default.
-        rate_hz: frames per second to request.
-        compression: JPEG compression; less is finer.
-        latency_s: time from light to a frame's first byte, as measured [s].
-    """
-
-    url: Annotated[str, Check(_web_address)] = ""
-    camera: Annotated[int, Gt(0)] = 1
-    user: str = ""
-    password: str = ""
-    size: Size = (704, 576)
-    resolution: str = "4CIF"
-    rate_hz: Positive = 25.0
-    compression: Annotated[int, Interval(ge=0, le=100)] = 30
-    latency_s: NotNegative = 0.1
-
-
-@model
-class HardwareZoom:
-    """The zoom camera, by gphoto2.
-
-    Attributes:
-        port: "usb:", "usb:BUS,DEVICE" or "ptpip:host:port:port", as gphoto2 writes them.
-        model: gphoto2's name of the model; empty for the camera that is found at the port.
-        settings: further settings to make when the camera is opened, by gphoto2's names.
-        zoom_key: gphoto2's name of the setting that moves the lens.
-        lens: some lens positions and their nominal focal lengths, both increasing; between them the logarithm of the
-            focal length is interpolated.
-        lens_speed: lens positions per second; the end of a movement is computed from it, as the camera reports none.
-        size: size of the viewfinder's frames [px].
-        still_size: size of full stills [px].
-        pitch_mm: nominal size of a pixel of the viewfinder's frames [mm].
-        rate_hz: highest number of viewfinder frames per second.
-        latency_s: time from light to a frame, as measured [s].
-        command_delay_s: time from a command to the start of the lens's motion [s].
-    """
-
-    port: str = ""
-    model: str = ""
-    settings: Mapping[str, str] = field(default_factory=dict)
-    zoom_key: str = "zoom"
-    lens: Annotated[tuple[Annotated[tuple[int, Positive], "[position, mm]"], ...], Check(_lens_table)] = S5_IS_LENS
-    lens_speed: Positive = 60.0
-    size: Size = (320, 240)
-    still_size: Size = (3264, 2448)
-    pitch_mm: Positive = 0.01794
-    rate_hz: Positive = 15.0
-    latency_s: NotNegative = 0.1
-    command_delay_s: NotNegative = 0.05
-
-
-@model
-class HardwareBoard:
-    """How the calibration board is presented.
-
-    Attributes:
-        presenter: "person", who is asked on the terminal to hold it, or a program at "socket://host:port".
-    """
-
-    presenter: Annotated[str, Check(_presenter)] = "person"
+Table = Mapping[str, Any]
 
 
 @model
 class HardwareConfig:
-    """The real devices."""
+    """The real devices. The tables hold what rig.toml says; a device's driver says what it may be.
 
-    head: HardwareHead = HardwareHead()
-    fixed: HardwareFixed = HardwareFixed()
-    zoom: HardwareZoom = field(default_factory=HardwareZoom)
-    board: HardwareBoard = HardwareBoard()
+    Attributes:
+        head: the pan-tilt head.
+        fixed: the fixed camera.
+        zoom: the zoom camera on the head.
+        board: how the calibration board is presented.
+    """
+
+    head: Table = field(default_factory=dict)
+    fixed: Table = field(default_factory=dict)
+    zoom: Table = field(default_factory=dict)
+    board: Table = field(default_factory=dict)
 
 
 # Checks of the [sim] tables
@@ -773,64 +639,6 @@ class RigConfig:
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     targets: Mapping[str, TargetProfile] = field(default_factory=lambda: dict(DEFAULT_TARGETS))
 
-    @property
-    def head_limits(self) -> tuple[Pair, Pair]:
-        """Pan and tilt limits [rad]: the device's, and the soft ones where they are tighter."""
-        pan, tilt = self.head_limits_deg
-        return (math.radians(pan[0]), math.radians(pan[1])), (math.radians(tilt[0]), math.radians(tilt[1]))
-
-    @property
-    def head_limits_deg(self) -> tuple[Pair, Pair]:
-        """Pan and tilt limits [degrees]: the device's, and the soft ones where they are tighter."""
-        head, soft = self.sim.head if self.backend == "sim" else self.hardware.head, self.safety
-        pan = _overlap(head.pan_deg, soft.pan_deg, "safety.pan_deg")
-        return pan, _overlap(head.tilt_deg, soft.tilt_deg, "safety.tilt_deg")
-
-    @property
-    def head_step(self) -> float:
-        """Step size of the head [rad]; 0 for a continuous head."""
-        if self.backend != "sim":
-            return math.radians(self.hardware.head.step_deg)
-        return math.radians(self.sim.head.step_deg) if self.sim.effects.steps else 0.0
-
-    @property
-    def focal_range_px(self) -> Pair:
-        """Shortest and longest nominal focal length of the zoom camera [px]."""
-        if self.backend == "sim":
-            shortest, longest = self.sim.zoom.focal_mm
-        else:
-            shortest, longest = self.hardware.zoom.lens[0][1], self.hardware.zoom.lens[-1][1]
-        return shortest / self.pitch_mm, longest / self.pitch_mm
-
-    @property
-    def pitch_mm(self) -> float:
-        """Size of a pixel of the zoom camera's stream [mm]."""
-        return self.sim.zoom.pitch_mm if self.backend == "sim" else self.hardware.zoom.pitch_mm
-
-    @property
-    def stream_sizes(self) -> tuple[Size, Size]:
-        """(width, height) of the streams of the fixed and the zoom camera [px]."""
-        if self.backend == "sim":
-            return self.sim.fixed.size, self.sim.zoom.size
-        return self.hardware.fixed.size, self.hardware.zoom.size
-
-    @property
-    def rate_hz(self) -> float:
-        """Frame rate of the fixed camera [Hz]."""
-        return self.sim.fixed.rate_hz if self.backend == "sim" else self.hardware.fixed.rate_hz
-
-    @property
-    def command_delay_s(self) -> float:
-        """Time from a command to the start of the head's motion, as configured [s]."""
-        if self.backend != "sim":
-            return self.hardware.head.command_delay_s
-        return self.sim.head.command_delay_s if self.sim.effects.command_delay else 0.0
-
-    @property
-    def lens_delay_s(self) -> float:
-        """Time from a command to the start of the lens's motion, as configured [s]."""
-        return self.command_delay_s if self.backend == "sim" else self.hardware.zoom.command_delay_s
-
     def target(self, name: str) -> TargetProfile:
         """Look up a target profile by name; a further one of a kind, such as ``bird2``, defaults to that kind's.
 
@@ -841,16 +649,6 @@ class RigConfig:
         if found is None:
             raise ConfigError(f"unknown target '{name}'; the targets are: {choices(self.targets)}")
         return found
-
-
-def load_config(path: Path | str) -> RigConfig:
-    """Read rig.toml.
-
-    Raises:
-        ConfigError: the file is missing or malformed, or has an unknown key or an impossible value.
-    """
-    path = Path(path)
-    return config_of(read_text(path), path)
 
 
 def config_of(text: str, path: Path) -> RigConfig:
@@ -879,7 +677,21 @@ def config_of(text: str, path: Path) -> RigConfig:
     safety = dataclasses.replace(
         config.safety, stop_file=config.safety.stop_file and path.parent / config.safety.stop_file
     )
-    return dataclasses.replace(config, targets=beside, sim=sim, recording=recording, safety=safety)
+    hardware = {name: _located(table, path.parent) for name, table in vars(config.hardware).items()}
+    return dataclasses.replace(
+        config,
+        targets=beside,
+        sim=sim,
+        recording=recording,
+        safety=safety,
+        hardware=HardwareConfig(**hardware),
+    )
+
+
+def _located(device: Table, folder: Path) -> Table:
+    """Replace the module of a user's own driver by its file, where that lies beside rig.toml."""
+    driver = device.get("driver")
+    return {**device, "driver": locate(driver, folder)} if isinstance(driver, str) else device
 
 
 def read_tables(path: Path) -> dict[str, Any]:
@@ -948,13 +760,6 @@ def _of_kind(targets: Mapping[str, TargetProfile], name: str) -> TargetProfile |
     return targets.get(name) or targets.get(split_name(name)[0])
 
 
-def _overlap(own: Pair, soft: Pair | None, where: str) -> Pair:
-    both = own if soft is None else (max(own[0], soft[0]), min(own[1], soft[1]))
-    if both[0] >= both[1]:
-        raise ConfigError(f"{where}: {list(soft or own)} leaves nothing of the device's own range {list(own)}")
-    return both
-
-
 def config_table(config: RigConfig) -> dict[str, Any]:
     """Convert a configuration to tables that `parse_config` reads.
 
@@ -962,8 +767,19 @@ def config_table(config: RigConfig) -> dict[str, Any]:
     """
     table: dict[str, Any] = as_table(dataclasses.replace(config, recording=None))
     table["safety"].pop("stop_file", None)
-    fixed = table["hardware"]["fixed"]
-    fixed["password"] = ""
-    url = urlsplit(fixed["url"])
-    fixed["url"] = url._replace(netloc=url.netloc.rpartition("@")[2]).geturl()
+    table["hardware"] = {name: _without_secrets(device) for name, device in table["hardware"].items()}
     return table
+
+
+def _without_secrets(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out a device's password, and the login in an address."""
+    kept = {key: value for key, value in table.items() if key != "password"}
+    return {key: _without_login(value) if isinstance(value, str) else value for key, value in kept.items()}
+
+
+def _without_login(text: str) -> str:
+    try:
+        url = urlsplit(text)
+    except ValueError:  # no address
+        return text
+    return url._replace(netloc=url.netloc.rpartition("@")[2]).geturl() if "@" in url.netloc else text

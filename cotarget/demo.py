@@ -121,7 +121,7 @@ def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> 
         calibration = calibrate(
             rig,
             config.board,
-            pitch_mm=config.pitch_mm,
+            pitch_mm=config.sim.zoom.pitch_mm,
             seed=seed,
             progress=lambda done, total, text: progress(f"calibrating: {text}", done, total),
         )
@@ -153,7 +153,7 @@ def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> 
 def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, report: Report) -> list[Row]:
     """Follow one target; write its picture and its part of the video, and return its rows."""
     config = sim_config(SCENES[name], (name,), seed)
-    target, rate_hz = config.target(name), config.rate_hz
+    target, rate_hz = config.target(name), config.sim.fixed.rate_hz
     world = SimWorld(config)
     truth = world.truth()
     rows: list[Row] = []

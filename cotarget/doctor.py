@@ -13,7 +13,7 @@ from cotarget.errors import ConfigError, CotargetError, EmergencyStopError, Miss
 from cotarget.files import assets_dir
 
 if TYPE_CHECKING:
-    from cotarget.config import HardwareConfig, RigConfig
+    from cotarget.config import RigConfig
 
 PACKAGES = (
     "cotarget",
@@ -62,7 +62,7 @@ def examine(config: "RigConfig | None" = None) -> list[Finding]:
     ]
     if config is not None:
         found.append(_emergency_stop(config))
-    return found if config is None or not _is_real(config) else [*found, _position(config), *_devices(config.hardware)]
+    return found if config is None or not _is_real(config) else [*found, *_devices(config)]
 
 
 def _is_real(config: "RigConfig | None") -> bool:
@@ -158,38 +158,35 @@ def _emergency_stop(config: "RigConfig") -> Finding:
     return Finding(name, True, "nobody has called for one")
 
 
-def _position(config: "RigConfig") -> Finding:
+def _position(config: "RigConfig", port: str) -> Finding:
     """Check whether the head's position is marked as lost."""
     from cotarget.drivers.interlock import PositionLostMarker
 
     try:
-        PositionLostMarker(config.hardware.head.port, config.safety.stop_file).refuse()
+        PositionLostMarker(port, config.safety.stop_file).refuse()
     except CotargetError as error:
         return Finding("head's position", False, str(error), "cotarget reset-head --rig rig.toml")
     return Finding("head's position", True, "nothing says that it is lost")
 
 
-def _devices(hardware: "HardwareConfig") -> list[Finding]:
+def _devices(config: "RigConfig") -> list[Finding]:
     """Ask each device for its identity."""
-    from cotarget.drivers import axis, board, gphoto, ptu_d46
+    from cotarget.drivers import board
+    from cotarget.drivers.rig import board_settings, devices, port_of
 
-    head, zoom = hardware.head, hardware.zoom
-    questions: tuple[tuple[str, str, Callable[[], str]], ...] = (
-        ("head", head.port, lambda: ptu_d46.probe(head.port, head.baud)),
-        ("fixed", hardware.fixed.url, lambda: axis.probe(hardware.fixed)),
-        ("zoom", zoom.port, lambda: gphoto.probe(zoom.port, zoom.model)),
-        ("board", hardware.board.presenter, lambda: board.probe(hardware.board)),
-    )
-    found = []
-    for table, there, ask in questions:
-        name = f"hardware.{table}"
-        try:
-            if not there:
-                raise ConfigError("is not configured")
-            found.append(Finding(name, True, ask()))
-        except CotargetError as error:
-            found.append(Finding(name, False, str(error), _fix(error, name, there)))
-    return found
+    found, presenter = devices(config.hardware), board_settings(config.hardware)
+    return [
+        _position(config, port_of(found["head"])),
+        *(_ask(device.where, device.probe, port_of(device)) for device in found.values()),
+        _ask("hardware.board", lambda: board.probe(presenter), presenter.presenter),
+    ]
+
+
+def _ask(name: str, ask: Callable[[], str], there: str) -> Finding:
+    try:
+        return Finding(name, True, ask())
+    except CotargetError as error:
+        return Finding(name, False, str(error), _fix(error, name, there))
 
 
 def _fix(error: CotargetError, name: str, there: str) -> str:

@@ -74,6 +74,26 @@ class OneOf(Check):
         super().__init__(check, before=True)
 
 
+@dataclass(frozen=True)
+class Needed:
+    """Mark a text that may be empty in a file, but not where the device is opened; see `missing_key`.
+
+    Attributes:
+        example: a value, for messages.
+    """
+
+    example: str
+
+
+def missing_key(settings: Any) -> tuple[str, str] | None:
+    """Find the first empty field that is `Needed`: its key, and an example; None if nothing is missing."""
+    for key, hint in typing.get_type_hints(type(settings), include_extras=True).items():
+        for needed in _metadata(hint):
+            if isinstance(needed, Needed) and not getattr(settings, key):
+                return key, needed.example
+    return None
+
+
 def _refuse_empty(value: Any) -> Any:
     if value == "":
         raise ValueError("is empty; give a path, or leave it out")

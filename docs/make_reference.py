@@ -18,8 +18,12 @@ from typing import Annotated, Any, Literal
 
 import griffe
 
+from cotarget.backends import check
 from cotarget.cli.main import _parser
-from cotarget.config import DEFAULT_TARGETS, RigConfig, parse_config
+from cotarget.config import DEFAULT_TARGETS, HardwareConfig, RigConfig, parse_config
+from cotarget.drivers import DRIVERS
+from cotarget.drivers.board import BoardSettings
+from cotarget.drivers.rig import ROLES, device_of
 from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, pose_dict
 from cotarget.schema import bare, form_of
@@ -43,7 +47,20 @@ def configuration() -> str:
     return "\n".join((*_tables("", RigConfig), "These targets need no table:\n", _grid(("target", *keys), known)))
 
 
-def _tables(where: str, cls: type[Any]) -> Iterator[str]:
+def _hardware() -> Iterator[str]:
+    """Describe the tables of [hardware], one a driver, and the board's."""
+    yield "## `[hardware]` { #hardware }\n"
+    yield (
+        "The real devices. The key `driver` of a device's table names its driver, and the driver says which other keys "
+        'there are. A driver of your own is `"module:class"`.\n'
+    )
+    for role in ROLES:
+        for driver in DRIVERS[role]:
+            yield from _tables(f"hardware.{role}", device_of(role, {"driver": driver}).driver.Settings, driver)
+    yield from _tables("hardware.board", BoardSettings)
+
+
+def _tables(where: str, cls: type[Any], driver: str = "") -> Iterator[str]:
     """Describe one table, then the tables in it."""
     docstrings = [griffe.Docstring(inspect.cleandoc(each.__doc__ or "")) for each in cls.__mro__[-2::-1]]
     sections = [section for each in docstrings for section in each.parse("google", warnings=False)]
@@ -63,12 +80,20 @@ def _tables(where: str, cls: type[Any]) -> Iterator[str]:
             logging.getLogger("mkdocs.hooks").warning("%s: 'Attributes:' has no %s", cls.__name__, field.name)
         by_suffix = [unit for end, unit in UNITS.items() if field.name.endswith(f"_{end}")]
         unit, meaning = (UNIT_IN_TEXT.findall(meaning) or by_suffix or [""])[0], UNIT_IN_TEXT.sub("", meaning)
-        rows.append((f"`{field.name}`", _kind(hint), unit, _toml(default), _range(key, hint, default), meaning))
-    yield f"## {f'`[{where}]`' if where else 'Outside of the tables'} {{ #{where or 'backend'} }}\n"
+        rows.append((f"`{field.name}`", _kind(hint), unit, _toml(default), _range(key, hint, default, driver), meaning))
+    title, anchor = f"`[{where}]`" if where else "Outside of the tables", where or "backend"
+    if driver:
+        names = DRIVERS[where.rpartition(".")[2]]
+        first = next(iter(names))
+        anchor += "" if driver == first else f".{driver}"
+        title += "" if len(names) == 1 else f" with driver `{driver}`"
+        choices = f'{", ".join(json.dumps(name) for name in names)} or `"module:class"`'
+        rows.insert(0, ("`driver`", "string", "", f"`{json.dumps(first)}`", choices, f"the driver; here `{driver}`"))
+    yield f"## {title} {{ #{anchor} }}\n"
     yield (cls.__doc__ or "").partition("Attributes:")[0].replace("\n    ", "\n").strip() + "\n"
     yield _grid(("key", "type", "unit", "default", "range", "meaning"), rows) if rows else ""
     for key, held in inner:
-        yield from _tables(key, held)
+        yield from _hardware() if held is HardwareConfig else _tables(key, held)
 
 
 def _kind(hint: Any) -> str:
@@ -97,33 +122,34 @@ def _toml(value: Any) -> str:
     return f"`{json.dumps(value)}`"
 
 
-def _range(key: str, hint: Any, default: Any) -> str:
+def _range(key: str, hint: Any, default: Any, driver: str) -> str:
     """Find by trying which numbers are accepted while all other keys have their defaults."""
     number: Any = bare(hint)
     if number not in (int, float):
         return ""
     usual = default if isinstance(default, int | float) else 1.0
-    if choices := _refusal(key, usual + 1).partition("is not one of: ")[2]:
+    if choices := _refusal(key, driver, usual + 1).partition("is not one of: ")[2]:
         return choices
     words = []
     for inclusive, exclusive, bad in (("≥", ">", -(10**9)), ("≤", "<", 10**9)):
-        if _refusal(key, number(bad)):
+        if _refusal(key, driver, number(bad)):
             good = usual
             while abs(good - bad) > (1 if number is int else 1e-9):
                 middle = number((good + bad) / 2)
-                good, bad = (good, middle) if _refusal(key, middle) else (middle, bad)
+                good, bad = (good, middle) if _refusal(key, driver, middle) else (middle, bad)
             edge = number(round(good, 6))
-            words.append(f"{exclusive if _refusal(key, edge) else inclusive} {edge:g}")
+            words.append(f"{exclusive if _refusal(key, driver, edge) else inclusive} {edge:g}")
     return " and ".join(words)
 
 
-def _refusal(key: str, value: float) -> str:
+def _refusal(key: str, driver: str, value: float) -> str:
     """Say why a value is refused; empty where it is accepted."""
     table: dict[str, Any] = {"sim": {"effects": {"optics": False}}}  # with it, a check takes ten times as long
     *path, name = (key := key.replace("NAME", "book")).split(".")
-    reduce(lambda inner, part: inner.setdefault(part, {}), path, table)[name] = value
+    last = reduce(lambda inner, part: inner.setdefault(part, {}), path, table)
+    last |= {name: value, **({"driver": driver} if driver else {})}
     try:
-        parse_config(table)
+        check(parse_config(table))
     except ConfigError as error:
         return str(error) if str(error).startswith(key) else ""
     return ""

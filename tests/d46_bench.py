@@ -1,14 +1,13 @@
 """The driver of the PTU-D46 and the tests' own unit on a line in simulated time."""
 
-from cotarget.config import HardwareHead
 from cotarget.drivers.polled_head import Halt, Loop, Move
-from cotarget.drivers.ptu_d46 import D46Link
+from cotarget.drivers.ptu_d46 import D46Link, D46Settings
 from cotarget.drivers.ptu_protocol import Line
 from tests.d46_peer import SimPort, Unit
 from tests.simulated_clock import SimClock
 
 # With pan in the unit's own sense, so that what is sent is what the tests say.
-CONFIG = HardwareHead(port="PORT", pan_deg=(-158.9, 158.9), tilt_deg=(-46.6, 31.1), pan_sign=1, command_delay_s=0.04)
+CONFIG = D46Settings(port="PORT", pan_deg=(-158.9, 158.9), tilt_deg=(-46.6, 31.1), pan_sign=1, command_delay_s=0.04)
 
 
 class Bench:

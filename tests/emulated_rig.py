@@ -13,8 +13,8 @@ from pathlib import Path
 
 import tomli_w
 
+from cotarget.backends import load_config
 from cotarget.calibration import save_calibration
-from cotarget.config import load_config
 from tests.cli.test_commands import true_calibration
 
 DEADLINE_S = 60.0  # for whatever must happen at all, on a machine that is busy with other things

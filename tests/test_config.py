@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cotarget.config import SafetyConfig, SimEffects, load_config, parse_config
+from cotarget.backends import load_config
+from cotarget.config import SafetyConfig, SimEffects, parse_config
 from cotarget.errors import ConfigError
 
 DOG = "[targets.dog]\nsize = 0.6\ndimension = 'height'\nwanted_px = 200\ndetector = 'motion'\n"

@@ -4,7 +4,10 @@ import tomllib
 
 import pytest
 
-from cotarget.config import parse_config, socket_address
+from cotarget.backends import check, describe
+from cotarget.config import HardwareConfig, parse_config
+from cotarget.drivers.board import socket_address
+from cotarget.drivers.rig import devices
 from cotarget.errors import ConfigError
 
 MISTAKES = [
@@ -26,6 +29,12 @@ MISTAKES = [
     ("hardware.zoom.lens = [[0, 6.0], [9, 5.0]]", "hardware.zoom.lens: needs two or more"),
     ("hardware.zoom.lens = [[0, 0.0], [9, 5.0]]", "hardware.zoom.lens: 0 is not greater than zero"),
     ("hardware.board.presenter = 'nobody'", "hardware.board.presenter: 'nobody' is neither person nor like socket://"),
+    (
+        "hardware.head.buad = 9600",
+        "unknown key 'hardware.head.buad'; valid here: baud, command_delay_s, driver, pan_deg",
+    ),
+    ("hardware.fixed.driver = 'axes'", "hardware.fixed.driver: 'axes' is neither module:name nor one of: axis"),
+    ("hardware.fixed.driver = 3", "hardware.fixed.driver: 3 is neither module:name nor one of: axis"),
     ("hardware.camera.url = ''", "unknown key 'hardware.camera'; valid here: board, fixed, head, zoom"),
 ]
 
@@ -33,7 +42,7 @@ MISTAKES = [
 @pytest.mark.parametrize(("text", "message"), MISTAKES)
 def test_each_mistake_names_its_key(text, message):
     with pytest.raises(ConfigError) as error:
-        parse_config(tomllib.loads(text))
+        check(parse_config(tomllib.loads(text)))
     assert str(error.value).startswith(message)
 
 
@@ -54,13 +63,13 @@ def test_socket_addresses(url, address):
 
 def test_a_head_of_which_nothing_is_said_counts_as_the_makers_manual_has_it():
     """Positive pan of a PTU-D46 turns left, where a rig's turns right; positive tilt goes up for both."""
-    head = parse_config({}).hardware.head
+    head = devices(HardwareConfig())["head"].settings
     assert (head.pan_sign, head.tilt_sign) == (-1, 1)
 
 
-def test_the_backend_decides_which_device_speaks():
+def test_the_drivers_describe_their_devices():
     """Half the S5 IS's viewfinder width is 160 px of 17.94 um: at 6 mm its focal length is 334.4 px."""
-    config = parse_config(tomllib.loads('backend = "hardware"\nhardware.head.pan_deg = [-90, 90]'))
-    assert config.focal_range_px == pytest.approx((6 / 0.01794, 72 / 0.01794))
-    assert config.stream_sizes == ((704, 576), (320, 240))
-    assert config.head_limits[0] == pytest.approx((-1.5707963, 1.5707963))
+    spec = describe(parse_config(tomllib.loads('backend = "hardware"\nhardware.head.pan_deg = [-90, 90]')))
+    assert spec.zoom.focal_range == pytest.approx((6 / 0.01794, 72 / 0.01794))
+    assert (spec.fixed.size, spec.zoom.size) == ((704, 576), (320, 240))
+    assert spec.head.limits.pan == pytest.approx((-1.5707963, 1.5707963))

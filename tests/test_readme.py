@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cotarget import cli
-from cotarget.config import load_config
+from cotarget.backends import load_config
 from cotarget.sim.world import SimWorld
 from experiments.engine.cases import choose, known_experiments
 from experiments.engine.command import main

@@ -34,9 +34,9 @@ SESSION = ("placements", "stops")  # options of a capture session
 def calibrate(options: argparse.Namespace) -> None:
     """Run `cotarget calibrate`: calibrate from a capture session, saved captures or photos, and print a summary."""
     from cotarget import calibration as cal
-    from cotarget.backends import open_rig
+    from cotarget.backends import load_config, open_rig
     from cotarget.calibration.calibrate import calibrate as calibrate_rig
-    from cotarget.config import BoardConfig, load_config
+    from cotarget.config import BoardConfig
     from cotarget.safety.stop_file import refuse_if_stopped
 
     config = None if options.rig is None else load_config(options.rig)

@@ -34,19 +34,19 @@ def aim(options: argparse.Namespace) -> None:
     """Run `cotarget aim`: print pan, tilt and focal length for one pixel of the fixed camera."""
     import numpy as np
 
-    from cotarget.backends import describe
+    from cotarget.backends import describe, load_config
     from cotarget.calibration.joint import SAME_FOCAL
-    from cotarget.config import RigConfig, load_config
+    from cotarget.config import RigConfig
     from cotarget.targeting import Reach, WantedSize, depth_of, error_budget, point_at
     from cotarget.targeting import aim as aim_at
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
     if config.backend == "replay":
         raise ConfigError(f"{options.rig}: backend is 'replay'; give the rig.toml of the rig that was recorded")
-    spec = None if options.rig is None else describe(config)
-    calibration = load_plausible(options.calibration, spec, insist=options.insist)
+    spec = describe(config)
+    calibration = load_plausible(options.calibration, None if options.rig is None else spec, insist=options.insist)
     if options.rig is not None:
-        calibration = calibration.for_streams(*config.stream_sizes)
+        calibration = calibration.for_streams(spec.fixed.size, spec.zoom.size)
     target = None if options.target is None else config.target(options.target)
     if options.size_px is not None and target is None:
         raise ConfigError("--size-px needs --target NAME, whose true size gives the depth")
@@ -60,11 +60,12 @@ def aim(options: argparse.Namespace) -> None:
                 f"--size-px: {options.size_px:g} px is no size that a {options.target} of {target.size:g} m has in the "
                 "fixed camera's {}x{} image".format(*calibration.fixed.size)
             )
-    pitch_mm = calibration.pitch_mm or config.pitch_mm
-    shortest, longest = config.focal_range_px
+    pitch_mm = calibration.pitch_mm or spec.zoom.pitch_mm
+    shortest, longest = spec.zoom.focal_range
     if options.rig is None:  # without a rig.toml, the calibration gives the shortest focal length
         shortest = calibration.zoom.nominal_px[0]
-    reach = Reach(*config.head_limits, (shortest, max(shortest, longest)), step=config.head_step)
+    limits = spec.head.limits
+    reach = Reach(limits.pan, limits.tilt, (shortest, max(shortest, longest)), step=limits.step)
     wanted_size = (
         WantedSize(target.size, options.wanted_px, target.is_vertical())
         if target and options.wanted_px is not None
@@ -171,7 +172,8 @@ def emulate(options: argparse.Namespace) -> None:
     """Run `cotarget emulate`: serve a simulated rig by the devices' wire protocols, and write a rig.toml for it."""
     os.environ.setdefault(*RENDER_THREADS)
     sys.setswitchinterval(SWITCH_S)
-    from cotarget.config import RigConfig, SimConfig, load_config, read_tables
+    from cotarget.backends import load_config
+    from cotarget.config import RigConfig, SimConfig, read_tables
     from cotarget.emulators.emulation import Emulation, Ports, copied_tables, parse_fault
     from cotarget.emulators.world import paced
     from cotarget.files import write_atomically
@@ -224,9 +226,8 @@ ACCURACY_S = 0.01
 
 def latency(options: argparse.Namespace) -> None:
     """Run `cotarget latency`: measure the latencies of cameras, head and lens, and print them as keys of rig.toml."""
-    from cotarget.backends import describe, open_rig
+    from cotarget.backends import describe, load_config, open_rig
     from cotarget.calibration import load_calibration
-    from cotarget.config import load_config
     from cotarget.latency import measure_fixed, measure_head, measure_lens
     from cotarget.safety.stop_file import refuse_if_stopped
 
@@ -240,12 +241,11 @@ def latency(options: argparse.Namespace) -> None:
         spec = describe(config)
         calibration.for_streams(spec.fixed.size, spec.zoom.size)
         check_board_is_told(options.rig, config)
-    tables = config.sim if config.backend == "sim" else config.hardware
     where = "sim" if config.backend == "sim" else "hardware"
     with open_rig(config) as rig:
         head = measure_head(rig)
         found = {
-            f"{where}.zoom.latency_s": tables.zoom.latency_s + head.zoom.seconds,
+            f"{where}.zoom.latency_s": rig.spec.zoom.latency_s + head.zoom.seconds,
             f"{where}.head.command_delay_s": head.command,
         }
         agreement = {"zoom": head.zoom.agreement}
@@ -254,7 +254,7 @@ def latency(options: argparse.Namespace) -> None:
         if calibration is not None:
             fixed, _ = measure_fixed(rig, calibration, config.board)
             # Relative to the zoom camera, whose frame times contain the error found above.
-            found[f"{where}.fixed.latency_s"] = tables.fixed.latency_s + fixed.seconds + head.zoom.seconds
+            found[f"{where}.fixed.latency_s"] = rig.spec.fixed.latency_s + fixed.seconds + head.zoom.seconds
             agreement["fixed"] = fixed.agreement
     if calibration is None:
         print("the fixed camera's latency needs --calibration, to look at a board with both cameras", file=sys.stderr)
@@ -278,10 +278,9 @@ def _plausible(name: str, seconds: float) -> float:
 
 def point(options: argparse.Namespace) -> None:
     """Run `cotarget point`: move head and lens, and write a picture of each camera on request."""
-    from cotarget.backends import open_rig
+    from cotarget.backends import load_config, open_rig
     from cotarget.calibration.captures import write_image
     from cotarget.calibration.session import wait_for_lens
-    from cotarget.config import load_config
     from cotarget.safety.stop_file import refuse_if_stopped
 
     config = load_config(options.rig)
@@ -345,17 +344,19 @@ def clear(options: argparse.Namespace) -> None:
 
 def reset_head(options: argparse.Namespace) -> None:
     """Run `cotarget reset-head`: reset the pan-tilt unit after consent."""
-    from cotarget.config import load_config
+    from cotarget.backends import load_config
     from cotarget.drivers.clock import MonotonicClock
-    from cotarget.drivers.interlock import PositionLostMarker
-    from cotarget.drivers.ptu_d46 import reset
+    from cotarget.drivers.rig import devices
     from cotarget.safety.signals import end_politely
     from cotarget.safety.stop_file import StopLook, refuse_if_stopped
+    from cotarget.schema import missing_key
 
     config = load_config(options.rig)
-    head = config.hardware.head
-    if config.backend != "hardware" or not head.port:
+    head = devices(config.hardware)["head"]
+    if config.backend != "hardware" or missing_key(head.settings):
         raise ConfigError(f'{options.rig}: names no pan-tilt unit; backend = "hardware" and [hardware.head] port do')
+    if not hasattr(head.driver, "reset"):
+        raise ConfigError(f"{options.rig}: the driver of {head.where} has no reset; the unit needs none")
     refuse_if_stopped(config.safety.stop_file)
     if not options.yes:
         print("The head will turn through its whole range. Are camera and cables clear of it? [yes/no]", flush=True)
@@ -363,13 +364,11 @@ def reset_head(options: argparse.Namespace) -> None:
             raise ConfigError("not reset; it needs the answer yes, or --yes")
     look, undo = StopLook(config.safety.stop_file), end_politely()
     try:
-        lost = PositionLostMarker(head.port, config.safety.stop_file)
-        unit = reset(head, MonotonicClock(), lost, stopped=look.reason)
+        done = head.driver.reset(head.settings, MonotonicClock(), config.safety, look.reason)
     finally:
         undo()
         look.close()
-    pan, tilt = (f"{axis.lowest} to {axis.highest}" for axis in (unit.pan, unit.tilt))
-    print(f"reset: {unit.version}: pan {pan}, tilt {tilt} steps")
+    print(f"reset: {done}")
 
 
 def _answer() -> str:

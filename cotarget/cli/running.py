@@ -83,7 +83,8 @@ def watch(sights: "Iterator[Snapshot]", window: Any, now: Callable[[], float], s
 
 def _config(options: argparse.Namespace) -> "RigConfig":
     """Load or make the configuration of the rig to view."""
-    from cotarget.config import RigConfig, load_config
+    from cotarget.backends import load_config
+    from cotarget.config import RigConfig
     from cotarget.demo import SCENES, sim_config
 
     if options.rig is None:
@@ -175,8 +176,7 @@ NOBODY_FOLLOWED = 4  # exit status of `follow`
 
 def follow(options: argparse.Namespace) -> int:
     """Run `cotarget follow`: follow a target with the rig, and record it on request; return the exit status."""
-    from cotarget.backends import describe, open_rig
-    from cotarget.config import load_config
+    from cotarget.backends import describe, load_config, open_rig
     from cotarget.recording.recorder import Recorder
     from cotarget.safety.safe_rig import guard
     from cotarget.safety.stop_file import refuse_if_stopped
@@ -355,7 +355,8 @@ def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int], s
 
 def detect(options: argparse.Namespace) -> None:
     """Run `cotarget detect`: run the fixed camera's detector and tracker on a video."""
-    from cotarget.config import RigConfig, load_config
+    from cotarget.backends import load_config
+    from cotarget.config import RigConfig
     from cotarget.detect_video import run_on_film
     from cotarget.metrics import read_labels, read_tracks
 
@@ -412,7 +413,7 @@ def doctor(options: argparse.Namespace) -> int:
 
     config = None
     if options.rig is not None:
-        from cotarget.config import load_config
+        from cotarget.backends import load_config
 
         config = load_config(options.rig)
     findings = examine(config)

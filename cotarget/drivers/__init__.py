@@ -1,1 +1,11 @@
-"""The real devices behind the Rig's Protocols; the only user of serial ports, HTTP and gphoto2."""
+"""Drivers of real devices, a file each, and the table of their names; docs/drivers.md says how to write one."""
+
+from collections.abc import Mapping
+
+# By table of [hardware]: the names that its key `driver` takes, the default first, and the class that each means. The
+# class is imported when a rig.toml names it, and the device's library when the device is opened.
+DRIVERS: Mapping[str, Mapping[str, str]] = {
+    "fixed": {"axis": "cotarget.drivers.axis:AxisCamera"},
+    "zoom": {"gphoto2": "cotarget.drivers.gphoto_camera:GphotoCamera"},
+    "head": {"ptu_d46": "cotarget.drivers.ptu_d46:D46Head"},
+}

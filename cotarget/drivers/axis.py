@@ -14,14 +14,16 @@ import threading
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 from urllib.parse import unquote, urlsplit
 
-from cotarget.config import HardwareFixed
+from annotated_types import Gt, Interval
+
 from cotarget.drivers.frame_buffer import BusyError, FrameBuffer, FrameCounts, RefusedError
 from cotarget.drivers.mjpeg import MultipartReader, boundary_of, import_simplejpeg
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError
-from cotarget.rig import Clock, Frame
+from cotarget.rig import CameraSpec, Clock, Frame
+from cotarget.schema import Check, Needed, NotNegative, Positive, Size, model
 
 if TYPE_CHECKING:
     import httpx
@@ -34,6 +36,49 @@ STATUS_PATH = "/axis-cgi/videostatus.cgi"
 STREAM_PATH = "/axis-cgi/mjpg/video.cgi"
 # A stream has stalled after this time without a byte [s], or after this many frame periods where that is longer.
 SILENCE_S, SILENCE_PICTURES = 2.0, 3.0
+
+
+def _web_address(url: str) -> str:
+    try:
+        parts = urlsplit(url)
+        valid = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:  # an invalid address in brackets, or an invalid port
+        valid = False
+    if url and not valid:
+        raise ValueError(f"'{url}' is not like http://192.168.0.90")
+    return url
+
+
+@model
+class AxisSettings:
+    """The fixed camera, on an Axis video server or network camera.
+
+    Attributes:
+        url: address of the server, such as "http://192.168.0.90".
+        camera: number of the camera on the server, from 1.
+        user: user name; empty where the server asks for none.
+        password: password; empty where the environment variable COTARGET_PASSWORD holds it.
+        size: image size that is expected [px].
+        resolution: the server's name of the resolution, such as "4CIF"; empty for its default.
+        rate_hz: frames per second to request.
+        compression: JPEG compression; less is finer.
+        latency_s: time from light to a frame's first byte, as measured [s].
+    """
+
+    url: Annotated[str, Needed("http://192.168.0.90"), Check(_web_address)] = ""
+    camera: Annotated[int, Gt(0)] = 1
+    user: str = ""
+    password: str = ""
+    size: Size = (704, 576)
+    resolution: str = "4CIF"
+    rate_hz: Positive = 25.0
+    compression: Annotated[int, Interval(ge=0, le=100)] = 30
+    latency_s: NotNegative = 0.1
+
+    @property
+    def spec(self) -> CameraSpec:
+        """Describe the camera."""
+        return CameraSpec(self.size, self.rate_hz, self.latency_s)
 
 
 class LoginError(RefusedError):
@@ -82,7 +127,7 @@ class VideoServer:
         DeviceError: httpx is missing.
     """
 
-    def __init__(self, config: HardwareFixed) -> None:
+    def __init__(self, config: AxisSettings) -> None:
         self._config = config
         self.name, self._user, self._password = _access(config)
         self.silence_s = max(SILENCE_S, SILENCE_PICTURES / config.rate_hz)
@@ -236,7 +281,7 @@ class VideoServer:
         return RefusedError(f"{name} sends {kind}{said}, no stream of pictures: check hardware.fixed.url and camera")
 
 
-def _access(config: HardwareFixed) -> tuple[str, str, str]:
+def _access(config: AxisSettings) -> tuple[str, str, str]:
     """Split the configured address into URL without login, user and password."""
     if not config.url:
         raise ConfigError("hardware.fixed.url: missing; give the video server's address, such as http://192.168.0.90")
@@ -464,7 +509,14 @@ class AxisCamera:
         DeviceError: the server cannot be reached, refuses the stream, or sends no images.
     """
 
-    def __init__(self, config: HardwareFixed, clock: Clock) -> None:
+    Settings = AxisSettings
+
+    @staticmethod
+    def probe(settings: AxisSettings) -> str:
+        """Describe the video server in one line, by queries that change nothing; see `probe`."""
+        return probe(settings)
+
+    def __init__(self, config: AxisSettings, clock: Clock) -> None:
         self._config, self._clock = config, clock
         self._server = VideoServer(config)
         self._api = ""
@@ -555,7 +607,7 @@ class AxisCamera:
             self._frames.remark(f"its input {self._config.camera} has no video")
 
 
-def probe(config: HardwareFixed) -> str:
+def probe(config: AxisSettings) -> str:
     """Describe the video server in one line, by queries that change nothing.
 
     Raises:

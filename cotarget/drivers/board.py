@@ -7,21 +7,48 @@ it is not possible.
 """
 
 import json
+import re
 import socket
 import sys
-from typing import Protocol, TextIO
+from typing import Annotated, Protocol, TextIO
 
 import numpy as np
 
-from cotarget.config import HardwareBoard, socket_address
 from cotarget.errors import DeviceError
 from cotarget.geometry import RigidTransform, pose_dict
 from cotarget.rig import Board
+from cotarget.schema import Check, model
 
 PERSONS_PATIENCE = 60.0  # time to walk there, turn the board and hold it still [s]
 CONNECT_TIMEOUT, ANSWER_TIMEOUT = 3.0, 60.0  # a robot arm may take its time [s]
 LONGEST_ANSWER = 65536  # bytes
 TURNED_DEG = 5.0  # a smaller rotation is not mentioned to a person
+
+
+SOCKET = re.compile(r"socket://(\[[0-9A-Fa-f:.]+\]|[^:/\s]+):(\d+)/?")
+
+
+def socket_address(url: str) -> tuple[str, int] | None:
+    """Parse host and port of "socket://host:port"; None for anything else."""
+    match = SOCKET.fullmatch(url)
+    return None if match is None else (match[1].strip("[]"), int(match[2]))
+
+
+def _presenter(presenter: str) -> str:
+    if presenter != "person" and socket_address(presenter) is None:
+        raise ValueError(f"'{presenter}' is neither person nor like socket://host:port")
+    return presenter
+
+
+@model
+class BoardSettings:
+    """How the calibration board is presented.
+
+    Attributes:
+        presenter: "person", who is asked on the terminal to hold it, or a program at "socket://host:port".
+    """
+
+    presenter: Annotated[str, Check(_presenter)] = "person"
 
 
 class ClosingBoard(Board, Protocol):
@@ -31,7 +58,7 @@ class ClosingBoard(Board, Protocol):
         """Close the connection; may be called again."""
 
 
-def make_board(config: HardwareBoard) -> ClosingBoard:
+def make_board(config: BoardSettings) -> ClosingBoard:
     """Open the configured holder of the board: a person, or a program at a socket.
 
     Raises:
@@ -41,7 +68,7 @@ def make_board(config: HardwareBoard) -> ClosingBoard:
     return PersonBoard(sys.stderr) if address is None else SocketBoard(*address)
 
 
-def probe(config: HardwareBoard) -> str:
+def probe(config: BoardSettings) -> str:
     """Check that the board's holder is there, without a request for the board; describe the holder.
 
     Raises:

@@ -9,15 +9,15 @@ Measurements and faults of the library: docs/design-notes.md.
 """
 
 import contextlib
+import itertools
 import logging
 import math
 import threading
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
-from cotarget.config import HardwareZoom
 from cotarget.drivers.frame_buffer import FrameBuffer, FrameCounts
 from cotarget.drivers.gphoto import (
     BAD_PARAMETERS,
@@ -27,14 +27,72 @@ from cotarget.drivers.gphoto import (
     GphotoLink,
     LinkError,
     Setting,
+    probe,
     shortened,
 )
 from cotarget.drivers.lens import LensMotion, LensTable
 from cotarget.drivers.mjpeg import DamagedError, decode_jpeg
 from cotarget.errors import ConfigError, CotargetError, DeviceError
-from cotarget.rig import Clock, Frame, Image, ZoomState
+from cotarget.rig import Clock, Frame, Image, ZoomSpec, ZoomState
+from cotarget.schema import Check, Needed, NotNegative, Positive, Size, model
 
 log = logging.getLogger(__name__)
+# Positions of the S5 IS's lens and their focal lengths [mm], as measured by the CHDK project.
+S5_IS_LENS = ((0, 6.0), (11, 6.4), (41, 12.1), (64, 21.3), (86, 41.6), (105, 61.4), (128, 72.0))
+
+
+def _lens_table(lens: tuple[tuple[int, float], ...]) -> tuple[tuple[int, float], ...]:
+    if len(lens) < 2 or any(b[0] <= a[0] or b[1] <= a[1] for a, b in itertools.pairwise(lens)):
+        raise ValueError("needs two or more [position, mm], both of them increasing")
+    return lens
+
+
+@model
+class GphotoSettings:
+    """The zoom camera, by gphoto2.
+
+    Attributes:
+        port: "usb:", "usb:BUS,DEVICE" or "ptpip:host:port:port", as gphoto2 writes them.
+        model: gphoto2's name of the model; empty for the camera that is found at the port.
+        settings: further settings to make when the camera is opened, by gphoto2's names.
+        zoom_key: gphoto2's name of the setting that moves the lens.
+        lens: some lens positions and their nominal focal lengths, both increasing; between them the logarithm of the
+            focal length is interpolated.
+        lens_speed: lens positions per second; the end of a movement is computed from it, as the camera reports none.
+        size: size of the viewfinder's frames [px].
+        still_size: size of full stills [px].
+        pitch_mm: nominal size of a pixel of the viewfinder's frames [mm].
+        rate_hz: highest number of viewfinder frames per second.
+        latency_s: time from light to a frame, as measured [s].
+        command_delay_s: time from a command to the start of the lens's motion [s].
+    """
+
+    port: Annotated[str, Needed("usb:")] = ""
+    model: str = ""
+    settings: Mapping[str, str] = field(default_factory=dict)
+    zoom_key: str = "zoom"
+    lens: Annotated[tuple[Annotated[tuple[int, Positive], "[position, mm]"], ...], Check(_lens_table)] = S5_IS_LENS
+    lens_speed: Positive = 60.0
+    size: Size = (320, 240)
+    still_size: Size = (3264, 2448)
+    pitch_mm: Positive = 0.01794
+    rate_hz: Positive = 15.0
+    latency_s: NotNegative = 0.1
+    command_delay_s: NotNegative = 0.05
+
+    @property
+    def spec(self) -> ZoomSpec:
+        """Describe the camera; the lens may have fewer positions than its table."""
+        shortest, longest = (mm / self.pitch_mm for _, mm in (self.lens[0], self.lens[-1]))
+        return ZoomSpec(
+            size=self.size,
+            rate_hz=self.rate_hz,
+            latency_s=self.latency_s,
+            focal_range=(shortest, longest),
+            pitch_mm=self.pitch_mm,
+            still_size=self.still_size,
+            delay_s=self.command_delay_s,
+        )
 
 
 @dataclass
@@ -118,7 +176,7 @@ def patiently(clock: Clock, call: Callable[[], T]) -> T:
         clock.sleep_until(clock.now() + BUSY_PAUSE_S)
 
 
-def set_up(link: CameraLink, config: HardwareZoom, clock: Clock, camera: str) -> ZoomSetting:
+def set_up(link: CameraLink, config: GphotoSettings, clock: Clock, camera: str) -> ZoomSetting:
     """Switch an opened camera to shooting mode and apply the configured settings.
 
     Args:
@@ -174,7 +232,7 @@ def _check(setting: Setting, where: str, value: str) -> None:
 
 
 def _zoom_setting(
-    link: CameraLink, config: HardwareZoom, clock: Clock, camera: str, names: Collection[str]
+    link: CameraLink, config: GphotoSettings, clock: Clock, camera: str, names: Collection[str]
 ) -> ZoomSetting:
     """Find the setting that moves the lens, and check it against the configured lens table."""
     name, (first, last) = config.zoom_key, (config.lens[0][0], config.lens[-1][0])
@@ -263,7 +321,7 @@ class Patience:
 class LensJob:
     """Send the lens to the latest command, and verify that it went there."""
 
-    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, shared: SharedState) -> None:
+    def __init__(self, config: GphotoSettings, clock: Clock, link: CameraLink, shared: SharedState) -> None:
         self._config, self._clock, self._link, self._shared = config, clock, link, shared
         self._zoom: ZoomSetting | None = None
         self._order = -1  # the command being carried out
@@ -345,7 +403,7 @@ class LensJob:
 class StillJob:
     """Take a still for the caller that waits for one."""
 
-    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, shared: SharedState) -> None:
+    def __init__(self, config: GphotoSettings, clock: Clock, link: CameraLink, shared: SharedState) -> None:
         self._config, self._clock, self._link, self._shared = config, clock, link, shared
         self._future: Future[Frame] | None = None
         self._due = -math.inf
@@ -414,7 +472,7 @@ class StillJob:
 class ViewJob:
     """Fetch viewfinder frames and publish the newest."""
 
-    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, frames: FrameBuffer) -> None:
+    def __init__(self, config: GphotoSettings, clock: Clock, link: CameraLink, frames: FrameBuffer) -> None:
         self._config, self._clock, self._link, self._frames = config, clock, link, frames
         self._due = -math.inf
         self._patience = Patience(clock)
@@ -472,7 +530,7 @@ class ViewJob:
             self._due = arrived + (REPEAT_PAUSE_S if self._frames.waited_s < REPEAT_LIMIT_S else period)
 
 
-def freshness(config: HardwareZoom) -> float:
+def freshness(config: GphotoSettings) -> float:
     """Return for how long a frame counts as the newest [s]."""
     return max(FRESH_S, FRESH_FRAMES / config.rate_hz)
 
@@ -500,7 +558,7 @@ class Shooting:
         shared: commands and results.
     """
 
-    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink, shared: SharedState) -> None:
+    def __init__(self, config: GphotoSettings, clock: Clock, link: CameraLink, shared: SharedState) -> None:
         self._config, self._clock, self._link, self._shared = config, clock, link, shared
         self._lens = LensJob(config, clock, link, shared)
         self._still = StillJob(config, clock, link, shared)
@@ -639,7 +697,14 @@ class GphotoCamera:
         DeviceError: the camera is not there, or does not answer.
     """
 
-    def __init__(self, config: HardwareZoom, clock: Clock, link: CameraLink | None = None) -> None:
+    Settings = GphotoSettings
+
+    @staticmethod
+    def probe(settings: GphotoSettings) -> str:
+        """Detect the camera without opening it; describe it in one line. See `cotarget.drivers.gphoto.probe`."""
+        return probe(settings.port, settings.model)
+
+    def __init__(self, config: GphotoSettings, clock: Clock, link: CameraLink | None = None) -> None:
         self._config, self._clock = config, clock
         self._name = f"the zoom camera at '{config.port}'"
         self._frames = FrameBuffer(self._name, clock, config.size, config.latency_s, freshness(config))

@@ -22,7 +22,7 @@ from cotarget.config import SafetyConfig
 from cotarget.drivers.interlock import PositionLostError, PositionLostMarker
 from cotarget.drivers.serial_line import LostError, RefusedError, SilentError
 from cotarget.errors import ConfigError, DeviceError, HaltedError
-from cotarget.rig import Clock, PanTiltLimits, PanTiltState, Speed
+from cotarget.rig import Clock, HeadSpec, PanTiltLimits, PanTiltState, Speed
 
 log = logging.getLogger(__name__)
 
@@ -161,6 +161,13 @@ class HeadSettings(Protocol):
     @property
     def command_delay_s(self) -> float:
         """Time from a command to the start of motion."""
+
+
+def head_spec(settings: HeadSettings) -> HeadSpec:
+    """Describe a head by its settings; its acceleration is not known before it is opened."""
+    speed, step = math.radians(settings.speed_deg_s), math.radians(settings.step_deg)
+    limits = PanTiltLimits(_radians(settings.pan_deg), _radians(settings.tilt_deg), speed, math.inf, step)
+    return HeadSpec(limits, settings.command_delay_s)
 
 
 # Axis positions from polls

@@ -10,13 +10,13 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
-from cotarget.config import HardwareHead, SafetyConfig
+from cotarget.config import SafetyConfig
 from cotarget.drivers import ptu_protocol
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import PositionLostError, PositionLostMarker, rig_lock
-from cotarget.drivers.polled_head import NOTHING_SAID, AxisFacts, CutError, Poll, PolledHead
+from cotarget.drivers.polled_head import NOTHING_SAID, AxisFacts, CutError, Poll, PolledHead, head_spec
 from cotarget.drivers.ptu_protocol import (
     AXES,
     DELIMITER,
@@ -31,9 +31,11 @@ from cotarget.drivers.ptu_protocol import (
 )
 from cotarget.drivers.serial_line import RefusedError, ReplyError, SilentError
 from cotarget.errors import DeviceError, EmergencyStopError
-from cotarget.rig import Clock
+from cotarget.rig import Clock, HeadSpec
+from cotarget.schema import Limits, Needed, NotNegative, OneOf, Positive, model
 
 log = logging.getLogger(__name__)
+BAUDS = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 Meaning = TypeVar("Meaning")
 GREETINGS = 2  # to a unit that was interrupted in the middle of an exchange
 TRIES = 3  # of one exchange; the line is synchronised again before each but the first
@@ -41,6 +43,38 @@ GREETING_QUIET_S, GREETING_MOST_S = 0.25, 1.5  # [s]; at open the unit's last co
 STILL_S = 0.035  # longer than the slowest speed, 31 steps/s, takes for a step [s]
 # A delimiter before the halt ends what noise may have left at the unit; the unit refuses that and not the halt.
 HALT_NOW, HALT_TRIES = DELIMITER + HALT, 2
+
+
+@model
+class D46Settings:
+    """A Directed Perception PTU-D46.
+
+    Attributes:
+        port: serial port such as "/dev/ttyUSB0", or "socket://host:port".
+        baud: baud rate of the serial line.
+        step_deg: step size that the unit is expected to report [degrees].
+        pan_deg: range of pan that the unit is expected to report, with positive pan to the right [degrees].
+        tilt_deg: range of tilt that the unit is expected to report, with positive tilt up [degrees].
+        pan_sign: 1 where the unit's positive pan turns right, -1 where it turns left, as in the D46's manual.
+        tilt_sign: 1 where the unit's positive tilt goes up, -1 where it goes down.
+        speed_deg_s: speed of moves, at most the unit's own [degrees/s].
+        command_delay_s: time from a command to the start of motion, as measured [s].
+    """
+
+    port: Annotated[str, Needed("/dev/ttyUSB0")] = ""
+    baud: Annotated[int, OneOf(*BAUDS)] = 9600
+    step_deg: Positive = 0.0514286
+    pan_deg: Limits = (-158.9, 158.9)
+    tilt_deg: Limits = (-46.6, 31.1)
+    pan_sign: Annotated[int, OneOf(-1, 1)] = -1
+    tilt_sign: Annotated[int, OneOf(-1, 1)] = 1
+    speed_deg_s: Positive = 149.0
+    command_delay_s: NotNegative = 0.04
+
+    @property
+    def spec(self) -> HeadSpec:
+        """Describe the unit."""
+        return head_spec(self)
 
 
 @dataclass(frozen=True)
@@ -219,11 +253,25 @@ class D46Head(PolledHead):
         DeviceError: there is no unit, or it cannot be used in its state.
     """
 
-    def __init__(self, config: HardwareHead, clock: Clock, safety: SafetyConfig = NOTHING_SAID) -> None:
+    Settings = D46Settings
+
+    @staticmethod
+    def probe(settings: D46Settings) -> str:
+        """Describe the unit in one line, by queries that change nothing; see `probe`."""
+        return probe(settings.port, settings.baud)
+
+    @staticmethod
+    def reset(settings: D46Settings, clock: Clock, safety: SafetyConfig, stopped: Callable[[], str | None]) -> str:
+        """Let the unit find its limits again, and describe it in one line; see `reset`."""
+        unit = reset(settings, clock, PositionLostMarker(settings.port, safety.stop_file), stopped)
+        pan, tilt = (f"{axis.lowest} to {axis.highest}" for axis in (unit.pan, unit.tilt))
+        return f"{unit.version}: pan {pan}, tilt {tilt} steps"
+
+    def __init__(self, config: D46Settings, clock: Clock, safety: SafetyConfig = NOTHING_SAID) -> None:
         super().__init__(lambda: _open_link(config, clock), config, clock, safety)
 
 
-def _open_link(config: HardwareHead, clock: Clock) -> D46Link:
+def _open_link(config: D46Settings, clock: Clock) -> D46Link:
     line = open_line(config.port, config.baud, clock)
     try:
         return D46Link(line)
@@ -402,7 +450,7 @@ NOT_HALTED = (
 )
 
 
-def reset(config: HardwareHead, clock: Clock, lost: PositionLostMarker, stopped: Callable[[], str | None]) -> UnitInfo:
+def reset(config: D46Settings, clock: Clock, lost: PositionLostMarker, stopped: Callable[[], str | None]) -> UnitInfo:
     """Let the unit find its limits again; its position counts as lost until that has succeeded.
 
     Anything that ends the reset early, Ctrl-C included, sends a halt and waits `HALT_S` for the answer. Where none

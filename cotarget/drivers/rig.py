@@ -1,50 +1,162 @@
 """Open the real devices as one Rig; every exit halts the head and releases all devices."""
 
 import contextlib
-import math
 import sys
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol
 
-from cotarget.config import RigConfig
-from cotarget.drivers.axis import AxisCamera
-from cotarget.drivers.board import make_board
+from cotarget.config import HardwareConfig, RigConfig, SafetyConfig
+from cotarget.drivers import DRIVERS
+from cotarget.drivers.board import BoardSettings, make_board
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.gphoto_camera import GphotoCamera
 from cotarget.drivers.interlock import rig_lock
-from cotarget.drivers.ptu_d46 import D46Head
-from cotarget.errors import ConfigError
-from cotarget.rig import CameraSpec, HeadSpec, PanTiltLimits, Rig, RigSpec, ZoomSpec
+from cotarget.errors import ConfigError, choices
+from cotarget.plugins import FORM, Reporting, calling, is_own, load
+from cotarget.rig import Clock, Rig, RigSpec
+from cotarget.schema import missing_key, validate
 
 # Python's thread switch interval [s], instead of 5 ms: a driver's thread that waits for its turn delays every command.
 # Measurements: docs/design-notes.md.
 SWITCH_INTERVAL = 5e-4
-NEEDED = (("head", "port", "/dev/ttyUSB0"), ("fixed", "url", "http://192.168.0.90"), ("zoom", "port", "usb:"))
+ROLES = ("head", "fixed", "zoom")  # tables of [hardware] that have a driver
+KEY = "driver"
+
+
+class Driver(Protocol):
+    """A class that opens a device; the device keeps one of the Protocols of `cotarget.rig`, and has `close`.
+
+    Attributes:
+        Settings: dataclass of the device's table in rig.toml, with a property ``spec`` that describes the device before
+            it is opened: a CameraSpec, ZoomSpec or HeadSpec.
+    """
+
+    Settings: ClassVar[type[Any]]
+
+    def __call__(self, settings: Any, clock: Clock, safety: SafetyConfig = ..., /) -> Any:
+        """Open the device; ``safety`` is passed to heads alone."""
+
+
+@dataclass(frozen=True)
+class Device:
+    """A device of rig.toml: the driver that opens it, and its checked settings.
+
+    Attributes:
+        where: the device's table in rig.toml.
+        driver: see `Driver`.
+        settings: an instance of ``driver.Settings``.
+        own: whether the driver is a user's own.
+    """
+
+    where: str
+    driver: Any
+    settings: Any
+    own: bool
+
+    def refuse_missing(self) -> None:
+        """Refuse settings that lack what opening the device needs.
+
+        Raises:
+            ConfigError: a key is missing.
+        """
+        if missing := missing_key(self.settings):
+            key, example = missing
+            raise ConfigError(
+                f'{self.where}.{key}: is missing; the hardware backend needs it, for example {key} = "{example}"'
+            )
+
+    def probe(self) -> str:
+        """Describe the device in one line, by queries that change nothing.
+
+        Raises:
+            ConfigError: the settings lack what is needed to find the device.
+            DeviceError: the device is not there, or does not answer.
+        """
+        if missing_key(self.settings):
+            raise ConfigError("is not configured")
+        if not hasattr(self.driver, "probe"):
+            return "is not asked: its driver has no probe"
+        with calling(self.where):
+            return str(self.driver.probe(self.settings))
+
+    def open(self, *arguments: Any) -> Any:
+        """Open the device.
+
+        Raises:
+            ConfigError: the device differs from its settings.
+            DeviceError: the device cannot be opened.
+        """
+        if not self.own:
+            return self.driver(self.settings, *arguments)
+        with calling(self.where):
+            return Reporting(self.driver(self.settings, *arguments), self.where)
+
+
+def device_of(role: str, table: Mapping[str, Any]) -> Device:
+    """Find the driver that a table of [hardware] names, and check the table; no device is opened.
+
+    Args:
+        role: "head", "fixed" or "zoom".
+        table: the table.
+
+    Raises:
+        ConfigError: there is no such driver, or it refuses the table.
+    """
+    where, known = f"hardware.{role}", DRIVERS[role]
+    name = table.get(KEY, next(iter(known)))
+    own = isinstance(name, str) and is_own(name)
+    if not own and name not in known:
+        raise ConfigError(f"{where}.{KEY}: {name!r} is neither {FORM} nor one of: {choices(known)}")
+    driver = load(name if own else known[name], f"{where}.{KEY}")
+    if not hasattr(driver, "Settings"):
+        raise ConfigError(f"{where}.{KEY}: {name} has no Settings, the dataclass of its keys in rig.toml")
+    rest = {key: value for key, value in table.items() if key != KEY}
+    with calling(where):
+        return Device(where, driver, validate(driver.Settings, rest, where, beside=(KEY,)), own)
+
+
+def devices(hardware: HardwareConfig) -> dict[str, Device]:
+    """Find and check the head, the fixed and the zoom camera; no device is opened.
+
+    Raises:
+        ConfigError: a table is refused.
+    """
+    return {role: device_of(role, getattr(hardware, role)) for role in ROLES}
+
+
+def board_settings(hardware: HardwareConfig) -> BoardSettings:
+    """Check the board's table.
+
+    Raises:
+        ConfigError: it is refused.
+    """
+    return validate(BoardSettings, hardware.board, "hardware.board")
+
+
+def check_hardware(hardware: HardwareConfig) -> None:
+    """Check every table of [hardware] that says something; no device is opened.
+
+    Raises:
+        ConfigError: a table is refused.
+    """
+    for role in ROLES:
+        if table := getattr(hardware, role):
+            device_of(role, table)
+    board_settings(hardware)
 
 
 def rig_spec(config: RigConfig) -> RigSpec:
-    """Describe the configured devices without opening them; the head's acceleration is not known before."""
-    head, fixed, zoom = config.hardware.head, config.hardware.fixed, config.hardware.zoom
-    limits = PanTiltLimits(
-        pan=(math.radians(head.pan_deg[0]), math.radians(head.pan_deg[1])),
-        tilt=(math.radians(head.tilt_deg[0]), math.radians(head.tilt_deg[1])),
-        speed=math.radians(head.speed_deg_s),
-        acceleration=math.inf,
-        step=math.radians(head.step_deg),
-    )
-    return RigSpec(
-        fixed=CameraSpec(fixed.size, fixed.rate_hz, fixed.latency_s),
-        zoom=ZoomSpec(
-            size=zoom.size,
-            rate_hz=zoom.rate_hz,
-            latency_s=zoom.latency_s,
-            focal_range=(zoom.lens[0][1] / zoom.pitch_mm, zoom.lens[-1][1] / zoom.pitch_mm),
-            pitch_mm=zoom.pitch_mm,
-            still_size=zoom.still_size,
-            delay_s=zoom.command_delay_s,
-        ),
-        head=HeadSpec(limits, head.command_delay_s),
-        real_time=True,
-    )
+    """Describe the configured devices without opening them.
+
+    Raises:
+        ConfigError: a table of [hardware] is refused.
+    """
+    return _spec(devices(config.hardware))
+
+
+def _spec(found: Mapping[str, Device]) -> RigSpec:
+    specs = {role: found[role].settings.spec for role in ROLES}
+    return RigSpec(**specs, real_time=True)
 
 
 def open_hardware(config: RigConfig) -> Rig:
@@ -56,25 +168,26 @@ def open_hardware(config: RigConfig) -> Rig:
         ConfigError: a device is not named, or differs from the configuration.
         DeviceError: a device could not be opened, or another program uses it.
     """
-    hardware = config.hardware
-    for table, key, example in NEEDED:
-        if not getattr(getattr(hardware, table), key):
-            raise ConfigError(
-                f'hardware.{table}.{key}: is missing; the hardware backend needs it, for example {key} = "{example}"'
-            )
+    found = devices(config.hardware)
+    for device in found.values():
+        device.refuse_missing()
     sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL))
-    clock = MonotonicClock()
+    clock, spec = MonotonicClock(), _spec(found)
     with contextlib.ExitStack() as opened:
-        opened.enter_context(rig_lock(hardware.head.port))
-        board = opened.enter_context(contextlib.closing(make_board(hardware.board)))
-        fixed = opened.enter_context(contextlib.closing(AxisCamera(hardware.fixed, clock)))
-        zoom = opened.enter_context(contextlib.closing(GphotoCamera(hardware.zoom, clock)))
-        head = opened.enter_context(contextlib.closing(D46Head(hardware.head, clock, config.safety)))
-        spec = rig_spec(config)
-        reported = RigSpec(
+        opened.enter_context(rig_lock(port_of(found["head"])))
+        board = opened.enter_context(contextlib.closing(make_board(board_settings(config.hardware))))
+        fixed = opened.enter_context(contextlib.closing(found["fixed"].open(clock)))
+        zoom = opened.enter_context(contextlib.closing(found["zoom"].open(clock)))
+        head = opened.enter_context(contextlib.closing(found["head"].open(clock, config.safety)))
+        reported = replace(
+            spec,
             fixed=replace(spec.fixed, size=fixed.size),
             zoom=replace(spec.zoom, size=zoom.size, focal_range=zoom.focal_range, still_size=zoom.still_size),
             head=replace(spec.head, limits=head.limits),
-            real_time=True,
         )
         return Rig(fixed, zoom, head, clock, board, reported, opened.pop_all().close, config)
+
+
+def port_of(device: Device) -> str:
+    """Return the port that a device's settings name; empty if they name none."""
+    return str(getattr(device.settings, "port", ""))

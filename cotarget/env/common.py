@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
+from cotarget.backends import describe, load_config
 from cotarget.calibration import Calibration, load_calibration
 from cotarget.config import (
     DEFAULT_TARGETS,
@@ -21,7 +22,6 @@ from cotarget.config import (
     TargetProfile,
     Waypoint,
     check_config,
-    load_config,
 )
 from cotarget.errors import ConfigError, choices
 from cotarget.evaluation import TruthDetector, TruthNoise, counted, true_calibration
@@ -78,9 +78,15 @@ def rig_of(given: object) -> RigConfig:
     if given is not None:
         check_config(config)  # a configuration made in Python was not checked yet
         _check_waits(config.sim)
-    pan_deg, tilt_deg = config.head_limits_deg
-    head = replace(config.sim.head, pan_deg=pan_deg, tilt_deg=tilt_deg)
+    describe(config)  # refuses soft limits that leave nothing
+    head, soft = config.sim.head, config.safety
+    head = replace(head, pan_deg=_both(head.pan_deg, soft.pan_deg), tilt_deg=_both(head.tilt_deg, soft.tilt_deg))
     return replace(config, sim=replace(config.sim, head=head))
+
+
+def _both(own: tuple[float, float], soft: tuple[float, float] | None) -> tuple[float, float]:
+    """Intersect two ranges."""
+    return own if soft is None else (max(own[0], soft[0]), min(own[1], soft[1]))
 
 
 def _check_waits(sim: SimConfig) -> None:
@@ -226,7 +232,8 @@ class Units:
     @classmethod
     def of(cls, config: RigConfig) -> "Units":
         """Make the units of a rig, with the head's soft limits."""
-        return cls(*config.head_limits, config.focal_range_px)
+        spec = describe(config)
+        return cls(spec.head.limits.pan, spec.head.limits.tilt, spec.zoom.focal_range)
 
     def command(self, action: npt.ArrayLike) -> Command:
         """Convert an action (pan, tilt, focal length), clipped to -1 to 1, to a command.
@@ -366,10 +373,10 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         self.config = rig_of(rig)
         self.units = Units.of(self.config)
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": self.config.rate_hz}
+        self.metadata = {**self.metadata, "render_fps": self.config.sim.fixed.rate_hz}
         self._calibration, self._noise = calibration_of(calibration), noise_of(noise)
         self._observation, self._size = observation, size_of(image_size)
-        self._last = max(round(seconds_of(seconds) * self.config.rate_hz), 1)
+        self._last = max(round(seconds_of(seconds) * self.config.sim.fixed.rate_hz), 1)
         self._episode: Episode | None = None
         self._opened: dict[Size, SizedPictures] = {}  # for the present episode
 

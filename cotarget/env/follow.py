@@ -183,7 +183,7 @@ class Follow(RigEnv[Any, Vector]):
             across / width,
             down / height,
             track.larger_side_px / width,
-            track.missed / self.config.rate_hz,
+            track.missed / self.config.sim.fixed.rate_hz,
         ]
 
     def _info(self, judged: Closeup) -> dict[str, Any]:

@@ -100,7 +100,7 @@ class Watch:
     found: list[bool] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._detector = make_detector(self.target, self.config.rate_hz)
+        self._detector = make_detector(self.target, self.config.sim.fixed.rate_hz)
         self._tracker = Tracker(tracking_settings(self.target), self.config.sim.fixed.size)
 
     def see(self, frame: Frame, shift: Array, outlines: Mapping[str, Silhouette | None]) -> None:

@@ -73,7 +73,7 @@ def _calibrated(from_boards: bool, seed: int, rig: RigText) -> Calibration:
         return true_calibration(SimWorld(config, rendered=()))
     world = SimWorld(config)
     with guard(world.rig, config.safety) as safe:
-        return calibrate(safe, config.board, pitch_mm=config.pitch_mm, seed=config.sim.seed)
+        return calibrate(safe, config.board, pitch_mm=config.sim.zoom.pitch_mm, seed=config.sim.seed)
 
 
 # Calibration of a rig, from rendered boards or exact; shared by all experiments in the field with that rig.
@@ -119,7 +119,7 @@ def watched(
     """
     settings = settings or FollowSettings()
     if view is None:
-        world, detector = SimWorld(config), make_detector(target, config.rate_hz)
+        world, detector = SimWorld(config), make_detector(target, config.sim.fixed.rate_hz)
     else:
         world, detector = open_on(view, config, closed_loop=settings.closed_loop)
     how = partial(follow, selector=selector)

@@ -8,7 +8,8 @@ import functools
 from dataclasses import dataclass
 from pathlib import Path
 
-from cotarget.config import RigConfig, config_of, read_text
+from cotarget.backends import load_config
+from cotarget.config import RigConfig, read_text
 from cotarget.errors import ConfigError
 from experiments.engine import harness
 
@@ -27,7 +28,7 @@ class RigText:
 
     def config(self, scene: str, targets: tuple[str, ...], seed: int) -> RigConfig:
         """Configure the rig in a scene with targets."""
-        config = config_of(self.text, Path(self.path)) if self.path else RigConfig()
+        config = load_config(self.path, self.text) if self.path else RigConfig()
         sim = dataclasses.replace(config.sim, scene=scene, targets=targets, seed=seed, models={}, paths={})
         return dataclasses.replace(config, sim=sim)
 
@@ -72,6 +73,6 @@ class OwnRig(harness.Settings):
 
 def _check(text: str, path: Path) -> None:
     """Refuse a file that is not the configuration of a simulated rig."""
-    config = config_of(text, path)
+    config = load_config(path, text)
     if config.backend != "sim":
         raise ConfigError(f"{path}: backend = '{config.backend}' cannot be tried here; give a rig.toml with 'sim'")

@@ -159,7 +159,7 @@ class _Lookout:
 
     def __init__(self, rig: Rig, calibration: Calibration, config: RigConfig, target: TargetProfile) -> None:
         self._rig, self._config, self._calibration = rig, config, calibration
-        self._detector = make_detector(target, config.rate_hz)
+        self._detector = make_detector(target, config.sim.fixed.rate_hz)
         self._tracker = Tracker(tracking_settings(target), rig.fixed.size)
         self._wide = TargetFusion(calibration, target, rig.fixed.size)  # never updated from the zoom camera
         self._both: TargetFusion | None = None
@@ -191,8 +191,8 @@ class _Lookout:
     def shoot(self) -> Shot | None:
         """Aim at the track for the first zoom frame that can be exposed then, and wait for it; None if out of reach."""
         fusion = self._wide if self._both is None else self._both
-        rate, now = self._config.rate_hz, self._rig.clock.now()
-        still = now + self._config.command_delay_s + self._config.sim.zoom.exposure_s / 2
+        rate, now = self._config.sim.fixed.rate_hz, self._rig.clock.now()
+        still = now + self._rig.spec.head.delay_s + self._config.sim.zoom.exposure_s / 2
         t = (math.floor(still * rate + ROUNDING) + 1) / rate
         if self.track is None:
             return None

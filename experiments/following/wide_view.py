@@ -106,7 +106,7 @@ def record(config: RigConfig, target: TargetProfile, seconds: float) -> WideView
         seconds: length of the run [s].
     """
     frames: dict[int, Seen] = {}
-    detector, shelf = make_detector(target, config.rate_hz), Shelf()
+    detector, shelf = make_detector(target, config.sim.fixed.rate_hz), Shelf()
     with SimWorld(config, rendered=WIDE).rig as rig:
         t: float | None = None
         while t is None or t < seconds:

@@ -113,7 +113,7 @@ def _shown(
             rig.clock.sleep_until(arrives)
             ends: list[Step] = []
             for wanted, seconds in ((speck, TURN_S), (target, settings.seconds)):
-                detector = make_detector(target, config.rate_hz)
+                detector = make_detector(target, config.sim.fixed.rate_hz)
                 ends += _ends(WAYS[way](rig, calibration, wanted, detector, seconds=seconds, settings=how))
             shown = dict(zip(STAGES, (ends[0], ends[1], ends[3]), strict=True))
             row = {"seed": seed, "place": place, "way": way}

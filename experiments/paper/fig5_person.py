@@ -106,8 +106,8 @@ def _followed(calibration: Calibration, settings: PersonSettings, seed: int, way
     judged: list[Judged] = []
     moments: list[Step] = []
     # The last step comes a frame before the end, or later.
-    due = np.linspace(FIRST_S, settings.seconds - 1 / config.rate_hz, MOMENTS).tolist()
-    detector, world = make_detector(target, config.rate_hz), SimWorld(config)
+    due = np.linspace(FIRST_S, settings.seconds - 1 / config.sim.fixed.rate_hz, MOMENTS).tolist()
+    detector, world = make_detector(target, config.sim.fixed.rate_hz), SimWorld(config)
     for step, truth in watched_in(world, detector, calibration, target, settings.seconds, how, WAYS[way]):
         add_row(judged, step, truth, NAME, target)
         if due and step.t >= due[0]:

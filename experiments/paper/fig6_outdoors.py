@@ -106,7 +106,7 @@ def one(calibration: Calibration, settings: OutdoorSettings, seed: int) -> Pictu
     for way in settings.ways:
         watch, found_by = Watch(), settings.detector if way == OURS else "mog2"
         target = dataclasses.replace(config.target(KIND), detector=found_by)
-        detector, world = make_detector(target, config.rate_hz), SimWorld(config)
+        detector, world = make_detector(target, config.sim.fixed.rate_hz), SimWorld(config)
         for step, truth in watched_in(world, detector, calibration, target, settings.seconds, how, WAYS[way]):
             watch.see(step, truth, target)
         rows.append({"seed": seed, "way": way, "detector": found_by, **figures(watch.moments)})

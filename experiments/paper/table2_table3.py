@@ -207,7 +207,7 @@ def _table_2(settings: Settings, summary: Mapping[str, Any]) -> str:
     head = ("rows are [v, u]", "focal length, px", "mm", "centre, px", "CCD, mm", "pitch, mm")
     if not settings.rig:
         return table(head, _lens(summary, CAMERAS, "  true, as printed", PITCH_MM, CCD_MM))
-    pitch_mm = {"zoom": settings.config("indoor", (), settings.seed_base).pitch_mm}
+    pitch_mm = {"zoom": settings.config("indoor", (), settings.seed_base).sim.zoom.pitch_mm}
     return table([words for words in head if words != "CCD, mm"], _lens(summary, CAMERA_WORDS, "  true", pitch_mm))
 
 

@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_folder(out.parent)
         effects = SimEffects(noise=False, jpeg=False)  # these would take most of the file
         config = ct.RigConfig(sim=ct.SimConfig(scene="outdoor", targets=("bird",), effects=effects))
-        write_whole(out, animated_webp(list(pictures(config)), config.rate_hz / EVERY))
+        write_whole(out, animated_webp(list(pictures(config)), config.sim.fixed.rate_hz / EVERY))
     except CotargetError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         return 1
@@ -54,7 +54,7 @@ def pictures(config: ct.RigConfig) -> Iterator[Image]:
         calibration = ct.calibrate(rig)
     with ct.open_rig(config) as rig:  # from the start, while the bird is still outside
         for step in ct.follow(rig, calibration, "bird", seconds=TO_S):
-            if step.index >= FROM_S * config.rate_hz and step.index % EVERY == 0:
+            if step.index >= FROM_S * config.sim.fixed.rate_hz and step.index % EVERY == 0:
                 yield side_by_side(step)
 
 

@@ -10,8 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cotarget.config import HardwareFixed
-from cotarget.drivers.axis import AxisCamera
+from cotarget.drivers.axis import AxisCamera, AxisSettings
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.emulators.axis_241q import AxisServer
 from cotarget.emulators.plant import Feed, Picture
@@ -72,7 +71,7 @@ def run(seconds: float, seed: int) -> list[Row]:
 
 def _consume(url: str, sent: Any, seconds: float, rng: np.random.Generator) -> list[Row]:
     clock, rows = MonotonicClock(), []
-    camera = AxisCamera(HardwareFixed(url=url, size=SIZE, latency_s=0.0), clock)
+    camera = AxisCamera(AxisSettings(url=url, size=SIZE, latency_s=0.0), clock)
     try:
         begun = clock.now()
         while clock.now() < begun + seconds:

@@ -120,7 +120,7 @@ def _follow(emulated: EmulatedRig, name: str, seconds: float) -> list[Row]:
     config = emulated.config()
     taps: list[Tap] = []
     with guard(open_tapped(config, taps), config.safety) as rig:
-        notes = Notes(rig.clock, config.hardware.fixed.latency_s)
+        notes = Notes(rig.clock, rig.spec.fixed.latency_s)
         target = config.target(name)
         detector = TimedDetector(make_detector(target, rig.spec.fixed.rate_hz), notes)
         timed = replace(rig, fixed=TimedCamera(rig.fixed, notes), head=TimedHead(rig.head, notes))

@@ -21,6 +21,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from cotarget.backends import describe
 from cotarget.calibration import save_calibration
 from cotarget.config import parse_config
 from cotarget.emulators.emulation import FAULTS
@@ -175,7 +176,8 @@ def _directions() -> Array:
     config = parse_config(_tables())
     calibration = exact_calibration(config)
     path = waypoint_path(config.sim.paths["book"])
-    reach = Reach(*config.head_limits, config.focal_range_px)
+    spec = describe(config)
+    reach = Reach(spec.head.limits.pan, spec.head.limits.tilt, spec.zoom.focal_range)
     found = []
     for t in np.arange(PERIOD_S / TABLE_S + 1) * TABLE_S:
         x, y, z = path.position(PERIOD_S + t)  # skip the first round, which starts from rest

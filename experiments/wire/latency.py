@@ -100,7 +100,6 @@ def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
     """Measure all latencies; give a row for each camera and for the head's commands."""
     with EmulatedRig(folder / "latency", {"sim": {"scene": "outdoor"}}) as emulated, Watcher(emulated) as watcher:
         config = emulated.config()
-        hardware = config.hardware
         taps: list[Tap] = []
         with guard(open_tapped(config, taps), config.safety) as rig:
             notes = Notes(rig.clock, 0.0)
@@ -111,13 +110,13 @@ def run(folder: Path, head_seconds: float, board_seconds: float) -> list[Row]:
             calibration = exact_calibration(emulated.sim)
             swing, _ = measure_fixed(noted, calibration, config.board, board_seconds)
         truth = {
-            "fixed": _truth(cameras["fixed"], hardware.fixed.latency_s, watcher.exposures["fixed"]),
-            "zoom": _truth(cameras["zoom"], hardware.zoom.latency_s, watcher.exposures["zoom"]),
+            "fixed": _truth(cameras["fixed"], rig.spec.fixed.latency_s, watcher.exposures["fixed"]),
+            "zoom": _truth(cameras["zoom"], rig.spec.zoom.latency_s, watcher.exposures["zoom"]),
             "command": orders,
         }
     measured = {
-        "fixed": hardware.fixed.latency_s + swing.seconds + found.zoom.seconds,
-        "zoom": hardware.zoom.latency_s + found.zoom.seconds,
+        "fixed": rig.spec.fixed.latency_s + swing.seconds + found.zoom.seconds,
+        "zoom": rig.spec.zoom.latency_s + found.zoom.seconds,
         "command": found.command,
     }
     return [

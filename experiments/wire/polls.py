@@ -5,9 +5,9 @@ from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from cotarget.config import HardwareHead
 from cotarget.drivers.clock import MonotonicClock
-from cotarget.drivers.ptu_d46 import D46Head
+from cotarget.drivers.ptu_d46 import D46Head, D46Settings
+from cotarget.drivers.rig import devices
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.unit import D46_PAPER
@@ -19,7 +19,7 @@ BAUD, BITS = 9600, 10
 BYTES_S = BAUD / BITS
 NEAR, FAR = (0, 0), (-3000, -1500)  # steps of pan and tilt; the latter have the most digits of a D46's
 PAN_DEG, TILT_DEG = (-180.0, 180.0), (-79.97, 29.98)  # ranges of D46_PAPER
-UNIT = HardwareHead(baud=BAUD, pan_deg=PAN_DEG, tilt_deg=TILT_DEG, speed_deg_s=100.0)
+UNIT = D46Settings(baud=BAUD, pan_deg=PAN_DEG, tilt_deg=TILT_DEG, speed_deg_s=100.0)
 QUESTION = b"PP "  # first query of a pair
 
 
@@ -67,7 +67,7 @@ def poll_alone(position: tuple[int, int], seconds: float) -> Row:
 def poll_in_world(folder: Path, seconds: float) -> Row:
     """Poll the unit of an emulated rig while both cameras are rendered."""
     with EmulatedRig(folder, {"sim": {"scene": "outdoor", "targets": ["person"]}}) as emulated:
-        return _poll("beside the rendering world", emulated.config().hardware.head, seconds)
+        return _poll("beside the rendering world", devices(emulated.config().hardware)["head"].settings, seconds)
 
 
 def run(folder: Path, seconds: float) -> list[Row]:
@@ -76,7 +76,7 @@ def run(folder: Path, seconds: float) -> list[Row]:
     return [{"figure": "polls", **row, "load": load()} for row in rows]
 
 
-def _poll(case: str, config: HardwareHead, seconds: float) -> Row:
+def _poll(case: str, config: D46Settings, seconds: float) -> Row:
     clock = MonotonicClock()
     with tapped(clock) as taps:
         head = D46Head(config, clock)

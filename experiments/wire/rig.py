@@ -18,8 +18,9 @@ from unittest import mock
 
 import tomli_w
 
+from cotarget.backends import load_config
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig, load_config
+from cotarget.config import RigConfig
 from cotarget.drivers import ptu_protocol, serial_line
 from cotarget.errors import DeviceError
 from cotarget.evaluation import true_calibration

@@ -33,7 +33,7 @@ def true_calibration(config, zoom_size=None, with_head=True):
     zoom = Intrinsics(zoom_size or sim.zoom.size, sim.zoom.focal_px, sim.zoom.center_px, sim.zoom.distortion)
     return Calibration(
         fixed=Intrinsics(sim.fixed.size, sim.fixed.focal_px, sim.fixed.center_px, sim.fixed.distortion),
-        zoom=ZoomLens((config.focal_range_px[0],), (zoom,)),
+        zoom=ZoomLens((sim.zoom.focal_mm[0] / sim.zoom.pitch_mm,), (zoom,)),
         T_zoom0_fixed=sim.T_zoom0_fixed,
         T_head_zoom=sim.T_head_zoom if with_head else None,
         head=HeadGeometry(sim.head.axis_offset_mm / 1000, math.radians(sim.head.squareness_deg)),

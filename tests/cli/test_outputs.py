@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.backends import OPENERS
+from cotarget.backends import OPENERS, describe
 from cotarget.cli.common import previous_kept, print_json, progress_bar
 from cotarget.config import RigConfig
 from cotarget.errors import CalibrationError, DeviceError
@@ -92,7 +92,7 @@ class Session:
 def sessions(monkeypatch):
     """Lets `calibrate --rig` open a rig without a world; its session is what a test says."""
     rig = SimulatedDevices()
-    rig.zoom.still_size, rig.zoom.focal_range = rig.zoom.size, RigConfig().focal_range_px  # 12 x zoom
+    rig.zoom.still_size, rig.zoom.focal_range = rig.zoom.size, describe(RigConfig()).zoom.focal_range  # 12 x zoom
     monkeypatch.setitem(OPENERS, "sim", lambda config: rig_of(rig, config=config))
     return lambda error=None: monkeypatch.setattr("cotarget.calibration.calibrate.calibrate", Session(error))
 
@@ -239,7 +239,7 @@ def pointed(folder, monkeypatch):
     """A rig for `point`, with pictures and a lens of 6 to 72 mm."""
     rig = SimulatedDevices()
     image = np.zeros((2, 2, 3), np.uint8)
-    range_px = RigConfig().focal_range_px
+    range_px = describe(RigConfig()).zoom.focal_range
     rig.zoom = SimpleNamespace(
         size=(2, 2),
         focal_range=range_px,

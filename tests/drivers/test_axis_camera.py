@@ -19,9 +19,8 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.config import HardwareFixed
 from cotarget.drivers import axis, frame_buffer
-from cotarget.drivers.axis import AxisCamera, probe
+from cotarget.drivers.axis import AxisCamera, AxisSettings, probe
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.mjpeg import USUAL
 from cotarget.emulators.axis_241q import AxisServer
@@ -176,7 +175,7 @@ def tidy(monkeypatch):
 
 
 def config(server, **changes):
-    return HardwareFixed(**{"url": server.url, "size": SIZE, "latency_s": LATENCY_S} | changes)
+    return AxisSettings(**{"url": server.url, "size": SIZE, "latency_s": LATENCY_S} | changes)
 
 
 def opened(server, **changes):
@@ -401,7 +400,7 @@ def test_nobody_at_the_address():
     with socket.create_server(("127.0.0.1", 0)) as unused:
         port = unused.getsockname()[1]
     with pytest.raises(DeviceError, match=rf"http://127.0.0.1:{port} cannot be reached \(.*refused\): check"):
-        AxisCamera(HardwareFixed(url=f"http://127.0.0.1:{port}"), MonotonicClock())
+        AxisCamera(AxisSettings(url=f"http://127.0.0.1:{port}"), MonotonicClock())
 
 
 @pytest.mark.parametrize(
@@ -410,13 +409,13 @@ def test_nobody_at_the_address():
 )
 def test_an_address_that_is_none(url, words):
     with pytest.raises((ConfigError, DeviceError), match=words or "http"):
-        AxisCamera(HardwareFixed(url=url), MonotonicClock())
+        AxisCamera(AxisSettings(url=url), MonotonicClock())
 
 
 def test_httpx_is_named_where_it_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "httpx", None)
     with pytest.raises(MissingPackageError, match=r"need httpx: pip install 'cotarget\[hardware\]'"):
-        AxisCamera(HardwareFixed(url="http://127.0.0.1"), MonotonicClock())
+        AxisCamera(AxisSettings(url="http://127.0.0.1"), MonotonicClock())
 
 
 def test_another_size_than_configured(server):

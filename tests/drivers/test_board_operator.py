@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from cotarget.calibration.session import CaptureRecorder
-from cotarget.config import HardwareBoard
-from cotarget.drivers.board import PersonBoard, SocketBoard, in_words, make_board
+from cotarget.drivers.board import BoardSettings, PersonBoard, SocketBoard, in_words, make_board
 from cotarget.emulators.serve import JsonLines
 from cotarget.errors import DeviceError
 from cotarget.geometry import pose
@@ -71,7 +70,7 @@ def test_a_program_is_asked_in_json_and_its_refusal_is_an_error():
         return {"ok": True} if said["present"] is None else {"error": "out of reach"}
 
     with JsonLines(answer) as server:
-        board = make_board(HardwareBoard(f"socket://127.0.0.1:{server.port}"))
+        board = make_board(BoardSettings(f"socket://127.0.0.1:{server.port}"))
         assert board.patience == 0
         board.present(None)
         with pytest.raises(DeviceError, match="the board cannot be held there: out of reach"):

@@ -22,16 +22,15 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.config import HardwareZoom
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.frame_buffer import FrameBuffer
 from cotarget.drivers.gphoto import GphotoLink, LinkError, Setting, cameras, full_port, probe
-from cotarget.drivers.gphoto_camera import GphotoCamera, SharedState, Shooting, freshness
+from cotarget.drivers.gphoto_camera import GphotoCamera, GphotoSettings, SharedState, Shooting, freshness
 from cotarget.errors import ConfigError, DeviceError, MissingPackageError, StaleFrameError
 from tests.simulated_clock import SimClock
 
 SIZE, STILL_SIZE = (32, 24), (64, 48)
-CONFIG = HardwareZoom(port="usb:", size=SIZE, still_size=STILL_SIZE, latency_s=0.1)
+CONFIG = GphotoSettings(port="usb:", size=SIZE, still_size=STILL_SIZE, latency_s=0.1)
 PERIOD = 1 / 10  # of the fake viewfinder [s]
 CALL_S = 0.002  # that a call takes [s]
 DEADLINE_S = 20.0  # for whatever should happen at once: only a hang takes as long
@@ -1074,12 +1073,13 @@ from cotarget.errors import ConfigError
 from cotarget.drivers.gphoto_camera import GphotoCamera
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.gphoto import cameras, probe
-from cotarget.config import HardwareZoom
+from cotarget.drivers.gphoto_camera import GphotoSettings
+
 
 print(cameras())
 print(probe("usb:", ""))
 try:
-    GphotoCamera(HardwareZoom(port="usb:"), MonotonicClock())
+    GphotoCamera(GphotoSettings(port="usb:"), MonotonicClock())
 except ConfigError as error:
     print(error)
 """
@@ -1191,7 +1191,7 @@ def emulated(process, tmp_path, monkeypatch):
     home = home_in(tmp_path)
     monkeypatch.setenv("HOME", str(home))
     monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
-    camera = GphotoCamera(HardwareZoom(port=f"ptpip:localhost:{process.port}"), MonotonicClock())
+    camera = GphotoCamera(GphotoSettings(port=f"ptpip:localhost:{process.port}"), MonotonicClock())
     process.camera = camera
     yield process
     camera.close()

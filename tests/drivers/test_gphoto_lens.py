@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from cotarget.config import S5_IS_LENS
+from cotarget.drivers.gphoto_camera import S5_IS_LENS
 from cotarget.drivers.lens import LensMotion, LensTable
 
 PITCH_MM = 0.01794  # 5.74 mm of sensor on 320 px

@@ -7,11 +7,16 @@ import sys
 import pytest
 
 from cotarget.backends import open_rig
-from cotarget.config import HardwareConfig, HardwareHead, RigConfig, parse_config
+from cotarget.config import HardwareConfig, RigConfig, parse_config
+from cotarget.drivers import DRIVERS
 from cotarget.drivers import rig as rig_module
-from cotarget.drivers.ptu_d46 import probe
+from cotarget.drivers.axis import AxisSettings
+from cotarget.drivers.board import BoardSettings
+from cotarget.drivers.gphoto_camera import GphotoSettings
+from cotarget.drivers.ptu_d46 import D46Settings, probe
 from cotarget.drivers.rig import open_hardware
 from cotarget.errors import ConfigError, DeviceError
+from cotarget.plugins import load
 from cotarget.rig import PanTiltLimits
 
 ORDER = ("board", "fixed", "zoom", "head")
@@ -53,8 +58,12 @@ def devices(monkeypatch):
 
         return Device
 
-    for name, attribute in zip(ORDER, ("make_board", "AxisCamera", "GphotoCamera", "D46Head"), strict=True):
-        monkeypatch.setattr(rig_module, attribute, maker(name))
+    found = {}
+    for name in ("fixed", "zoom", "head"):
+        found[name] = maker(name)
+        found[name].Settings = load(next(iter(DRIVERS[name].values())), name).Settings
+    monkeypatch.setattr(rig_module, "load", lambda _, where: found[where.split(".")[1]])
+    monkeypatch.setattr(rig_module, "make_board", maker("board"))
     return log, missing, stuck
 
 
@@ -68,7 +77,7 @@ def devices(monkeypatch):
 )
 def test_a_device_that_is_not_named_is_asked_for_before_any_is_opened(devices, table, key, line):
     log, *_ = devices
-    nameless = dataclasses.replace(getattr(CONFIG.hardware, table), **{key: ""})
+    nameless = {**getattr(CONFIG.hardware, table), key: ""}
     config = dataclasses.replace(CONFIG, hardware=dataclasses.replace(CONFIG.hardware, **{table: nameless}))
     with pytest.raises(ConfigError) as error:
         open_hardware(config)
@@ -87,11 +96,11 @@ def test_the_head_comes_last_and_is_let_go_first(devices):
         assert log == [f"open {name}" for name in ORDER]
         assert rig.spec.real_time
         assert (rig.spec.zoom.still_size, rig.spec.zoom.focal_range) == ((3264, 2448), (300.0, 4000.0))
-        assert (rig.spec.head.limits, rig.spec.zoom.delay_s) == (LIMITS, CONFIG.hardware.zoom.command_delay_s)
-        assert rig.head.arguments == (CONFIG.hardware.head, rig.clock, CONFIG.safety)
-        assert rig.fixed.arguments == (CONFIG.hardware.fixed, rig.clock)
-        assert rig.zoom.arguments == (CONFIG.hardware.zoom, rig.clock)
-        assert rig.board.arguments == (CONFIG.hardware.board,)
+        assert (rig.spec.head.limits, rig.spec.zoom.delay_s) == (LIMITS, GphotoSettings().command_delay_s)
+        assert rig.head.arguments == (D46Settings(port="/dev/null/head"), rig.clock, CONFIG.safety)
+        assert rig.fixed.arguments == (AxisSettings(url="http://192.0.2.1"), rig.clock)
+        assert rig.zoom.arguments == (GphotoSettings(port="usb:"), rig.clock)
+        assert rig.board.arguments == (BoardSettings(),)
         log.clear()
     assert log == [f"close {name}" for name in reversed(ORDER)]
     rig.close()
@@ -125,7 +134,7 @@ def test_a_rig_that_another_program_has_is_said_to_be_before_any_device_is_asked
     address = f"socket://192.0.2.1:{os.getpid()}"  # of no other test's process
     names = {"its name": (port, port), "another name": (port, str(tmp_path / "link")), "a URL": (address, address)}[by]
     first, second = (
-        dataclasses.replace(CONFIG, hardware=dataclasses.replace(CONFIG.hardware, head=HardwareHead(port=name)))
+        dataclasses.replace(CONFIG, hardware=dataclasses.replace(CONFIG.hardware, head={"port": name}))
         for name in names
     )
     with open_hardware(first):
@@ -162,7 +171,8 @@ def test_ctrl_c_while_it_opens_lets_go_too(devices, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(rig_module, "D46Head", interrupted)
+    interrupted.Settings, before = D46Settings, rig_module.load
+    monkeypatch.setattr(rig_module, "load", lambda name, where: interrupted if "head" in where else before(name, where))
     with pytest.raises(KeyboardInterrupt):
         open_hardware(CONFIG)
     assert log[-3:] == ["close zoom", "close fixed", "close board"]

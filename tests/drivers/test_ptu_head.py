@@ -8,10 +8,10 @@ import time
 import pytest
 import serial
 
-from cotarget.config import HardwareHead, SafetyConfig
+from cotarget.config import SafetyConfig
 from cotarget.drivers.interlock import PositionLostMarker
 from cotarget.drivers.polled_head import Move
-from cotarget.drivers.ptu_d46 import D46Head
+from cotarget.drivers.ptu_d46 import D46Head, D46Settings
 from cotarget.errors import ConfigError, DeviceError, HaltedError
 from tests.d46_bench import CONFIG, Bench
 
@@ -69,13 +69,13 @@ def test_limits_are_the_units_in_the_sense_of_the_file(opened, bench):
 
 def test_as_the_manual_has_it_a_unit_counts_to_the_left(opened, bench):
     """Positive pan of a PTU-D46 turns left, says its manual; that of a rig turns right. Tilt goes up for both."""
-    head = opened(HardwareHead(port="PORT"))
+    head = opened(D46Settings(port="PORT"))
     head.move(10 * STEP, 20 * STEP, wait=True)
     assert bench.unit.goals() == (-10, 20)
 
 
 def test_signs_turn_axes_round(opened, bench):
-    config = HardwareHead(port="PORT", pan_sign=-1, tilt_sign=-1, tilt_deg=(-31.1, 46.6))
+    config = D46Settings(port="PORT", pan_sign=-1, tilt_sign=-1, tilt_deg=(-31.1, 46.6))
     head = opened(config)
     assert math.degrees(head.limits.tilt[1]) == pytest.approx(46.65, abs=0.01)
     pan, tilt = head.move(10 * STEP, 20.4 * STEP, wait=True)
@@ -110,7 +110,7 @@ SLOW = "0.5 degrees/s is slower than the unit at PORT can turn; it takes 1.6 at 
 @pytest.mark.parametrize(
     ("config", "safety", "key"),
     [
-        (HardwareHead(**{**vars(CONFIG), "speed_deg_s": 0.5}), SafetyConfig(), "hardware.head"),
+        (D46Settings(**{**vars(CONFIG), "speed_deg_s": 0.5}), SafetyConfig(), "hardware.head"),
         (CONFIG, SafetyConfig(speed_deg_s=0.5), "safety"),
     ],
 )
@@ -289,7 +289,7 @@ def test_a_lost_position_is_remembered_until_the_unit_was_reset(opened, bench, t
     bench.unit.heard.clear()
     for port in ("PORT", "ANOTHER"):  # as an adapter that was replugged may have
         with pytest.raises(DeviceError) as again:
-            opened(HardwareHead(**{**vars(CONFIG), "port": port}), safety)
+            opened(D46Settings(**{**vars(CONFIG), "port": port}), safety)
         assert str(again.value) == f"{caught.value} (or, where no unit is at that port any more, remove {file})"
     assert bench.unit.heard == []
     PositionLostMarker("PORT", safety.stop_file).forget()

@@ -12,10 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from cotarget.config import HardwareHead
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import PositionLostMarker
-from cotarget.drivers.ptu_d46 import D46Head, probe, reset
+from cotarget.drivers.ptu_d46 import D46Head, D46Settings, probe, reset
 from cotarget.emulators.faults import Faults
 from cotarget.emulators.ptu_d46.firmware import D46, D46_FAULTS
 from cotarget.emulators.ptu_d46.unit import D46_STOCK, E_SERIES
@@ -70,7 +69,7 @@ class Bench:
         unit = D46(self.pan, self.tilt, profile, self.faults, time.monotonic)
         self.line = TcpLine(unit) if tcp else SerialLine(unit)
         step = profile.step / 3600
-        self.config = HardwareHead(
+        self.config = D46Settings(
             port=self.line.url if tcp else self.line.port,
             step_deg=step,
             pan_deg=tuple(step * end for end in profile.pan),
@@ -173,8 +172,8 @@ def test_it_goes_where_it_is_sent_and_halts(bench):
 def test_the_end_of_the_program_stops_it(stock):
     program = (
         "from cotarget.drivers.clock import MonotonicClock; from cotarget.drivers.ptu_d46 import D46Head\n"
-        "from cotarget.config import HardwareHead\n"
-        f"D46Head(HardwareHead(port='{stock.config.port}'), MonotonicClock()).move(2.5, 0.0, speed=0.5)"
+        "from cotarget.drivers.ptu_d46 import D46Settings\n"
+        f"D46Head(D46Settings(port='{stock.config.port}'), MonotonicClock()).move(2.5, 0.0, speed=0.5)"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=DEADLINE_S)
     until(lambda: not stock.turning())
@@ -368,14 +367,14 @@ def test_a_harmless_look(bench):
 
 
 def test_another_unit_is_refused_before_it_moves(stock):
-    stock.config = HardwareHead(port=stock.config.port, pan_deg=(-100.0, 100.0))
+    stock.config = D46Settings(port=stock.config.port, pan_deg=(-100.0, 100.0))
     with pytest.raises(ConfigError, match=r"hardware.head.pan_deg: the unit at"):
         stock.open()
     assert stock.pan.position() == 0
 
 
 def test_the_wrong_baud_is_told(stock):
-    stock.config = HardwareHead(port=stock.config.port, baud=19200)
+    stock.config = D46Settings(port=stock.config.port, baud=19200)
     with pytest.raises(DeviceError, match="19200 baud"):
         stock.open()
 
@@ -390,17 +389,17 @@ def test_what_is_no_serial_port(tmp_path):
     (tmp_path / "file").touch()
     for name in (tmp_path / "file", tmp_path):
         with pytest.raises(DeviceError, match=r"cannot open .* as a serial port"):
-            D46Head(HardwareHead(port=str(name)), MonotonicClock())
+            D46Head(D46Settings(port=str(name)), MonotonicClock())
     with pytest.raises(DeviceError, match=r"there is no port .*missing for the pan-tilt unit; serial ports here:"):
-        D46Head(HardwareHead(port=str(tmp_path / "missing")), MonotonicClock())
+        D46Head(D46Settings(port=str(tmp_path / "missing")), MonotonicClock())
 
 
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:1", "socket://no.such.host.invalid:4000"])
 def test_nobody_listens(port):
     with pytest.raises(DeviceError, match=f"cannot connect to the pan-tilt unit at {port}: "):
-        D46Head(HardwareHead(port=port), MonotonicClock())
+        D46Head(D46Settings(port=port), MonotonicClock())
 
 
 def test_an_unknown_kind_of_port():
     with pytest.raises(DeviceError, match=r"cannot open sockt://a:1 as a serial port: invalid URL"):
-        D46Head(HardwareHead(port="sockt://a:1"), MonotonicClock())
+        D46Head(D46Settings(port="sockt://a:1"), MonotonicClock())

@@ -5,8 +5,9 @@ import sys
 
 import pytest
 
+from cotarget.backends import load_config
 from cotarget.calibration import save_calibration
-from cotarget.config import RigConfig, load_config
+from cotarget.config import RigConfig
 from tests.cli.test_commands import call, true_calibration
 
 

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 import serial
 
-from cotarget.backends import open_recording
+from cotarget.backends import describe, load_config, open_recording
 from cotarget.calibration import load_calibration
-from cotarget.config import RigConfig, load_config
+from cotarget.config import RigConfig
 from cotarget.emulators.emulation import FAULTS
 from cotarget.targeting import Reach, WantedSize, aim, point_at
 from tests.cli.test_commands import call
@@ -148,11 +148,12 @@ def test_a_book_is_looked_at_and_a_recording_of_it_says_the_same(rig, capsys):
     config, (x, y, z) = load_config(rig.hardware), BOOK_M
     book = config.target("book")
     assert book.wanted_px == load_config(rig.sim).target("book").wanted_px / 2  # as the viewfinder's pictures are half
-    calibration = load_calibration(rig.calibration).for_streams(*config.stream_sizes)
+    spec = describe(config)
+    calibration = load_calibration(rig.calibration).for_streams(spec.fixed.size, spec.zoom.size)
     there = aim(
         calibration,
         np.array([x, MOUNT_M - z, y]),
-        Reach(*config.head_limits, config.focal_range_px),
+        Reach(spec.head.limits.pan, spec.head.limits.tilt, spec.zoom.focal_range),
         wanted_size=WantedSize(book.size, book.wanted_px),
     )
     truth = rig.truth()
@@ -210,7 +211,8 @@ def check_calibration(rig, capsys, placements, stops):
     said, truth, found = json.loads(said), load_calibration(rig.calibration), load_calibration(out)
     assert said["baseline_m"] == pytest.approx(np.linalg.norm(truth.T_zoom0_fixed.translation), abs=BASELINE_M)
     predicted = next(iter(said["predicted_error_deg"].values()))  # at the shortest focal length
-    reach = Reach(*load_config(rig.sim).head_limits, load_config(rig.sim).focal_range_px)
+    spec = describe(load_config(rig.sim))
+    reach = Reach(spec.head.limits.pan, spec.head.limits.tilt, spec.zoom.focal_range)
     misses = []
     for pixel in ((100, 100), (540, 100), (320, 240), (100, 380), (540, 380)):
         for depth in (4.0, 6.0, 12.0):
@@ -295,7 +297,7 @@ def test_every_fault_is_survived_or_ends_in_one_line(rig, capsys, fault):
         while not (port := rig.truth()["port"]):
             assert time.monotonic() < deadline
         text = rig.hardware.read_text()
-        rig.hardware.write_text(text.replace(load_config(rig.hardware).hardware.head.port, port))
+        rig.hardware.write_text(text.replace(load_config(rig.hardware).hardware.head["port"], port))
     assert status in (0, 1)
     assert len(err.splitlines()) == status
     assert err.startswith("cotarget follow: " if status else "")
@@ -371,7 +373,7 @@ def test_an_operator_elsewhere_stops_it_until_it_is_cleared(rig, capsys):
 
 @moves
 def test_a_head_that_another_program_has_is_not_taken(rig, capsys):
-    port = load_config(rig.hardware).hardware.head.port
+    port = load_config(rig.hardware).hardware.head["port"]
     rig.wait_until_it_rests()
     before = rig.truth()
     with serial.Serial(port, exclusive=True):
@@ -384,7 +386,7 @@ def test_a_head_that_another_program_has_is_not_taken(rig, capsys):
 @moves
 def test_a_head_that_is_taken_away_on_a_network_ends_in_one_line(rig, capsys):
     """A terminal server serves one; here who comes last, so that one whose cable was pulled does not keep it."""
-    serial_port = load_config(rig.hardware).hardware.head.port
+    serial_port = load_config(rig.hardware).hardware.head["port"]
     address = rig.said["head"].rsplit("socket://", 1)[1].strip()
     text = rig.hardware.read_text()
 
@@ -412,7 +414,7 @@ def test_a_wrong_password_is_told(rig, capsys, monkeypatch):
     rig.wait_until_it_rests()
     before = rig.truth()
     status, out, err = run(capsys, *rig.follow("--seconds", "60"))
-    url = load_config(rig.hardware).hardware.fixed.url
+    url = load_config(rig.hardware).hardware.fixed["url"]
     assert (status, out) == (1, "")
     assert err.startswith(f"cotarget follow: {url} refuses the user 'viewer' (401): check hardware.fixed.user and the")
     assert len(err.splitlines()) == 1

@@ -36,7 +36,7 @@ def seen_well(config, target, seconds, *, pictures=False):
     with (world := SimWorld(config, rendered=())).rig:
         detector = TruthDetector(world.truth(), config.sim.seed, TruthNoise(0.2, 0.01, 0.0))
         image = np.zeros((480, 640, 3), np.uint8)
-        times = [k / config.rate_hz for k in range(round(seconds * config.rate_hz) + 1)]
+        times = [k / config.sim.fixed.rate_hz for k in range(round(seconds * config.sim.fixed.rate_hz) + 1)]
         frames = {round(t * 1e6): Seen(tuple(detector.detect(Frame(image, t)))) for t in times}
     return WideView(frames, pictures=False)
 
@@ -78,7 +78,7 @@ def test_what_was_recorded_is_what_is_seen():
 def test_a_delay_is_shared_as_in_the_field():
     config = delay.delayed(hold_config("person", 0), 0.6)
     assert config.sim.fixed.latency_s == config.sim.zoom.latency_s == pytest.approx(0.36)
-    assert config.command_delay_s == pytest.approx(0.24)
+    assert config.sim.head.command_delay_s == pytest.approx(0.24)
     assert delay.delayed(config, 0.2).sim.head.command_delay_s == pytest.approx(0.08)
 
 

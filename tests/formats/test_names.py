@@ -19,15 +19,19 @@ import pytest
 
 import cotarget
 import experiments
+from cotarget.backends import load_config
 from cotarget.cli.main import main
-from cotarget.config import config_table, load_config, parse_config
-from cotarget.drivers.board import make_board
+from cotarget.config import config_table, parse_config
+from cotarget.drivers import DRIVERS
+from cotarget.drivers.board import BoardSettings, make_board
+from cotarget.drivers.rig import board_settings, devices
 from cotarget.env import SchedulingPolicy
 from cotarget.env.common import RIG_FEATURES
 from cotarget.env.follow import TRACK_FEATURES
 from cotarget.env.schedule import CANDIDATE_FEATURES
 from cotarget.errors import ConfigError
 from cotarget.geometry import pose
+from cotarget.schema import as_table
 from cotarget.sim.world import SimWorld
 from tests.formats.lists import (
     DEADLINE_S,
@@ -91,7 +95,10 @@ def same_default(text, value):
 
 
 def test_rig_toml_defaults_to_what_is_listed():
-    table = config_table(parse_config({}))
+    config = parse_config({})
+    table, found = config_table(config), devices(config.hardware)
+    table["hardware"] = {name: {"driver": next(iter(DRIVERS[name]))} | as_table(found[name].settings) for name in found}
+    table["hardware"]["board"] = as_table(board_settings(config.hardware))
     for key, default, _ in RIG_TOML:
         value = table
         for part in key.split("."):
@@ -118,7 +125,7 @@ def test_v010_rig_files_name_every_key():
     free = ("sim.models.", "sim.paths.", "hardware.zoom.settings.")  # whose keys are names
     found = {next((start[:-1] for start in free if key.startswith(start)), key) for key in found}
     found = {re.sub(r"^targets\.\w+\.", "targets.book.", key) for key in found}
-    newer = {"targets.book.shape"}
+    newer = {"targets.book.shape", *(f"hardware.{name}.driver" for name in DRIVERS)}
     assert {re.sub(r"^targets\.\w+\.", "targets.book.", key) for key in KEYS} - newer == found
 
 
@@ -168,21 +175,22 @@ def test_v010_scene_and_model_make_a_world():
 
 def test_v010_hardware_rigs_load():
     hardware = load_config(OLD / "rig_hardware.toml").hardware
+    found = devices(hardware)
     head = ("/dev/ttyUSB0", 19200, 0.0514286, (-158.0, 158.0), (-46.0, 31.0), 1, -1, 90.0, 0.05)
-    assert dataclasses.astuple(hardware.head) == head
+    assert dataclasses.astuple(found["head"].settings) == head
     fixed = ("http://192.168.0.90", 2, "viewer", "secret", (352, 288), "CIF", 15.0, 20, 0.12)
-    assert dataclasses.astuple(hardware.fixed) == fixed
-    assert dataclasses.astuple(hardware.zoom) == (
+    assert dataclasses.astuple(found["fixed"].settings) == fixed
+    assert dataclasses.astuple(found["zoom"].settings) == (
         *("usb:", "Canon PowerShot S5 IS", {"imagequality": "Fine", "iso": "Auto"}, "zoom"),
         *(((0, 6.0), (64, 21.3), (128, 72.0)), 50.0, (320, 240), (3264, 2448), 0.01794, 10.0, 0.09, 0.06),
     )
-    assert dataclasses.astuple(hardware.board) == ("person",)
+    assert board_settings(hardware) == BoardSettings("person")
     config = load_config(OLD / "rig_hardware_network.toml")
     assert (config.backend, config.board.square) == ("hardware", 0.1)
-    assert config.hardware.head.port == "socket://127.0.0.1:4001"
-    assert config.hardware.fixed.url == "http://127.0.0.1:8090"
-    assert config.hardware.zoom.port == "ptpip:127.0.0.1:15740:15740"
-    assert config.hardware.board.presenter == "socket://127.0.0.1:4002"
+    assert config.hardware.head["port"] == "socket://127.0.0.1:4001"
+    assert config.hardware.fixed["url"] == "http://127.0.0.1:8090"
+    assert config.hardware.zoom["port"] == "ptpip:127.0.0.1:15740:15740"
+    assert config.hardware.board["presenter"] == "socket://127.0.0.1:4002"
 
 
 # --- commands ---
@@ -292,10 +300,10 @@ def test_the_emulator_writes_and_answers_what_is_listed(old):
     assert board[:3] == [{"ok": True}] * 3
     assert set(board[3]) == {"error"}
     config = load_config(old / "rig.toml")  # and unknown keys are refused
-    assert config.hardware.board.presenter == address["board"]
-    assert config.hardware.zoom.port == address["zoom"]
-    assert config.hardware.fixed.url == address["fixed"].removesuffix("/mjpg/video.mjpg")
-    assert address["head"] == f"{config.hardware.head.port} and {address['head'].split()[-1]}"
+    assert config.hardware.board["presenter"] == address["board"]
+    assert config.hardware.zoom["port"] == address["zoom"]
+    assert config.hardware.fixed["url"] == address["fixed"].removesuffix("/mjpg/video.mjpg")
+    assert address["head"] == f"{config.hardware.head['port']} and {address['head'].split()[-1]}"
 
 
 @pytest.mark.parametrize("device", ["head", "fixed", "zoom"])
@@ -320,9 +328,8 @@ def test_a_program_that_holds_the_board_is_asked_in_the_listed_words():
 
         holder = threading.Thread(target=hold)
         holder.start()
-        network = load_config(OLD / "rig_hardware_network.toml").hardware.board
         presenter = f"socket://127.0.0.1:{server.getsockname()[1]}"
-        board = make_board(dataclasses.replace(network, presenter=presenter))
+        board = make_board(BoardSettings(presenter))
         board.present(pose([0.5, -0.25, 2.0], [0.0, 0.0, 90.0]))
         board.swing(pose([0.0, 0.0, 3.0], [0.0, 0.0, 0.0]))
         board.present(None)

@@ -215,7 +215,7 @@ def test_no_password_is_recorded(tmp_path, calibration_path):
     with Recorder(tmp_path / "run", parse_config(table), calibration_path, "bird") as recorder:
         list(run(recorder.wrap(toy_rig()), load_calibration(calibration_path), seconds=0.1))
     assert not [path for path in (tmp_path / "run").iterdir() if path.is_file() and b"secret" in path.read_bytes()]
-    assert open_recording(tmp_path / "run").config.hardware.fixed.url == "http://10.0.0.1/"
+    assert open_recording(tmp_path / "run").config.hardware.fixed["url"] == "http://10.0.0.1/"
 
 
 def test_the_targets_picture_comes_along(tmp_path, calibration_path):

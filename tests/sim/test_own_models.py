@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.config import load_config
+from cotarget.backends import load_config
 from cotarget.errors import ConfigError
 from cotarget.geometry import pose
 from cotarget.sim.model import BOARD

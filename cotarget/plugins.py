@@ -1,0 +1,129 @@
+"""Drivers and detectors of a user's own, named "module:name" in rig.toml.
+
+The module is found beside rig.toml, or else where Python finds modules. `locate` writes a module beside rig.toml as its
+file, so that the name means the same in every process and folder; `load` imports it. An error inside the user's code
+becomes one line that names file and line.
+"""
+
+import contextlib
+import functools
+import importlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from cotarget.errors import ConfigError, CotargetError, DeviceError, choices
+
+FORM = "module:name"
+
+
+def is_own(name: str) -> bool:
+    """Whether a name is of the form "module:name"."""
+    module, _, attribute = name.rpartition(":")
+    return bool(module) and attribute.isidentifier()
+
+
+def locate(name: str, folder: Path) -> str:
+    """Replace a module that lies in a folder by its file; any other name stays."""
+    module, _, attribute = name.rpartition(":")
+    file = folder.joinpath(*module.split(".")).with_suffix(".py")
+    return f"{file.resolve()}:{attribute}" if is_own(name) and file.is_file() else name
+
+
+def load(name: str, where: str) -> Any:
+    """Import the object that "module:name" means.
+
+    Args:
+        name: as written in rig.toml, or as `locate` returned it.
+        where: key of rig.toml, for messages.
+
+    Raises:
+        ConfigError: there is no such module or object, or its import fails.
+    """
+    module_name, _, attribute = name.rpartition(":")
+    try:
+        with calling(where):
+            module = _from_file(module_name) if module_name.endswith(".py") else importlib.import_module(module_name)
+    except DeviceError as error:
+        if isinstance(error.__cause__, ModuleNotFoundError) and error.__cause__.name == module_name.split(".")[0]:
+            raise ConfigError(
+                f"{where}: there is no module '{module_name}' beside rig.toml or on Python's path"
+            ) from None
+        raise ConfigError(str(error)) from error.__cause__
+    if not callable(found := getattr(module, attribute, None)):
+        names = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
+        raise ConfigError(f"{where}: {module_name} has no '{attribute}'; it has: {choices(names)}")
+    return found
+
+
+@functools.cache
+def _from_file(path: str) -> ModuleType:
+    """Import a file as a module of its own; modules beside it can be imported from it."""
+    file = Path(path)
+    if str(file.parent) not in sys.path:
+        sys.path.append(str(file.parent))
+    spec = importlib.util.spec_from_file_location(file.stem, file)
+    if spec is None or spec.loader is None or not file.is_file():
+        raise ModuleNotFoundError(f"there is no {file}")
+    module = importlib.util.module_from_spec(spec)
+    # Dataclasses look their module up by its name; a module of that name that is imported already keeps it.
+    added = sys.modules.setdefault(spec.name, module) is module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        if added:
+            del sys.modules[spec.name]
+        raise
+    return module
+
+
+@contextlib.contextmanager
+def calling(what: str) -> Iterator[None]:
+    """Turn an error of a user's code into one line that names file and line.
+
+    Raises:
+        DeviceError: the code raised anything but a CotargetError.
+    """
+    try:
+        yield
+    except CotargetError:
+        raise
+    except Exception as error:
+        said = " ".join(str(error).split())
+        raise DeviceError(f"{what}: {_place(error)}: {type(error).__name__}{said and f': {said}'}") from error
+
+
+def _place(error: Exception) -> str:
+    """Return file and line where an error was raised."""
+    if isinstance(error, SyntaxError):
+        return f"{error.filename}:{error.lineno}"
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_ours(frame.filename)]
+    return f"{frames[-1].filename}:{frames[-1].lineno}" if frames else "?"
+
+
+def _is_ours(file: str) -> bool:
+    return file == __file__ or file.startswith("<frozen") or "importlib" in file
+
+
+class Reporting:
+    """A user's device whose errors name file and line; everything else passes through."""
+
+    def __init__(self, device: Any, what: str) -> None:
+        self._device, self._what = device, what
+
+    def __getattr__(self, name: str) -> Any:
+        with calling(self._what):
+            found = getattr(self._device, name)
+        if not callable(found):
+            return found
+
+        @functools.wraps(found)
+        def call(*arguments: Any, **keywords: Any) -> Any:
+            with calling(self._what):
+                return found(*arguments, **keywords)
+
+        return call
