@@ -369,6 +369,7 @@ SMALL_TURN = np.radians(7.0)  # enough for T's rotation, and keeps a central boa
 ROUGH_MARGIN = 0.04  # border that plans keep clear while the model is rough, over the image's width
 ENOUGH_VIEWS = 12  # zoom views from which the zoom intrinsics and T's translation join the rough fit
 ROUGH_RMS_PX = 3.0  # a rough fit with a larger rms starts again
+OTHER_LENS = 1.25  # ratio of focal lengths from which the lens and not the head is wrong; a few boards tell a tenth
 CENTRAL = 0.12  # a board is central within this distance of the image's centre, over the image's width
 
 
@@ -472,8 +473,26 @@ def _likeliest(model: RigModel, recorder: CaptureRecorder, seen: Sequence[View])
         # The fit's T serves the comparison only: these few views do not determine its translation.
         results.append((result.rms_px, replace(model, hand=hand, gamma=gamma)))
     if not results:
+        _check_lens(zoom.focal_px[0], recorder)
         raise refused or CalibrationError("hand-eye: no motion of the head was seen")
     return min(results, key=lambda one: one[0])[1]
+
+
+def _check_lens(told_px: float, recorder: CaptureRecorder) -> None:
+    """Refuse a zoom lens whose focal length is far from what the boards in its images show.
+
+    Through a wrong focal length the camera seems to turn by another angle than the head.
+
+    Raises:
+        CalibrationError: the lens reports another focal length than it has.
+    """
+    views = [view for view in recorder.views if view.camera == "zoom"]
+    seen_px = rough_intrinsics("zoom", views, board_points(recorder.board), recorder.rig.zoom.size).focal_px[0]
+    if max(seen_px / told_px, told_px / seen_px) > OTHER_LENS:
+        raise CalibrationError(
+            f"the zoom lens reports a focal length of {told_px:.0f} px, and the boards in its pictures look as through "
+            f"one of about {seen_px:.0f} px; check its focal lengths and pitch_mm"
+        )
 
 
 def _find_with_zoom(recorder: CaptureRecorder, model: RigModel) -> View:

@@ -119,6 +119,8 @@ NARROW = PanTiltLimits((-0.4, 0.4), (-0.4, 0.4), 2.6, 3.6, 0.0009)
     ({"stuck": True, "truth": Truth()}, "the head stands at pan 0.00, tilt 0.00 degrees where pan"),
     ({"short_of": 0.5}, "the head stands at"),
     ({"frozen_camera": True}, r"turned by 0\.0"),
+    ({"told": 0.4}, "the zoom lens reports a focal length of 267 px, and the boards in its pictures look"),
+    ({"told": 3.0}, "the zoom lens reports a focal length of 2001 px"),
     ({"truth": Truth(gamma=pose([0, 0, 0], [0, 180, 0])), "limits": NARROW}, "the zoom camera does not see the board"),
     ({"board_config": BoardConfig(corners=(7, 6))}, "the fixed camera does not see the 9x6 board"),
 ])  # fmt: skip
@@ -126,6 +128,11 @@ def test_a_broken_rig_is_refused_in_one_line(broken, message):
     with pytest.raises(CalibrationError, match=message) as caught:
         calibrate(SyntheticRig(**broken), BOARD)
     assert "\n" not in str(caught.value)
+
+
+def test_a_lens_that_reports_two_thirds_of_its_focal_length_is_calibrated_all_the_same():
+    found = calibrate(SyntheticRig(told=478 / 692), BOARD, placements=8)
+    assert found.zoom.stops[0].focal_px[0] == pytest.approx(Truth().zoom.fx, rel=0.01)  # 8 placements know it to 0.2 %
 
 
 @pytest.mark.parametrize(("halts", "arrives"), [(1, True), (2, True), (3, False)])
