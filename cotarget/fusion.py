@@ -130,8 +130,10 @@ class FusionSettings:
         unfound_s: a target that both cameras should see and that the zoom image does not show for this long is
             elsewhere [s]. A bird at the right place was missed for 0.8 s at most, a person or a book for a frame or
             two.
-        inflated_size: standard deviation by which the search is then widened, of the logarithm of size and depth
-            together; a nominal size twice too large is 0.7.
+        unconfirmed_s: a target not shown for this long is unconfirmed, because the widened search has not found it
+            either [s]. With a nominal size three times too large it was found after 2.2 s.
+        inflated_size: standard deviation by which the search is widened after ``unfound_s``, of the logarithm of size
+            and depth together; a nominal size twice too large is 0.7.
         inflated_bias: standard deviation by which it is widened, of the head's bias [rad].
         near: a registration within this many standard deviations of the expected place agrees with the estimate.
         just_seen_s: longest time since the last measurement for which a target still counts as seen [s].
@@ -141,6 +143,7 @@ class FusionSettings:
     time_sigma_s: float = 2e-3
     contradicted: float = 4.0
     unfound_s: float = 1.5
+    unconfirmed_s: float = 3.0
     inflated_size: float = 0.4
     inflated_bias: float = 5e-3
     near: float = 3.0
@@ -302,6 +305,11 @@ class TargetFusion:
     def _overdue(self) -> bool:
         """Whether the zoom image has failed to show the target for too long."""
         return self._unfound_s > self._settings.unfound_s
+
+    @property
+    def unconfirmed(self) -> bool:
+        """Whether the zoom image has failed to show the target even to the widened search."""
+        return self._unfound_s > self._settings.unconfirmed_s
 
     def _count_unfound(self, frame: Frame, found: ZoomMeasurement | None, seen: Appearance, estimate: Estimate) -> None:
         """Count the time for which the zoom image should have shown the target and did not."""

@@ -185,6 +185,7 @@ class State(enum.StrEnum):
 
     SEARCHING = "searching"  # nothing to follow; the lens is at its shortest
     FOLLOWING = "following"  # the head follows the target
+    UNCONFIRMED = "unconfirmed"  # likewise, but the zoom camera should have shown the target for seconds and has not
     COASTING = "coasting"  # the target is out of sight for a moment; the head follows its prediction
     LOST = "lost"  # out of sight for longer: the lens zooms out; the head goes on while the prediction is certain
     UNREACHABLE = "unreachable"  # the target is seen but cannot be aimed at
@@ -434,7 +435,9 @@ class _Loop:
             self._beyond.add(chosen.id)
             return State.UNREACHABLE, str(error), None
         zoom = "" if drive.zoom_reason == "wanted" else f"zoom: {drive.zoom_reason}"
-        return State.COASTING if chosen.missed else State.FOLLOWING, zoom, drive.aim
+        if chosen.missed:
+            return State.COASTING, zoom, drive.aim
+        return State.UNCONFIRMED if self._fusion.unconfirmed else State.FOLLOWING, zoom, drive.aim
 
     def _search(self, chosen: Track, seen_t: float, interval: float) -> tuple[str, Aim | None]:
         """Point where a target out of sight should be; return what the head does, and the aim."""

@@ -171,7 +171,7 @@ def demo(options: argparse.Namespace) -> None:
     print(f"pictures, video and metrics.json are in {options.out} ({metrics['wall_s']:.0f} s)")
 
 
-NOBODY_FOLLOWED = 4  # exit status of `follow`
+NEVER_CONFIRMED, NOBODY_FOLLOWED = 3, 4  # exit statuses of `follow`
 
 
 def follow(options: argparse.Namespace) -> int:
@@ -207,7 +207,7 @@ def follow(options: argparse.Namespace) -> int:
         print_json(run.counts)
         if run.interrupted is not None:
             raise run.interrupted
-    return 0 if run.followed else NOBODY_FOLLOWED
+    return run.status
 
 
 def replay(options: argparse.Namespace) -> int:
@@ -252,11 +252,29 @@ def replay(options: argparse.Namespace) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class _Run:
-    """Result of following: what is printed as JSON, whether a target was followed, and the Ctrl-C that cut it short."""
+    """Result of following.
+
+    Attributes:
+        counts: what is printed as JSON.
+        confirmed: number of frames in which the zoom camera showed the followed target.
+        interrupted: the Ctrl-C that cut the run short.
+    """
 
     counts: dict[str, Any]
-    followed: bool
+    confirmed: int
     interrupted: KeyboardInterrupt | None = None
+
+    @property
+    def status(self) -> int:
+        """Exit status of `follow`: 0 for a target that was followed and, where there was time for it, confirmed."""
+        from cotarget.pipeline import State
+
+        states = self.counts["states"]
+        if not sum(states.values()) - states[State.SEARCHING] - states[State.UNREACHABLE]:
+            return NOBODY_FOLLOWED
+        # A wrong match in a few frames confirms nothing; a target hidden from the zoom camera for a while was confirmed
+        # before or after.
+        return NEVER_CONFIRMED if states[State.UNCONFIRMED] > self.confirmed else 0
 
 
 def _follow(
@@ -286,7 +304,7 @@ def _follow(
     target = config.target(name)
     detector = make_detector(target, rate_hz)
     states: dict[str, int] = dict.fromkeys(State, 0)
-    reasons, skipped = Reasons(), SkippedFrames(rate_hz)
+    confirmed, reasons, skipped = 0, Reasons(), SkippedFrames(rate_hz)
     limit = math.inf if seconds is None else seconds
     expected = frames if math.isinf(limit) else math.ceil(limit * rate_hz)
     is_live, first_t, epoch = config.backend == "hardware" and frames is None, None, None
@@ -313,6 +331,7 @@ def _follow(
                     see(step)
                     first_t = step.fixed.t if first_t is None else first_t
                     states[step.state] += 1
+                    confirmed += step.found is not None and step.state is not State.UNCONFIRMED
                     if film is not None:
                         film.write(side_by_side(step, name, step.fixed.t - first_t), step.fixed.t)
                     progress(f"following: {name}: {step.state}", step.index + 1, expected)
@@ -332,9 +351,7 @@ def _follow(
         "reasons": reasons.table,
         "started": None if epoch is None or first_t is None else utc_text(epoch, first_t),
     }
-    return _Run(
-        counts, any(states[each] for each in State if each not in (State.SEARCHING, State.UNREACHABLE)), interrupted
-    )
+    return _Run(counts, confirmed, interrupted)
 
 
 def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int], selection: Selection) -> None:

@@ -263,7 +263,14 @@ def test_v010_recording_is_replayed(old, capsys):
     printed = capsys.readouterr()
     now, then = json.loads(printed.out), read(old / "printed" / "replay.json")
     assert now["steps"] == 7
-    assert now["states"] == {"searching": 3, "following": 4, "coasting": 0, "lost": 0, "unreachable": 0}
+    assert now["states"] == {
+        "searching": 3,
+        "following": 4,
+        "unconfirmed": 0,
+        "coasting": 0,
+        "lost": 0,
+        "unreachable": 0,
+    }
     differences = now["differences"]
     assert status == (0 if differences["frames_differing"] == 0 else 1)
     assert (differences["missing"], differences["extra"], differences["moves"]) == (0, 0, 4)
@@ -310,7 +317,7 @@ def test_a_recording_is_written_with_the_listed_keys(old, capsys):
     assert read(old / "now" / "recording.json")["whom"] == {"policy": "most-served"}
 
 
-NEW_KEYS = {"skipped", "started"}  # of follow and replay, which v0.1.0 did not print
+NEW_KEYS = {"skipped", "started", "states.unconfirmed"}  # of follow and replay, which v0.1.0 did not print
 NEW_COLUMNS = ["utc"]  # of follow.csv
 
 
