@@ -25,7 +25,7 @@ from cotarget.estimation.zoom_matching import CloseupFinder, Expected, Finder, M
 from cotarget.geometry import Array
 from cotarget.pantilt import towards
 from cotarget.rig import Frame, Image, PanTiltState, ZoomState
-from cotarget.tracking.track import Track, missing, room_inside
+from cotarget.tracking.track import Measurement, Track, missing, room_inside
 
 REMEMBERED_S = 2.0  # longer than any latency [s]
 # States for the cubic interpolation: two before a time and two after it. A straight line through the nearest two is
@@ -150,8 +150,187 @@ class FusionSettings:
     just_seen_s: float = 0.2
 
 
+class TrackFilters:
+    """One target filter for each of the most important tracks."""
+
+    def __init__(self, calibration: Calibration, target: TargetProfile, settings: FilterSettings, most: int) -> None:
+        """Create no filter yet.
+
+        Args:
+            calibration: calibration of the rig, for the streams in use.
+            target: profile of the target to follow.
+            settings: settings of the filters.
+            most: most tracks with a filter.
+        """
+        self._make = partial(TargetFilter, calibration, target, settings)
+        self._most = most
+        self._filters: dict[int, TargetFilter] = {}
+
+    def keep(self, tracks: Sequence[Track], followed: int | None, favoured: Collection[int]) -> list[Track]:
+        """Select the tracks that have a filter, and drop the filters of all others.
+
+        Args:
+            tracks: tracks after a frame, the oldest first.
+            followed: id of the followed track.
+            favoured: ids of tracks that get a filter before others.
+
+        Returns:
+            The most important tracks, the followed one first.
+        """
+
+        def last(track: Track) -> tuple[bool, ...]:
+            return (
+                track.id != followed,
+                track.id not in favoured,
+                not track.confirmed,
+                track.id not in self._filters,  # a new track must not displace a filter in use
+            )
+
+        kept = sorted(tracks, key=last)[: self._most]
+        numbers = {track.id for track in kept}
+        self._filters = {number: each for number, each in self._filters.items() if number in numbers}
+        return kept
+
+    def get(self, number: int) -> TargetFilter | None:
+        """Return the filter of a track; None if it has none."""
+        return self._filters.get(number)
+
+    def make(self, number: int) -> TargetFilter:
+        """Return the filter of a track, a new one if it has none."""
+        if number not in self._filters:
+            self._filters[number] = self._make()
+        return self._filters[number]
+
+
+@dataclass(frozen=True)
+class FixedMeasurement:
+    """What one frame of the fixed camera measures of a track, see `TargetFilter.update_fixed`.
+
+    Attributes:
+        box: bounding box; the size of a clipped one is only a lower bound.
+        sigma_px: standard deviation of its centre, (2,) [px]; None for that of the settings.
+        size_px: the known dimension [px], if it is better known than from this box alone.
+    """
+
+    box: Measurement
+    sigma_px: Array | None = None
+    size_px: float | None = None
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the box shows the whole target, and nothing else."""
+        return self.sigma_px is None
+
+
+def measure(track: Track, target: TargetProfile) -> FixedMeasurement:
+    """Derive the measurement from a track's newest detection."""
+    box = track.box
+    if track.shared:  # its box covers other targets too: it bounds the place and shows no size
+        inside = Detection(track.center_px, np.zeros(2), track.score, clipped=True)
+        return FixedMeasurement(inside, np.hypot(room_inside(box.size_px, track.size_px), track.size_px / 2))
+    lacks = missing(track.size_px, box.size_px)
+    if lacks.any() and isinstance(box, Detection):  # a part of the target: no size, and a poor centre
+        return FixedMeasurement(replace(box, clipped=True), np.hypot(lacks, box.size_px) / 2)
+    return FixedMeasurement(box, size_px=track.larger_side_px if target.largest_over_time else None)
+
+
+class ZoomSearch:
+    """Search for the followed target in the zoom image.
+
+    Attributes:
+        finder: registers the target; a new one for each followed track.
+        waiting: zoom frames without a fixed frame of their time.
+        unfound_s: time for which the zoom image should have shown the target and did not [s].
+        apart_s: time of the newest zoom frame less that of the newest fixed frame [s].
+    """
+
+    def __init__(self, make_finder: Callable[[], Finder], settings: FusionSettings, latest_s: float) -> None:
+        """Create a search without a target.
+
+        Args:
+            make_finder: makes the finder for a target.
+            settings: settings of the fusion.
+            latest_s: largest delay of one camera's frames against the other's [s].
+        """
+        self._make_finder, self._settings, self._latest_s = make_finder, settings, latest_s
+        self.waiting: deque[Frame] = deque(maxlen=MOST_WAITING)
+        self._zoom_t = math.inf
+        self.apart_s = 0.0
+        self.start()
+
+    def start(self) -> None:
+        """Search for another target from now on."""
+        self.finder, self.unfound_s = self._make_finder(), 0.0
+
+    def add(self, frame: Frame, fixed_t: float) -> None:
+        """Add a zoom frame; fixed_t is the time of the newest fixed frame [s]."""
+        self.waiting.append(frame)
+        self.apart_s = frame.t - fixed_t
+
+    def clear(self) -> None:
+        """Drop the frames that wait."""
+        self.waiting.clear()
+
+    def next_frame(self, fixed_t: float) -> Frame | None:
+        """Return the newest zoom frame for which the fixed camera has shown the target; drop it and older ones.
+
+        Args:
+            fixed_t: time of the newest fixed frame [s]; frames older than `latest_s` before it are dropped too.
+        """
+        due = next((each for each in reversed(self.waiting) if self.finder.sight_at(each.t) is not None), None)
+        done_t = fixed_t - self._latest_s if due is None else due.t
+        while self.waiting and self.waiting[0].t <= done_t:
+            self.waiting.popleft()
+        return due
+
+    def find(self, frame: Frame, pose: Pose, estimate: Estimate) -> ZoomMeasurement | None:
+        """Find the target in a zoom frame.
+
+        Args:
+            frame: frame of the zoom camera.
+            pose: pan, tilt and focal length at its time.
+            estimate: estimate of the target at its time.
+        """
+        seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
+        if seen is None:
+            return None
+        # With a wrong size or calibration the search would look beside the target for ever, so it is widened.
+        wider = None
+        if self.is_overdue:
+            wider = _inflated(estimate, self._settings).appearance(pose.pan, pose.tilt, pose.nominal_px)
+        pan, tilt = pose.pan + estimate.bias[0], pose.tilt + estimate.bias[1]
+        covariance = (seen if wider is None else wider).covariance
+        found = self.finder.find(frame, Expected(estimate.x_fixed, covariance, pan, tilt, pose.nominal_px))
+        self._count_unfound(frame, found, seen, estimate)
+        return found
+
+    @property
+    def is_overdue(self) -> bool:
+        """Whether the zoom image has failed to show the target for too long."""
+        return self.unfound_s > self._settings.unfound_s
+
+    @property
+    def is_unconfirmed(self) -> bool:
+        """Whether the zoom image has failed to show the target even to the widened search."""
+        return self.unfound_s > self._settings.unconfirmed_s
+
+    def _count_unfound(self, frame: Frame, found: ZoomMeasurement | None, seen: Appearance, estimate: Estimate) -> None:
+        """Count the time for which the zoom image should have shown the target and did not."""
+        passed, self._zoom_t = min(max(frame.t - self._zoom_t, 0.0), self._settings.just_seen_s), frame.t
+        size = np.array(frame.image.shape[1::-1])
+        if found is not None:
+            innovation = found.center_px - (size - 1) / 2 - seen.offset_px
+            S = seen.covariance + np.diag(np.square(found.sigma_px) + np.square(found.body_sigma_px))
+            if float(innovation @ np.linalg.solve(S, innovation)) <= self._settings.near**2:
+                self.unfound_s = 0.0
+                return
+        is_inside = np.all(np.abs(seen.offset_px) + seen.size_px / 2 <= size / 2)
+        if is_inside and frame.t - estimate.measured_t <= self._settings.just_seen_s:
+            self.unfound_s += passed
+
+
 class TargetFusion:
-    """The target filters of all tracks, updated frame by frame.
+    """Fuse the measurements of both cameras into one 3D estimate per track.
 
     Args:
         calibration: calibration of the rig, for the streams in use.
@@ -162,6 +341,10 @@ class TargetFusion:
         filter: settings of the target filters; by default those of the target profile.
         matching: settings of the registration in the zoom image.
         settings: settings of the fusion.
+
+    Attributes:
+        states: states of head and lens by time.
+        search: search for the followed target in the zoom image.
     """
 
     def __init__(
@@ -176,21 +359,24 @@ class TargetFusion:
         matching: MatchingSettings | None = None,
         settings: FusionSettings = FusionSettings(),
     ) -> None:
-        self._calibration, self._target, self._size = calibration, target, size
-        self._closed_loop, self._matching = closed_loop, matching or MatchingSettings()
-        self._make_finder = finder or partial(CloseupFinder, settings=self._matching)
-        self._assumed, self._settings = filter or filter_settings(target, calibration), settings
-        self._filters: dict[int, TargetFilter] = {}
-        self._seen_s: dict[int, float] = {}
-        self._unlikely: set[int] = set()
+        self._target, self._size, self._closed_loop, self._settings = target, size, closed_loop, settings
+        matching = matching or MatchingSettings()
+        make_finder = finder or partial(CloseupFinder, settings=matching)
+        self._latest_s = matching.latest_s
+        self._filter_settings = filter or filter_settings(target, calibration)
+        self._filters = TrackFilters(calibration, target, self._filter_settings, settings.most_filters)
         self._followed: int | None = None
-        self._zoom_t = math.inf
-        self._unfound_s = 0.0
-        self._finder = self._make_finder(calibration, target)
-        self._waiting: deque[Frame] = deque(maxlen=MOST_WAITING)  # zoom frames without a fixed frame of their time
-        self._apart_s = 0.0  # time of the newest zoom frame less that of the newest fixed frame
-        self._to_base = calibration.T_base_fixed
+        self._seen_well_s: dict[int, float] = {}  # time for which each track was seen well in the close-up [s]
+        self._unlikely: set[int] = set()  # tracks whose size or pointing contradicts the priors
+        self._T_base_fixed = calibration.T_base_fixed
         self.states = StateHistory()
+        self.search = ZoomSearch(partial(make_finder, calibration, target), settings, matching.latest_s)
+
+    def follow(self, number: int | None) -> None:
+        """Register another track in the zoom image from now on; None for no track."""
+        if number != self._followed:
+            self._followed = number
+            self.search.start()
 
     def update_fixed(
         self, frame: Frame, tracks: Sequence[Track], mask: Image | None, favoured: Collection[int] = ()
@@ -203,127 +389,64 @@ class TargetFusion:
             mask: foreground of the detector, (H, W).
             favoured: ids of tracks that get a filter before others.
         """
-
-        def last(track: Track) -> tuple[bool, ...]:
-            return (
-                track.id != self._followed,
-                track.id not in favoured,
-                not track.confirmed,
-                track.id not in self._filters,  # a new track must not displace a filter in use
-            )
-
-        known = sorted(tracks, key=last)[: self._settings.most_filters]
-        numbers = {track.id for track in known}
-        self._filters = {number: each for number, each in self._filters.items() if number in numbers}
         numbers = {track.id for track in tracks}
-        self._seen_s = {number: seconds for number, seconds in self._seen_s.items() if number in numbers}
+        self._seen_well_s = {number: seconds for number, seconds in self._seen_well_s.items() if number in numbers}
         self._unlikely &= numbers
-        for track in known:
+        for track in self._filters.keep(tracks, self._followed, favoured):
             if track.missed:
                 continue
-            if track.id not in self._filters:
-                self._filters[track.id] = TargetFilter(self._calibration, self._target, self._assumed)
-            found = self._filters[track.id]
-            box, sigma_px = track.box, None
-            if track.shared:  # its box covers other targets too, and the finder would learn those
-                inside = Detection(track.center_px, np.zeros(2), track.score, clipped=True)  # this frame shows no size
-                room = room_inside(box.size_px, track.size_px)
-                found.update_fixed(inside, frame.t, sigma_px=np.hypot(room, track.size_px / 2))
-                continue
-            lacks = missing(track.size_px, box.size_px)
-            if lacks.any() and isinstance(box, Detection):  # a part of the target: no size, and a poor centre
-                sigma_px = np.hypot(lacks, box.size_px) / 2
-                found.update_fixed(replace(box, clipped=True), frame.t, sigma_px=sigma_px)
-                continue
-            if track.id == self._followed and isinstance(box, Detection):
-                sight = self._finder.update_fixed(frame, box, mask)
+            measured = measure(track, self._target)
+            if track.id == self._followed and measured.is_whole and isinstance(measured.box, Detection):
+                sight = self.search.finder.update_fixed(frame, measured.box, mask)
                 if sight is not None:  # the same body point that the zoom image measures
-                    box, sigma_px = replace(box, center_px=sight.body_px), sight.body_sigma_px
-            size_px = track.larger_side_px if self._target.largest_over_time else None
-            found.update_fixed(box, frame.t, sigma_px=sigma_px, size_px=size_px)
+                    body = replace(measured.box, center_px=sight.body_px)
+                    measured = replace(measured, box=body, sigma_px=sight.body_sigma_px)
+            self._filters.make(track.id).update_fixed(
+                measured.box, frame.t, sigma_px=measured.sigma_px, size_px=measured.size_px
+            )
 
-    def update_zoom(self, frame: Frame | None, wide_t: float) -> ZoomMeasurement | None:
+    def update_zoom(self, frame: Frame | None, fixed_t: float) -> ZoomMeasurement | None:
         """Register the followed target in the zoom image and update its filter.
 
         A zoom frame newer than the fixed camera's waits until the fixed camera has shown the target at about its time.
 
         Args:
             frame: frame of the zoom camera; None if there is no new one.
-            wide_t: exposure time of the newest fixed frame [s].
+            fixed_t: exposure time of the newest fixed frame [s].
         """
         if not self._closed_loop:
             return None
         if frame is not None:
-            self._waiting.append(frame)
-            self._apart_s = frame.t - wide_t
+            self.search.add(frame, fixed_t)
         if self._followed is None:
-            self._waiting.clear()
+            self.search.clear()
             return None
-        due = next((each for each in reversed(self._waiting) if self._finder.sight_at(each.t) is not None), None)
-        # Older frames had no sight of the target, or are superseded.
-        done_t = wide_t - self._matching.latest_s if due is None else due.t
-        while self._waiting and self._waiting[0].t <= done_t:
-            self._waiting.popleft()
-        return None if due is None else self._look_close(due)
-
-    def _look_close(self, frame: Frame) -> ZoomMeasurement | None:
-        """Register the followed target in a zoom frame for which the fixed camera has a sight of it."""
-        assert self._followed is not None, "who asks has looked"
-        pose, estimate = self.states.at(frame.t), self.estimate(self._followed, frame.t)
+        due = self.search.next_frame(fixed_t)
+        known = self._filters.get(self._followed)
+        if due is None or known is None:
+            return None
+        pose, estimate = self.states.at(due.t), known.at(due.t)
         if pose is None or estimate is None:
             return None
-        if _contradicted(estimate, self._settings):
+        if _contradictions(estimate, self._settings):
             self._unlikely.add(self._followed)
         else:
             self._unlikely.discard(self._followed)
-        seen = estimate.appearance(pose.pan, pose.tilt, pose.nominal_px)
-        if seen is None:
-            return None
-        # With a wrong size or calibration the search would look beside the target for ever, so it is widened.
-        inflated = None
-        if self._overdue:
-            inflated = _inflated(estimate, self._settings).appearance(pose.pan, pose.tilt, pose.nominal_px)
-        pan, tilt = pose.pan + estimate.bias[0], pose.tilt + estimate.bias[1]
-        covariance = (seen if inflated is None else inflated).covariance
-        found = self._finder.find(frame, Expected(estimate.x_fixed, covariance, pan, tilt, pose.nominal_px))
-        self._count_unfound(frame, found, seen, estimate)
+        found = self.search.find(due, pose, estimate)
         if found is not None:
-            self._filters[self._followed].update_zoom(
-                found.center_px,
-                # Both cameras show the same point, but wings and limbs move it. With the registration's own error
-                # alone, the filter would take their beats for motion of the target.
-                np.hypot(found.sigma_px, found.body_sigma_px),
-                pose.pan,
-                pose.tilt,
-                pose.nominal_px,
-                frame.t,
-                head_sigma=math.hypot(self._assumed.head_sigma, pose.speed * self._settings.time_sigma_s),
+            # Both cameras show the same point, but wings and limbs move it. With the registration's own error alone,
+            # the filter would take their beats for motion of the target.
+            sigma_px = np.hypot(found.sigma_px, found.body_sigma_px)
+            head_sigma = math.hypot(self._filter_settings.head_sigma, pose.speed * self._settings.time_sigma_s)
+            known.update_zoom(
+                found.center_px, sigma_px, pose.pan, pose.tilt, pose.nominal_px, due.t, head_sigma=head_sigma
             )
         return found
 
-    @property
-    def _overdue(self) -> bool:
-        """Whether the zoom image has failed to show the target for too long."""
-        return self._unfound_s > self._settings.unfound_s
-
-    @property
-    def unconfirmed(self) -> bool:
-        """Whether the zoom image has failed to show the target even to the widened search."""
-        return self._unfound_s > self._settings.unconfirmed_s
-
-    def _count_unfound(self, frame: Frame, found: ZoomMeasurement | None, seen: Appearance, estimate: Estimate) -> None:
-        """Count the time for which the zoom image should have shown the target and did not."""
-        passed, self._zoom_t = min(max(frame.t - self._zoom_t, 0.0), self._settings.just_seen_s), frame.t
-        size = np.array(frame.image.shape[1::-1])
-        if found is not None:
-            off = found.center_px - (size - 1) / 2 - seen.offset_px
-            spread = seen.covariance + np.diag(np.square(found.sigma_px) + np.square(found.body_sigma_px))
-            if float(off @ np.linalg.solve(spread, off)) <= self._settings.near**2:
-                self._unfound_s = 0.0
-                return
-        wholly = np.all(np.abs(seen.offset_px) + seen.size_px / 2 <= size / 2)
-        if wholly and frame.t - estimate.measured_t <= self._settings.just_seen_s:
-            self._unfound_s += passed
+    def estimate(self, number: int, t: float) -> Estimate | None:
+        """Estimate a track at time t [s]; None if it has no filter or no measurement by then."""
+        known = self._filters.get(number)
+        return None if known is None else known.at(t)
 
     def warnings(self, number: int, t: float) -> list[str]:
         """Describe what contradicts the nominal size of a target or the calibration.
@@ -339,23 +462,16 @@ class TargetFusion:
         if estimate is None:
             return []
         found = []
-        if wrong := _contradicted(estimate, self._settings):
-            found.append(f"the told size or the calibration seems wrong: {', '.join(wrong)}")
-        if number == self._followed and abs(self._apart_s) > self._matching.latest_s:
-            later = "zoom" if self._apart_s < 0 else "wide"
-            found.append(f"the views are too far apart in time: the {later} one comes {abs(self._apart_s):.2f} s later")
-        elif number == self._followed and self._overdue:
-            found.append(
-                f"for {self._unfound_s:.1f} s not found where the zoom view should show it: it is hidden there, or the "
-                "told size or the calibration is wrong"
-            )
+        if wrong := _contradictions(estimate, self._settings):
+            found.append(f"the nominal size or the calibration seems wrong: {', '.join(wrong)}")
+        apart_s = self.search.apart_s
+        if number == self._followed and abs(apart_s) > self._latest_s:
+            later = "zoom" if apart_s < 0 else "fixed"
+            found.append(f"the cameras are too far apart in time: the {later} one comes {abs(apart_s):.2f} s later")
+        elif number == self._followed and self.search.is_overdue:
+            unfound = f"for {self.search.unfound_s:.1f} s not found where the zoom camera should show it"
+            found.append(f"{unfound}: it is hidden there, or the nominal size or the calibration is wrong")
         return found
-
-    def follow(self, number: int | None) -> None:
-        """Register another track in the zoom image from now on; None for no track."""
-        if number != self._followed:
-            self._followed, self._unfound_s = number, 0.0
-            self._finder = self._make_finder(self._calibration, self._target)
 
     def count_seen_well(self, track: Track, seconds: float, longest_px: float) -> None:
         """Add to the time for which a track was seen well in the close-up, by the reported states at its time.
@@ -369,35 +485,27 @@ class TargetFusion:
         if pose is None or estimate is None or track.t - estimate.measured_t > self._settings.just_seen_s:
             return
         if is_seen_well(estimate, pose.pan, pose.tilt, pose.nominal_px, longest_px, shape=shape_of(track)):
-            self._seen_s[track.id] = self._seen_s.get(track.id, 0.0) + seconds
-
-    def estimate(self, number: int, t: float) -> Estimate | None:
-        """Estimate a track at time t [s]; None if it has no filter or no measurement by then."""
-        found = self._filters.get(number)
-        return None if found is None else found.at(t)
+            self._seen_well_s[track.id] = self._seen_well_s.get(track.id, 0.0) + seconds
 
     def candidates(self, tracks: Sequence[Track], t: float) -> list[Candidate]:
-        """List the confirmed tracks that a selection policy may choose from at time t [s]."""
-        return [
-            Candidate(
-                track,
-                partial(self._direction, self._filters[track.id], t),
-                leaves_in(track, self._size),
-                self._seen_s.get(track.id, 0.0),
-                likely=track.id not in self._unlikely,
-            )
-            for track in tracks
-            if track.confirmed and track.id in self._filters and self._filters[track.id].knows(t)
-        ]
+        """List the confirmed tracks that may be selected at time t [s]."""
+        found = []
+        for track in tracks:
+            known = self._filters.get(track.id)
+            if track.confirmed and known is not None and known.knows(t):
+                direction = partial(self._direction, known, t)
+                seen_s, likely = self._seen_well_s.get(track.id, 0.0), track.id not in self._unlikely
+                found.append(Candidate(track, direction, leaves_in(track, self._size), seen_s, likely=likely))
+        return found
 
     def _direction(self, known: TargetFilter, t: float, later: float) -> Array:
         """Pan and tilt of a target from the head, (2,) [rad]; the zoom camera's offset on the head is neglected."""
         estimate = known.at(t + later)
         assert estimate is not None, "what is known at a time is known later"
-        return np.array(towards(self._to_base.apply(estimate.x_fixed)))
+        return np.array(towards(self._T_base_fixed.apply(estimate.x_fixed)))
 
 
-def _contradicted(estimate: Estimate, settings: FusionSettings) -> list[str]:
+def _contradictions(estimate: Estimate, settings: FusionSettings) -> list[str]:
     """Describe where size and head bias, as both cameras show them, contradict their priors."""
     wrong = []
     if abs(estimate.size_deviation) > settings.contradicted:

@@ -437,7 +437,7 @@ class _Loop:
         zoom = "" if drive.zoom_reason == "wanted" else f"zoom: {drive.zoom_reason}"
         if chosen.missed:
             return State.COASTING, zoom, drive.aim
-        return State.UNCONFIRMED if self._fusion.unconfirmed else State.FOLLOWING, zoom, drive.aim
+        return State.UNCONFIRMED if self._fusion.search.is_unconfirmed else State.FOLLOWING, zoom, drive.aim
 
     def _search(self, chosen: Track, seen_t: float, interval: float) -> tuple[str, Aim | None]:
         """Point where a target out of sight should be; return what the head does, and the aim."""

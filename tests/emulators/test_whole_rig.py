@@ -63,8 +63,8 @@ STANDS_S, END_S = "4", 0.5
 # as the pictures of the zoom camera are then older than it is told, that its view of the book does not fit.
 BUSY = re.compile(
     "no frame|the newest frame is .* s old|this one is .* after the last|the zoom camera has shown nothing new"
-    "|the views are too far apart in time|the told size or the calibration seems wrong"
-    "|for .* s not found where the zoom view should show it"
+    "|the cameras are too far apart in time|the nominal size or the calibration seems wrong"
+    "|for .* s not found where the zoom camera should show it"
 )
 # Between the simulation opened directly and over the wire, a step; and what changes the book's width, of which a fifth
 # of a pixel is as much depth as 0.03 degrees: the coarser JPEG of the wire, and the book's sway, another in either run.

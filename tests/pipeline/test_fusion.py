@@ -131,7 +131,7 @@ def test_who_crosses_another_is_predicted_as_before():
     """While both are one box neither is where its own last box was, 6 px a frame ago and more."""
     tracker, fusion = Tracker(tracking_settings(PERSON), SIZE), TargetFusion(CALIBRATION, PERSON, SIZE)
     fusion.follow(1)
-    fusion._finder, merged, worst = Learner(), [], 0.0
+    fusion.search.finder, merged, worst = Learner(), [], 0.0
     for i in range(100):
         t = i * FRAME_S
         middles, size = crossing_persons(t)
@@ -148,8 +148,8 @@ def test_who_crosses_another_is_predicted_as_before():
             assert found.depth == pytest.approx(10.0, rel=0.01)
     assert len(merged) >= 5
     assert worst < 1.0  # stale boxes make it 50 px and more
-    assert not set(merged) & set(fusion._finder.shown)
-    np.testing.assert_allclose(list(fusion._finder.shown.values()), [size] * len(fusion._finder.shown))
+    assert not set(merged) & set(fusion.search.finder.shown)
+    np.testing.assert_allclose(list(fusion.search.finder.shown.values()), [size] * len(fusion.search.finder.shown))
 
 
 def test_a_share_of_a_box_is_the_less_believed_the_more_room_there_is():
@@ -230,7 +230,7 @@ def followed(x_fixed, wrong, frames, finder, **fusion):
     """A pursuit of a book at a place whose size looks wrong, whose zoom view the finder answers for."""
     fusion = TargetFusion(CALIBRATION, BOOK, SIZE, **fusion)
     fusion.follow(1)
-    fusion._finder = finder
+    fusion.search.finder = finder
     found = []
     for i in range(frames):
         t = i * FRAME_S
@@ -269,24 +269,24 @@ def test_a_point_that_may_not_be_the_body_moves_the_estimate_less():
 def test_the_zoom_view_is_not_asked_before_it_is_known_where_it_looks_and_for_whom():
     x = (0.45, 0.1, 10.0)
     fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
-    fusion._finder = Finder(x)
+    fusion.search.finder = Finder(x)
     fusion.update_fixed(Frame(PICTURE, 0.0), [track(1, box_at(*x))], None)
     assert fusion.update_zoom(Frame(PICTURE, 0.0), 0.0) is None  # nobody is followed, and nothing was heard of the head
     fusion.states.add(PanTiltState(0.0, 0.0, False, 0.0), ZoomState(ZOOMED, False, 0.0))
     assert fusion.update_zoom(Frame(PICTURE, 0.0), 0.0) is None
     fusion.follow(1)
-    fusion._finder = Finder(x)
+    fusion.search.finder = Finder(x)
     assert fusion.update_zoom(Frame(PICTURE, 0.0), 0.0) is not None
 
 
 def test_another_target_is_looked_for_by_another_finder():
     fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
     fusion.follow(1)
-    finder = fusion._finder
+    finder = fusion.search.finder
     fusion.follow(1)
-    assert fusion._finder is finder
+    assert fusion.search.finder is finder
     fusion.follow(2)
-    assert fusion._finder is not finder
+    assert fusion.search.finder is not finder
 
 
 def test_the_middle_of_the_followed_body_is_what_both_views_show():
@@ -299,7 +299,7 @@ def test_the_middle_of_the_followed_body_is_what_both_views_show():
     box = box_at(0.0, 0.0, 10.0)
     fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
     fusion.follow(1)
-    fusion._finder = Sees((0, 0, 10))
+    fusion.search.finder = Sees((0, 0, 10))
     t = seen(fusion, lambda t: [track(1, box, t), track(2, replace(box), t)], 10)
     ours, other = (fusion.estimate(n, t).x_fixed for n in (1, 2))
     assert ours[0] * FOCAL / ours[2] == pytest.approx(5.0, abs=0.05)
@@ -358,12 +358,12 @@ def test_what_is_not_found_where_it_should_be_is_said_and_then_looked_for_farthe
     t = (frames - 1) * FRAME_S
     assert found[:-2] == [None] * (frames - 2)
     (told,) = fusion.warnings(1, t)
-    assert told.startswith("for 1.5 s not found where the zoom view should show it")
+    assert told.startswith("for 1.5 s not found where the zoom camera should show it")
     assert fusion.warnings(2, t) == []
     fusion, found = followed(x, 1.15, frames + 30, Gated(x))
     assert all(each is not None for each in found[-20:])
     (told,) = fusion.warnings(1, t + 30 * FRAME_S)
-    assert told.startswith("the told size or the calibration seems wrong: both views make it 0.2")
+    assert told.startswith("the nominal size or the calibration seems wrong: both views make it 0.2")
     fusion.follow(2)
     fusion.follow(1)
     assert len(fusion.warnings(1, t)) <= 1
@@ -414,7 +414,7 @@ def apart(by, frames=60):
     x = (BASELINE, 0.0, 10.0)
     fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
     fusion.follow(1)
-    fusion._finder = Compared(CALIBRATION, BOOK)
+    fusion.search.finder = Compared(CALIBRATION, BOOK)
     found = []
     for i in range(frames):
         t = 1.0 + i * FRAME_S
@@ -436,10 +436,10 @@ def test_views_of_other_latencies_are_compared(by):
     assert warnings == []
 
 
-@pytest.mark.parametrize(("by", "later"), [(0.7, "wide"), (-0.7, "zoom")])
+@pytest.mark.parametrize(("by", "later"), [(0.7, "fixed"), (-0.7, "zoom")])
 def test_views_that_are_too_far_apart_in_time_are_told(by, later):
     warnings = apart(by)[1]
-    assert warnings == [f"the views are too far apart in time: the {later} one comes 0.70 s later"]
+    assert warnings == [f"the cameras are too far apart in time: the {later} one comes 0.70 s later"]
 
 
 def test_a_zoom_frame_without_a_wide_view_of_its_time_is_not_one_without_the_target():
@@ -447,14 +447,14 @@ def test_a_zoom_frame_without_a_wide_view_of_its_time_is_not_one_without_the_tar
     x = (BASELINE, 0.0, 10.0)
     fusion = TargetFusion(CALIBRATION, BOOK, SIZE)
     fusion.follow(1)
-    fusion._finder = Sparse(CALIBRATION, BOOK)
+    fusion.search.finder = Sparse(CALIBRATION, BOOK)
     for i in range(100):
         t = i * FRAME_S
         fusion.update_fixed(Frame(PICTURE, t), [track(1, box_at(*x), t, missed=i % 25)], None)
         fusion.states.add(PanTiltState(0.0, 0.0, False, t), ZoomState(ZOOMED, False, t))
         fusion.update_zoom(Frame(PICTURE, t), t)
-    assert len(fusion._finder.asked) <= 4 * 2 * MatchingSettings.longest_apart_s / FRAME_S + 1
-    assert len(fusion._waiting) <= MOST_WAITING
+    assert len(fusion.search.finder.asked) <= 4 * 2 * MatchingSettings.longest_apart_s / FRAME_S + 1
+    assert len(fusion.search.waiting) <= MOST_WAITING
     assert fusion.warnings(1, t) == []
 
 

@@ -1,4 +1,4 @@
-"""A told size that is wrong is told: the simulation unrendered, its truth instead of what the pictures show."""
+"""A wrong nominal size is reported: the simulation unrendered, its truth instead of what the pictures show."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ NEAR_PX = 64.0  # a tenth of the close-up's width
 # The head's bias could be to blame as well, and takes its part at first: so much may be left of the size's logarithm.
 LEFT = 2 / 3 * math.log(2)
 SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))]
-WRONG = "the told size or the calibration seems wrong"
+WRONG = "the nominal size or the calibration seems wrong"
 
 
 def warnings(step):
