@@ -28,6 +28,7 @@ from cotarget.errors import ConfigError, choices
 from cotarget.files import assets_dir
 from cotarget.geometry import pose
 from cotarget.plugins import locate
+from cotarget.safety.stop_file import locate_stop_file
 from cotarget.schema import (
     ASCENDING,
     Check,
@@ -606,7 +607,8 @@ class SafetyConfig:
         max_frame_age_s: a frame older than this is not acted on [s].
         watchdog_s: a head that may be moving is halted after this time without a new frame or command; braking comes on
             top [s].
-        stop_file: while this file exists, the head does not move; relative to rig.toml; no such file by default.
+        stop_file: while this file exists, the head does not move; relative to rig.toml. By default, RIG.stop beside
+            RIG.toml for real devices and none for any other rig; ``false`` to do without.
     """
 
     pan_deg: Limits | None = None
@@ -674,9 +676,8 @@ def config_of(text: str, path: Path) -> RigConfig:
     sim = dataclasses.replace(config.sim, scene=str(scene)) if scene.is_file() else config.sim
     sim = dataclasses.replace(sim, models={name: path.parent / model for name, model in sim.models.items()})
     recording = config.recording and path.parent / config.recording
-    safety = dataclasses.replace(
-        config.safety, stop_file=config.safety.stop_file and path.parent / config.safety.stop_file
-    )
+    said = table.get("safety", {}).get("stop_file")
+    safety = dataclasses.replace(config.safety, stop_file=locate_stop_file(path, config.backend, said))
     hardware = {name: _located(table, path.parent) for name, table in vars(config.hardware).items()}
     return dataclasses.replace(
         config,
@@ -749,6 +750,9 @@ def parse_config(table: Mapping[str, Any], *, recorded: bool = False) -> RigConf
     sim_table = table.get("sim")
     if isinstance(sim_table, Mapping) and isinstance(sim_table.get("effects"), Mapping):
         table["sim"] = {**sim_table, "effects": expand_all(sim_table["effects"])}
+    safety = table.get("safety")
+    if isinstance(safety, Mapping) and safety.get("stop_file") is False:
+        table["safety"] = {key: value for key, value in safety.items() if key != "stop_file"}
     config = validate(RigConfig, table, "")
     config = dataclasses.replace(config, targets=targets, sim=fit_sizes(config.sim, table.get("sim", {})))
     _check_combinations(config, recorded)

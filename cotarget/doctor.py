@@ -148,13 +148,13 @@ def _emergency_stop(config: "RigConfig") -> Finding:
 
     name, path = "emergency stop", config.safety.stop_file
     if path is None:
-        return Finding(name, True, "no stop file is configured: no other shell can stop the head")
+        return Finding(name, True, "there is no stop file: no other shell can stop the head")
     try:
         refuse_if_stopped(path)
     except EmergencyStopError as error:
         return Finding(name, False, str(error), "cotarget clear --rig rig.toml")
     except ConfigError as error:
-        return Finding(name, False, str(error), f"mkdir -p {path.parent}")
+        return Finding(name, False, str(error), f"{'chmod u+w' if path.parent.is_dir() else 'mkdir -p'} {path.parent}")
     return Finding(name, True, "nobody has called for one")
 
 

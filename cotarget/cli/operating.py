@@ -3,12 +3,9 @@
 import argparse
 import math
 import os
-import re
 import sys
 import time
-import tomllib
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import (
@@ -217,8 +214,6 @@ def emulate(options: argparse.Namespace) -> None:
 
 
 CONSENT = "yes"
-# Line of an invalid TOML file that still names the stop file.
-STOP_FILE_LINE = r"""^[^#\n]*\bstop_file[ \t]*=[ \t]*(["'])([^"'\n]+)\1"""
 ENOUGH_DIGITS = 4  # decimals of a latency [s]
 # Accuracy of a measured latency [s]; a more negative one is refused.
 ACCURACY_S = 0.01
@@ -326,18 +321,18 @@ def point(options: argparse.Namespace) -> None:
 
 def stop(options: argparse.Namespace) -> None:
     """Run `cotarget stop`: write the stop file."""
-    from cotarget.safety.stop_file import write_stop_file
+    from cotarget.safety.stop_file import find_stop_file, write_stop_file
 
-    path = _stop_file(options.rig)
+    path = find_stop_file(options.rig)
     write_stop_file(path, options.reason)
     print(f"stopped: no head that watches {path} moves until cotarget clear")
 
 
 def clear(options: argparse.Namespace) -> None:
     """Run `cotarget clear`: remove the stop file."""
-    from cotarget.safety.stop_file import clear_stop_file
+    from cotarget.safety.stop_file import clear_stop_file, find_stop_file
 
-    path = _stop_file(options.rig)
+    path = find_stop_file(options.rig)
     reason = clear_stop_file(path)
     print(f"{path}: there was no stop" if reason is None else f"cleared: {reason}")
 
@@ -377,27 +372,3 @@ def _answer() -> str:
         return sys.stdin.readline() if sys.stdin is not None else ""
     except (OSError, ValueError):  # closed terminal, closed file, or not text
         return ""
-
-
-def _stop_file(rig: Path) -> Path:
-    """Find the stop file that a rig.toml names; no other fault of the file keeps a user from stopping the head.
-
-    Raises:
-        ConfigError: the file names no stop file.
-    """
-    by_hand = "the rig's stop file itself can be made and removed by hand"
-    try:
-        text = rig.read_bytes().decode("utf-8-sig", "replace")
-    except OSError as error:
-        raise ConfigError(f"{rig}: {error.strerror}; {by_hand}") from None
-    try:
-        safety = tomllib.loads(text).get("safety")
-        path = safety.get("stop_file") if isinstance(safety, dict) else None
-    except tomllib.TOMLDecodeError as error:
-        lines = re.findall(STOP_FILE_LINE, text, re.MULTILINE)
-        if len(lines) != 1:
-            raise ConfigError(f"{rig}: is not TOML: {error}; {by_hand}") from None
-        path = lines[0][1]
-    if not isinstance(path, str) or Path(path).name in ("", ".."):
-        raise ConfigError(f'{rig}: has no stop file; give one: [safety] stop_file = "stop"')
-    return rig.parent / path

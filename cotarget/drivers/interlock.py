@@ -6,7 +6,8 @@
 limit, stalled or was switched off goes on counting from a wrong position, and no later answer shows it: its limits, and
 the soft limits inside them, are off by the loss. The marker is a file that stays until the unit has found its limits
 again. It lies beside the rig's stop file, or else in the user's state folder. It applies to every head of the rig,
-because a serial adapter may come back at another port.
+because a serial adapter may come back at another port. Version 0.1 had no default stop file; its markers in the state
+folder apply to the unit at their port.
 """
 
 import contextlib
@@ -50,10 +51,12 @@ class PositionLostMarker:
     """
 
     def __init__(self, port: str, stop_file: Path | None) -> None:
-        beside = _state_home() / WITHOUT_STOP_FILE if stop_file is None else stop_file
+        port = re.sub(r"[^A-Za-z0-9.]+", "-", port).strip("-")[-LONGEST_NAME:]
+        without = _state_home() / WITHOUT_STOP_FILE
+        beside = without if stop_file is None else stop_file
         self._folder, self._begin = beside.parent, f"{beside.name}."
-        name = re.sub(r"[^A-Za-z0-9.]+", "-", port).strip("-")[-LONGEST_NAME:]
-        self.file = self._folder / f"{self._begin}{name}{SUFFIX}"
+        self.file = self._folder / f"{self._begin}{port}{SUFFIX}"
+        self._earlier = without.with_name(f"{without.name}.{port}{SUFFIX}")
 
     def refuse(self) -> None:
         """Raise if there is a marker for any unit of this rig.
@@ -64,14 +67,14 @@ class PositionLostMarker:
         try:
             files = sorted(self._folder.iterdir())
         except (FileNotFoundError, NotADirectoryError):
-            return
+            files = []
         except OSError as error:
             raise DeviceError(
                 f"{self._folder}: cannot be read, where it would say that the head's position is lost: {error.strerror}"
             ) from None
-        for file in files:
-            if file.name.startswith(self._begin) and file.name.endswith(SUFFIX):
-                raise DeviceError(f"{_reason(file)} (or, where no unit is at that port any more, remove {file})")
+        found = [file for file in files if file.name.startswith(self._begin) and file.name.endswith(SUFFIX)]
+        for file in (*found, *([self._earlier] if self._earlier.exists() else [])):
+            raise DeviceError(f"{_reason(file)} (or, where no unit is at that port any more, remove {file})")
 
     def note(self, reason: str) -> None:
         """Write the marker; a failure is logged."""
@@ -82,17 +85,18 @@ class PositionLostMarker:
             log.error("%s: cannot be written (%s), so that nobody will remember: %s", self.file, error.strerror, reason)
 
     def forget(self) -> None:
-        """Remove the marker after a reset.
+        """Remove the unit's marker after a reset.
 
         Raises:
             DeviceError: the file cannot be removed.
         """
-        try:
-            self.file.unlink(missing_ok=True)
-        except NotADirectoryError:
-            return
-        except OSError as error:
-            raise DeviceError(f"{self.file}: cannot be removed, though the unit was reset: {error.strerror}") from None
+        for file in (self.file, self._earlier):
+            try:
+                file.unlink(missing_ok=True)
+            except NotADirectoryError:
+                continue
+            except OSError as error:
+                raise DeviceError(f"{file}: cannot be removed, though the unit was reset: {error.strerror}") from None
 
 
 def _state_home() -> Path:

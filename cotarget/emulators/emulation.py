@@ -247,7 +247,7 @@ def copied_tables(table: Mapping[str, Any], directory: Path) -> dict[str, Any]:
             else target
             for name, target in copied["targets"].items()
         }
-    if "stop_file" in copied.get("safety", {}):
+    if isinstance(copied.get("safety", {}).get("stop_file"), str):
         copied["safety"] = {**copied["safety"], "stop_file": str((directory / table["safety"]["stop_file"]).resolve())}
     return copied
 

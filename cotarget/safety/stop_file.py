@@ -2,7 +2,9 @@
 
 import math
 import os
+import re
 import threading
+import tomllib
 from pathlib import Path
 from time import monotonic
 
@@ -10,6 +12,55 @@ from cotarget.errors import ConfigError, DeviceError, EmergencyStopError
 
 NO_REASON = "no reason given"
 LONGEST_REASON = 200  # shown part of the file's first line [characters]
+
+
+SUFFIX = ".stop"  # of the default stop file
+# Lines of a file that is TOML no more, which still say where the stop file is.
+STOP_FILE_LINE = r"""^[^#\n]*\bstop_file[ \t]*=[ \t]*(?:(["'])([^"'\n]+)\1|(false)\b)?"""
+HARDWARE_LINE = r"""^[ \t]*backend[ \t]*=[ \t]*["']hardware["']"""
+
+
+def locate_stop_file(rig: Path, backend: object, said: object) -> Path | None:
+    """Locate the stop file of a rig.toml: commands, the guard and the position-lost marker use this path.
+
+    Args:
+        rig: path of the rig.toml; a relative path is relative to its folder.
+        backend: its `backend`.
+        said: its `stop_file`; None where it has none, and False to do without one.
+
+    Returns:
+        The path; by default RIG.stop beside rig.toml for real devices, and None for any other rig.
+    """
+    if said is None:
+        return rig.with_suffix(SUFFIX) if backend == "hardware" else None
+    return rig.parent / said if isinstance(said, str) else None
+
+
+def find_stop_file(rig: Path) -> Path:
+    """Find the stop file of a rig.toml; no other fault of the file keeps a user from stopping the head.
+
+    Raises:
+        ConfigError: the file cannot be read, or the rig has no stop file.
+    """
+    by_hand = "the rig's stop file itself can be made and removed by hand"
+    try:
+        text = rig.read_bytes().decode("utf-8-sig", "replace")
+    except OSError as error:
+        raise ConfigError(f"{rig}: {error.strerror}; {by_hand}") from None
+    try:
+        tables = tomllib.loads(text)
+        backend, safety = tables.get("backend"), tables.get("safety")
+        said = safety.get("stop_file") if isinstance(safety, dict) else None
+    except tomllib.TOMLDecodeError as error:
+        lines = re.findall(STOP_FILE_LINE, text, re.MULTILINE)
+        backend = "hardware" if re.search(HARDWARE_LINE, text, re.MULTILINE) else None
+        said = (lines[0][1] or (False if lines[0][2] else "")) if len(lines) == 1 else None
+        if said == "" or len(lines) > 1 or not (lines or backend):
+            raise ConfigError(f"{rig}: is not TOML: {error}; {by_hand}") from None
+    path = locate_stop_file(rig, backend, said)
+    if path is None or path.name in ("", "..") or path == rig.parent:
+        raise ConfigError(f'{rig}: has no stop file; give one: [safety] stop_file = "stop"')
+    return path
 
 
 def stop_reason(path: Path | None) -> str | None:
@@ -41,10 +92,15 @@ def refuse_if_stopped(path: Path | None) -> None:
 
     Raises:
         EmergencyStopError: the file exists; the message has the reason, and how to clear it.
-        ConfigError: its folder does not exist.
+        ConfigError: its folder does not exist, or cannot be written.
     """
     if path is not None and not path.parent.is_dir():
         raise ConfigError(f"{path}: nobody could stop the head by this file: {_no_folder(path)}")
+    if path is not None and not os.access(path.parent, os.W_OK):
+        raise ConfigError(
+            f"{path}: nobody could stop the head by this file: {path.parent} cannot be written; allow it, or name a "
+            "file elsewhere: stop_file in [safety] of rig.toml"
+        )
     if (reason := stop_reason(path)) is not None:
         raise stopped_by_file(path, reason)
 

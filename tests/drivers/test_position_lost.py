@@ -75,3 +75,16 @@ def test_without_a_stop_file_it_is_in_the_users_state_folder(tmp_path, monkeypat
     assert (
         PositionLostMarker("/dev/ttyS0", None).file == tmp_path / ".local/state/cotarget/head.dev-ttyS0.position-lost"
     )
+
+
+def test_a_marker_of_a_rig_that_had_no_stop_file_is_found_beside_one(tmp_path, monkeypatch, stop_file):
+    """Version 0.1 had no default stop file; its markers must not be lost by the update."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    PositionLostMarker("/dev/ttyS0", None).note("lost long ago")
+    now, another = PositionLostMarker("/dev/ttyS0", stop_file), PositionLostMarker("/dev/ttyS1", stop_file)
+    with pytest.raises(DeviceError, match=r"^lost long ago"):
+        now.refuse()
+    another.refuse()  # a stop file's rig is not that of every unit of this user
+    now.forget()
+    now.refuse()
+    PositionLostMarker("/dev/ttyS0", None).refuse()
