@@ -67,7 +67,7 @@ def test_a_target_that_the_close_up_never_shows_is_unconfirmed(tmp_path, capsys,
     assert status == 3
     states = json.loads(out)["states"]
     assert states["unconfirmed"] > 3
-    assert "not found where the zoom view should show it" in err
+    assert "not found where the zoom camera should show it" in err
     assert len(err.splitlines()) == 1
 
 
