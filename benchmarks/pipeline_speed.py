@@ -74,7 +74,7 @@ class Pipeline:
             kind: name of the detector.
             film: film that gives size and rate.
         """
-        self.target: TargetProfile = replace(DEFAULT_TARGETS["bird"], detector=kind)  # type: ignore[arg-type]
+        self.target: TargetProfile = replace(DEFAULT_TARGETS["bird"], detector=kind)
         self.detector: Detector = make_detector(self.target, film.rate_hz)
         self.calibration = calibration_of(film.size)
         self.tracker, self.policy = Tracker(tracking_settings(self.target), film.size), FirstCome()

@@ -27,7 +27,7 @@ from cotarget.camera import Intrinsics
 from cotarget.errors import ConfigError, choices
 from cotarget.files import assets_dir
 from cotarget.geometry import pose
-from cotarget.plugins import locate
+from cotarget.plugins import FORM, is_own, locate
 from cotarget.safety.stop_file import locate_stop_file
 from cotarget.schema import (
     ASCENDING,
@@ -531,6 +531,18 @@ class BoardConfig:
     square: Positive = 0.1
 
 
+DETECTORS = ("colour", "motion", "speck", "mog2")
+
+
+def _detector(name: str) -> str:
+    if name not in DETECTORS and not is_own(name):
+        raise ValueError(f"{name!r} is neither {FORM} nor one of: {choices(DETECTORS)}")
+    return name
+
+
+DetectorName = Annotated[str, '"colour", "motion", "speck", "mog2" or "module:function"', Check(_detector)]
+
+
 @model
 class TargetProfile:
     """What is known of a target before it is seen.
@@ -540,7 +552,8 @@ class TargetProfile:
         dimension: the dimension that ``size`` gives; a wingspan is the larger side of the target's box.
         wanted_px: size of that dimension in the close-up [px].
         detector: how the fixed camera's images are searched: "colour" matches a template, "motion" subtracts the
-            background, "speck" finds targets of a few pixels, "mog2" is the paper's plain background subtraction.
+            background, "speck" finds targets of a few pixels, "mog2" is the paper's plain background subtraction; or a
+            function of your own from an image to boxes, in a module beside rig.toml or on Python's path.
         template: picture of the target, cut to its outline, for the detector "colour"; relative to rig.toml.
         motion: motion model; "general" covers anything that moves by itself.
         shape: expected width over height of the target's box; none if it is unknown or changes.
@@ -549,7 +562,7 @@ class TargetProfile:
     size: Positive
     dimension: Literal["width", "height", "wingspan"]
     wanted_px: Positive
-    detector: Literal["colour", "motion", "speck", "mog2"]
+    detector: DetectorName
     template: FilePath | None = None
     motion: Literal["standing", "walking", "flying", "general"] = "general"
     shape: Positive | None = None
@@ -669,7 +682,11 @@ def config_of(text: str, path: Path) -> RigConfig:
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     beside = {  # an absolute template path stays unchanged
-        name: dataclasses.replace(target, template=target.template and path.parent / target.template)
+        name: dataclasses.replace(
+            target,
+            template=target.template and path.parent / target.template,
+            detector=locate(target.detector, path.parent),
+        )
         for name, target in config.targets.items()
     }
     scene = path.parent / config.sim.scene

@@ -61,7 +61,7 @@ def examine(config: "RigConfig | None" = None) -> list[Finding]:
         _gphoto_cameras(needed=_is_real(config)),
     ]
     if config is not None:
-        found.append(_emergency_stop(config))
+        found += [_emergency_stop(config), *_own_detectors(config)]
     return found if config is None or not _is_real(config) else [*found, *_devices(config)]
 
 
@@ -156,6 +156,22 @@ def _emergency_stop(config: "RigConfig") -> Finding:
     except ConfigError as error:
         return Finding(name, False, str(error), f"{'chmod u+w' if path.parent.is_dir() else 'mkdir -p'} {path.parent}")
     return Finding(name, True, "nobody has called for one")
+
+
+def _own_detectors(config: "RigConfig") -> list[Finding]:
+    """Import the detectors of the user's own that targets name."""
+    from cotarget.plugins import is_own, load
+
+    found = []
+    for name, target in config.targets.items():
+        if is_own(target.detector):
+            where = f"targets.{name}.detector"
+            try:
+                load(target.detector, where)
+                found.append(Finding(where, True, target.detector))
+            except CotargetError as error:
+                found.append(Finding(where, False, str(error), f"correct it, or [targets.{name}] in rig.toml"))
+    return found
 
 
 def _position(config: "RigConfig", port: str) -> Finding:

@@ -11,7 +11,7 @@ import importlib
 import importlib.util
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -29,9 +29,11 @@ def is_own(name: str) -> bool:
 
 def locate(name: str, folder: Path) -> str:
     """Replace a module that lies in a folder by its file; any other name stays."""
+    if not is_own(name):
+        return name
     module, _, attribute = name.rpartition(":")
-    file = folder.joinpath(*module.split(".")).with_suffix(".py")
-    return f"{file.resolve()}:{attribute}" if is_own(name) and file.is_file() else name
+    file = folder / f"{module.replace('.', '/')}.py"
+    return f"{file.resolve()}:{attribute}" if file.is_file() else name
 
 
 def load(name: str, where: str) -> Any:
@@ -109,6 +111,17 @@ def _is_ours(file: str) -> bool:
     return file == __file__ or file.startswith("<frozen") or "importlib" in file
 
 
+def reporting(function: Callable[..., Any], what: str) -> Callable[..., Any]:
+    """Wrap a user's function so that its errors name file and line."""
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **keywords: Any) -> Any:
+        with calling(what):
+            return function(*arguments, **keywords)
+
+    return call
+
+
 class Reporting:
     """A user's device whose errors name file and line; everything else passes through."""
 
@@ -118,12 +131,4 @@ class Reporting:
     def __getattr__(self, name: str) -> Any:
         with calling(self._what):
             found = getattr(self._device, name)
-        if not callable(found):
-            return found
-
-        @functools.wraps(found)
-        def call(*arguments: Any, **keywords: Any) -> Any:
-            with calling(self._what):
-                return found(*arguments, **keywords)
-
-        return call
+        return reporting(found, self._what) if callable(found) else found

@@ -3,7 +3,7 @@
 `make_detector` makes one of four by name: "colour"; "mog2", the paper's adaptive Gaussian mixture, with its foreground
 cleaned and joined to regions of a target's size; "motion", the same mixture made robust against foliage and light; and
 "speck", for small targets that may hover, seen by a camera that may shake. `ExternalDetector` makes a detector of any
-function from an image to boxes.
+function from an image to boxes; the name "module:function" stands for one of a user's own.
 """
 
 import cv2
@@ -15,6 +15,7 @@ from cotarget.detection.base import Detection, Detector, ExternalDetector
 from cotarget.detection.color_template import ColorTemplateDetector
 from cotarget.detection.small_target import SmallTargetDetector
 from cotarget.errors import ConfigError
+from cotarget.plugins import is_own, load, reporting
 from cotarget.rig import Image
 
 __all__ = [
@@ -42,9 +43,11 @@ def make_detector(target: TargetProfile, rate_hz: float, template: Image | None 
         template: image of the target for the detector "colour", (h, w, 3) BGR; that of the target profile by default.
 
     Raises:
-        ConfigError: a colour target has no usable template.
+        ConfigError: a colour target has no usable template, or a detector of the user's own cannot be imported.
     """
-    kind: str = target.detector
+    kind = target.detector
+    if is_own(kind):
+        return ExternalDetector(reporting(load(kind, f"detector '{kind}'"), "the detector"))
     if kind == "speck":
         return SmallTargetDetector()
     if kind in ("motion", "mog2"):

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from cotarget.errors import ConfigError, choices
+from cotarget.plugins import is_own
 from cotarget.schema import validate
 from experiments.engine.harness import Experiment, Settings
 from experiments.engine.results import identity
@@ -166,7 +167,7 @@ def _check(settings: Settings, key: str, where: str) -> None:
         raise ConfigError(f"{where}: is empty; at least one is needed")
     for each in value if isinstance(value, tuple) else (value,):
         if isinstance(each, str):
-            if isinstance(usual, tuple) and usual and each not in usual:
+            if isinstance(usual, tuple) and usual and each not in usual and not is_own(each):
                 raise ConfigError(f"{where}: {each!r} is not one of: {choices(usual)}")
         elif not isinstance(each, bool):
             least = 1 if isinstance(each, int) and usual else 0

@@ -14,13 +14,13 @@ import dataclasses
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
-from cotarget.config import RigConfig, TargetProfile
+from cotarget.config import DetectorName, RigConfig, TargetProfile
 from cotarget.detection import make_detector
 from cotarget.evaluation import off_target, on_target
 from cotarget.geometry import Array
@@ -38,7 +38,6 @@ from experiments.engine.texts import table
 from experiments.following.field_scenes import field_config, five_targets_config
 from experiments.following.wide_view import WIDE
 
-DetectorName = Literal["mog2", "motion", "speck"]
 DETECTORS: tuple[DetectorName, ...] = ("mog2", "motion", "speck")
 STANDS, SHAKES = "stands", "shakes"
 MEMORY_S = 0.1  # correlation time of the shake

@@ -13,12 +13,13 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
+from cotarget.config import DetectorName
 from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
 from cotarget.errors import ConfigError
@@ -70,7 +71,7 @@ class PersonSettings(OwnRigInField):
 
     seeds: int = 2
     seconds: float = 7.0
-    detector: Literal["mog2", "motion"] = "mog2"
+    detector: DetectorName = "mog2"
 
     def __post_init__(self) -> None:
         if self.seconds <= FIRST_S:

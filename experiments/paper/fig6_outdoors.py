@@ -14,13 +14,13 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from cotarget.calibration import Calibration
-from cotarget.config import RigConfig, TargetProfile, Waypoint
+from cotarget.config import DetectorName, RigConfig, TargetProfile, Waypoint
 from cotarget.detection import make_detector
 from cotarget.drawing import draw_wide, draw_zoom
 from cotarget.errors import ConfigError, choices
@@ -83,7 +83,7 @@ class OutdoorSettings(OwnRigInField):
 
     seeds: int = 2
     seconds: float = 12.0
-    detector: Literal["motion", "mog2"] = "motion"
+    detector: DetectorName = "motion"
     ways: tuple[str, ...] = tuple(WAYS)
 
     def __post_init__(self) -> None:

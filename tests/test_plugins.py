@@ -1,0 +1,217 @@
+"""Drivers and detectors of a user's own, which rig.toml names and nobody puts into the package."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from cotarget.backends import check, describe, load_config, open_rig
+from cotarget.cli.main import main
+from cotarget.config import parse_config
+from cotarget.detection import make_detector
+from cotarget.doctor import examine
+from cotarget.errors import ConfigError, CotargetError, DeviceError
+from cotarget.rig import Frame
+
+DEVICES = """
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from helper import GREY
+from cotarget.rig import CameraSpec, Frame, HeadSpec, PanTiltLimits, PanTiltState, ZoomSpec, ZoomState
+
+LIMITS = PanTiltLimits((-1.0, 1.0), (-0.5, 0.5), 2.0, 4.0, 0.0)
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    size: tuple[int, int] = (64, 48)
+    rate_hz: float = 100.0
+    colour: str = "grey"
+
+    @property
+    def spec(self):
+        return CameraSpec(self.size, self.rate_hz, 0.0)
+
+
+@dataclass(frozen=True)
+class ZoomSettings(CameraSettings):
+    @property
+    def spec(self):
+        return ZoomSpec(self.size, self.rate_hz, 0.0, (100.0, 400.0), 0.01, self.size, 0.0)
+
+
+@dataclass(frozen=True)
+class HeadSettings:
+    @property
+    def spec(self):
+        return HeadSpec(LIMITS, 0.0)
+
+
+class Camera:
+    Settings = CameraSettings
+
+    def __init__(self, settings, clock):
+        self.size, self.still_size, self.clock, self.settings = settings.size, settings.size, clock, settings
+
+    @staticmethod
+    def probe(settings):
+        return f"a {settings.colour} wall"
+
+    def read(self, newer_than=None, timeout=1.0):
+        if self.settings.colour == "pink":
+            return {}["no such"]
+        self.clock.sleep_until(self.clock.now() + 0.01)
+        return Frame(np.full((*self.size[::-1], 3), GREY, np.uint8), self.clock.now())
+
+    def close(self):
+        pass
+
+
+class Zoom(Camera):
+    Settings, focal_range = ZoomSettings, (100.0, 400.0)
+
+    def zoom(self, focal_px):
+        return focal_px
+
+    def state(self):
+        return ZoomState(100.0, False, self.clock.now())
+
+    def capture(self):
+        return self.read()
+
+
+class Head:
+    Settings, limits = HeadSettings, LIMITS
+
+    def __init__(self, settings, clock, safety):
+        self.at, self.clock, self.safety = (0.0, 0.0), clock, safety
+
+    def state(self):
+        return PanTiltState(*self.at, False, self.clock.now())
+
+    def move(self, pan, tilt, speed=None, wait=False):
+        self.at = (pan, tilt)
+        return self.at
+
+    def halt(self):
+        pass
+
+    def close(self):
+        pass
+
+
+class Broken:
+    Settings = CameraSettings
+
+    def __init__(self, settings, clock):
+        raise RuntimeError("the lens cap is on")
+
+
+class Unset:
+    pass
+
+
+def boxes(image):
+    return [(2, 3, 4, 5)] if image.mean() > 0 else {}["dark"]
+"""
+RIG = """
+backend = "hardware"
+[hardware.fixed]
+driver = "devices:Camera"
+colour = "green"
+[hardware.zoom]
+driver = "devices:Zoom"
+[hardware.head]
+driver = "devices:Head"
+[targets.wall]
+size = 2.0
+dimension = "width"
+wanted_px = 40
+detector = "devices:boxes"
+"""
+
+
+@pytest.fixture
+def rig(tmp_path):
+    (tmp_path / "helper.py").write_text("GREY = 128\n")
+    (tmp_path / "devices.py").write_text(DEVICES)
+    (tmp_path / "rig.toml").write_text(RIG)
+    return tmp_path / "rig.toml"
+
+
+def test_a_rig_of_own_devices_is_opened_from_rig_toml_alone(rig, monkeypatch):
+    monkeypatch.chdir("/")
+    config = load_config(rig)
+    assert describe(config).zoom.focal_range == (100.0, 400.0)
+    with open_rig(rig) as opened:
+        assert opened.fixed.read().image[0, 0].tolist() == [128] * 3
+        assert opened.head.move(math.radians(10), 0.0, wait=True)[0] == pytest.approx(math.radians(10))
+        assert opened.spec.head.limits.pan == (-1.0, 1.0)
+
+
+def test_the_commands_know_them(rig, capsys, monkeypatch):
+    monkeypatch.chdir("/")
+    assert main(["point", "--rig", str(rig), "--pan-deg", "5"]) == 0
+    assert json.loads(capsys.readouterr().out)["pan_deg"] == pytest.approx(5)
+    found = {finding.name: finding for finding in examine(load_config(rig))}
+    assert found["hardware.fixed"].text == "a green wall"
+    assert found["hardware.head"].text == "is not asked: its driver has no probe"
+    assert found["targets.wall.detector"].ok
+
+
+def test_an_own_detector_is_found_beside_rig_toml(rig, monkeypatch):
+    monkeypatch.chdir("/")
+    detector = make_detector(load_config(rig).target("wall"), 25.0)
+    [found] = detector.detect(Frame(np.full((48, 64, 3), 9, np.uint8), 0.0))
+    assert found.size_px.tolist() == [4.0, 5.0]
+    with pytest.raises(CotargetError, match=r"^the detector: .*devices\.py:\d+: KeyError: 'dark'$"):
+        detector.detect(Frame(np.zeros((48, 64, 3), np.uint8), 0.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ('"devices:Camera"', ""),
+        (
+            '"devices:Camera"\ncolor = "red"',
+            "unknown key 'hardware.fixed.color'; valid here: colour, driver, rate_hz, ",
+        ),
+        ('"devices:Camera"\nrate_hz = "9"', "hardware.fixed.rate_hz: '9' is not a finite number"),
+        ('"device:Camera"', "hardware.fixed.driver: there is no module 'device' beside rig.toml or on Python's path"),
+        ('"devices:Camer"', "hardware.fixed.driver: "),
+        ('"devices:Unset"', "hardware.fixed.driver: "),
+        ('"devices"', "hardware.fixed.driver: 'devices' is neither module:name nor one of: axis"),
+        ('"syntax:Camera"', "hardware.fixed.driver: {folder}/syntax.py:2: SyntaxError"),
+        ('"failing:Camera"', "hardware.fixed.driver: {folder}/failing.py:3: ZeroDivisionError: division by zero"),
+        ('"needs:Camera"', "hardware.fixed.driver: {folder}/needs.py:1: ModuleNotFoundError: No module named 'no_such"),
+    ],
+)
+def test_each_mistake_is_one_line_that_names_it(rig, change, said):
+    (rig.parent / "syntax.py").write_text("x = 1\nclass Camera(:\n")
+    (rig.parent / "failing.py").write_text("x = 1\n\n1 / 0\n")
+    (rig.parent / "needs.py").write_text("import no_such_library\n")
+    rig.write_text(RIG.replace('"devices:Camera"\ncolour = "green"', change))
+    if not said:
+        load_config(rig)
+        return
+    with pytest.raises(ConfigError) as caught:
+        load_config(rig)
+    assert str(caught.value).startswith(f"{rig}: {said.format(folder=rig.parent)}")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_error_of_a_device_is_one_line_that_names_file_and_line(rig):
+    rig.write_text(RIG.replace("devices:Camera", "devices:Broken"))
+    with pytest.raises(DeviceError, match=r"^hardware\.fixed: .*devices\.py:\d+: RuntimeError: the lens cap is on$"):
+        open_rig(rig)
+    rig.write_text(RIG.replace('"green"', '"pink"'))
+    with open_rig(rig) as opened, pytest.raises(DeviceError, match=r"^hardware\.fixed: .*devices\.py:\d+: KeyError"):
+        opened.fixed.read()
+
+
+def test_a_module_on_pythons_path_needs_no_file_beside_rig_toml(rig, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(rig.parent))
+    check(parse_config({"hardware": {"fixed": {"driver": "devices:Camera", "colour": "blue"}}}))
