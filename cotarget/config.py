@@ -43,6 +43,7 @@ from cotarget.schema import (
     model,
     validate,
 )
+from cotarget.sim.targets import KINDS
 
 FEWEST_CORNERS, MOST_CORNERS = 3, 100  # corners along a side of a board
 
@@ -91,7 +92,7 @@ Distortion = Annotated[tuple[float, float, float, float, float], "[k1, k2, p1, p
 Waypoint = Annotated[tuple[float, float, float, float], "[t, x, y, z]"]
 # Coefficients of s, s^2, s^3 ...: a curve that is 0 at the shortest focal length.
 Curve = Annotated[tuple[float, ...], "[of s, of s^2, ...]"]
-TARGETS = ("book", "person", "bird")  # targets with a model in the simulation
+TARGETS = KINDS  # targets with a model in the simulation
 
 
 @model

@@ -283,7 +283,7 @@ def test_a_birds_larger_side_is_the_maximum_over_a_beat():
     world = SimWorld(parse_config({"sim": sim}))
     world.rig.clock.sleep_until(1.0)
     truth = world.truth()
-    beat = truth.targets["bird"].beat_s
+    beat = truth.targets["bird"].kind.beat_s
     sides = [truth.silhouette("bird", "fixed", t).size_px.max() for t in np.linspace(0, beat, 200, endpoint=False)]
     found = [truth.largest_side_px("bird", "fixed", t) for t in (0.0, 0.03, 0.1, 0.7)]
     world.close()

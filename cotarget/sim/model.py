@@ -102,9 +102,10 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
 
 def _target_spec(target: Target) -> "mujoco.MjSpec":
     """Read a target's model, scaled to its true size and with its marker."""
-    if target.own is not None:
-        return own_model(target.own, target.kind, BOARD_GROUP)
-    asset = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / f"{target.kind}.xml"))
+    kind = target.kind
+    if kind.own is not None:
+        return own_model(kind.own, kind.name, BOARD_GROUP)
+    asset = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / f"{kind.name}.xml"))
     scale_spec(asset, target.size)
     change_marker(asset, target.name)
     return asset

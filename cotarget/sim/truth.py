@@ -26,8 +26,7 @@ from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.sim.model import BOARD_GROUP, FRAME_GROUP, RIG, RIG_GROUP, mount_pose, scene_spec
 from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.render.optics import TrueLens, fold
-from cotarget.sim.targets.gait import limbs
-from cotarget.sim.targets.target import Target
+from cotarget.sim.targets.target import Target, kind_of
 
 CameraName = Literal["fixed", "zoom"]
 
@@ -263,7 +262,7 @@ class Truth:
     def largest_side_px(self, name: str, camera: CameraName, t: float) -> float:
         """Give the larger side of the box, its maximum over one limb cycle, at the pose of time t [px]; nan behind."""
         target = self.targets[name]
-        phases = np.arange(BEAT_PHASES) / BEAT_PHASES * target.beat_s if target.beat_s else [0.0]
+        phases = np.arange(BEAT_PHASES) / BEAT_PHASES * beat_s if (beat_s := target.kind.beat_s) else [0.0]
         data = self._copy(self.set_bodies(t))
         lens = self.lens(camera, t)
         view = self._camera(data, camera, lens)
@@ -424,7 +423,7 @@ class Outlines:
         mujoco.mj_kinematics(self._model, self._data)
         data = self._data  # reading an array attribute takes as long as the computation with it
         self._qpos, self._places, self._turns = data.qpos, data.xpos, data.xmat.reshape(-1, 3, 3)
-        self._points = {name: outermost(each.kind) * each.size for name, each in truth.targets.items()}
+        self._points = {name: outermost(each.kind.name) * each.size for name, each in truth.targets.items()}
         self._beats = {name: np.concatenate(points[::EVERY], axis=1) for name, points in self._points.items()}
         self._reach = {name: float(np.linalg.norm(points, axis=1).max()) for name, points in self._points.items()}
         self._axes = [int(self._model.joint(RIG + axis).qposadr[0]) for axis in ("pan", "tilt")]
@@ -597,18 +596,18 @@ def outermost(kind: str) -> Array:
     """Compute a target's outermost points at each phase of its limb cycle, with the body's centre as the last point.
 
     Args:
-        kind: kind of the target.
+        kind: name of the target's kind.
 
     Returns:
         Points in the body's frame, at the model's own size [m], (PHASES, 3, n).
     """
     model = mujoco.MjSpec.from_file(str(assets_dir() / "targets" / f"{kind}.xml")).compile()
     data, body = mujoco.MjData(model), model.body(kind).id
-    surfaces = [surface_points(model, geom) for geom in range(model.ngeom)]
+    surfaces, limbs = [surface_points(model, geom) for geom in range(model.ngeom)], kind_of(kind).limbs
     directions = sphere_points(DIRECTIONS)
     found = []
     for beat in np.arange(PHASES) * 2 * math.pi / PHASES:
-        for joint, angle in limbs(kind, beat).items():
+        for joint, angle in limbs(beat).items():
             data.joint(joint).qpos[0] = angle
         mujoco.mj_kinematics(model, data)
         turns, places = data.geom_xmat.reshape(-1, 3, 3), data.geom_xpos

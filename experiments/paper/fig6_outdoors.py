@@ -26,7 +26,8 @@ from cotarget.drawing import draw_wide, draw_zoom
 from cotarget.errors import ConfigError, choices
 from cotarget.evaluation import closeup_of, on_target
 from cotarget.pipeline import FollowSettings, Step
-from cotarget.sim.targets.target import PERSON_HEIGHT, draw_size, target_rng
+from cotarget.sim.targets.person import PERSON_HEIGHT
+from cotarget.sim.targets.target import draw_size, target_rng
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
 from experiments.engine.harness import Experiment, Row, seeds_of

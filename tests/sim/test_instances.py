@@ -13,13 +13,13 @@ NEAR = 2.4  # where a marker decodes in the wide view [m]
 
 
 def world(paths, **sim):
-    targets = dict(DEFAULT_TARGETS) | {name: DEFAULT_TARGETS[kind_of(name)] for name in paths}
+    targets = dict(DEFAULT_TARGETS) | {name: DEFAULT_TARGETS[kind_of(name).name] for name in paths}
     sim = SimConfig(scene="indoor", targets=tuple(paths), paths={n: p for n, p in paths.items() if p}, **sim)
     return SimWorld(RigConfig(sim=sim, targets=targets))
 
 
 def test_names_have_a_kind_and_a_marker():
-    assert [kind_of(name) for name in ("bird", "bird2", "person13", "book5")] == ["bird", "bird", "person", "book"]
+    assert [kind_of(name).name for name in ("bird", "bird2", "person13", "book5")] == ["bird", "bird", "person", "book"]
     assert [marker_of(name) for name in TARGETS] == [1, 2, 3]  # as drawn in sim_assets
     names = [f"{kind}{i}" for kind in ("person", "bird") for i in ("", 2, 3, 4, 5)]
     assert len({marker_of(name) for name in names}) == len(names)

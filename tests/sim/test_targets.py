@@ -187,7 +187,7 @@ def test_wings_beat_four_times_a_second():
     ups = np.sum((angle[:-1] < angle.mean()) & (angle[1:] >= angle.mean()))
     assert ups in (8, 9) if abs(angle[0] - angle.mean()) < 0.02 else ups == 8
     assert np.degrees(np.ptp(angle)) == pytest.approx(70.0, abs=0.5)
-    assert target.beat_s == 0.25
+    assert target.kind.beat_s == 0.25
 
 
 @pytest.mark.parametrize("name", TARGETS)

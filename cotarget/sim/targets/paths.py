@@ -1,4 +1,4 @@
-"""Smooth paths through the simulated world, and the default paths of book, person and bird.
+"""Smooth paths through the simulated world.
 
 Paths are in the scene's world: z up, the fixed camera 1.6 m above the origin, looking along +y. A moving target stays
 outside the fixed camera's view while the background is learnt, then enters and stays inside.
@@ -119,7 +119,7 @@ def _measured(spline: CubicSpline, lap: tuple[float, float] | None = None) -> Pa
     return Path(spline, CubicSpline(t, speed).antiderivative(), lap)
 
 
-def _loop_path(
+def loop_path(
     loop: Array,
     speed: float,
     spacing: float,
@@ -138,7 +138,7 @@ def _loop_path(
         edge: time [s] at which the target passes the coordinate x [m] on its approach.
     """
     count = int(PATH_SECONDS * speed / spacing)
-    line = _even(np.vstack([loop, loop[:1]]), spacing)[:-1]
+    line = even(np.vstack([loop, loop[:1]]), spacing)[:-1]
     start = line[1] - line[-1]
     start = start / np.linalg.norm(start)
     laps = np.tile(line, (count // len(line) + 2, 1))
@@ -156,56 +156,13 @@ def _loop_path(
     return _measured(CubicSpline(t, points), (float(begin), float(end)))
 
 
-def _even(points: Array, spacing: float) -> Array:
+def even(points: Array, spacing: float) -> Array:
     """Resample a line at about ``spacing``, with both ends kept."""
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     at = np.linspace(0.0, s[-1], round(s[-1] / spacing) + 1)
     return np.stack([np.interp(at, s, points[:, k]) for k in range(3)], axis=1)
 
 
-def _angles(count: int = 720) -> Array:
+def angles(count: int = 720) -> Array:
+    """Give angles around a circle, evenly spaced from 0 [rad], (count,)."""
     return np.linspace(0.0, 2 * np.pi, count, endpoint=False)
-
-
-def book_path(scene: str, rng: np.random.Generator) -> Path:
-    """Carry the book slowly along an ellipse about 10 m away, in view from the start."""
-    a, phase = _angles(), rng.uniform(0, 2 * np.pi)
-    wide, deep, high = rng.uniform(1.2, 1.6), rng.uniform(0.3, 0.5), rng.uniform(0.25, 0.4)
-    center = np.array([rng.uniform(-0.3, 0.3), rng.uniform(9.8, 10.2), rng.uniform(1.5, 1.7)])
-    tilt = rng.uniform(0, 2 * np.pi)
-    shape = [wide * np.cos(a + phase), deep * np.sin(a + phase), high * np.sin(a + phase + tilt)]
-    return _loop_path(center + np.stack(shape, axis=1), rng.uniform(0.22, 0.28), 0.05, 0.1)
-
-
-def person_path(scene: str, rng: np.random.Generator) -> Path:
-    """Walk in from one side at about 1.5 m/s, then along a figure of eight; z is that of the ground."""
-    # The outdoor camera looks up: nearer than 13 m it does not see the feet.
-    near, reach, deep = (13.4, 4.4, 2.2) if scene == "outdoor" else (8.95, 2.65, 1.0)
-    side = rng.choice([-1.0, 1.0])
-    a = _angles() - np.pi / 4  # starts at the nearest point of the figure's first half, heading inwards
-    reach, deep = reach * rng.uniform(0.94, 1.0), deep * rng.uniform(0.9, 1.05)
-    figure = np.stack([-side * reach * np.sin(a), near + deep + deep * np.sin(2 * a), np.zeros_like(a)], axis=1)
-    edge = (rng.uniform(2.7, 3.0), side * VIEW_EDGE * near)
-    return _loop_path(figure, rng.uniform(1.42, 1.55), 0.15, 0.25, 14.0, edge)
-
-
-def bird_path(scene: str, rng: np.random.Generator) -> Path:
-    """Fly in from one side at about 5 m/s, then in rounds; indoors the rounds are smaller and slower.
-
-    A round has two half circles and two straights across the view, so that the bird shows its side most of the time.
-    """
-    a = _angles()
-    side = rng.choice([-1.0, 1.0])
-    if scene == "indoor":
-        radius, across, near, height, rise, speed, soften = rng.uniform(2.0, 2.2), 0.8, 7.4, 2.3, 0.25, 2.9, 0.5
-    else:
-        radius, across, near, height, rise, speed, soften = rng.uniform(2.5, 2.8), 4.4, 19.4, 7.8, 1.6, 5.0, 0.6
-    height += 0.3 * rise * rng.uniform(-1, 1)
-    start, lift = rng.uniform(0, 2 * np.pi), rise * rng.uniform(0.7, 1.0)
-    x = side * (radius * np.sin(a) + across * np.where(a < np.pi, 1.0, -1.0))
-    y = near + radius * (1 - np.cos(a))
-    flat = _even(np.stack([[*x, x[0]], [*y, y[0]], np.zeros(len(a) + 1)], axis=1), 0.02)[:-1]
-    flat[:, 2] = height + lift * np.sin(start + _angles(len(flat)))
-    speed *= rng.uniform(0.96, 1.04)
-    edge = (rng.uniform(2.4, 2.8), -side * VIEW_EDGE * near)
-    return _loop_path(flat, speed, 0.1 * speed, soften, 8.0 * speed, edge)

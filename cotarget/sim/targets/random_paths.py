@@ -13,7 +13,8 @@ from cotarget.config import Waypoint
 from cotarget.errors import ConfigError, choices
 from cotarget.geometry import Array
 from cotarget.sim.targets.paths import MOUNT
-from cotarget.sim.targets.target import PERSON_HEIGHT, draw_size, target_rng
+from cotarget.sim.targets.person import PERSON_HEIGHT
+from cotarget.sim.targets.target import draw_size, target_rng
 
 SECONDS = 20.0  # of a run
 LONE, GROUPED = ("book", "person", "bird"), ("person", "bird")  # kinds with paths for one target, and for five

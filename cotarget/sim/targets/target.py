@@ -1,12 +1,12 @@
-"""Simulated targets (book, person, bird): pose, joint angles and true size at any time.
+"""Simulated targets: what a kind of target is, and a target's pose, joint angles and true size at any time.
 
-A scene may have several targets of one kind: ``bird2`` is a second bird. Paths are in `cotarget.sim.targets.paths`, the
-models in sim_assets/targets.
+A scene may have several targets of one kind: ``bird2`` is a second bird. Each kind is a module beside this one, listed
+in `cotarget.sim.targets.KINDS`; its model is in sim_assets/targets. A user's own model is a kind too.
 """
 
-import math
+import importlib
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path as FilePath
@@ -14,49 +14,56 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cotarget.config import TARGETS, Waypoint, known_targets, split_name
+from cotarget.config import Waypoint, known_targets, split_name
 from cotarget.errors import ConfigError
 from cotarget.geometry import Array, RigidTransform, Rotation
-from cotarget.sim.targets.gait import (
-    STRIDE,
-    WALK_SPEED,
-    WING_BEAT_HZ,
-    Axes,
-    bank,
-    face_mount,
-    flap,
-    heading,
-    turned,
-    walk,
-)
-from cotarget.sim.targets.paths import MOUNT, Path, bird_path, book_path, person_path, waypoint_path
+from cotarget.sim.targets import KINDS
+from cotarget.sim.targets.attitude import Axes, heading
+from cotarget.sim.targets.paths import Path, waypoint_path
 
 if TYPE_CHECKING:
     import mujoco
 
 
-__all__ = [
-    "MOUNT",
-    "TARGETS",
-    "Target",
-    "TargetPose",
-    "change_marker",
-    "draw_size",
-    "kind_of",
-    "make_target",
-    "marker_of",
-    "scale_spec",
-    "target_rng",
-    "waypoint_path",
-]
-# Markers on the targets, ids in DICT_4X4_50: the first target of each kind, and the step for each further one of
-# persons and birds. There are textures for five of a kind, after which the ids repeat. All books have the same marker.
-MARKERS = {"book": 1, "person": 2, "bird": 3}
-MARKER_STEP, MARKERS_OF_A_KIND = 10, 5
+MARKERS_OF_A_KIND = 5  # textures of different markers, after which the ids repeat
 RANDOM = 3  # random stream of the targets, separate from the world's others
-PERSON_HEIGHT = 1.75  # height of the model [m]
-SCATTER = {"book": 0.0, "person": 0.04, "bird": 0.15}  # largest relative deviation from the nominal size
-SCATTER_SIGMA = 0.5  # standard deviation over that range: it is two of them
+SCATTER_SIGMA = 0.5  # standard deviation over the range of a kind's size: it is two of them
+# Position of the body [m], (3,); axes of the body in the world; joint angles [rad] by name.
+Stance = tuple[list[float], Axes, Mapping[str, float]]
+
+
+def _constant(target: "Target", t: float) -> float:
+    return target.phase
+
+
+@dataclass(frozen=True)
+class TargetKind:
+    """One kind of target.
+
+    Attributes:
+        name: also the name of the body in the model.
+        stance: gives the stance of a target at a time [s] and a phase of its limb cycle [rad].
+        path: draws the kind's path in a scene, given by its name; None where each target needs waypoints. Any scene but
+            the built-in ones has the indoor paths of book and person and the outdoor path of the bird.
+        limbs: gives the joint angles [rad] by name at a phase of the limb cycle [rad].
+        beat: gives the phase of a target's limb cycle at a time [s], which may grow without limit [rad].
+        beat_s: period of the limb cycle [s]; 0 for a rigid target.
+        scatter: largest relative deviation of the true size from the model's.
+        marker: id in DICT_4X4_50 of the marker on the first target of the kind; None for no marker.
+        marker_step: from the id of one target of the kind to the next one's; 0 if all have the same marker.
+        own: file of a user's own model; the others are in sim_assets/targets.
+    """
+
+    name: str
+    stance: Callable[["Target", float, float], Stance]
+    path: Callable[[str, np.random.Generator], Path] | None
+    limbs: Callable[[float], Mapping[str, float]] = lambda beat: {}
+    beat: Callable[["Target", float], float] = _constant
+    beat_s: float = 0.0
+    scatter: float = 0.0
+    marker: int | None = None
+    marker_step: int = 0
+    own: FilePath | None = None
 
 
 @dataclass(frozen=True)
@@ -79,68 +86,52 @@ class Target:
 
     Attributes:
         name: kind of the target, with a number from the second of its kind on.
-        beat_s: period of the limb cycle [s]; 0 for a rigid target.
+        kind: what it is.
         size: true size over the model's size.
-        path: path of the body through the world.
+        path: path through the world.
         phase: phase of the limb cycle at the start [rad].
-        grounded: whether the target stands on the ground, so that its height follows from its size.
-        own: file of a user's own model, which is rigid and has the model's size.
+        own_way: whether the path is the kind's own, and no waypoints.
     """
 
     name: str
-    beat_s: float
+    kind: TargetKind
     size: float
     path: Path = field(repr=False)
     phase: float = 0.0
-    grounded: bool = False
-    own: FilePath | None = None
-
-    @property
-    def kind(self) -> str:
-        """Kind of the target, one of TARGETS or a user's own; also the name of the model's body."""
-        return split_name(self.name)[0]
+    own_way: bool = False
 
     @property
     def body(self) -> str:
         """Name of the target's body in the compiled world."""
-        return f"{self.name}/{self.kind}"
+        return f"{self.name}/{self.kind.name}"
 
     def pose(self, t: float) -> TargetPose:
         """Give pose and joint angles at time ``t`` [s]."""
-        if self.kind == "book":
-            place = self.path.position(t)
-            return TargetPose(place, Rotation.from_euler("ZYX", face_mount(place, t, self.phase)), {})
         position, axes, joints = self.stance(t, self.beat(t))
         return TargetPose(np.array(position), Rotation.from_matrix(np.transpose(axes), assume_valid=True), joints)
 
-    def stance(self, t: float, beat: float) -> tuple[list[float], Axes, Mapping[str, float]]:
+    def stance(self, t: float, beat: float) -> Stance:
         """Give pose and joint angles as floats, which is faster than `pose`.
 
         Args:
             t: the time [s].
             beat: phase of the limb cycle at that time, from `beat` [rad].
-
-        Returns:
-            Position of the body [m], (3,); axes of the body in the world; joint angles [rad] by name.
         """
-        position, velocity, acceleration = self.path.motion(t)
-        kind = self.kind
-        if kind == "book":
-            return position, turned(*face_mount(position, t, self.phase)), {}
-        if kind == "bird":
-            return position, bank(heading(position, velocity), acceleration), flap(beat)
-        if self.own is not None:
-            return position, heading(position, velocity), {}
-        joints, bob = walk(beat, min(math.hypot(*velocity) / WALK_SPEED, 1.0))
-        axes = heading(position, [*velocity[:2], 0.0 * velocity[2]])  # a walking person stays upright
-        position[2] += bob * self.size + (0.5 * PERSON_HEIGHT * self.size if self.grounded else 0.0)
-        return position, axes, joints
+        return self.kind.stance(self, t, beat)
 
     def beat(self, t: float) -> float:
-        """Give the phase of the limb cycle at time ``t`` [s], which grows without limit [rad]."""
-        if self.kind == "person":
-            return self.phase + 2 * np.pi * self.path.travelled(t) / (STRIDE * self.size)
-        return self.phase + 2 * np.pi * WING_BEAT_HZ * t
+        """Give the phase of the limb cycle at time ``t`` [s], which may grow without limit [rad]."""
+        return self.kind.beat(self, t)
+
+
+def own_kind(name: str, model: FilePath) -> TargetKind:
+    """Make the kind of a user's own model, which is rigid, turns as it moves and has the model's size."""
+
+    def stance(target: Target, t: float, beat: float) -> Stance:
+        position, velocity, _ = target.path.motion(t)
+        return position, heading(position, velocity), {}
+
+    return TargetKind(name, stance, None, own=model)
 
 
 def make_target(
@@ -154,30 +145,26 @@ def make_target(
     """Make one target.
 
     Args:
-        name: one of TARGETS, with a number from 2 on for a further one of its kind.
-        scene: name or path of the scene. Any scene but the built-in ones has the indoor paths of book and person and
-            the outdoor path of the bird.
+        name: one of KINDS or a user's own, with a number from 2 on for a further one of its kind.
+        scene: name or path of the scene.
         rng: source of the small differences between runs; the same seed gives the same path.
         scatter: whether the true size differs from the nominal size.
         waypoints: [t, x, y, z] of the body's centre in the world [s, m], in place of the kind's own path.
         own: file of a user's own model, which needs waypoints.
 
     Raises:
-        ConfigError: an unknown target, or waypoints whose times do not increase.
+        ConfigError: an unknown target, no waypoints where the kind has no path, or waypoints whose times do not
+            increase.
     """
-    if own is not None:
-        if waypoints is None:
-            raise ConfigError(f"sim.targets: a {name} of your own needs a way: [sim.paths] {name}")
-        return Target(name, 0.0, 1.0, waypoint_path(waypoints, f"sim.paths.{name}"), own=own)
-    kind = kind_of(name)
+    kind = kind_of(name) if own is None else own_kind(split_name(name)[0], own)
     # Drawn also where it is not used, so that no switch changes the path.
-    size = draw_size(name, rng, scatter)
+    size = _draw_size(kind, rng, scatter)
     phase = float(rng.uniform(0.0, 2 * np.pi))
-    make = {"book": book_path, "person": person_path, "bird": bird_path}[kind]
-    path = make(scene, rng) if waypoints is None else waypoint_path(waypoints, f"sim.paths.{name}")
-    beat_s = {"book": 0.0, "person": STRIDE / WALK_SPEED, "bird": 1 / WING_BEAT_HZ}[kind]
-    grounded = kind == "person" and waypoints is None
-    return Target(name, beat_s, size, path, phase, grounded)
+    if waypoints is not None:
+        return Target(name, kind, size, waypoint_path(waypoints, f"sim.paths.{name}"), phase)
+    if kind.path is None:
+        raise ConfigError(f"sim.targets: a {name} of your own needs a way: [sim.paths] {name}")
+    return Target(name, kind, size, kind.path(scene, rng), phase, own_way=True)
 
 
 def target_rng(seed: int, name: str) -> np.random.Generator:
@@ -187,43 +174,47 @@ def target_rng(seed: int, name: str) -> np.random.Generator:
 
 def draw_size(name: str, rng: np.random.Generator, scatter: bool) -> float:
     """Draw a target's true size over its nominal size; it is the first number from its generator."""
-    return 1.0 + SCATTER[kind_of(name)] * SCATTER_SIGMA * float(np.clip(rng.standard_normal(), -2.0, 2.0)) * scatter
+    return _draw_size(kind_of(name), rng, scatter)
 
 
-def kind_of(name: str) -> str:
-    """Give the kind of a target by its name: ``bird`` for ``bird`` and for ``bird2``.
-
-    Raises:
-        ConfigError: an unknown target.
-    """
-    return TARGETS[_place_of(name)[0]]
-
-
-def marker_of(name: str) -> int:
-    """Give the marker on a target, an id in DICT_4X4_50.
-
-    Raises:
-        ConfigError: an unknown target.
-    """
-    kind, number = _place_of(name)
-    marker = MARKERS[TARGETS[kind]]
-    return marker if kind == 0 else marker + MARKER_STEP * ((number - 1) % MARKERS_OF_A_KIND)
+def _draw_size(kind: TargetKind, rng: np.random.Generator, scatter: bool) -> float:
+    return 1.0 + kind.scatter * SCATTER_SIGMA * float(np.clip(rng.standard_normal(), -2.0, 2.0)) * scatter
 
 
 @lru_cache(maxsize=256)
-def _place_of(name: str) -> tuple[int, int]:
-    """Split a name into the index of its kind in TARGETS and its number, counted from 1."""
-    kind, number = split_name(name)
-    if kind not in TARGETS:
+def kind_of(name: str) -> TargetKind:
+    """Find the kind of a target by its name: that of ``bird`` for ``bird`` and for ``bird2``.
+
+    Raises:
+        ConfigError: an unknown target.
+    """
+    kind, _ = split_name(name)
+    if kind not in KINDS:
         raise ConfigError(f"unknown target '{name}'; {known_targets()}")
-    return TARGETS.index(kind), number
+    found: TargetKind = importlib.import_module(f"cotarget.sim.targets.{kind}").KIND
+    return found
+
+
+def marker_of(name: str) -> int | None:
+    """Give the marker on a target, an id in DICT_4X4_50; None for a kind without markers.
+
+    Raises:
+        ConfigError: an unknown target.
+    """
+    kind = kind_of(name)
+    return None if kind.marker is None else kind.marker + kind.marker_step * _index(name)
+
+
+def _index(name: str) -> int:
+    """Give a target's index among the markers of its kind."""
+    return (split_name(name)[1] - 1) % MARKERS_OF_A_KIND
 
 
 def change_marker(spec: "mujoco.MjSpec", name: str) -> None:
     """Set the marker of that name on a target's model; do it before attaching."""
-    kind, number = _place_of(name)
-    if kind and (number - 1) % MARKERS_OF_A_KIND:
-        spec.texture(f"{TARGETS[kind]}_marker").file = f"{TARGETS[kind]}_marker_{marker_of(name)}.png"
+    kind = kind_of(name)
+    if kind.marker_step and _index(name):
+        spec.texture(f"{kind.name}_marker").file = f"{kind.name}_marker_{marker_of(name)}.png"
 
 
 def scale_spec(spec: "mujoco.MjSpec", factor: float) -> None:
