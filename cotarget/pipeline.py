@@ -9,24 +9,25 @@ import enum
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from numbers import Real
 
 import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.calibration.plausibility import check_plausible
-from cotarget.config import TargetProfile
+from cotarget.config import TargetProfile, check_shown
 from cotarget.control.controller import Controller, Predict
 from cotarget.control.head import HeadSettings
 from cotarget.control.selection import FirstCome, TargetSelector
 from cotarget.control.zoom import ZoomSettings, shape_of
 from cotarget.detection import Detection, Detector, make_detector
 from cotarget.detection.base import flood
-from cotarget.errors import DeviceError, StaleFrameError, UnreachableError
+from cotarget.errors import ConfigError, DeviceError, StaleFrameError, UnreachableError, choices
 from cotarget.estimation import Estimate, FilterSettings
 from cotarget.estimation.zoom_matching import MatchingSettings, ZoomMeasurement
 from cotarget.fusion import FusionSettings, MakeFinder, TargetFusion
 from cotarget.rig import FUTURE_S, PATIENCE_S, Camera, Clock, Frame, Image, PanTiltState, Rig, ZoomState, opened_from
-from cotarget.targeting import Aim
+from cotarget.targeting import Aim, target_implausibility
 from cotarget.tracking.track import Track, TrackingSettings, tracking_settings
 from cotarget.tracking.tracker import Tracker
 
@@ -288,21 +289,26 @@ def follow(
         target: target profile, or its name in the rig's configuration.
         detector: detector for the fixed camera's images; by default the one that the target profile names.
         selector: selects the track to follow; by default the first that comes.
-        seconds: duration on the rig's clock [s].
+        seconds: duration on the rig's clock [s]; without an end by default.
         settings: settings of the run.
-        insist: whether to accept an implausible calibration, see `check_plausible`.
+        insist: whether to accept an implausible calibration or target profile, see `check_plausible` and
+            `target_implausibility`.
 
     Raises:
         CalibrationError: the calibration has no T, or is implausible or another rig's.
-        ConfigError: the target is unknown, the rig has no configuration to take it from, or the calibration has another
-            aspect ratio than the rig's streams.
+        ConfigError: the target is unknown or implausible, the simulated scene lacks it, the rig has no configuration to
+            take it from, the calibration has another aspect ratio than the rig's streams, or an argument has the wrong
+            type.
         StaleFrameError: frames of the fixed camera stopped coming, came too late to act on, or repeated; or the zoom
             camera showed nothing new for 10 s. Until then the run goes on without it, and every Step says so.
         DeviceError: a device failed, or its frames changed their size.
     """
+    _check_seconds(seconds)
     calibration.hand_eye()  # raises with the first step, not when the first target is seen
     check_plausible(calibration, rig.spec, insist=insist)
-    wanted = opened_from(rig).target(target) if isinstance(target, str) else target
+    name, wanted = _profile(rig, target)
+    if not insist and (text := target_implausibility(wanted, calibration, rig.spec, name)):
+        raise ConfigError(f"{text}; insist=True follows it all the same")
     if detector is None:
         detector = make_detector(wanted, rig.spec.fixed.rate_hz)
     if settings is None:
@@ -312,6 +318,29 @@ def follow(
     end = rig.clock.now() + seconds
     while rig.clock.now() < end:
         yield loop.turn()
+
+
+def _check_seconds(seconds: object) -> None:
+    if not (isinstance(seconds, Real) and float(seconds) > 0):
+        raise ConfigError(f"follow: seconds is {seconds!r}; give a number greater than zero")
+
+
+def _profile(rig: Rig, target: TargetProfile | str) -> tuple[str, TargetProfile]:
+    """Return the name, empty where it has none, and the profile of a target.
+
+    Raises:
+        ConfigError: it is none, is unknown, or is not in the simulated scene.
+    """
+    if isinstance(target, TargetProfile):
+        return "", target
+    config = opened_from(rig)
+    if not isinstance(target, str):
+        raise ConfigError(
+            f"follow: target is {target!r}; give a TargetProfile or one name, of: {choices(config.targets)}"
+        )
+    profile = config.target(target)
+    check_shown(config, target)
+    return target, profile
 
 
 class _Loop:

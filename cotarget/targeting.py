@@ -12,10 +12,11 @@ import numpy.typing as npt
 
 from cotarget.calibration import Calibration, predicted_pointing
 from cotarget.camera import depth_from_size, focal_for_size
-from cotarget.config import TargetProfile
+from cotarget.config import DEFAULT_TARGETS, TargetProfile, split_name
 from cotarget.errors import ConfigError, UnreachableError, choices
 from cotarget.geometry import FARTHEST_M, Array
 from cotarget.pantilt import Pointing, nearest, shortcut, solve
+from cotarget.rig import RigSpec
 
 Method = Literal["exact", "paper-table", "paper-example"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -100,6 +101,54 @@ def depth_of(
     """
     vertical = target.is_vertical(height=2.0 if upright else 1.0)
     return depth_from_size(calibration.fixed, target.size, size_px, np.asarray(center_px, float), vertical=vertical)
+
+
+# Sizes of targets [m]. Beyond them another unit was meant: a beetle has 5 mm, the largest aircraft 84 m.
+SIZES_M = (1e-3, 200.0)
+KIND_TIMES = 10.0  # factor beyond which a target of a known kind has a size that its kind never has
+
+
+def target_implausibility(target: TargetProfile, calibration: Calibration, spec: RigSpec, name: str = "") -> str:
+    """Describe what of a target profile is far outside of anything plausible on a rig; empty where nothing is.
+
+    Args:
+        target: the target profile.
+        calibration: calibration of the rig.
+        spec: description of the rig in use.
+        name: name of the target in the rig's configuration; its kind, such as that of ``bird2``, has a usual size.
+
+    Raises:
+        ConfigError: a stream has another aspect ratio than that calibrated.
+    """
+    where = f"targets.{name}" if name else "target"
+    if not SIZES_M[0] <= target.size <= SIZES_M[1]:
+        return f"{where}.size: {target.size:g} m is no size of a target; sizes are in metres"
+    usual = DEFAULT_TARGETS.get(split_name(name)[0])
+    if usual is not None and usual.dimension == target.dimension:
+        times = target.size / usual.size
+        if max(times, 1 / times) > KIND_TIMES:
+            return (
+                f"{where}.size: {target.size:g} m is far from the {usual.size:g} m of a {split_name(name)[0]}; sizes "
+                "are in metres"
+            )
+    along = 1 if target.is_vertical() else 0
+    room_px = max(spec.zoom.size) if target.largest_over_time else spec.zoom.size[along]
+    if target.wanted_px > room_px:
+        width, height = spec.zoom.size
+        return (
+            f"{where}.wanted_px: {target.wanted_px:g} px does not fit into the zoom camera's {width}x{height} image; "
+            f"give less than {room_px}"
+        )
+    # The nearest target fills the fixed image, and the longest focal length shows it largest.
+    fixed = calibration.fixed.resized(spec.fixed.size)
+    longest = calibration.zoom.resized(spec.zoom.size).at(spec.zoom.focal_range[1])
+    largest_px = longest.focal_px[along] * spec.fixed.size[along] / fixed.focal_px[along]
+    if target.wanted_px > largest_px:
+        return (
+            f"{where}.wanted_px: {target.wanted_px:g} px is more than the {largest_px:.0f} px at which the longest "
+            "focal length shows a target that fills the fixed image"
+        )
+    return ""
 
 
 def point_at(calibration: Calibration, pixel: Array, depth: float) -> Array:

@@ -12,7 +12,17 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.errors import CalibrationError, ConfigError, CotargetError, UnreachableError
 from cotarget.geometry import RigidTransform, Rotation
 from cotarget.pantilt import HeadGeometry
-from cotarget.targeting import METHODS, Reach, WantedSize, aim, depth_of, error_budget, point_at
+from cotarget.rig import CameraSpec, HeadSpec, RigSpec, ZoomSpec
+from cotarget.targeting import (
+    METHODS,
+    Reach,
+    WantedSize,
+    aim,
+    depth_of,
+    error_budget,
+    point_at,
+    target_implausibility,
+)
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
 
 # The solver accepts a miss of 1e-11 rad, which is 1e-7 px at the longest focal length of 8000 px.
@@ -303,3 +313,40 @@ def test_a_pixel_and_its_depth_aim_at_the_point_that_they_mean():
 def test_a_target_given_in_no_way_or_in_two_is_refused(given):
     with pytest.raises(ConfigError):
         aim(HOME, **given)
+
+
+def spec(zoom_size=(640, 480), longest_px=8000.0):
+    return RigSpec(
+        CameraSpec(SIZE, 25.0, 0.06),
+        ZoomSpec(zoom_size, 25.0, 0.06, (667.0, longest_px), 0.009, zoom_size, 0.04),
+        HeadSpec(None, 0.04),
+    )
+
+
+BOOK, PERSON, BIRD = (DEFAULT_TARGETS[name] for name in ("book", "person", "bird"))
+
+
+@pytest.mark.parametrize(("target", "name", "rig", "said"), [
+    (BOOK, "book", spec(), ""),
+    (PERSON, "person", spec(), ""),
+    (BIRD, "bird", spec(), ""),
+    (replace(BIRD, size=0.2), "bird2", spec(), ""),  # a sparrow
+    (replace(BOOK, size=23.4), "book", spec(), "targets.book.size: 23.4 m is far from the 0.234 m of a book;"),
+    (replace(BIRD, size=80.0), "bird2", spec(), "targets.bird2.size: 80 m is far from the 0.8 m of a bird;"),
+    (replace(BOOK, size=23.4), "house", spec(), ""),
+    (replace(BOOK, size=600.0), "dog", spec(), "targets.dog.size: 600 m is no size of a target; sizes are in metres"),
+    (replace(BOOK, size=600.0), "", spec(), "target.size: 600 m is no size of a target; sizes are in metres"),
+    (replace(BOOK, wanted_px=5000.0), "book", spec(),
+     "targets.book.wanted_px: 5000 px does not fit into the zoom camera's 640x480 image; give less than 640"),
+    (PERSON, "person", spec((320, 240)),
+     "targets.person.wanted_px: 300 px does not fit into the zoom camera's 320x240 image; give less than 240"),
+    (replace(BIRD, wanted_px=500.0), "bird", spec(), ""),  # along the width
+    # 686 px show a target that fills the 640 px wide fixed image; 300 px show it 280 px wide.
+    (replace(BOOK, wanted_px=300.0), "book", spec(longest_px=667.0), ""),
+    (replace(BOOK, wanted_px=300.0), "book", spec(longest_px=300.0 * 667 / 686),
+     "targets.book.wanted_px: 300 px is more than the 280 px at which the longest focal length shows a target that"),
+])  # fmt: skip
+def test_what_no_target_is_and_no_lens_shows_is_implausible(target, name, rig, said):
+    found = target_implausibility(target, HOME, rig, name)
+    assert found.startswith(said)
+    assert bool(found) == bool(said)

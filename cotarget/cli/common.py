@@ -80,31 +80,6 @@ def load_plausible(path: Path, spec: "RigSpec | None" = None, *, insist: bool) -
     return calibration
 
 
-def check_shown(config: "RigConfig", name: str, rig: Path) -> None:
-    """Refuse to follow a target that the simulated scene does not contain.
-
-    Args:
-        config: the rig's configuration.
-        name: name of the target, one of the configuration's.
-        rig: file of the configuration.
-
-    Raises:
-        ConfigError: the scene lacks the target; the message says how to add it.
-    """
-    from cotarget.config import TARGETS, known_targets, split_name
-
-    if config.backend != "sim" or name in config.sim.targets:
-        return
-    own = config.sim.models
-    if split_name(name)[0] not in (*TARGETS, *own):
-        raise ConfigError(
-            f"--target: a simulated {name} cannot be, whatever [targets.{name}] says; {known_targets(own)}"
-        )
-    raise ConfigError(
-        f"{rig}: the simulated scene has no {name}; add it: [sim] targets = {json.dumps([*config.sim.targets, name])}"
-    )
-
-
 class Selection:
     """Selector of the target by the options, and whether a matching track ever appeared.
 

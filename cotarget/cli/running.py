@@ -17,7 +17,6 @@ from cotarget.cli.common import (
     Selection,
     SkippedFrames,
     check_outputs,
-    check_shown,
     load_plausible,
     nothing,
     print_json,
@@ -97,8 +96,18 @@ def _config(options: argparse.Namespace) -> "RigConfig":
         raise ConfigError(f"{options.rig}: backend is '{config.backend}'; what is viewed is a simulated rig")
     if options.target is not None:
         config.target(options.target)
-        check_shown(config, options.target, options.rig)
+        _check_shown(config, options)
     return config
+
+
+def _check_shown(config: "RigConfig", options: argparse.Namespace) -> None:
+    """Refuse to follow a target that the simulated scene does not contain; name the file."""
+    from cotarget.config import check_shown
+
+    try:
+        check_shown(config, options.target)
+    except ConfigError as error:
+        raise ConfigError(f"{options.rig}: {error}") from None
 
 
 def _opener(options: argparse.Namespace) -> "Callable[[Truth], Any]":
@@ -180,13 +189,16 @@ def follow(options: argparse.Namespace) -> int:
     from cotarget.recording.recorder import Recorder
     from cotarget.safety.safe_rig import guard
     from cotarget.safety.stop_file import refuse_if_stopped
+    from cotarget.targeting import target_implausibility
 
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
-    config.target(options.target)  # refuse an unknown target before the long work
+    target = config.target(options.target)  # refuse an unknown target before the long work
     spec = describe(config)
     calibration = load_plausible(options.calibration, spec, insist=options.insist)
-    check_shown(config, options.target, options.rig)
+    _check_shown(config, options)
+    if not options.insist and (text := target_implausibility(target, calibration, spec, options.target)):
+        raise ConfigError(f"{options.rig}: {text}; --insist follows it all the same")
     inputs = [*rig_files(options.rig, config), options.calibration]
     check_outputs([options.csv, options.video], inputs, options.record)
     selection = Selection(options, spec.fixed.size)
@@ -321,7 +333,7 @@ def _follow(
             if film is not None:
                 film.epoch = epoch
             try:
-                # `follow` has checked the calibration; a recorded run is replayed with whatever it had.
+                # `follow` has checked calibration and target; a recorded run is replayed with whatever it had.
                 selector = selection.selector
                 followed = follow(rig, calibration, target, detector, selector=selector, seconds=limit, insist=True)
                 for step in until_end(followed):

@@ -77,3 +77,15 @@ def test_offsets_in_millimetres_are_refused(tmp_path, capsys, true):
     assert (status, out) == (1, "")
     assert "T_zoom0_fixed: the cameras are 4" in err
     assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("rig", "said"), [
+    (LARGE_BOOK.replace("2.3", "23.4"), "targets.book.size: 23.4 m is far from the 0.234 m of a book"),
+    (LARGE_BOOK.replace("160", "5000"), "targets.book.wanted_px: 5000 px does not fit into the zoom camera's 640x480"),
+])  # fmt: skip
+def test_what_no_target_is_and_no_lens_shows_is_refused(tmp_path, capsys, true, rig, said):
+    status, out, err = follow(tmp_path, capsys, true, rig=RIG + rig)
+    assert (status, out) == (1, "")
+    assert err.startswith(f"cotarget follow: {tmp_path / 'rig.toml'}: {said}")
+    assert err.endswith("; --insist follows it all the same\n")
+    assert len(err.splitlines()) == 1

@@ -9,7 +9,7 @@ import pytest
 
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.config import DEFAULT_TARGETS
+from cotarget.config import DEFAULT_TARGETS, RigConfig, SimConfig
 from cotarget.control.selection import FirstCome
 from cotarget.control.zoom import ZoomSettings
 from cotarget.detection import Detection
@@ -461,3 +461,29 @@ def test_a_picture_that_changes_as_a_whole_is_told():
     assert {step.reason for step in run(Rig(), seer, 0.5)} == {
         "nothing is detected: 50% of the wide view changed at once, as when the light does or the camera moves"
     }
+
+
+@pytest.mark.parametrize(("arguments", "said"), [
+    ({"target": ["bird"]}, "follow: target is ['bird']; give a TargetProfile or one name, of: bird, book, person"),
+    ({"target": "whale"}, "unknown target 'whale'; the targets are: bird, book, person"),
+    ({"target": "bird"}, 'the simulated scene has no bird; add it: [sim] targets = ["book", "bird"]'),
+    ({"seconds": -1}, "follow: seconds is -1; give a number greater than zero"),
+    ({"seconds": math.nan}, "follow: seconds is nan; give a number greater than zero"),
+    ({"seconds": "8"}, "follow: seconds is '8'; give a number greater than zero"),
+    ({"target": replace(BOOK, wanted_px=5000.0)}, "target.wanted_px: 5000 px does not fit into the zoom camera's"),
+    ({"target": replace(BOOK, size=234.0)}, "target.size: 234 m is no size of a target; sizes are in metres; insist="),
+])  # fmt: skip
+def test_a_wrong_argument_is_refused_with_the_first_step(arguments, said):
+    rig = Rig()
+    config = RigConfig(sim=SimConfig(targets=("book",)))
+    steps = follow(rig_of(rig, config=config), CALIBRATION, **{"target": BOOK, "detector": Seer(still), **arguments})
+    with pytest.raises(ConfigError) as raised:
+        next(steps)
+    assert str(raised.value).startswith(said)
+    assert not rig.moves
+
+
+def test_an_implausible_target_is_followed_on_request():
+    large = replace(BOOK, wanted_px=5000.0)
+    steps = follow(rig_of(Rig()), CALIBRATION, large, Seer(still), seconds=0.5, insist=True)
+    assert [step.state for step in steps][-1] is State.FOLLOWING
