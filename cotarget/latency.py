@@ -11,6 +11,7 @@ constant. The choice of intervals: docs/design-notes.md.
 """
 
 import itertools
+import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ from cotarget.geometry import Array, RigidTransform, pose
 from cotarget.rig import Camera, Frame, Image, PanTiltState, Rig
 from cotarget.targeting import aim
 
+log = logging.getLogger(__name__)
 GROWTH = 2.0  # zoom factor of a measurement, or the lens's whole range; less than LEAST_GROWTH measures nothing
 LEAST_GROWTH = 1.1
 WAYS = 6  # number of ways, in and out alternately
@@ -173,7 +175,8 @@ LONGEST_DELAY = 0.6  # largest delay searched, of either sign [s]
 COARSE = 0.01  # step of the coarse search [s]
 FEWEST = 20  # fewest samples of a motion
 AGREEMENT = 0.9  # least correlation of two records
-ASIDE_DEG = 5.0  # farther from straight ahead than this, the message suggests pointing the head there
+ASIDE = np.radians(1.0)  # farther from straight ahead than this, the head measures there where it sees no motion [rad]
+BANDS = 3  # horizontal parts of the image that are compared one by one where the whole does not move
 EARLY = 0.4  # part of a turn's way in which the head still accelerates
 BOARD_SHARE, BOARD_TURNED = 0.35, 15.0  # part of the fixed image's width that the board fills; its turn [degrees]
 
@@ -205,7 +208,8 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
     """Measure the latencies of zoom camera and head by wiggling the head.
 
     Args:
-        rig: the rig; its lens goes to the shortest focal length, and its head back to where it was.
+        rig: the rig; its lens goes to the shortest focal length, and its head back to where it was; or straight
+            ahead, where the image showed no motion there.
         seconds: duration [s].
 
     Raises:
@@ -214,8 +218,25 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
     """
     _zoom_out(rig)
     home = rig.head.state()
+    try:
+        return _wiggle(rig, (home.pan, home.tilt), seconds)
+    except CalibrationError as error:
+        if max(abs(home.pan), abs(home.tilt)) <= ASIDE:
+            raise
+        log.warning("%s; the head measures straight ahead", error)
+    return _wiggle(rig, rig.head.move(0.0, 0.0, wait=True), seconds)
+
+
+def _wiggle(rig: Rig, home: tuple[float, float], seconds: float) -> HeadLatency:
+    """Wiggle the head about a pan and tilt [rad] for some seconds, and compare its reports with the image's shift.
+
+    Raises:
+        CalibrationError: the image does not move with the head.
+        StaleFrameError: frames stopped coming.
+    """
+    pan, tilt = home
     low, high = rig.head.limits.pan
-    way = WIGGLE if home.pan + WIGGLE <= high else -WIGGLE
+    way = WIGGLE if pan + WIGGLE <= high else -WIGGLE
     frames: list[Frame] = []
     states: list[PanTiltState] = []
     starts: list[tuple[float, float, float]] = []
@@ -223,32 +244,41 @@ def measure_head(rig: Rig, seconds: float = WIGGLE_SECONDS) -> HeadLatency:
     pauses = itertools.cycle(TURNS_EVERY)
     end = rig.clock.now() + seconds
     while rig.clock.now() < end:
-        goal = min(max(home.pan + way * next(side), low), high)
+        goal = min(max(pan + way * next(side), low), high)
         before = rig.head.state().pan
         t = rig.clock.now()
-        goal, _ = rig.head.move(goal, home.tilt)
+        goal, _ = rig.head.move(goal, tilt)
         starts.append((t, before, goal))
         for frame in _frames(rig, rig.zoom, t + next(pauses), frames[-1].t if frames else None, states):
             frames.append(frame)
-    rig.head.move(home.pan, home.tilt, wait=True)
+    rig.head.move(pan, tilt, wait=True)
     if len(frames) < FEWEST:
         raise StaleFrameError(f"the zoom camera gave {len(frames)} frames in {seconds:g} s; {FEWEST} are needed")
-    shifts = picture_shifts([frame.image for frame in frames])
-    t, pans = np.array([(state.t, state.pan) for state in states]).T
-    zoom = delay_between(np.array([frame.t for frame in frames]), shifts, t, pans)
+    times, pans = np.array([(state.t, state.pan) for state in states]).T
+    zoom = _zoom_delay(frames, times, pans)
     if zoom.agreement < AGREEMENT:
-        pan, tilt = np.degrees(home.pan), np.degrees(home.tilt)
-        elsewhere = (
-            ", such as by cotarget point --rig FILE --pan-deg 0 --tilt-deg 0"
-            if max(abs(pan), abs(tilt)) > ASIDE_DEG
-            else ""
-        )
         raise CalibrationError(
-            f"the zoom camera's picture at pan {pan:z.1f}, tilt {tilt:z.1f} degrees does not move with the head "
-            f"(correlation {zoom.agreement:.2f}); point it at something with structure that stands still, not at the "
-            f"sky{elsewhere}"
+            f"the zoom camera's picture at pan {np.degrees(pan):z.1f}, tilt {np.degrees(tilt):z.1f} degrees does not "
+            f"move with the head (correlation {zoom.agreement:.2f}); point it at something with structure that stands "
+            "still, not at the sky"
         )
     return HeadLatency(zoom, command_delay(starts, states, rig.head.limits.acceleration), len(frames))
+
+
+def _zoom_delay(frames: Sequence[Frame], times: Array, pans: Array) -> Delay:
+    """Find the delay of the zoom camera's frames from the shift of the image, or of the third of it that agrees best.
+
+    Above the horizon the sky does not show the motion; a third of the image may show it all the same.
+    """
+    t = np.array([frame.t for frame in frames])
+    images = [frame.image for frame in frames]
+    whole = delay_between(t, picture_shifts(images), times, pans)
+    if whole.agreement >= AGREEMENT:
+        return whole
+    edges = np.linspace(0, images[0].shape[0], BANDS + 1).astype(int)
+    bands = [[image[top:bottom] for image in images] for top, bottom in itertools.pairwise(edges)]
+    delays = [delay_between(t, picture_shifts(band), times, pans) for band in bands]
+    return max(whole, *delays, key=lambda delay: delay.agreement)
 
 
 def measure_fixed(

@@ -65,6 +65,9 @@ class LateCamera:
         return Frame(frame.image, frame.t + self._by)
 
 
+SMALL = {"fixed": {"rate_hz": 15.0}, "zoom": {"rate_hz": 10.0, "size": [320, 240]}}
+
+
 class Wrapped:
     def __init__(self, rig, **changed):
         self.fixed, self.zoom, self.head, self.clock, self.board = rig.fixed, rig.zoom, rig.head, rig.clock, rig.board
@@ -75,8 +78,16 @@ class Wrapped:
 def world():
     from cotarget.sim.world import SimWorld
 
-    config = parse_config({"sim": {"fixed": {"rate_hz": 15.0}, "zoom": {"rate_hz": 10.0, "size": [320, 240]}}})
-    world = SimWorld(config)
+    world = SimWorld(parse_config({"sim": SMALL}))
+    yield world
+    world.rig.close()
+
+
+@pytest.fixture
+def outdoors():
+    from cotarget.sim.world import SimWorld
+
+    world = SimWorld(parse_config({"sim": {**SMALL, "scene": "outdoor"}}))
     yield world
     world.rig.close()
 
@@ -102,12 +113,23 @@ def test_a_picture_that_stands_still_is_no_measurement(world):
         CalibrationError, match=r"at pan 0\.0, tilt 0\.0 degrees does not move with the head .* the sky$"
     ):
         measure_head(frozen, seconds=4.0)
-    world.rig.head.move(0.0, np.radians(20), wait=True)
-    with pytest.raises(
-        CalibrationError, match=r"the sky, such as by cotarget point --rig FILE --pan-deg 0 --tilt-deg 0$"
-    ):
-        measure_head(frozen, seconds=4.0)
-    world.rig.head.move(0.0, 0.0, wait=True)
+
+
+@pytest.mark.render
+@pytest.mark.parametrize(
+    ("pan_deg", "tilt_deg", "ends_at_deg"),
+    [
+        pytest.param(10.0, 5.0, (10.0, 5.0), id="the ground below the horizon"),
+        pytest.param(0.0, 28.0, (0.0, 0.0), id="the sky alone, then straight ahead"),
+    ],
+)
+def test_the_head_is_measured_where_it_stands_or_straight_ahead(outdoors, pan_deg, tilt_deg, ends_at_deg):
+    outdoors.rig.head.move(np.radians(pan_deg), np.radians(tilt_deg), wait=True)
+    found = measure_head(outdoors.rig, seconds=4.0)
+    assert found.zoom.seconds == pytest.approx(0.0, abs=CLOSE)
+    assert found.command == pytest.approx(outdoors.config.sim.head.command_delay_s, abs=CLOSE)
+    state = outdoors.rig.head.state()
+    assert np.degrees([state.pan, state.tilt]) == pytest.approx(ends_at_deg, abs=0.06)  # a step of the head
 
 
 @pytest.mark.slow
