@@ -52,7 +52,7 @@ def _hardware() -> Iterator[str]:
     yield "## `[hardware]` { #hardware }\n"
     yield (
         "The real devices. The key `driver` of a device's table names its driver, and the driver says which other keys "
-        'there are. A driver of your own is `"module:class"`.\n'
+        'there are. A driver of your own is `"module:class"`, see [Drivers](drivers.md).\n'
     )
     for role in ROLES:
         for driver in DRIVERS[role]:
