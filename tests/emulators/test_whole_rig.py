@@ -299,10 +299,12 @@ def test_every_fault_is_survived_or_ends_in_one_line(rig, capsys, fault):
         text = rig.hardware.read_text()
         rig.hardware.write_text(text.replace(load_config(rig.hardware).hardware.head["port"], port))
     assert status in (0, 1)
-    assert len(err.splitlines()) == status
-    assert err.startswith("cotarget follow: " if status else "")
     assert stays_within_limits(watch)
-    if status:
+    if status == 0:
+        told(err, "follow")  # the book goes beyond the limits, which is a warning
+    else:
+        assert err.startswith("cotarget follow: ")
+        assert len(err.splitlines()) == 1
         assert watch.rests_since() - at < RESTS_S
 
 
@@ -318,7 +320,8 @@ def test_a_gap_in_the_stream_is_survived(rig, capsys):
     table = rig.folder / "gap.csv"
     with Watch(rig) as watch, meanwhile(break_it):
         status, _, err = run(capsys, *rig.follow("--seconds", "5", "--csv", table))
-    assert (status, err) == (0, "")
+    assert status == 0
+    told(err, "follow")
     assert stays_within_limits(watch)
     gaps = [float(b["t_fixed_s"]) - float(a["t_fixed_s"]) for a, b in pairwise(rows(table))]
     assert 0.2 <= max(gaps) < 1.0

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from cotarget.config import build
 from cotarget.errors import ConfigError
 from cotarget.geometry import RigidTransform, pose
+from cotarget.schema import validate
 from experiments.calibration import calibration_budget
 from experiments.calibration.synthetic.aims import looking_off
 from experiments.calibration.synthetic.rig import Lens, Truth
@@ -301,7 +301,7 @@ def test_a_calibration_is_to_err_as_theory_and_it_itself_have_it():
 
 @pytest.mark.slow
 def test_a_calibration_of_less_noise_points_better():
-    settings = build(
+    settings = validate(
         calibration_budget.BudgetSettings,
         {"noises_px": [0.02, 0.5], "placements": [6]},
         "",
@@ -323,7 +323,7 @@ def test_a_calibration_of_less_noise_points_better():
 def test_settings_that_cannot_be_are_refused(module, given, said):
     settings = module.EXPERIMENT.settings
     with pytest.raises(ConfigError, match=said):
-        build(type(settings), given, module.EXPERIMENT.name, base=settings)
+        validate(type(settings), given, module.EXPERIMENT.name, base=settings)
 
 
 BOUNDED = (shortcut, models, depth_error, calibration_budget)
