@@ -245,6 +245,7 @@ class Step:
             time it has, if the fixed camera is later.
         head_commands: commands sent to the head since the run began.
         lens_commands: commands sent to the lens since the run began.
+        skipped: frames of the fixed camera that were not worked on since the previous step, by its rate.
     """
 
     index: int
@@ -265,6 +266,7 @@ class Step:
     found: ZoomMeasurement | None = None
     head_commands: int = 0
     lens_commands: int = 0
+    skipped: int = 0
 
 
 def follow(
@@ -418,9 +420,15 @@ class _Loop:
             found=found,
             head_commands=self._controller.head_commands,
             lens_commands=self._controller.lens_commands,
+            skipped=self._skipped(),
         )
         self._index += 1
         return step
+
+    def _skipped(self) -> int:
+        """Number of frames of the fixed camera between the last two that were worked on."""
+        interval = self._frames.interval
+        return 0 if math.isinf(interval) else max(round(interval * self._rig.spec.fixed.rate_hz) - 1, 0)
 
     def _read_states(self) -> None:
         """Read the states of head and lens."""

@@ -142,22 +142,18 @@ def _selector_table_of(options: argparse.Namespace) -> dict[str, Any]:
 
 
 class SkippedFrames:
-    """Count of the fixed camera's frames that a run did not work on, by the times of those that it did.
+    """Count of the fixed camera's frames that a run did not work on.
 
     Attributes:
         count: frames that were skipped so far.
     """
 
-    def __init__(self, rate_hz: float) -> None:
-        """Start to count frames of a camera of this rate [Hz]."""
-        self._rate_hz, self._steps, self.count = rate_hz, 0, 0
-        self._last: float | None = None
+    def __init__(self) -> None:
+        self._steps = self.count = 0
 
     def see(self, step: "Step") -> None:
-        """Count the frames between the last step's and this one's."""
-        if self._last is not None:
-            self.count += max(0, round((step.fixed.t - self._last) * self._rate_hz) - 1)
-        self._last = step.fixed.t
+        """Count the frames skipped before a step."""
+        self.count += step.skipped
         self._steps += 1
 
     @property

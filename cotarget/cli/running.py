@@ -316,7 +316,7 @@ def _follow(
     target = config.target(name)
     detector = make_detector(target, rate_hz)
     states: dict[str, int] = dict.fromkeys(State, 0)
-    confirmed, reasons, skipped = 0, Reasons(), SkippedFrames(rate_hz)
+    confirmed, reasons, skipped = 0, Reasons(), SkippedFrames()
     limit = math.inf if seconds is None else seconds
     expected = frames if math.isinf(limit) else math.ceil(limit * rate_hz)
     is_live, first_t, epoch = config.backend == "hardware" and frames is None, None, None

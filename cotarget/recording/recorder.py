@@ -273,7 +273,7 @@ def _logged(rig: Rig, writer: RecordWriter) -> Rig:
 COLUMNS = (
     "index", "t_s", "t_fixed_s", "t_zoom_s", "state", "reason", "track", "u_px", "v_px", "width_px", "height_px",
     "depth_m", "range_m", "pan_commanded_deg", "tilt_commanded_deg", "focal_commanded_px", "pan_deg", "tilt_deg",
-    "focal_px", "utc",
+    "focal_px", "utc", "skipped",
 )  # fmt: skip
 
 
@@ -318,7 +318,7 @@ class StepTable:
             + (["", ""] if aim is None else [aim.depth, aim.range])
             + [math.degrees(pan), math.degrees(tilt), focal]
             + [math.degrees(step.head.pan), math.degrees(step.head.tilt), step.lens.focal_px]
-            + ["" if self.epoch is None else utc_text(self.epoch, step.fixed.t)]
+            + ["" if self.epoch is None else utc_text(self.epoch, step.fixed.t), step.skipped]
         )
         self._file.write(cell + 0.0 if isinstance(cell, float) else cell for cell in row)  # no -0.0
 

@@ -211,6 +211,8 @@ def test_frames_that_were_skipped_are_counted_and_leave_their_time_in_table_and_
     times = np.array([float(row["t_fixed_s"]) for row in rows])
     frames = round((times[-1] - times[0]) * 25) + 1
     assert (status, told["skipped"]) == (0, frames - len(rows))
+    assert [int(row["skipped"]) for row in rows[1:]] == list(np.round(np.diff(times) * 25).astype(int) - 1)
+    assert rows[0]["skipped"] == "0"
     assert frames > 2 * len(rows) > 50
     assert f"cotarget follow: {told['skipped']} of {frames} frames of the fixed camera were not worked on" in err
     with Film(folder / "out.mp4") as film:

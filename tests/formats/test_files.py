@@ -318,7 +318,7 @@ def test_a_recording_is_written_with_the_listed_keys(old, capsys):
 
 
 NEW_KEYS = {"skipped", "started", "states.unconfirmed"}  # of follow and replay, which v0.1.0 did not print
-NEW_COLUMNS = ["utc"]  # of follow.csv
+NEW_COLUMNS = ["utc", "skipped"]  # of follow.csv
 
 
 class Fake:
