@@ -49,33 +49,33 @@ class Node:
         t: time [s].
         x: state, see `cotarget.estimation.motion_model`, (13,).
         P: covariance of the state, (13, 13).
-        nis: running mean of the normalised innovation squared per dimension, of centres in both images.
+        mean_nis: running mean of the normalised innovation squared per dimension, of centres in both images.
         noise_scale: factor on the variance of the acceleration.
-        missed_wide: centres in the fixed image rejected in a row.
-        missed_zoom: centres in the zoom image rejected in a row.
-        missed_size: sizes rejected in a row.
+        rejected_fixed: centres in the fixed image rejected in a row.
+        rejected_zoom: centres in the zoom image rejected in a row.
+        rejected_size: sizes rejected in a row.
         size_t: time of the last size measurement [s].
-        wide_t: time of the last correction by a centre in the fixed image [s]; a start or restart is no correction.
-        moved_t: time of the last jump, when the target was found where it could not be [s].
+        fixed_t: time of the last correction by a centre in the fixed image [s]; a start or restart is no correction.
+        jump_t: time of the last jump, when the target was found where it could not be [s].
         mean_innovation: running mean of the innovation in the zoom image, in standard deviations along u and v, (2,).
     """
 
     t: float
     x: Array
     P: Array
-    nis: float = 1.0
+    mean_nis: float = 1.0
     noise_scale: float = 1.0
-    missed_wide: int = 0
-    missed_zoom: int = 0
-    missed_size: int = 0
+    rejected_fixed: int = 0
+    rejected_zoom: int = 0
+    rejected_size: int = 0
     size_t: float = -math.inf
-    wide_t: float = -math.inf
-    moved_t: float = -math.inf
+    fixed_t: float = -math.inf
+    jump_t: float = -math.inf
     mean_innovation: tuple[float, float] = (0.0, 0.0)
 
     def jumped(self, jump: Jump) -> bool:
         """Whether the last jump is so recent that the target may still be on its way."""
-        return self.t < self.moved_t + jump.seconds
+        return self.t < self.jump_t + jump.seconds
 
 
 def sound(node: Node, nearest: float) -> Node | None:
@@ -94,14 +94,14 @@ def sound(node: Node, nearest: float) -> Node | None:
 
 # Corrections by measurements
 
-ROUNDS = 4  # most rounds of an iterated correction
-SOONEST = 1e-3  # least time between two measurements, in the variance of repeated errors [s]
-SETTLED = 1e-3  # the iteration ends when the logarithm of the depth changes by less
+MOST_ITERATIONS = 4  # of an iterated correction
+LEAST_INTERVAL_S = 1e-3  # least time between two measurements, in the variance of repeated errors [s]
+CONVERGED = 1e-3  # the iteration ends when the logarithm of the depth changes by less
 
 
 @dataclass(frozen=True)
-class SizeSeen:
-    """An apparent size, as the depth at which a target of nominal size looks that large.
+class SizeObservation:
+    """Observed size, as the depth at which a target of nominal size looks that large.
 
     Attributes:
         log_depth: logarithm of that depth.
@@ -115,13 +115,13 @@ class SizeSeen:
 
 
 @dataclass(frozen=True)
-class WideSeen:
-    """A target's centre in the fixed image: tangents (2,), their covariance (2, 2), and the apparent size."""
+class FixedObservation:
+    """Observation in the fixed image: tangents of the centre (2,), their covariance (2, 2), and the apparent size."""
 
     t: float
     tangent: Array
     R: Array
-    size: SizeSeen | None
+    size: SizeObservation | None
 
     @property
     def key(self) -> tuple[float, int]:
@@ -130,8 +130,8 @@ class WideSeen:
 
 
 @dataclass(frozen=True)
-class ZoomSeen:
-    """A target's centre in the zoom image: tangents (2,), their covariance (2, 2), and the camera's sight line."""
+class ZoomObservation:
+    """Observation in the zoom image: tangents of the centre (2,), their covariance (2, 2), and the sight line."""
 
     t: float
     tangent: Array
@@ -144,17 +144,17 @@ class ZoomSeen:
         return self.t, 1
 
 
-def begin(seen: WideSeen, settings: FilterSettings) -> Node:
+def begin(observed: FixedObservation, settings: FilterSettings) -> Node:
     """Initialise the state from the first measurement.
 
-    `wide_t` stays unset, so that the second measurement counts fully: an error that both share does not change the
+    `fixed_t` stays unset, so that the second measurement counts fully: an error that both share does not change the
     velocity between them.
     """
     motion = settings.motion
     x = np.zeros(STATES)
-    x[:2] = seen.tangent
+    x[:2] = observed.tangent
     x[G] = motion.attitude_mean
-    x[L] = math.log(USUAL_DEPTH) if seen.size is None or seen.size.bound else seen.size.log_depth + x[G]
+    x[L] = math.log(USUAL_DEPTH) if observed.size is None or observed.size.bound else observed.size.log_depth + x[G]
     nearness = math.exp(-x[L])
     sigma = np.zeros(STATES)
     sigma[L] = settings.depth_sigma
@@ -162,63 +162,63 @@ def begin(seen: WideSeen, settings: FilterSettings) -> Node:
     sigma[[K, G]] = motion.size_sigma, motion.attitude_sigma
     sigma[[PAN, TILT]] = motion.bias_sigma
     P = np.diag(sigma**2)
-    P[:2, :2] = seen.R
-    return _size(Node(seen.t, x, P), seen.size, settings)
+    P[:2, :2] = observed.R
+    return _size(Node(observed.t, x, P), observed.size, settings)
 
 
-def correct_wide(node: Node, seen: WideSeen, settings: FilterSettings) -> Node:
+def correct_fixed(node: Node, observed: FixedObservation, settings: FilterSettings) -> Node:
     """Correct a node with a centre and a size in the fixed image."""
-    if seen.size is None or seen.size.bound:
-        node = _slowed(node, settings)
+    if observed.size is None or observed.size.bound:
+        node = _with_fading_velocity(node, settings)
     PHt = node.P[:, :2]
-    innovation = seen.tangent - node.x[:2]
-    R = seen.R * _repeated(node.t - node.wide_t, settings.noise_s)
+    innovation = observed.tangent - node.x[:2]
+    R = observed.R * _variance_factor(node.t - node.fixed_t, settings.noise_s)
     S_inv = _inverse(PHt[:2] + R)
     nis = float(innovation @ S_inv @ innovation)
     if nis > settings.jump_gate:
-        if node.missed_wide + 1 < settings.misses:
-            return replace(node, missed_wide=node.missed_wide + 1, missed_zoom=0, mean_innovation=(0.0, 0.0))
-        return _size(_elsewhere(node, seen, settings), seen.size, settings)
+        if node.rejected_fixed + 1 < settings.misses:
+            return replace(node, rejected_fixed=node.rejected_fixed + 1, rejected_zoom=0, mean_innovation=(0.0, 0.0))
+        return _size(_restarted(node, observed, settings), observed.size, settings)
     if nis > settings.gate:  # worse than its noise says: it counts as much as one at the gate
         S_inv = _inverse(PHt[:2] + R * (nis / settings.gate))
         nis = float(innovation @ S_inv @ innovation)
     gain = PHt @ S_inv
     P = node.P - gain @ PHt.T
     node = _with_noise_scale(
-        replace(node, x=node.x + gain @ innovation, P=P, missed_wide=0, wide_t=node.t), nis, settings
+        replace(node, x=node.x + gain @ innovation, P=P, rejected_fixed=0, fixed_t=node.t), nis, settings
     )
-    return _size(node, seen.size, settings)
+    return _size(node, observed.size, settings)
 
 
-def correct_zoom(node: Node, seen: ZoomSeen, settings: FilterSettings) -> Node:
+def correct_zoom(node: Node, observed: ZoomObservation, settings: FilterSettings) -> Node:
     """Correct a node with a centre in the zoom image, iterated because the depth enters nonlinearly."""
-    if node.missed_zoom >= settings.zoom_misses or math.hypot(*node.mean_innovation) > settings.most_mean_innovation:
-        node = replace(node, P=_inflated(node.P, settings), missed_zoom=0, mean_innovation=(0.0, 0.0))
+    if node.rejected_zoom >= settings.zoom_misses or math.hypot(*node.mean_innovation) > settings.most_mean_innovation:
+        node = replace(node, P=_inflated(node.P, settings), rejected_zoom=0, mean_innovation=(0.0, 0.0))
     # If the fixed image contradicts the state too, the target has moved, and neither its size nor the head is wrong.
-    missed = node.missed_zoom + (node.missed_wide == 0 and node.nis < settings.consistent_nis)
+    missed = node.rejected_zoom + (node.rejected_fixed == 0 and node.mean_nis < settings.consistent_nis)
     x = node.x
     nis = 0.0
-    for i in range(ROUNDS):
-        tangent, J, d = seen.sight.seen(x)
+    for i in range(MOST_ITERATIONS):
+        tangent, J, d = observed.sight.seen(x)
         if d[2] <= 0:
-            return replace(node, missed_zoom=missed)
-        innovation = seen.tangent - tangent + J @ (x - node.x)[SEEN]
+            return replace(node, rejected_zoom=missed)
+        innovation = observed.tangent - tangent + J @ (x - node.x)[SEEN]
         PHt = node.P[:, SEEN] @ J.T
-        S_inv = _inverse(J @ PHt[SEEN] + seen.R)
+        S_inv = _inverse(J @ PHt[SEEN] + observed.R)
         if i == 0:
             nis = float(innovation @ S_inv @ innovation)
             if nis > settings.gate:
-                return replace(node, missed_zoom=missed)
-            mean_innovation = _mean_innovation(node, J @ PHt[SEEN] + seen.R, innovation, settings)
+                return replace(node, rejected_zoom=missed)
+            mean_innovation = _mean_innovation(node, J @ PHt[SEEN] + observed.R, innovation, settings)
         gain = PHt @ S_inv
         before, x = x[L], node.x + gain @ innovation
-        if abs(x[L] - before) < SETTLED:
+        if abs(x[L] - before) < CONVERGED:
             break
     P = node.P - gain @ PHt.T
-    return _with_noise_scale(replace(node, x=x, P=P, missed_zoom=0, mean_innovation=mean_innovation), nis, settings)
+    return _with_noise_scale(replace(node, x=x, P=P, rejected_zoom=0, mean_innovation=mean_innovation), nis, settings)
 
 
-def _size(node: Node, size: SizeSeen | None, settings: FilterSettings) -> Node:
+def _size(node: Node, size: SizeObservation | None, settings: FilterSettings) -> Node:
     """Correct a node with an apparent size, which measures l - k - g."""
     if size is None:
         return node
@@ -226,15 +226,15 @@ def _size(node: Node, size: SizeSeen | None, settings: FilterSettings) -> Node:
     h = np.zeros(STATES)
     h[L], h[K], h[G] = 1.0, -1.0, -1.0
     # Limbs and wings move the box's sides together for a while, so sizes in quick succession share their error.
-    variance = size.sigma**2 * _repeated(node.t - node.size_t, settings.size_s)
+    variance = size.sigma**2 * _variance_factor(node.t - node.size_t, settings.size_s)
     Ph = P @ h
     S = float(h @ Ph) + variance
     innovation = size.log_depth - float(h @ node.x)
     if size.bound and innovation >= 0:  # the state is nearer than the bound already
         return node
     if innovation * innovation > settings.size_gate * S:
-        if node.missed_size + 1 < settings.misses:
-            return replace(node, missed_size=node.missed_size + 1)
+        if node.rejected_size + 1 < settings.misses:
+            return replace(node, rejected_size=node.rejected_size + 1)
         # The target has turned or come nearer unexpectedly: inflate depth and attitude.
         P = P.copy()
         P[L, L] += settings.depth_inflation**2
@@ -243,14 +243,14 @@ def _size(node: Node, size: SizeSeen | None, settings: FilterSettings) -> Node:
         S = float(h @ Ph) + variance
     x = node.x + Ph * (innovation / S)
     P = P - np.outer(Ph, Ph / S)
-    return replace(node, x=x, P=P, missed_size=0, size_t=node.size_t if size.bound else node.t)
+    return replace(node, x=x, P=P, rejected_size=0, size_t=node.size_t if size.bound else node.t)
 
 
-def _slowed(node: Node, settings: FilterSettings) -> Node:
+def _with_fading_velocity(node: Node, settings: FilterSettings) -> Node:
     """Let the velocity along the axis fade while no size measures it."""
     if math.isinf(node.size_t):
         return node
-    rho = math.exp(-(node.t - node.wide_t) / settings.unsized_s)
+    rho = math.exp(-(node.t - node.fixed_t) / settings.unsized_s)
     usual = np.array([settings.motion.speed, settings.motion.acceleration]) * math.exp(-node.x[L])
     x, P = node.x.copy(), node.P.copy()
     along = [W.stop - 1, C.stop - 1]
@@ -263,16 +263,16 @@ def _slowed(node: Node, settings: FilterSettings) -> Node:
 
 def _with_noise_scale(node: Node, nis: float, settings: FilterSettings) -> Node:
     """Update the mean NIS and scale the process noise with it: a target beyond prediction manoeuvres harder."""
-    mean = node.nis + settings.nis_gain * (nis / 2 - node.nis)
+    mean = node.mean_nis + settings.nis_gain * (nis / 2 - node.mean_nis)
     noise_scale = min(max(mean, 1.0), settings.most_noise_scale)
     if node.jumped(settings.motion.jump):
         noise_scale = max(noise_scale, settings.jump_noise_scale)
-    return replace(node, nis=mean, noise_scale=noise_scale)
+    return replace(node, mean_nis=mean, noise_scale=noise_scale)
 
 
 def _mean_innovation(node: Node, S: Array, innovation: Array, settings: FilterSettings) -> tuple[float, float]:
     """Average the zoom image's innovations; a mean far from zero shows a bias, however small it is."""
-    if node.nis >= settings.consistent_nis:  # the target manoeuvres, so its innovation shows nothing of the head
+    if node.mean_nis >= settings.consistent_nis:  # the target manoeuvres, so its innovation shows nothing of the head
         return 0.0, 0.0
     g = settings.mean_innovation_gain
     u, v = node.mean_innovation
@@ -282,17 +282,17 @@ def _mean_innovation(node: Node, S: Array, innovation: Array, settings: FilterSe
     )
 
 
-def _elsewhere(node: Node, seen: WideSeen, settings: FilterSettings) -> Node:
+def _restarted(node: Node, observed: FixedObservation, settings: FilterSettings) -> Node:
     """Restart position and motion at the measured place after a jump; size and head bias stay."""
     motion = settings.motion
     nearness = math.exp(-node.x[L])
     x, P = node.x.copy(), node.P.copy()
-    x[:2] = seen.tangent
+    x[:2] = observed.tangent
     x[C] = 0.0  # the velocity stays the best guess: a target that is carried off is soon farther off
     moved = [A, B, *range(W.start, C.stop)]
     P[moved] = 0.0
     P[:, moved] = 0.0
-    P[:2, :2] = seen.R
+    P[:2, :2] = observed.R
     # Along the axis only sizes measure, and badly: the target is taken as no faster there than usual.
     speeds = motion.jump.speed, motion.jump.speed, motion.speed
     accelerations = motion.jump.acceleration, motion.jump.acceleration, motion.acceleration
@@ -302,12 +302,12 @@ def _elsewhere(node: Node, seen: WideSeen, settings: FilterSettings) -> Node:
         node,
         x=x,
         P=P,
-        missed_wide=0,
-        missed_zoom=0,
+        rejected_fixed=0,
+        rejected_zoom=0,
         mean_innovation=(0.0, 0.0),
-        nis=1.0,
+        mean_nis=1.0,
         noise_scale=settings.jump_noise_scale,
-        moved_t=node.t,
+        jump_t=node.t,
     )
 
 
@@ -321,9 +321,9 @@ def _inflated(P: Array, settings: FilterSettings) -> Array:
     return P
 
 
-def _repeated(interval: float, lasting_s: float) -> float:
-    """Factor on a variance whose error lasts lasting_s [s], for measurements an interval apart [s]."""
-    return max(1.0, 2 * lasting_s / max(interval, SOONEST))
+def _variance_factor(interval: float, correlation_s: float) -> float:
+    """Factor on a variance whose error lasts correlation_s [s], for measurements an interval apart [s]."""
+    return max(1.0, 2 * correlation_s / max(interval, LEAST_INTERVAL_S))
 
 
 def _inverse(S: Array) -> Array:
@@ -337,7 +337,8 @@ class TargetFilter:
     """Iterated extended Kalman filter of one target: position, velocity, size, and the head's pointing bias.
 
     Measurements may come in any order. Those of the last `history_s` are kept; a late one is inserted at its time and
-    the later ones are repeated, so the result is the same as if all had come in order.
+    the later corrections are repeated, so the result is the same as if all had come in order. Reading an estimate
+    changes nothing.
     """
 
     def __init__(self, calibration: Calibration, target: TargetProfile, settings: FilterSettings | None = None) -> None:
@@ -356,8 +357,8 @@ class TargetFilter:
         self._settings = settings or filter_settings(target, calibration)
         self._sights = Sights(calibration)
         self._base: Node | None = None  # state before the first kept measurement
-        self._seen: list[WideSeen | ZoomSeen] = []
-        self._nodes: list[Node | None] = []  # states after the measurements processed so far
+        self._observed: list[FixedObservation | ZoomObservation] = []
+        self._nodes: list[Node | None] = []  # state after each of them; None before the first in the fixed image
 
     def update_fixed(
         self, detection: Measurement, t: float, *, sigma_px: Array | None = None, size_px: float | None = None
@@ -391,7 +392,7 @@ class TargetFilter:
         if size_px is not None and not detection.clipped:
             side = size_px
         size = self._size(side, J[int(vertical), int(vertical)], bound=detection.clipped)
-        return self._insert(WideSeen(t, z, (J * np.array([sigma_u**2, sigma_v**2])) @ J.T, size))
+        return self._insert(FixedObservation(t, z, (J * np.array([sigma_u**2, sigma_v**2])) @ J.T, size))
 
     def update_zoom(
         self,
@@ -426,7 +427,7 @@ class TargetFilter:
         z, J = found
         sigma = self._settings.head_sigma if head_sigma is None else head_sigma
         R = (J * np.square(sigma_px)) @ J.T + np.eye(2) * sigma**2
-        return self._insert(ZoomSeen(t, z, R, self._sights.at(pan, tilt, nominal_px)))
+        return self._insert(ZoomObservation(t, z, R, self._sights.at(pan, tilt, nominal_px)))
 
     def at(self, t: float) -> Estimate | None:
         """Estimate the target at a time [s], after the newest measurement or up to `history_s` before it.
@@ -464,49 +465,44 @@ class TargetFilter:
 
     def _before(self, t: float) -> Node | None:
         """Return the newest node that is no later than time t [s]."""
-        self._run()
         node = next((node for node in reversed(self._nodes) if node is not None and node.t <= t), self._base)
         return None if node is None or node.t > t else node
 
-    def _size(self, size_px: float, tangent_per_px: float, *, bound: bool) -> SizeSeen | None:
+    def _size(self, size_px: float, tangent_per_px: float, *, bound: bool) -> SizeObservation | None:
         """Convert a size in the image [px], or a lower bound of it, to a size measurement."""
         if not size_px > 0:
             return None
         settings = self._settings
         sigma = math.hypot(settings.size_noise, settings.size_noise_px / size_px)
-        return SizeSeen(math.log(self._target.size / (size_px * abs(tangent_per_px))), sigma, bound)
+        return SizeObservation(math.log(self._target.size / (size_px * abs(tangent_per_px))), sigma, bound)
 
-    def _insert(self, seen: WideSeen | ZoomSeen) -> bool:
-        """Insert a measurement at its time and discard the nodes after it."""
-        if not math.isfinite(seen.t) or (self._base is not None and seen.t < self._base.t):
+    def _insert(self, observed: FixedObservation | ZoomObservation) -> bool:
+        """Insert an observation at its time, repeat the later corrections, and drop what is older than the history."""
+        if not math.isfinite(observed.t) or (self._base is not None and observed.t < self._base.t):
             return False
-        at = bisect.bisect_left(self._seen, seen.key, key=lambda each: each.key)
-        if at < len(self._seen) and self._seen[at].key == seen.key:  # a repeated frame
+        at = bisect.bisect_left(self._observed, observed.key, key=lambda each: each.key)
+        if at < len(self._observed) and self._observed[at].key == observed.key:  # a repeated frame
             return False
-        self._seen.insert(at, seen)
+        self._observed.insert(at, observed)
         del self._nodes[at:]
+        for each in self._observed[at:]:
+            self._nodes.append(self._step(self._nodes[-1] if self._nodes else self._base, each))
+        while self._observed[0].t < self._observed[-1].t - self._settings.history_s:
+            self._base = self._nodes.pop(0)
+            self._observed.pop(0)
         return True
 
-    def _run(self) -> None:
-        """Process the measurements without a node, and drop those older than the history."""
-        for seen in self._seen[len(self._nodes) :]:
-            before = self._nodes[-1] if self._nodes else self._base
-            self._nodes.append(self._step(before, seen))
-        while len(self._seen) > 1 and self._seen[0].t < self._seen[-1].t - self._settings.history_s:
-            self._base = self._nodes.pop(0)
-            self._seen.pop(0)
-
-    def _step(self, node: Node | None, seen: WideSeen | ZoomSeen) -> Node | None:
+    def _step(self, node: Node | None, observed: FixedObservation | ZoomObservation) -> Node | None:
         """Propagate a node to a measurement's time and correct it."""
         settings = self._settings
         nearest = settings.motion.nearest
         if node is None:
-            return sound(begin(seen, settings), nearest) if isinstance(seen, WideSeen) else None
-        x, P = self._propagate(node, seen.t)
-        node = replace(node, t=seen.t, x=x, P=P)
-        if isinstance(seen, WideSeen):
-            corrected = correct_wide(node, seen, settings)
+            return sound(begin(observed, settings), nearest) if isinstance(observed, FixedObservation) else None
+        x, P = self._propagate(node, observed.t)
+        node = replace(node, t=observed.t, x=x, P=P)
+        if isinstance(observed, FixedObservation):
+            corrected = correct_fixed(node, observed, settings)
         else:
-            corrected = correct_zoom(node, seen, settings)
+            corrected = correct_zoom(node, observed, settings)
         # A correction that is not finite is left out.
         return sound(corrected, nearest) or sound(node, nearest)

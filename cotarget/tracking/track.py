@@ -1,8 +1,8 @@
 """Filter one track in the image: constant velocity in (u, v), with histories of size and travel.
 
 The Kalman filter is driven by white acceleration, so frames may come at any times. Neither motion nor measurement mixes
-u and v, so each coordinate has a filter of its own. They compute in floats: numpy takes ten times as long for so few
-numbers, and every track has two of them in every frame. Users of the tracker see a frozen `Track`.
+u and v, so `ImageFilter` has a filter for each coordinate. They compute in floats: numpy takes ten times as long for so
+few numbers, and every track has two of them in every frame. Users of the tracker see a frozen `Track`.
 """
 
 import math
@@ -20,56 +20,110 @@ from cotarget.geometry import Array
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Covariance of a coordinate and its velocity.
+class AxisCovariance:
+    """Covariance of an image coordinate and its velocity.
 
     Attributes:
-        at: variance of the coordinate [px^2].
-        both: covariance of the two [px^2/s].
-        speed: variance of the velocity [px^2/s^2].
+        position: variance of the coordinate [px^2].
+        cross: covariance of the two [px^2/s].
+        velocity: variance of the velocity [px^2/s^2].
     """
 
-    at: float
-    both: float
-    speed: float
+    position: float
+    cross: float
+    velocity: float
 
-    def after(self, dt: float, noise: float) -> "Spread":
+    def predicted(self, dt: float, process_noise: float) -> "AxisCovariance":
         """Predict the covariance over ``dt`` [s], forward or back, with white acceleration [px^2/s^3]."""
         span = abs(dt)
-        return Spread(
-            self.at + dt * (2 * self.both + dt * self.speed) + noise * span**3 / 3,
-            self.both + dt * self.speed + noise * dt * span / 2,
-            self.speed + noise * span,
+        return AxisCovariance(
+            self.position + dt * (2 * self.cross + dt * self.velocity) + process_noise * span**3 / 3,
+            self.cross + dt * self.velocity + process_noise * dt * span / 2,
+            self.velocity + process_noise * span,
         )
-
-
-def covariance_of(u: Spread, v: Spread) -> Array:
-    """Covariance of (u, v, du, dv), (4, 4)."""
-    return np.array(
-        [[u.at, 0.0, u.both, 0.0], [0.0, v.at, 0.0, v.both], [u.both, 0.0, u.speed, 0.0], [0.0, v.both, 0.0, v.speed]]
-    )
 
 
 class AxisFilter:
     """Kalman filter of one image coordinate [px] and its velocity [px/s]."""
 
-    def __init__(self, at: float, variance: float, speed_variance: float) -> None:
-        self.at, self.speed = at, 0.0
-        self.spread = Spread(variance, 0.0, speed_variance)
+    def __init__(self, position: float, variance: float, velocity_variance: float) -> None:
+        self.position, self.velocity = position, 0.0
+        self.covariance = AxisCovariance(variance, 0.0, velocity_variance)
 
-    def predict(self, dt: float, noise: float) -> None:
+    def predict(self, dt: float, process_noise: float) -> None:
         """Predict ``dt`` [s] ahead with white acceleration [px^2/s^3]."""
-        self.at += dt * self.speed
-        self.spread = self.spread.after(dt, noise)
+        self.position += dt * self.velocity
+        self.covariance = self.covariance.predicted(dt, process_noise)
 
     def correct(self, measured: float, variance: float) -> None:
         """Correct with a measurement [px] and its variance [px^2]."""
-        P = self.spread
-        S = P.at + variance
-        innovation, gain, speed_gain = measured - self.at, P.at / S, P.both / S
-        self.at += gain * innovation
-        self.speed += speed_gain * innovation
-        self.spread = Spread(P.at - gain * P.at, P.both - gain * P.both, P.speed - speed_gain * P.both)
+        P = self.covariance
+        S = P.position + variance
+        innovation, gain, velocity_gain = measured - self.position, P.position / S, P.cross / S
+        self.position += gain * innovation
+        self.velocity += velocity_gain * innovation
+        self.covariance = AxisCovariance(
+            P.position - gain * P.position, P.cross - gain * P.cross, P.velocity - velocity_gain * P.cross
+        )
+
+
+class ImageFilter:
+    """Kalman filter of a target in the image: centre (u, v) [px] and its velocity [px/s]."""
+
+    def __init__(
+        self, center: Sequence[float], variance: Sequence[float], velocity_variance: float, process_noise: float
+    ) -> None:
+        """Begin at rest.
+
+        Args:
+            center: first measured centre [px], (2,).
+            variance: its variances [px^2], (2,).
+            velocity_variance: variance of the unknown velocity, along each axis [px^2/s^2].
+            process_noise: spectral density of the white acceleration [px^2/s^3].
+        """
+        self._axes = [AxisFilter(at, var, velocity_variance) for at, var in zip(center, variance, strict=True)]
+        self._process_noise = process_noise
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """Centre (u, v) [px]."""
+        u, v = self._axes
+        return u.position, v.position
+
+    @property
+    def velocity(self) -> tuple[float, float]:
+        """Velocity (du, dv) [px/s]."""
+        u, v = self._axes
+        return u.velocity, v.velocity
+
+    @property
+    def center_variance(self) -> tuple[float, float]:
+        """Variances of the centre along u and v, which are uncorrelated [px^2]."""
+        u, v = self._axes
+        return u.covariance.position, v.covariance.position
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of (u, v, du, dv), (4, 4)."""
+        u, v = (axis.covariance for axis in self._axes)
+        return np.array(
+            [
+                [u.position, 0.0, u.cross, 0.0],
+                [0.0, v.position, 0.0, v.cross],
+                [u.cross, 0.0, u.velocity, 0.0],
+                [0.0, v.cross, 0.0, v.velocity],
+            ]
+        )
+
+    def predict(self, dt: float) -> None:
+        """Predict ``dt`` [s] ahead."""
+        for axis in self._axes:
+            axis.predict(dt, self._process_noise)
+
+    def correct(self, center: Sequence[float], variance: Sequence[float]) -> None:
+        """Correct with a measured centre [px] and its variances [px^2], (2,) each."""
+        for axis, at, var in zip(self._axes, center, variance, strict=True):
+            axis.correct(at, var)
 
 
 # Histories of a track's size and travel
@@ -388,8 +442,8 @@ class Track:
     shared: bool = False
 
 
-class ImageFilter:
-    """Kalman filters, histories and life cycle of one track."""
+class LiveTrack:
+    """One track while it lives: image filter, histories and life cycle."""
 
     def __init__(
         self,
@@ -401,7 +455,6 @@ class ImageFilter:
     ) -> None:
         self.number = number
         self.settings = settings
-        self.noise = settings.acceleration_px**2 * settings.manoeuvre_s
         self.t = self.born = self.seen = t
         self.detection, self.shared = detection, False
         self.hits = 1
@@ -412,20 +465,15 @@ class ImageFilter:
         # Travel is needed until the track is confirmed, and only if the settings ask for it.
         self._trail = Trail(settings.travel_s, image_size) if settings.confirm_travel else None
         self._note(detection)
-        self._u, self._v = (
-            AxisFilter(at, variance, settings.speed_px**2)
-            for at, variance in zip(detection.center_px.tolist(), self.variance(detection), strict=True)
+        process_noise = settings.acceleration_px**2 * settings.manoeuvre_s
+        self.filter = ImageFilter(
+            detection.center_px.tolist(), self.variance(detection), settings.speed_px**2, process_noise
         )
 
     @property
     def center(self) -> tuple[float, float]:
         """Centre (u, v) [px]."""
-        return self._u.at, self._v.at
-
-    @property
-    def place_variance(self) -> tuple[float, float]:
-        """Variances of the centre along u and v, which are uncorrelated [px^2]."""
-        return self._u.spread.at, self._v.spread.at
+        return self.filter.center
 
     @property
     def size(self) -> Array:
@@ -434,8 +482,7 @@ class ImageFilter:
 
     def predict(self, t: float) -> None:
         """Predict the track at time ``t`` [s]."""
-        for axis in (self._u, self._v):
-            axis.predict(t - self.t, self.noise)
+        self.filter.predict(t - self.t)
         self.t = t
 
     def correct(self, detection: Measurement) -> None:
@@ -474,8 +521,8 @@ class ImageFilter:
     def is_over(self, image_size: tuple[int, int] | None) -> bool:
         """Whether the track ends: no detection for too long, outside the image, or a score that is too low."""
         if self.missed and image_size is not None:
-            width, height = image_size
-            if not (-0.5 <= self._u.at <= width - 0.5 and -0.5 <= self._v.at <= height - 0.5):
+            (u, v), (width, height) = self.center, image_size
+            if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
                 return True
         if self.confirmed and self.mean_score < self.settings.doubt_score:
             return True
@@ -489,10 +536,10 @@ class ImageFilter:
             confirmed=self.confirmed,
             missed=self.missed,
             center_px=np.array(self.center),
-            velocity_px=np.array([self._u.speed, self._v.speed]),
+            velocity_px=np.array(self.filter.velocity),
             size_px=self.size.copy(),
             larger_side_px=self._sizes.larger_side,
-            covariance=covariance_of(self._u.spread, self._v.spread),
+            covariance=self.filter.covariance,
             score=self.detection.score,
             box=self.detection,
             shared=self.shared,
@@ -522,8 +569,7 @@ class ImageFilter:
 
     def _measure(self, center: Sequence[float], variance: Sequence[float]) -> None:
         """Correct with a measured centre [px] and its variances [px^2], (2,) each."""
-        for axis, at, spread in zip((self._u, self._v), center, variance, strict=True):
-            axis.correct(at, spread)
+        self.filter.correct(center, variance)
         self.seen = self.t
         self.missed = 0
 

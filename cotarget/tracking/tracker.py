@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 from cotarget.geometry import Array
 from cotarget.tracking.track import (
     CUT,
-    ImageFilter,
+    LiveTrack,
     Measurement,
     Track,
     TrackingSettings,
@@ -45,7 +45,7 @@ class Tracker:
         """
         self._settings = settings or TrackingSettings()
         self._image_size = image_size
-        self._tracks: list[ImageFilter] = []
+        self._tracks: list[LiveTrack] = []
         self._next_id = 1
         self._t: float | None = None
         self._intervals = deque([FIRST_INTERVAL_S], INTERVALS)
@@ -133,7 +133,7 @@ class Tracker:
         for j, detection in enumerate(detections):
             if free[j]:  # detections that cover this new track are no further target
                 free &= ~covers[j]
-                self._tracks.append(ImageFilter(self._next_id, detection, t, self._settings, self._image_size))
+                self._tracks.append(LiveTrack(self._next_id, detection, t, self._settings, self._image_size))
                 self._next_id += 1
 
 
@@ -152,14 +152,14 @@ class _Pairs:
 
     def __init__(
         self,
-        states: Sequence[ImageFilter],
+        states: Sequence[LiveTrack],
         detections: Sequence[Measurement],
         image_size: tuple[int, int] | None,
     ) -> None:
         """Compare tracks and detections, at least one of each; new objects need the image's (width, height) [px]."""
         self.confirmed = [state.confirmed for state in states]
         (at, size), (center, extent) = _boxes_of(states), _boxes(detections)
-        spread = np.array([state.place_variance for state in states])[:, None]
+        spread = np.array([state.filter.center_variance for state in states])[:, None]
         cut = np.array([detection.clipped for detection in detections], dtype=bool)
         lacks = missing(size[:, None], extent)
         self.settings = settings = states[0].settings
@@ -182,7 +182,7 @@ class _Pairs:
         self.possible = near | (self.overlap > settings.overlap_enough)
 
 
-def _least_likely(states: Sequence[ImageFilter], image_size: tuple[int, int] | None) -> Array:
+def _least_likely(states: Sequence[LiveTrack], image_size: tuple[int, int] | None) -> Array:
     """Largest distance plus log volume at which a detection is no new object, (tracks, 1).
 
     A target hidden for some time reappears at a rate of about once in that time, with a normal density; new objects
@@ -197,7 +197,7 @@ def _least_likely(states: Sequence[ImageFilter], image_size: tuple[int, int] | N
     return limits
 
 
-def _boxes_of(states: Sequence[ImageFilter]) -> tuple[Array, Array]:
+def _boxes_of(states: Sequence[LiveTrack]) -> tuple[Array, Array]:
     """Centres and sizes of tracks [px], (n, 2) each."""
     at, size = [state.center for state in states], [state.size for state in states]
     return np.array(at).reshape(-1, 2), np.array(size).reshape(-1, 2)
@@ -216,7 +216,7 @@ def _shared(at: Array, size: Array, center: Array, extent: Array) -> Array:
     return _area(np.maximum(0.0, high - low))
 
 
-def _belongs(state: ImageFilter, detection: Measurement, image_size: tuple[int, int] | None) -> bool:
+def _belongs(state: LiveTrack, detection: Measurement, image_size: tuple[int, int] | None) -> bool:
     """Whether a single detection may belong to a single track; the result of `_Pairs`, mostly in a fifth of the time.
 
     If the boxes overlap enough, they match whatever their distance is.
@@ -226,7 +226,7 @@ def _belongs(state: ImageFilter, detection: Measurement, image_size: tuple[int, 
     return bool(_Pairs([state], [detection], image_size).possible[0, 0])
 
 
-def _overlap(state: ImageFilter, detection: Measurement) -> float:
+def _overlap(state: LiveTrack, detection: Measurement) -> float:
     """Intersection over union of a track's predicted box and a detection's, 0 to 1."""
     shared = own = other = 1.0
     boxes = state.center, state.size.tolist(), detection.center_px.tolist(), detection.size_px.tolist()

@@ -104,15 +104,15 @@ class Course:
     def at(self, t: float) -> tuple[Angles, Angles]:
         """Predict pan and tilt at a time, with their variances."""
         dt = t - self.seen_t
-        spread = [axis.spread.after(dt, self._noise(self.range)).at for axis in self._axes]
-        (pan, tilt) = (axis.at + dt * axis.speed for axis in self._axes)
+        spread = [axis.covariance.predicted(dt, self._noise(self.range)).position for axis in self._axes]
+        (pan, tilt) = (axis.position + dt * axis.velocity for axis in self._axes)
         return (pan, tilt), (spread[0], spread[1])
 
     @property
     def rates(self) -> Angles:
         """Rates of pan and tilt [rad/s]."""
         pan, tilt = self._axes
-        return pan.speed, tilt.speed
+        return pan.velocity, tilt.velocity
 
     def _noise(self, distance: float) -> float:
         """Give the white acceleration of an angle [rad^2/s^3] that stands for manoeuvres at constant velocity."""

@@ -18,7 +18,7 @@ from cotarget.estimation.measurement_model import Sights
 from cotarget.estimation.motion_model import MOTIONS, STATES, USUAL_BIAS, MotionSettings, propagate
 from cotarget.geometry import RigidTransform
 from cotarget.targeting import Reach, aim, depth_of, point_at
-from cotarget.tracking.track import ImageFilter, tracking_settings
+from cotarget.tracking.track import LiveTrack, tracking_settings
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth
 from tests.moving_targets import APART, RATE, Flight, calibration_of, magnified, show
 
@@ -56,6 +56,9 @@ def depth_sigma(estimate):
     return math.sqrt(estimate.state_covariance[2, 2])
 
 
+SAME = 1e-9  # of the state and its covariance, whatever the order of the measurements: a last digit or two
+
+
 def run(flight, zoom=True, delays=DELAYS, settings=None):
     """Follow a target; yields (time of the newest frame, {delay: estimate})."""
     estimator = TargetFilter(flight.calibration, flight.target, settings)
@@ -90,7 +93,7 @@ def baselines(flight):
         if seen is None:
             continue
         if state is None:
-            state = ImageFilter(1, seen, t, tracking_settings(flight.target))
+            state = LiveTrack(1, seen, t, tracking_settings(flight.target))
         else:
             state.predict(t)
             state.correct(seen)
@@ -319,6 +322,40 @@ def test_out_of_order_is_as_in_order():
     a, b = ordered.at(3.2), shuffled.at(3.2)
     np.testing.assert_array_equal(a.state, b.state)
     np.testing.assert_array_equal(a.state_covariance, b.state_covariance)
+
+
+@pytest.mark.parametrize("kind", ["person", "bird"])
+def test_any_permutation_of_the_measurements_gives_the_same_estimate(kind):
+    """Of both cameras and within the memory, the newest or the zoom camera's first of all; read in between or not."""
+    flight = Flight(kind, 3, 1.4)
+    every = measurements(flight)
+    assert {each[0] for each in every} > set(flight.times)  # both cameras measure
+    rng, estimates = np.random.default_rng(0), []
+    for order in (range(len(every)), range(len(every))[::-1], *(rng.permutation(len(every)) for _ in range(4))):
+        estimator = TargetFilter(flight.calibration, flight.target)
+        for i in order:
+            assert every[i][1](estimator)
+            if rng.random() < 0.5:
+                estimator.at(every[i][0])
+        estimates.append([estimator.at(t) for t in (0.7, 1.3, 1.6)])
+    for found in estimates[1:]:
+        for a, b in zip(estimates[0], found, strict=True):
+            np.testing.assert_allclose(b.state, a.state, rtol=0, atol=SAME)
+            np.testing.assert_allclose(b.state_covariance, a.state_covariance, rtol=0, atol=SAME)
+
+
+def test_reading_changes_nothing():
+    """The same estimate after a thousand readings, and before a later measurement as if there had been none."""
+    flight = Flight("bird", 1, 2.0)
+    read, unread = (TargetFilter(flight.calibration, flight.target) for _ in range(2))
+    for t, give in measurements(flight):
+        assert give(read)
+        assert give(unread)
+        for later in np.linspace(-2.0, 1.0, 20):
+            read.at(t + later)
+            read.knows(t + later)
+    np.testing.assert_array_equal(read.at(2.1).state, unread.at(2.1).state)
+    np.testing.assert_array_equal(read.at(2.1).state_covariance, unread.at(2.1).state_covariance)
 
 
 def test_what_is_older_than_memory_is_refused():

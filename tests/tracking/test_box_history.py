@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cotarget.detection import Detection
-from cotarget.tracking.track import ImageFilter, SizeHistory, TrackingSettings, Trail
+from cotarget.tracking.track import LiveTrack, SizeHistory, TrackingSettings, Trail
 
 DT = 0.04
 
@@ -94,7 +94,7 @@ def confirmed_after(speed, size, seconds=20.0, flicker=0.1):
         low, high = low + flicker * size * rng.uniform(-1, 1, 2), high + flicker * size * rng.uniform(-1, 1, 2)
         seen = Detection((low + high) / 2, high - low, 1.0)
         if found is None:
-            found = ImageFilter(1, seen, 0.0, settings)
+            found = LiveTrack(1, seen, 0.0, settings)
         else:
             found.predict(i * DT)
             found.correct(seen)

@@ -8,7 +8,7 @@ import pytest
 
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.tracking import tracker as tracker_module
-from cotarget.tracking.track import CUT, ImageFilter, TrackingSettings, center_variance, missing, tracking_settings
+from cotarget.tracking.track import CUT, LiveTrack, TrackingSettings, center_variance, missing, tracking_settings
 from cotarget.tracking.tracker import Tracker
 
 RATE = 25.0
@@ -407,7 +407,7 @@ def test_a_lone_pair_is_matched_as_any_other(monkeypatch, name):
 def test_a_boxs_variance_is_the_same_in_floats_and_for_many():
     rng = np.random.default_rng(3)
     for settings in (PLAIN, *map(tracking_settings, DEFAULT_TARGETS.values())):
-        state = ImageFilter(1, Seen(np.zeros(2), np.array([20.0, 12.0])), 0.0, settings)
+        state = LiveTrack(1, Seen(np.zeros(2), np.array([20.0, 12.0])), 0.0, settings)
         boxes = [Seen(np.zeros(2), rng.uniform(3, 40, 2), clipped=bool(rng.random() < 0.3)) for _ in range(50)]
         sides = np.array([box.size_px for box in boxes])
         part = np.where([[box.clipped] for box in boxes], CUT, settings.noise_of_size)
