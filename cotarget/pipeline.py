@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from numbers import Real
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,7 +38,7 @@ ZOOM_WAIT_S = 2e-3
 # not acted on, and the watchdog halts a moving head meanwhile.
 REPEATED_S, AGAIN_S = 0.5, 5e-3
 # Time after which a zoom camera that repeats a frame is reported [s].
-BLIND_S = 0.5
+ZOOM_STALE_S = 0.5
 # Time after which it is an error [s]: longer than the 5 s for which a driver tries to reconnect to its camera.
 GONE_S = 10.0
 # Time after which an image that stays the same to the last bit is reported [s]: images of a live camera have noise.
@@ -61,12 +62,13 @@ class FrameSource:
 
     def __init__(self, fixed: Camera, zoom: Camera, clock: Clock) -> None:
         self._fixed, self._zoom, self._clock = fixed, zoom, clock
-        self._wide: Frame | None = None
-        self._close: Frame | None = None
-        # In times of fixed frames:
-        self._now = self._picture_t = self._close_t = self._shown_t = -math.inf
-        self._why_blind = self._why_late = ""
-        self._looked_t = -math.inf  # on the rig's clock
+        self._fixed_frame: Frame | None = None
+        self._zoom_frame: Frame | None = None
+        # Times of fixed frames [s]: of the newest and of the first with its image; of those when the newest zoom frame
+        # came and when the first with its image did.
+        self._fixed_t = self._fixed_changed_t = self._zoom_t = self._zoom_changed_t = -math.inf
+        self._zoom_fault = self._fixed_fault = ""
+        self._read_t = -math.inf  # when it came, on the rig's clock [s]
         self.interval, self.zoom_is_new = math.inf, False
 
     def read_fixed(self) -> Frame:
@@ -76,26 +78,26 @@ class FrameSource:
             StaleFrameError: no frame came, or none that is newer and not from the future for too long.
             DeviceError: the frame has another size.
         """
-        self._why_late, until, timeout = "", math.inf, PATIENCE_S
+        self._fixed_fault, until, timeout = "", math.inf, PATIENCE_S
         while True:
             try:
-                return self._next_wide(timeout, until)
+                return self._next_fixed(timeout, until)
             except StaleFrameError as error:
                 now = self._clock.now()
-                if not self._why_late:
+                if not self._fixed_fault:
                     until = now + REPEATED_S
-                if self._wide is None or now - self._looked_t >= PATIENCE_S or not now < until:
+                if self._fixed_frame is None or now - self._read_t >= PATIENCE_S or not now < until:
                     raise
-                self._why_late = str(error)
+                self._fixed_fault = str(error)
                 self._clock.sleep_until(now + AGAIN_S)
                 timeout = until - now
 
-    def _next_wide(self, timeout: float, until: float) -> Frame:
+    def _next_fixed(self, timeout: float, until: float) -> Frame:
         """Read the next fixed frame by a given time. Raises as `read_fixed` does, but at once."""
-        before = self._wide
+        before = self._fixed_frame
         frame = self._fixed.read(None if before is None else before.t, timeout)
         _check_size(frame, self._fixed, "fixed")
-        if not frame.t > self._now:
+        if not frame.t > self._fixed_t:
             after = "" if before is None else f" after one of {before.t:.3f} s"
             raise StaleFrameError(
                 f"the fixed camera gave a frame of {frame.t:.3f} s{after}: its frames repeat, or its clock has jumped"
@@ -104,11 +106,11 @@ class FrameSource:
         if (ahead := frame.t - now) > FUTURE_S:
             raise StaleFrameError(f"the fixed camera's frame is from {ahead:.2f} s in the future; mind the clock")
         if now > until:  # its times jumped back and have now reached the last one
-            raise StaleFrameError(self._why_late)
-        if before is None or not _same(frame.image, before.image):
-            self._picture_t = frame.t
-        self.interval = frame.t - self._now
-        self._wide, self._now, self._looked_t = frame, frame.t, now
+            raise StaleFrameError(self._fixed_fault)
+        if before is None or not _is_same(frame.image, before.image):
+            self._fixed_changed_t = frame.t
+        self.interval = frame.t - self._fixed_t
+        self._fixed_frame, self._fixed_t, self._read_t = frame, frame.t, now
         return frame
 
     def read_zoom(self) -> Frame:
@@ -118,43 +120,43 @@ class FrameSource:
             StaleFrameError: no frame came at all, or no new one for `GONE_S`.
             DeviceError: the frame has another size.
         """
-        before, self._why_blind = self._close, ""
+        before, self._zoom_fault = self._zoom_frame, ""
         try:
             frame = self._zoom.read() if before is None else self._zoom.read(timeout=ZOOM_WAIT_S)
         except StaleFrameError as error:
             if before is None:
                 raise
-            frame, self._why_blind = before, str(error)
+            frame, self._zoom_fault = before, str(error)
         is_later = before is None or frame.t > before.t
         if is_later:
             _check_size(frame, self._zoom, "zoom")
-            self._close, self._close_t = frame, self._now
-            if before is None or not _same(frame.image, before.image):
-                self._shown_t = self._now
-        self.zoom_is_new = is_later and not self._picture_t > self._shown_t
+            self._zoom_frame, self._zoom_t = frame, self._fixed_t
+            if before is None or not _is_same(frame.image, before.image):
+                self._zoom_changed_t = self._fixed_t
+        self.zoom_is_new = is_later and not self._fixed_changed_t > self._zoom_changed_t
         if before is None or is_later:
             return frame
-        if self._now - self._close_t > GONE_S:
-            raise StaleFrameError(self._blindness())
+        if self._fixed_t - self._zoom_t > GONE_S:
+            raise StaleFrameError(self._describe_stale_zoom())
         return before
 
-    def troubles(self) -> list[str]:
+    def faults(self) -> list[str]:
         """Describe what is wrong with the newest frames, one message each."""
         found = []
-        if self._why_late:
-            found.append(f"{self._why_late}; this one is {self.interval:.2f} s after the last")
-        if (same := self._now - self._picture_t) > FROZEN_S:
+        if self._fixed_fault:
+            found.append(f"{self._fixed_fault}; this one is {self.interval:.2f} s after the last")
+        if (same := self._fixed_t - self._fixed_changed_t) > FROZEN_S:
             found.append(f"the fixed camera has shown the same picture for {same:.1f} s")
-        if self._why_blind or self._now - self._close_t > BLIND_S:
-            found.append(self._blindness())
-        elif (same := self._picture_t - self._shown_t) > FROZEN_S:
+        if self._zoom_fault or self._fixed_t - self._zoom_t > ZOOM_STALE_S:
+            found.append(self._describe_stale_zoom())
+        elif (same := self._fixed_changed_t - self._zoom_changed_t) > FROZEN_S:
             found.append(f"the zoom camera has shown the same picture for {same:.1f} s")
         return found
 
-    def _blindness(self) -> str:
+    def _describe_stale_zoom(self) -> str:
         """Describe for how long the zoom camera has shown nothing new, and why if that is known."""
-        why = self._why_blind and f": {self._why_blind}"
-        return f"the zoom camera has shown nothing new for {self._now - self._close_t:.1f} s{why}"
+        why = self._zoom_fault and f": {self._zoom_fault}"
+        return f"the zoom camera has shown nothing new for {self._fixed_t - self._zoom_t:.1f} s{why}"
 
 
 def _check_size(frame: Frame, camera: Camera, name: str) -> None:
@@ -172,7 +174,7 @@ def _check_size(frame: Frame, camera: Camera, name: str) -> None:
         )
 
 
-def _same(a: Image, b: Image) -> bool:
+def _is_same(a: Image, b: Image) -> bool:
     """Whether two images are the same to the last bit."""
     return a is b or (np.array_equal(a[::ROWS], b[::ROWS]) and np.array_equal(a, b))
 
@@ -316,10 +318,10 @@ def follow(
     if settings is None:
         settings = FollowSettings()
     fitting = calibration.for_streams(rig.fixed.size, rig.zoom.size)
-    loop = _Loop(rig, fitting, wanted, detector, selector or FirstCome(), settings)
+    run = _Run(rig, fitting, wanted, detector, selector or FirstCome(), settings)
     end = rig.clock.now() + seconds
     while rig.clock.now() < end:
-        yield loop.turn()
+        yield run.step()
 
 
 def _check_seconds(seconds: object) -> None:
@@ -345,8 +347,16 @@ def _profile(rig: Rig, target: TargetProfile | str) -> tuple[str, TargetProfile]
     return target, profile
 
 
-class _Loop:
-    """State of one run of `follow`."""
+class _Outcome(NamedTuple):
+    """State after a frame, the reason for it, and the aim, if any."""
+
+    state: State
+    reason: str
+    aim: Aim | None = None
+
+
+class _Run:
+    """One run of `follow`."""
 
     def __init__(
         self,
@@ -373,57 +383,59 @@ class _Loop:
             rig, calibration, head=settings.head, zoom=settings.zoom, predict=settings.predict
         )
         self._frames = FrameSource(rig.fixed, rig.zoom, rig.clock)
-        self._beyond: set[int] = set()  # tracks that could not be aimed at
+        self._unreachable: set[int] = set()  # ids of tracks that could not be aimed at
         self._selector = selector
         self._selector.start(rig.fixed.size)
         self._seen_t: dict[int, float] = {}  # time at which each track was last seen
         self._index = 0
 
-    def turn(self) -> Step:
-        """Process one frame of the fixed camera."""
-        rig, fusion = self._rig, self._fusion
+    def step(self) -> Step:
+        """Process one frame of the fixed camera, in the order of the paper's Table 1."""
         frame = self._frames.read_fixed()
         interval = min(self._frames.interval, LONGEST_INTERVAL_S)
         detections = self._detector.detect(frame)
         tracks = self._tracker.update(detections, frame.t)
-        self._seen_t = {each.id: self._seen_t.get(each.id, frame.t) if each.missed else frame.t for each in tracks}
-        favoured = {track.id for track in tracks if self._selector.favours(track)}
-        fusion.update_fixed(frame, tracks, self._detector.mask, favoured)
+        zoom, found = self._estimate(frame, tracks)
+        followed = self._select(tracks)
+        outcome = self._search(tracks) if followed is None else self._follow(followed, frame.t, interval)
         self._read_states()
-        zoom = self._frames.read_zoom()
-        found = fusion.update_zoom(zoom if self._frames.zoom_is_new else None, frame.t)
-        chosen = self._choose(tracks)
-        if chosen is None:
-            self._controller.zoom_out()
-            mode, reason, aim = State.SEARCHING, self._why_searching(tracks), None
-        else:
-            fusion.count_seen_well(chosen, interval, rig.zoom.focal_range[1])
-            mode, reason, aim = self._drive(chosen, frame.t, interval)
-        self._read_states()
-        warnings = [] if chosen is None else fusion.warnings(chosen.id, frame.t)
-        step = Step(
-            index=self._index,
-            t=rig.clock.now(),
-            state=mode,
-            reason="; ".join(filter(None, [reason, *warnings, *self._frames.troubles()])),
+        warnings, estimate = [], None
+        if followed is not None:
+            warnings, estimate = (
+                self._fusion.warnings(followed.id, frame.t),
+                self._fusion.estimate(followed.id, frame.t),
+            )
+        self._index += 1
+        return Step(
+            index=self._index - 1,
+            t=self._rig.clock.now(),
+            state=outcome.state,
+            reason="; ".join(filter(None, [outcome.reason, *warnings, *self._frames.faults()])),
             fixed=frame,
             zoom=zoom,
             mask=self._detector.mask,
             detections=tuple(detections),
             tracks=tuple(tracks),
-            target=chosen,
-            aim=aim,
+            target=followed,
+            aim=outcome.aim,
             commanded=self._controller.commanded,
             head=self._head,
             lens=self._lens,
-            estimate=None if chosen is None else fusion.estimate(chosen.id, frame.t),
+            estimate=estimate,
             found=found,
             head_commands=self._controller.head_commands,
             lens_commands=self._controller.lens_commands,
             skipped=self._skipped(),
         )
-        self._index += 1
-        return step
+
+    def _estimate(self, frame: Frame, tracks: list[Track]) -> tuple[Frame, ZoomMeasurement | None]:
+        """Update the 3D estimates with both cameras' newest frames; return the zoom frame and what it measured."""
+        self._seen_t = {each.id: self._seen_t.get(each.id, frame.t) if each.missed else frame.t for each in tracks}
+        favoured = {track.id for track in tracks if self._selector.favours(track)}
+        self._fusion.update_fixed(frame, tracks, self._detector.mask, favoured)
+        self._read_states()
+        zoom = self._frames.read_zoom()
+        return zoom, self._fusion.update_zoom(zoom if self._frames.zoom_is_new else None, frame.t)
 
     def _skipped(self) -> int:
         """Number of frames of the fixed camera between the last two that were worked on."""
@@ -435,57 +447,66 @@ class _Loop:
         self._head, self._lens = self._rig.head.state(), self._rig.zoom.state()
         self._fusion.states.add(self._head, self._lens)
 
-    def _why_searching(self, tracks: list[Track]) -> str:
-        """Explain why no track is followed."""
-        if unmet := self._selector.unmet:
-            return unmet
-        if not tracks:
-            part = flood(self._detector.mask)
-            why = part and f": {part:.0%} of the wide view changed at once, as when the light does or the camera moves"
-            return f"nothing is detected{why or ''}"
-        return "what is detected is not believed yet"
-
-    def _choose(self, tracks: list[Track]) -> Track | None:
+    def _select(self, tracks: list[Track]) -> Track | None:
         """Select the track to follow."""
         now = self._rig.clock.now()
         candidates = self._fusion.candidates(tracks, now)
-        if self._beyond:  # an unreachable target may have become reachable
-            estimates = {number: self._fusion.estimate(number, now) for number in self._beyond}
-            self._beyond = {
+        if self._unreachable:  # a target may have become reachable
+            estimates = {number: self._fusion.estimate(number, now) for number in self._unreachable}
+            self._unreachable = {
                 n for n, each in estimates.items() if each is not None and not self._controller.can_reach(each)
             }
-            candidates = [replace(each, reachable=each.id not in self._beyond) for each in candidates]
+            candidates = [replace(each, reachable=each.id not in self._unreachable) for each in candidates]
         head = np.array([self._head.pan, self._head.tilt])
         number = self._selector.select(candidates, head, self._rig.head.limits)
         self._fusion.follow(number)
         return next((track for track in tracks if track.id == number), None)
 
-    def _drive(self, chosen: Track, t: float, interval: float) -> tuple[State, str, Aim | None]:
-        """Command head and lens; return the state, its reason, and the aim."""
-        seen_t = self._seen_t[chosen.id]
-        if t - seen_t > self._settings.zoom_out_after_s:
-            reason, aim = self._search(chosen, seen_t, interval)
-            return State.LOST, f"out of sight for {t - seen_t:.1f} s; {reason}", aim
-        try:
-            drive = self._controller.drive(self._predict(chosen), seen_t, interval, shape=shape_of(chosen))
-        except UnreachableError as error:
-            self._beyond.add(chosen.id)
-            return State.UNREACHABLE, str(error), None
-        zoom = "" if drive.zoom_reason == "wanted" else f"zoom: {drive.zoom_reason}"
-        if chosen.missed:
-            return State.COASTING, zoom, drive.aim
-        return State.UNCONFIRMED if self._fusion.search.is_unconfirmed else State.FOLLOWING, zoom, drive.aim
+    def _search(self, tracks: list[Track]) -> _Outcome:
+        """Zoom out while no track is followed, and explain why none is."""
+        self._controller.zoom_out()
+        if unmet := self._selector.unmet:
+            return _Outcome(State.SEARCHING, unmet)
+        if tracks:
+            return _Outcome(State.SEARCHING, "what is detected is not confirmed yet")
+        part = flood(self._detector.mask)
+        why = part and f": {part:.0%} of the fixed image changed at once, as when the light does or the camera moves"
+        return _Outcome(State.SEARCHING, f"nothing is detected{why or ''}")
 
-    def _search(self, chosen: Track, seen_t: float, interval: float) -> tuple[str, Aim | None]:
+    def _follow(self, followed: Track, t: float, interval: float) -> _Outcome:
+        """Aim at the followed track and command head and lens.
+
+        Args:
+            followed: the followed track.
+            t: time of the newest fixed frame [s].
+            interval: time from one command to the next [s].
+        """
+        self._fusion.count_seen_well(followed, interval, self._rig.zoom.focal_range[1])
+        seen_t = self._seen_t[followed.id]
+        if t - seen_t > self._settings.zoom_out_after_s:
+            reason, aim = self._follow_unseen(followed, seen_t, interval)
+            return _Outcome(State.LOST, f"out of sight for {t - seen_t:.1f} s; {reason}", aim)
+        try:
+            drive = self._controller.drive(self._predict(followed), seen_t, interval, shape=shape_of(followed))
+        except UnreachableError as error:
+            self._unreachable.add(followed.id)
+            return _Outcome(State.UNREACHABLE, str(error))
+        reason = "" if drive.zoom_reason == "wanted" else f"zoom: {drive.zoom_reason}"
+        if followed.missed:
+            return _Outcome(State.COASTING, reason, drive.aim)
+        state = State.UNCONFIRMED if self._fusion.search.is_unconfirmed else State.FOLLOWING
+        return _Outcome(state, reason, drive.aim)
+
+    def _follow_unseen(self, followed: Track, seen_t: float, interval: float) -> tuple[str, Aim | None]:
         """Point where a target out of sight should be; return what the head does, and the aim."""
         try:
-            aim = self._controller.search(self._predict(chosen), seen_t, interval)
+            aim = self._controller.search(self._predict(followed), seen_t, interval)
         except UnreachableError as error:
             return f"the head waits: {error}", None
         if aim is None:
             return "the head waits: where it is by now is not known well enough", None
         return "looked for where it should be", aim
 
-    def _predict(self, chosen: Track) -> Predict:
+    def _predict(self, followed: Track) -> Predict:
         """Give the target's estimate as a function of time."""
-        return lambda t: self._fusion.estimate(chosen.id, t)
+        return lambda t: self._fusion.estimate(followed.id, t)

@@ -111,7 +111,7 @@ class Selection:
         if "click" in table:
             (u, v), name = table["click"], "--click" if is_option else "the recorded click"
             if not (-0.5 <= u <= size[0] - 0.5 and -0.5 <= v <= size[1] - 0.5):
-                raise ConfigError(f"{name}: ({u:g}, {v:g}) is not in the wide view's {size[0]}x{size[1]} image")
+                raise ConfigError(f"{name}: ({u:g}, {v:g}) is not in the fixed camera's {size[0]}x{size[1]} image")
             self._expected = f"{name}: no track came near ({u:g}, {v:g})"
         elif "track" in table:
             name = "--track" if is_option else "the recorded track"
@@ -177,7 +177,7 @@ EITHER = re.compile(rf"(\w[^;]*{ANY}) or \1")  # one and two solutions count as 
 USUAL = (
     "zoom: ",
     "nothing is detected",
-    "what is detected is not believed yet",
+    "what is detected is not confirmed yet",
     "out of sight",
     "looked for",
     "the head waits: where it is by now",

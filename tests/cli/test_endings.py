@@ -259,7 +259,7 @@ def _with(plain, reason, seen):
 @pytest.mark.parametrize("runs", [
     [(500, "nothing is detected", False)],  # told in other words
     [(300, "nothing is detected", False), (100, "", True)],
-    [(10, "what is detected is not believed yet", False), (90, "", True), (40, "zoom: unsure", True)],
+    [(10, "what is detected is not confirmed yet", False), (90, "", True), (40, "zoom: unsure", True)],
     [(60, "", True), (50, "out of sight for 0.5 s; looked for where it should be", True)],
     [(3, "", True), (MANY - 1, "zoom: unsure", True)],  # so short a run tells nothing
     [(50, "", True), (FEW - 1, "both views make it 0.1 m", True)],

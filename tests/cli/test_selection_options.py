@@ -76,7 +76,9 @@ def test_what_a_recording_says_is_not_called_an_option():
     parser = argparse.ArgumentParser(exit_on_error=False)
     add_selection(parser)
     plain = parser.parse_args([])
-    with pytest.raises(ConfigError, match=r"^the recorded click: \(640, 3\) is not in the wide view's 640x480 image"):
+    with pytest.raises(
+        ConfigError, match=r"^the recorded click: \(640, 3\) is not in the fixed camera's 640x480 image"
+    ):
         Selection(plain, SIZE, {"click": [640.0, 3.0]})
     for table, said in (
         ({"click": [3.0, 4.0]}, "the recorded click: no track came near (3, 4)"),
@@ -107,8 +109,8 @@ def follow(capsys, *arguments):
 
 @pytest.mark.parametrize(("arguments", "part"), [
     (("--policy", "best"), "invalid choice: 'best'"),
-    (("--click", "640", "3"), "--click: (640, 3) is not in the wide view's 640x480 image"),
-    (("--click", "-1", "3"), "--click: (-1, 3) is not in the wide view's 640x480 image"),
+    (("--click", "640", "3"), "--click: (640, 3) is not in the fixed camera's 640x480 image"),
+    (("--click", "-1", "3"), "--click: (-1, 3) is not in the fixed camera's 640x480 image"),
     (("--click", "3", "nan"), "nan is not a finite number"),
     (("--click", "3"), "expected 2 arguments"),
     (("--track", "0"), "'0' is not a whole number from 1"),

@@ -19,7 +19,7 @@ from cotarget.detection import Detection
 from cotarget.errors import CotargetError, DeviceError, StaleFrameError
 from cotarget.evaluation import TruthDetector, true_calibration
 from cotarget.fusion import FusionSettings
-from cotarget.pipeline import BLIND_S, FROZEN_S, GONE_S, ZOOM_WAIT_S, FollowSettings, State, follow
+from cotarget.pipeline import FROZEN_S, GONE_S, ZOOM_STALE_S, ZOOM_WAIT_S, FollowSettings, State, follow
 from cotarget.recording.replay import Replay, until_end
 from cotarget.rig import Frame
 from cotarget.sim.world import SimWorld
@@ -306,7 +306,7 @@ def test_a_zoom_camera_that_repeats_its_frame_is_told():
     rig.zoom = Faulty(rig.zoom, change)
     steps = run(rig, Seer(crossing), 3.0)
     told = [step for step in steps if "the zoom camera has shown nothing new for" in step.reason]
-    assert told[0].t == pytest.approx(FAULT + BLIND_S, abs=2 * FRAME_S)
+    assert told[0].t == pytest.approx(FAULT + ZOOM_STALE_S, abs=2 * FRAME_S)
     assert told == steps[-len(told) :]
     assert {step.state for step in told} == {State.FOLLOWING}
 

@@ -201,7 +201,7 @@ def test_from_searching_to_lost_and_back():
             assert step.reason.startswith("out of sight for 0.")
             assert "s; looked for where it should be" in step.reason
         if step.state is State.SEARCHING:
-            assert step.reason == ("what is detected is not believed yet" if step.tracks else "nothing is detected")
+            assert step.reason == ("what is detected is not confirmed yet" if step.tracks else "nothing is detected")
         if not followed:
             assert step.commanded[2] == 667.0  # zoomed out to see more
         assert step.t >= step.fixed.t + LATENCY - 1e-9
@@ -459,7 +459,7 @@ def test_a_picture_that_changes_as_a_whole_is_told():
     seer.mask = np.zeros((480, 640), np.uint8)
     seer.mask[:240] = 255
     assert {step.reason for step in run(Rig(), seer, 0.5)} == {
-        "nothing is detected: 50% of the wide view changed at once, as when the light does or the camera moves"
+        "nothing is detected: 50% of the fixed image changed at once, as when the light does or the camera moves"
     }
 
 

@@ -258,8 +258,8 @@ def test_a_recording_that_does_not_say_whom_replays_as_the_first_policy_does(rep
 
 @pytest.mark.parametrize(("table", "said"), [
     ({"policy": "by-name"}, "the recorded policy 'by-name' is unknown; give --policy, one of: first-come"),
-    ({"click": [500.0, 3.0]}, "the recorded click: (500, 3) is not in the wide view's 96x72 image"),
-    ({"click": [float("nan"), 3.0]}, "is not in the wide view"),
+    ({"click": [500.0, 3.0]}, "the recorded click: (500, 3) is not in the fixed camera's 96x72 image"),
+    ({"click": [float("nan"), 3.0]}, "is not in the fixed camera"),
     ({"click": [10**400, 3.0]}, "recording.json: whom: int too large"),
     ({"click": [1.0]}, "recording.json: whom: click [1.0] is no pixel"),
     ({"track": 0}, "recording.json: whom: {'track': 0} is no"),
