@@ -234,7 +234,7 @@ def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str
         return f"unknown key '{at}'; valid here: {choices([*names, *(beside if len(loc) == 1 else ())])}"
     if kind == MISSING and not isinstance(loc[-1], int):
         first = min(each["loc"][-1] for each in errors if each["type"] == MISSING and each["loc"][:-1] == loc[:-1])
-        return f"{above}: missing key '{first}'; needed here: {choices(_required(outer))}"
+        return f"{above and f'{above}: '}missing key '{first}'; needed here: {choices(_required(outer))}"
     if kind in (MISSING, "too_long", "too_short"):  # of a list
         here, listed = (above, loc[:-1]) if kind == MISSING else (at, loc)
         of_list = _hint_at(cls, listed)

@@ -18,18 +18,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from annotated_types import Ge
 
-from cotarget.calibration import file
-from cotarget.calibration.file import Table, get, parse_board, write_board
+from cotarget.calibration.file import check_schema, read_json, write_board
 from cotarget.calibration.model import CameraName, Capture
 from cotarget.config import BoardConfig, RigConfig, config_table
-from cotarget.errors import CalibrationError
+from cotarget.errors import CalibrationError, ConfigError
 from cotarget.files import write_atomically
 from cotarget.rig import Image
+from cotarget.schema import Positive, model, validate
 
 SCHEMA = 1
 SESSION, COMMANDS = "session.json", "commands.jsonl"
@@ -94,6 +95,48 @@ class CaptureIndex:
     captures: tuple[Capture, ...]
 
 
+@model
+class CaptureTable:
+    """An image of index.json; the fixed camera may have null for the head's angles, which is 0."""
+
+    file: str
+    camera: CameraName
+    board: Annotated[int, Ge(0)]
+    focal_px: Positive | None
+    t: float
+    pan: float | None = None
+    tilt: float | None = None
+
+    def __post_init__(self) -> None:
+        if Path(self.file).is_absolute() or ".." in Path(self.file).parts:
+            raise ValueError(f"file: {self.file!r} is not inside the folder of the index")
+        for key, angle in (("pan", self.pan), ("tilt", self.tilt)):
+            if angle is None and self.camera == "zoom":
+                raise ValueError(f"{key}: is missing; an image of the zoom camera needs the head's pan and tilt")
+            if angle is not None and abs(angle) > LARGEST_ANGLE:
+                raise ValueError(f"{key}: {angle:g} is more than a whole turn in radians; it looks like degrees")
+
+    def capture(self) -> Capture:
+        """Make the capture, with an empty image."""
+        return Capture(
+            NO_IMAGE, self.camera, self.board, self.pan or 0.0, self.tilt or 0.0, self.focal_px, self.t, self.file
+        )
+
+
+@model
+class IndexTable:
+    """Content of index.json."""
+
+    schema: int
+    board: BoardConfig
+    pitch_mm: Positive | None
+    captures: tuple[CaptureTable, ...]
+
+    def __post_init__(self) -> None:
+        if not self.captures:
+            raise ValueError("captures: is empty")
+
+
 NO_IMAGE: Image = np.zeros((0, 0, 3), np.uint8)
 
 
@@ -152,23 +195,15 @@ def read_index(directory: Path) -> CaptureIndex:
     path = directory / INDEX
     if not directory.is_dir():
         raise CalibrationError(f"{directory}: no such folder; give a folder of captures")
-    table = file.read_json(path, "give a folder of captures, as cotarget calibrate --captures DIR makes one")
-    file.check_schema(path, table, SCHEMA)
+    table = read_json(path, "give a folder of captures, as cotarget calibrate --captures DIR makes one")
+    check_schema(path, table, SCHEMA)
     try:
-        pitch = get(table, "pitch_mm")
-        rows = file.as_list(get(table, "captures"), "captures")
-        if not rows:
-            raise CalibrationError("captures: is empty")
-        board = parse_board(get(table, "board"), "board")
-        captures = tuple(_parse_capture(row, f"captures[{i}]") for i, row in enumerate(rows))
+        index = validate(IndexTable, table, "")
+        captures = tuple(row.capture() for row in index.captures)
         _check_files(directory, captures)
-        return CaptureIndex(
-            board=board,
-            pitch_mm=None if pitch is None else file.as_number(pitch, "pitch_mm", positive=True),
-            captures=captures,
-        )
-    except CalibrationError as error:
+    except (ConfigError, CalibrationError) as error:
         raise CalibrationError(f"{path}: {error}") from None
+    return CaptureIndex(index.board, index.pitch_mm, captures)
 
 
 def read_images(directory: Path, captures: Sequence[Capture]) -> Iterator[Capture]:
@@ -268,44 +303,6 @@ def _numbered(directory: Path, pattern: str) -> dict[int, str]:
             raise CalibrationError(f"{path}: has the same number as {names[number]}, {number}; pairs need one each")
         names[number] = path.relative_to(directory).as_posix()
     return names
-
-
-def _parse_capture(value: object, where: str) -> Capture:
-    row: Table = file.as_table(value, where)
-    camera = get(row, "camera", where)
-    if camera not in ("fixed", "zoom"):
-        raise CalibrationError(f"{where}.camera: {file.short(camera)} is not one of: fixed, zoom")
-    source = file.as_text(get(row, "file", where), f"{where}.file")
-    if Path(source).is_absolute() or ".." in Path(source).parts:
-        raise CalibrationError(f"{where}.file: {file.short(source)} is not inside the folder of the index")
-    focal = get(row, "focal_px", where)
-    board = file.as_whole(get(row, "board", where), f"{where}.board")
-    if board < 0:
-        raise CalibrationError(f"{where}.board: {board} is negative; placements are numbered from 0")
-    pan, tilt = (_parse_angle(row, key, where, camera) for key in ("pan", "tilt"))
-    return Capture(
-        image=NO_IMAGE,
-        camera=camera,
-        board=board,
-        pan=pan,
-        tilt=tilt,
-        focal_px=None if focal is None else file.as_number(focal, f"{where}.focal_px", positive=True),
-        t=file.as_number(get(row, "t", where), f"{where}.t"),
-        source=source,
-    )
-
-
-def _parse_angle(row: Table, key: str, where: str, camera: CameraName) -> float:
-    """Parse an angle of the head [rad]; the fixed camera may have null, which is 0."""
-    value = get(row, key, where) if camera == "fixed" else row.get(key)
-    if value is None:
-        if camera == "fixed":
-            return 0.0
-        raise CalibrationError(f"{where}.{key}: is missing; an image of the zoom camera needs the head's pan and tilt")
-    angle = file.as_number(value, f"{where}.{key}")
-    if abs(angle) > LARGEST_ANGLE:
-        raise CalibrationError(f"{where}.{key}: {angle:g} is more than a whole turn in radians; it looks like degrees")
-    return angle
 
 
 def _check_files(directory: Path, captures: Sequence[Capture]) -> None:

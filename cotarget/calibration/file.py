@@ -6,7 +6,7 @@ covariance (or null); held_out (or null); board and board_warp [m]; provenance; 
 not seen. Lengths are metres. Angles are degrees where people read them, and radians in the views, so that a refit
 starts from exactly the same numbers.
 
-Reading checks every key and value. Errors of `get` and the ``as_`` functions name the key; their callers add the file.
+`CalibrationTable` and what is in it describe the keys; `validate` checks them.
 """
 
 import dataclasses
@@ -14,22 +14,24 @@ import itertools
 import json
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge, Interval
 
 from cotarget.calibration.bundle import EVERY_BLOCK, parameter_names
-from cotarget.calibration.model import Covariance, HeldOut, Rejected, Residuals, View
+from cotarget.calibration.model import CameraName, Covariance, HeldOut, Residuals, View
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
-from cotarget.errors import CalibrationError, choices
+from cotarget.errors import CalibrationError, ConfigError
 from cotarget.files import write_atomically
-from cotarget.geometry import Array, RigidTransform, pose, pose_dict
+from cotarget.geometry import Array, RigidTransform, pose_dict
 from cotarget.pantilt import IDEAL_HEAD, HeadGeometry
+from cotarget.schema import NotNegative, Pose, Positive, Size, model, validate
 
 Table = Mapping[str, Any]
 
@@ -202,148 +204,199 @@ def check_schema(path: Path, table: Table, schema: int) -> None:
         raise CalibrationError(f"{path}: schema {table['schema']!r} is not {schema}, the one that this version reads")
 
 
-def get(table: Table, key: str, where: str = "") -> Any:
-    """Look a key up, and refuse a table without it."""
-    if key not in table:
-        raise CalibrationError(f"missing key '{join(where, key)}'; found here: {choices(table)}")
-    return table[key]
-
-
-def join(where: str, key: str) -> str:
-    """Join a table's name and a key with a dot."""
-    return f"{where}.{key}" if where else key
-
-
-def as_table(value: Any, where: str) -> Table:
-    """Expect a JSON object."""
-    if not isinstance(value, dict):
-        raise CalibrationError(f"{where}: {short(value)} is not an object")
-    return value
-
-
-def as_list(value: Any, where: str, length: int | None = None) -> Sequence[Any]:
-    """Expect a JSON list, of the given length unless that is None."""
-    if not isinstance(value, list):
-        raise CalibrationError(f"{where}: {short(value)} is not a list")
-    if length is not None and len(value) != length:
-        raise CalibrationError(f"{where}: has {len(value)} values where {length} are wanted")
-    return value
-
-
-def as_number(value: Any, where: str, *, positive: bool = False) -> float:
-    """Expect a finite number, greater than zero if ``positive``."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise CalibrationError(f"{where}: {short(value)} is not a finite number")
-    if positive and value <= 0:
-        raise CalibrationError(f"{where}: {value:g} is not greater than zero")
-    return float(value)
-
-
-def as_whole(value: Any, where: str, *, lowest: int = 0) -> int:
-    """Expect a whole number not below ``lowest``."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < lowest:
-        raise CalibrationError(f"{where}: {short(value)} is not a whole number from {lowest} up")
-    return value
-
-
-def as_text(value: Any, where: str) -> str:
-    """Expect a string."""
-    if not isinstance(value, str):
-        raise CalibrationError(f"{where}: {short(value)} is not a text")
-    return value
-
-
-def as_numbers(value: Any, where: str, length: int) -> tuple[float, ...]:
-    """Expect a list of finite numbers of the given length."""
-    return tuple(as_number(item, f"{where}[{i}]") for i, item in enumerate(as_list(value, where, length)))
-
-
-def as_size(value: Any, where: str) -> tuple[int, int]:
-    """Expect a pair of positive whole numbers: (width, height) or (columns, rows)."""
-    first, second = as_list(value, where, 2)
-    return as_whole(first, f"{where}[0]", lowest=1), as_whole(second, f"{where}[1]", lowest=1)
-
-
-def as_pose(value: Any, where: str) -> RigidTransform:
-    """Expect a table of translation [m] and rotation vector [degrees]."""
-    table = as_table(value, where)
-    translation = as_numbers(get(table, "translation", where), join(where, "translation"), 3)
-    rotvec_deg = as_numbers(get(table, "rotvec_deg", where), join(where, "rotvec_deg"), 3)
-    try:
-        return pose(translation, rotvec_deg)
-    except ValueError as error:
-        raise CalibrationError(join(where, str(error))) from None
-
-
-def short(value: Any) -> str:
-    """Quote a value for an error message, cut to 40 characters."""
-    text = repr(value)
-    return text if len(text) <= 40 else text[:37] + "..."
-
-
-# Parsing the parts of calibration.json
+# Tables of calibration.json
 
 # Largest asymmetry and negative eigenvalue that rounding leaves per parameter, in a covariance scaled to a unit
 # diagonal.
 ROUNDING = 1e-9
 # Values beyond these are mistyped: an encoder's scale is within percents of 1, and no lens is longer than a telescope's
 # 1e7 px, has its axis more than ten images off the middle, or needs coefficients that large.
-SCALES, FOCALS_PX, IMAGES_OFF, LARGEST_COEFFICIENT = (0.5, 2.0), (1.0, 1e7), 10.0, 1e6
-RESIDUAL_KEYS = (
-    "fixed_rms_px",
-    "zoom_rms_px",
-    "stereo_rms_px",
-    "handeye_rms_px",
-    "fixed_views",
-    "zoom_views",
-    "pairs",
-    "outliers",
-)
+IMAGES_OFF = 10.0
+Scale = Annotated[float, Interval(ge=0.5, le=2.0)]
+FocalPx = Annotated[float, Interval(ge=1.0, le=1e7)]
+Coefficient = Annotated[float, Interval(ge=-1e6, le=1e6)]
+Distortion = Annotated[tuple[Coefficient, Coefficient, Coefficient, Coefficient, Coefficient], "[k1, k2, p1, p2, k3]"]
 
 
-def parse_calibration(table: Table) -> Calibration:
-    """Parse a calibration from the JSON object of calibration.json.
+@model
+class LensTable:
+    """Intrinsics without the image's size."""
 
-    Raises:
-        CalibrationError: a key is missing or its value is invalid; the message names the key.
-    """
-    T_head_zoom = get(table, "T_head_zoom")
-    head = as_table(get(table, "head"), "head")
-    pitch = get(table, "pitch_mm")
-    board = None if get(table, "board") is None else parse_board(table["board"], "board")
-    views = as_list(get(table, "views"), "views")
-    if views and board is None:
-        raise CalibrationError("board: is null, but there are views of one")
-    fixed = as_table(get(table, "fixed"), "fixed")
-    warp = as_numbers(get(table, "board_warp"), "board_warp", 2)
+    fx: FocalPx
+    fy: FocalPx
+    cx: float
+    cy: float
+    distortion: Distortion
 
-    def angle(name: str) -> float:
-        return math.radians(as_number(get(head, f"{name}_deg", "head"), f"head.{name}_deg"))
+    def check_center(self, size: tuple[int, int], where: str = "") -> None:
+        """Refuse a principal point that is far off the image."""
+        far = IMAGES_OFF * max(size)
+        for key in ("cx", "cy"):
+            if not -far <= (value := getattr(self, key)) <= far:
+                raise ValueError(f"{where}{key}: {value:g} is not within {-far:g} to {far:g}")
 
-    zoom = _parse_lens(as_table(get(table, "zoom"), "zoom"))
-    return Calibration(
-        fixed=_parse_intrinsics(fixed, as_size(get(fixed, "size", "fixed"), "fixed.size"), "fixed"),
-        zoom=zoom,
-        T_zoom0_fixed=as_pose(get(table, "T_zoom0_fixed"), "T_zoom0_fixed"),
-        T_head_zoom=None if T_head_zoom is None else as_pose(T_head_zoom, "T_head_zoom"),
-        head=HeadGeometry(
-            axis_offset=as_number(get(head, "axis_offset", "head"), "head.axis_offset"),
-            squareness=angle("squareness"),
-            pan_scale=_within(SCALES, get(head, "pan_scale", "head"), "head.pan_scale"),
-            tilt_scale=_within(SCALES, get(head, "tilt_scale", "head"), "head.tilt_scale"),
-            pan_zero=angle("pan_zero"),
-            tilt_zero=angle("tilt_zero"),
-        ),
-        jitter=math.radians(_at_least(0, get(head, "jitter_deg", "head"), "head.jitter_deg")),
-        pitch_mm=None if pitch is None else as_number(pitch, "pitch_mm", positive=True),
-        residuals=_parse_residuals(get(table, "residuals")),
-        covariance=_parse_covariance(get(table, "covariance"), len(zoom.stops)),
-        held_out=_parse_held_out(get(table, "held_out")),
-        board_warp=(warp[0], warp[1]),
-        board=board,
-        views=tuple(_parse_view(view, f"views[{i}]", board) for i, view in enumerate(views) if board is not None),
-        provenance=as_table(get(table, "provenance"), "provenance"),
-    )
+    def intrinsics(self, size: tuple[int, int]) -> Intrinsics:
+        """Make the intrinsics for an image's size."""
+        return Intrinsics(size, (self.fx, self.fy), (self.cx, self.cy), self.distortion)
+
+
+@model
+class FixedTable(LensTable):
+    """The fixed camera."""
+
+    size: Size
+
+    def __post_init__(self) -> None:
+        self.check_center(self.size)
+
+
+@model
+class StopTable(LensTable):
+    """A zoom sample."""
+
+    nominal_px: FocalPx
+    pupil: float
+
+
+@model
+class ZoomTable:
+    """The zoom lens."""
+
+    size: Size
+    stops: tuple[StopTable, ...]
+
+    def __post_init__(self) -> None:
+        if not self.stops:
+            raise ValueError("stops: is empty; at least one calibrated focal length is needed")
+        for i, stop in enumerate(self.stops):
+            stop.check_center(self.size, f"stops[{i}].")
+        if any(b.nominal_px <= a.nominal_px for a, b in itertools.pairwise(self.stops)):
+            raise ValueError("stops: the values of nominal_px do not increase")
+        if self.stops[0].pupil != 0:
+            raise ValueError("stops[0].pupil: is not 0, from which the others are counted")
+
+    def lens(self) -> ZoomLens:
+        """Make the zoom lens."""
+        return ZoomLens(
+            tuple(stop.nominal_px for stop in self.stops),
+            tuple(stop.intrinsics(self.size) for stop in self.stops),
+            tuple(stop.pupil for stop in self.stops),
+        )
+
+
+@model
+class HeadTable:
+    """The head's geometry and jitter."""
+
+    axis_offset: float
+    squareness_deg: float
+    pan_scale: Scale
+    tilt_scale: Scale
+    pan_zero_deg: float
+    tilt_zero_deg: float
+    jitter_deg: NotNegative
+
+    def geometry(self) -> HeadGeometry:
+        """Make the head's geometry."""
+        return HeadGeometry(
+            axis_offset=self.axis_offset,
+            squareness=math.radians(self.squareness_deg),
+            pan_scale=self.pan_scale,
+            tilt_scale=self.tilt_scale,
+            pan_zero=math.radians(self.pan_zero_deg),
+            tilt_zero=math.radians(self.tilt_zero_deg),
+        )
+
+
+@model
+class CovarianceTable:
+    """The covariance."""
+
+    parameters: tuple[str, ...]
+    matrix: tuple[tuple[float, ...], ...]
+
+    def __post_init__(self) -> None:
+        n = len(self.parameters)
+        if len(self.matrix) != n:
+            raise ValueError(f"matrix: has {len(self.matrix)} values where {n} are wanted")
+        for i, row in enumerate(self.matrix):
+            if len(row) != n:
+                raise ValueError(f"matrix[{i}]: has {len(row)} values where {n} are wanted")
+
+    def covariance(self) -> Covariance:
+        """Make the covariance."""
+        n = len(self.parameters)
+        return Covariance(self.parameters, np.array(self.matrix).reshape(n, n))
+
+
+@model
+class ViewTable:
+    """A view; its corners are null where they are not seen."""
+
+    camera: CameraName
+    board: Annotated[int, Ge(0)]
+    pan: float
+    tilt: float
+    focal_px: Positive | None
+    t: float
+    source: str | None
+    corners_px: tuple[Annotated[tuple[float, float], "[u, v]"] | None, ...]
+
+    def view(self) -> View:
+        """Make the view."""
+        corners_px = np.array([(np.nan, np.nan) if corner is None else corner for corner in self.corners_px])
+        return View(self.camera, corners_px, self.board, self.pan, self.tilt, self.focal_px, self.t, self.source)
+
+
+@model
+class CalibrationTable:
+    """Content of calibration.json."""
+
+    schema: int
+    fixed: FixedTable
+    zoom: ZoomTable
+    T_zoom0_fixed: Pose
+    T_head_zoom: Pose | None
+    head: HeadTable
+    pitch_mm: Positive | None
+    residuals: Residuals | None
+    covariance: CovarianceTable | None
+    held_out: HeldOut | None
+    board: BoardConfig | None
+    board_warp: Annotated[tuple[float, float], "[along x, along y]"]
+    provenance: Mapping[str, Any]
+    views: tuple[ViewTable, ...]
+
+    def __post_init__(self) -> None:
+        if self.covariance is not None:
+            check_covariance(self.covariance.covariance(), len(self.zoom.stops))
+        if self.board is None:
+            if self.views:
+                raise ValueError("board: is null, but there are views of one")
+            return
+        corners = math.prod(self.board.corners)
+        for i, view in enumerate(self.views):
+            if len(view.corners_px) != corners:
+                raise ValueError(f"views[{i}].corners_px: has {len(view.corners_px)} values where {corners} are wanted")
+
+    def calibration(self) -> Calibration:
+        """Make the calibration."""
+        return Calibration(
+            fixed=self.fixed.intrinsics(self.fixed.size),
+            zoom=self.zoom.lens(),
+            T_zoom0_fixed=self.T_zoom0_fixed,
+            T_head_zoom=self.T_head_zoom,
+            head=self.head.geometry(),
+            jitter=math.radians(self.head.jitter_deg),
+            pitch_mm=self.pitch_mm,
+            residuals=self.residuals,
+            covariance=None if self.covariance is None else self.covariance.covariance(),
+            held_out=self.held_out,
+            board_warp=self.board_warp,
+            board=self.board,
+            views=tuple(view.view() for view in self.views),
+            provenance=self.provenance,
+        )
 
 
 def check_covariance(covariance: Covariance, stops: int) -> None:
@@ -375,142 +428,6 @@ def check_covariance(covariance: Covariance, stops: int) -> None:
     rounding = ROUNDING * len(C)
     if not np.isfinite(R).all() or np.abs(R - R.T).max() > rounding or np.linalg.eigvalsh(R)[0] < -rounding:
         raise CalibrationError("covariance.matrix: is no covariance: not symmetric, or with a variance below zero")
-
-
-def parse_board(value: Any, where: str) -> BoardConfig:
-    """Parse a board from a JSON object."""
-    table = as_table(value, where)
-    kind = get(table, "kind", where)
-    if kind not in ("chessboard", "charuco"):
-        raise CalibrationError(f"{join(where, 'kind')}: {short(kind)} is not one of: chessboard, charuco")
-    return BoardConfig(
-        kind=kind,
-        corners=as_size(get(table, "corners", where), join(where, "corners")),
-        square=as_number(get(table, "square", where), join(where, "square"), positive=True),
-    )
-
-
-def _parse_intrinsics(table: Table, size: tuple[int, int], where: str) -> Intrinsics:
-    fx, fy = (_within(FOCALS_PX, get(table, k, where), join(where, k)) for k in ("fx", "fy"))
-    far = IMAGES_OFF * max(size)
-    cx, cy = (_within((-far, far), get(table, k, where), join(where, k)) for k in ("cx", "cy"))
-    told = as_list(get(table, "distortion", where), join(where, "distortion"), 5)
-    bounds = (-LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
-    k1, k2, p1, p2, k3 = (_within(bounds, k, f"{join(where, 'distortion')}[{i}]") for i, k in enumerate(told))
-    return Intrinsics(size=size, focal_px=(fx, fy), center_px=(cx, cy), distortion=(k1, k2, p1, p2, k3))
-
-
-def _parse_lens(table: Table) -> ZoomLens:
-    size = as_size(get(table, "size", "zoom"), "zoom.size")
-    stops = as_list(get(table, "stops", "zoom"), "zoom.stops")
-    if not stops:
-        raise CalibrationError("zoom.stops: is empty; at least one calibrated focal length is needed")
-    nominal, intrinsics, pupil = [], [], []
-    for i, value in enumerate(stops):
-        where = f"zoom.stops[{i}]"
-        stop = as_table(value, where)
-        nominal.append(_within(FOCALS_PX, get(stop, "nominal_px", where), join(where, "nominal_px")))
-        intrinsics.append(_parse_intrinsics(stop, size, where))
-        pupil.append(as_number(get(stop, "pupil", where), join(where, "pupil")))
-    if any(b <= a for a, b in itertools.pairwise(nominal)):
-        raise CalibrationError("zoom.stops: the values of nominal_px do not increase")
-    if pupil[0] != 0:
-        raise CalibrationError("zoom.stops[0].pupil: is not 0, from which the others are counted")
-    return ZoomLens(tuple(nominal), tuple(intrinsics), tuple(pupil))
-
-
-def _parse_residuals(value: Any) -> Residuals | None:
-    if value is None:
-        return None
-    where = "residuals"
-    table = as_table(value, where)
-    numbers: dict[str, Any] = {}
-    for key in RESIDUAL_KEYS:
-        item = get(table, key, where)
-        if key.endswith("_px"):
-            missing = item is None and key in ("handeye_rms_px", "stereo_rms_px")
-            numbers[key] = None if missing else _at_least(0, item, join(where, key))
-        else:
-            numbers[key] = as_whole(item, join(where, key))
-    rejected = []
-    for i, item in enumerate(as_list(get(table, "rejected", where), "residuals.rejected")):
-        entry = as_table(item, f"residuals.rejected[{i}]")
-        name, reason = (
-            as_text(get(entry, k, f"residuals.rejected[{i}]"), f"residuals.rejected[{i}].{k}")
-            for k in ("name", "reason")
-        )
-        rejected.append(Rejected(name, reason))
-    return Residuals(**numbers, rejected=tuple(rejected))
-
-
-def _parse_held_out(value: Any) -> HeldOut | None:
-    if value is None:
-        return None
-    table = as_table(value, "held_out")
-    lowest = {"measured_px": 0, "predicted_px": 0, "corners_rms_px": 0, "ratio": 0, "widened": 1}
-    numbers = {
-        name: _at_least(least, get(table, name, "held_out"), f"held_out.{name}") for name, least in lowest.items()
-    }
-    return HeldOut(views=as_whole(get(table, "views", "held_out"), "held_out.views"), **numbers)
-
-
-def _within(bounds: tuple[float, float], value: Any, where: str) -> float:
-    """Expect a number within bounds; for a positive lower bound, refuse zero and less with a message of its own."""
-    low, high = bounds
-    number = as_number(value, where, positive=low > 0)
-    if not low <= number <= high:
-        raise CalibrationError(f"{where}: {number:g} is not between {low:g} and {high:g}")
-    return number
-
-
-def _at_least(lowest: int, value: Any, where: str) -> float:
-    """Expect a number not below ``lowest``."""
-    number = as_number(value, where)
-    if number < lowest:
-        raise CalibrationError(f"{where}: {number:g} is less than {lowest}")
-    return number
-
-
-def _parse_covariance(value: Any, stops: int) -> Covariance | None:
-    if value is None:
-        return None
-    table = as_table(value, "covariance")
-    names = as_list(get(table, "parameters", "covariance"), "covariance.parameters")
-    rows = as_list(get(table, "matrix", "covariance"), "covariance.matrix", len(names))
-    matrix = [as_numbers(r, f"covariance.matrix[{i}]", len(names)) for i, r in enumerate(rows)]
-    covariance = Covariance(
-        parameters=tuple(as_text(n, f"covariance.parameters[{i}]") for i, n in enumerate(names)),
-        matrix=np.array(matrix).reshape(len(names), len(names)),
-    )
-    check_covariance(covariance, stops)
-    return covariance
-
-
-def _parse_view(value: Any, where: str, board: BoardConfig) -> View:
-    table = as_table(value, where)
-    camera = get(table, "camera", where)
-    if camera not in ("fixed", "zoom"):
-        raise CalibrationError(f"{where}.camera: {short(camera)} is not one of: fixed, zoom")
-    focal = get(table, "focal_px", where)
-    source = get(table, "source", where)
-    columns, rows = board.corners
-    corners = as_list(get(table, "corners_px", where), f"{where}.corners_px", columns * rows)
-    pan, tilt, t = (as_number(get(table, k, where), join(where, k)) for k in ("pan", "tilt", "t"))
-    return View(
-        camera=camera,
-        corners_px=np.array(
-            [
-                (np.nan, np.nan) if c is None else as_numbers(c, f"{where}.corners_px[{i}]", 2)
-                for i, c in enumerate(corners)
-            ]
-        ),
-        board=as_whole(get(table, "board", where), join(where, "board")),
-        pan=pan,
-        tilt=tilt,
-        focal_px=None if focal is None else as_number(focal, join(where, "focal_px"), positive=True),
-        t=t,
-        source=None if source is None else as_text(source, join(where, "source")),
-    )
 
 
 # Reading and writing calibration.json
@@ -548,11 +465,9 @@ def load_calibration(path: Path) -> Calibration:
         raise CalibrationError(f"{path}: is no calibration{_what(table)}; {WANTED}")
     check_schema(path, table, SCHEMA)
     try:
-        found = parse_calibration(table)
-        _refuse_unknown(table, _table(found))
-    except CalibrationError as error:
+        return validate(CalibrationTable, table, "").calibration()
+    except (ConfigError, CalibrationError) as error:
         raise CalibrationError(f"{path}: {error}") from None
-    return found
 
 
 def _table(calibration: Calibration) -> dict[str, Any]:
@@ -581,7 +496,7 @@ def _table(calibration: Calibration) -> dict[str, Any]:
             "jitter_deg": math.degrees(calibration.jitter),
         },
         "pitch_mm": calibration.pitch_mm,
-        "residuals": None if calibration.residuals is None else _write_residuals(calibration.residuals),
+        "residuals": None if calibration.residuals is None else dataclasses.asdict(calibration.residuals),
         "covariance": None
         if covariance is None
         else {"parameters": list(covariance.parameters), "matrix": covariance.matrix.tolist()},
@@ -596,27 +511,6 @@ def _table(calibration: Calibration) -> dict[str, Any]:
 def _what(table: Table) -> str:
     """Describe a file that is no calibration, by its keys; empty where it is not recognised."""
     return next((f", but {what}" for keys, what in OTHERS if table.keys() >= keys), "")
-
-
-def _refuse_unknown(read: Any, written: Any, where: str = "") -> None:
-    """Refuse unknown keys, which would otherwise be ignored without notice.
-
-    Args:
-        read: value from the file.
-        written: the same value as this version writes it.
-        where: key of both.
-
-    Raises:
-        CalibrationError: a key is unknown; the message lists the valid ones.
-    """
-    if isinstance(read, dict) and isinstance(written, dict):
-        for key, value in read.items():
-            if key not in written:
-                raise CalibrationError(f"unknown key '{join(where, key)}'; valid here: {choices(written)}")
-            _refuse_unknown(value, written[key], join(where, key))
-    elif isinstance(read, list) and isinstance(written, list):
-        for i, (a, b) in enumerate(zip(read, written, strict=False)):
-            _refuse_unknown(a, b, f"{where}[{i}]")
 
 
 def write_board(board: BoardConfig) -> dict[str, Any]:
@@ -647,13 +541,6 @@ def _write_intrinsics(camera: Intrinsics) -> dict[str, Any]:
     (fx, fy), (cx, cy) = camera.focal_px, camera.center_px
     numbers = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
     return {k: float(v) for k, v in numbers.items()} | {"distortion": [float(k) for k in camera.distortion]}
-
-
-def _write_residuals(residuals: Residuals) -> dict[str, Any]:
-    return {
-        **{name: getattr(residuals, name) for name in RESIDUAL_KEYS},
-        "rejected": [{"name": r.name, "reason": r.reason} for r in residuals.rejected],
-    }
 
 
 def _write_view(view: View) -> dict[str, Any]:

@@ -2,21 +2,24 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
+from annotated_types import Ge
 
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
 from cotarget.pantilt import IDEAL_HEAD, HeadGeometry
 from cotarget.rig import Image
+from cotarget.schema import NotNegative, model
 
 STILL = RigidTransform.identity()
 
 
 CameraName = Literal["fixed", "zoom"]
+Count = Annotated[int, Ge(0)]
 Progress = Callable[[int, int, str], None]  # done, total, text
 
 
@@ -86,7 +89,7 @@ def unseen(count: int) -> Array:
     return np.full((count, 2), np.nan)
 
 
-@dataclass(frozen=True)
+@model
 class Rejected:
     """Name of an image or view that was not used, with the reason."""
 
@@ -115,7 +118,7 @@ class Options:
 DEFAULT_OPTIONS = Options()
 
 
-@dataclass(frozen=True)
+@model
 class Residuals:
     """Residuals of a calibration: root mean square distance per point, over all corners of all views used [px].
 
@@ -131,14 +134,14 @@ class Residuals:
         rejected: images and views that were not used.
     """
 
-    fixed_rms_px: float
-    zoom_rms_px: float
-    stereo_rms_px: float | None
-    handeye_rms_px: float | None
-    fixed_views: int
-    zoom_views: int
-    pairs: int
-    outliers: int = 0
+    fixed_rms_px: NotNegative
+    zoom_rms_px: NotNegative
+    stereo_rms_px: NotNegative | None
+    handeye_rms_px: NotNegative | None
+    fixed_views: Count
+    zoom_views: Count
+    pairs: Count
+    outliers: Count = 0
     rejected: tuple[Rejected, ...] = ()
 
 
@@ -179,7 +182,7 @@ class Covariance:
         return float(np.sqrt(self.matrix[i, i]))
 
 
-@dataclass(frozen=True)
+@model
 class HeldOut:
     """Result of the held-out check: how well placements kept out of the fit are predicted.
 
@@ -196,12 +199,12 @@ class HeldOut:
             predicted one beyond chance; 1 where they agree.
     """
 
-    views: int
-    measured_px: float
-    predicted_px: float
-    corners_rms_px: float
-    ratio: float
-    widened: float = 1.0
+    views: Count
+    measured_px: NotNegative
+    predicted_px: NotNegative
+    corners_rms_px: NotNegative
+    ratio: NotNegative
+    widened: Annotated[float, Ge(1)] = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,7 +60,7 @@ def test_what_makes_no_sense_is_refused_by_name(folder, rows, said):
 
 def test_an_unknown_kind_of_board_is_named(folder):
     write(folder, [FIXED], kind="circles")
-    with pytest.raises(CalibrationError, match=r"board.kind: 'circles' is not one of: chessboard, charuco"):
+    with pytest.raises(CalibrationError, match=r"board.kind: 'circles' is not one of: charuco, chessboard"):
         read_index(folder)
 
 
