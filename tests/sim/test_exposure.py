@@ -51,9 +51,9 @@ def draws(monkeypatch):
     """Counts the pixels of every render."""
     drawn, draw = [], Canvas.draw
 
-    def counted(self, eye, axes, tangents, size, part):
+    def counted(self, eye, axes, tangents, size, part, **more):
         drawn.append(size[0] * size[1])
-        return draw(self, eye, axes, tangents, size, part)
+        return draw(self, eye, axes, tangents, size, part, **more)
 
     monkeypatch.setattr(Canvas, "draw", counted)
     return drawn
@@ -131,3 +131,20 @@ def test_a_window_is_the_part_of_the_whole_picture(monkeypatch):
     # Wings apart, which beat: the sky and the trunk in the window are as they were.
     assert np.median(inside) == 0
     assert math.isclose(float(np.percentile(inside, 40)), 0.0)
+
+
+def test_pictures_with_and_without_multisampling_do_not_change_one_another():
+    """One OpenGL context draws both, also of the largest size, in any order."""
+    with (w := world()).rig:
+        size = w.rig.fixed.size
+        canvas, data = w._views().canvas, w._state.lit(1.0)
+        eye, axes = np.array([0.0, 0.0, 1.6]), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+        def picture(multisampled):
+            canvas.look(data, 0, 1)
+            return canvas.draw(eye, axes, (-0.5, 0.5, -0.4, 0.4), size, multisampled=multisampled)
+
+        first = {multisampled: picture(multisampled) for multisampled in (True, False)}
+        assert (first[True] != first[False]).any()
+        for multisampled in (False, True, True, False, True):
+            np.testing.assert_array_equal(picture(multisampled), first[multisampled])

@@ -130,19 +130,8 @@ class Canvas:
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._option, self._untouched = mujoco.MjvOption(), mujoco.MjvPerturb()
         self._option.sitegroup[:] = 0
-        self._others: list[Canvas] = []
-
-    def without_multisampling(self) -> "Canvas":
-        """Open a canvas of the same model that does not antialias; it is closed with this one."""
-        if self._others:
-            return self._others[0]
-        quality = self._model.vis.quality
-        before, quality.offsamples = quality.offsamples, 0
-        try:
-            self._others.append(Canvas(self._model, self._size, self._shadows))
-        finally:
-            quality.offsamples = before
-        return self._others[0]
+        context = self._renderer._mjr_context
+        self._samples, self._buffer_size = context.offSamples, (context.offWidth, context.offHeight)
 
     def turn_to(self, model: "mujoco.MjModel") -> bool:
         """Draw another model from now on, if it differs from the current one in mesh vertices at most.
@@ -155,13 +144,11 @@ class Canvas:
         told = _told(model)
         if told != self._told or not np.array_equal(model.tex_data, self._model.tex_data):
             return False
-        for canvas in (self, *self._others):
-            renderer, canvas._model = canvas._renderer, model
-            renderer._model = model
-            if renderer._gl_context:
-                renderer._gl_context.make_current()
-            for mesh in range(model.nmesh):
-                mujoco.mjr_uploadMesh(model, renderer._mjr_context, mesh)
+        renderer, self._model = self._renderer, model
+        renderer._model = model
+        self._make_current()
+        for mesh in range(model.nmesh):
+            mujoco.mjr_uploadMesh(model, renderer._mjr_context, mesh)
         return True
 
     def look(self, data: "mujoco.MjData", camera_id: int, layers: int) -> None:
@@ -186,6 +173,7 @@ class Canvas:
         tangents: tuple[float, float, float, float],
         size: tuple[int, int],
         part: float = 1.0,
+        multisampled: bool = True,
     ) -> Image:
         """Draw the scene, RGB.
 
@@ -195,6 +183,7 @@ class Canvas:
             tangents: tangents of the picture's borders: left, right, bottom, top; right and up are positive.
             size: (width, height) [px].
             part: fraction of a picture that it counts as in `drawn`.
+            multisampled: whether the picture is antialiased, if the model is to be.
         """
         renderer, (left, right, bottom, top) = self._renderer, tangents
         for camera in renderer.scene.camera:  # MuJoCo keeps two for stereo; both get the same pose
@@ -205,8 +194,8 @@ class Canvas:
         rect = mujoco.MjrRect(0, 0, *size)
         image = np.empty((size[1], size[0], 3), dtype=np.uint8)
         # mujoco.Renderer draws whole pictures of its own size only.
-        if renderer._gl_context:
-            renderer._gl_context.make_current()
+        self._make_current()
+        self._set_samples(self._samples if multisampled else 0)
         mujoco.mjr_render(rect, renderer.scene, renderer._mjr_context)
         mujoco.mjr_readPixels(image, None, rect, renderer._mjr_context)
         before = int(Canvas.drawn)
@@ -218,8 +207,23 @@ class Canvas:
 
     def close(self) -> None:
         """Release OpenGL; safe to call more than once."""
-        for canvas in (*self._others, self):
-            canvas._renderer.close()
+        self._renderer.close()
+
+    def _make_current(self) -> None:
+        if self._renderer._gl_context:
+            self._renderer._gl_context.make_current()
+
+    def _set_samples(self, samples: int) -> None:
+        """Make the offscreen buffer anew, with another number of samples a pixel.
+
+        It takes a millisecond. A second context for this would hold all textures once more, some 90 MB.
+        """
+        context = self._renderer._mjr_context
+        if context.offSamples != samples:
+            context.offSamples = samples
+            width, height = self._buffer_size
+            # MuJoCo makes a new buffer only for another size.
+            mujoco.mjr_resizeOffscreen(width if context.offWidth != width else width + 1, height, context)
 
 
 def _told(model: "mujoco.MjModel") -> tuple[object, ...]:

@@ -112,7 +112,6 @@ class Views:
         """
         self._model, self._state, self._size, self._shadows = model, state, size, shadows
         self.canvas = canvas or Canvas(model, size, shadows)
-        self._plain = self.canvas  # canvas without multisampling, opened on first use
         self._multisampling, self._soft = multisampling, soft
         corners = np.stack(np.meshgrid(*([-1, 1],) * 3), axis=-1).reshape(-1, 3)
         self._corners = model.geom_aabb[:, None, :3] + corners * model.geom_aabb[:, None, 3:]
@@ -124,10 +123,7 @@ class Views:
     def apart(self) -> "Views":
         """Open another renderer of the same world for the calling thread; the two share no mutable data."""
         model = copy.copy(self._model)
-        other = Views(model, self._state.apart(model), self._size, self._shadows, self._multisampling)
-        if self._multisampling:
-            other._plain = other.canvas.without_multisampling()
-        return other
+        return Views(model, self._state.apart(model), self._size, self._shadows, self._multisampling)
 
     def close(self) -> None:
         """Release OpenGL; safe to call more than once."""
@@ -161,7 +157,7 @@ class Views:
             for moment, jitter in zip(moments, jitters, strict=True):
                 now = lens_at(moment)
                 aside = _shifted(_as_if(view, lens, now), jitter)
-                cv2.accumulate(self._render(camera, now, aside, moment, plain=self._multisampling), total)
+                cv2.accumulate(self._render(camera, now, aside, moment, plain=True), total)
             return self._through(lens, view, cv2.convertScaleAbs(total, alpha=1 / BLUR_RENDERS))
         image = np.ascontiguousarray(self._render(camera, lens, view, t))
         parts = [np.zeros((window.height, window.width, 3), dtype=np.float32) for window in windows]
@@ -195,20 +191,18 @@ class Views:
         """Render a view, or a window of it, RGB."""
         moment = self._moment(camera, lens, t, view)
         data = self._state.lit(t)
-        if plain and self._plain is self.canvas:
-            self._plain = self.canvas.without_multisampling()
-        canvas = self._plain if plain else self.canvas
         shown = window or Window(0, 0, *view.size)
         self._model.geom_group[:] = self._layers(moment, shown, self._visible(t))
         try:
-            canvas.look(data, self._model.camera(RIG + camera).id, LAYERS)
+            self.canvas.look(data, self._model.camera(RIG + camera).id, LAYERS)
         finally:
             self._model.geom_group[:] = self._groups
         (fx, fy), (cx, cy) = view.focal_px, view.center_px
         left, top = shown.left - 0.5 - cx, shown.top - 0.5 - cy
         tangents = (left / fx, (left + shown.width) / fx, -(top + shown.height) / fy, -top / fy)
         size = (shown.width, shown.height)
-        return canvas.draw(moment.eye, moment.axes, tangents, size, math.prod(size) / math.prod(view.size))
+        part = math.prod(size) / math.prod(view.size)
+        return self.canvas.draw(moment.eye, moment.axes, tangents, size, part, multisampled=not plain)
 
     def _moment(self, camera: str, lens: TrueLens, t: float, view: Pinhole) -> Moment:
         data = self._state.at(t)
