@@ -34,13 +34,15 @@ def load_config(path: Path | str, text: str | None = None) -> "RigConfig":
 
 
 def check(config: "RigConfig") -> None:
-    """Check what the backends know of a configuration: [hardware] by its drivers; no device is opened.
+    """Check what only the backends know: the simulated world, and [hardware] by its drivers; nothing is opened.
 
     Raises:
         ConfigError: a value is refused; the message names the key.
     """
     from cotarget.drivers.rig import check_hardware
+    from cotarget.sim.check import check_sim
 
+    check_sim(config.sim)
     check_hardware(config.hardware)
     if config.backend != "replay" and config.safety.watchdog_s * (rate_hz := _described(config).fixed.rate_hz) <= 1:
         raise ConfigError(

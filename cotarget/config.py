@@ -9,9 +9,7 @@ values that make no sense.
 """
 
 import dataclasses
-import itertools
 import json
-import math
 import re
 import tomllib
 import types
@@ -21,10 +19,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
-import numpy as np
 from annotated_types import Ge, Interval, Le
 
-from cotarget.camera import Intrinsics
 from cotarget.errors import ConfigError, choices
 from cotarget.files import assets_dir
 from cotarget.geometry import pose
@@ -56,12 +52,6 @@ def check_config(config: "RigConfig") -> None:
         ConfigError: a value is refused; the message names the key.
     """
     validate(RigConfig, as_table(config), "")
-    _check_combinations(config)
-
-
-def _check_combinations(config: "RigConfig", recorded: bool = False) -> None:
-    if not recorded:
-        check_sim(config.sim)
     check_corners(config.board)
 
 
@@ -93,7 +83,6 @@ Distortion = Annotated[tuple[float, float, float, float, float], "[k1, k2, p1, p
 Waypoint = Annotated[tuple[float, float, float, float], "[t, x, y, z]"]
 # Coefficients of s, s^2, s^3 ...: a curve that is 0 at the shortest focal length.
 Curve = Annotated[tuple[float, ...], "[of s, of s^2, ...]"]
-TARGETS = KINDS  # targets with a model in the simulation
 
 
 @model
@@ -140,16 +129,6 @@ class SimCamera:
 
 
 @model
-class ZoomOptics:
-    """Optics of a zoom lens at one focal length; ``pupil`` is the forward movement of its entrance pupil [m]."""
-
-    focal_px: Focal
-    center_px: Center
-    distortion: Distortion
-    pupil: float
-
-
-@model
 class SimZoomCamera(SimCamera):
     """The simulated zoom camera; ``focal_px``, ``center_px`` and ``distortion`` hold at the shortest focal length.
 
@@ -188,31 +167,6 @@ class SimZoomCamera(SimCamera):
             "pitch_mm": self.pitch_mm / by,
             "center_drift_px": tuple(tuple(by * c for c in curve) for curve in self.center_drift_px),
         }
-
-    def optics_at(self, magnification: float) -> ZoomOptics:
-        """Compute the optics at a nominal focal length, given as a multiple of the shortest."""
-        s = math.log(magnification) / math.log(self.focal_mm[1] / self.focal_mm[0])
-        gain = magnification * (1 + _along(self.focal_curve, s))
-        (fx, fy), (cx, cy), (k1, k2, p1, p2, k3) = self.focal_px, self.center_px, self.distortion
-        du, dv = (_along(curve, s) for curve in self.center_drift_px)
-        # Tangents within the image shrink as the focal length grows. Coefficients that grow with its powers keep the
-        # image's distortion.
-        squared = gain * gain
-        k1 = (k1 + _along(self.distortion_drift, s)) * squared
-        return ZoomOptics(
-            focal_px=(fx * gain, fy * gain),
-            center_px=(cx + du, cy + dv),
-            distortion=(k1, k2 * squared * squared, p1 * gain, p2 * gain, k3 * squared * squared * squared),
-            pupil=_along(self.pupil, s),
-        )
-
-
-def _along(curve: Curve, s: float) -> float:
-    """Evaluate a curve by Horner's rule."""
-    value = 0.0
-    for coefficient in reversed(curve):
-        value = (value + coefficient) * s
-    return value
 
 
 @model
@@ -371,6 +325,34 @@ def split_name(name: str) -> tuple[str, int]:
     return (name, 1) if number is None else (name[: number.start()], int(number[0]))
 
 
+def known_targets(own: Iterable[str] = ()) -> str:
+    """Format the names of the simulation's targets and of [sim.models], for messages."""
+    return (
+        f"the simulation has: {choices([*KINDS, *own])}, and further ones with a number, as 'bird2'; others need a "
+        "model: [sim.models]"
+    )
+
+
+def check_shown(config: "RigConfig", name: str) -> None:
+    """Refuse to follow a target that the simulated scene does not contain.
+
+    Args:
+        config: configuration of the rig.
+        name: name of the target, one of the configuration's.
+
+    Raises:
+        ConfigError: the scene lacks the target; the message says how to add it.
+    """
+    if config.backend != "sim" or name in config.sim.targets:
+        return
+    own = config.sim.models
+    if split_name(name)[0] not in (*KINDS, *own):
+        raise ConfigError(f"a simulated {name} cannot be, whatever [targets.{name}] says; {known_targets(own)}")
+    raise ConfigError(
+        f"the simulated scene has no {name}; add it: [sim] targets = {json.dumps([*config.sim.targets, name])}"
+    )
+
+
 # The [hardware] tables
 
 Table = Mapping[str, Any]
@@ -391,147 +373,6 @@ class HardwareConfig:
     fixed: Table = field(default_factory=dict)
     zoom: Table = field(default_factory=dict)
     board: Table = field(default_factory=dict)
-
-
-# Checks of the [sim] tables
-
-# Number of focal lengths at which the zoom lens's curves are checked.
-CHECKED_FOCALS = 33
-# Largest movement of an entrance pupil, longer than any lens; beyond it millimetres were given [m].
-FARTHEST_PUPIL = 1.0
-MODEL_SUFFIXES = (".obj", ".stl", ".xml")  # files of a user's own target models
-
-
-def check_sim(sim: SimConfig) -> None:
-    """Refuse an impossible simulated world.
-
-    Raises:
-        ConfigError: a value is refused; the message names the key.
-    """
-    for name, camera in (("fixed", sim.fixed), ("zoom", sim.zoom)):
-        _check_center(f"sim.{name}", camera)
-        _check_frame_time(f"sim.{name}", camera)
-        _check_lens(f"sim.{name}", camera)
-    if sim.effects.optics:
-        _check_optics(sim.zoom)
-    for name, waypoints in sim.paths.items():
-        if len(waypoints) < 2 or any(b[0] <= a[0] for a, b in itertools.pairwise(waypoints)):
-            raise ConfigError(f"sim.paths.{name}: needs two or more waypoints [t, x, y, z] with increasing t")
-    _check_models(sim)
-    _check_targets(sim)
-    for name in sim.targets:
-        if split_name(name)[0] in sim.models and name not in sim.paths:
-            raise ConfigError(
-                f"sim.targets: a {name} of your own needs a way: [sim.paths] {name} = [[t, x, y, z], ...]"
-            )
-
-
-def known_targets(own: Iterable[str] = ()) -> str:
-    """Format the names of the simulation's targets and of [sim.models], for messages."""
-    return (
-        f"the simulation has: {choices([*TARGETS, *own])}, and further ones with a number, as 'bird2'; others need a "
-        "model: [sim.models]"
-    )
-
-
-def check_shown(config: "RigConfig", name: str) -> None:
-    """Refuse to follow a target that the simulated scene does not contain.
-
-    Args:
-        config: configuration of the rig.
-        name: name of the target, one of the configuration's.
-
-    Raises:
-        ConfigError: the scene lacks the target; the message says how to add it.
-    """
-    if config.backend != "sim" or name in config.sim.targets:
-        return
-    own = config.sim.models
-    if split_name(name)[0] not in (*TARGETS, *own):
-        raise ConfigError(f"a simulated {name} cannot be, whatever [targets.{name}] says; {known_targets(own)}")
-    raise ConfigError(
-        f"the simulated scene has no {name}; add it: [sim] targets = {json.dumps([*config.sim.targets, name])}"
-    )
-
-
-def _check_models(sim: SimConfig) -> None:
-    """Refuse models with the name of a built-in target, with a number, or with an unknown suffix."""
-    for name, path in sim.models.items():
-        if name in TARGETS:
-            raise ConfigError(f"sim.models.{name}: the simulation has a {name} of its own; give yours another name")
-        if split_name(name)[1] > 1:
-            raise ConfigError(f"sim.models.{name}: a model is of a kind; give its name without the number")
-        if path.suffix not in MODEL_SUFFIXES:
-            raise ConfigError(f"sim.models.{name}: {path} is not one of: {choices(MODEL_SUFFIXES)}")
-
-
-def _check_targets(sim: SimConfig) -> None:
-    """Refuse targets without a model, and two targets of one name."""
-    for where, names in (("sim.targets", sim.targets), ("sim.paths", tuple(sim.paths))):
-        for at, name in enumerate(names):
-            if split_name(name)[0] not in (*TARGETS, *sim.models):
-                raise ConfigError(f"{where}: unknown target '{name}'; {known_targets(sim.models)}")
-            if name in names[:at]:
-                kind = split_name(name)[0]
-                free = next(f"{kind}{number}" for number in itertools.count(2) if f"{kind}{number}" not in names)
-                raise ConfigError(f"{where}: '{name}' is named twice; a further one has a number, as '{free}'")
-
-
-def _check_frame_time(where: str, camera: SimCamera) -> None:
-    """Refuse an exposure that is longer than a frame's interval."""
-    if camera.exposure_s * camera.rate_hz > 1:
-        raise ConfigError(
-            f"{where}.exposure_s: {camera.exposure_s:g} s is longer than the {1 / camera.rate_hz:g} s from one frame "
-            f"to the next, of which {camera.rate_hz:g} come a second"
-        )
-
-
-def _check_center(where: str, camera: SimCamera) -> None:
-    """Refuse a principal point outside the image, such as one meant for a larger image."""
-    (u, v), (width, height) = camera.center_px, camera.size
-    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
-        raise ConfigError(
-            f"{where}.center_px: ({u:g}, {v:g}) is not in the {width}x{height} image; give one near its middle, or none"
-        )
-
-
-def _sees_nothing(lens: Intrinsics) -> bool:
-    """Whether a part of the image has no ray."""
-    w, h = lens.size
-    rim = np.array([(u, v) for u in np.linspace(-1, w, 9) for v in np.linspace(-1, h, 9)])
-    return not np.isfinite(lens.ray(rim)).all()
-
-
-def _check_lens(where: str, camera: SimCamera) -> None:
-    """Refuse a distortion that leaves a part of the image without rays."""
-    if _sees_nothing(Intrinsics(camera.size, camera.focal_px, camera.center_px, camera.distortion)):
-        raise ConfigError(
-            f"{where}.distortion: {list(camera.distortion)} folds back inside the image, so that parts of it see "
-            "nothing; give a weaker distortion, a longer focal_px or a smaller size"
-        )
-
-
-def _check_optics(zoom: SimZoomCamera) -> None:
-    """Refuse zoom curves that no real lens follows."""
-    shortest_mm, longest_mm = zoom.focal_mm
-    before = 0.0
-    for magnification in np.geomspace(1.0, longest_mm / shortest_mm, CHECKED_FOCALS).tolist():
-        optics, at = zoom.optics_at(magnification), f"at {magnification:.3g} times the shortest focal length"
-        focal = optics.focal_px[0]
-        if not before < focal < math.inf:
-            raise ConfigError(f"sim.zoom.focal_curve: the true focal length does not grow with the nominal one {at}")
-        before = focal
-        drift = np.abs(np.subtract(optics.center_px, zoom.center_px))
-        if not (drift < zoom.size).all():
-            raise ConfigError(f"sim.zoom.center_drift_px: moves the centre by the whole image or more {at}")
-        if not abs(optics.pupil) < FARTHEST_PUPIL:
-            raise ConfigError(f"sim.zoom.pupil: {optics.pupil:g} m {at} is {FARTHEST_PUPIL:g} m or more; give metres")
-        lens = Intrinsics(zoom.size, optics.focal_px, optics.center_px, optics.distortion)
-        if not np.isfinite(optics.distortion).all() or _sees_nothing(lens):
-            raise ConfigError(
-                f"sim.zoom.distortion_drift: the distortion folds back inside the image {at}, so that parts of it see "
-                "nothing; give smaller coefficients"
-            )
 
 
 ENCODING = "utf-8-sig"  # UTF-8 with or without the byte order mark that some editors write
@@ -768,13 +609,13 @@ def _tables(text: str, path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: is not TOML: {error}") from None
 
 
-def parse_config(table: Mapping[str, Any], *, recorded: bool = False) -> RigConfig:
+def parse_config(table: Mapping[str, Any]) -> RigConfig:
     """Build the configuration from TOML's tables; missing keys keep their defaults.
+
+    What only a backend can check, such as a simulated world, is checked by `cotarget.backends.check`.
 
     Args:
         table: tables as TOML gives them.
-        recorded: whether they belong to a recording. It opens no simulated world, so a world that only an earlier
-            version had is not refused.
 
     Raises:
         ConfigError: an unknown key or an impossible value.
@@ -794,7 +635,7 @@ def parse_config(table: Mapping[str, Any], *, recorded: bool = False) -> RigConf
         table["safety"] = {key: value for key, value in safety.items() if key != "stop_file"}
     config = validate(RigConfig, table, "")
     config = dataclasses.replace(config, targets=targets, sim=fit_sizes(config.sim, table.get("sim", {})))
-    _check_combinations(config, recorded)
+    check_corners(config.board)
     return config
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.config import TARGETS, TargetProfile, split_name
+from cotarget.config import TargetProfile, split_name
 from cotarget.detection import Detection
 from cotarget.errors import ConfigError, UnreachableError
 from cotarget.estimation.zoom_matching import CloseupFinder, Expected, MatchingSettings, ZoomMeasurement
@@ -25,6 +25,7 @@ from cotarget.metrics import WHOLLY_VISIBLE, Closeup, Row
 from cotarget.pantilt import HeadGeometry
 from cotarget.pipeline import Step
 from cotarget.rig import Frame, Image, to_step
+from cotarget.sim.targets import KINDS
 from cotarget.sim.targets.target import marker_of
 from cotarget.sim.truth import Appearances, CameraName, Silhouette, Truth
 from cotarget.sim.world import SimWorld
@@ -259,7 +260,7 @@ def observe(step: Step, truth: Truth, name: str, target: TargetProfile) -> Row:
     wide_px = truth.pixel("fixed", truth.center(name, t_fixed), t_fixed)
     wide_outlines = {each: truth.silhouette(each, "fixed", t_fixed) for each in truth.targets}
     wide_outline = wide_outlines[name]
-    marker = marker_of(name) if split_name(name)[0] in TARGETS else None  # a user's own target has no marker
+    marker = marker_of(name) if split_name(name)[0] in KINDS else None  # a user's own target has no marker
     pan, tilt = truth.head_at(t)
     followed = step.target
     alone = followed is not None and not followed.missed and not followed.shared

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cotarget.backends import load_config
+from cotarget.backends import check, load_config
 from cotarget.config import SafetyConfig, SimEffects, parse_config
 from cotarget.errors import ConfigError
 
@@ -218,7 +218,7 @@ def test_the_curves_of_the_zoom_lens_are_taken_and_checked_only_where_they_are_u
     assert not parse_config({"sim": {"effects": {"all": False}}}).sim.effects.optics
     assert SimEffects().optics
     with pytest.raises(ConfigError, match="does not grow"):
-        parse_config({"sim": {"zoom": curves}})
+        check(parse_config({"sim": {"zoom": curves}}))
 
 
 @pytest.mark.parametrize(("size", "by"), [([1280, 960], 2), ([320, 240], 0.5), ([1280, 720], 2)])

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.backends import describe, load_config
+from cotarget.backends import check, describe, load_config
 from cotarget.calibration import Calibration, load_calibration
 from cotarget.config import (
     DEFAULT_TARGETS,
@@ -77,6 +77,7 @@ def rig_of(given: object) -> RigConfig:
         raise ConfigError(f"rig: its backend is '{config.backend}'; environments are on 'sim' alone")
     if given is not None:
         check_config(config)  # a configuration made in Python was not checked yet
+        check(config)
         _check_waits(config.sim)
     describe(config)  # refuses soft limits that leave nothing
     head, soft = config.sim.head, config.safety

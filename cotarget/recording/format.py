@@ -397,7 +397,7 @@ def _parse_meta(directory: Path, meta: Mapping[str, Any]) -> tuple[str, dict[str
             raise ConfigError("target: is not a text")
         if not isinstance(table, Mapping):
             raise ConfigError(f"config: {table!r} is not a table")
-        config = parse_config(table, recorded=True)
+        config = parse_config(table)
         target = config.target(name)
         selector_table = meta.get("whom", {})
         check_selector_table(selector_table)

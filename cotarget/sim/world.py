@@ -30,6 +30,7 @@ from cotarget.sim.state import WorldState
 from cotarget.sim.targets.target import Target, make_target, target_rng
 from cotarget.sim.truth import CameraName, Truth
 from cotarget.sim.weather import Clutter
+from cotarget.sim.zoom_lens import optics_at
 
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -123,7 +124,7 @@ class SimWorld:
         """Give the zoom camera's true optics at a nominal focal length [px]."""
         factor = nominal_px / self.lens_drive.shortest_px
         if self.config.sim.effects.optics:
-            optics = self.config.sim.zoom.optics_at(factor)
+            optics = optics_at(self.config.sim.zoom, factor)
             distortion = optics.distortion if self.config.sim.effects.distortion else NO_DISTORTION
             return TrueLens(self._zoom_lens.size, optics.focal_px, optics.center_px, distortion, optics.pupil)
         fx, fy = self._zoom_lens.focal_px

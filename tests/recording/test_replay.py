@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cotarget.backends import describe, open_recording, open_rig
+from cotarget.backends import check, describe, open_recording, open_rig
 from cotarget.calibration import load_calibration
 from cotarget.calibration.file import save_calibration
 from cotarget.cli.main import main
@@ -576,7 +576,7 @@ def test_a_simulated_world_that_would_be_refused_by_now_can_still_be_replayed(co
     for camera in ("fixed", "zoom"):  # of which the principal point was not moved with the size, at that time
         config["sim"][camera] |= {"size": [320, 240], "center_px": [326.0, 239.0], "exposure_s": 1.0}
     with pytest.raises(ConfigError, match=r"center_px: \(326, 239\) is not in the 320x240 image"):
-        parse_config(config)
+        check(parse_config(config))
     edit("config", config)(copy)
     assert open_recording(copy).config.sim.zoom.center_px == (326.0, 239.0)
     config["sim"]["fixed"]["rate_hz"] = 0.0  # by which a replay goes

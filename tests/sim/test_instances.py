@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from cotarget.config import DEFAULT_TARGETS, TARGETS, RigConfig, SimConfig
+from cotarget.config import DEFAULT_TARGETS, RigConfig, SimConfig
 from cotarget.errors import ConfigError
+from cotarget.sim.targets import KINDS
 from cotarget.sim.targets.target import kind_of, marker_of
 from cotarget.sim.world import SimWorld
 
@@ -20,7 +21,7 @@ def world(paths, **sim):
 
 def test_names_have_a_kind_and_a_marker():
     assert [kind_of(name).name for name in ("bird", "bird2", "person13", "book5")] == ["bird", "bird", "person", "book"]
-    assert [marker_of(name) for name in TARGETS] == [1, 2, 3]  # as drawn in sim_assets
+    assert [marker_of(name) for name in KINDS] == [1, 2, 3]  # as drawn in sim_assets
     names = [f"{kind}{i}" for kind in ("person", "bird") for i in ("", 2, 3, 4, 5)]
     assert len({marker_of(name) for name in names}) == len(names)
     assert max(map(marker_of, names)) < 50  # of DICT_4X4_50

@@ -94,6 +94,6 @@ def test_a_new_kind_is_a_model_a_module_and_a_name(tmp_path):
 
 
 def test_the_names_of_the_kinds_need_no_mujoco():
-    program = "import sys; from cotarget.config import TARGETS; assert 'mujoco' not in sys.modules; print(*TARGETS)"
+    program = "import sys; from cotarget.sim.targets import KINDS; assert 'mujoco' not in sys.modules; print(*KINDS)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=100)
     assert done.stdout == "book person bird\n"

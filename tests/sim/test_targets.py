@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cotarget.config import TARGETS
 from cotarget.errors import ConfigError
 from cotarget.sim.render.opengl import mujoco
+from cotarget.sim.targets import KINDS
 from cotarget.sim.targets.paths import MOUNT, waypoint_path
 from cotarget.sim.targets.target import make_target, scale_spec
 
@@ -21,7 +21,7 @@ ENTERING = 1.5  # from crossing the border until the margin is kept [s]
 PITCH = {"indoor": 0.0, "outdoor": 9.0}  # of the mount in the scenes [degrees]
 DIMENSION = {"book": (1, 0.234), "person": (2, 1.75), "bird": (1, 0.8)}  # axis, size [m]
 SIZE_TOLERANCE = 0.01  # relative; what the pipeline is told is good to this
-CASES = [(name, scene) for name in TARGETS for scene in PITCH]
+CASES = [(name, scene) for name in KINDS for scene in PITCH]
 
 
 def bearings(points, scene):
@@ -190,7 +190,7 @@ def test_wings_beat_four_times_a_second():
     assert target.kind.beat_s == 0.25
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize("name", KINDS)
 @pytest.mark.parametrize("factor", [1.0, 1.12])
 def test_model_has_the_size_that_it_claims(name, factor):
     spec = mujoco.MjSpec.from_file(str(ASSETS / "targets" / f"{name}.xml"))
@@ -201,7 +201,7 @@ def test_model_has_the_size_that_it_claims(name, factor):
     assert (high + low)[axis] == pytest.approx(0.0, abs=SIZE_TOLERANCE * size)  # the origin is its middle
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize("name", KINDS)
 def test_model_has_the_joints_that_move(name):
     model = mujoco.MjModel.from_xml_path(str(ASSETS / "targets" / f"{name}.xml"))
     assert {model.joint(j).name for j in range(model.njnt)} == set(make(name).pose(0.0).joints)
@@ -212,11 +212,11 @@ def test_model_has_the_joints_that_move(name):
 @pytest.mark.parametrize("scene", PITCH)
 def test_scene_takes_rig_and_targets_without_a_warning(scene):
     spec = mujoco.MjSpec.from_file(str(ASSETS / "scenes" / f"{scene}.xml"))
-    for part in ("rig", *(f"targets/{name}" for name in TARGETS)):
+    for part in ("rig", *(f"targets/{name}" for name in KINDS)):
         child = mujoco.MjSpec.from_file(str(ASSETS / f"{part}.xml"))
         spec.attach(child, frame=spec.worldbody.add_frame(), prefix=f"{part}/")
     model = spec.compile()
-    assert model.nmocap == len(TARGETS)
+    assert model.nmocap == len(KINDS)
     assert model.vis.map.znear * model.stat.extent == pytest.approx(0.05, rel=1e-3)
     assert model.vis.map.zfar * model.stat.extent >= 120
     assert not model.geom_contype.any()
@@ -225,7 +225,7 @@ def test_scene_takes_rig_and_targets_without_a_warning(scene):
 
 def test_waypoints_replace_the_path():
     way = ((1.0, -2.0, 8.0, 1.0), (3.0, 0.0, 9.0, 1.5), (6.0, 2.0, 8.0, 1.0))
-    for name in TARGETS:
+    for name in KINDS:
         target = make(name, waypoints=way)
         assert target.path.position(3.0) == pytest.approx([0.0, 9.0, 1.5])
         assert target.path.position(-5.0) == pytest.approx(way[0][1:])
