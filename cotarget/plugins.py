@@ -129,6 +129,8 @@ class Reporting:
         self._device, self._what = device, what
 
     def __getattr__(self, name: str) -> Any:
+        if not hasattr(type(self._device), name) and name not in vars(self._device):
+            raise AttributeError(name)  # so that hasattr works
         with calling(self._what):
             found = getattr(self._device, name)
         return reporting(found, self._what) if callable(found) else found

@@ -114,6 +114,17 @@ class Unset:
     pass
 
 
+class Wrong(Camera):
+    Settings = HeadSettings
+
+
+class Short:
+    Settings = CameraSettings
+
+    def __init__(self, settings, clock):
+        self.size = settings.size
+
+
 def boxes(image):
     return [(2, 3, 4, 5)] if image.mean() > 0 else {}["dark"]
 """
@@ -182,7 +193,11 @@ def test_an_own_detector_is_found_beside_rig_toml(rig, monkeypatch):
         ('"devices:Camera"\nrate_hz = "9"', "hardware.fixed.rate_hz: '9' is not a finite number"),
         ('"device:Camera"', "hardware.fixed.driver: there is no module 'device' beside rig.toml or on Python's path"),
         ('"devices:Camer"', "hardware.fixed.driver: "),
-        ('"devices:Unset"', "hardware.fixed.driver: "),
+        (
+            '"devices:Unset"',
+            "hardware.fixed.driver: {folder}/devices.py:Unset has no Settings, a dataclass of its keys",
+        ),
+        ('"devices:Wrong"', "hardware.fixed.driver: spec of its Settings is no CameraSpec of cotarget.rig"),
         ('"devices"', "hardware.fixed.driver: 'devices' is neither module:name nor one of: axis"),
         ('"syntax:Camera"', "hardware.fixed.driver: {folder}/syntax.py:2: SyntaxError"),
         ('"failing:Camera"', "hardware.fixed.driver: {folder}/failing.py:3: ZeroDivisionError: division by zero"),
@@ -206,6 +221,9 @@ def test_each_mistake_is_one_line_that_names_it(rig, change, said):
 def test_an_error_of_a_device_is_one_line_that_names_file_and_line(rig):
     rig.write_text(RIG.replace("devices:Camera", "devices:Broken"))
     with pytest.raises(DeviceError, match=r"^hardware\.fixed: .*devices\.py:\d+: RuntimeError: the lens cap is on$"):
+        open_rig(rig)
+    rig.write_text(RIG.replace("devices:Camera", "devices:Short"))
+    with pytest.raises(ConfigError, match=r"^hardware\.fixed\.driver: Short has no read; docs/drivers\.md says what"):
         open_rig(rig)
     rig.write_text(RIG.replace('"green"', '"pink"'))
     with open_rig(rig) as opened, pytest.raises(DeviceError, match=r"^hardware\.fixed: .*devices\.py:\d+: KeyError"):

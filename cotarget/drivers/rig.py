@@ -3,7 +3,7 @@
 import contextlib
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from typing import Any, ClassVar, Protocol
 
 from cotarget.config import HardwareConfig, RigConfig, SafetyConfig
@@ -13,14 +13,20 @@ from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import rig_lock
 from cotarget.errors import ConfigError, choices
 from cotarget.plugins import FORM, Reporting, calling, is_own, load
-from cotarget.rig import Clock, Rig, RigSpec
+from cotarget.rig import CameraSpec, Clock, HeadSpec, Rig, RigSpec, ZoomSpec
 from cotarget.schema import missing_key, validate
 
 # Python's thread switch interval [s], instead of 5 ms: a driver's thread that waits for its turn delays every command.
 # Measurements: docs/design-notes.md.
 SWITCH_INTERVAL = 5e-4
-ROLES = ("head", "fixed", "zoom")  # tables of [hardware] that have a driver
 KEY = "driver"
+# By table of [hardware] that has a driver: what the driver's settings describe, and what the opened device has.
+CAMERA = ("size", "read", "close")
+ROLES: Mapping[str, tuple[type[Any], tuple[str, ...]]] = {
+    "head": (HeadSpec, ("limits", "state", "move", "halt", "close")),
+    "fixed": (CameraSpec, CAMERA),
+    "zoom": (ZoomSpec, (*CAMERA, "still_size", "focal_range", "zoom", "state", "capture")),
+}
 
 
 class Driver(Protocol):
@@ -42,16 +48,34 @@ class Device:
     """A device of rig.toml: the driver that opens it, and its checked settings.
 
     Attributes:
-        where: the device's table in rig.toml.
+        role: "head", "fixed" or "zoom".
         driver: see `Driver`.
         settings: an instance of ``driver.Settings``.
         own: whether the driver is a user's own.
     """
 
-    where: str
+    role: str
     driver: Any
     settings: Any
     own: bool
+
+    @property
+    def where(self) -> str:
+        """The device's table in rig.toml."""
+        return f"hardware.{self.role}"
+
+    @property
+    def spec(self) -> Any:
+        """What the settings say of the device.
+
+        Raises:
+            ConfigError: they do not describe such a device.
+        """
+        with calling(self.where):
+            spec, wanted = self.settings.spec, ROLES[self.role][0]
+        if not isinstance(spec, wanted):
+            raise ConfigError(f"{self.where}.{KEY}: spec of its Settings is no {wanted.__name__} of cotarget.rig")
+        return spec
 
     def refuse_missing(self) -> None:
         """Refuse settings that lack what opening the device needs.
@@ -89,7 +113,12 @@ class Device:
         if not self.own:
             return self.driver(self.settings, *arguments)
         with calling(self.where):
-            return Reporting(self.driver(self.settings, *arguments), self.where)
+            device = self.driver(self.settings, *arguments)
+        if lacks := [name for name in ROLES[self.role][1] if not hasattr(device, name)]:
+            raise ConfigError(
+                f"{self.where}.{KEY}: {self.driver.__name__} has no {lacks[0]}; docs/drivers.md says what it needs"
+            )
+        return Reporting(device, self.where)
 
 
 def device_of(role: str, table: Mapping[str, Any]) -> Device:
@@ -108,11 +137,11 @@ def device_of(role: str, table: Mapping[str, Any]) -> Device:
     if not own and name not in known:
         raise ConfigError(f"{where}.{KEY}: {name!r} is neither {FORM} nor one of: {choices(known)}")
     driver = load(name if own else known[name], f"{where}.{KEY}")
-    if not hasattr(driver, "Settings"):
-        raise ConfigError(f"{where}.{KEY}: {name} has no Settings, the dataclass of its keys in rig.toml")
+    if not is_dataclass(settings := getattr(driver, "Settings", None)) or not hasattr(settings, "spec"):
+        raise ConfigError(f"{where}.{KEY}: {name} has no Settings, a dataclass of its keys in rig.toml with a spec")
     rest = {key: value for key, value in table.items() if key != KEY}
     with calling(where):
-        return Device(where, driver, validate(driver.Settings, rest, where, beside=(KEY,)), own)
+        return Device(role, driver, validate(driver.Settings, rest, where, beside=(KEY,)), own)
 
 
 def devices(hardware: HardwareConfig) -> dict[str, Device]:
@@ -155,8 +184,7 @@ def rig_spec(config: RigConfig) -> RigSpec:
 
 
 def _spec(found: Mapping[str, Device]) -> RigSpec:
-    specs = {role: found[role].settings.spec for role in ROLES}
-    return RigSpec(**specs, real_time=True)
+    return RigSpec(**{role: found[role].spec for role in ROLES}, real_time=True)
 
 
 def open_hardware(config: RigConfig) -> Rig:

@@ -99,8 +99,7 @@ class Watchdog:
 
         Returns:
             Whether the head was halted during the call. The command may have reached the unit after the halt, so the
-                head is
-            halted again.
+                head is halted again.
         """
         with self._lock:
             interrupted = self._halts != motion.halts

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import subprocess
 import sys
 
 import pytest
@@ -176,3 +177,15 @@ def test_ctrl_c_while_it_opens_lets_go_too(devices, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         open_hardware(CONFIG)
     assert log[-3:] == ["close zoom", "close fixed", "close board"]
+
+
+def test_a_driver_is_imported_without_its_devices_library():
+    """So that every command can check a rig.toml on a machine that lacks it."""
+    program = (
+        "import sys; sys.modules.update(dict.fromkeys(('serial', 'httpx', 'gphoto2', 'simplejpeg')))\n"
+        "from cotarget.drivers import DRIVERS; from cotarget.drivers.rig import device_of\n"
+        "print(*(device_of(role, {'driver': name}).spec for role in DRIVERS for name in DRIVERS[role]), sep='\\n')"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [line.partition("(")[0] for line in done.stdout.splitlines()] == ["CameraSpec", "ZoomSpec", "HeadSpec"]
