@@ -163,12 +163,17 @@ def validate(cls: type[T], table: Any, where: str, base: T | None = None, beside
         whole = {name: as_table(getattr(base, name)) for name in _required(cls)} | dict(table)
     try:
         adapter = _adapter(cast(Any, cls))
-        found: T = adapter.validate_json(json.dumps(whole, default=str))
+        found: T = adapter.validate_json(json.dumps(whole, default=_no_json))
     except ValidationError as error:
         raise ConfigError(_message(cls, error.errors(include_url=False), where, beside)) from None
     if base is None:
         return found
     return dataclasses.replace(base, **{name: getattr(found, name) for name in table})  # type: ignore[type-var]
+
+
+def _no_json(value: Any) -> Any:
+    """Write a value that JSON lacks, such as TOML's dates, as one that no field takes."""
+    return {type(value).__name__: str(value)}
 
 
 def as_table(value: Any) -> Any:
@@ -227,6 +232,8 @@ def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str
     """Say in one line what is wrong; an unknown key comes first, because a misspelt one makes others missing."""
     error = min(errors, key=lambda each: each["type"] != UNKNOWN)
     kind, loc, value = error["type"], error["loc"], error["input"]
+    if kind == "json_invalid":  # a text with half of a surrogate pair, or tables in tables without end
+        return f"{where or 'the file'}: {error['msg']}"
     outer, hint = _table_at(cls, loc[:-1]), None if kind == UNKNOWN else _hint_at(cls, loc)
     at, above = _join(where, loc), _join(where, loc[:-1])
     if kind == UNKNOWN:

@@ -1,5 +1,6 @@
 """Tables of TOML and JSON against dataclasses: what is taken, what is refused, and when pydantic is imported."""
 
+import datetime
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -96,6 +97,8 @@ def test_a_base_gives_what_the_table_does_not_say():
             {"nam": "a"},
             "unknown key 'camera.nam'; valid here: file, lens, mount, name, on, points, quality, rate_hz, s",
         ),
+        ({"name": datetime.date(2026, 1, 2)}, "camera.name: {'date': '2026-01-02'} is not a text"),
+        ({"name": "\ud800"}, "camera: Invalid JSON: "),
         ([], "camera: [] is not a table"),
     ],
 )
