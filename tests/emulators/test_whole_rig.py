@@ -122,10 +122,11 @@ def end_of(path):
 
 
 def told(err, command):
-    """The reasons of a warning, which is all that is said; none where there is none."""
-    if not err:
+    """The reasons of a warning, which is all that is said but for frames skipped by a busy machine."""
+    lines = [line for line in err.splitlines() if not line.endswith("the machine or the line is slow")]
+    if not lines:
         return []
-    [line] = err.splitlines()
+    [line] = lines
     begin, *reasons = re.split(r"(?:^|(?<=: )|(?<=; ))\d+ of \d+ frames: ", line)
     assert begin == f"cotarget {command}: "
     return reasons
