@@ -200,7 +200,7 @@ class TruthFinder:
     def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> None:
         """Do nothing: the ground truth is always known."""
 
-    def sight_at(self, t: float) -> bool:
+    def fixed_view_at(self, t: float) -> bool:
         """Return True: the ground truth is known at any time."""
         return True
 

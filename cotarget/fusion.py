@@ -277,7 +277,7 @@ class ZoomSearch:
         Args:
             fixed_t: time of the newest fixed frame [s]; frames older than `latest_s` before it are dropped too.
         """
-        due = next((each for each in reversed(self.waiting) if self.finder.sight_at(each.t) is not None), None)
+        due = next((each for each in reversed(self.waiting) if self.finder.fixed_view_at(each.t) is not None), None)
         done_t = fixed_t - self._latest_s if due is None else due.t
         while self.waiting and self.waiting[0].t <= done_t:
             self.waiting.popleft()
@@ -397,10 +397,10 @@ class TargetFusion:
                 continue
             measured = measure(track, self._target)
             if track.id == self._followed and measured.is_whole and isinstance(measured.box, Detection):
-                sight = self.search.finder.update_fixed(frame, measured.box, mask)
-                if sight is not None:  # the same body point that the zoom image measures
-                    body = replace(measured.box, center_px=sight.body_px)
-                    measured = replace(measured, box=body, sigma_px=sight.body_sigma_px)
+                fixed_view = self.search.finder.update_fixed(frame, measured.box, mask)
+                if fixed_view is not None:  # the same body point that the zoom image measures
+                    body = replace(measured.box, center_px=fixed_view.body_px)
+                    measured = replace(measured, box=body, sigma_px=fixed_view.body_sigma_px)
             self._filters.make(track.id).update_fixed(
                 measured.box, frame.t, sigma_px=measured.sigma_px, size_px=measured.size_px
             )

@@ -151,7 +151,7 @@ class Controller:
         if at_effect is None or then is None:
             raise UnreachableError("where the target is was not seen yet")
         state = self._rig.head.state()
-        self._head_controller.head.saw(state)  # a halted or slow head is not where it was sent
+        self._head_controller.head.correct(state)  # a halted or slow head is not where it was sent
         reach = reach_of(self._rig, state)
         first = self._aim(at_effect, reach)
         later = predict(effect + self._ahead_s) if at_effect.carried else None

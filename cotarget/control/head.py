@@ -115,11 +115,11 @@ class HeadModel:
         """Time at which the last command takes effect [s]."""
         return self._plans[-1].t if self._plans else -math.inf
 
-    def obeys(self, t: float, command: HeadCommand) -> None:
+    def add_command(self, t: float, command: HeadCommand) -> None:
         """Add a command that takes effect at time t [s]."""
         self._plans.append(_Plan(t, self.at(t), command))
 
-    def saw(self, state: PanTiltState) -> None:
+    def correct(self, state: PanTiltState) -> None:
         """Correct the model with a report of the head."""
         while len(self._plans) > 1 and self._plans[1].t <= state.t:
             self._plans.pop(0)
@@ -224,7 +224,7 @@ LEAST_SPEED = 1e-3  # least commanded speed, because a command needs one above z
 
 
 @dataclass(frozen=True)
-class _Way:
+class _Reference:
     """Wanted motion of the head, after damping.
 
     Attributes:
@@ -284,51 +284,55 @@ class HeadController:
             The command; None if the head is best left alone.
         """
         zone = max(self._settings.zone * field, self._limits.step)
-        way = self._damped(wanted, rates, zone, lead_s)
-        resting = self._axes_at_rest(effect_t, interval_s, way, zone) if self._settings.deadband else [False, False]
-        if self._settings.deadband and self._may_hold(effect_t, interval_s, way, zone, resting):
+        reference = self._damped(wanted, rates, zone, lead_s)
+        resting = (
+            self._axes_at_rest(effect_t, interval_s, reference, zone) if self._settings.deadband else [False, False]
+        )
+        if self._settings.deadband and self._may_hold(effect_t, interval_s, reference, zone, resting):
             return None
-        off = _apart(way.wanted, self._at(effect_t), wanted[1])
+        off = _angle_between(reference.wanted, self._at(effect_t), wanted[1])
         if math.isinf(self._limits.acceleration):  # it jumps: halfway to the next command
-            command = HeadCommand(*way.after(interval_s / 2), None)
-        elif way.still and off > zone:
-            command = HeadCommand(*way.wanted, None)
+            command = HeadCommand(*reference.after(interval_s / 2), None)
+        elif reference.still and off > zone:
+            command = HeadCommand(*reference.wanted, None)
         else:
             catch_s = self._settings.hurry_s if off > self._settings.far * zone else self._settings.catch_s
-            command = self._along(effect_t, interval_s, way, catch_s)
-            if self._settings.deadband and not way.still:
-                command = self._held(command, way, resting, goal_sigmas)
-        command = self._within(command)
+            command = self._follow_reference(effect_t, interval_s, reference, catch_s)
+            if self._settings.deadband and not reference.still:
+                command = self._hold_slow_axes(command, reference, resting, goal_sigmas)
+        command = self._clipped(command)
         self._note_turns(command)
-        self.head.obeys(effect_t, command)
+        self.head.add_command(effect_t, command)
         return command
 
-    def _damped(self, wanted: Angles, rates: Angles, zone: float, lead_s: float) -> _Way:
+    def _damped(self, wanted: Angles, rates: Angles, zone: float, lead_s: float) -> _Reference:
         """Remove speed and lead from slow axes, where they are mostly noise."""
         limit = self._settings.slow * zone
         slow = tuple(abs(rate) * scale <= limit for rate, scale in zip(rates, _scales(wanted[1]), strict=True))
-        still = _apart(rates, (0.0, 0.0), wanted[1]) <= self._settings.still * zone
+        still = _angle_between(rates, (0.0, 0.0), wanted[1]) <= self._settings.still * zone
         back_s = lead_s if still else self._settings.slow_lead * lead_s
         pan, tilt = (q - back_s * rate if at_rest else q for q, rate, at_rest in zip(wanted, rates, slow, strict=True))
         pan_rate, tilt_rate = (0.0 if at_rest else rate for rate, at_rest in zip(rates, slow, strict=True))
-        return _Way((pan, tilt), (pan_rate, tilt_rate), (slow[0], slow[1]), still)
+        return _Reference((pan, tilt), (pan_rate, tilt_rate), (slow[0], slow[1]), still)
 
-    def _may_hold(self, effect_t: float, interval_s: float, way: _Way, zone: float, resting: Sequence[bool]) -> bool:
+    def _may_hold(
+        self, effect_t: float, interval_s: float, reference: _Reference, zone: float, resting: Sequence[bool]
+    ) -> bool:
         """Whether the last command suffices until the next one; `resting` says for which axis it does."""
         command = self.head.command
         if command is None:
             return False
-        off_goal = _apart(way.wanted, (command.pan, command.tilt), way.wanted[1])
-        off_then = _apart(way.after(interval_s), self._at(effect_t + interval_s), way.wanted[1])
+        off_goal = _angle_between(reference.wanted, (command.pan, command.tilt), reference.wanted[1])
+        off_then = _angle_between(reference.after(interval_s), self._at(effect_t + interval_s), reference.wanted[1])
         # At rest in place, or on the way there; an axis that overran its goal while following would return too slowly.
-        if way.still and off_goal <= zone and (command.speed is None or off_then <= zone):
+        if reference.still and off_goal <= zone and (command.speed is None or off_then <= zone):
             fine = max(self._settings.fine_steps * self._limits.step, self._settings.fine * zone)
-            there = zip(way.after(interval_s), self._at(effect_t + interval_s), strict=True)
+            there = zip(reference.after(interval_s), self._at(effect_t + interval_s), strict=True)
             centred = all(abs(q - to_step(x, self._limits.step)) <= fine for q, x in there)
             return centred or effect_t - self.head.commanded_t < self._settings.rest_s
         return all(resting)
 
-    def _axes_at_rest(self, effect_t: float, interval_s: float, way: _Way, zone: float) -> list[bool]:
+    def _axes_at_rest(self, effect_t: float, interval_s: float, reference: _Reference, zone: float) -> list[bool]:
         """For each axis, whether its last goal and speed suffice until the next command.
 
         They do if the target stays in the deadband, or if the axis is on its way there already. A new command in every
@@ -337,10 +341,10 @@ class HeadController:
         settings = self._settings
         times = (0.0, interval_s, settings.back_s)
         now, then, back = (
-            [abs(q - x) for q, x in zip(way.after(s), self._at(effect_t + s), strict=True)] for s in times
+            [abs(q - x) for q, x in zip(reference.after(s), self._at(effect_t + s), strict=True)] for s in times
         )
         resting = []
-        for i, scale in enumerate(_scales(way.wanted[1])):
+        for i, scale in enumerate(_scales(reference.wanted[1])):
             most = zone / scale
             returns = then[i] < now[i] and back[i] <= max(most, settings.nearer * now[i])
             resting.append(then[i] <= most or returns)
@@ -351,12 +355,14 @@ class HeadController:
         (pan, _), (tilt, _) = self.head.at(t)
         return pan, tilt
 
-    def _along(self, effect_t: float, interval_s: float, way: _Way, catch_s: float) -> HeadCommand:
+    def _follow_reference(
+        self, effect_t: float, interval_s: float, reference: _Reference, catch_s: float
+    ) -> HeadCommand:
         """Set a goal ahead of each axis, and the target's speed, corrected for the axis's error."""
         limits = self._limits
         ahead = max(self._settings.ahead_s, self._settings.frames_ahead * interval_s)
         goals, speeds = [], []
-        for w, r, x in zip(way.wanted, way.rates, self._at(effect_t), strict=True):
+        for w, r, x in zip(reference.wanted, reference.rates, self._at(effect_t), strict=True):
             v = r + (w - x) / catch_s
             v = math.copysign(min(abs(v), limits.speed), v)
             # Behind the target, an axis goes to where it will be; ahead of it, an axis slows down until it catches up.
@@ -365,7 +371,9 @@ class HeadController:
             speeds.append(max(abs(v), LEAST_SPEED))
         return HeadCommand(goals[0], goals[1], (speeds[0], speeds[1]))
 
-    def _held(self, command: HeadCommand, way: _Way, resting: Sequence[bool], goal_sigmas: Angles) -> HeadCommand:
+    def _hold_slow_axes(
+        self, command: HeadCommand, reference: _Reference, resting: Sequence[bool], goal_sigmas: Angles
+    ) -> HeadCommand:
         """Keep the last goal and speed of an axis that is slow and near enough.
 
         A person who walks by stays at one height. If tilt were commanded as often as pan has to be, it would go up and
@@ -379,7 +387,7 @@ class HeadController:
         for i in range(2):
             turn = news[i][0] - olds[i][0]
             back = turn * self._turning[i] < 0 and abs(turn) <= self._settings.turn_sigmas * goal_sigmas[i]
-            kept.append(olds[i] if back or (way.slow[i] and resting[i]) else news[i])
+            kept.append(olds[i] if back or (reference.slow[i] and resting[i]) else news[i])
         (pan, pan_speed), (tilt, tilt_speed) = kept
         return HeadCommand(pan, tilt, (pan_speed, tilt_speed))
 
@@ -396,7 +404,7 @@ class HeadController:
         pan, tilt = self._limits.capped(command.speed)
         return (command.pan, pan), (command.tilt, tilt)
 
-    def _within(self, command: HeadCommand) -> HeadCommand:
+    def _clipped(self, command: HeadCommand) -> HeadCommand:
         """Clip a command to the limits of pan and tilt."""
         pan, tilt = (
             min(max(q, low), high)
@@ -410,6 +418,6 @@ def _scales(tilt: float) -> Angles:
     return math.cos(tilt), 1.0
 
 
-def _apart(a: Angles, b: Angles, tilt: float) -> float:
+def _angle_between(a: Angles, b: Angles, tilt: float) -> float:
     """Angle between two nearby directions, at a given tilt [rad]."""
     return math.hypot((a[0] - b[0]) * math.cos(tilt), a[1] - b[1])

@@ -59,7 +59,7 @@ class Desk:
     def command(self) -> Command:
         """Compute the command that carries out the pipeline's requests."""
         state, wish = self._head.state(), self._head.wish
-        self._model.saw(state)
+        self._model.correct(state)
         if wish is None:
             return *clipped(state.pan, state.tilt, self._head.limits), self._zoom.wish
         pan, tilt = wish.pan, wish.tilt
@@ -69,7 +69,7 @@ class Desk:
             axes = zip(self._model.at(effect), (pan, tilt), speeds, strict=True)
             pan, tilt = (self._hurried(x, v, goal, speed) for (x, v), goal, speed in axes)
             pan, tilt = clipped(pan, tilt, self._head.limits)
-        self._model.obeys(effect, HeadCommand(pan, tilt, None))
+        self._model.add_command(effect, HeadCommand(pan, tilt, None))
         return pan, tilt, self._zoom.wish
 
     def _hurried(self, x: float, v: float, goal: float, speed: float) -> float:

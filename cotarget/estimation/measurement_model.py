@@ -33,7 +33,7 @@ class SightLine:
     by_pan: Array
     by_tilt: Array
 
-    def seen(self, x: Array) -> tuple[Array, Array, Array]:
+    def project(self, x: Array) -> tuple[Array, Array, Array]:
         """Predict where a target in a given state appears.
 
         Args:
@@ -52,7 +52,7 @@ class SightLine:
         return tangent, (by[:2] - tangent[:, None] * by[2]) / d[2], d
 
 
-class Sights:
+class SightLines:
     """Compute the zoom camera's sight line at any pan, tilt and focal length of one rig."""
 
     def __init__(self, calibration: Calibration) -> None:
@@ -137,7 +137,7 @@ class Estimate:
         bias_prior: standard deviation of the head bias's prior, per axis [rad].
         target: target profile.
         calibration: calibration of the rig.
-        sights: sight lines of that calibration.
+        sight_lines: sight lines of that calibration.
     """
 
     t: float
@@ -149,7 +149,7 @@ class Estimate:
     bias_prior: float
     target: TargetProfile
     calibration: Calibration
-    sights: Sights
+    sight_lines: SightLines
 
     @property
     def x_fixed(self) -> Array:
@@ -199,7 +199,7 @@ class Estimate:
         Returns:
             The appearance; None if the target is behind the zoom camera.
         """
-        tangent, J, d = self.sights.at(pan, tilt, nominal_px).seen(self.state)
+        tangent, J, d = self.sight_lines.at(pan, tilt, nominal_px).project(self.state)
         if d[2] <= 0:
             return None
         lens = self.calibration.zoom.at(nominal_px)

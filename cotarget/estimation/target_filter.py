@@ -16,7 +16,7 @@ import numpy as np
 
 from cotarget.calibration import Calibration
 from cotarget.config import TargetProfile
-from cotarget.estimation.measurement_model import Estimate, SightLine, Sights
+from cotarget.estimation.measurement_model import Estimate, SightLine, SightLines
 from cotarget.estimation.motion_model import (
     PAN,
     SEEN,
@@ -199,7 +199,7 @@ def correct_zoom(node: Node, observed: ZoomObservation, settings: FilterSettings
     x = node.x
     nis = 0.0
     for i in range(MOST_ITERATIONS):
-        tangent, J, d = observed.sight.seen(x)
+        tangent, J, d = observed.sight.project(x)
         if d[2] <= 0:
             return replace(node, rejected_zoom=missed)
         innovation = observed.tangent - tangent + J @ (x - node.x)[SEEN]
@@ -355,7 +355,7 @@ class TargetFilter:
         self._calibration = calibration
         self._target = target
         self._settings = settings or filter_settings(target, calibration)
-        self._sights = Sights(calibration)
+        self._sight_lines = SightLines(calibration)
         self._base: Node | None = None  # state before the first kept measurement
         self._observed: list[FixedObservation | ZoomObservation] = []
         self._nodes: list[Node | None] = []  # state after each of them; None before the first in the fixed image
@@ -427,7 +427,7 @@ class TargetFilter:
         z, J = found
         sigma = self._settings.head_sigma if head_sigma is None else head_sigma
         R = (J * np.square(sigma_px)) @ J.T + np.eye(2) * sigma**2
-        return self._insert(ZoomObservation(t, z, R, self._sights.at(pan, tilt, nominal_px)))
+        return self._insert(ZoomObservation(t, z, R, self._sight_lines.at(pan, tilt, nominal_px)))
 
     def at(self, t: float) -> Estimate | None:
         """Estimate the target at a time [s], after the newest measurement or up to `history_s` before it.
@@ -450,7 +450,7 @@ class TargetFilter:
             bias_prior=motion.bias_sigma,
             target=self._target,
             calibration=self._calibration,
-            sights=self._sights,
+            sight_lines=self._sight_lines,
         )
 
     def knows(self, t: float) -> bool:

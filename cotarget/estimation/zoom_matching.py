@@ -312,26 +312,26 @@ class Place:
     sigma_px: float = math.nan
 
 
-def register(image: Image, sight: FixedView, view: ZoomView) -> Place | None:
+def register(image: Image, fixed_view: FixedView, view: ZoomView) -> Place | None:
     """Find a target's cut-out in a zoom image, first coarsely, then finely.
 
     Args:
         image: zoom image, (H, W, 3) BGR.
-        sight: the target in the fixed image.
+        fixed_view: the target in the fixed image.
         view: mapping from the fixed to the zoom image.
 
     Returns:
         The place; None if nothing correlates, if two places do, or if the maximum lies beyond the gate.
     """
-    settings = sight.settings
+    settings = fixed_view.settings
     finest = max(1 / settings.finest, 1 / view.scale)
     coarse, fine = (
-        max(sight.side_px / samples, finest) for samples in (settings.coarse_samples, settings.fine_samples)
+        max(fixed_view.side_px / samples, finest) for samples in (settings.coarse_samples, settings.fine_samples)
     )
-    place = _search(image, sight, view, coarse, view.center_px, None)
+    place = _search(image, fixed_view, view, coarse, view.center_px, None)
     if place is None or place.lead < settings.least_lead:
         return None
-    place = _search(image, sight, view, fine, place.center_px, settings.fine_search + math.ceil(coarse / fine / 2))
+    place = _search(image, fixed_view, view, fine, place.center_px, settings.fine_search + math.ceil(coarse / fine / 2))
     if place is None:
         return None
     lack = max(1 - place.score, settings.least_lack) / settings.usual_lack
@@ -339,23 +339,23 @@ def register(image: Image, sight: FixedView, view: ZoomView) -> Place | None:
 
 
 def _search(
-    image: Image, sight: FixedView, view: ZoomView, pitch: float, around_px: Array, reach: int | None
+    image: Image, fixed_view: FixedView, view: ZoomView, pitch: float, around_px: Array, reach: int | None
 ) -> Place | None:
     """Find the place of highest correlation with a cut-out sampled every ``pitch`` fixed pixels.
 
     Args:
         image: zoom image, (H, W, 3) BGR.
-        sight: the target in the fixed image.
+        fixed_view: the target in the fixed image.
         view: mapping from the fixed to the zoom image.
         pitch: distance of samples [px of the fixed image].
         around_px: centre of the search in the zoom image (u, v), (2,).
         reach: samples to each side; None for the whole gate, which then limits the search.
     """
-    settings = sight.settings
-    template, weight, middle = sight.at_pitch(pitch)
+    settings = fixed_view.settings
+    template, weight, middle = fixed_view.at_pitch(pitch)
     step = view.J * pitch  # zoom pixels per sample
     back = np.linalg.inv(step)
-    spread = back @ view.covariance @ back.T + np.diag((sight.body_sigma_px / pitch) ** 2)
+    spread = back @ view.covariance @ back.T + np.diag((fixed_view.body_sigma_px / pitch) ** 2)
     sides = np.full(2, settings.widest_search if reach is None else reach)
     if reach is None:
         sides = np.minimum(np.ceil(settings.gate_sigmas * np.sqrt(np.diag(spread))).astype(int) + 1, sides)
@@ -364,14 +364,14 @@ def _search(
     samples, inside = resample(image, A, (width, height))
     if pitch < 1:  # blur the zoom samples as the fixed camera does, where the sampling resolves it
         samples = cv2.GaussianBlur(samples, (0, 0), settings.blur_px / pitch)
-    mix = sight.whitening
+    mix = fixed_view.whitening
     likeness = correlate(cv2.transform(samples, mix), inside, cv2.transform(template, mix), weight)
     v, u = np.mgrid[-sides[1] : sides[1] + 1, -sides[0] : sides[0] + 1]
     inverse = np.linalg.inv(spread)
     distance = inverse[0, 0] * u * u + 2 * inverse[0, 1] * u * v + inverse[1, 1] * v * v
     if reach is not None:
         distance = np.zeros_like(distance)
-    apart = settings.one_place * sight.size_px / pitch
+    apart = settings.one_place * fixed_view.size_px / pitch
     return _best(likeness, distance, apart, around_px - step @ sides, step, settings)
 
 
@@ -457,7 +457,7 @@ class Finder(Protocol):
     def update_fixed(self, frame: Frame, detection: Detection, mask: Image | None = None) -> FixedView | None:
         """Store the target as a fixed-camera frame shows it."""
 
-    def sight_at(self, t: float) -> object | None:
+    def fixed_view_at(self, t: float) -> object | None:
         """Return the stored cut-out nearest to time t [s]; None if none is near enough."""
 
     def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
@@ -484,7 +484,7 @@ class CloseupFinder:
         self._T_base_fixed = calibration.T_base_fixed
         self._T_zoom_head = calibration.hand_eye().inv()
         self._target, self._settings = target, settings
-        self._sights: deque[FixedView] = deque()
+        self._fixed_views: deque[FixedView] = deque()
         self._usual_score, self._sure_t = 0.0, -math.inf
         self._last_t = -math.inf
         self._last_offset: Array = np.zeros(2)  # from the expected place, in pixels of the fixed image
@@ -500,17 +500,17 @@ class CloseupFinder:
         Returns:
             The cut-out, with the centre of the body; None if the box holds no pixel of the frame.
         """
-        sight = look(frame, detection, mask, self._target, self._settings)
-        if sight is not None:
-            self._sights.append(sight)
+        fixed_view = look(frame, detection, mask, self._target, self._settings)
+        if fixed_view is not None:
+            self._fixed_views.append(fixed_view)
             kept_s = self._settings.latest_s + self._settings.longest_apart_s
-            while self._sights[0].t < sight.t - kept_s:
-                self._sights.popleft()
-        return sight
+            while self._fixed_views[0].t < fixed_view.t - kept_s:
+                self._fixed_views.popleft()
+        return fixed_view
 
-    def sight_at(self, t: float) -> FixedView | None:
+    def fixed_view_at(self, t: float) -> FixedView | None:
         """Return the stored cut-out nearest to time t [s]; None if none is within `longest_apart_s`."""
-        near = min(self._sights, key=lambda sight: abs(sight.t - t), default=None)
+        near = min(self._fixed_views, key=lambda fixed_view: abs(fixed_view.t - t), default=None)
         return None if near is None or abs(near.t - t) > self._settings.longest_apart_s else near
 
     def find(self, frame: Frame, expected: Expected) -> ZoomMeasurement | None:
@@ -523,23 +523,23 @@ class CloseupFinder:
         Returns:
             The measurement; None if the target is not found, or not with certainty.
         """
-        sight, view = self.sight_at(frame.t), self.view(expected)
-        if sight is None or view is None:
+        fixed_view, view = self.fixed_view_at(frame.t), self.view(expected)
+        if fixed_view is None or view is None:
             return None
-        place = register(frame.image, sight, view)
-        if place is None or not self._believes(place, sight, view, frame.t):
+        place = register(frame.image, fixed_view, view)
+        if place is None or not self._accepts(place, fixed_view, view, frame.t):
             return None
         return ZoomMeasurement(
             center_px=place.center_px,
             sigma_px=place.sigma_px,
-            body_sigma_px=np.abs(view.J) @ sight.body_sigma_px,
+            body_sigma_px=np.abs(view.J) @ fixed_view.body_sigma_px,
             score=place.score,
             seen=place.seen,
-            size_px=np.linalg.norm(view.J, axis=0) * sight.size_px,
+            size_px=np.linalg.norm(view.J, axis=0) * fixed_view.size_px,
             t=frame.t,
         )
 
-    def _believes(self, place: Place, sight: FixedView, view: ZoomView, t: float) -> bool:
+    def _accepts(self, place: Place, fixed_view: FixedView, view: ZoomView, t: float) -> bool:
         """Decide whether a match is sure, or weaker but continuous with the last ones; store it if so."""
         offset = np.asarray(np.linalg.solve(view.J, place.center_px - view.center_px), dtype=float)
         settings = self._settings
@@ -548,7 +548,7 @@ class CloseupFinder:
             self._usual_score, self._sure_t = max(place.score, usual), t
         else:
             recent = abs(t - self._sure_t) <= settings.believed_s and abs(t - self._last_t) <= settings.longest_gap_s
-            most = settings.steady_px + settings.steady_of_side * sight.side_px
+            most = settings.steady_px + settings.steady_of_side * fixed_view.side_px
             steady = np.linalg.norm(offset - self._last_offset) <= most
             if not (place.score >= settings.least_score and recent and steady):
                 return False
@@ -567,8 +567,8 @@ class CloseupFinder:
         x_head = T_base_head.inv().apply(self._T_base_fixed.apply(cross))
         pupil = np.array([0.0, 0.0, calibration.zoom.pupil_at(nominal)])
         zoom = calibration.zoom.at(nominal).project(self._T_zoom_head.apply(x_head) - pupil)
-        wide = calibration.fixed.project(cross)
-        if not (np.isfinite(zoom).all() and np.isfinite(wide).all()):
+        fixed = calibration.fixed.project(cross)
+        if not (np.isfinite(zoom).all() and np.isfinite(fixed).all()):
             return None
-        J = (zoom[1:3] - zoom[3:5]).T @ np.linalg.inv((wide[1:3] - wide[3:5]).T)
+        J = (zoom[1:3] - zoom[3:5]).T @ np.linalg.inv((fixed[1:3] - fixed[3:5]).T)
         return ZoomView(zoom[0], covariance + self._settings.least_sigma_px**2 * np.eye(2), J)

@@ -161,7 +161,7 @@ class SizeHistory:
         self.size: Array = np.zeros(2)
         self.larger_side = 0.0
 
-    def note(self, t: float, width: float, height: float, clipped: bool) -> None:
+    def add(self, t: float, width: float, height: float, clipped: bool) -> None:
         """Add a box and update the sizes.
 
         Args:
@@ -209,7 +209,7 @@ class Trail:
         self._extents = image_size or (None, None)
         self._boxes: deque[_Place] = deque()
 
-    def note(self, t: float, center: tuple[float, float], size: tuple[float, float], clipped: bool) -> None:
+    def add(self, t: float, center: tuple[float, float], size: tuple[float, float], clipped: bool) -> None:
         """Add a box.
 
         Args:
@@ -219,7 +219,7 @@ class Trail:
             clipped: whether the image's border cuts the box.
         """
         across, down = (_edges(*of, clipped) for of in zip(center, size, self._extents, strict=True))
-        step = _way([self._boxes[-1].edges], [(across, down)]) if self._boxes else 0.0
+        step = _common_motion([self._boxes[-1].edges], [(across, down)]) if self._boxes else 0.0
         self._boxes.append(_Place(t, (across, down), step))
         while self._boxes[0].t < t - self._span_s:
             self._boxes.popleft()
@@ -232,7 +232,7 @@ class Trail:
         """
         edges = [box.edges for box in self._boxes]
         count = max(1, min(ENDS, int(END_PART * len(edges))))
-        way = _way(edges[:count], edges[-count:])
+        way = _common_motion(edges[:count], edges[-count:])
         longest = max((box.step for box in islice(self._boxes, 1, None)), default=0.0)
         return way if longest <= max(LARGEST_STEP * way, LEAST_JUMP_PX) else 0.0
 
@@ -254,7 +254,7 @@ def _edges(center: float, size: float, extent: int | None, clipped: bool) -> Edg
     return low if low > BORDER_PX else math.nan, high if high < extent - 1 - BORDER_PX else math.nan
 
 
-def _way(before: Sequence[tuple[Edges, Edges]], after: Sequence[tuple[Edges, Edges]]) -> float:
+def _common_motion(before: Sequence[tuple[Edges, Edges]], after: Sequence[tuple[Edges, Edges]]) -> float:
     """Length of the common motion of both edges between two groups of boxes [px]; of one edge if only that is seen."""
     return math.hypot(*(_shift([box[i] for box in before], [box[i] for box in after]) for i in range(2)))
 
@@ -464,7 +464,7 @@ class LiveTrack:
         self._sizes = SizeHistory(settings.size_s, settings.beat_s)
         # Travel is needed until the track is confirmed, and only if the settings ask for it.
         self._trail = Trail(settings.travel_s, image_size) if settings.confirm_travel else None
-        self._note(detection)
+        self._add_box(detection)
         process_noise = settings.acceleration_px**2 * settings.manoeuvre_s
         self.filter = ImageFilter(
             detection.center_px.tolist(), self.variance(detection), settings.speed_px**2, process_noise
@@ -490,7 +490,7 @@ class LiveTrack:
         weight = 1 - math.exp(-(self.t - self.seen) / self.settings.score_s)
         self.mean_score += weight * (detection.score - self.mean_score)
         self._measure(detection.center_px.tolist(), self.variance(detection))
-        self._note(detection)
+        self._add_box(detection)
         self.detection, self.shared = detection, False
         self.hits += 1
         if not self.confirmed:
@@ -504,7 +504,7 @@ class LiveTrack:
             if self.confirmed:
                 self._trail = None
 
-    def share(self, detection: Measurement) -> None:
+    def correct_shared(self, detection: Measurement) -> None:
         """Correct with a detection that covers other tracks too: this track is somewhere inside it."""
         room = room_inside(detection.size_px, self.size)
         inside = np.clip(self.center, detection.center_px - room, detection.center_px + room)
@@ -554,12 +554,12 @@ class LiveTrack:
             for usual, side in sides
         ]
 
-    def _note(self, detection: Measurement) -> None:
+    def _add_box(self, detection: Measurement) -> None:
         """Add a box to the histories."""
         (u, v), (width, height) = detection.center_px.tolist(), detection.size_px.tolist()
-        self._sizes.note(self.t, width, height, detection.clipped)
+        self._sizes.add(self.t, width, height, detection.clipped)
         if self._trail is not None:
-            self._trail.note(self.t, (u, v), (width, height), detection.clipped)
+            self._trail.add(self.t, (u, v), (width, height), detection.clipped)
 
     def _has_travelled(self) -> bool:
         """Whether the track has travelled far enough to be confirmed."""

@@ -72,26 +72,26 @@ class Tracker:
                 return self.tracks
             self._tracks.clear()
         self._begin(t)
-        detections = self._worth(detections)
+        detections = self._most_useful(detections)
         matches: dict[int, int] = {}
-        crowds: dict[int, int] = {}
+        merged: dict[int, int] = {}
         if len(self._tracks) == len(detections) == 1:
             if _belongs(self._tracks[0], detections[0], self._image_size):
                 matches = {0: 0}
         elif self._tracks and detections:
             pairs = _Pairs(self._tracks, detections, self._image_size)
             matches = _assign(pairs)
-            crowds = _crowds(pairs, matches)
+            merged = _merged(pairs, matches)
         taken = set(matches.values())
         for i, state in enumerate(self._tracks):
-            if i in crowds:
-                state.share(detections[crowds[i]])
+            if i in merged:
+                state.correct_shared(detections[merged[i]])
             elif i in matches:
                 state.correct(detections[matches[i]])
             else:
                 state.missed += 1
         self._tracks = [s for s in self._tracks if not s.is_over(self._image_size)]
-        self._bear([detection for j, detection in enumerate(detections) if j not in taken], t)
+        self._start_tracks([detection for j, detection in enumerate(detections) if j not in taken], t)
         return self.tracks
 
     def _begin(self, t: float) -> None:
@@ -108,7 +108,7 @@ class Tracker:
             self._intervals.append(t - self._t)
         self._t = t
 
-    def _worth(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
+    def _most_useful(self, detections: Sequence[Measurement]) -> Sequence[Measurement]:
         """Select at most `most_detections` detections, in their order."""
         most = self._settings.most_detections
         if len(detections) <= most:
@@ -121,7 +121,7 @@ class Tracker:
             distance = np.where(explained, pairs.distance, np.inf).min(axis=0)
         return [detections[j] for j in sorted(np.argsort(distance, kind="stable")[:most].tolist())]
 
-    def _bear(self, detections: Sequence[Measurement], t: float) -> None:
+    def _start_tracks(self, detections: Sequence[Measurement], t: float) -> None:
         """Start a track at each detection that does not cover an existing one."""
         if not detections:
             return
@@ -261,14 +261,14 @@ def _assign(pairs: _Pairs) -> dict[int, int]:
     return matches
 
 
-def _crowds(pairs: _Pairs, matches: dict[int, int]) -> dict[int, int]:
+def _merged(pairs: _Pairs, matches: dict[int, int]) -> dict[int, int]:
     """Find detections that cover two or more confirmed tracks: {index of the track: index of the detection}."""
-    crowds: dict[int, int] = {}
+    merged: dict[int, int] = {}
     if sum(pairs.confirmed) < 2:
-        return crowds
+        return merged
     inside = (pairs.covered > pairs.settings.covered) & np.array(pairs.confirmed)[:, None]
     for j in np.flatnonzero(np.count_nonzero(inside, axis=0) > 1):
         covered = [int(i) for i in np.flatnonzero(inside[:, j]) if matches.get(int(i), j) == j]
         if len(covered) > 1:
-            crowds |= dict.fromkeys(covered, int(j))
-    return crowds
+            merged |= dict.fromkeys(covered, int(j))
+    return merged

@@ -148,7 +148,7 @@ class LoneCamera:
         course, rig = self._course, self._rig
         now = rig.clock.now()
         effect = now + self._delay_s
-        self._head_controller.head.saw(rig.head.state())
+        self._head_controller.head.correct(rig.head.state())
         wanted, _ = course.at(effect)
         true_px = self._zoom.at(self._focal).focal_px[0]
         field = rig.zoom.size[0] / true_px

@@ -90,7 +90,7 @@ def follow(name, seed, settings):
             goals = [q + r * abs(r) / (2 * LIMITS.acceleration) for q, r in zip(after, rates, strict=True)]
             head.move(t, *goals, None)
         else:
-            head_controller.head.saw(PanTiltState(*head.at(t), True, t))
+            head_controller.head.correct(PanTiltState(*head.at(t), True, t))
             late, ahead = effect - estimates[0].measured_t, estimator.at(effect + AHEAD)
             doubts = goal_sigmas_of(ahead, aims[0]) if ahead.carried else (0.0, 0.0)
             command = head_controller.decide(effect, 1 / RATE, wanted, rates, field_angle, late, doubts)
@@ -156,7 +156,7 @@ ZONE = max(HeadSettings().zone * WIDTH, STEP)
 def standing(limits=LIMITS, pan=0.0):
     """A head that stands, and nobody has commanded."""
     head_controller = HeadController(limits)
-    head_controller.head.saw(PanTiltState(pan, 0.0, False, -FRAME))
+    head_controller.head.correct(PanTiltState(pan, 0.0, False, -FRAME))
     return head_controller
 
 

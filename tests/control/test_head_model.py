@@ -27,14 +27,14 @@ class Unit:
         speeds = LIMITS.capped(speed)
         self.rests = max(axis.command(t, q, v) for axis, q, v in zip(self.axes, (pan, tilt), speeds, strict=True))
         if told:
-            self.model.obeys(t, HeadCommand(pan, tilt, speed))
+            self.model.add_command(t, HeadCommand(pan, tilt, speed))
 
     def halt(self, t):
         self.rests = max(axis.halt(t) for axis in self.axes)
 
     def report(self, t):
         pan, tilt = (round(axis.motor(t)[0] / STEP) * STEP for axis in self.axes)
-        self.model.saw(PanTiltState(pan, tilt, t < self.rests, t))
+        self.model.correct(PanTiltState(pan, tilt, t < self.rests, t))
 
     def off(self, t):
         """How far the model is from where the unit really is at a time [rad]."""
@@ -101,8 +101,8 @@ def test_a_head_that_turns_when_it_is_first_seen_is_caught_up_with(unit):
 
 
 def test_a_head_that_arrives_early_is_not_sent_again(unit):
-    unit.model.obeys(0.1, HeadCommand(0.1, 0.0, None))
-    unit.model.saw(PanTiltState(0.1, 0.0, False, 0.12))
+    unit.model.add_command(0.1, HeadCommand(0.1, 0.0, None))
+    unit.model.correct(PanTiltState(0.1, 0.0, False, 0.12))
     assert unit.model.command == HeadCommand(0.1, 0.0, None)
     assert unit.model.at(0.2) == ((0.1, 0.0), (0.0, 0.0))
 

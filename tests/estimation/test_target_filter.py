@@ -14,7 +14,7 @@ from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.errors import CalibrationError
 from cotarget.estimation import TargetFilter, filter_settings
-from cotarget.estimation.measurement_model import Sights
+from cotarget.estimation.measurement_model import SightLines
 from cotarget.estimation.motion_model import MOTIONS, STATES, USUAL_BIAS, MotionSettings, propagate
 from cotarget.geometry import RigidTransform
 from cotarget.targeting import Reach, aim, depth_of, point_at
@@ -112,7 +112,7 @@ def baselines(flight):
 # ---------------------------------------------------------------- geometry
 def test_the_zoom_cameras_sight_is_that_of_written_out_matrices():
     truth = Truth(pan_scale=1.001, tilt_scale=0.998)
-    sight = Sights(calibration_of(truth)).at(0.4, 0.2, NOMINAL_PX)
+    sight = SightLines(calibration_of(truth)).at(0.4, 0.2, NOMINAL_PX)
 
     def seen(a, b, log_depth, pan, tilt):
         x = truth.in_zoom(np.array([a, b, 1.0]) * math.exp(log_depth), *truth.stands(np.array([0.4 + pan, 0.2 + tilt])))
@@ -121,7 +121,7 @@ def test_the_zoom_cameras_sight_is_that_of_written_out_matrices():
     at = np.array([0.3, -0.1, math.log(9.0), 0.0, 0.0])
     x = np.zeros(STATES)
     x[:3] = at[:3]
-    tangent, J, d = sight.seen(x)
+    tangent, J, d = sight.project(x)
     np.testing.assert_allclose(tangent, seen(*at), atol=EXACT)
     assert d[2] * 9.0 == pytest.approx(
         truth.in_zoom(np.array([0.3, -0.1, 1.0]) * 9, *truth.stands(np.array([0.4, 0.2])))[2], abs=EXACT
@@ -137,11 +137,11 @@ def test_the_sight_is_from_where_the_entrance_pupil_has_moved():
     still = calibration_of(truth)
     lens = still.zoom.stops[0]
     zoom = ZoomLens((NOMINAL_PX, 2 * NOMINAL_PX), (lens, lens.scaled(2.0)), (0.0, forward))
-    sight = Sights(replace(still, zoom=zoom)).at(0.4, 0.2, 2 * NOMINAL_PX)
+    sight = SightLines(replace(still, zoom=zoom)).at(0.4, 0.2, 2 * NOMINAL_PX)
     x_fixed = np.array([2.7, -0.9, 9.0])
     x = np.zeros(STATES)
     x[:3] = *(x_fixed[:2] / 9.0), math.log(9.0)
-    _, _, d = sight.seen(x)
+    _, _, d = sight.project(x)
     np.testing.assert_allclose(d * 9.0, truth.in_zoom(x_fixed, 0.4, 0.2) - [0.0, 0.0, forward], atol=EXACT)
 
 

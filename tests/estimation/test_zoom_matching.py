@@ -115,7 +115,7 @@ class Scene:
 
     def error(self, found, finder=None):
         """How far the point that was found is from the point that the wide view shows, in wide pixels."""
-        body_px = (self.finder() if finder is None else finder).sight_at(0.0).body_px
+        body_px = (self.finder() if finder is None else finder).fixed_view_at(0.0).body_px
         depth = self.birds[0][2]
         ray = np.append(
             cv2.undistortPoints(
@@ -207,9 +207,9 @@ def test_the_sight_nearest_in_time_counts_and_an_old_one_does_not():
     assert finder.find(zoom, scene.expected()) is None
     for t in (0.8, 0.94, 0.98, 1.03):
         finder.update_fixed(Frame(frame.image, t), detection, mask)
-    assert finder.sight_at(1.0).t == 0.98
+    assert finder.fixed_view_at(1.0).t == 0.98
     assert finder.find(zoom, scene.expected()).t == 1.0
-    assert finder.sight_at(1.2) is None
+    assert finder.fixed_view_at(1.2) is None
     assert finder.find(Frame(zoom.image, 1.2), scene.expected()) is None
 
 

@@ -320,7 +320,7 @@ class Asked:
     def update_fixed(self, frame, detection, mask=None):
         del frame, detection, mask
 
-    def sight_at(self, t):
+    def fixed_view_at(self, t):
         return t
 
     def find(self, frame, expected):

@@ -216,7 +216,7 @@ class Finder:
     def update_fixed(self, frame, detection, mask):
         return None
 
-    def sight_at(self, t):
+    def fixed_view_at(self, t):
         return "a sight"
 
     def find(self, frame, expected):

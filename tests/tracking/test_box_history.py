@@ -13,7 +13,7 @@ def trail(boxes, image_size=None, clipped=()):
     """Of boxes (left, top, right, bottom), one a frame."""
     found = Trail(2.0, image_size)
     for i, (left, top, right, bottom) in enumerate(boxes):
-        found.note(i * DT, ((left + right) / 2, (top + bottom) / 2), (right - left, bottom - top), i in clipped)
+        found.add(i * DT, ((left + right) / 2, (top + bottom) / 2), (right - left, bottom - top), i in clipped)
     return found
 
 
@@ -21,7 +21,7 @@ def sizes(boxes, clipped=()):
     """Of boxes (left, top, right, bottom), one a frame."""
     found = SizeHistory(size_s=0.6, beat_s=0.5)
     for i, (left, top, right, bottom) in enumerate(boxes):
-        found.note(i * DT, right - left, bottom - top, i in clipped)
+        found.add(i * DT, right - left, bottom - top, i in clipped)
     return found
 
 

@@ -388,7 +388,7 @@ def test_a_lone_pair_is_matched_as_any_other(monkeypatch, name):
         matches = tracker_module._assign(pairs)
         found = shortcut(state, detection, image_size)
         assert tracker_module._overlap(state, detection) == pairs.overlap[0, 0]
-        assert (matches, tracker_module._crowds(pairs, matches)) == ({0: 0} if found else {}, {})
+        assert (matches, tracker_module._merged(pairs, matches)) == ({0: 0} if found else {}, {})
         ways[found, bool(pairs.overlap[0, 0] > TrackingSettings.overlap_enough), state.missed > 0] += 1
         return found
 
