@@ -30,7 +30,7 @@ from cotarget.safety.safe_rig import clipped
 NEAR = 1e-6  # tolerance of an angle [rad]
 
 
-class Desk:
+class EnvironmentRig:
     """A rig and a detector for `cotarget.pipeline.follow` that read an environment's last step.
 
     Attributes:
@@ -47,8 +47,8 @@ class Desk:
         """
         rig = env.episode.rig
         self._env, self._interval = env, 1 / rig.spec.fixed.rate_hz
-        self._head, self._zoom = WishedHead(rig.head.limits, rig.head.state), WishedLens(env)
-        fixed = Eye(lambda: env.wide, rig.fixed.size)
+        self._head, self._zoom = EnvironmentHead(rig.head.limits, rig.head.state), EnvironmentLens(env)
+        fixed = EnvironmentCamera(lambda: env.wide, rig.fixed.size)
         self.rig = replace(rig, fixed=fixed, zoom=self._zoom, head=self._head, release=lambda: None)
         self._model = HeadModel(rig.head.limits)
 
@@ -58,19 +58,19 @@ class Desk:
 
     def command(self) -> Command:
         """Compute the command that carries out the pipeline's requests."""
-        state, wish = self._head.state(), self._head.wish
+        state, request = self._head.state(), self._head.request
         self._model.correct(state)
-        if wish is None:
-            return *clipped(state.pan, state.tilt, self._head.limits), self._zoom.wish
-        pan, tilt = wish.pan, wish.tilt
+        if request is None:
+            return *clipped(state.pan, state.tilt, self._head.limits), self._zoom.request
+        pan, tilt = request.pan, request.tilt
         effect = self.rig.clock.now() + self.rig.spec.head.delay_s
-        if wish.speed is not None:
-            speeds = self._head.limits.capped(wish.speed)
+        if request.speed is not None:
+            speeds = self._head.limits.capped(request.speed)
             axes = zip(self._model.at(effect), (pan, tilt), speeds, strict=True)
             pan, tilt = (self._hurried(x, v, goal, speed) for (x, v), goal, speed in axes)
             pan, tilt = clipped(pan, tilt, self._head.limits)
         self._model.add_command(effect, HeadCommand(pan, tilt, None))
-        return pan, tilt, self._zoom.wish
+        return pan, tilt, self._zoom.request
 
     def _hurried(self, x: float, v: float, goal: float, speed: float) -> float:
         """Find the goal that at full speed brings an axis as far by the next step as a slower command would [rad].
@@ -93,7 +93,7 @@ class Desk:
         return float(brentq(beyond, x - far, x + far, xtol=NEAR))
 
 
-class Eye:
+class EnvironmentCamera:
     """A camera whose newest frame is that of the environment."""
 
     def __init__(self, newest: Callable[[], Frame], size: tuple[int, int]) -> None:
@@ -104,42 +104,42 @@ class Eye:
         return self._newest()
 
 
-class WishedLens(Eye):
+class EnvironmentLens(EnvironmentCamera):
     """The zoom camera; its lens moves only with the environment's next step."""
 
     def __init__(self, env: Follow) -> None:
         lens = env.episode.rig.zoom
         super().__init__(lambda: env.closeup, lens.size)
         self.still_size, self.focal_range, self.state = lens.still_size, lens.focal_range, lens.state
-        self.wish = lens.state().focal_px
+        self.request = lens.state().focal_px
 
     def zoom(self, focal_px: float) -> float:
         """Store the requested focal length [px], within the lens's range."""
         shortest, longest = self.focal_range
-        self.wish = min(max(focal_px, shortest), longest)
-        return self.wish
+        self.request = min(max(focal_px, shortest), longest)
+        return self.request
 
     def capture(self) -> Frame:
         """Return the newest frame."""
         return self.read()
 
 
-class WishedHead:
+class EnvironmentHead:
     """The head; it moves only with the environment's next step."""
 
     def __init__(self, limits: PanTiltLimits, state: Callable[[], PanTiltState]) -> None:
         self.limits, self.state = limits, state
-        self.wish: HeadCommand | None = None
+        self.request: HeadCommand | None = None
 
     def move(self, pan: float, tilt: float, speed: Speed | None = None, wait: bool = False) -> tuple[float, float]:
         """Store the requested command, within the limits."""
         pan, tilt = clipped(pan, tilt, self.limits)
-        self.wish = HeadCommand(pan, tilt, speed)
+        self.request = HeadCommand(pan, tilt, speed)
         return pan, tilt
 
     def halt(self) -> None:
         """Drop the requested command."""
-        self.wish = None
+        self.request = None
 
 
 class PipelinePolicy:
@@ -164,14 +164,14 @@ class PipelinePolicy:
         """Return the pipeline's command after the newest frames; the same one until the next step."""
         env = self._env
         if env.episode is not self._episode:
-            self._episode, self._desk = env.episode, Desk(env)
+            self._episode, self._rig = env.episode, EnvironmentRig(env)
             settings = FollowSettings(closed_loop=False)
             self._steps: Iterator[Step] = follow(
-                self._desk.rig, env.calibration, env.target, self._desk, seconds=math.inf, settings=settings
+                self._rig.rig, env.calibration, env.target, self._rig, seconds=math.inf, settings=settings
             )
         if env.wide is not self._seen:
             next(self._steps)
-            self._seen, self._action = env.wide, env.units.action(self._desk.command())
+            self._seen, self._action = env.wide, env.units.action(self._rig.command())
         return self._action
 
 

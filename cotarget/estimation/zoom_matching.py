@@ -223,22 +223,37 @@ def look(
     foreground = np.zeros_like(in_box) if mask is None else (mask[here] > 0) & in_box
     if not _is_outline(foreground, in_box, settings):
         foreground = _stands_out(patch, in_box, settings)
-    masked = _is_outline(foreground, in_box, settings)
-    body, sigma = center, BOX_SIGMA * size
-    if target.matcher == "box":
-        sigma = TEMPLATE_SIGMA * size
-    elif masked:
-        rows, columns = foreground.nonzero()
-        middle = np.array([np.median(u[columns]), np.median(v[rows])], dtype=float)
-        upright = target.matcher == "upright"
-        body = np.array([middle[0], center[1]]) if upright else middle
-        sigma = (UPRIGHT_SIGMA if upright else OUTLINE_SIGMA) * size
-    if not masked:
+    is_outline = _is_outline(foreground, in_box, settings)
+    body, sigma = _body(target, center, size, (u, v), foreground if is_outline else None)
+    if not is_outline:
         du, dv = (2 * (each + side / 2) / side for each, side in zip(beyond, size, strict=True))
         foreground = du**2 + dv**2 <= 1
     if detection.clipped:  # the hidden part may be as large again
         sigma = np.hypot(sigma, size / 2)
     return FixedView(frame.t, body, sigma, size, patch, low.astype(float), foreground, outside, settings)
+
+
+def _body(
+    target: TargetProfile, center: Array, size: Array, pixels: tuple[Array, Array], outline: Pixels | None
+) -> tuple[Array, Array]:
+    """Locate the centre of the body in a box; return it and its standard deviation, (2,) [px] each.
+
+    Args:
+        target: target profile; its matcher decides.
+        center: centre of the box (u, v), (2,) [px].
+        size: width and height of the box, (2,) [px].
+        pixels: u of the patch's columns and v of its rows [px].
+        outline: whether each pixel of the patch is the target's, (h, w); None if that is not known.
+    """
+    if target.matcher == "box":
+        return center, TEMPLATE_SIGMA * size
+    if outline is None:
+        return center, BOX_SIGMA * size
+    (u, v), (rows, columns) = pixels, outline.nonzero()
+    middle = np.array([np.median(u[columns]), np.median(v[rows])], dtype=float)
+    if target.matcher == "upright":
+        return np.array([middle[0], center[1]]), UPRIGHT_SIGMA * size
+    return middle, OUTLINE_SIGMA * size
 
 
 def _margin(size: Array, settings: MatchingSettings) -> float:
