@@ -96,10 +96,10 @@ def calling(what: str) -> Iterator[None]:
         raise
     except Exception as error:
         said = " ".join(str(error).split())
-        raise DeviceError(f"{what}: {_place(error)}: {type(error).__name__}{said and f': {said}'}") from error
+        raise DeviceError(f"{what}: {place_of(error)}: {type(error).__name__}{said and f': {said}'}") from error
 
 
-def _place(error: Exception) -> str:
+def place_of(error: Exception) -> str:
     """Return file and line where an error was raised."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}"

@@ -17,6 +17,7 @@ import numpy as np
 
 from cotarget.drivers.mjpeg import DamagedError, StreamDecoder
 from cotarget.errors import DeviceError, StaleFrameError
+from cotarget.plugins import place_of
 from cotarget.rig import Clock, Frame, Image
 
 log = logging.getLogger(__name__)
@@ -121,7 +122,7 @@ class FrameBuffer:
                 work()
             except Exception as error:  # readers must learn that the thread has ended
                 log.debug("the driver of %s failed", self.name, exc_info=True)
-                self.fail(f"the driver of {self.name} failed: {error!r}")
+                self.fail(f"the driver of {self.name} failed: {error!r} ({place_of(error)})")
 
         self._thread = threading.Thread(target=run, name=name, daemon=True)
         self._thread.start()

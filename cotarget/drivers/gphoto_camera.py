@@ -33,6 +33,7 @@ from cotarget.drivers.gphoto import (
 from cotarget.drivers.lens import LensMotion, LensTable
 from cotarget.drivers.mjpeg import DamagedError, decode_jpeg
 from cotarget.errors import ConfigError, CotargetError, DeviceError
+from cotarget.plugins import place_of
 from cotarget.rig import Clock, Frame, Image, ZoomSpec, ZoomState
 from cotarget.schema import Check, Needed, NotNegative, Positive, Size, model
 
@@ -832,7 +833,7 @@ class GphotoCamera:
                 self._rest_until(work.work())
         except Exception as error:  # callers must learn that the thread has ended
             log.debug("the driver of the zoom camera failed", exc_info=True)
-            self._shared.dismiss(f"the driver of {self._name} failed: {error!r}")
+            self._shared.dismiss(f"the driver of {self._name} failed: {error!r} ({place_of(error)})")
         finally:
             with contextlib.suppress(Exception):
                 work.close()

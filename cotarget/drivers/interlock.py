@@ -123,8 +123,8 @@ def rig_lock(port: str) -> Iterator[None]:
         InUseError: another program has the lock.
     """
     url = "://" in port
-    if not sys.platform.startswith("linux") or not (url or Path(port).exists()):
-        yield  # a port that does not exist needs no lock
+    if not sys.platform.startswith("linux") or not (url or (port and Path(port).exists())):
+        yield  # a port that does not exist needs no lock, and a head without one has none
         return
     address = port if url else str(Path(port).resolve())
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:

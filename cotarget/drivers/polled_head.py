@@ -22,6 +22,7 @@ from cotarget.config import SafetyConfig
 from cotarget.drivers.interlock import PositionLostError, PositionLostMarker
 from cotarget.drivers.serial_line import LostError, RefusedError, SilentError
 from cotarget.errors import ConfigError, DeviceError, HaltedError
+from cotarget.plugins import place_of
 from cotarget.rig import Clock, HeadSpec, PanTiltLimits, PanTiltState, Speed
 
 log = logging.getLogger(__name__)
@@ -661,7 +662,7 @@ class PolledHead:
             reason = error
         except Exception as error:  # a bug in the driver must not leave the head turning
             log.debug("the driver of the pan-tilt unit failed", exc_info=True)
-            reason = DeviceError(f"the driver of the pan-tilt unit failed: {error!r}")
+            reason = DeviceError(f"the driver of the pan-tilt unit failed: {error!r} ({place_of(error)})")
         self._dead = reason
         self._loop.stop_for_good(reason)
         self._remember(reason)  # after the halt: a hanging disk must not delay it

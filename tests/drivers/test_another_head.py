@@ -161,3 +161,10 @@ def test_a_newer_move_takes_the_place_of_one_that_waits(opened, link):
     link.move = newer
     with pytest.raises(HaltedError, match="another move took this one's place"):
         head.move(STEP, 0.0, wait=True)
+
+
+def test_a_mistake_in_a_link_is_told_with_its_file_and_line(opened, link):
+    head = opened()
+    link.polls_fail = ValueError("a mistake")
+    with pytest.raises(DeviceError, match=r"failed: ValueError\('a mistake'\) \(.*test_another_head\.py:\d+\)$"):
+        ask_again_and_again(head)
