@@ -59,6 +59,8 @@ def held(way: str, name: str, seed: int, seconds: float, miss: float, lasts_s: f
             last = rig.zoom.read(newer_than=last).t
             rows.append(judge(outlines, name, target, last))
         left, delay_s = seconds - rig.clock.now(), rig.spec.head.delay_s
+        if left <= 0:  # the target was not in view in time
+            return rows
         if way == PAIR:
             times = by_pair(rig, calibration, target, outlines, name, seed, shaken, left)
         else:
