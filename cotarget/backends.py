@@ -44,6 +44,8 @@ def check(config: "RigConfig") -> None:
 
     check_sim(config.sim)
     check_hardware(config.hardware)
+    if config.backend == "replay":
+        _recording_of(config)
     if config.backend != "replay" and config.safety.watchdog_s * (rate_hz := _described(config).fixed.rate_hz) <= 1:
         raise ConfigError(
             f"safety.watchdog_s: {config.safety.watchdog_s:g} s would halt the head between any two frames of the "

@@ -9,6 +9,7 @@ import csv
 import fcntl
 import io
 import os
+import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -181,8 +182,11 @@ def write_whole(path: Path, data: bytes) -> None:
         os.fsync(file.fileno())
 
 
+STDOUT = Path("-")  # name by which a table goes to stdout
+
+
 class CsvFile:
-    """Write a table as csv, under its name only when it is complete. A context manager.
+    """Write a table as csv, under its name only when it is complete; `STDOUT` gets each row at once. A context manager.
 
     Each row is on the disk before the next one, so that the temporary file of a killed run holds all rows.
     """
@@ -200,8 +204,8 @@ class CsvFile:
             ConfigError: the file cannot be written.
         """
         self._path, self._keep, self._rows = path, keep, 0
-        self._part = PartFile(path)
-        self._file = self._part.path.open("wb", buffering=0)
+        self._part = None if path == STDOUT else PartFile(path)
+        self._file = None if self._part is None else self._part.path.open("wb", buffering=0)
         self._line = io.StringIO(newline="")
         self._writer = csv.writer(self._line, lineterminator=line_end)
         try:
@@ -221,11 +225,16 @@ class CsvFile:
 
     def _append(self, cells: Iterable[object]) -> None:
         self._writer.writerow(cells)
-        data, begin = self._line.getvalue().encode(), self._file.tell()
+        line = self._line.getvalue()
         self._line.seek(0)
         self._line.truncate()
+        if self._file is None:
+            sys.stdout.write(line)
+            sys.stdout.flush()
+            return
+        begin = self._file.tell()
         try:
-            write_all(self._file, data)
+            write_all(self._file, line.encode())
         except OSError as error:
             self._file.truncate(begin)
             raise said(self._path, error) from None
@@ -242,6 +251,8 @@ class CsvFile:
         Raises:
             ConfigError: the file could not be completed.
         """
+        if self._part is None or self._file is None:
+            return
         with self._part.ending(keep=error is None or (self._keep and self._rows > 0), error=error):
             self._file.close()
 

@@ -13,6 +13,7 @@ from cotarget.cli.common import (
     check_board_is_told,
     check_outputs,
     load_plausible,
+    open_named,
     previous_kept,
     print_json,
     progress_bar,
@@ -34,7 +35,7 @@ SESSION = ("placements", "stops")  # options of a capture session
 def calibrate(options: argparse.Namespace) -> None:
     """Run `cotarget calibrate`: calibrate from a capture session, saved captures or photos, and print a summary."""
     from cotarget import calibration as cal
-    from cotarget.backends import load_config, open_rig
+    from cotarget.backends import load_config
     from cotarget.calibration.calibrate import calibrate as calibrate_rig
     from cotarget.config import BoardConfig
     from cotarget.safety.stop_file import refuse_if_stopped
@@ -58,7 +59,7 @@ def calibrate(options: argparse.Namespace) -> None:
         if config is not None:
             refuse_if_stopped(config.safety.stop_file)
             check_board_is_told(options.rig, config)
-            with open_rig(config) as rig:
+            with open_named(options.rig, config) as rig:
                 found = calibrate_rig(
                     rig,
                     captures_dir=options.captures,
@@ -148,8 +149,7 @@ def _check_together(options: argparse.Namespace) -> None:
     if photos:
         if missing := [name for name in PHOTOS if name not in photos]:
             raise ConfigError(f"plain photos need --{missing[0]} too: --fixed, --zoom, --board and --square")
-        if options.square > LARGEST_SQUARE:
-            raise ConfigError(f"--square: {options.square:g} m is no board's square; 25 mm are 0.025")
+        _check_square(options.square)
         if options.encoders:
             raise ConfigError("--encoders goes with --rig or saved captures; plain photos know nothing of a head")
     elif not options.source.is_dir():
@@ -158,6 +158,12 @@ def _check_together(options: argparse.Namespace) -> None:
         raise ConfigError(
             f"{options.source}: holds no index.json of captures; photos need --fixed, --zoom, --board and --square"
         )
+
+
+def _check_square(square: float) -> None:
+    """Refuse a square that is given in millimetres."""
+    if square > LARGEST_SQUARE:
+        raise ConfigError(f"--square: {square:g} m is no board's square; 25 mm are 0.025")
 
 
 def summary(found: "Calibration", path: Path) -> dict[str, Any]:
@@ -199,11 +205,17 @@ def report(options: argparse.Namespace) -> None:
 
 def board(options: argparse.Namespace) -> None:
     """Run `cotarget board`: write a board to print."""
-    from cotarget.board import print_board
+    from cotarget.board import check_board, print_board
     from cotarget.config import BoardConfig
 
     check_outputs([options.out], [])
-    width, height = print_board(options.out, BoardConfig(options.kind, options.board, options.square))
+    _check_square(options.square)
+    made = BoardConfig(options.kind, options.board, options.square)
+    try:
+        check_board(made)
+    except ConfigError as error:
+        raise ConfigError(f"--board: {str(error).removeprefix('board.corners: ')}") from None
+    width, height = print_board(options.out, made)
     print(
         f"{options.out}: {1000 * width:.1f} x {1000 * height:.1f} mm with its white border; print it at 100 %, stick it"
     )

@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cotarget.errors import CalibrationError, ConfigError, choices
-from cotarget.files import behind_link, write_atomically
+from cotarget.files import STDOUT, behind_link, write_atomically
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
-    from cotarget.config import RigConfig
+    from cotarget.config import RigConfig, TargetProfile
     from cotarget.pipeline import Step
-    from cotarget.rig import RigSpec
+    from cotarget.rig import Rig, RigSpec
 
 
 # Names of `cotarget.control.selection`, which --help does not import; the paper's first.
@@ -75,9 +75,51 @@ def load_plausible(path: Path, spec: "RigSpec | None" = None, *, insist: bool) -
     from cotarget.calibration.plausibility import implausibility
 
     calibration = load_calibration(path)
+    if spec is not None:
+        check_streams(path, calibration, spec)
     if not insist and (text := implausibility(calibration, spec)):
         raise CalibrationError(f"{path}: {text}; --insist uses it all the same")
     return calibration
+
+
+def open_named(path: Path, config: "RigConfig", guarded: bool = True) -> "Rig":
+    """Open the rig of a rig.toml.
+
+    Raises:
+        ConfigError: as by `open_rig`; the message names the file.
+        DeviceError: a device could not be opened.
+        EmergencyStopError: the stop file exists.
+    """
+    from cotarget.backends import open_rig
+
+    try:
+        return open_rig(config, guarded)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def check_streams(path: Path, calibration: "Calibration", spec: "RigSpec") -> None:
+    """Refuse a calibration whose streams have another aspect ratio than the rig's.
+
+    Raises:
+        ConfigError: the aspect ratio differs; the message names the calibration's file.
+    """
+    try:
+        calibration.for_streams(spec.fixed.size, spec.zoom.size)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def target_of(config: "RigConfig", name: str) -> "TargetProfile":
+    """Look up the target of --target.
+
+    Raises:
+        ConfigError: the configuration has no such target.
+    """
+    try:
+        return config.target(name)
+    except ConfigError as error:
+        raise ConfigError(f"--target: {error}") from None
 
 
 class Selection:
@@ -281,9 +323,9 @@ def _remarks(now: Callable[[], float]) -> Callable[[str, int, int | None], None]
     return remark
 
 
-def print_json(table: Any) -> None:
-    """Print a result as JSON on stdout."""
-    print(json.dumps(_positive_zeros(table), indent=2))
+def print_json(table: Any, csv: Path | None = None) -> None:
+    """Print a result as JSON on stdout; on stderr if stdout has the table of --csv."""
+    print(json.dumps(_positive_zeros(table), indent=2), file=sys.stderr if csv == STDOUT else sys.stdout)
 
 
 def _positive_zeros(value: Any) -> Any:
@@ -319,6 +361,8 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None],
     for path in outputs:
         if path is None:
             continue
+        if path == STDOUT:
+            raise ConfigError("-: stdout takes the table of --csv alone; name a file")
         if path.is_dir():
             raise ConfigError(f"{path}: is a folder; name the file to write")
         if path.exists() and not path.is_file():
@@ -327,6 +371,8 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None],
             raise ConfigError(f"{path}: is where this command's own words go; name another file to write")
         if (goal := behind_link(path)).is_symlink():
             raise ConfigError(f"{path}: is a link to itself; name the file to write")
+        if goal.parent.exists() and not goal.parent.is_dir():
+            raise ConfigError(f"{path}: {goal.parent} is a file, not a folder; name a file in a folder")
         if not goal.absolute().parent.is_dir():
             raise ConfigError(f"{path}: its folder does not exist; create it first")
         _refuse_taken(path, taken)

@@ -224,7 +224,7 @@ def _parser() -> argparse.ArgumentParser:
     follow.add_argument("--target", required=True, metavar="NAME", help="a target of rig.toml")
     add_selection(follow)
     follow.add_argument("--seconds", type=duration, metavar="S", help="duration [s] (until Ctrl-C)")
-    follow.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
+    follow.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step; -: to stdout")
     follow.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
     follow.add_argument("--record", type=Path, metavar="DIR", help="record everything, for cotarget replay")
     add_insist(follow)
@@ -243,7 +243,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="score the tracks by these labels: a csv as for detect, whose frame is the image number in DIR/fixed",
     )
-    replay.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step")
+    replay.add_argument("--csv", type=Path, metavar="FILE", help="write one line a step; -: to stdout")
     replay.add_argument("--video", type=Path, metavar="FILE", help="write a side-by-side video (.mp4)")
 
     point = command("point", operating.point, "move head and lens to given values, and take a picture with each camera")
@@ -329,8 +329,8 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         required=True,
         metavar="FILE",
-        help="write one line per confirmed track and frame: u_px and v_px are the box's centre, the score is 0 "
-        "where the box is only predicted",
+        help="write one line per confirmed track and frame, to stdout with -: u_px and v_px are the box's centre, the "
+        "score is 0 where the box is only predicted",
     )
     detect.add_argument("--video", type=Path, metavar="OUT", help="write the video with the tracks drawn (.mp4)")
     detect.add_argument("--rig", type=Path, metavar="FILE", help="rig.toml, for targets of your own")

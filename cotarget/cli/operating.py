@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Any
 from cotarget.cli.common import (
     check_board_is_told,
     check_outputs,
+    check_streams,
     check_within,
     load_plausible,
+    open_named,
     previous_kept,
     print_json,
     rig_files,
+    target_of,
 )
 from cotarget.errors import CalibrationError, ConfigError
 
@@ -44,11 +47,19 @@ def aim(options: argparse.Namespace) -> None:
     calibration = load_plausible(options.calibration, None if options.rig is None else spec, insist=options.insist)
     if options.rig is not None:
         calibration = calibration.for_streams(spec.fixed.size, spec.zoom.size)
-    target = None if options.target is None else config.target(options.target)
+    target = None if options.target is None else target_of(config, options.target)
     if options.size_px is not None and target is None:
         raise ConfigError("--size-px needs --target NAME, whose true size gives the depth")
     if options.wanted_px is not None and target is None:
         raise ConfigError("--wanted-px needs --target NAME, whose true size gives the focal length")
+    if options.wanted_px is not None and target is not None:
+        side = calibration.zoom.size[int(target.is_vertical())]
+        if options.wanted_px > side:
+            raise ConfigError(
+                f"--wanted-px: {options.wanted_px:g} px do not fit into the zoom camera's {{}}x{{}} image".format(
+                    *calibration.zoom.size
+                )
+            )
     depth = options.depth
     if target is not None and options.size_px is not None:
         depth = depth_of(calibration, target, options.size_px, np.array(options.pixel))
@@ -184,7 +195,10 @@ def emulate(options: argparse.Namespace) -> None:
     beside["safety"] = {"stop_file": STOP_FILE} | beside.get("safety", {})
     check_outputs([options.write], rig_files(options.rig, config))
     for fault in options.fault:
-        parse_fault(fault)
+        try:
+            parse_fault(fault)
+        except ConfigError as error:
+            raise ConfigError(f"--fault: {error}") from None
     ports = Ports(options.host, options.head, options.fixed, options.zoom, options.board, options.control)
     password = os.environ.get("COTARGET_PASSWORD", "") if options.user else ""
     if options.user and not password:
@@ -221,7 +235,7 @@ ACCURACY_S = 0.01
 
 def latency(options: argparse.Namespace) -> None:
     """Run `cotarget latency`: measure the latencies of cameras, head and lens, and print them as keys of rig.toml."""
-    from cotarget.backends import describe, load_config, open_rig
+    from cotarget.backends import describe, load_config
     from cotarget.calibration import load_calibration
     from cotarget.latency import measure_fixed, measure_head, measure_lens
     from cotarget.safety.stop_file import refuse_if_stopped
@@ -234,10 +248,10 @@ def latency(options: argparse.Namespace) -> None:
     if calibration is not None:  # refused before the head moves
         calibration.hand_eye()
         spec = describe(config)
-        calibration.for_streams(spec.fixed.size, spec.zoom.size)
+        check_streams(options.calibration, calibration, spec)
         check_board_is_told(options.rig, config)
     where = "sim" if config.backend == "sim" else "hardware"
-    with open_rig(config) as rig:
+    with open_named(options.rig, config) as rig:
         head = measure_head(rig)
         found = {
             f"{where}.zoom.latency_s": rig.spec.zoom.latency_s + head.zoom.seconds,
@@ -273,7 +287,7 @@ def _plausible(name: str, seconds: float) -> float:
 
 def point(options: argparse.Namespace) -> None:
     """Run `cotarget point`: move head and lens, and write a picture of each camera on request."""
-    from cotarget.backends import load_config, open_rig
+    from cotarget.backends import load_config
     from cotarget.calibration.captures import write_image
     from cotarget.calibration.session import wait_for_lens
     from cotarget.safety.stop_file import refuse_if_stopped
@@ -284,7 +298,7 @@ def point(options: argparse.Namespace) -> None:
     check_outputs(shots.values(), rig_files(options.rig, config))
     if config.backend == "replay":
         raise ConfigError(f"{options.rig}: backend is 'replay'; a recording's head and lens cannot be sent anywhere")
-    with open_rig(config) as rig:
+    with open_named(options.rig, config) as rig:
         limits = rig.head.limits
         for option, angle, bounds in (
             ("--pan-deg", options.pan_deg, limits.pan),

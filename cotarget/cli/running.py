@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import (
@@ -19,11 +20,14 @@ from cotarget.cli.common import (
     check_outputs,
     load_plausible,
     nothing,
+    open_named,
     print_json,
     progress_bar,
     rig_files,
+    target_of,
 )
 from cotarget.errors import ConfigError
+from cotarget.files import STDOUT
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
@@ -88,14 +92,14 @@ def _config(options: argparse.Namespace) -> "RigConfig":
 
     if options.rig is None:
         if options.target is not None:
-            RigConfig().target(options.target)  # refuse an unknown target before the long work
+            target_of(RigConfig(), options.target)  # refuse an unknown target before the long work
         targets = LOOKED_AT if options.target is None else (options.target,)
         return sim_config(SCENES.get(targets[0].rstrip("0123456789"), "outdoor"), targets, 0)
     config = load_config(options.rig)
     if config.backend != "sim":
         raise ConfigError(f"{options.rig}: backend is '{config.backend}'; what is viewed is a simulated rig")
     if options.target is not None:
-        config.target(options.target)
+        target_of(config, options.target)
         _check_shown(config, options)
     return config
 
@@ -185,7 +189,7 @@ NEVER_CONFIRMED, NOBODY_FOLLOWED = 3, 4  # exit statuses of `follow`
 
 def follow(options: argparse.Namespace) -> int:
     """Run `cotarget follow`: follow a target with the rig, and record it on request; return the exit status."""
-    from cotarget.backends import describe, load_config, open_rig
+    from cotarget.backends import describe, load_config
     from cotarget.recording.recorder import Recorder
     from cotarget.safety.safe_rig import guard
     from cotarget.safety.stop_file import refuse_if_stopped
@@ -193,14 +197,14 @@ def follow(options: argparse.Namespace) -> int:
 
     config = load_config(options.rig)
     refuse_if_stopped(config.safety.stop_file)
-    target = config.target(options.target)  # refuse an unknown target before the long work
+    target = target_of(config, options.target)  # refuse an unknown target before the long work
     spec = describe(config)
     calibration = load_plausible(options.calibration, spec, insist=options.insist)
     _check_shown(config, options)
     if not options.insist and (text := target_implausibility(target, calibration, spec, options.target)):
         raise ConfigError(f"{options.rig}: {text}; --insist follows it all the same")
     inputs = [*rig_files(options.rig, config), options.calibration]
-    check_outputs([options.csv, options.video], inputs, options.record)
+    check_outputs(_files(options), inputs, options.record)
     selection = Selection(options, spec.fixed.size)
     with (
         Recorder(options.record, config, options.calibration, options.target, selection.selector)
@@ -209,17 +213,22 @@ def follow(options: argparse.Namespace) -> int:
     ):
 
         def opened() -> "Rig":
-            rig = open_rig(config, guarded=False)
+            rig = open_named(options.rig, config, guarded=False)
             return guard(recorder.wrap(rig) if recorder else rig, config.safety)
 
         run = _follow(
             opened, calibration, config, spec.fixed.rate_hz, options, options.target, selection, options.seconds
         )
         _tell_if_nothing_was_seen("follow", options.target, run.counts["states"], selection)
-        print_json(run.counts)
+        print_json(run.counts, options.csv)
         if run.interrupted is not None:
             raise run.interrupted
     return run.status
+
+
+def _files(options: argparse.Namespace) -> list[Path | None]:
+    """List the files that a run writes; a table may go to stdout instead."""
+    return [None if options.csv == STDOUT else options.csv, options.video]
 
 
 def replay(options: argparse.Namespace) -> int:
@@ -235,7 +244,7 @@ def replay(options: argparse.Namespace) -> int:
         print(f"{options.recording}: {note}", file=sys.stderr)
     calibration = load_calibration(recording.calibration)
     inputs = [*rig_files(None, recording.config), options.recording, options.labels]
-    check_outputs([options.csv, options.video], inputs)
+    check_outputs(_files(options), inputs)
     labels = None if options.labels is None else read_labels(options.labels)
     pictures, tracks = recording.pictures, list[Tracked]()
 
@@ -256,7 +265,7 @@ def replay(options: argparse.Namespace) -> int:
     _tell_if_nothing_was_seen("replay", recording.target, run.counts["states"], selection)
     scores = _scores(options, tracks, labels, rate_hz, max(pictures.values(), default=-1) + 1)
     differences = played.differences
-    print_json(run.counts | {"differences": dataclasses.asdict(differences)} | scores)
+    print_json(run.counts | {"differences": dataclasses.asdict(differences)} | scores, options.csv)
     if not differences.same:
         print(f"cotarget replay: {differences}", file=sys.stderr)
     return 1 if options.check and not differences.same else 0
@@ -390,11 +399,13 @@ def detect(options: argparse.Namespace) -> None:
     from cotarget.metrics import read_labels, read_tracks
 
     config = RigConfig() if options.rig is None else load_config(options.rig)
-    target = config.target(options.target)
+    target = target_of(config, options.target)
+    if options.csv == STDOUT and options.labels is not None:
+        raise ConfigError("--labels: scores the table of --csv; name its file, not -")
     if options.film.is_dir():
         raise ConfigError(f"{options.film}: is a directory; give a film")
     inputs = [options.film, options.labels, *rig_files(options.rig, config)]
-    check_outputs([options.csv, options.video], inputs)
+    check_outputs(_files(options), inputs)
     labels = None if options.labels is None else read_labels(options.labels)
     with progress_bar() as progress:
         found = run_on_film(
@@ -406,8 +417,9 @@ def detect(options: argparse.Namespace) -> None:
             keep=True,
         )
     whole = found.shortfall is None
-    scores = _scores(options, read_tracks(options.csv), labels, found.rate_hz, found.last_frame + 1, whole=whole)
-    print_json(dataclasses.asdict(found) | scores)
+    tracks = [] if labels is None else read_tracks(options.csv)
+    scores = _scores(options, tracks, labels, found.rate_hz, found.last_frame + 1, whole=whole)
+    print_json(dataclasses.asdict(found) | scores, options.csv)
     if not whole:
         print(f"{options.film}: is not whole: {found.shortfall}; the results are of what there is", file=sys.stderr)
 
@@ -421,12 +433,21 @@ def _scores(
     *,
     whole: bool = True,
 ) -> dict[str, Any]:
-    """Score tracks against labels; empty without labels."""
+    """Score tracks against labels; empty without labels.
+
+    Raises:
+        ConfigError: no labelled frame is in the film, though the film is whole.
+    """
     from cotarget.metrics import score_tracks
 
     if labels is None:
         return {}
     score = score_tracks(tracks, labels, rate_hz, frames)
+    if whole and labels and score.labels_beyond_end == len(labels):
+        raise ConfigError(
+            f"{options.labels}: no labelled frame is in the film, whose last one is {frames - 1}; give the labels of "
+            "this film, with frames from 0"
+        )
     if score.labels_beyond_end:
         print(
             f"{options.labels}: {score.labels_beyond_end} of {len(labels)} labelled frames are beyond the last one, "

@@ -369,6 +369,8 @@ class Recorder:
         """
         self._directory = directory
         self._wrapped = False
+        if directory.is_file():
+            raise ConfigError(f"{directory}: is a file; give a new folder for the recording")
         try:
             self._made = not directory.exists()
             directory.mkdir(parents=True, exist_ok=True)

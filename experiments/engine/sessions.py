@@ -106,12 +106,23 @@ class Log:
 
 
 def sessions(folder: Path) -> list[Session]:
-    """Read the sessions of a folder; unreadable ones are left out, because they change no result."""
+    """Read the sessions of a folder; single ones of another format are left out, because they change no result.
+
+    Raises:
+        ConfigError: the file is damaged.
+    """
+    path = folder / SESSIONS
     try:
-        found = json.loads((folder / SESSIONS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(found, list):
+            raise ValueError("it holds no list")
+    except FileNotFoundError:
         return []
-    return [each for told in (found if isinstance(found, list) else []) if (each := _read(told)) is not None]
+    except (OSError, ValueError) as error:
+        raise ConfigError(
+            f"{path}: cannot be read ({error}); restore it, or remove it: the report then lacks earlier sessions' times"
+        ) from None
+    return [each for told in found if (each := _read(told)) is not None]
 
 
 def _read(told: Any) -> Session | None:
