@@ -18,8 +18,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = (
     ROOT / "README.md",
     *sorted((ROOT / "docs" / "tutorials").glob("*.md")),
-    ROOT / "docs/targets-and-scenes.md",
-    ROOT / "docs/drivers.md",
+    *(ROOT / "docs" / f"{name}.md" for name in ("calibration", "drivers", "environments", "targets-and-scenes")),
 )
 BLOCK = re.compile(r"^(?:<!-- ([^\n]*?) -->\n)?```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 RUN_ELSEWHERE = ("demo", "test")  # the marks of README's two commands, which the gate runs by themselves
