@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cotarget.errors import ConfigError, CotargetError, EmergencyStopError, MissingPackageError
@@ -49,8 +50,13 @@ class Finding:
     fix: str = ""
 
 
-def examine(config: "RigConfig | None" = None) -> list[Finding]:
-    """Examine everything that cotarget needs; with a rig's configuration also its devices, without moving anything."""
+def examine(config: "RigConfig | None" = None, rig: Path = Path("rig.toml")) -> list[Finding]:
+    """Examine everything that cotarget needs; with a rig's configuration also its devices, without moving anything.
+
+    Args:
+        config: the configuration.
+        rig: its file.
+    """
     found = [
         _python(),
         *map(_package, PACKAGES),
@@ -61,8 +67,10 @@ def examine(config: "RigConfig | None" = None) -> list[Finding]:
         _gphoto_cameras(needed=_is_real(config)),
     ]
     if config is not None:
-        found += [_emergency_stop(config), *_own_detectors(config)]
-    return found if config is None or not _is_real(config) else [*found, *_devices(config)]
+        found += [_emergency_stop(config, rig), *_own_detectors(config, rig)]
+        if _is_real(config):
+            found += [*_board(config, rig), *_devices(config, rig)]
+    return found
 
 
 def _is_real(config: "RigConfig | None") -> bool:
@@ -142,7 +150,7 @@ def _gphoto_cameras(needed: bool) -> Finding:
         return Finding("gphoto2 cameras", not needed, f"{error}{note}", "pip install 'cotarget[hardware]'" * needed)
 
 
-def _emergency_stop(config: "RigConfig") -> Finding:
+def _emergency_stop(config: "RigConfig", rig: Path) -> Finding:
     """Check whether an operator has stopped the head."""
     from cotarget.safety.stop_file import refuse_if_stopped
 
@@ -152,13 +160,13 @@ def _emergency_stop(config: "RigConfig") -> Finding:
     try:
         refuse_if_stopped(path)
     except EmergencyStopError as error:
-        return Finding(name, False, str(error), "cotarget clear --rig rig.toml")
+        return Finding(name, False, str(error), f"cotarget clear --rig {rig}")
     except ConfigError as error:
         return Finding(name, False, str(error), f"{'chmod u+w' if path.parent.is_dir() else 'mkdir -p'} {path.parent}")
     return Finding(name, True, "nobody has called for one")
 
 
-def _own_detectors(config: "RigConfig") -> list[Finding]:
+def _own_detectors(config: "RigConfig", rig: Path) -> list[Finding]:
     """Import the detectors of the user's own that targets name."""
     from cotarget.plugins import is_own, load
 
@@ -170,44 +178,59 @@ def _own_detectors(config: "RigConfig") -> list[Finding]:
                 load(target.detector, where)
                 found.append(Finding(where, True, target.detector))
             except CotargetError as error:
-                found.append(Finding(where, False, str(error), f"correct it, or [targets.{name}] in rig.toml"))
+                found.append(Finding(where, False, str(error), f"correct it, or [targets.{name}] in {rig}"))
     return found
 
 
-def _position(config: "RigConfig", port: str) -> Finding:
+def _board(config: "RigConfig", rig: Path) -> list[Finding]:
+    """Check whether rig.toml says how large the board's squares are; without that no real rig is calibrated."""
+    from cotarget.config import read_tables
+
+    if not rig.exists():  # a configuration that was made in Python says all that it has to
+        return []
+    if "square" not in read_tables(rig).get("board", {}):
+        fix = f"measure ten squares, and write one into [board] in {rig}: square = 0.025"
+        return [Finding("board", False, "how large its squares are is not configured", fix)]
+    board, (columns, rows) = config.board, config.board.corners
+    text = f"{board.kind} of {columns}x{rows} inner corners, squares of {1000 * board.square:g} mm"
+    return [Finding("board", True, text)]
+
+
+def _position(config: "RigConfig", port: str, rig: Path) -> Finding:
     """Check whether the head's position is marked as lost."""
     from cotarget.drivers.interlock import PositionLostMarker
 
     try:
         PositionLostMarker(port, config.safety.stop_file).refuse()
     except CotargetError as error:
-        return Finding("head's position", False, str(error), "cotarget reset-head --rig rig.toml")
+        return Finding("head's position", False, str(error), f"cotarget reset-head --rig {rig}")
     return Finding("head's position", True, "nothing says that it is lost")
 
 
-def _devices(config: "RigConfig") -> list[Finding]:
+def _devices(config: "RigConfig", rig: Path) -> list[Finding]:
     """Ask each device for its identity."""
     from cotarget.drivers import board
     from cotarget.drivers.rig import board_settings, devices, port_of
 
     found, presenter = devices(config.hardware), board_settings(config.hardware)
     return [
-        _position(config, port_of(found["head"])),
-        *(_ask(device.where, device.probe, port_of(device)) for device in found.values()),
-        _ask("hardware.board", lambda: board.probe(presenter), presenter.presenter),
+        _position(config, port_of(found["head"]), rig),
+        *(_ask(device.where, device.probe, port_of(device), rig) for device in found.values()),
+        _ask("hardware.board", lambda: board.probe(presenter), presenter.presenter, rig),
     ]
 
 
-def _ask(name: str, ask: Callable[[], str], there: str) -> Finding:
+def _ask(name: str, ask: Callable[[], str], there: str, rig: Path) -> Finding:
     try:
         return Finding(name, True, ask())
     except CotargetError as error:
-        return Finding(name, False, str(error), _fix(error, name, there))
+        return Finding(name, False, str(error), _fix(error, name, there, rig))
 
 
-def _fix(error: CotargetError, name: str, there: str) -> str:
+def _fix(error: CotargetError, name: str, there: str, rig: Path) -> str:
     """Return the command or advice that helps with a device that does not answer as it should."""
     from cotarget.drivers.axis import LoginError
+    from cotarget.drivers.ptu_d46 import UncalibratedError
     from cotarget.drivers.serial_line import InUseError, NoPermissionError
 
     match error:
@@ -217,6 +240,8 @@ def _fix(error: CotargetError, name: str, there: str) -> str:
             return "end the program that has it" + (f", which 'fuser -v {there}' names" if "://" not in there else "")
         case NoPermissionError():
             return "sudo usermod -a -G dialout $USER, then log in anew"
+        case UncalibratedError():
+            return f"cotarget reset-head --rig {rig}"
         case LoginError():
-            return f"give the right user in [{name}] in rig.toml, and export COTARGET_PASSWORD=..."
-    return f"look at the device, its cable, and [{name}] in rig.toml"
+            return f"give the right user in [{name}] in {rig}, and export COTARGET_PASSWORD=..."
+    return f"look at the device, its cable, and [{name}] in {rig}"

@@ -4,14 +4,17 @@ import os
 import socket
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import serial
 
 from cotarget import cli, doctor
+from cotarget.backends import load_config
 from cotarget.config import parse_config
 from cotarget.doctor import PACKAGES, Finding
+from cotarget.drivers.ptu_d46 import UncalibratedError
 from cotarget.emulators.axis_241q import AxisServer
 from cotarget.emulators.plant import Feed
 
@@ -188,6 +191,37 @@ def test_a_port_that_is_not_for_this_user_is_told_with_the_group(tried, monkeypa
     head = findings(parse_config({"backend": "hardware", "hardware": {"head": {"port": "/dev/x"}}}))["hardware.head"]
     assert head.text.startswith("no permission to use /dev/x")
     assert "dialout" in head.fix
+
+
+def test_the_size_of_real_squares_has_to_be_told(tried, tmp_path):
+    path = tmp_path / "hw.toml"
+    path.write_text('backend = "hardware"\n')
+    board = next(f for f in doctor.examine(load_config(path), path) if f.name == "board")
+    assert not board.ok
+    assert board.fix.endswith(f"write one into [board] in {path}: square = 0.025")
+    path.write_text('backend = "hardware"\n[board]\nsquare = 0.0254\n')
+    board = next(f for f in doctor.examine(load_config(path), path) if f.name == "board")
+    assert board == Finding("board", True, "chessboard of 9x6 inner corners, squares of 25.4 mm")
+
+
+def test_a_head_that_has_not_found_its_limits_is_told(tried, monkeypatch):
+    def probe(port, baud):
+        raise UncalibratedError(f"the pan-tilt unit at {port} is not calibrated")
+
+    monkeypatch.setattr("cotarget.drivers.ptu_d46.probe", probe)
+    config = parse_config({"backend": "hardware", "hardware": {"head": {"port": "/dev/x"}}})
+    (head,) = [f for f in doctor.examine(config, Path("hw.toml")) if f.name == "hardware.head"]
+    assert (head.ok, head.fix) == (False, "cotarget reset-head --rig hw.toml")
+
+
+@pytest.mark.wire
+def test_an_input_without_video_is_told(tried):
+    with AxisServer({1: Feed()}) as server:
+        server.faults.set("no-video", True)
+        table = {"fixed": {"url": server.url}}
+        fixed = findings(parse_config({"backend": "hardware", "hardware": table}))["hardware.fixed"]
+    assert not fixed.ok
+    assert "has no video on input 1" in fixed.text
 
 
 @pytest.mark.wire

@@ -466,7 +466,7 @@ def doctor(options: argparse.Namespace) -> int:
         from cotarget.backends import load_config
 
         config = load_config(options.rig)
-    findings = examine(config)
+    findings = examine(config) if options.rig is None else examine(config, options.rig)
     for finding in findings:
         print(f"{'ok     ' if finding.ok else 'MISSING'}  {finding.name}: {finding.text}")
         if finding.fix:

@@ -213,8 +213,8 @@ class VideoServer:
         told = [] if identity is None else [f"{identity.brand} {identity.product}".strip()]
         if identity is not None and identity.firmware:
             told.append(f"firmware {identity.firmware}")
-        if video is not None:
-            told.append(f"input {self._config.camera} has {'' if video else 'no '}video")
+        if video:
+            told.append(f"input {self._config.camera} has video")
         return ", ".join(told)
 
     @contextlib.contextmanager
@@ -612,7 +612,8 @@ def probe(config: AxisSettings) -> str:
 
     Raises:
         ConfigError: the config has no address.
-        DeviceError: the server cannot be reached, or reports nothing.
+        DeviceError: the server cannot be reached, reports nothing, is no Axis, or has no such input or no video there.
     """
     with contextlib.closing(VideoServer(config)) as server:
+        server.check()
         return server.describe()

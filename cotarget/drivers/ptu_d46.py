@@ -109,7 +109,7 @@ def connect(line: Line) -> UnitInfo:
     greet(line)
     try:
         unit = identify(line)
-        refuse_uncalibrated(line.name, unit)
+        refuse_uncalibrated(line.name, *((axis.lowest, axis.highest) for axis in (unit.pan, unit.tilt)))
         _halt(line, PATIENCE_S + unit.braking_s)
         line.query(command("I"), ptu_protocol.done, PATIENCE_S)
         _make_independent(line)
@@ -343,24 +343,29 @@ def identify(line: Line) -> UnitInfo:
     return UnitInfo(_told(line, "V"), _told(line, "WP"), _axis(line, "P"), _axis(line, "T"))
 
 
-def refuse_uncalibrated(name: str, unit: UnitInfo) -> None:
-    """Refuse a unit that has not found its limits.
+class UncalibratedError(DeviceError):
+    """The unit has not found its limits."""
+
+
+def refuse_uncalibrated(name: str, pan: tuple[int, int], tilt: tuple[int, int]) -> None:
+    """Refuse a unit that has not found its limits, given as lowest and highest steps.
 
     Raises:
-        DeviceError: an axis has no range; the message names the remedy.
+        UncalibratedError: an axis has no range; the message names the remedy.
     """
-    for word, axis in (("pan", unit.pan), ("tilt", unit.tilt)):
-        if axis.lowest >= axis.highest:
-            raise DeviceError(
-                f"the pan-tilt unit at {name} is not calibrated: its {word} goes from {axis.lowest} to {axis.highest}; "
+    for word, (lowest, highest) in (("pan", pan), ("tilt", tilt)):
+        if lowest >= highest:
+            raise UncalibratedError(
+                f"the pan-tilt unit at {name} is not calibrated: its {word} goes from {lowest} to {highest}; "
                 "clear its way and run cotarget reset-head, which turns it through its whole range"
             )
 
 
 def probe(port: str, baud: int) -> str:
-    """Query version and network number of the unit at a port; nothing is changed.
+    """Query version, network number and limits of the unit at a port; nothing is changed.
 
     Raises:
+        UncalibratedError: the unit has not found its limits.
         DeviceError: there is no pan-tilt unit, or another program uses it.
     """
     with rig_lock(port), contextlib.closing(open_line(port, baud, MonotonicClock())) as line:
@@ -370,9 +375,14 @@ def probe(port: str, baud: int) -> str:
             version = line.ask(command("V"), PATIENCE_S).text
             if not version:
                 raise ReplyError(f"what answers at {port} tells no version")
-            return f"{version}, unit {ptu_protocol.integer(line.ask(command('U'), PATIENCE_S).text)}"
+            unit, *limits = (
+                ptu_protocol.integer(line.ask(command(name), PATIENCE_S).text) for name in ("U", "PN", "PX", "TN", "TX")
+            )
         except (SilentError, ReplyError, RefusedError) as error:
             raise _stranger(line) from error
+    lowest_pan, highest_pan, lowest_tilt, highest_tilt = limits
+    refuse_uncalibrated(port, (lowest_pan, highest_pan), (lowest_tilt, highest_tilt))
+    return f"{version}, unit {unit}"
 
 
 def _axis(line: Line, axis: AxisName) -> AxisFacts:
@@ -477,7 +487,7 @@ def reset(config: D46Settings, clock: Clock, lost: PositionLostMarker, stopped: 
         line.hurry = lambda: False
         _expect_both_axes(line)
         unit = identify(line)
-        refuse_uncalibrated(line.name, unit)
+        refuse_uncalibrated(line.name, *((axis.lowest, axis.highest) for axis in (unit.pan, unit.tilt)))
         refuse_events(line)
         lost.forget()
         return unit

@@ -673,7 +673,8 @@ def test_closing_while_the_server_hangs(server, monkeypatch):
 def test_probe_tells_who_it_is(server):
     assert probe(config(server)) == "AXIS 241Q, firmware 4.48, input 1 has video"
     server.pages[STATUS] = reply(body=b"Video 2 = no video\n")
-    assert probe(config(server, camera=2)) == "AXIS 241Q, firmware 4.48, input 2 has no video"
+    with pytest.raises(DeviceError, match="has no video on input 2: check its cable"):
+        probe(config(server, camera=2))
     assert not [request for request in server.requests if request.path == VIDEO]
     video = server.pages[VIDEO]
     server.pages.clear()

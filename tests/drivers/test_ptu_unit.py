@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import serial
 
-from cotarget.drivers.ptu_d46 import D46Head, probe
+from cotarget.drivers.ptu_d46 import D46Head, UncalibratedError, probe
 from cotarget.drivers.ptu_protocol import open_line
 from cotarget.errors import ConfigError, DeviceError
 from tests.d46_bench import CONFIG, Bench
@@ -139,11 +139,18 @@ def test_a_unit_that_starts_up_is_told(bench):
 def test_a_look_at_a_unit_changes_nothing(opened, monkeypatch):
     monkeypatch.setattr("cotarget.drivers.ptu_d46.MonotonicClock", lambda: opened.clock)
     assert probe("PORT", 9600) == f"{VERSION}, unit 0"
-    assert opened.unit.heard == ["V", "U"]
+    assert opened.unit.heard == ["V", "U", "PN", "PX", "TN", "TX"]
     assert opened.unit.echo
     assert opened.port.closed
     opened.unit.receive = lambda data: b""
     with pytest.raises(DeviceError, match="nothing answers at PORT"):
+        probe("PORT", 9600)
+
+
+def test_a_look_at_a_unit_that_has_not_found_its_limits(opened, monkeypatch):
+    monkeypatch.setattr("cotarget.drivers.ptu_d46.MonotonicClock", lambda: opened.clock)
+    opened.unit.facts |= {"TN": 0, "TX": 0}
+    with pytest.raises(UncalibratedError, match="its tilt goes from 0 to 0"):
         probe("PORT", 9600)
 
 
