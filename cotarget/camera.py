@@ -277,11 +277,11 @@ class ZoomLens:
         if not self.pupil:
             object.__setattr__(self, "pupil", (0.0,) * len(self.stops))
         if not self.stops or not len(self.stops) == len(self.nominal_px) == len(self.pupil):
-            raise ConfigError("a zoom lens needs one nominal focal length and one pupil for each calibrated stop")
+            raise ConfigError("a zoom lens needs one nominal focal length and one pupil for each zoom sample")
         if self.pupil[0] != 0:
             raise ConfigError("a zoom lens's pupil is counted from the first stop, where it must be 0")
         if any(b <= a for a, b in itertools.pairwise(self.nominal_px)):
-            raise ConfigError("the zoom stops' nominal focal lengths must increase")
+            raise ConfigError("the zoom samples' nominal focal lengths must increase")
 
     @property
     def size(self) -> tuple[int, int]:

@@ -435,8 +435,7 @@ def _enough_stops(wanted: int, focal_range_px: tuple[float, float]) -> int:
         return wanted
     leap = (focal_range_px[1] / focal_range_px[0]) ** (1 / (wanted - 1))
     log.warning(
-        "%d stops of the zoom lens are %.2g times apart, too far to know the board again from one to the next; %d are "
-        "taken",
+        "%d zoom samples are %.2g times apart, too far to know the board again from one to the next; %d are taken",
         wanted,
         leap,
         needed,

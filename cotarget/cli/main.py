@@ -118,9 +118,7 @@ def _notes(end: BaseException) -> list[str]:
     return getattr(end, "__notes__", [])
 
 
-DESCRIPTION = (
-    "Two cameras that cooperate: a wide one finds a small target, a zoom camera on a pan-tilt unit shows it large."
-)
+DESCRIPTION = "A fixed camera finds a small target; a zoom camera on a pan-tilt head shows it large."
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -105,7 +105,7 @@ def depth_figure(calibration: Calibration, at: AtFocal, boards: Array | None) ->
         pixels = np.vstack([calibration.fixed.image_center_px, corners])
         error = np.degrees(predicted_pointing(calibration, pixels, depths[:, None], nominal_px=at.nominal_px))
         worst = np.fmax.reduce(error[:, 1:], axis=1)  # nan only where no corner is reached
-        ax.plot(depths, error[:, 0], color=BLUE, lw=1.6, label="middle of the wide view")
+        ax.plot(depths, error[:, 0], color=BLUE, lw=1.6, label="middle of the fixed image")
         ax.plot(depths, worst, color=ORANGE, lw=1.6, label="its worst corner")
         ax.set_ylim(bottom=0)
         ax.axvspan(*DEPTHS, color=BLUE, alpha=0.06, lw=0, label="range of the verdict")
@@ -355,7 +355,7 @@ def situation_figure(evidence: Evidence, nominal_px: tuple[float, ...], has_head
             ax = axes.pop(0)
             ax.bar(range(len(nominal_px)), evidence.per_stop, color=BLUE, alpha=0.8)
             ax.set_xticks(range(len(nominal_px)), [f"{n:.0f}" for n in nominal_px], rotation=45)
-            ax.set(title="views of each stop", xlabel="nominal focal length [px]", ylabel="views")
+            ax.set(title="views of each zoom sample", xlabel="nominal focal length [px]", ylabel="views")
         return figure
 
 
@@ -433,7 +433,7 @@ def draw(
             "lens",
             lens_figure(lens_curves(calibration)),
             "Curves of focal length ratio, principal point, distortion and entrance pupil over focal length",
-            f"What the zoom lens does over its range; the dots are the stops, and splines lead from one to the next."
+            f"What the zoom lens does over its range; the dots are the zoom samples, and splines join them."
             f"{bands} κ₁ = k1 (n₀/n)² is the distortion as it appears in the image. The entrance pupil moves forward.",
         )
     return made
@@ -450,16 +450,16 @@ def _pointing(
     add(
         "pointing_map",
         map_figure(calibration, last),
-        f"Heat maps of the predicted pointing error over the wide view at three depths; {digits(np.degrees(last.rms))} "
-        f"degrees on average",
-        "The wide view with targets at three depths; lines join places of equal error, written in degrees. The error "
+        "Heat maps of the predicted pointing error over the fixed image at three depths; "
+        f"{digits(np.degrees(last.rms))} degrees on average",
+        "The fixed image with targets at three depths; lines join places of equal error, written in degrees. The error "
         "grows where no board reached, and with distance where boards were near only.",
     )
     add(
         "pointing_depth",
         depth_figure(calibration, last, None if evidence is None else evidence.distances),
-        "Curves of the predicted pointing error over depth, for the middle and the worst corner of the wide view",
-        "Over depth, for a target in the middle of the wide view and in the worst of its four corners. The marks on "
+        "Curves of the predicted pointing error over depth, for the middle and the worst corner of the fixed image",
+        "Over depth, for a target in the middle of the fixed image and in the worst of its four corners. The marks on "
         "the axis are the boards of the calibration.",
     )
     if len(at) > 1:
@@ -467,7 +467,7 @@ def _pointing(
             "pointing_focal",
             focal_figure(at, between),
             "Curves of the predicted pointing error over the focal length, in degrees and in pixels of the zoom image",
-            "Over focal length, rms over the wide view and the depths; the dots are the calibrated stops. Between "
+            "Over focal length, rms over the fixed image and the depths; the dots are the zoom samples. Between "
             "them the lens is interpolated, and what that leaves in doubt is counted.",
         )
 

@@ -144,8 +144,8 @@ def _between_stops(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> Ite
     worst = max(between, key=lambda one: one.rms, default=None)
     if worst is not None and worst.rms > MUCH_WORSE * max(stop.rms for stop in at):
         yield (
-            f"Between the zoom lens's stops it is only interpolated: at {worst.nominal_px:.0f} px by the lens's own "
-            f"account the error is {_degrees(worst.rms)} degrees. Add a stop there."
+            f"Between the zoom samples the lens is only interpolated: at {worst.nominal_px:.0f} px by the lens's own "
+            f"account the error is {_degrees(worst.rms)} degrees. Add a sample there."
         )
 
 
@@ -157,7 +157,7 @@ def _worst_corner(calibration: Calibration, at: tuple[AtFocal, ...]) -> Iterator
     name, error = max(corners.items(), key=lambda item: item[1], default=("", 0.0))
     if error > MUCH_WORSE * middle:
         yield (
-            f"In the {name} corner of the wide view the error is {_degrees(error)} degrees, {digits(error / middle)} "
+            f"In the {name} corner of the fixed image the error is {_degrees(error)} degrees, {digits(error / middle)} "
             "times that in the middle: hold boards there, as far out as they are still seen."
         )
 
@@ -234,7 +234,9 @@ def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
             yield f"The head's {axis} changed by {digits(np.degrees(turn))} degrees in all: {NEARER}."
     for nominal, views in zip(calibration.zoom.nominal_px, evidence.per_stop, strict=True):
         if views < FEWEST_AT_STOP:
-            yield f"The stop at {nominal:.0f} px has {count(views, 'view')}: add some, {FEWEST_AT_STOP} at least."
+            yield (
+                f"The zoom sample at {nominal:.0f} px has {count(views, 'view')}: add some, {FEWEST_AT_STOP} at least."
+            )
     if (longest := uncalibrated_px(calibration)) is not None:
         yield (
             f"The lens goes to {longest:.0f} px by its own account, but was calibrated to "
@@ -587,7 +589,7 @@ def judge(
     at = pointing(calibration) if at is None else at
     between = pointing(calibration, between_stops(calibration)) if between is None else between
     if not np.isfinite(at[-1].rms):
-        return Verdict("Reaches no point of the wide view with the head: its geometry cannot be right.", "bad")
+        return Verdict("Reaches no point of the fixed image with the head: its geometry cannot be right.", "bad")
     width = calibration.zoom.size[0]
     level: Level = "care" if mismatch or calibration.held_out is None else "good"
     parts = [*mismatch, _how_well(at, between)]
@@ -638,10 +640,14 @@ def _how_well(at: tuple[AtFocal, ...], between: tuple[AtFocal, ...]) -> str:
     text = f"points to {digits(np.degrees(last.rms))} degrees ({in_px})"
     worst = max((*at, *between), key=lambda one: one.rms)
     if worst.rms > ALIKE * last.rms:
-        where = f"between its stops, at {worst.focal_px:.0f} px" if worst in between else f"at {worst.focal_px:.0f} px"
+        where = (
+            f"between its zoom samples, at {worst.focal_px:.0f} px"
+            if worst in between
+            else f"at {worst.focal_px:.0f} px"
+        )
         text += f" and to {digits(np.degrees(worst.rms))} degrees ({digits(worst.rms_px)} px) {where}"
     near, far = DEPTHS
-    return f"{text}, one standard deviation, all over the wide view from {near:g} to {far:g} m"
+    return f"{text}, one standard deviation, all over the fixed image from {near:g} to {far:g} m"
 
 
 def _jitter(calibration: Calibration, last: AtFocal) -> str:

@@ -97,7 +97,7 @@ def describe(settings: DeadZoneSettings, summary: Mapping[str, Any]) -> str:
         for name, figures in summary.items()
         for key, found in figures.items()
     ]
-    return f"the head with a dead zone and without, median (least to largest) of {seeds_of(settings)}\n" + table(
+    return f"the head with a deadband and without, median (least to largest) of {seeds_of(settings)}\n" + table(
         ("", "with", "without", "with / without", "wanted"), lines
     )
 
@@ -125,7 +125,7 @@ def plot(rows: Sequence[Row], figure: Figure) -> None:
 SETTINGS = DeadZoneSettings()
 EXPERIMENT = Experiment(
     "dead_zone",
-    "Commands and reversals a minute with the dead zone and without, and the offset it costs.",
+    "Commands and reversals a minute with the deadband and without, and the offset it costs.",
     SETTINGS,
     # Without correction from the zoom view, which takes a third of the time.
     dataclasses.replace(SETTINGS, seeds=1, targets=("person",), seconds=10.0, calibrated=False, closed_loop=False),

@@ -190,7 +190,7 @@ def _draw(ax: Axes, shots: Sequence[Row], key: str, **how: Any) -> None:
 SETTINGS = FirstShotSettings()
 EXPERIMENT = Experiment(
     "first_shot",
-    "How well a single shot from the wide view alone hits, and what a miss consists of.",
+    "How well a single shot from the fixed camera alone hits, and what a miss consists of.",
     SETTINGS,
     # Nine shots each. A bird's correction is bounded by the value reached, which misses the goal in the full run too.
     dataclasses.replace(SETTINGS, seeds=1, targets=("book", "bird"), seconds=10.0, calibrated=False),

@@ -301,7 +301,7 @@ def _map(rows: Sequence[Row], method: Method, depth: float) -> tuple[Array, Arra
 SETTINGS = ShortcutSettings()
 EXPERIMENT = Experiment(
     "shortcut",
-    "The exact range beside the paper's shortcut over the wide view.",
+    "The exact range beside the paper's shortcut over the fixed camera's view.",
     SETTINGS,
     replace(SETTINGS, seeds=2, depths=(5.0, 20.0), grid=(9, 7), near=20),
     one,

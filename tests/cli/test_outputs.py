@@ -128,8 +128,8 @@ def test_captures_of_another_session_are_not_taken_for_its_own(folder, capsys, s
     [
         (None, 8, None),
         (1, 1, None),
-        (2, 4, "2 stops of the zoom lens are 12 times apart"),
-        (3, 4, "3 stops of the zoom lens are 3.5 times apart"),
+        (2, 4, "2 zoom samples are 12 times apart"),
+        (3, 4, "3 zoom samples are 3.5 times apart"),
         (4, 4, None),
         (9, 9, None),
     ],

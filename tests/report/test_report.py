@@ -189,9 +189,10 @@ def test_the_verdict_is_as_true_as_it_says(plain, stops):
 def test_the_verdict_speaks_of_focal_lengths_between_the_stops(stops):
     at = pointing(stops)
     worse = replace(at[0], focal_px=1000.0, rms=2 * max(one.rms for one in at))
-    said = f"and to {digits(np.degrees(worse.rms))} degrees ({digits(worse.rms_px)} px) between its stops, at 1000 px"
+    error = f"{digits(np.degrees(worse.rms))} degrees ({digits(worse.rms_px)} px)"
+    said = f"and to {error} between its zoom samples, at 1000 px"
     assert said in judge(stops, at, (worse,)).text
-    assert "between its stops" not in judge(stops, at, ()).text
+    assert "between its zoom samples" not in judge(stops, at, ()).text
 
 
 def test_the_verdict_says_the_plain_truth(plain):
@@ -340,7 +341,7 @@ def test_advice_follows_from_the_figures(plain):
     words = advice(shaky, (much,), (), (Contribution(JITTER_GROUP, at[0].rms),), None)
     words += advice(shaky, pointing(shaky), (), (), gather(shaky))
     between = (replace(at[0], nominal_px=777.0, rms=4 * at[0].rms),)
-    assert any("at 777 px" in item and "Add a stop" in item for item in advice(plain, at, between, parts, None))
+    assert any("at 777 px" in item and "Add a sample" in item for item in advice(plain, at, between, parts, None))
     assert any("makes 99 % of the squared error" in item for item in words)
     assert any("play in the gears" in item for item in words)
     assert any("no number of them would halve it" in item for item in words)

@@ -37,7 +37,7 @@ PICTURE_PX = 400  # width of a camera's picture on the page
 MARGIN_PX = 12
 TITLE_PX = 30  # height of a window's title bar
 AFTER_ALL = messages.Priority.INTERNAL - 1  # priority of a handler that runs after the viewer's own
-NAMES = {"fixed": "wide camera", "zoom": "zoom camera"}
+NAMES = {"fixed": "fixed camera", "zoom": "zoom camera"}
 
 
 class BrowserWindow:
