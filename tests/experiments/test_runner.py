@@ -536,6 +536,16 @@ def test_sessions_are_told_without_what_was_forgotten(run, tmp_path):
     assert run("tiny", "--seeds", "1")[0] == 0
 
 
+@pytest.mark.parametrize("damaged", ["[", "{}"])
+def test_damaged_sessions_are_not_taken_for_none(run, tmp_path, damaged):
+    assert run("tiny", "--seeds", "1")[0] == 0
+    (tmp_path / "out" / "sessions.json").write_text(damaged)
+    status, _, complaints = run("tiny", "--seeds", "1", "--report")
+    assert (status, complaints.count("\n")) == (1, 1)
+    assert "sessions.json: cannot be read" in complaints
+    assert (tmp_path / "out" / "sessions.json").read_text() == damaged
+
+
 @pytest.mark.parametrize(
     ("what", "wall_s", "said"),
     [
