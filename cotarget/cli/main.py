@@ -84,7 +84,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # nohup ignores SIGHUP; keep that
         signal.signal(signal.SIGHUP, lambda *_: sys.exit(HUNG_UP))
-    logging.basicConfig(level=logging.INFO if options.verbose else logging.WARNING, format="%(message)s")
+    level = logging.INFO if options.verbose else logging.WARNING
+    logging.basicConfig(level=level, format="%(message)s", handlers=[StderrHandler()])
     logging.getLogger("httpx").setLevel(logging.WARNING)  # httpx logs every request at INFO
     try:
         status = int(options.run(options) or 0)
@@ -106,6 +107,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if _notes(end):
             _say(options.command, "terminated", end)
         raise
+
+
+class StderrHandler(logging.Handler):
+    """Print records on what is stderr at the moment, so that a progress bar moves below them."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a record."""
+        with contextlib.suppress(OSError):  # the terminal may be closed
+            print(self.format(record), file=sys.stderr)
 
 
 def _say(command: str, text: str, end: BaseException) -> None:

@@ -198,10 +198,14 @@ def test_progress_is_a_line_now_and_then_where_nobody_looks(capsys):
 
 
 SHOWING = """
+import logging
 from cotarget.cli.common import progress_bar
+from cotarget.cli.main import StderrHandler
+logging.basicConfig(format="%(message)s", handlers=[StderrHandler()])
 with progress_bar() as progress:
     progress("board [1]", 1, 8)
     print("a result")
+    logging.warning("a remark")
     progress("board [8]", 9, 8)
 """
 
@@ -215,6 +219,7 @@ def test_progress_is_a_bar_on_a_terminal_beside_the_results():
     assert made.stdout == b"a result\n"
     assert "board [8]" in shown
     assert "100%" in shown
+    assert "\x1b[2Ka remark\r\n" in shown  # on a line of its own
     assert shown.endswith("\x1b[2K")  # the line is cleared
 
 
