@@ -152,7 +152,7 @@ def folder(tmp_path, monkeypatch):
     ((), "this machine has no display; --browser shows the scene in a web browser instead"),
     (("--port", "8080"), "--port: is of the page that --browser serves; give both"),
     (("--calibration", "c.json"), "--calibration: is for following a target; name it: --target NAME"),
-    (("--target", "cow"), "unknown target 'cow'; the targets are: bird, book, person"),
+    (("--target", "cow"), "--target: unknown target 'cow'; the targets are: bird, book, person"),
     (("--rig", "hw.toml"), "hw.toml: backend is 'hardware'; what is viewed is a simulated rig"),
     (("--rig", "none.toml"), "none.toml: no such file; give the path of a rig.toml"),
     (("--rig", "rig.toml", "--target", "bird"),
