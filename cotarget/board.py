@@ -43,8 +43,8 @@ def print_board(path: Path, board: BoardConfig) -> tuple[float, float]:
         Width and height of the page, white border included [m].
 
     Raises:
-        ConfigError: the suffix is unknown, `check_board` refuses the board, or the page is larger than 5 m.
-        CalibrationError: the file cannot be written.
+        ConfigError: the suffix is unknown, `check_board` refuses the board, the page is larger than 5 m, or the file
+            cannot be written.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{path}: cannot be drawn as '{path.suffix}'; the formats are: {choices(SUFFIXES)}")

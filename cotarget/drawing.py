@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from cotarget.files import write_whole
+from cotarget.files import write_atomically
 from cotarget.geometry import Array
 from cotarget.metrics import Row
 from cotarget.pipeline import State, Step
@@ -143,7 +143,7 @@ def write_picture(path: Path, image: Image) -> None:
     Raises:
         ConfigError: the file cannot be written.
     """
-    write_whole(path, cv2.imencode(".png", image)[1].tobytes())
+    write_atomically(path, cv2.imencode(".png", image)[1].tobytes())
 
 
 def captioned(image: Image, text: str) -> Image:

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
-from cotarget.errors import CalibrationError, ConfigError, CotargetError
+from cotarget.errors import ConfigError, CotargetError
 from cotarget.safety.signals import DeferredSignals
 
 
@@ -24,18 +24,6 @@ def assets_dir() -> Path:
     package = Path(__file__).parent
     inside = package / "sim_assets"
     return inside if inside.is_dir() else package.parent / "sim_assets"
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Replace a file's content in one step, even if the program or the power fails halfway.
-
-    Raises:
-        CalibrationError: the file cannot be written, or another run is writing it.
-    """
-    try:
-        write_whole(path, data)
-    except ConfigError as error:
-        raise CalibrationError(str(error)) from None
 
 
 # Longest wait for another run that is writing a small file [s]; writing takes less.
@@ -169,7 +157,7 @@ def said(path: Path, failure: OSError | CotargetError) -> CotargetError:
     )
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_atomically(path: Path, data: bytes) -> None:
     """Replace a file's content in one step, even if the program or the power fails halfway.
 
     Raises:

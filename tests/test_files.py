@@ -12,7 +12,7 @@ import pytest
 from cotarget import files
 from cotarget.drawing import write_picture
 from cotarget.errors import ConfigError, CotargetError
-from cotarget.files import CsvFile, PartFile, write_whole
+from cotarget.files import CsvFile, PartFile, write_atomically
 from cotarget.video import Film, FilmWriter
 from tests.full_disk import SAID, full_disk
 
@@ -150,7 +150,7 @@ def test_small_files_wait_for_each_other(tmp_path):
 
     timer = threading.Timer(0.1, end)
     timer.start()
-    write_whole(path, b"second")
+    write_atomically(path, b"second")
     timer.join()
     assert path.read_text() == "second"
     assert names(tmp_path) == ["a.json"]
@@ -159,7 +159,7 @@ def test_small_files_wait_for_each_other(tmp_path):
 def test_who_waits_for_a_run_that_goes_on_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("cotarget.files.PATIENCE_S", 0.05)
     with CsvFile(tmp_path / "a.csv", ("n",)), pytest.raises(ConfigError, match="is being written by another run"):
-        write_whole(tmp_path / "a.csv", b"whole")
+        write_atomically(tmp_path / "a.csv", b"whole")
     assert (tmp_path / "a.csv").read_text().split() == ["n"]
 
 
@@ -302,7 +302,7 @@ def test_a_link_stays_and_its_goal_is_written(tmp_path, exists):
     write_table(link, 1)
     assert link.is_symlink()
     assert goal.read_text().split() == ["n", "0"]
-    write_whole(link, b"whole")
+    write_atomically(link, b"whole")
     assert link.is_symlink()
     assert goal.read_bytes() == b"whole"
     assert names(goal.parent) == ["goal.csv"]

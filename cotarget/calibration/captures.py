@@ -41,7 +41,7 @@ def write_session(directory: Path, config: RigConfig | None) -> None:
     """Write session.json and an empty commands.jsonl.
 
     Raises:
-        CalibrationError: a file cannot be written.
+        ConfigError: a file cannot be written.
     """
     table = {
         "schema": SCHEMA,
@@ -57,14 +57,14 @@ def write_command(directory: Path, t: float, do: str, asked: Any, got: Any = Non
     """Append a command to commands.jsonl.
 
     Raises:
-        CalibrationError: the file cannot be written.
+        ConfigError: the file cannot be written.
     """
     path = directory / COMMANDS
     try:
         with path.open("a", encoding="utf-8") as file:
             file.write(json.dumps({"t": t, "do": do, "asked": asked, "got": got}) + "\n")
     except OSError as error:
-        raise CalibrationError(f"{path}: cannot be written: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def _version(package: str) -> str | None:
@@ -149,7 +149,7 @@ def write_image(path: Path, image: Image) -> None:
     """Write a PNG atomically.
 
     Raises:
-        CalibrationError: the file cannot be written.
+        ConfigError: the file cannot be written.
     """
     ok, data = cv2.imencode(".png", image, PNG_OPTIONS)
     if not ok:
@@ -161,7 +161,7 @@ def write_index(directory: Path, index: CaptureIndex) -> None:
     """Write index.json atomically.
 
     Raises:
-        CalibrationError: the file cannot be written.
+        ConfigError: the file cannot be written.
     """
     rows = ",\n    ".join(
         json.dumps(

@@ -98,7 +98,7 @@ class FoundCorners:
         return np.where(self.seen[:, None], np.round(self.corners_px, CORNER_DECIMALS), np.nan)
 
 
-def search(grey: Image, grid: Array, predicted: Array, look: Look) -> FoundCorners | None:
+def search_near(grey: Image, grid: Array, predicted: Array, look: Look) -> FoundCorners | None:
     """Search for corners near their predictions, correct the predictions by what is found, and repeat.
 
     Args:
@@ -324,7 +324,7 @@ def find_charuco(grey: Image, board: BoardConfig, *, thorough: bool = True) -> A
     # Corners without two readable markers beside them are searched where the others predict them.
     straight = through(H, grid)
     elsewhere = mapped(straight, rough, read, curved=bool(np.count_nonzero(read) >= CURVED_CORNERS))
-    found = search(grey, grid, np.where(read[:, None], rough, elsewhere), BETWEEN_MARKERS)
+    found = search_near(grey, grid, np.where(read[:, None], rough, elsewhere), BETWEEN_MARKERS)
     if found is None or any(len(np.unique(grid[found.seen, axis])) < 2 for axis in (0, 1)):
         return None
     return found.rounded()
@@ -378,7 +378,7 @@ def find_near(image: Image, board: BoardConfig, predicted_px: Array) -> Array | 
     if board.kind == "charuco":  # the markers number the corners better than any prediction
         return find_charuco(grey, board)
     grid, predicted = grid_of(board), np.asarray(predicted_px, dtype=float).reshape(-1, 2)
-    found = search(grey, grid, predicted, PLAIN)
+    found = search_near(grey, grid, predicted, PLAIN)
     if found is None or not _as_predicted(grey, grid, predicted, found):
         return None
     return found.rounded()
@@ -433,8 +433,8 @@ def find_corners(image: Image, board: BoardConfig, *, thorough: bool = True) -> 
     if board.kind == "charuco":
         return find_charuco(grey, board, thorough=thorough)
     for level in _pyramid(grey):
-        for search in SEARCHES if thorough else SEARCHES[:1]:
-            found = search(level, board.corners)
+        for find in FINDERS if thorough else FINDERS[:1]:
+            found = find(level, board.corners)
             if found is None:
                 continue
             numbered = _number(level, found, board.corners)
@@ -491,7 +491,7 @@ def guess_corners(image: Image) -> tuple[int, int] | None:
     if not ok:
         return None
     rows, columns = sorted(layout.shape)
-    found = SEARCHES[0](grey, (columns, rows))
+    found = FINDERS[0](grey, (columns, rows))
     numbered = None if found is None else _number(grey, found, (columns, rows))
     board = BoardConfig(corners=(columns, rows))
     return (columns, rows) if numbered is not None and _is_whole(grey, numbered, board) else None
@@ -547,12 +547,12 @@ def _refine(grey: Image, corners_px: Array, corners: tuple[int, int]) -> Array:
     return np.asarray(refined, dtype=float).reshape(-1, 2)
 
 
-def _sector_based(flags: int) -> "Search":
-    def search(grey: Image, corners: tuple[int, int]) -> Array | None:
+def _sector_based(flags: int) -> "BoardFinder":
+    def find(grey: Image, corners: tuple[int, int]) -> Array | None:
         ok, found = cv2.findChessboardCornersSB(grey, corners, flags=flags)
         return np.asarray(found, dtype=float).reshape(-1, 2) if ok else None  # (N, 1, 2) in OpenCV 4, (N, 2) in 5
 
-    return search
+    return find
 
 
 def _quadrangles(grey: Image, corners: tuple[int, int]) -> Array | None:
@@ -564,8 +564,8 @@ def _quadrangles(grey: Image, corners: tuple[int, int]) -> Array | None:
 
 # Finders accurate to about a pixel, the fastest first (20, 25, 100 ms and up at 640x480). What one misses, another
 # often sees.
-Search = Callable[[Image, tuple[int, int]], Array | None]
-SEARCHES: tuple[Search, ...] = (
+BoardFinder = Callable[[Image, tuple[int, int]], Array | None]
+FINDERS: tuple[BoardFinder, ...] = (
     _sector_based(0),
     _sector_based(cv2.CALIB_CB_NORMALIZE_IMAGE),
     _sector_based(cv2.CALIB_CB_ACCURACY),

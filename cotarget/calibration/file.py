@@ -150,7 +150,8 @@ class Calibration:
         """Write a calibration.json atomically.
 
         Raises:
-            CalibrationError: the file cannot be written.
+            ConfigError: the file cannot be written.
+            CalibrationError: the calibration holds a number that is not finite.
         """
         save_calibration(Path(path), self)
 
@@ -445,7 +446,8 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
     """Write calibration.json atomically.
 
     Raises:
-        CalibrationError: the file cannot be written, or the calibration holds a number that is not finite.
+        ConfigError: the file cannot be written.
+        CalibrationError: the calibration holds a number that is not finite.
     """
     try:
         text = _readable(_table(calibration))

@@ -97,7 +97,7 @@ HELD_PX, HELD_FOR, LEFT_PX = 0.3, 0.4, 8.0
 TRIES = 3
 LENS_TOLERANCE = 0.03  # relative to the focal length; a step of a usual lens is 0.02
 # Finds a board's corners in an image, given the view to be filled, whose corners are still nan.
-Finder = Callable[[Image, View], Array | None]
+CornerFinder = Callable[[Image, View], Array | None]
 Seen = TypeVar("Seen")
 
 
@@ -257,7 +257,7 @@ class CaptureRecorder:
         frame = self._look(self._read_fixed)
         return self._keep(Capture(frame.image, "fixed", self.number, t=frame.t), expected)
 
-    def see_zoom(self, *, expected: bool = True, find: Finder | None = None) -> View | None:
+    def see_zoom(self, *, expected: bool = True, find: CornerFinder | None = None) -> View | None:
         """Take an image with the zoom camera at the present head pose and find the board in it.
 
         Args:
@@ -316,7 +316,7 @@ class CaptureRecorder:
         if self.directory is not None:
             write_command(self.directory, t, do, asked, got)
 
-    def _keep(self, capture: Capture, expected: bool, find: Finder | None = None) -> View | None:
+    def _keep(self, capture: Capture, expected: bool, find: CornerFinder | None = None) -> View | None:
         """Find the board in a capture; keep the image if the board was found or expected."""
         if find is None:
             corners = find_corners(capture.image, self.board, thorough=expected)

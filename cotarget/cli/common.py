@@ -433,7 +433,7 @@ def previous_kept(path: Path) -> Iterator[None]:
     Both files are complete at every moment. If the block fails, the earlier file stays and the other name is removed.
 
     Raises:
-        CalibrationError: the earlier file cannot be kept.
+        ConfigError: the earlier file cannot be kept.
     """
     kept = _second_name(behind_link(path))
     try:

@@ -29,6 +29,7 @@ from cotarget.calibration.file import Calibration
 from cotarget.calibration.initialization import place_boards
 from cotarget.calibration.model import CameraName, Covariance, View, stop_of
 from cotarget.calibration.observability import name_directions, weak_directions
+from cotarget.calibration.planning import GRID
 from cotarget.calibration.uncertainty import STEP, miss_derivatives, model_of, predicted_pointing
 from cotarget.camera import ZoomLens
 from cotarget.errors import CalibrationError
@@ -340,7 +341,6 @@ BEYOND_CHANCE = 3.0  # standard deviations of a cell's average, which chance exc
 SHAPE_CHI2 = 16.3  # 99.9 % of a chi-square with three degrees of freedom
 WRONG_SHARE = 0.1  # share of a board's corners that are off, above which the board is wrong
 POINT_STEP = 1e-5  # step of a corner for derivatives [m]
-COVER = (10, 8)  # cells in which corners are counted, as `planning.GRID`
 # Names of the thirds of an image.
 ROWS, COLUMNS = ("upper", "", "lower"), ("left", "", "right")
 
@@ -512,7 +512,7 @@ def averaged(corners: Corners) -> Cells:
         return Cells(middles, means, np.linalg.norm(means, axis=-1) > limit)
 
 
-def counts(corners: Corners, cells: tuple[int, int] = COVER) -> Array:
+def counts(corners: Corners, cells: tuple[int, int] = GRID) -> Array:
     """Count the corners in each cell of the image, (down, across)."""
     found = np.bincount(_cell(corners, cells), minlength=cells[0] * cells[1])
     return found.reshape(cells[1], cells[0]).astype(float)

@@ -12,7 +12,7 @@ import jinja2
 import numpy as np
 
 from cotarget.calibration.file import Calibration, check_covariance
-from cotarget.errors import CalibrationError
+from cotarget.errors import ConfigError
 from cotarget.report import figures
 from cotarget.report.analysis import (
     CAMERAS,
@@ -89,8 +89,8 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
         The verdict.
 
     Raises:
-        CalibrationError: a file cannot be written, the covariance is invalid, or the stored corners do not determine
-            the boards' poses.
+        CalibrationError: the covariance is invalid, or the stored corners do not determine the boards' poses.
+        ConfigError: a file cannot be written.
     """
     if calibration.covariance is not None:
         check_covariance(calibration.covariance, len(calibration.zoom.stops))
@@ -144,7 +144,7 @@ def _write(path: Path, page: str, made: dict[str, Plot]) -> None:
                 (folder / f"{name}.png").unlink(missing_ok=True)
     except OSError as error:
         where = folder if folder.exists() and not folder.is_dir() else path
-        raise CalibrationError(f"{where}: cannot be written: {error.strerror}") from None
+        raise ConfigError(f"{where}: cannot be written: {error.strerror}") from None
 
 
 def _pointing(

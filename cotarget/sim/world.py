@@ -28,12 +28,11 @@ from cotarget.sim.render.sensor import Sensor
 from cotarget.sim.render.views import Ahead, Views, is_allowed
 from cotarget.sim.state import WorldState
 from cotarget.sim.targets.target import Target, make_target, target_rng
-from cotarget.sim.truth import CameraName, Truth
+from cotarget.sim.truth import NO_DISTORTION, CameraName, Truth
 from cotarget.sim.weather import Clutter
 from cotarget.sim.zoom_lens import optics_at
 
 CAMERAS: tuple[CameraName, ...] = ("fixed", "zoom")
-NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 # Random streams of the sensors' noise, so that the draws of one effect never shift those of another.
 FIXED_NOISE, ZOOM_NOISE = 1, 2
 # The render's size is computed from this many focal lengths of the zoom lens; its optics vary smoothly between them.

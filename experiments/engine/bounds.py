@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from cotarget.errors import ConfigError
-from cotarget.files import write_whole
+from cotarget.files import write_atomically
 from experiments.engine.harness import Experiment
 from experiments.engine.texts import plain
 
@@ -152,7 +152,7 @@ def tighten(experiment: Experiment[Any], summary: Mapping[str, Any], folder: Pat
             put(value)
             changed.append(f"{experiment.name}: {bound.name}: {bound.text} -> {value:g}")
     if changed:
-        write_whole(folder / f"{experiment.name}.json", (json.dumps(tree, indent=2) + "\n").encode())
+        write_atomically(folder / f"{experiment.name}.json", (json.dumps(tree, indent=2) + "\n").encode())
     return changed
 
 

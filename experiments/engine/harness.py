@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from cotarget.cli.common import count, not_negative, progress_bar
 from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, CotargetError, DeviceError
-from cotarget.files import write_whole
+from cotarget.files import write_atomically
 from experiments.engine.arguments import check_folder
 from experiments.engine.pictured import Pictured, parted, shown
 from experiments.engine.texts import in_one_line, plain
@@ -257,14 +257,14 @@ class Experiment(Generic[S]):
             "versions": versions(),
             "summary": summary,
         }
-        write_whole(out / "result.json", (json.dumps(plain(result), indent=2) + "\n").encode())
+        write_atomically(out / "result.json", (json.dumps(plain(result), indent=2) + "\n").encode())
         table = io.StringIO(newline="")
         writer = csv.DictWriter(table, fieldnames=list(dict.fromkeys(key for row in rows for key in row)))
         writer.writeheader()
         writer.writerows(rows)
-        write_whole(out / "rows.csv", table.getvalue().encode())
+        write_atomically(out / "rows.csv", table.getvalue().encode())
         for name, png in {**({} if picture is None else {FIGURE: picture}), **pictures}.items():
-            write_whole(out / f"{name}.png", png)
+            write_atomically(out / f"{name}.png", png)
 
     def picture(self, rows: Sequence[Row]) -> bytes | None:
         """Draw the plot as a PNG; None without a plot."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from cotarget.files import write_whole
+from cotarget.files import write_atomically
 from cotarget.report.figures import Plot
 from cotarget.report.page import render
 from cotarget.report.text import Level, Table, count, digits, listed
@@ -70,7 +70,7 @@ def write_report(path: Path, run: Run) -> None:
         command=run.command,
         made=_made(run),
     )
-    write_whole(path, page.encode())
+    write_atomically(path, page.encode())
 
 
 def _verdict(run: Run) -> tuple[str, Level, str]:

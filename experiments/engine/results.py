@@ -26,7 +26,7 @@ from typing import Any
 import cotarget
 import experiments
 from cotarget.errors import ConfigError
-from cotarget.files import assets_dir, write_whole
+from cotarget.files import assets_dir, write_atomically
 from experiments.engine.harness import Row, Settings
 from experiments.engine.versions import versions
 
@@ -214,8 +214,8 @@ class Jobs:
         told["pictures"] = {name: base64.b64encode(png).decode() for name, png in record.pictures.items()}
         traceback = self._folder / f"{record.number:06d}.traceback.txt"
         if record.failed:
-            write_whole(traceback, record.traceback.encode())
-        write_whole(self._folder / f"{record.number:06d}.json", (json.dumps(told) + "\n").encode())
+            write_atomically(traceback, record.traceback.encode())
+        write_atomically(self._folder / f"{record.number:06d}.json", (json.dumps(told) + "\n").encode())
         if not record.failed:
             traceback.unlink(missing_ok=True)
 
@@ -230,7 +230,9 @@ class Jobs:
             ConfigError: the file cannot be written.
         """
         self._folder.mkdir(parents=True, exist_ok=True)
-        write_whole(self._folder / SHARED, (json.dumps({**self._head, **dataclasses.asdict(spent)}) + "\n").encode())
+        write_atomically(
+            self._folder / SHARED, (json.dumps({**self._head, **dataclasses.asdict(spent)}) + "\n").encode()
+        )
 
     def read_shared(self) -> Spent:
         """Read what the preparation took; zero where that is unknown."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cotarget.errors import ConfigError
-from cotarget.files import write_whole
+from cotarget.files import write_atomically
 from cotarget.schema import validate
 from experiments.engine.results import code_version
 from experiments.engine.versions import versions
@@ -143,4 +143,4 @@ def forget(folder: Path, cases: Collection[str]) -> None:
 
 def _write(folder: Path, found: list[Session]) -> None:
     told = json.dumps([dataclasses.asdict(each) for each in found], indent=2) + "\n"
-    write_whole(folder / SESSIONS, told.encode())
+    write_atomically(folder / SESSIONS, told.encode())

@@ -15,7 +15,7 @@ import numpy as np
 
 from cotarget.cli.main import Parser
 from cotarget.errors import ConfigError, CotargetError, choices
-from cotarget.files import write_whole
+from cotarget.files import write_atomically
 from experiments.engine.arguments import check_folder
 from experiments.engine.harness import FIGURE
 from experiments.paper.paper_loop import WAYS, picture_name
@@ -90,7 +90,7 @@ def gather(results: Path, out: Path, names: Collection[str]) -> list[Path]:
     files = {out / f"{each.name}.jpg": _jpeg(results / each.experiment / f"{each.picture}.png") for each in shown}
     out.mkdir(parents=True, exist_ok=True)
     for path, data in files.items():
-        write_whole(path, data)
+        write_atomically(path, data)
     return list(files)
 
 

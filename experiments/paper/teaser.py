@@ -17,7 +17,7 @@ from cotarget.cli.main import Parser
 from cotarget.config import SimEffects
 from cotarget.drawing import write_text
 from cotarget.errors import CotargetError
-from cotarget.files import write_whole
+from cotarget.files import write_atomically
 from cotarget.rig import Image
 from experiments.engine.arguments import check_folder
 from experiments.paper.gallery import PICTURES
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_folder(out.parent)
         effects = SimEffects(noise=False, jpeg=False)  # these would take most of the file
         config = ct.RigConfig(sim=ct.SimConfig(scene="outdoor", targets=("bird",), effects=effects))
-        write_whole(out, animated_webp(list(pictures(config)), config.sim.fixed.rate_hz / EVERY))
+        write_atomically(out, animated_webp(list(pictures(config)), config.sim.fixed.rate_hz / EVERY))
     except CotargetError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         return 1

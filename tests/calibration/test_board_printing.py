@@ -9,7 +9,7 @@ import pytest
 from cotarget.board import print_board
 from cotarget.calibration.corners import find_corners
 from cotarget.config import BoardConfig
-from cotarget.errors import CalibrationError, ConfigError
+from cotarget.errors import ConfigError
 from tests.full_disk import SAID, full_disk
 
 BOARD = BoardConfig(corners=(7, 4), square=0.02)
@@ -56,6 +56,6 @@ def test_what_cannot_be_printed_is_said(tmp_path, name, board, said):
 @pytest.mark.parametrize("room", [0, 4096])
 def test_a_full_disk_leaves_nothing(tmp_path, suffix, room):
     path = tmp_path / f"board{suffix}"
-    with full_disk(room), pytest.raises(CalibrationError, match=re.escape(f"{path}: cannot be written: {SAID}")):
+    with full_disk(room), pytest.raises(ConfigError, match=re.escape(f"{path}: cannot be written: {SAID}")):
         print_board(path, BoardConfig(corners=(9, 6), square=0.025))
     assert not list(tmp_path.iterdir())

@@ -19,7 +19,7 @@ from cotarget.calibration import (
 )
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_GAMMA, DEFAULT_T, BoardConfig
-from cotarget.errors import CalibrationError
+from cotarget.errors import CalibrationError, ConfigError
 from cotarget.pantilt import HeadGeometry
 
 ROUNDING = 1e-15  # between radians and degrees, matrix and rotation vector
@@ -197,7 +197,7 @@ def test_missing_file_and_folder(tmp_path):
         load_calibration(tmp_path / "none.json")
     with pytest.raises(CalibrationError, match="cannot be read"):
         load_calibration(tmp_path)
-    with pytest.raises(CalibrationError, match="cannot be written"):
+    with pytest.raises(ConfigError, match="cannot be written"):
         save_calibration(tmp_path / "none" / "c.json", example())
 
 

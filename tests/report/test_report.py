@@ -16,7 +16,7 @@ from cotarget.board import board_points
 from cotarget.calibration import Covariance, HeldOut, Options, Rejected, View, calibrate_views, save_calibration
 from cotarget.cli.calibrating import summary
 from cotarget.config import BoardConfig
-from cotarget.errors import CalibrationError
+from cotarget.errors import CalibrationError, ConfigError
 from cotarget.report import verdict
 from cotarget.report.analysis import (
     JITTER_GROUP,
@@ -435,12 +435,12 @@ def test_mistakes_end_in_one_line_and_leave_the_page(plain, tmp_path, capsys):
 def test_a_full_disk_leaves_nothing_of_a_report(plain, tmp_path):
     """There is room for some of its pictures, and none for the page."""
     page = tmp_path / "page.html"
-    with full_disk(60_000), pytest.raises(CalibrationError, match=f"page.html: cannot be written: {SAID}"):
+    with full_disk(60_000), pytest.raises(ConfigError, match=f"page.html: cannot be written: {SAID}"):
         write_report(page, plain)
     assert not list(tmp_path.iterdir())
     write_report(page, bare(plain, covariance=None))
     before = page.read_bytes()
-    with full_disk(), pytest.raises(CalibrationError):
+    with full_disk(), pytest.raises(ConfigError):
         write_report(page, bare(plain, covariance=None))
     assert page.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html", "page_pictures"]
