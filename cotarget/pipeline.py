@@ -27,7 +27,18 @@ from cotarget.errors import ConfigError, DeviceError, StaleFrameError, Unreachab
 from cotarget.estimation import Estimate, FilterSettings
 from cotarget.estimation.zoom_matching import MatchingSettings, ZoomMeasurement
 from cotarget.fusion import FusionSettings, MakeFinder, TargetFusion
-from cotarget.rig import FUTURE_S, PATIENCE_S, Camera, Clock, Frame, Image, PanTiltState, Rig, ZoomState, opened_from
+from cotarget.rig import (
+    FUTURE_S,
+    READ_TIMEOUT_S,
+    Camera,
+    Clock,
+    Frame,
+    Image,
+    PanTiltState,
+    Rig,
+    ZoomState,
+    opened_from,
+)
 from cotarget.targeting import Aim, target_implausibility
 from cotarget.tracking.track import Track, TrackingSettings, tracking_settings
 from cotarget.tracking.tracker import Tracker
@@ -78,7 +89,7 @@ class FrameSource:
             StaleFrameError: no frame came, or none that is newer and not from the future for too long.
             DeviceError: the frame has another size.
         """
-        self._fixed_fault, until, timeout = "", math.inf, PATIENCE_S
+        self._fixed_fault, until, timeout = "", math.inf, READ_TIMEOUT_S
         while True:
             try:
                 return self._next_fixed(timeout, until)
@@ -86,7 +97,7 @@ class FrameSource:
                 now = self._clock.now()
                 if not self._fixed_fault:
                     until = now + REPEATED_S
-                if self._fixed_frame is None or now - self._read_t >= PATIENCE_S or not now < until:
+                if self._fixed_frame is None or now - self._read_t >= READ_TIMEOUT_S or not now < until:
                     raise
                 self._fixed_fault = str(error)
                 self._clock.sleep_until(now + AGAIN_S)

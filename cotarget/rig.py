@@ -24,7 +24,7 @@ Angles = tuple[float, float]  # pan and tilt [rad]
 Speed = float | tuple[float, float]  # one speed for both axes of a head, or one each for pan and tilt [rad/s]
 
 # Longest wait of a camera for its next frame [s]; later none will come.
-PATIENCE_S = 1.0
+READ_TIMEOUT_S = 1.0
 # A frame cannot be from the future; this tolerance allows for a configured latency that is too long [s].
 FUTURE_S = 0.05
 
@@ -162,7 +162,7 @@ class Camera(Protocol):
     def size(self) -> tuple[int, int]:
         """(width, height) [px]."""
 
-    def read(self, newer_than: float | None = None, timeout: float = PATIENCE_S) -> Frame:
+    def read(self, newer_than: float | None = None, timeout: float = READ_TIMEOUT_S) -> Frame:
         """Wait for the newest frame; with ``newer_than`` [s], for one exposed after that time.
 
         Raises:

@@ -26,7 +26,7 @@ from cotarget.config import (
 from cotarget.errors import ConfigError, choices
 from cotarget.evaluation import TruthDetector, TruthNoise, counted, true_calibration
 from cotarget.geometry import Array
-from cotarget.rig import PATIENCE_S, PanTiltState, ZoomState
+from cotarget.rig import READ_TIMEOUT_S, PanTiltState, ZoomState
 from cotarget.schema import Size
 from cotarget.sim.model import has_clutter
 from cotarget.sim.render.pictures import SizedPictures
@@ -44,7 +44,7 @@ DEFAULT_RIG = RigConfig(
 )
 
 
-def told(given: object) -> str:
+def shortened(given: object) -> str:
     """Format a given value for messages, on one line and shortened."""
     return " ".join(reprlib.repr(given).split())
 
@@ -57,7 +57,9 @@ def name_of(what: str, given: object, known: Collection[str]) -> str:
     """
     if isinstance(given, str) and given in known:
         return given
-    raise ConfigError(f"{what}: unknown {told(given)}; there {'are' if len(known) > 1 else 'is'}: {choices(known)}")
+    raise ConfigError(
+        f"{what}: unknown {shortened(given)}; there {'are' if len(known) > 1 else 'is'}: {choices(known)}"
+    )
 
 
 def rig_of(given: object) -> RigConfig:
@@ -72,7 +74,7 @@ def rig_of(given: object) -> RigConfig:
         given = load_config(Path(given))
     config = DEFAULT_RIG if given is None else given
     if not isinstance(config, RigConfig):
-        raise ConfigError(f"rig: {told(given)} is neither a cotarget.config.RigConfig nor the path of a rig.toml")
+        raise ConfigError(f"rig: {shortened(given)} is neither a cotarget.config.RigConfig nor the path of a rig.toml")
     if config.backend != "sim":
         raise ConfigError(f"rig: its backend is '{config.backend}'; environments are on 'sim' alone")
     if given is not None:
@@ -96,8 +98,10 @@ def _check_waits(sim: SimConfig) -> None:
     if sim.effects.latency:
         waits_s |= {"fixed.latency_s": sim.fixed.latency_s, "zoom.latency_s": sim.zoom.latency_s}
     for name, wait_s in waits_s.items():
-        if wait_s > PATIENCE_S:
-            raise ConfigError(f"rig: sim.{name}: makes a frame {wait_s:g} s late; nobody waits above {PATIENCE_S:g} s")
+        if wait_s > READ_TIMEOUT_S:
+            raise ConfigError(
+                f"rig: sim.{name}: makes a frame {wait_s:g} s late; the pipeline waits for {READ_TIMEOUT_S:g} s"
+            )
 
 
 def check_scene(sim: SimConfig, name: str, paths: Callable[[str, int], Mapping[str, Sequence[Waypoint]]]) -> None:
@@ -118,7 +122,7 @@ def check_scene(sim: SimConfig, name: str, paths: Callable[[str, int], Mapping[s
     seen = part_seen(sim, places[in_view(places)])
     if seen < LEAST_SEEN:
         raise ConfigError(
-            f"rig: in the scene '{sim.scene}' {seen:.0%} of a {name}'s ways can be seen; they are made for "
+            f"rig: in the scene '{sim.scene}' {seen:.0%} of a {name}'s paths can be seen; they are made for "
             f"'{SimConfig.scene}': fixed_mount at (0, 0, 1.6), looking along +y and 9 degrees up, over open ground"
         )
 
@@ -134,7 +138,9 @@ def calibration_of(given: object) -> Calibration | None:
         return load_calibration(Path(given))
     if given is None or isinstance(given, Calibration):
         return given
-    raise ConfigError(f"calibration: {told(given)} is neither a cotarget.calibration.Calibration nor the path of one")
+    raise ConfigError(
+        f"calibration: {shortened(given)} is neither a cotarget.calibration.Calibration nor the path of one"
+    )
 
 
 def noise_of(given: object) -> TruthNoise:
@@ -145,7 +151,7 @@ def noise_of(given: object) -> TruthNoise:
     """
     if isinstance(given, TruthNoise):
         return given
-    raise ConfigError(f"noise: {told(given)} is no cotarget.evaluation.TruthNoise")
+    raise ConfigError(f"noise: {shortened(given)} is no cotarget.evaluation.TruthNoise")
 
 
 def seconds_of(given: object) -> float:
@@ -156,7 +162,9 @@ def seconds_of(given: object) -> float:
     """
     if isinstance(given, Real) and 0 < float(given) <= SECONDS:
         return float(given)
-    raise ConfigError(f"seconds: {told(given)} is not above 0 and up to {SECONDS:g}, for which there are ways to go")
+    raise ConfigError(
+        f"seconds: {shortened(given)} is not above 0 and up to {SECONDS:g}, as long as the targets' paths"
+    )
 
 
 def size_of(given: object) -> Size:
@@ -169,7 +177,7 @@ def size_of(given: object) -> Size:
     whole = all(isinstance(side, int | np.integer) and SMALLEST_PX <= side <= LARGEST_PX for side in size)
     if len(size) != 2 or not whole:
         raise ConfigError(
-            f"image_size: {told(given)} is not (width, height) of {SMALLEST_PX} to {LARGEST_PX} pixels each"
+            f"image_size: {shortened(given)} is not (width, height) of {SMALLEST_PX} to {LARGEST_PX} pixels each"
         )
     return int(size[0]), int(size[1])
 
@@ -182,7 +190,7 @@ def reward_of(given: object) -> float:
     """
     if isinstance(given, Real) and math.isfinite(given):
         return float(given)
-    raise ConfigError(f"served_reward: {told(given)} is not a finite number")
+    raise ConfigError(f"served_reward: {shortened(given)} is not a finite number")
 
 
 def check_options(given: object) -> None:
@@ -193,7 +201,7 @@ def check_options(given: object) -> None:
     """
     if given is not None and not (isinstance(given, Mapping) and not given):
         first = next(iter(given)) if isinstance(given, Mapping) else given
-        raise ConfigError(f"options: reset knows no {told(first)}; it takes a seed only")
+        raise ConfigError(f"options: reset knows no {shortened(first)}; it takes a seed only")
 
 
 # Commands and states as numbers from -1 to 1
@@ -247,7 +255,7 @@ class Units:
         except (TypeError, ValueError):
             given = np.empty(0)
         if given.shape != (3,) or not all(map(math.isfinite, given.tolist())):
-            raise ConfigError(f"action: {told(action)} is not three finite numbers, of pan, tilt and focal length")
+            raise ConfigError(f"action: {shortened(action)} is not three finite numbers, of pan, tilt and focal length")
         parts = [(min(max(number, -1.0), 1.0) + 1) / 2 for number in given.tolist()]
         (low_pan, high_pan), (low_tilt, high_tilt), (short, long) = self.pan, self.tilt, self.focal_px
         return (
@@ -402,7 +410,7 @@ class RigEnv(gymnasium.Env[Observation, Action], Generic[Observation, Action]):
         """Exposure times of the newest frames of the fixed and the zoom camera [s]."""
         raise NotImplementedError
 
-    def told_of(self, name: str) -> TargetProfile:
+    def profile_of(self, name: str) -> TargetProfile:
         """Target profile for the pipeline; its detector is the default one, as all detections come from the truth."""
         return replace(self.config.target(name), detector=DEFAULT_TARGETS[name].detector)
 

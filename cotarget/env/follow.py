@@ -103,7 +103,7 @@ class Follow(RigEnv[Any, Vector]):
         self.name = name_of("target", target, LONE)
         super().__init__(observation, rig, calibration, seconds, image_size, noise, render_mode)
         check_scene(self.config.sim, target, lone_path)
-        self.target = self.told_of(target)
+        self.target = self.profile_of(target)
         self._rig_space = box(RIG_FEATURES.values())
         self._track_space = box([*TRACK_FEATURES.values(), *RIG_FEATURES.values()])
         self.action_space = box([(-1.0, 1.0)] * 3)  # type: ignore[assignment]

@@ -23,7 +23,7 @@ from cotarget.env.common import (
     name_of,
     reward_of,
     rig_numbers,
-    told,
+    shortened,
     within,
 )
 from cotarget.errors import ConfigError
@@ -136,7 +136,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
         self.kind = name_of("kind", kind, GROUPED)
         super().__init__(observation, rig, calibration, seconds, image_size, noise, render_mode)
         check_scene(self.config.sim, kind, group_paths)
-        self.target, self._served_reward = self.told_of(kind), reward_of(served_reward)
+        self.target, self._served_reward = self.profile_of(kind), reward_of(served_reward)
         self._rig_space, self._track_space = box(RIG_FEATURES.values()), box(CANDIDATE_FEATURES.values(), SLOTS)
         self.action_space = gymnasium.spaces.Discrete(SLOTS)  # type: ignore[assignment]  # its numbers are numpy's
         pictures = self._picture_spaces() if observation == "images" else {}
@@ -196,7 +196,7 @@ class Schedule(RigEnv[dict[str, Any], int]):
         """
         self.episode  # noqa: B018  raises if there is none
         if not self.action_space.contains(action):
-            raise ConfigError(f"action: {told(action)} is not the number of a slot, 0 to {SLOTS - 1}")
+            raise ConfigError(f"action: {shortened(action)} is not the number of a slot, 0 to {SLOTS - 1}")
         self._selector.number = self._slots[action]
         before = self._step.zoom.t
         self._index += 1

@@ -38,7 +38,7 @@ def check_sim(sim: SimConfig) -> None:
     for name in sim.targets:
         if split_name(name)[0] in sim.models and name not in sim.paths:
             raise ConfigError(
-                f"sim.targets: a {name} of your own needs a way: [sim.paths] {name} = [[t, x, y, z], ...]"
+                f"sim.targets: a {name} of your own needs a path: [sim.paths] {name} = [[t, x, y, z], ...]"
             )
 
 

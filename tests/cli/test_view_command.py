@@ -17,7 +17,7 @@ from cotarget.config import RigConfig, SimConfig
 from cotarget.errors import DeviceError
 from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.viewer import browser, desktop
-from cotarget.sim.viewer.scene import FAR, SIDE_POINTS, Onlooker, Snapshot, frusta_of, frustum_rim, line_geoms
+from cotarget.sim.viewer.scene import FAR, SIDE_POINTS, Snapshot, WorldCopy, frusta_of, frustum_rim, line_geoms
 from cotarget.sim.world import SimWorld
 from tests.cli.test_commands import call
 
@@ -82,13 +82,13 @@ def test_lines_are_drawn_from_end_to_end(world):
 
 
 def test_an_onlookers_state_is_the_worlds_and_stays_when_the_world_moves_on(world):
-    onlooker, truth = Onlooker(world.truth()), world.truth()
-    onlooker.come_to(5.0)
-    mujoco.mj_kinematics(onlooker.model, onlooker.data)
-    eye = np.array(onlooker.data.body("rig/zoom").xpos)
+    shown, truth = WorldCopy(world.truth()), world.truth()
+    shown.move_to(5.0)
+    mujoco.mj_kinematics(shown.model, shown.data)
+    eye = np.array(shown.data.body("rig/zoom").xpos)
     np.testing.assert_allclose(eye, truth.set_bodies(5.0).body("rig/zoom").xpos)
     truth.set_bodies(0.0)
-    np.testing.assert_array_equal(onlooker.data.body("rig/zoom").xpos, eye)
+    np.testing.assert_array_equal(shown.data.body("rig/zoom").xpos, eye)
 
 
 class People:
@@ -269,7 +269,7 @@ def test_the_page_is_served_to_this_machine_alone_with_the_model_and_ends_with_t
             assert page.headers["Content-Type"].startswith("text/html")
             assert b"web_client" in page.read()
         with urllib.request.urlopen(f"{window.where}model", timeout=ANSWER_S) as served:
-            assert served.read() == state_payload.serialize_model_bundle(window._onlooker.model)
+            assert served.read() == state_payload.serialize_model_bundle(window._copy.model)
     finally:
         window.close()
         where = window.where

@@ -99,9 +99,9 @@ def test_nobody_is_scheduled_beyond_the_soft_limits(narrow):
 @pytest.mark.parametrize(("change", "said"), [
     ({"fixed": {"rate_hz": 0.0}}, "sim.fixed.rate_hz: 0 is not greater than zero"),
     ({"zoom": {"focal_mm": (6.0, 6.0)}}, "sim.zoom.focal_mm: [6.0, 6.0] is not [lowest, highest]"),
-    ({"fixed": {"rate_hz": 0.5}}, "rig: sim.fixed.rate_hz: makes a frame 2 s late; nobody waits above 1 s"),
-    ({"fixed": {"latency_s": 1.5}}, "rig: sim.fixed.latency_s: makes a frame 1.5 s late; nobody waits above 1 s"),
-    ({"zoom": {"latency_s": 1.5}}, "rig: sim.zoom.latency_s: makes a frame 1.5 s late; nobody waits above 1 s"),
+    ({"fixed": {"rate_hz": 0.5}}, "rig: sim.fixed.rate_hz: makes a frame 2 s late; the pipeline waits for 1 s"),
+    ({"fixed": {"latency_s": 1.5}}, "rig: sim.fixed.latency_s: makes a frame 1.5 s late; the pipeline waits for 1 s"),
+    ({"zoom": {"latency_s": 1.5}}, "rig: sim.zoom.latency_s: makes a frame 1.5 s late; the pipeline waits for 1 s"),
 ])  # fmt: skip
 def test_a_rig_that_cannot_be_or_is_too_slow_is_refused_in_a_line(change, said):
     ((part, values),) = change.items()
@@ -138,7 +138,7 @@ def test_a_scene_in_which_the_ways_cannot_be_seen_is_refused(field, tmp_path, ol
     if seen is None:
         Follow("bird", rig=rig)
         return
-    with pytest.raises(ConfigError, match=rf"other.xml' {seen} of a bird's ways can be seen; .*'outdoor'") as caught:
+    with pytest.raises(ConfigError, match=rf"other.xml' {seen} of a bird's paths can be seen; .*'outdoor'") as caught:
         Follow("bird", rig=rig)
     assert "\n" not in str(caught.value)
 
@@ -146,7 +146,7 @@ def test_a_scene_in_which_the_ways_cannot_be_seen_is_refused(field, tmp_path, ol
 def test_indoors_there_is_room_for_a_book_and_not_for_a_bird():
     Follow("book", rig=simulated(scene="indoor"))
     for make in (Follow, Schedule):
-        with pytest.raises(ConfigError, match="rig: in the scene 'indoor' 0% of a bird's ways"):
+        with pytest.raises(ConfigError, match="rig: in the scene 'indoor' 0% of a bird's paths"):
             make("bird", rig=simulated(scene="indoor"))
 
 

@@ -135,7 +135,7 @@ def test_the_scene_may_have_a_board_of_its_own(folder):
     ("dog.obj", "nothing.xml", "nothing.xml: shows nothing: it has no geom of the groups 0 to 2"),
     ("dog = \"", "bird = \"", "sim.models.bird: the simulation has a bird of its own; give yours another name"),
     ("dog = \"", "dog2 = \"", "sim.models.dog2: a model is of a kind; give its name without the number"),
-    ("dog2 = [[", "dog3 = [[", "sim.targets: a dog2 of your own needs a way: [sim.paths] dog2 = [[t, x, y, z], ...]"),
+    ("dog2 = [[", "dog3 = [[", "sim.targets: a dog2 of your own needs a path: [sim.paths] dog2 = [[t, x, y, z], ...]"),
     ('[sim.models]\ndog = "dog.obj"', "", "unknown target 'dog'; the simulation has: bird, book, person, and"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused_in_one_line(folder, monkeypatch, old, new, said):

@@ -125,7 +125,7 @@ class Canvas:
         Raises:
             DeviceError: the machine has no suitable OpenGL.
         """
-        self._model, self._size, self._shadows, self._told = model, size, shadows, _told(model)
+        self._model, self._size, self._shadows, self._uploaded_parts = model, size, shadows, _uploaded_parts(model)
         self._renderer: Any = make_renderer(model, *size)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._option, self._untouched = mujoco.MjvOption(), mujoco.MjvPerturb()
@@ -141,8 +141,8 @@ class Canvas:
         Returns:
             Whether the model was accepted; otherwise nothing changes.
         """
-        told = _told(model)
-        if told != self._told or not np.array_equal(model.tex_data, self._model.tex_data):
+        parts = _uploaded_parts(model)
+        if parts != self._uploaded_parts or not np.array_equal(model.tex_data, self._model.tex_data):
             return False
         renderer, self._model = self._renderer, model
         renderer._model = model
@@ -226,7 +226,7 @@ class Canvas:
             mujoco.mjr_resizeOffscreen(width if context.offWidth != width else width + 1, height, context)
 
 
-def _told(model: "mujoco.MjModel") -> tuple[object, ...]:
+def _uploaded_parts(model: "mujoco.MjModel") -> tuple[object, ...]:
     """List what is uploaded to OpenGL once for a model, except textures and mesh vertices."""
     visual, planes = model.vis, model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     return (

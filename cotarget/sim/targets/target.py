@@ -163,7 +163,7 @@ def make_target(
     if waypoints is not None:
         return Target(name, kind, size, waypoint_path(waypoints, f"sim.paths.{name}"), phase)
     if kind.path is None:
-        raise ConfigError(f"sim.targets: a {name} of your own needs a way: [sim.paths] {name}")
+        raise ConfigError(f"sim.targets: a {name} of your own needs a path: [sim.paths] {name}")
     return Target(name, kind, size, kind.path(scene, rng), phase, own_way=True)
 
 

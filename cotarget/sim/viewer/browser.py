@@ -18,7 +18,7 @@ import numpy as np
 from cotarget.errors import DeviceError
 from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.truth import Truth
-from cotarget.sim.viewer.scene import Onlooker, Snapshot, line_geoms
+from cotarget.sim.viewer.scene import Snapshot, WorldCopy, line_geoms
 
 try:
     from mujoco.studio import launch_thread, messages, viewer_protocol, web_viewer
@@ -55,8 +55,8 @@ class BrowserWindow:
         """
         logging.getLogger("WebServer").setLevel(logging.WARNING)  # connections are not logged
         self.where = f"http://{HOST}:{listener.getsockname()[1]}/"
-        self._onlooker = Onlooker(truth)
-        self._overlay = Overlay(self._onlooker.aim)
+        self._copy = WorldCopy(truth)
+        self._overlay = Overlay(self._copy.aim)
         started: queue.Queue[Exception | None] = queue.Queue()
 
         def serve(endpoint: Any) -> None:
@@ -74,7 +74,7 @@ class BrowserWindow:
             try:
                 if (failed := started.get(timeout=START_S)) is not None:
                     raise DeviceError(f"MuJoCo's web viewer does not start: {failed}")
-                self._handle.set_model(self._onlooker.model, data=self._onlooker.data)
+                self._handle.set_model(self._copy.model, data=self._copy.data)
                 self._overlay.ready.get(timeout=START_S)
             except BaseException as error:
                 with contextlib.suppress(Exception):  # the first error is the one to report
@@ -101,7 +101,7 @@ class BrowserWindow:
 
     def show(self, sight: Snapshot) -> None:
         """Show a snapshot."""
-        self._onlooker.come_to(sight.t)
+        self._copy.move_to(sight.t)
         self._overlay.sight = sight
         self._handle.sync()
 

@@ -11,7 +11,7 @@ from cotarget.errors import DeviceError
 from cotarget.rig import Image
 from cotarget.sim.render.opengl import mujoco
 from cotarget.sim.truth import Truth
-from cotarget.sim.viewer.scene import Onlooker, Snapshot, line_geoms
+from cotarget.sim.viewer.scene import Snapshot, WorldCopy, line_geoms
 
 OTHERWISE = "--browser shows the scene in a web browser instead"
 PICTURE_SHARE = 0.3  # width of each camera's picture over the window's
@@ -32,15 +32,15 @@ class DesktopWindow:
         """
         import mujoco.viewer  # needs GLFW
 
-        self._onlooker = Onlooker(truth)
+        self._copy = WorldCopy(truth)
         try:
             self._handle = mujoco.viewer.launch_passive(
-                self._onlooker.model, self._onlooker.data, show_left_ui=False, show_right_ui=False
+                self._copy.model, self._copy.data, show_left_ui=False, show_right_ui=False
             )
         except RuntimeError as error:  # on macOS the viewer needs its own launcher
             raise DeviceError(f"the viewer does not open: {error}; {OTHERWISE}") from None
         with self._handle.lock():
-            self._onlooker.aim(self._handle.cam, self._handle.opt)
+            self._copy.aim(self._handle.cam, self._handle.opt)
 
     where = "the viewer's window"
 
@@ -52,7 +52,7 @@ class DesktopWindow:
         """Show a snapshot."""
         handle = self._handle
         with handle.lock():
-            self._onlooker.come_to(sight.t)
+            self._copy.move_to(sight.t)
             handle.user_scn.ngeom = line_geoms(sight, iter(handle.user_scn.geoms))
         handle.set_texts((None, None, sight.caption, None))
         whole = handle.viewport

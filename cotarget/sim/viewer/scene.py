@@ -82,7 +82,7 @@ SHOWN_GROUPS = (0, 1, 2, RIG_GROUP)
 AHEAD, DISTANCE, ASIDE_DEG, ELEVATION_DEG = 3.0, 7.0, 25.0, -22.0  # [m], [m], [degrees]
 
 
-class Onlooker:
+class WorldCopy:
     """Copy of a world's model and state, which stays as it is when the world's own state moves to another time."""
 
     def __init__(self, truth: Truth) -> None:
@@ -94,10 +94,10 @@ class Onlooker:
         self._truth = truth
         self.model = copy.copy(truth.model)
         self.data = mujoco.MjData(self.model)
-        self.come_to(0.0)
+        self.move_to(0.0)
         mujoco.mj_forward(self.model, self.data)
 
-    def come_to(self, t: float) -> None:
+    def move_to(self, t: float) -> None:
         """Copy the world's poses at a time up to now [s]."""
         state = self._truth.set_bodies(t)
         self.data.time = t
