@@ -371,7 +371,7 @@ class Loop:
         try:
             self._link.halt_last(patience)
             self.rests = True
-        except DeviceError as error:
+        except Exception as error:  # a mistake in a link must not keep a lost position from being remembered
             log.warning("%s: the pan-tilt unit did not acknowledge the last halt: %s", self._link.name, error)
 
     def _halt(self) -> None:

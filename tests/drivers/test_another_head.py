@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from cotarget.config import SafetyConfig
+from cotarget.drivers.interlock import PositionLostError
 from cotarget.drivers.polled_head import AxisFacts, CutError, Poll, PolledHead
 from cotarget.drivers.serial_line import RefusedError
 from cotarget.errors import ConfigError, DeviceError, HaltedError
@@ -137,6 +138,20 @@ def test_a_head_that_does_not_arrive_is_not_opened_again(opened, link):
     link.stuck = True
     with pytest.raises(DeviceError, match="did not arrive in time: pan 0, tilt 0 steps, where 1, 0 were commanded"):
         head.move(STEP, 0.0, wait=True)
+    head.close()
+    with pytest.raises(DeviceError, match="cotarget reset-head"):
+        opened()
+
+
+def test_a_mistake_in_the_last_halt_forgets_no_lost_position(opened, link):
+    def halt_last(patience):
+        raise ValueError("a mistake")
+
+    head = opened()
+    link.polls_fail = PositionLostError("COUNTER", "hit its limit")
+    link.halt_last = halt_last
+    with pytest.raises(DeviceError, match="hit its limit"):
+        ask_again_and_again(head)
     head.close()
     with pytest.raises(DeviceError, match="cotarget reset-head"):
         opened()
