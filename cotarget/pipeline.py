@@ -7,7 +7,7 @@ may fail for a moment, because its lens moves, its line is slow or it reconnects
 
 import enum
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import NamedTuple
@@ -358,11 +358,16 @@ def _profile(rig: Rig, target: TargetProfile | str) -> tuple[str, TargetProfile]
     return target, profile
 
 
+def _joined(reasons: Iterable[str]) -> str:
+    """Join reasons by semicolons, which none then has in itself: tables and counts are split there."""
+    return "; ".join(reason.replace("; ", ", ") for reason in reasons if reason)
+
+
 class _Outcome(NamedTuple):
-    """State after a frame, the reason for it, and the aim, if any."""
+    """State after a frame, the reasons for it, and the aim, if any."""
 
     state: State
-    reason: str
+    reasons: tuple[str, ...]
     aim: Aim | None = None
 
 
@@ -421,7 +426,7 @@ class _Run:
             index=self._index - 1,
             t=self._rig.clock.now(),
             state=outcome.state,
-            reason="; ".join(filter(None, [outcome.reason, *warnings, *self._frames.faults()])),
+            reason=_joined([*outcome.reasons, *warnings, *self._frames.faults()]),
             fixed=frame,
             zoom=zoom,
             mask=self._detector.mask,
@@ -477,12 +482,12 @@ class _Run:
         """Zoom out while no track is followed, and explain why none is."""
         self._controller.zoom_out()
         if unmet := self._selector.unmet:
-            return _Outcome(State.SEARCHING, unmet)
+            return _Outcome(State.SEARCHING, (unmet,))
         if tracks:
-            return _Outcome(State.SEARCHING, "what is detected is not confirmed yet")
+            return _Outcome(State.SEARCHING, ("what is detected is not confirmed yet",))
         part = flood(self._detector.mask)
         why = part and f": {part:.0%} of the fixed image changed at once, as when the light does or the camera moves"
-        return _Outcome(State.SEARCHING, f"nothing is detected{why or ''}")
+        return _Outcome(State.SEARCHING, (f"nothing is detected{why or ''}",))
 
     def _follow(self, followed: Track, t: float, interval: float) -> _Outcome:
         """Aim at the followed track and command head and lens.
@@ -496,17 +501,17 @@ class _Run:
         seen_t = self._seen_t[followed.id]
         if t - seen_t > self._settings.zoom_out_after_s:
             reason, aim = self._follow_unseen(followed, seen_t, interval)
-            return _Outcome(State.LOST, f"out of sight for {t - seen_t:.1f} s; {reason}", aim)
+            return _Outcome(State.LOST, (f"out of sight for {t - seen_t:.1f} s", reason), aim)
         try:
             drive = self._controller.drive(self._predict(followed), seen_t, interval, shape=shape_of(followed))
         except UnreachableError as error:
             self._unreachable.add(followed.id)
-            return _Outcome(State.UNREACHABLE, str(error))
-        reason = "" if drive.zoom_reason == "wanted" else f"zoom: {drive.zoom_reason}"
+            return _Outcome(State.UNREACHABLE, (str(error),))
+        reasons = () if drive.zoom_reason == "wanted" else (f"zoom: {drive.zoom_reason}",)
         if followed.missed:
-            return _Outcome(State.COASTING, reason, drive.aim)
+            return _Outcome(State.COASTING, reasons, drive.aim)
         state = State.UNCONFIRMED if self._fusion.search.is_unconfirmed else State.FOLLOWING
-        return _Outcome(state, reason, drive.aim)
+        return _Outcome(state, reasons, drive.aim)
 
     def _follow_unseen(self, followed: Track, seen_t: float, interval: float) -> tuple[str, Aim | None]:
         """Point where a target out of sight should be; return what the head does, and the aim."""

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+import statistics
 import sys
 import time
 from collections import Counter
@@ -206,6 +207,38 @@ class SkippedFrames:
             return ""
         return (
             f"{self.count} of {frames} frames of the fixed camera were not worked on: the machine or the line is slow"
+        )
+
+
+class LensAtItsEnd:
+    """Count of the steps in which the lens's range kept it from the wanted size."""
+
+    def __init__(self, name: str, target: "TargetProfile") -> None:
+        """Start to count for a target of this name."""
+        from cotarget.control.zoom import GOOD_SIZE
+
+        self._name, self._target, self._good = name, target, GOOD_SIZE
+        self._steps = 0
+        self._shown_px: list[float] = []
+
+    def see(self, step: "Step") -> None:
+        """Count a step with an aim, and how large it shows the target."""
+        if step.aim is None:
+            return
+        self._steps += 1
+        shown_px = step.aim.focal_px * self._target.size / step.aim.range
+        if step.aim.limited and not self._good[0] <= shown_px / self._target.wanted_px <= self._good[1]:
+            self._shown_px.append(shown_px)
+
+    @property
+    def warning(self) -> str:
+        """One line if the lens was at its end in most steps with an aim; empty otherwise."""
+        count = len(self._shown_px)
+        if count < max(MANY, MOST * self._steps):
+            return ""
+        return (
+            f"in {count} of {self._steps} frames the lens was at its end and could show the {self._name} only "
+            f"{statistics.median(self._shown_px):.0f} px large, and not {self._target.wanted_px:g}"
         )
 
 

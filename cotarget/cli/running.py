@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cotarget.cli.common import (
+    LensAtItsEnd,
     Reasons,
     Selection,
     SkippedFrames,
@@ -31,7 +32,7 @@ from cotarget.files import STDOUT
 
 if TYPE_CHECKING:
     from cotarget.calibration import Calibration
-    from cotarget.config import RigConfig
+    from cotarget.config import RigConfig, TargetProfile
     from cotarget.metrics import Label, Tracked
     from cotarget.pipeline import Step
     from cotarget.rig import Rig
@@ -219,7 +220,7 @@ def follow(options: argparse.Namespace) -> int:
         run = _follow(
             opened, calibration, config, spec.fixed.rate_hz, options, options.target, selection, options.seconds
         )
-        _tell_if_nothing_was_seen("follow", options.target, run.counts["states"], selection)
+        _tell_if_nothing_was_seen("follow", options.target, target, run.counts["states"], selection)
         print_json(run.counts, options.csv)
         if run.interrupted is not None:
             raise run.interrupted
@@ -262,7 +263,7 @@ def replay(options: argparse.Namespace) -> int:
     run = _follow(opened, calibration, config, rate_hz, options, name, selection, None, steps, see)
     if run.interrupted is not None:
         raise run.interrupted
-    _tell_if_nothing_was_seen("replay", recording.target, run.counts["states"], selection)
+    _tell_if_nothing_was_seen("replay", name, config.target(name), run.counts["states"], selection)
     scores = _scores(options, tracks, labels, rate_hz, max(pictures.values(), default=-1) + 1)
     differences = played.differences
     print_json(run.counts | {"differences": dataclasses.asdict(differences)} | scores, options.csv)
@@ -325,7 +326,7 @@ def _follow(
     target = config.target(name)
     detector = make_detector(target, rate_hz)
     states: dict[str, int] = dict.fromkeys(State, 0)
-    confirmed, reasons, skipped = 0, Reasons(), SkippedFrames()
+    confirmed, reasons, skipped, lens = 0, Reasons(), SkippedFrames(), LensAtItsEnd(name, target)
     limit = math.inf if seconds is None else seconds
     expected = frames if math.isinf(limit) else math.ceil(limit * rate_hz)
     is_live, first_t, epoch = config.backend == "hardware" and frames is None, None, None
@@ -347,7 +348,7 @@ def _follow(
                 followed = follow(rig, calibration, target, detector, selector=selector, seconds=limit, insist=True)
                 for step in until_end(followed):
                     table.write(step)
-                    for each in (selection, reasons, skipped):
+                    for each in (selection, reasons, skipped, lens):
                         each.see(step)
                     see(step)
                     first_t = step.fixed.t if first_t is None else first_t
@@ -363,7 +364,7 @@ def _follow(
         if first_t is None:
             raise
         interrupted = end
-    for line in filter(None, (selection.unmet, reasons.warning, skipped.warning)):
+    for line in filter(None, (selection.unmet, reasons.warning, skipped.warning, lens.warning)):
         print(f"cotarget {options.command}: {line}", file=sys.stderr)
     counts = {
         "steps": sum(states.values()),
@@ -375,14 +376,25 @@ def _follow(
     return _Run(counts, confirmed, interrupted)
 
 
-def _tell_if_nothing_was_seen(command: str, name: str, states: dict[str, int], selection: Selection) -> None:
+# What a detector needs to find a target.
+NEEDED = {
+    "colour": "what --target names has to look like its template",
+    "motion": "what --target names has to move",
+    "mog2": "what --target names has to move",
+    "speck": "what --target names has to move",
+}
+
+
+def _tell_if_nothing_was_seen(
+    command: str, name: str, target: "TargetProfile", states: dict[str, int], selection: Selection
+) -> None:
     """Print a hint where no target was detected in the whole run."""
     from cotarget.pipeline import State
 
     steps = sum(states.values())
     if steps and states[State.SEARCHING] == steps and not selection.unmet:
         why = {"replay": "the recording has none, or is too short for one to be believed"}.get(
-            command, "what --target names has to move in the fixed camera's view"
+            command, f"{NEEDED.get(target.detector, 'what --target names has to be')} in the fixed camera's view"
         )
         print(
             f"cotarget {command}: no {name} was seen in {steps} frames; {why}; --video FILE shows that view (an "

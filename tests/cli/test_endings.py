@@ -11,7 +11,8 @@ import pytest
 
 import cotarget.detect_video  # noqa: F401  # before the fixture replaces the detectors that it imports
 from cotarget.backends import OPENERS
-from cotarget.cli.common import FEW, MANY, Reasons, folded
+from cotarget.cli.common import FEW, MANY, LensAtItsEnd, Reasons, folded
+from cotarget.config import DEFAULT_TARGETS
 from cotarget.drawing import side_by_side
 from cotarget.errors import DeviceError
 from cotarget.pipeline import State, follow
@@ -301,3 +302,20 @@ def test_the_film_shows_the_reason():
     assert 440 < short.min() < short.max() < 480
     assert long.min() < short.min() - 10
     assert long.max() < 480
+
+
+@pytest.mark.parametrize(("limited", "range_m", "steps", "said"), [
+    # 8000 px show the 0.8 m of a bird at 100 m 64 px large, and at 45 m 142 px large, which is nearly as wanted.
+    (True, 100.0, MANY, f"in {MANY} of {MANY} frames the lens was at its end and could show the bird only 64 px large, "
+                        "and not 160"),
+    (True, 100.0, MANY - 1, ""),
+    (False, 100.0, MANY, ""),
+    (True, 45.0, MANY, ""),
+])  # fmt: skip
+def test_a_wanted_size_that_the_lens_does_not_make_is_told(limited, range_m, steps, said):
+    lens, plain = LensAtItsEnd("bird", DEFAULT_TARGETS["bird"]), step(0.0)
+    aim = replace(plain.aim, focal_px=8000.0, range=range_m, limited=limited)
+    for _ in range(steps):
+        lens.see(replace(plain, aim=aim))
+    lens.see(replace(plain, aim=None))
+    assert lens.warning == said

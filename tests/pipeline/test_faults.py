@@ -144,9 +144,9 @@ def test_frames_that_repeat_or_jump_in_time(change, told):
 
 
 @pytest.mark.parametrize(("spoil", "told"), [
-    (lambda last, frame: last, "frames repeat, or its clock has jumped; this one is 0.0"),
-    (lambda last, frame: replace(frame, t=frame.t - 0.2), "frames repeat, or its clock has jumped; this one is 0.0"),
-    (lambda last, frame: replace(frame, t=frame.t + 5.0), "in the future; mind the clock; this one is 0.0"),
+    (lambda last, frame: last, "frames repeat, or its clock has jumped, this one is 0.0"),
+    (lambda last, frame: replace(frame, t=frame.t - 0.2), "frames repeat, or its clock has jumped, this one is 0.0"),
+    (lambda last, frame: replace(frame, t=frame.t + 5.0), "in the future, mind the clock, this one is 0.0"),
 ])  # fmt: skip
 @pytest.mark.parametrize("safe", [False, True])
 def test_a_frame_that_repeats_or_jumps_is_passed_over_and_told(spoil, told, safe):
@@ -286,7 +286,7 @@ def test_a_zoom_camera_that_is_blind_for_a_while_stops_nothing(waits):
         assert step.state is State.FOLLOWING
         assert step.zoom is last.zoom
         assert "the zoom camera has shown nothing new for" in step.reason
-        assert step.reason.endswith("it is lost; reconnecting")
+        assert step.reason.endswith("it is lost, reconnecting")
         assert step.found is None
     assert not [s for s in steps if s not in without and "nothing new" in s.reason]
     assert steps[-1].zoom.t > last.zoom.t + 1.0
