@@ -249,7 +249,7 @@ def prepare(tmp_path, what):
 
 @pytest.mark.parametrize(("what", "target", "calibration", "message"), [
     ("full", "bird", "rig_calibration.json", r"run: is not empty; give a new folder for the recording"),
-    ("file", "bird", "rig_calibration.json", r"run: cannot hold a recording: File exists"),
+    ("file", "bird", "rig_calibration.json", r"run: is a file; give a new folder for the recording"),
     ("under a file", "bird", "rig_calibration.json", r"run: cannot hold a recording: Not a directory"),
     ("", "yeti", "rig_calibration.json", r"unknown target 'yeti'"),
     ("", "bird", "none.json", r"none\.json: cannot be recorded: No such file or directory"),
