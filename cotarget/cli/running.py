@@ -202,10 +202,9 @@ def follow(options: argparse.Namespace) -> int:
     spec = describe(config)
     calibration = load_plausible(options.calibration, spec, insist=options.insist)
     _check_shown(config, options)
+    check_outputs(_files(options), [*rig_files(options.rig, config), options.calibration], options.record)
     if not options.insist and (text := target_implausibility(target, calibration, spec, options.target)):
         raise ConfigError(f"{options.rig}: {text}; --insist follows it all the same")
-    inputs = [*rig_files(options.rig, config), options.calibration]
-    check_outputs(_files(options), inputs, options.record)
     selection = Selection(options, spec.fixed.size)
     with (
         Recorder(options.record, config, options.calibration, options.target, selection.selector)
