@@ -1,7 +1,8 @@
 """Demonstrate the method in simulation: calibrate a rig from rendered boards, then follow three targets.
 
-The software knows nothing of the simulated rig but what it measures. The three runs share only the calibration, so they
-run side by side. A script that calls `run_demo` needs ``if __name__ == "__main__"``, because each run is a new process.
+The software knows nothing of the simulated rig but what it measures. Calibration and runs come one after the other,
+each in a process of its own, because a world and its renderers need some 300 MB. So a script that calls `run_demo`
+needs ``if __name__ == "__main__"``.
 """
 
 import dataclasses
@@ -25,7 +26,7 @@ from cotarget.drawing import TargetStages, captioned, draw_frames, plot_aim_erro
 from cotarget.errors import ConfigError
 from cotarget.evaluation import add_row, pointing_errors
 from cotarget.metrics import Row, Score, score, write_rows
-from cotarget.parallel import Report, run_side_by_side
+from cotarget.parallel import run_apart
 from cotarget.pipeline import FollowSettings, follow
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.world import SimWorld
@@ -60,11 +61,9 @@ def run_demo(out: Path, seed: int, progress: Progress) -> dict[str, Any]:
     began = time.perf_counter()
     with finished_together(out) as work:
         config = sim_config(CALIBRATION_SCENE, (), seed)
-        calibration, pointing = _calibrate(config, work, seed, progress)
-        jobs = [(name, seed, calibration, work) for name in SCENES]
-        runs = run_side_by_side(_follow_one, jobs, lambda done, total: progress("following", done, total))
-        rows = dict(zip(SCENES, runs, strict=True))
-        write_rows(work / "steps.csv", [row for run in runs for row in run])
+        calibration, pointing = run_apart(_calibrate, (config, work, seed), progress)
+        rows = {name: run_apart(_follow_one, (name, seed, calibration, work), progress) for name in SCENES}
+        write_rows(work / "steps.csv", [row for run in rows.values() for row in run])
         parts = [work / f"{name}.mp4" for name in SCENES]
         join_films(parts, work / "demo.mp4")
         for part in parts:
@@ -150,11 +149,11 @@ def _calibrate(config: RigConfig, work: Path, seed: int, progress: Progress) -> 
     return calibration, {"median": float(np.median(errors)), "p95": float(np.percentile(errors, 95))}
 
 
-def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, report: Report) -> list[Row]:
+def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, progress: Progress) -> list[Row]:
     """Follow one target; write its picture and its part of the video, and return its rows."""
     config = sim_config(SCENES[name], (name,), seed)
     target, rate_hz = config.target(name), config.sim.fixed.rate_hz
-    world = SimWorld(config)
+    world = SimWorld(config, ahead=False)  # rendering ahead takes another 200 MB
     truth = world.truth()
     rows: list[Row] = []
     with guard(world.rig, config.safety) as rig, FilmWriter(work / f"{name}.mp4", rate_hz) as film:
@@ -166,7 +165,7 @@ def _follow_one(name: str, seed: int, calibration: Calibration, work: Path, repo
             stages.see(step)
             add_row(rows, step, truth, name, target)
             film.write(side_by_side(step, name, step.fixed.t), step.fixed.t)
-            report(min(step.index + 1, frames), frames)
+            progress(f"following: {name}", min(step.index + 1, frames), frames)
     write_picture(work / f"{name}.png", stages.picture(name))
     return rows
 

@@ -1,74 +1,55 @@
-"""Run a few long jobs side by side, each in its own process, because an OpenGL context belongs to one thread."""
+"""Run long jobs in processes of their own, which end with their parent."""
 
 import contextlib
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
 from cotarget.errors import CotargetError
 
 Result = TypeVar("Result")
-Report = Callable[[int, int], None]
 ORPHANED = 1  # exit status of a process whose parent has ended
 
 
-def run_side_by_side(
-    job: Callable[..., Result],
-    arguments: Sequence[tuple[Any, ...]],
-    report: Report,
-) -> list[Result]:
-    """Run ``job(*arguments[i], report)`` for every i at the same time.
+def run_apart(job: Callable[..., Result], arguments: tuple[Any, ...], report: Callable[..., object]) -> Result:
+    """Run ``job(*arguments, report)`` in a process of its own, whose memory is free again afterwards.
 
     Args:
-        job: a function at the top level of a module; it reports its progress by report(done, total).
-        arguments: arguments of each run; they and the results are pickled.
-        report: called with (done, total) over all jobs.
-
-    Returns:
-        The results, in the order of the arguments.
+        job: a function at the top level of a module.
+        arguments: its arguments; they and the result are pickled.
+        report: called here with whatever the job reports.
 
     Raises:
-        CotargetError: a job raised it, or a job's process died; the other jobs are ended. Other errors of a job are
-            raised as they are.
+        CotargetError: the job raised it, or its process died. Other errors of the job are raised as they are.
     """
     context = multiprocessing.get_context("spawn")  # a forked process would share the parent's OpenGL context
-    processes, pipes = [], []
-    results: dict[int, Result] = {}
-    progress = dict.fromkeys(range(len(arguments)), (0, 1))
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_work, args=(job, arguments, theirs), daemon=True)
     try:
-        for given in arguments:
-            ours, theirs = context.Pipe(duplex=False)
-            process = context.Process(target=_work, args=(job, given, theirs), daemon=True)
-            with interrupts_kept_from_children():
-                process.start()
-            theirs.close()
-            processes.append(process)
-            pipes.append(ours)
-        while len(results) < len(arguments):
-            for pipe in wait([p for i, p in enumerate(pipes) if i not in results]):
-                index = pipes.index(pipe)  # type: ignore[arg-type]
-                try:
-                    kind, value = pipes[index].recv()
-                except EOFError:
-                    processes[index].join()
-                    status = processes[index].exitcode
-                    raise CotargetError(f"a job ended before it was done (exit status {status})") from None
-                if kind == "error":
-                    raise value
-                if kind == "done":
-                    results[index] = value
-                else:
-                    progress[index] = value
-                    report(sum(p[0] for p in progress.values()), sum(p[1] for p in progress.values()))
+        with interrupts_kept_from_children():
+            process.start()
+        theirs.close()
+        while True:
+            try:
+                kind, value = ours.recv()
+            except EOFError:
+                process.join()
+                raise CotargetError(f"a job ended before it was done (exit status {process.exitcode})") from None
+            if kind == "error":
+                raise value
+            if kind == "done":
+                result: Result = value
+                return result
+            report(*value)
     finally:
-        for process in processes:
+        if process.pid is not None:
             process.terminate()
             process.join()
-    return [results[i] for i in range(len(arguments))]
+        ours.close()
 
 
 def _work(job: Callable[..., Any], given: tuple[Any, ...], pipe: Connection) -> None:
@@ -76,8 +57,8 @@ def _work(job: Callable[..., Any], given: tuple[Any, ...], pipe: Connection) -> 
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its jobs itself
 
-    def report(done: int, total: int) -> None:
-        pipe.send(("progress", (done, total)))
+    def report(*given: object) -> None:
+        pipe.send(("progress", given))
 
     try:
         pipe.send(("done", job(*given, report)))

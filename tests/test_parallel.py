@@ -1,4 +1,4 @@
-"""Jobs side by side: results in order, progress over all, and mistakes that end the others."""
+"""Jobs in processes of their own: results, progress, and mistakes that end them."""
 
 import contextlib
 import os
@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 
 from cotarget.errors import ConfigError, CotargetError
-from cotarget.parallel import run_side_by_side
+from cotarget.parallel import run_apart
 
 DEADLINE_S = 60.0  # for what should come at once
 
 
 def square(x, report):
-    report(1, 1)
+    report("squaring", 1, 1)
     return x * x
 
 
@@ -33,20 +33,20 @@ def wait_for_ever(pipe_end, report):
     os.read(pipe_end, 1)
 
 
-def test_results_come_in_the_order_of_the_arguments():
+def test_the_result_comes_after_all_that_was_reported():
     told = []
-    assert run_side_by_side(square, [(3,), (1,), (2,)], lambda *given: told.append(given)) == [9, 1, 4]
-    assert told[-1] == (3, 3)
+    assert run_apart(square, (3,), lambda *given: told.append(given)) == 9
+    assert told == [("squaring", 1, 1)]
 
 
 def test_a_jobs_own_error_is_raised():
     with pytest.raises(ConfigError, match="7 is wrong"):
-        run_side_by_side(refuse, [(7,), (7,)], lambda *_: None)
+        run_apart(refuse, (7,), lambda *_: None)
 
 
 def test_a_job_that_dies_is_an_error():
     with pytest.raises(CotargetError, match=r"ended before it was done \(exit status 3\)"):
-        run_side_by_side(die, [(1,)], lambda *_: None)
+        run_apart(die, (1,), lambda *_: None)
 
 
 def test_an_interrupt_ends_the_jobs():
@@ -56,7 +56,7 @@ def test_an_interrupt_ends_the_jobs():
     reading, writing = os.pipe()
     try:
         with pytest.raises(KeyboardInterrupt):
-            run_side_by_side(wait_for_ever, [(0,)], interrupt)
+            run_apart(wait_for_ever, (0,), interrupt)
     finally:
         os.close(reading)
         os.close(writing)
@@ -64,7 +64,7 @@ def test_an_interrupt_ends_the_jobs():
 
 WAITER = """
 import time
-from cotarget.parallel import run_side_by_side
+from cotarget.parallel import run_apart
 
 def work(name, report):
     report(0, 1)
@@ -74,7 +74,7 @@ def tell(done, total):
     print("begun", flush=True)
 
 if __name__ == "__main__":
-    run_side_by_side(work, [("a",), ("b",)], tell)
+    run_apart(work, ("a",), tell)
 """
 
 
@@ -91,7 +91,7 @@ def is_deaf(heard, report):
 
 def test_jobs_that_begin_do_not_hear_an_interrupt():
     before = signal.getsignal(signal.SIGINT)
-    assert run_side_by_side(is_deaf, [(Hearing(),)], lambda *_: None) == [True]
+    assert run_apart(is_deaf, (Hearing(),), lambda *_: None) is True
     assert signal.getsignal(signal.SIGINT) == before
 
 
@@ -103,7 +103,7 @@ def test_jobs_end_with_their_parent_however_it_ends(tmp_path):
         env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
     ) as process:  # fmt: skip
         try:
-            assert [process.stdout.readline() for _ in range(2)] == [b"begun\n"] * 2
+            assert process.stdout.readline() == b"begun\n"
             process.kill()
             process.communicate(timeout=DEADLINE_S)
         finally:
