@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cotarget.calibration import Calibration, predicted_pointing
+from cotarget.calibration.plausibility import check_plausible
 from cotarget.camera import depth_from_size, focal_for_size
 from cotarget.config import DEFAULT_TARGETS, TargetProfile, split_name
 from cotarget.errors import ConfigError, UnreachableError, choices
@@ -191,6 +192,7 @@ def aim(
     nominal_px: float | None = None,
     method: Method = "exact",
     zoom_pixel: Array | None = None,
+    insist: bool = False,
 ) -> Aim:
     """Solve pan, tilt and focal length for a target (Eqs. 6, 13, 16 and 17, with the exact range).
 
@@ -206,9 +208,11 @@ def aim(
         nominal_px: nominal focal length if no size is wanted [px]; the shortest by default.
         method: the exact inverse, or the paper's shortcut in one of its two readings.
         zoom_pixel: wanted place of the target in the zoom image, (2,) [px]; its centre by default.
+        insist: with a pixel, whether to accept an implausible calibration, see `check_plausible`. For a point the
+            calibration is not checked, because `follow` solves one a frame.
 
     Raises:
-        CalibrationError: the calibration has no T.
+        CalibrationError: the calibration has no T, or is implausible.
         ConfigError: the target is given in no way or in two, or the method is unknown.
         UnreachableError: no pan and tilt within the limits do it.
     """
@@ -216,6 +220,7 @@ def aim(
         raise ConfigError(f"unknown method '{method}'; the methods are: {choices(METHODS)}")
     if x_fixed is None:
         x_fixed = _seen_at(calibration, pixel, depth)
+        check_plausible(calibration, insist=insist)
     elif pixel is not None or depth is not None:
         raise ConfigError("aim: give x_fixed, or pixel and depth, and not both")
     if reach is None:

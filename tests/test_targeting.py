@@ -299,6 +299,14 @@ def test_a_pixel_and_its_depth_aim_at_the_point_that_they_mean():
     assert (by_pixel.pan, by_pixel.tilt, by_pixel.nominal_px) == (by_point.pan, by_point.tilt, by_point.nominal_px)
 
 
+def test_a_pixel_is_not_aimed_at_by_a_calibration_in_millimetres_unless_insisted_on():
+    gamma = HOME.T_zoom0_fixed
+    apart = replace(HOME, T_zoom0_fixed=RigidTransform.from_components([400.0, 0.0, 0.0], gamma.rotation))
+    with pytest.raises(CalibrationError, match=r"T_zoom0_fixed: the cameras are 400 m apart; .* insist=True"):
+        aim(apart, pixel=(400, 100), depth=9.0)
+    assert aim(apart, pixel=(400, 100), depth=9.0, insist=True).range > 300
+
+
 @pytest.mark.parametrize(
     "given",
     [
