@@ -651,8 +651,8 @@ def config_table(config: RigConfig) -> dict[str, Any]:
     """
     table: dict[str, Any] = as_table(dataclasses.replace(config, recording=None))
     table["safety"].pop("stop_file", None)
-    table["hardware"] = {name: _without_secrets(device) for name, device in table["hardware"].items()}
-    return table
+    devices = {name: _without_secrets(device) for name, device in table.pop("hardware").items() if device}
+    return table | ({"hardware": devices} if devices else {})
 
 
 def _without_secrets(table: Mapping[str, Any]) -> dict[str, Any]:

@@ -428,6 +428,11 @@ def detect(options: argparse.Namespace) -> None:
             keep=True,
         )
     whole = found.shortfall is None
+    if labels and whole and min(labels) > found.last_frame:
+        raise ConfigError(
+            f"{options.labels}: no labelled frame is in the film, whose last one is {found.last_frame}; give the "
+            "labels of this film, with frames from 0"
+        )
     tracks = [] if labels is None else read_tracks(options.csv)
     scores = _scores(options, tracks, labels, found.rate_hz, found.last_frame + 1, whole=whole)
     print_json(dataclasses.asdict(found) | scores, options.csv)
@@ -444,21 +449,12 @@ def _scores(
     *,
     whole: bool = True,
 ) -> dict[str, Any]:
-    """Score tracks against labels; empty without labels.
-
-    Raises:
-        ConfigError: no labelled frame is in the film, though the film is whole.
-    """
+    """Score tracks against labels; empty without labels."""
     from cotarget.metrics import score_tracks
 
     if labels is None:
         return {}
     score = score_tracks(tracks, labels, rate_hz, frames)
-    if whole and labels and score.labels_beyond_end == len(labels):
-        raise ConfigError(
-            f"{options.labels}: no labelled frame is in the film, whose last one is {frames - 1}; give the labels of "
-            "this film, with frames from 0"
-        )
     if score.labels_beyond_end:
         print(
             f"{options.labels}: {score.labels_beyond_end} of {len(labels)} labelled frames are beyond the last one, "
