@@ -76,11 +76,9 @@ def load_plausible(path: Path, spec: "RigSpec | None" = None, *, insist: bool) -
     from cotarget.calibration.plausibility import implausibility
 
     calibration = load_calibration(path)
-    if insist:
-        return calibration
     if spec is not None:
         check_streams(path, calibration, spec)
-    if text := implausibility(calibration, spec):
+    if not insist and (text := implausibility(calibration, spec)):
         raise CalibrationError(f"{path}: {text}; --insist uses it all the same")
     return calibration
 

@@ -276,6 +276,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="calibration.json; measures the fixed camera too, by a board that is swung",
     )
+    add_insist(latency)
 
     stop = command("stop", operating.stop, "emergency stop of every rig that watches this rig.toml's stop file")
     stop.add_argument("--rig", type=Path, required=True, metavar="FILE", help="rig.toml")

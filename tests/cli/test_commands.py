@@ -162,6 +162,8 @@ MISTAKES = {
                                 ["millimetres.json: T_zoom0_fixed", "metres", "--insist"]),
     "follow in millimetres": (changed(FOLLOW, "--calibration", "millimetres.json"),
                               ["millimetres.json: T_zoom0_fixed", "metres", "--insist"]),
+    "latency in millimetres": (["latency", "--rig", "rig.toml", "--calibration", "millimetres.json"],
+                               ["millimetres.json: T_zoom0_fixed", "metres", "--insist"]),
     # photos and captures
     "photos without a board": ([*FROM, "grey", *PHOTOS], ["grey: no picture shows", "9x6 inner corners"]),
     "a single photo of each": ([*FROM, "single", *PHOTOS], ["1 usable views of the board; at least 3"]),
