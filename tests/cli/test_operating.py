@@ -69,7 +69,7 @@ MISTAKES = {
     "latency of no devices": (["latency", "--rig", "nameless.toml"], ["hardware.head.port: is missing", "/dev/tty"]),
     "latency of a recording": (["latency", "--rig", "replayed.toml"], ["replayed.toml: backend is 'replay'"]),
     "latency without a calibration": ([*LATENCY, "--calibration", "none.json"], ["none.json: no such file"]),
-    "latency without T": ([*LATENCY, "--calibration", "headless.json"], ["T_head_zoom"]),
+    "latency without T": (["latency", "--rig", "sim.toml", "--calibration", "headless.json"], ["T_head_zoom"]),
     "latency of other cameras": ([*LATENCY, "--calibration", "wide.json"], ["aspect ratio"]),
     "latency with nobody at the server": (["latency", "--rig", "hw.toml"], ["http://127.0.0.1:9", "cannot be reached"]),
     # replay
