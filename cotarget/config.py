@@ -378,6 +378,10 @@ class HardwareConfig:
 ENCODING = "utf-8-sig"  # UTF-8 with or without the byte order mark that some editors write
 
 
+BoardKind = Literal["chessboard", "charuco"]
+BoardCorners = Annotated[tuple[int, int], "[columns, rows]"]
+
+
 @model
 class BoardConfig:
     """The calibration board.
@@ -389,9 +393,22 @@ class BoardConfig:
         square: side of a square, as measured on the print [m].
     """
 
-    kind: Literal["chessboard", "charuco"] = "chessboard"
-    corners: Annotated[tuple[int, int], "[columns, rows]"] = (9, 6)
+    kind: BoardKind = "chessboard"
+    corners: BoardCorners = (9, 6)
     square: Positive = 0.1
+
+
+@model
+class WrittenBoard:
+    """A board as the program writes it; a default in place of a lost key would change the scale of a calibration."""
+
+    kind: BoardKind
+    corners: BoardCorners
+    square: Positive
+
+    def config(self) -> BoardConfig:
+        """Return the board."""
+        return BoardConfig(self.kind, self.corners, self.square)
 
 
 DETECTORS = ("colour", "motion", "speck", "mog2")

@@ -26,7 +26,7 @@ from annotated_types import Ge
 
 from cotarget.calibration.file import check_schema, read_json, write_board
 from cotarget.calibration.model import CameraName, Capture
-from cotarget.config import BoardConfig, RigConfig, config_table
+from cotarget.config import BoardConfig, RigConfig, WrittenBoard, config_table
 from cotarget.errors import CalibrationError, ConfigError
 from cotarget.files import write_atomically
 from cotarget.rig import Image
@@ -128,7 +128,7 @@ class IndexTable:
     """Content of index.json."""
 
     schema: int
-    board: BoardConfig
+    board: WrittenBoard
     pitch_mm: Positive | None
     captures: tuple[CaptureTable, ...]
 
@@ -203,7 +203,7 @@ def read_index(directory: Path) -> CaptureIndex:
         _check_files(directory, captures)
     except (ConfigError, CalibrationError) as error:
         raise CalibrationError(f"{path}: {error}") from None
-    return CaptureIndex(index.board, index.pitch_mm, captures)
+    return CaptureIndex(index.board.config(), index.pitch_mm, captures)
 
 
 def read_images(directory: Path, captures: Sequence[Capture]) -> Iterator[Capture]:

@@ -26,7 +26,7 @@ from annotated_types import Ge, Interval
 from cotarget.calibration.bundle import EVERY_BLOCK, parameter_names
 from cotarget.calibration.model import CameraName, Covariance, HeldOut, Residuals, View
 from cotarget.camera import Intrinsics, ZoomLens
-from cotarget.config import BoardConfig
+from cotarget.config import BoardConfig, WrittenBoard
 from cotarget.errors import CalibrationError, ConfigError
 from cotarget.files import write_atomically
 from cotarget.geometry import Array, RigidTransform, pose_dict
@@ -363,7 +363,7 @@ class CalibrationTable:
     residuals: Residuals | None
     covariance: CovarianceTable | None
     held_out: HeldOut | None
-    board: BoardConfig | None
+    board: WrittenBoard | None
     board_warp: Annotated[tuple[float, float], "[along x, along y]"]
     provenance: Mapping[str, Any]
     views: tuple[ViewTable, ...]
@@ -394,7 +394,7 @@ class CalibrationTable:
             covariance=None if self.covariance is None else self.covariance.covariance(),
             held_out=self.held_out,
             board_warp=self.board_warp,
-            board=self.board,
+            board=None if self.board is None else self.board.config(),
             views=tuple(view.view() for view in self.views),
             provenance=self.provenance,
         )

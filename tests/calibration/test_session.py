@@ -289,13 +289,13 @@ ZOOM_ROW = {**ROW, "file": "z.png", "camera": "zoom", "focal_px": 667.0}
     ([ROW], {"schema": 2}, "schema 2 is not 1"),
     ([{**ROW, "camera": "left"}], {}, r"captures\[0\].camera: 'left'"),
     ([{**ROW, "file": "../a.png"}], {}, "not inside the folder"),
-    ([{k: v for k, v in ROW.items() if k != "pan"}], {}, r"missing key 'captures\[0\].pan'"),
+    ([{k: v for k, v in ZOOM_ROW.items() if k != "pan"}], {}, r"captures\[0\].pan: is missing"),
     ([{**ROW, "tilt": "up"}], {}, r"captures\[0\].tilt: 'up' is not a finite number"),
     ([{**ROW, "file": "missing.png"}], {}, "missing.png: no such file"),
     ([ROW], {}, "has no capture of the zoom camera"),
     ([{**ROW, "file": "text.png"}, ZOOM_ROW], {}, "text.png: is not an image"),
     ([ROW, {**ROW, "file": "small.png"}, ZOOM_ROW], {}, "small.png: is 32x24 px where a.png .* is 64x48"),
-    ([ROW], {"board": {"kind": "chessboard", "corners": [9, 6]}}, "missing key 'board.square'"),
+    ([ROW], {"board": {"kind": "chessboard", "corners": [9, 6]}}, "board: missing key 'square'"),
 ])  # fmt: skip
 def test_malformed_captures_are_refused_by_name(tmp_path, rows, changes, message):
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((48, 64, 3), np.uint8))
