@@ -90,6 +90,8 @@ def build_model(config: RigConfig, targets: tuple[Target, ...], render_size: tup
     if has_clutter(config.sim):
         add_clutter(spec, config.sim.seed)
     spec.visual.quality.offsamples = 4 if config.sim.effects.multisampling else 0
+    if not config.sim.effects.shadows:
+        spec.visual.quality.shadowsize = 0  # no shadow map, which takes 64 MB outdoors
     visual = spec.visual.global_
     # No larger than needed: OpenGL clears and resolves the whole buffer for every picture.
     visual.offwidth = max(PORTRAIT_SIZE[0], render_size[0])

@@ -184,6 +184,7 @@ backend = "hardware"
 port = "/dev/none"
 [hardware.fixed]
 url = "http://camera"
+size = [640, 480]
 [safety]
 stop_file = "stop"
 """
