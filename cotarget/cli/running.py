@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from cotarget.config import RigConfig, TargetProfile
     from cotarget.metrics import Label, Tracked
     from cotarget.pipeline import Step
+    from cotarget.recording.replay import Replay
     from cotarget.rig import Rig
     from cotarget.sim.truth import Truth
     from cotarget.sim.viewer.scene import Snapshot
@@ -259,7 +260,7 @@ def replay(options: argparse.Namespace) -> int:
     def opened() -> "Rig":
         return guard(played.rig, config.safety)
 
-    run = _follow(opened, calibration, config, rate_hz, options, name, selection, None, steps, see)
+    run = _follow(opened, calibration, config, rate_hz, options, name, selection, None, steps, see, played)
     if run.interrupted is not None:
         raise run.interrupted
     _tell_if_nothing_was_seen("replay", name, config.target(name), run.counts["states"], selection)
@@ -309,6 +310,7 @@ def _follow(
     seconds: float | None,
     frames: int | None = None,
     see: "Callable[[Step], None]" = lambda _: None,
+    replay: "Replay | None" = None,
 ) -> _Run:
     """Follow a target with progress and outputs.
 
@@ -345,7 +347,7 @@ def _follow(
                 # `follow` has checked calibration and target; a recorded run is replayed with whatever it had.
                 selector = selection.selector
                 followed = follow(rig, calibration, target, detector, selector=selector, seconds=limit, insist=True)
-                for step in until_end(followed):
+                for step in until_end(followed, replay):
                     table.write(step)
                     for each in (selection, reasons, skipped, lens):
                         each.see(step)

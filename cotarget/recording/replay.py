@@ -11,7 +11,6 @@ import math
 import threading
 from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -163,9 +162,14 @@ class Replay:
         return threading.get_ident() != self._thread
 
     @property
-    def _breaks_off(self) -> bool:
+    def breaks_off(self) -> bool:
         """Whether an error ended the run after the newest frame, so that later calls are unknown."""
         return self._broke_off and self._index == len(self._spans) - 1
+
+    def was_ended_by(self, error: CotargetError) -> bool:
+        """Whether this error ended the recorded run too, after the same frame."""
+        ending = self._recording.ending
+        return self.breaks_off and str(error) in (ending, ending.partition(": ")[2])
 
     def take(self, call: str) -> Event | None:
         """Take the recorded event of a call between the same two frames; None if there is none.
@@ -177,7 +181,7 @@ class Replay:
             return None
         span = self._spans[self._index]
         event = span.take(call)
-        if event is None and self._breaks_off and not span.left(call) and not self._ended and call not in COMMANDS:
+        if event is None and self.breaks_off and not span.left(call) and not self._ended and call not in COMMANDS:
             raise self._end()
         return event
 
@@ -232,7 +236,7 @@ class Replay:
             return
         counts = self.differences
         if recorded is None:
-            if not (self._ended or self._breaks_off):
+            if not (self._ended or self.breaks_off):
                 self.differences = replace(counts, extra=counts.extra + 1)
                 self._note(self._index)
             return
@@ -324,10 +328,18 @@ def _recorded_error(name: str, message: str, error_class: str) -> CotargetError:
 T = TypeVar("T")
 
 
-def until_end(steps: Iterable[T]) -> Iterator[T]:
-    """Yield the steps of a run on a replayed rig, until the recording ends."""
-    with suppress(RecordingEndedError):
+def until_end(steps: Iterable[T], replay: Replay | None = None) -> Iterator[T]:
+    """Yield the steps of a run on a replayed rig, until the recording ends.
+
+    With ``replay`` the error that ended the recorded run is its end too.
+    """
+    try:
         yield from steps
+    except RecordingEndedError:
+        pass
+    except CotargetError as error:
+        if replay is None or not replay.was_ended_by(error):
+            raise
 
 
 class _Camera:
@@ -455,7 +467,11 @@ class _Head:
         return self._possible(pan, self._limits.pan), self._possible(tilt, self._limits.tilt)
 
     def halt(self) -> None:
-        self._replay.answer("head.halt")
+        try:
+            self._replay.answer("head.halt")
+        except CotargetError:
+            if not self._replay.breaks_off:  # a halt that failed when the recorded rig was closed leaves nothing moving
+                raise
 
     def _possible(self, angle: float, limits: tuple[float, float]) -> float:
         step = self._limits.step

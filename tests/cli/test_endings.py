@@ -96,6 +96,21 @@ def test_ctrl_c_ends_a_recorded_run_that_can_be_replayed(folder, capsys, monkeyp
     assert json.loads(out)["steps"] == 2 * FRAMES - 1
 
 
+@pytest.mark.parametrize("failing", ["head.move", "fixed.read"])
+def test_the_recording_of_an_accident_is_replayed_to_its_end(folder, capsys, caplog, monkeypatch, failing):
+    """The head of the recorded run was lost, so its halts failed too; the replay has no head that could go on."""
+    lost = DeviceError("the line is lost")
+    accident = {(failing, FRAMES): lost} | {("head.halt", number): lost for number in range(1, 50)}
+    monkeypatch.setitem(OPENERS, "sim", lambda config: toy_rig(accident))
+    assert call(capsys, *FOLLOW, "--record", "run")[0] == 1
+    caplog.clear()
+    steps = rows_of(folder / "out.csv")
+    status, out, err = call(capsys, "replay", "run", "--check")
+    assert (status, err) == (0, "run: the run was ended by DeviceError: the line is lost\n")
+    assert json.loads(out)["steps"] == steps > 0
+    assert not caplog.records
+
+
 def test_ctrl_c_does_not_hide_a_head_that_cannot_be_halted(folder, capsys, monkeypatch):
     failing = {("fixed.read", FRAMES): KeyboardInterrupt()}
     failing |= {("head.halt", number): DeviceError("the head is gone") for number in range(1, 50)}
