@@ -57,7 +57,11 @@ def load(name: str, where: str) -> Any:
             ) from None
         raise ConfigError(str(error)) from error.__cause__
     if not callable(found := getattr(module, attribute, None)):
-        names = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
+        names = [
+            key
+            for key, value in vars(module).items()
+            if callable(value) and getattr(value, "__module__", None) == module.__name__ and not key.startswith("_")
+        ]
         raise ConfigError(f"{where}: {module_name} has no '{attribute}'; it has: {choices(names)}")
     return found
 

@@ -192,7 +192,10 @@ def test_an_own_detector_is_found_beside_rig_toml(rig, monkeypatch):
         ),
         ('"devices:Camera"\nrate_hz = "9"', "hardware.fixed.rate_hz: '9' is not a finite number"),
         ('"device:Camera"', "hardware.fixed.driver: there is no module 'device' beside rig.toml or on Python's path"),
-        ('"devices:Camer"', "hardware.fixed.driver: "),
+        (
+            '"devices:Camer"',  # what the file imports is no driver of it
+            "hardware.fixed.driver: {folder}/devices.py has no 'Camer'; it has: Broken, Camera, CameraSettings, Head, HeadSettings, ",
+        ),
         (
             '"devices:Unset"',
             "hardware.fixed.driver: {folder}/devices.py:Unset has no Settings, a dataclass of its keys",
