@@ -5,6 +5,7 @@
 
 import contextlib
 import errno
+import re
 from typing import Protocol
 
 from cotarget.errors import ConfigError, DeviceError
@@ -183,5 +184,7 @@ def _why_not(name: str, error: Exception) -> DeviceError:
         case errno.EBUSY | errno.EAGAIN:
             return InUseError(f"{name} is in use by another program")
     if name.startswith("socket://"):
+        if not re.fullmatch(r"socket://[^/]+:\d+", name):
+            return DeviceError(f"hardware.head.port: '{name}' is no address; write socket://HOST:PORT")
         return DeviceError(f"cannot connect to the pan-tilt unit at {name}: {error}")
     return DeviceError(f"cannot open {name} as a serial port: {error}")

@@ -400,6 +400,13 @@ def test_nobody_listens(port):
         D46Head(D46Settings(port=port), MonotonicClock())
 
 
+@pytest.mark.parametrize("port", ["socket://127.0.0.1", "socket://127.0.0.1:", "socket://terminal:four"])
+def test_an_address_without_a_port(port):
+    with pytest.raises(DeviceError) as caught:
+        D46Head(D46Settings(port=port), MonotonicClock())
+    assert str(caught.value) == f"hardware.head.port: '{port}' is no address; write socket://HOST:PORT"
+
+
 def test_an_unknown_kind_of_port():
     with pytest.raises(DeviceError, match=r"cannot open sockt://a:1 as a serial port: invalid URL"):
         D46Head(D46Settings(port="sockt://a:1"), MonotonicClock())
