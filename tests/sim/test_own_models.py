@@ -133,6 +133,7 @@ def test_the_scene_may_have_a_board_of_its_own(folder):
     ("dog.obj", "plane.xml", "plane.xml: has a geom of type plane; what a target is made of is: box, capsule, "),
     ("dog.obj", "hidden.xml", "hidden.xml: shows nothing: it has no geom of the groups 0 to 2"),
     ("dog.obj", "nothing.xml", "nothing.xml: shows nothing: it has no geom of the groups 0 to 2"),
+    ("dog.obj", "mm.obj", "mm.obj: a part is 1233 m large; models are in metres, and this one seems to be in mm"),
     ("dog = \"", "bird = \"", "sim.models.bird: the simulation has a bird of its own; give yours another name"),
     ("dog = \"", "dog2 = \"", "sim.models.dog2: a model is of a kind; give its name without the number"),
     ("dog2 = [[", "dog3 = [[", "sim.targets: a dog2 of your own needs a path: [sim.paths] dog2 = [[t, x, y, z], ...]"),
@@ -141,6 +142,7 @@ def test_the_scene_may_have_a_board_of_its_own(folder):
 def test_what_cannot_be_is_refused_in_one_line(folder, monkeypatch, old, new, said):
     monkeypatch.chdir(folder)
     (folder / "bad.obj").write_text("v 1 2\n")
+    (folder / "mm.obj").write_text(mesh(1000 * CORNERS, FACES))
     for name, inside in (
         ("plane", '<geom type="plane" size="1 1 1"/>'),
         ("hidden", '<geom size="1" group="3"/>'),

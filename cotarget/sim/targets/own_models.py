@@ -8,6 +8,7 @@ from cotarget.errors import ConfigError, choices
 from cotarget.sim.render.opengl import mujoco
 
 GREY = (0.55, 0.55, 0.55, 1.0)  # colour of a mesh without a texture
+LARGEST_M = 200.0  # of a target's part; a larger one is a model in millimetres
 SHAPES = ("box", "capsule", "cylinder", "ellipsoid", "mesh", "sphere")  # geom types with a known outline
 
 
@@ -23,7 +24,7 @@ def own_model(path: Path, kind: str, hidden: int) -> "mujoco.MjSpec":
         hidden: first group of geoms that are not drawn; models keep collision geoms there.
 
     Raises:
-        ConfigError: the file cannot be read, or is not such a model.
+        ConfigError: the file cannot be read, or is not such a model, or is in millimetres.
     """
     if not path.is_file():
         raise ConfigError(f"sim.models.{kind}: {path}: no such file; give the path of a mesh or an MJCF file")
@@ -39,9 +40,11 @@ def own_model(path: Path, kind: str, hidden: int) -> "mujoco.MjSpec":
         body = bodies[0]
         body.name, body.mocap = kind, True
         body.pos, body.quat = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-        spec.compile()
+        largest = 2 * float(spec.compile().geom_rbound.max())
     except ValueError as error:
         raise ConfigError(f"{path}: is not a target's model: {' '.join(str(error).split())}") from None
+    if largest > LARGEST_M:
+        raise ConfigError(f"{path}: a part is {largest:.4g} m large; models are in metres, and this one seems to be in mm")
     return spec
 
 
