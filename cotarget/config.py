@@ -42,6 +42,7 @@ from cotarget.schema import (
 )
 from cotarget.sim.targets import KINDS
 
+LARGEST_SQUARE_M = 2.0  # a larger one is in millimetres
 FEWEST_CORNERS, MOST_CORNERS = 3, 100  # corners along a side of a board
 
 
@@ -53,6 +54,16 @@ def check_config(config: "RigConfig") -> None:
     """
     validate(RigConfig, as_table(config), "")
     check_corners(config.board)
+
+
+def check_square(square: float, where: str) -> None:
+    """Refuse the side of a board's square [m] that was given in millimetres.
+
+    Raises:
+        ConfigError: the side is refused; the message names the option or key ``where``.
+    """
+    if square > LARGEST_SQUARE_M:
+        raise ConfigError(f"{where}: {square:g} m is no board's square; 25 mm are 0.025")
 
 
 def check_corners(board: "BoardConfig") -> None:

@@ -184,7 +184,7 @@ def _own_detectors(config: "RigConfig", rig: Path) -> list[Finding]:
 
 def _board(config: "RigConfig", rig: Path) -> list[Finding]:
     """Check whether rig.toml says how large the board's squares are; without that no real rig is calibrated."""
-    from cotarget.config import read_tables
+    from cotarget.config import check_square, read_tables
 
     if not rig.exists():  # a configuration that was made in Python says all that it has to
         return []
@@ -192,6 +192,10 @@ def _board(config: "RigConfig", rig: Path) -> list[Finding]:
         fix = f"measure ten squares, and write one into [board] in {rig}: square = 0.025"
         return [Finding("board", False, "how large its squares are is not configured", fix)]
     board, (columns, rows) = config.board, config.board.corners
+    try:
+        check_square(board.square, "square")
+    except ConfigError as error:
+        return [Finding("board", False, str(error), f"write it in metres into [board] in {rig}")]
     text = f"{board.kind} of {columns}x{rows} inner corners, squares of {1000 * board.square:g} mm"
     return [Finding("board", True, text)]
 

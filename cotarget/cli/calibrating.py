@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from cotarget.calibration import Calibration
 
 
-LARGEST_SQUARE = 2.0  # largest plausible square [m]; a larger value is in millimetres
 PHOTOS = ("fixed", "zoom", "board", "square")  # options that plain photos need
 LISTS = ("index.json", "session.json", "commands.jsonl")  # files beside the images of a session
 SESSION = ("placements", "stops")  # options of a capture session
@@ -134,6 +133,8 @@ def _given(options: argparse.Namespace, names: Sequence[str]) -> list[str]:
 
 def _check_together(options: argparse.Namespace) -> None:
     """Refuse options of calibrate that contradict each other or have no effect."""
+    from cotarget.config import check_square
+
     photos = _given(options, (*PHOTOS, "kind"))
     for name in ("encoders", "insist"):
         if getattr(options, name) and options.method == "sequential":
@@ -149,7 +150,7 @@ def _check_together(options: argparse.Namespace) -> None:
     if photos:
         if missing := [name for name in PHOTOS if name not in photos]:
             raise ConfigError(f"plain photos need --{missing[0]} too: --fixed, --zoom, --board and --square")
-        _check_square(options.square)
+        check_square(options.square, "--square")
         if options.encoders:
             raise ConfigError("--encoders goes with --rig or saved captures; plain photos know nothing of a head")
     elif not options.source.is_dir():
@@ -158,12 +159,6 @@ def _check_together(options: argparse.Namespace) -> None:
         raise ConfigError(
             f"{options.source}: holds no index.json of captures; photos need --fixed, --zoom, --board and --square"
         )
-
-
-def _check_square(square: float) -> None:
-    """Refuse a square that is given in millimetres."""
-    if square > LARGEST_SQUARE:
-        raise ConfigError(f"--square: {square:g} m is no board's square; 25 mm are 0.025")
 
 
 def summary(found: "Calibration", path: Path) -> dict[str, Any]:
@@ -206,10 +201,10 @@ def report(options: argparse.Namespace) -> None:
 def board(options: argparse.Namespace) -> None:
     """Run `cotarget board`: write a board to print."""
     from cotarget.board import check_board, print_board
-    from cotarget.config import BoardConfig
+    from cotarget.config import BoardConfig, check_square
 
     check_outputs([options.out], [])
-    _check_square(options.square)
+    check_square(options.square, "--square")
     made = BoardConfig(options.kind, options.board, options.square)
     try:
         check_board(made)

@@ -421,14 +421,14 @@ def rig_files(rig: Path | None, config: "RigConfig") -> list[Path | None]:
 
 
 def check_board_is_told(rig: Path, config: "RigConfig") -> None:
-    """Refuse a real rig whose configuration does not give the size of the board's squares.
+    """Refuse a rig whose board has squares of metres, and a real one whose configuration does not give their size.
 
     All lengths of a calibration are multiples of that size, so that no later check can find it wrong.
 
     Raises:
-        ConfigError: the size is missing.
+        ConfigError: the size is missing, or in millimetres.
     """
-    from cotarget.config import read_tables
+    from cotarget.config import check_square, read_tables
 
     told = read_tables(rig).get("board", {})
     if config.backend == "hardware" and "square" not in told:
@@ -436,6 +436,7 @@ def check_board_is_told(rig: Path, config: "RigConfig") -> None:
             f"{rig}: does not say how large the squares of your board are; measure ten of them, and say so in metres: "
             "[board] square = 0.025"
         )
+    check_square(config.board.square, f"{rig}: board.square")
 
 
 def _real(path: Path) -> Path:

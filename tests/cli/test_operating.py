@@ -320,6 +320,15 @@ def test_real_squares_have_no_size_by_default(folder, capsys, command, more, mar
     assert "squares" not in call(capsys, *command)[2]
 
 
+def test_squares_in_millimetres_are_refused_before_anybody_holds_the_board(folder, capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "_rendering", lambda: Finding("rendering", True, "replaced: it takes a second"))
+    (folder / "hw.toml").write_text(HARDWARE + "[board]\nsquare = 25\n")
+    command = ("calibrate", "--rig", "hw.toml", "--out", "new.json")
+    wrong = "square: 25 m is no board's square; 25 mm are 0.025\n"
+    assert call(capsys, *command) == (1, "", f"cotarget calibrate: hw.toml: board.{wrong}")
+    assert f"MISSING  board: {wrong}" in call(capsys, "doctor", "--rig", "hw.toml")[1]
+
+
 def test_a_printed_board_is_told_as_the_rig_wants_it(folder, capsys):
     status, out, _ = call(capsys, "board", "--out", "board.svg", "--board", "7x6", "--kind", "charuco")
     assert status == 0
