@@ -194,7 +194,7 @@ def test_an_own_detector_is_found_beside_rig_toml(rig, monkeypatch):
         ('"device:Camera"', "hardware.fixed.driver: there is no module 'device' beside rig.toml or on Python's path"),
         (
             '"devices:Camer"',  # what the file imports is no driver of it
-            "hardware.fixed.driver: {folder}/devices.py has no 'Camer'; it has: Broken, Camera, CameraSettings, Head, HeadSettings, ",
+            "hardware.fixed.driver: {folder}/devices.py has no 'Camer'; it has: Broken, Camera, CameraSettings, Head, ",
         ),
         (
             '"devices:Unset"',

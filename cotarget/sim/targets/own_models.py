@@ -44,7 +44,9 @@ def own_model(path: Path, kind: str, hidden: int) -> "mujoco.MjSpec":
     except ValueError as error:
         raise ConfigError(f"{path}: is not a target's model: {' '.join(str(error).split())}") from None
     if largest > LARGEST_M:
-        raise ConfigError(f"{path}: a part is {largest:.4g} m large; models are in metres, and this one seems to be in mm")
+        raise ConfigError(
+            f"{path}: a part is {largest:.4g} m large; models are in metres, and this one seems to be in mm"
+        )
     return spec
 
 
