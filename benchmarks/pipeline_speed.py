@@ -30,6 +30,7 @@ from cotarget.errors import ConfigError
 from cotarget.evaluation import true_calibration
 from cotarget.fusion import TargetFusion
 from cotarget.rig import Frame, PanTiltLimits
+from cotarget.rig_geometry import FixedCamera
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim
 from cotarget.tracking.track import tracking_settings
@@ -107,7 +108,8 @@ def calibration_of(size: tuple[int, int]) -> Calibration:
     """Give the default rig's calibration, with a fixed image of that size."""
     calibration = true_calibration(SimWorld(RigConfig(), rendered=()))
     middle = ((size[0] - 1) / 2, (size[1] - 1) / 2)
-    return replace(calibration, fixed=replace(calibration.fixed, size=size, center_px=middle))
+    lens = replace(calibration.fixed.lens, size=size, center_px=middle)
+    return replace(calibration, fixed=FixedCamera(lens))
 
 
 def needs(settings: PipelineSpeedSettings) -> str:

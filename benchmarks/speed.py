@@ -77,7 +77,7 @@ def one(_: None, settings: SpeedSettings, seed: int) -> list[Row]:
 
 def _joint(views: Sequence[View]) -> float:
     calibration = calibrate_views(views, BOARD, SIZES, options=Options(folds=0))
-    return float(np.linalg.norm(calibration.T_zoom0_fixed.translation))
+    return float(np.linalg.norm(calibration.zoom_head.T_zoom0_fixed.translation))
 
 
 def _opencv(views: Sequence[View], flags: int) -> float:

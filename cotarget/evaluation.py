@@ -25,6 +25,7 @@ from cotarget.metrics import WHOLLY_VISIBLE, Closeup, Row
 from cotarget.pantilt import HeadGeometry
 from cotarget.pipeline import Step
 from cotarget.rig import Frame, Image, to_step
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.targets import KINDS
 from cotarget.sim.targets.target import marker_of
 from cotarget.sim.truth import Appearances, CameraName, Silhouette, Truth
@@ -43,11 +44,13 @@ def true_calibration(world: SimWorld, stops: int = 8) -> Calibration:
     )
     real = sim.effects.axes
     return Calibration(
-        fixed=fixed,
-        zoom=ZoomLens(nominal, tuple(zooms), tuple(lens.pupil for lens in lenses)),
-        T_zoom0_fixed=sim.T_zoom0_fixed,
-        T_head_zoom=sim.T_head_zoom,
-        head=HeadGeometry(sim.head.axis_offset_mm / 1000 * real, np.radians(sim.head.squareness_deg) * real),
+        fixed=FixedCamera(fixed),
+        zoom_head=ZoomHead(
+            ZoomLens(nominal, tuple(zooms), tuple(lens.pupil for lens in lenses)),
+            sim.T_zoom0_fixed,
+            sim.T_head_zoom,
+            HeadGeometry(sim.head.axis_offset_mm / 1000 * real, np.radians(sim.head.squareness_deg) * real),
+        ),
         pitch_mm=sim.zoom.pitch_mm,
     )
 

@@ -368,7 +368,7 @@ class TargetFusion:
         self._followed: int | None = None
         self._seen_well_s: dict[int, float] = {}  # time for which each track was seen well in the close-up [s]
         self._unlikely: set[int] = set()  # tracks whose size or pointing contradicts the priors
-        self._T_base_fixed = calibration.T_base_fixed
+        self._T_base_fixed = calibration.zoom_head.T_base_fixed
         self.states = StateHistory()
         self.search = ZoomSearch(partial(make_finder, calibration, target), settings, matching.latest_s)
 

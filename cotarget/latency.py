@@ -402,8 +402,8 @@ def in_both_views(calibration: Calibration, board: BoardConfig) -> RigidTransfor
     """Pose of a board ahead of the fixed camera, of a good size in its image, T_fixed_board."""
     points = board_points(board)
     width = float(np.ptp(points[:, 0]))
-    depth = calibration.fixed.focal_px[0] * width / (BOARD_SHARE * calibration.fixed.size[0])
-    ray = calibration.fixed.ray(calibration.fixed.image_center_px)
+    depth = calibration.fixed.lens.focal_px[0] * width / (BOARD_SHARE * calibration.fixed.size[0])
+    ray = calibration.fixed.ray(calibration.fixed.lens.image_center_px)
     turned = pose([0.0, 0.0, 0.0], [0.0, BOARD_TURNED, 0.0])
     return RigidTransform.from_translation(ray * depth - turned.apply(points.mean(axis=0))) * turned
 

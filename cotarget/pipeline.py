@@ -319,7 +319,7 @@ def follow(
         DeviceError: a device failed, or its frames changed their size.
     """
     _check_seconds(seconds)
-    calibration.hand_eye()  # raises with the first step, not when the first target is seen
+    calibration.zoom_head.hand_eye()  # raises with the first step, not when the first target is seen
     check_plausible(calibration, rig.spec, insist=insist)
     name, wanted = _profile(rig, target)
     if not insist and (text := target_implausibility(wanted, calibration, rig.spec, name)):

@@ -101,7 +101,9 @@ def depth_of(
         upright: for a wingspan, whether the larger side of the box is its height.
     """
     vertical = target.is_vertical(height=2.0 if upright else 1.0)
-    return depth_from_size(calibration.fixed, target.size, size_px, np.asarray(center_px, float), vertical=vertical)
+    return depth_from_size(
+        calibration.fixed.lens, target.size, size_px, np.asarray(center_px, float), vertical=vertical
+    )
 
 
 # Sizes of targets [m]. Beyond them another unit was meant: a beetle has 5 mm, the largest aircraft 84 m.
@@ -141,8 +143,8 @@ def target_implausibility(target: TargetProfile, calibration: Calibration, spec:
             f"give less than {room_px}"
         )
     # The nearest target fills the fixed image, and the longest focal length shows it largest.
-    fixed = calibration.fixed.resized(spec.fixed.size)
-    longest = calibration.zoom.resized(spec.zoom.size).at(spec.zoom.focal_range[1])
+    fixed = calibration.fixed.lens.resized(spec.fixed.size)
+    longest = calibration.zoom_head.lens.resized(spec.zoom.size).at(spec.zoom.focal_range[1])
     largest_px = longest.focal_px[along] * spec.fixed.size[along] / fixed.focal_px[along]
     if target.wanted_px > largest_px:
         return (
@@ -223,23 +225,22 @@ def aim(
         check_plausible(calibration, insist=insist)
     elif pixel is not None or depth is not None:
         raise ConfigError("aim: give x_fixed, or pixel and depth, and not both")
+    head, zoom = calibration.zoom_head, calibration.zoom_head.lens
     if reach is None:
-        focal_px = calibration.zoom.nominal_px
+        focal_px = zoom.nominal_px
         reach = Reach((-math.pi, math.pi), (-math.pi, math.pi), (focal_px[0], focal_px[-1]))
-    x_base = calibration.in_base(x_fixed)  # (6)
-    wanted = calibration.zoom.stops[0].image_center_px if zoom_pixel is None else np.asarray(zoom_pixel, dtype=float)
+    x_base = head.in_base(x_fixed)  # (6)
+    wanted = zoom.stops[0].image_center_px if zoom_pixel is None else np.asarray(zoom_pixel, dtype=float)
     if wanted_size:  # start with the distance from the base for the range
-        nominal_px = calibration.zoom.nominal_for(
-            focal_for_size(wanted_size.size, wanted_size.wanted_px, math.hypot(*x_base))
-        )
+        nominal_px = zoom.nominal_for(focal_for_size(wanted_size.size, wanted_size.wanted_px, math.hypot(*x_base)))
     nominal, limited = _limit(reach.focal_px[0] if nominal_px is None else nominal_px, reach)
-    lens = calibration.zoom.at(nominal)
+    lens = zoom.at(nominal)
     for _ in range(FOCAL_ROUNDS if wanted_size else 1):
         ray = lens.ray(wanted)
         if method == "exact":
-            pupil = calibration.zoom.pupil_at(nominal)
-            ways = solve(x_base, calibration.hand_eye(), calibration.head, ray, pupil=pupil)
-            pointing = nearest(ways, reach.pan, reach.tilt, reach.now, calibration.head)
+            pupil = zoom.pupil_at(nominal)
+            ways = solve(x_base, head.hand_eye(), head.axes, ray, pupil=pupil)
+            pointing = nearest(ways, reach.pan, reach.tilt, reach.now, head.axes)
         else:
             pointing = _paper(calibration, x_fixed, method, reach)
         if wanted_size:
@@ -249,9 +250,9 @@ def aim(
                 fx, fy = lens.focal_px
                 focal *= fx / fy
             previous = nominal
-            nominal, limited = _limit(calibration.zoom.nominal_for(focal), reach)
+            nominal, limited = _limit(zoom.nominal_for(focal), reach)
             if nominal != previous:
-                lens = calibration.zoom.at(nominal)
+                lens = zoom.at(nominal)
             if abs(nominal - previous) <= FOCAL_FOUND * nominal:
                 break
     return Aim(
@@ -313,8 +314,9 @@ def _limit(nominal_px: float, reach: Reach) -> tuple[float, bool]:
 def _paper(calibration: Calibration, x_fixed: Array, method: Method, reach: Reach) -> Pointing:
     """Solve by the paper's shortcut and choose the reachable solution."""
     reading: Literal["table", "example"] = "table" if method == "paper-table" else "example"
-    found = shortcut(x_fixed, calibration.T_zoom0_fixed, calibration.hand_eye(), reading)
+    head = calibration.zoom_head
+    found = shortcut(x_fixed, head.T_zoom0_fixed, head.hand_eye(), reading)
     if not np.isfinite(found.pan):
         raise UnreachableError("the paper's shortcut has no solution for this point; use the exact method")
-    pan, tilt = calibration.head.reported_angles(np.atleast_1d(found.pan), np.atleast_1d(found.tilt))
-    return nearest(Pointing(pan, tilt, np.atleast_1d(found.range)), reach.pan, reach.tilt, reach.now, calibration.head)
+    pan, tilt = head.axes.reported_angles(np.atleast_1d(found.pan), np.atleast_1d(found.tilt))
+    return nearest(Pointing(pan, tilt, np.atleast_1d(found.range)), reach.pan, reach.tilt, reach.now, head.axes)

@@ -14,6 +14,7 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.detection import Detection
 from cotarget.pantilt import HeadGeometry
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from experiments.calibration.synthetic.aims import aimed
 from experiments.calibration.synthetic.rig import LONGEST_PX, NOMINAL_PX, SIZE, Truth
 
@@ -37,11 +38,13 @@ def calibration_of(truth, **more):
         return Intrinsics(SIZE, (lens.fx, lens.fy), (lens.cx, lens.cy), lens.distortion)
 
     return Calibration(
-        fixed=intrinsics(truth.fixed),
-        zoom=ZoomLens((NOMINAL_PX,), (intrinsics(truth.zoom),)),
-        T_zoom0_fixed=truth.gamma,
-        T_head_zoom=truth.hand,
-        head=HeadGeometry(truth.dz, truth.eps, truth.pan_scale, truth.tilt_scale),
+        fixed=FixedCamera(intrinsics(truth.fixed)),
+        zoom_head=ZoomHead(
+            ZoomLens((NOMINAL_PX,), (intrinsics(truth.zoom),)),
+            truth.gamma,
+            truth.hand,
+            HeadGeometry(truth.dz, truth.eps, truth.pan_scale, truth.tilt_scale),
+        ),
         **more,
     )
 

@@ -22,6 +22,7 @@ from cotarget.geometry import pose
 from cotarget.pipeline import FollowSettings, follow
 from cotarget.recording.recorder import Recorder
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from tests.rigs import guarded, rig_of
 
 SIZE = (96, 72)
@@ -169,7 +170,10 @@ class Bright:
 def calibration():
     focal, middle = (100.0, 100.0), ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
     plain = Intrinsics(SIZE, focal, middle)
-    return Calibration(plain, ZoomLens((100.0,), (plain,)), pose([0, 0.1, 0], [0, 0, 0]), pose([0, 0, 0.05], [0, 0, 0]))
+    return Calibration(
+        fixed=FixedCamera(plain),
+        zoom_head=ZoomHead(ZoomLens((100.0,), (plain,)), pose([0, 0.1, 0], [0, 0, 0]), pose([0, 0, 0.05], [0, 0, 0])),
+    )
 
 
 def calibration_file(folder: Path) -> Path:

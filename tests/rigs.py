@@ -1,5 +1,7 @@
 """Rigs of devices that tests make."""
 
+from dataclasses import replace
+
 from cotarget.config import SafetyConfig
 from cotarget.rig import CameraSpec, HeadSpec, Rig, RigSpec, ZoomSpec
 from cotarget.safety.safe_rig import guard
@@ -35,3 +37,8 @@ def rig_of(devices, *, delay_s=DELAY_S, config=None) -> Rig:
 def guarded(devices, safety: SafetyConfig) -> Rig:
     """The rig of such an object behind the safety layer."""
     return guard(rig_of(devices), safety)
+
+
+def with_zoom_head(calibration, **changes):
+    """The calibration with fields of its zoom head replaced."""
+    return replace(calibration, zoom_head=replace(calibration.zoom_head, **changes))

@@ -13,9 +13,11 @@ from cotarget.evaluation import add_row, decodes, observe, pointing_errors, true
 from cotarget.geometry import pose
 from cotarget.pipeline import State, Step
 from cotarget.rig import Frame
+from cotarget.rig_geometry import FixedCamera
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach
 from cotarget.tracking.track import Track
+from tests.rigs import with_zoom_head
 
 pytestmark = pytest.mark.render
 EXACT_DEG = 1e-6  # the inverse is exact to 1e-9; the rays of both lens models agree to 1e-12
@@ -60,7 +62,7 @@ def test_the_true_calibration_points_exactly(book):
 def test_a_boresight_that_is_off_by_a_tenth_of_a_degree_points_off_by_as_much(book):
     """Gamma turned about y by 0.1 degree: the line of sight misses by 0.1 degree in the middle, at most that aside."""
     true = true_calibration(book, stops=1)
-    off = dataclasses.replace(true, T_zoom0_fixed=pose([0, 0, 0], [0, 0.1, 0]) * true.T_zoom0_fixed)
+    off = with_zoom_head(true, T_zoom0_fixed=pose([0, 0, 0], [0, 0.1, 0]) * true.zoom_head.T_zoom0_fixed)
     errors = np.degrees(pointing_errors(off, book.truth(), reach_of(book), np.random.default_rng(0), 50))
     assert errors.max() < 0.1 + EXACT_DEG
     assert np.median(errors) > 0.09
@@ -69,8 +71,8 @@ def test_a_boresight_that_is_off_by_a_tenth_of_a_degree_points_off_by_as_much(bo
 def test_a_principal_point_that_is_off_matters_less_at_a_longer_focal_length(book):
     """The middle of the image is taken for a ray 20 px aside of the true one, at five times the shortest 692 px."""
     true = true_calibration(book, stops=1)
-    stop = dataclasses.replace(true.zoom.stops[0], center_px=(346.0, 235.0))
-    off = dataclasses.replace(true, zoom=dataclasses.replace(true.zoom, stops=(stop,)))
+    stop = dataclasses.replace(true.zoom_head.lens.stops[0], center_px=(346.0, 235.0))
+    off = with_zoom_head(true, lens=dataclasses.replace(true.zoom_head.lens, stops=(stop,)))
     reach = reach_of(book)
     for nominal, focal in ((None, 692), (5 * reach.focal_px[0], 3460)):
         errors = pointing_errors(off, book.truth(), reach, np.random.default_rng(0), 5, nominal_px=nominal)
@@ -87,11 +89,13 @@ def test_the_true_calibration_at_a_focal_length_points_exactly_with_it():
     to_pupil = pose([0, 0, lens.pupil], [0, 0, 0])
     true, sim = true_calibration(world, stops=1), world.config.sim
     at_nominal = dataclasses.replace(
-        true,
-        fixed=dataclasses.replace(true.fixed, distortion=sim.fixed.distortion),
-        zoom=ZoomLens((nominal,), (Intrinsics(lens.size, lens.focal_px, lens.center_px, lens.distortion),)),
-        T_zoom0_fixed=to_pupil.inv() * sim.T_zoom0_fixed,
-        T_head_zoom=sim.T_head_zoom * to_pupil,
+        with_zoom_head(
+            true,
+            lens=ZoomLens((nominal,), (Intrinsics(lens.size, lens.focal_px, lens.center_px, lens.distortion),)),
+            T_zoom0_fixed=to_pupil.inv() * sim.T_zoom0_fixed,
+            T_head_zoom=sim.T_head_zoom * to_pupil,
+        ),
+        fixed=FixedCamera(dataclasses.replace(true.fixed.lens, distortion=sim.fixed.distortion)),
     )
     judged = (world.truth(), reach_of(world))
     at, elsewhere = (

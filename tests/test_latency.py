@@ -11,6 +11,7 @@ from cotarget.errors import CalibrationError
 from cotarget.latency import command_delay, delay_between, measure_fixed, measure_head, picture_shifts
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig import Frame, PanTiltState
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 
 # The figure asked for is 10 ms; the simulation is measured without a wire in between.
 CLOSE = 0.003  # [s]
@@ -137,15 +138,17 @@ def test_the_head_is_measured_where_it_stands_or_straight_ahead(outdoors, pan_de
 def test_the_fixed_camera_against_the_zoom_camera(world):
     sim = world.config.sim
     calibration = Calibration(
-        fixed=Intrinsics(sim.fixed.size, sim.fixed.focal_px, sim.fixed.center_px, sim.fixed.distortion),
-        zoom=ZoomLens(
-            (world.rig.zoom.focal_range[0],),
-            (Intrinsics(sim.zoom.size, sim.zoom.focal_px, sim.zoom.center_px, sim.zoom.distortion),),
-            (0.0,),
+        fixed=FixedCamera(Intrinsics(sim.fixed.size, sim.fixed.focal_px, sim.fixed.center_px, sim.fixed.distortion)),
+        zoom_head=ZoomHead(
+            ZoomLens(
+                (world.rig.zoom.focal_range[0],),
+                (Intrinsics(sim.zoom.size, sim.zoom.focal_px, sim.zoom.center_px, sim.zoom.distortion),),
+                (0.0,),
+            ),
+            sim.T_zoom0_fixed,
+            sim.T_head_zoom,
+            HeadGeometry(),
         ),
-        T_zoom0_fixed=sim.T_zoom0_fixed,
-        T_head_zoom=sim.T_head_zoom,
-        head=HeadGeometry(),
     )
     late = Wrapped(world.rig, fixed=LateCamera(world.rig.fixed, 0.03))
     found, frames = measure_fixed(late, calibration, world.config.board, seconds=4.0)

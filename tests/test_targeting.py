@@ -13,6 +13,7 @@ from cotarget.errors import CalibrationError, ConfigError, CotargetError, Unreac
 from cotarget.geometry import RigidTransform, Rotation
 from cotarget.pantilt import HeadGeometry
 from cotarget.rig import CameraSpec, HeadSpec, RigSpec, ZoomSpec
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.targeting import (
     METHODS,
     Reach,
@@ -24,6 +25,7 @@ from cotarget.targeting import (
     target_implausibility,
 )
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
+from tests.rigs import with_zoom_head
 
 # The solver accepts a miss of 1e-11 rad, which is 1e-7 px at the longest focal length of 8000 px.
 PIXEL = 1e-6
@@ -39,12 +41,15 @@ RELATIVE = 1e-9  # double precision through a few square roots
 CURVATURE = 1e-3
 ANYWHERE = Reach((-math.pi, math.pi), (-math.pi / 2, math.pi / 2), (667.0, 8000.0))
 CENTRED = Intrinsics(SIZE, (686.0, 684.0), (319.5, 239.5))
-HOME = Calibration(CENTRED, ZoomLens((667.0,), (CENTRED,)), RigidTransform.identity(), RigidTransform.identity())
+HOME = Calibration(
+    fixed=FixedCamera(CENTRED),
+    zoom_head=ZoomHead(ZoomLens((667.0,), (CENTRED,)), RigidTransform.identity(), RigidTransform.identity()),
+)
 
 
 def shifted(x, y=0.0, z=0.0):
     """A rig without any rotation whose zoom camera sees a point shifted by (x, y, z) [m]."""
-    return replace(HOME, T_zoom0_fixed=RigidTransform.from_translation([x, y, z]))
+    return with_zoom_head(HOME, T_zoom0_fixed=RigidTransform.from_translation([x, y, z]))
 
 
 def random_truth(rng, real_head):
@@ -66,11 +71,10 @@ def calibration_of(truth):
         return Intrinsics(SIZE, (lens.fx, lens.fy), (lens.cx, lens.cy), lens.distortion)
 
     return Calibration(
-        fixed=intrinsics(truth.fixed),
-        zoom=ZoomLens((667.0,), (intrinsics(truth.zoom),)),
-        T_zoom0_fixed=truth.gamma,
-        T_head_zoom=truth.hand,
-        head=HeadGeometry(truth.dz, truth.eps),
+        fixed=FixedCamera(intrinsics(truth.fixed)),
+        zoom_head=ZoomHead(
+            ZoomLens((667.0,), (intrinsics(truth.zoom),)), truth.gamma, truth.hand, HeadGeometry(truth.dz, truth.eps)
+        ),
     )
 
 
@@ -128,7 +132,7 @@ def test_a_height_is_magnified_by_the_vertical_focal_length():
 def test_an_aim_uses_the_lens_as_it_was_calibrated_at_that_focal_length():
     """Between two stops the principal point drifts: half way in the logarithm it is half way between."""
     stops = (Intrinsics(SIZE, (700.0, 700.0), (326.0, 235.0)), Intrinsics(SIZE, (2828.0, 2828.0), (336.0, 245.0)))
-    calibration = replace(HOME, zoom=ZoomLens((700.0, 2800.0), stops))
+    calibration = with_zoom_head(HOME, lens=ZoomLens((700.0, 2800.0), stops))
     found = aim(calibration, np.array([0.0, 0.0, 10.0]), ANYWHERE, nominal_px=1400.0)
     focal = 1400 * 1.01**0.5  # the ratio to the nominal one is half way between 1 and 1.01 in the logarithm
     assert found.focal_px == pytest.approx(focal, rel=RELATIVE)
@@ -158,15 +162,14 @@ def test_the_shortcut_too_is_told_as_the_head_reports(method):
     """An encoder that counts 1 for every 1.01 turned, and 0 where the axis is at 0.02 rad."""
     x_fixed = np.array([1.0, -0.7, 10.0])
     true = aim(shifted(0.3), x_fixed, ANYWHERE, method=method)
-    told = aim(
-        replace(shifted(0.3), head=HeadGeometry(0.0, 0.0, 1.01, 1.01, 0.02, 0.02)), x_fixed, ANYWHERE, method=method
-    )
+    off = with_zoom_head(shifted(0.3), axes=HeadGeometry(0.0, 0.0, 1.01, 1.01, 0.02, 0.02))
+    told = aim(off, x_fixed, ANYWHERE, method=method)
     assert told.pan == pytest.approx((true.pan - 0.02) / 1.01, rel=RELATIVE)
     assert told.tilt == pytest.approx((true.tilt - 0.02) / 1.01, rel=RELATIVE)
     assert told.range == true.range
     # A whole turn further is reported as 1 / 1.01 of one.
     beyond = replace(ANYWHERE, pan=(3.2, 7.0), now=(6.0, 0.0))
-    around = aim(replace(shifted(0.3), head=HeadGeometry(pan_scale=1.01)), x_fixed, beyond, method=method)
+    around = aim(with_zoom_head(shifted(0.3), axes=HeadGeometry(pan_scale=1.01)), x_fixed, beyond, method=method)
     assert around.pan == pytest.approx((true.pan + 2 * math.pi) / 1.01, rel=RELATIVE)
 
 
@@ -217,7 +220,9 @@ def test_the_nearest_way_round_is_taken():
     ("bird", 686 * 0.8 / 25, 25.0),
 ])  # fmt: skip
 def test_depth_from_the_known_size(name, size_px, depth):
-    assert depth_of(HOME, DEFAULT_TARGETS[name], size_px, HOME.fixed.center_px) == pytest.approx(depth, rel=RELATIVE)
+    assert depth_of(HOME, DEFAULT_TARGETS[name], size_px, HOME.fixed.lens.center_px) == pytest.approx(
+        depth, rel=RELATIVE
+    )
 
 
 def test_a_pixel_and_a_depth_are_a_point():
@@ -227,8 +232,8 @@ def test_a_pixel_and_a_depth_are_a_point():
 
 
 # The zoom camera 0.3 m beside the axes: it cannot look at a point 0.1 m from them.
-LONG_LEVER = replace(HOME, T_head_zoom=RigidTransform.from_translation([0.3, 0.0, 0.0]))
-FOLDING = replace(HOME, fixed=replace(CENTRED, distortion=(-0.3, 0.0, 0.0, 0.0, 0.0)))
+LONG_LEVER = with_zoom_head(HOME, T_head_zoom=RigidTransform.from_translation([0.3, 0.0, 0.0]))
+FOLDING = replace(HOME, fixed=FixedCamera(replace(CENTRED, distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))))
 
 
 @pytest.mark.parametrize(("act", "kind", "message"), [
@@ -245,7 +250,7 @@ FOLDING = replace(HOME, fixed=replace(CENTRED, distortion=(-0.3, 0.0, 0.0, 0.0, 
     (lambda: aim(HOME, np.array([0, -10.0, 1]), replace(ANYWHERE, pan=(-1, 1), tilt=(-1, 1))), UnreachableError,
      r"tilt 84\.29"),
     (lambda: aim(LONG_LEVER, np.array([-0.2, 0.0, 0.0]), ANYWHERE), UnreachableError, "too close to the head"),
-    (lambda: aim(replace(HOME, T_head_zoom=None), np.array([0, 0, 5.0]), ANYWHERE), CalibrationError,
+    (lambda: aim(with_zoom_head(HOME, T_head_zoom=None), np.array([0, 0, 5.0]), ANYWHERE), CalibrationError,
      "no T_head_zoom; calibrate on a rig"),
 ])  # fmt: skip
 def test_what_cannot_be_aimed_at_is_named_in_one_line(act, kind, message):
@@ -300,8 +305,8 @@ def test_a_pixel_and_its_depth_aim_at_the_point_that_they_mean():
 
 
 def test_a_pixel_is_not_aimed_at_by_a_calibration_in_millimetres_unless_insisted_on():
-    gamma = HOME.T_zoom0_fixed
-    apart = replace(HOME, T_zoom0_fixed=RigidTransform.from_components([400.0, 0.0, 0.0], gamma.rotation))
+    gamma = HOME.zoom_head.T_zoom0_fixed
+    apart = with_zoom_head(HOME, T_zoom0_fixed=RigidTransform.from_components([400.0, 0.0, 0.0], gamma.rotation))
     with pytest.raises(CalibrationError, match=r"T_zoom0_fixed: the cameras are 400 m apart; .* insist=True"):
         aim(apart, pixel=(400, 100), depth=9.0)
     assert aim(apart, pixel=(400, 100), depth=9.0, insist=True).range > 300

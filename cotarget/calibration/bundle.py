@@ -24,11 +24,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cotarget.calibration.model import RigModel, View, stop_of
+from cotarget.calibration.model import BundleModel, View, stop_of
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import HeadGeometry
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 
 Block = Literal["fixed", "zoom", "pupil", "gamma", "hand", "head", "warp", "k3", "scale", "zero"]
 # Blocks that a calibration fits by default, in the order of the parameters. "k3" is the fixed camera's; "scale" and
@@ -86,40 +87,49 @@ def _names(block: str, stops: int) -> list[str]:
             return [f"head.{name}" for name in HEAD_NAMES[block]]
 
 
-def stepped(model: RigModel, shared: Array, boards: Array, free: Collection[Block]) -> RigModel:
+def stepped(model: BundleModel, shared: Array, boards: Array, free: Collection[Block]) -> BundleModel:
     """Apply a step of the shared parameters (n,) and of the boards' poses (B, 6) to a model."""
     steps = {name: shared[columns] for name, columns in columns_of(free, model.stops).items()}
-    head = model.head
-    for block, names in HEAD_NAMES.items():
-        if block in steps:
-            changed = {name: getattr(head, name) + float(d) for name, d in zip(names, steps[block], strict=True)}
-            head = replace(head, **changed)
-    zoom = model.zoom
-    if zoom is not None and ("zoom" in steps or "pupil" in steps):
-        lenses = steps.get("zoom", np.zeros(LENS_PARAMETERS * model.stops)).reshape(model.stops, LENS_PARAMETERS)
-        pupils = np.append(0.0, steps.get("pupil", np.zeros(model.stops - 1)))
-        zoom = ZoomLens(
-            zoom.nominal_px,
-            tuple(_bent(stop, step) for stop, step in zip(zoom.stops, lenses, strict=True)),
-            tuple(float(old + step) for old, step in zip(zoom.pupil, pupils, strict=True)),
-        )
-    fixed = model.fixed
-    if fixed is not None and "fixed" in steps:
-        fixed = _bent(fixed, steps["fixed"])
-    if fixed is not None and "k3" in steps:
-        fixed = replace(fixed, distortion=(*fixed.distortion[:4], fixed.distortion[4] + float(steps["k3"][0])))
-    return RigModel(
+    return BundleModel(
         boards=_all_moved(model.boards, boards),
-        fixed=fixed,
-        zoom=zoom,
-        gamma=_moved(model.gamma, steps.get("gamma")),
-        hand=_moved(model.hand, steps.get("hand")),
-        head=head,
+        fixed=None if model.fixed is None else _stepped_camera(model.fixed, steps),
+        zoom_head=None if model.zoom_head is None else _stepped_head(model.zoom_head, steps),
         warp=model.warp if "warp" not in steps else _pair(np.add(model.warp, steps["warp"])),
     )
 
 
-def difference(model: RigModel, reference: RigModel, free: Collection[Block]) -> Array:
+def _stepped_camera(camera: FixedCamera, steps: Mapping[str, Array]) -> FixedCamera:
+    """Apply the steps of the fixed camera's blocks; without any it is the same object."""
+    lens = camera.lens
+    if "fixed" in steps:
+        lens = _bent(lens, steps["fixed"])
+    if "k3" in steps:
+        lens = replace(lens, distortion=(*lens.distortion[:4], lens.distortion[4] + float(steps["k3"][0])))
+    return camera if lens is camera.lens else replace(camera, lens=lens)
+
+
+def _stepped_head(head: ZoomHead, steps: Mapping[str, Array]) -> ZoomHead:
+    """Apply the steps of the blocks of the zoom camera and its head."""
+    axes = head.axes
+    for block, names in HEAD_NAMES.items():
+        if block in steps:
+            changed = {name: getattr(axes, name) + float(d) for name, d in zip(names, steps[block], strict=True)}
+            axes = replace(axes, **changed)
+    lens, stops = head.lens, len(head.lens.stops)
+    if "zoom" in steps or "pupil" in steps:
+        lenses = steps.get("zoom", np.zeros(LENS_PARAMETERS * stops)).reshape(stops, LENS_PARAMETERS)
+        pupils = np.append(0.0, steps.get("pupil", np.zeros(stops - 1)))
+        lens = ZoomLens(
+            lens.nominal_px,
+            tuple(_bent(stop, step) for stop, step in zip(lens.stops, lenses, strict=True)),
+            tuple(float(old + step) for old, step in zip(lens.pupil, pupils, strict=True)),
+        )
+    return ZoomHead(
+        lens, _moved(head.T_zoom0_fixed, steps.get("gamma")), _moved(head.hand_eye(), steps.get("hand")), axes
+    )
+
+
+def difference(model: BundleModel, reference: BundleModel, free: Collection[Block]) -> Array:
     """Compute the step of the shared parameters from the reference to the model, (n,), the inverse of `stepped`."""
     parts: list[Array] = []
     for block in columns_of(free, model.stops):
@@ -127,28 +137,40 @@ def difference(model: RigModel, reference: RigModel, free: Collection[Block]) ->
             case "fixed":
                 assert model.fixed is not None
                 assert reference.fixed is not None
-                parts.append(_numbers(model.fixed) - _numbers(reference.fixed))
-            case "zoom" | "pupil":
-                assert model.zoom is not None
-                assert reference.zoom is not None
-                if block == "pupil":
-                    parts.append(np.subtract(model.zoom.pupil, reference.zoom.pupil)[1:])
-                else:
-                    pairs = zip(model.zoom.stops, reference.zoom.stops, strict=True)
-                    parts.extend(_numbers(a) - _numbers(b) for a, b in pairs)
-            case "gamma" | "hand":
-                T, T_ref = getattr(model, block), getattr(reference, block)
-                parts.append((T.rotation * T_ref.rotation.inv()).as_rotvec())
-                parts.append(T.translation - T_ref.translation)
+                parts.append(_numbers(model.fixed.lens) - _numbers(reference.fixed.lens))
             case "k3":
                 assert model.fixed is not None
                 assert reference.fixed is not None
-                parts.append(np.array([model.fixed.distortion[4] - reference.fixed.distortion[4]]))
+                parts.append(np.array([model.fixed.lens.distortion[4] - reference.fixed.lens.distortion[4]]))
             case "warp":
                 parts.append(np.subtract(model.warp, reference.warp))
             case _:
-                parts.append(np.array([getattr(model.head, k) - getattr(reference.head, k) for k in HEAD_NAMES[block]]))
+                assert model.zoom_head is not None
+                assert reference.zoom_head is not None
+                parts.append(_head_difference(model.zoom_head, reference.zoom_head, block))
     return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def _head_difference(head: ZoomHead, reference: ZoomHead, block: str) -> Array:
+    """Compute the step of one block of the zoom camera and its head from the reference."""
+    match block:
+        case "zoom":
+            pairs = zip(head.lens.stops, reference.lens.stops, strict=True)
+            return np.concatenate([_numbers(a) - _numbers(b) for a, b in pairs])
+        case "pupil":
+            return np.subtract(head.lens.pupil, reference.lens.pupil)[1:]
+        case "gamma":
+            return _pose_difference(head.T_zoom0_fixed, reference.T_zoom0_fixed)
+        case "hand":
+            return _pose_difference(head.hand_eye(), reference.hand_eye())
+        case _:
+            return np.array([getattr(head.axes, k) - getattr(reference.axes, k) for k in HEAD_NAMES[block]])
+
+
+def _pose_difference(T: RigidTransform, reference: RigidTransform) -> Array:
+    """Compute the step (w, d) from the reference to T, (6,), the inverse of `_moved`."""
+    turn = (T.rotation * reference.rotation.inv()).as_rotvec()
+    return np.concatenate([turn, T.translation - reference.translation])
 
 
 def _all_moved(boards: Mapping[int, RigidTransform], steps: Array) -> dict[int, RigidTransform]:
@@ -229,7 +251,7 @@ class Prediction:
     by_turn: Array | None
 
 
-def batches_of(model: RigModel, views: Sequence[View]) -> list[Batch]:
+def batches_of(model: BundleModel, views: Sequence[View]) -> list[Batch]:
     """Group views by lens; their placements must be among the model's boards.
 
     Raises:
@@ -239,7 +261,8 @@ def batches_of(model: RigModel, views: Sequence[View]) -> list[Batch]:
     lenses: dict[int | None, list[int]] = {}
     for row, view in enumerate(views):
         model.lens_of(view)
-        stop = None if view.camera == "fixed" or model.zoom is None else stop_of(model.zoom.nominal_px, view)
+        zoom = model.zoom_head
+        stop = None if view.camera == "fixed" or zoom is None else stop_of(zoom.lens.nominal_px, view)
         lenses.setdefault(stop, []).append(row)
     found = []
     for stop, rows in lenses.items():
@@ -260,14 +283,14 @@ def batches_of(model: RigModel, views: Sequence[View]) -> list[Batch]:
     return found
 
 
-def predict(model: RigModel, batch: Batch, points: Array, free: Collection[Block]) -> Prediction:
+def predict(model: BundleModel, batch: Batch, points: Array, free: Collection[Block]) -> Prediction:
     """Predict every corner of a batch with its derivatives; nan behind a camera."""
     if batch.stop is None:
         assert model.fixed is not None
-        lens, own = model.fixed, "fixed"
+        lens, own = model.fixed.lens, "fixed"
     else:
-        assert model.zoom is not None
-        lens, own = model.zoom.stops[batch.stop], "zoom"
+        assert model.zoom_head is not None
+        lens, own = model.zoom_head.lens.stops[batch.stop], "zoom"
     x, moved = _points_in_camera(model, batch, points)
     pixels, by_x, by_lens, by_k3 = _project(lens, x)
     columns = columns_of(free, model.stops)
@@ -295,7 +318,7 @@ def predict(model: RigModel, batch: Batch, points: Array, free: Collection[Block
     )
 
 
-def predict_pixels(model: RigModel, views: Sequence[View], points: Array) -> Array:
+def predict_pixels(model: BundleModel, views: Sequence[View], points: Array) -> Array:
     """Predict every corner of all views, (V, N, 2) [px]; nan behind a camera."""
     pixels = np.empty((len(views), len(points), 2))
     for batch in batches_of(model, views):
@@ -303,7 +326,7 @@ def predict_pixels(model: RigModel, views: Sequence[View], points: Array) -> Arr
     return pixels
 
 
-def _points_in_camera(model: RigModel, batch: Batch, points: Array) -> tuple[Array, dict[str, Array]]:
+def _points_in_camera(model: BundleModel, batch: Batch, points: Array) -> tuple[Array, dict[str, Array]]:
     """Map the board's points into the camera of each view, (v, N, 3), with derivatives (v, N, 3, parameters)."""
     M = np.stack([T.as_matrix() for T in model.boards.values()])[batch.owners]
     bulge = _bulge(points)
@@ -313,27 +336,29 @@ def _points_in_camera(model: RigModel, batch: Batch, points: Array) -> tuple[Arr
     d_warp = M[:, None, :3, 2:3] * bulge[:, None]  # dy/dwarp, (v, N, 3, 2)
     if batch.stop is None:
         return y, {"board": d_board, "warp": d_warp}
-    assert model.zoom is not None
-    R_g, R_h = model.gamma.rotation.as_matrix(), model.hand.rotation.as_matrix()
-    t_h = model.hand.translation
-    R_p, t_p, A = base_heads(model.head, batch.pan, batch.tilt)
+    head = model.zoom_head
+    assert head is not None
+    T = head.hand_eye()
+    R_g, R_h = head.T_zoom0_fixed.rotation.as_matrix(), T.rotation.as_matrix()
+    t_h = T.translation
+    R_p, t_p, A = base_heads(head.axes, batch.pan, batch.tilt)
     turned_g = y @ R_g.T
-    w = turned_g + model.gamma.translation  # x_zoom0
+    w = turned_g + head.T_zoom0_fixed.translation  # x_zoom0
     turned_h = w @ R_h.T
     v = turned_h + t_h  # x_base
     p = (v - t_p[:, None]) @ R_p  # x_head = R_p^T (x_base - t_p)
-    x = (p - t_h) @ R_h - model.zoom.pupil[batch.stop] * E3  # x_zoom, from the pupil
+    x = (p - t_h) @ R_h - head.lens.pupil[batch.stop] * E3  # x_zoom, from the pupil
     R_xp = R_h.T  # dx/dp
     R_xv = R_xp @ R_p.swapaxes(1, 2)  # dx/dv
     R_xw = R_xv @ R_h  # dx/dw
     d_hand = R_xv[:, None] @ _pose_derivative(turned_h) - R_xp @ _pose_derivative(p - t_h)
-    d_turn = R_xp @ _by_turn(model.head, A, p)
+    d_turn = R_xp @ _by_turn(head.axes, A, p)
     return x, {
         "board": (R_xw @ R_g)[:, None] @ d_board,
         "warp": (R_xw @ R_g)[:, None] @ d_warp,
         "gamma": R_xw[:, None] @ _pose_derivative(turned_g),
         "hand": d_hand,
-        "head": R_xp @ _by_head(model.head, A, p),
+        "head": R_xp @ _by_head(head.axes, A, p),
         "scale": d_turn * np.stack([batch.pan, batch.tilt], axis=-1)[:, None, None],
         "zero": d_turn,
         "turn": d_turn,
@@ -422,7 +447,7 @@ class Prior:
         sigmas: standard deviations by parameter name; a parameter without one has no prior.
     """
 
-    reference: RigModel
+    reference: BundleModel
     sigmas: Mapping[str, float]
 
 
@@ -465,7 +490,7 @@ class Evaluation:
         sigma: robust standard deviation of a coordinate of ``after`` [px].
     """
 
-    model: RigModel
+    model: BundleModel
     predictions: list[Prediction]
     residuals: list[Array]
     after: list[Array]
@@ -492,7 +517,7 @@ class Problem:
     prior: Prior | None
     jitter: float
 
-    def at(self, model: RigModel) -> Evaluation:
+    def at(self, model: BundleModel) -> Evaluation:
         """Evaluate a model: predict every view and compute the residuals."""
         predictions = [predict(model, batch, self.points, self.free) for batch in self.batches]
         residuals = [
@@ -601,7 +626,7 @@ class Problem:
             squares += float(off @ (information * off))
         return Equations(shared, mixed, board, shared_gradient, board_gradient, squares)
 
-    def _known(self, model: RigModel, variance: float) -> tuple[Array, Array]:
+    def _known(self, model: BundleModel, variance: float) -> tuple[Array, Array]:
         """Compute the free parameters' deviations from the prior's means, (n,), and their weights [px^2], (n,)."""
         assert self.prior is not None
         names = parameter_names(self.free, model.stops)
@@ -741,7 +766,7 @@ class Fit:
         views: views that were fitted.
     """
 
-    model: RigModel
+    model: BundleModel
     free: tuple[Block, ...]
     residuals: Array
     left: Array
@@ -757,7 +782,7 @@ class Fit:
 
 
 def fit(
-    model: RigModel,
+    model: BundleModel,
     views: Sequence[View],
     points: Array,
     free: Collection[Block],
@@ -810,7 +835,7 @@ def fit(
     return Fit(here.model, problem.free, residuals, left, normal, variance, jitter, tuple(views))
 
 
-def information(model: RigModel, views: Sequence[View], points: Array, free: Collection[Block]) -> Array:
+def information(model: BundleModel, views: Sequence[View], points: Array, free: Collection[Block]) -> Array:
     """Compute the normal matrix that views would add, with the boards' poses eliminated.
 
     Args:

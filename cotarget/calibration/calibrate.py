@@ -36,12 +36,12 @@ from cotarget.calibration.joint import (
 )
 from cotarget.calibration.model import (
     DEFAULT_OPTIONS,
+    BundleModel,
     CameraName,
     Capture,
     Options,
     Progress,
     Rejected,
-    RigModel,
     View,
     unseen,
 )
@@ -183,8 +183,8 @@ def _find_parts(
     rejected = [Rejected(view.name, NO_PLACE) for _, view in blank if view.board not in model.boards]
     found: list[View] = []
     for nominal in stops_of([view for _, view in blank]):
-        assert model.zoom is not None
-        model = replace(model, zoom=with_stop(model.zoom, nominal))
+        assert model.zoom_head is not None
+        model = model.with_zoom_head(lens=with_stop(model.zoom_head.lens, nominal))
         here: list[View] = []
         waiting = [(image, view) for image, view in blank if same_focal(view, nominal) and view.board in model.boards]
         for learning in (True, False):  # images missed in the first round may be found once the sample is fitted
@@ -205,7 +205,7 @@ def _find_parts(
     return found, rejected
 
 
-def _taught(model: RigModel, known: Sequence[View], here: Sequence[View], points: Array) -> RigModel:
+def _taught(model: BundleModel, known: Sequence[View], here: Sequence[View], points: Array) -> BundleModel:
     """Fit the last zoom sample of a model to the views at it."""
     numbers = {view.board for view in here}
     fixed = [view for view in known if view.camera == "fixed" and view.board in numbers]
@@ -265,13 +265,10 @@ def calibrate_views(
         solution = sequential(shortest, points, sizes, nominal[0] if nominal else None)
     model = solution.model
     assert model.fixed is not None
-    assert model.zoom is not None
+    assert model.zoom_head is not None
     return Calibration(
         fixed=model.fixed,
-        zoom=model.zoom,
-        T_zoom0_fixed=model.gamma,
-        T_head_zoom=model.hand if solution.has_head else None,
-        head=model.head,
+        zoom_head=model.zoom_head if solution.has_head else replace(model.zoom_head, T_head_zoom=None),
         pitch_mm=pitch_mm,
         residuals=replace(solution.residuals, rejected=(*rejected, *others, *solution.residuals.rejected)),
         covariance=solution.covariance,

@@ -16,7 +16,6 @@ import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,8 +28,9 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig, WrittenBoard
 from cotarget.errors import CalibrationError, ConfigError
 from cotarget.files import write_atomically
-from cotarget.geometry import Array, RigidTransform, pose_dict
-from cotarget.pantilt import IDEAL_HEAD, HeadGeometry
+from cotarget.geometry import pose_dict
+from cotarget.pantilt import HeadGeometry
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.schema import NotNegative, Pose, Positive, Size, model, validate
 
 Table = Mapping[str, Any]
@@ -41,11 +41,8 @@ class Calibration:
     """Calibration of a rig, with the views it comes from.
 
     Attributes:
-        fixed: intrinsics of the fixed camera.
-        zoom: optics of the zoom camera over its focal range.
-        T_zoom0_fixed: the paper's Gamma, at the shortest focal length.
-        T_head_zoom: the paper's T, at the shortest focal length; None where no head was calibrated.
-        head: geometry of the head.
+        fixed: fixed camera.
+        zoom_head: zoom camera on its pan-tilt head.
         pitch_mm: pixel size of the zoom camera [mm], for focal lengths in millimetres; None if unknown.
         residuals: residuals of the fit, and what was rejected.
         covariance: covariance of the parameters; None where the method gives none.
@@ -58,11 +55,8 @@ class Calibration:
         provenance: versions, options, time and origin of the captures; JSON values only.
     """
 
-    fixed: Intrinsics
-    zoom: ZoomLens
-    T_zoom0_fixed: RigidTransform
-    T_head_zoom: RigidTransform | None
-    head: HeadGeometry = IDEAL_HEAD
+    fixed: FixedCamera
+    zoom_head: ZoomHead
     pitch_mm: float | None = None
     residuals: Residuals | None = None
     covariance: Covariance | None = None
@@ -73,65 +67,26 @@ class Calibration:
     views: tuple[View, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    def hand_eye(self, nominal_px: float | None = None) -> RigidTransform:
-        """Return T_head_zoom at a focal length, and refuse a calibration without it.
-
-        Args:
-            nominal_px: nominal focal length whose entrance pupil is the origin [px]; None for the shortest one.
-
-        Raises:
-            CalibrationError: no head was calibrated.
-        """
-        if self.T_head_zoom is None:
-            raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
-        if nominal_px is None:
-            return self.T_head_zoom
-        return self.T_head_zoom * self.zoom.to_pupil(nominal_px)
-
-    @cached_property
-    def T_base_fixed(self) -> RigidTransform:
-        """Transform from the fixed camera to the base, T_head_zoom T_zoom0_fixed (Eq. 6).
-
-        Raises:
-            CalibrationError: no head was calibrated.
-        """
-        return self.hand_eye() * self.T_zoom0_fixed
-
-    @cached_property
-    def _base_fixed(self) -> Array:
-        """Rotation and translation of T_base_fixed side by side, (3, 4)."""
-        return self.T_base_fixed.as_matrix()[:3]
-
-    def in_base(self, x_fixed: Array) -> Array:
-        """Map a point from the fixed camera's frame to the base's, (3,) [m] (Eq. 6).
-
-        It takes a third of the time of scipy's transform.
-
-        Raises:
-            CalibrationError: no head was calibrated.
-        """
-        x, y, z = x_fixed
-        return np.asarray(self._base_fixed @ np.array((x, y, z, 1.0)))
-
     def for_streams(self, fixed_size: tuple[int, int], zoom_size: tuple[int, int]) -> "Calibration":
         """Return the calibration for streams scaled to other sizes (width, height) [px].
 
         Raises:
             ConfigError: the aspect ratio of a stream differs from that calibrated.
         """
-        factors = {"fixed": fixed_size[0] / self.fixed.size[0], "zoom": zoom_size[0] / self.zoom.size[0]}
+        zoom = self.zoom_head.lens
+        factors = {"fixed": fixed_size[0] / self.fixed.size[0], "zoom": zoom_size[0] / zoom.size[0]}
         covariance = self.covariance
         if covariance is not None:
             in_pixels = ("fx", "fy", "cx", "cy")
             covariance = covariance.scaled(
                 {f"fixed.{k}": factors["fixed"] for k in in_pixels}
-                | {f"zoom[{i}].{k}": factors["zoom"] for i in range(len(self.zoom.stops)) for k in in_pixels}
+                | {f"zoom[{i}].{k}": factors["zoom"] for i in range(len(zoom.stops)) for k in in_pixels}
             )
-        pitch_mm = self.pitch_mm and self.pitch_mm * self.zoom.size[0] / zoom_size[0]  # a larger pixel, where binned
+        pitch_mm = self.pitch_mm and self.pitch_mm * zoom.size[0] / zoom_size[0]  # a larger pixel, where binned
         return replace(
             self,
             fixed=self.fixed.resized(fixed_size),
-            zoom=self.zoom.resized(zoom_size),
+            zoom_head=self.zoom_head.resized(zoom_size),
             covariance=covariance,
             pitch_mm=pitch_mm,
             views=tuple(view.scaled(factors[view.camera]) for view in self.views),
@@ -383,11 +338,8 @@ class CalibrationTable:
     def calibration(self) -> Calibration:
         """Make the calibration."""
         return Calibration(
-            fixed=self.fixed.intrinsics(self.fixed.size),
-            zoom=self.zoom.lens(),
-            T_zoom0_fixed=self.T_zoom0_fixed,
-            T_head_zoom=self.T_head_zoom,
-            head=self.head.geometry(),
+            fixed=FixedCamera(self.fixed.intrinsics(self.fixed.size)),
+            zoom_head=ZoomHead(self.zoom.lens(), self.T_zoom0_fixed, self.T_head_zoom, self.head.geometry()),
             jitter=math.radians(self.head.jitter_deg),
             pitch_mm=self.pitch_mm,
             residuals=self.residuals,
@@ -474,27 +426,27 @@ def load_calibration(path: Path) -> Calibration:
 
 def _table(calibration: Calibration) -> dict[str, Any]:
     """Make the JSON object of a calibration."""
-    T_head_zoom = calibration.T_head_zoom
+    head = calibration.zoom_head
     covariance = calibration.covariance
     return {
         "schema": SCHEMA,
-        "fixed": {"size": list(calibration.fixed.size), **_write_intrinsics(calibration.fixed)},
+        "fixed": {"size": list(calibration.fixed.size), **_write_intrinsics(calibration.fixed.lens)},
         "zoom": {
-            "size": list(calibration.zoom.size),
+            "size": list(head.lens.size),
             "stops": [
                 {"nominal_px": float(nominal), **_write_intrinsics(stop), "pupil": float(pupil)}
-                for nominal, stop, pupil in zip(*_columns(calibration.zoom), strict=True)
+                for nominal, stop, pupil in zip(*_columns(head.lens), strict=True)
             ],
         },
-        "T_zoom0_fixed": pose_dict(calibration.T_zoom0_fixed),
-        "T_head_zoom": None if T_head_zoom is None else pose_dict(T_head_zoom),
+        "T_zoom0_fixed": pose_dict(head.T_zoom0_fixed),
+        "T_head_zoom": None if head.T_head_zoom is None else pose_dict(head.T_head_zoom),
         "head": {
-            "axis_offset": float(calibration.head.axis_offset),
-            "squareness_deg": math.degrees(calibration.head.squareness),
-            "pan_scale": float(calibration.head.pan_scale),
-            "tilt_scale": float(calibration.head.tilt_scale),
-            "pan_zero_deg": math.degrees(calibration.head.pan_zero),
-            "tilt_zero_deg": math.degrees(calibration.head.tilt_zero),
+            "axis_offset": float(head.axes.axis_offset),
+            "squareness_deg": math.degrees(head.axes.squareness),
+            "pan_scale": float(head.axes.pan_scale),
+            "tilt_scale": float(head.axes.tilt_scale),
+            "pan_zero_deg": math.degrees(head.axes.pan_zero),
+            "tilt_zero_deg": math.degrees(head.axes.tilt_zero),
             "jitter_deg": math.degrees(calibration.jitter),
         },
         "pitch_mm": calibration.pitch_mm,

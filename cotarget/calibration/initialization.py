@@ -18,11 +18,12 @@ import numpy as np
 
 from cotarget.calibration.bundle import Fit, fit, predict_pixels, robust_sigma
 from cotarget.calibration.handeye import motions, park_martin, solve_hand_eye_from_motions
-from cotarget.calibration.model import CameraName, Rejected, RigModel, View, stop_of
+from cotarget.calibration.model import BundleModel, CameraName, Rejected, View, stop_of
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform, Rotation
-from cotarget.pantilt import base_head, zoom_fixed
+from cotarget.pantilt import base_head
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 
 # Intrinsics and board pose of one camera
 
@@ -59,9 +60,9 @@ def calibrate_camera(
     lens = start or rough_intrinsics(camera, views, points, size)
     alone = [replace(view, camera="fixed", board=i) for i, view in enumerate(views)]
     boards = {i: board_pose(lens, view.corners_px, points) for i, view in enumerate(views)}
-    result = fit(RigModel(boards=boards, fixed=lens), alone, points, {"fixed"})
+    result = fit(BundleModel(boards=boards, fixed=FixedCamera(lens)), alone, points, {"fixed"})
     assert result.model.fixed is not None
-    return result.model.fixed, result
+    return result.model.fixed.lens, result
 
 
 def rough_intrinsics(camera: CameraName, views: Sequence[View], points: Array, size: tuple[int, int]) -> Intrinsics:
@@ -150,7 +151,7 @@ def _seen(points: Array, corners_px: Array) -> tuple[Array, Array]:
 ASKED_VIEWS = 2  # views of a placement whose candidate poses are tried on all of its views
 
 
-def place_boards(model: RigModel, views: Sequence[View], points: Array) -> RigModel:
+def place_boards(model: BundleModel, views: Sequence[View], points: Array) -> BundleModel:
     """Choose the pose of every placement: of the candidates from its views, the one that fits all its views best.
 
     Args:
@@ -174,18 +175,19 @@ def place_boards(model: RigModel, views: Sequence[View], points: Array) -> RigMo
     return replace(model, boards=boards)
 
 
-def _suggested(model: RigModel, view: View, points: Array) -> list[RigidTransform]:
+def _suggested(model: BundleModel, view: View, points: Array) -> list[RigidTransform]:
     """Find the candidates of T_fixed_board from one view."""
     poses = pose_candidates(model.lens_of(view), view.corners_px, points)
     if view.camera == "fixed":
         return poses
-    assert model.zoom is not None
-    pupil = RigidTransform.from_translation([0.0, 0.0, model.zoom.pupil[stop_of(model.zoom.nominal_px, view)]])
-    T_fixed_zoom = zoom_fixed(view.pan, view.tilt, model.hand, model.gamma, model.head).inv() * pupil
+    head = model.zoom_head
+    assert head is not None
+    pupil = RigidTransform.from_translation([0.0, 0.0, head.lens.pupil[stop_of(head.lens.nominal_px, view)]])
+    T_fixed_zoom = head.T_fixed_zoom(view.pan, view.tilt) * pupil
     return [T_fixed_zoom * T for T in poses]
 
 
-def _misfit(model: RigModel, number: int, T: RigidTransform, views: Sequence[View], points: Array) -> float:
+def _misfit(model: BundleModel, number: int, T: RigidTransform, views: Sequence[View], points: Array) -> float:
     """Compute the mean distance between predicted and seen corners [px]; infinite behind a camera."""
     pixels = predict_pixels(replace(model, boards={number: T}), views, points)
     off = np.concatenate([
@@ -210,7 +212,7 @@ class Steps:
         rejected: views left out.
     """
 
-    model: RigModel
+    model: BundleModel
     fixed_fit: Fit
     zoom_fit: Fit
     views: tuple[View, ...]
@@ -228,14 +230,16 @@ def both_cameras(
     """Calibrate each camera by itself, from views at one focal length (step 1 of the sequential method)."""
     fixed, fixed_fit, fixed_views, fixed_rejected = one_camera("fixed", views, points, sizes["fixed"])
     zoom, zoom_fit, zoom_views, zoom_rejected = one_camera("zoom", views, points, sizes["zoom"])
-    model = RigModel({}, fixed, ZoomLens((nominal_px or zoom.focal_px[0],), (zoom,)))
+    lens = ZoomLens((nominal_px or zoom.focal_px[0],), (zoom,))
+    still = RigidTransform.identity()
+    model = BundleModel({}, FixedCamera(fixed), ZoomHead(lens, still, still))
     rejected = (*fixed_rejected, *zoom_rejected)
     return Steps(model, fixed_fit, zoom_fit, (*fixed_views, *zoom_views), rejected)
 
 
-def stereo(model: RigModel, pairs: Sequence[View], points: Array) -> Fit:
+def stereo(model: BundleModel, pairs: Sequence[View], points: Array) -> Fit:
     """Fit Gamma to pairs at home with the intrinsics held (step 2 of the sequential method)."""
-    start = replace(model, gamma=rough_gamma(model, pairs, points))
+    start = model.with_zoom_head(T_zoom0_fixed=rough_gamma(model, pairs, points))
     return fit(place_boards(start, pairs, points), pairs, points, {"gamma"})
 
 
@@ -313,7 +317,7 @@ def of_both(views: Sequence[View]) -> tuple[View, ...]:
     return tuple(view for view in views if view.board in seen[0] & seen[1])
 
 
-def rough_gamma(model: RigModel, views: Sequence[View], points: Array) -> RigidTransform:
+def rough_gamma(model: BundleModel, views: Sequence[View], points: Array) -> RigidTransform:
     """Estimate Gamma from placements that both cameras see at any head pose: the candidate nearest to all others.
 
     Args:
@@ -322,18 +326,19 @@ def rough_gamma(model: RigModel, views: Sequence[View], points: Array) -> RigidT
         points: the board's corners in its frame [m], (N, 3).
     """
     assert model.fixed is not None
+    assert model.zoom_head is not None
+    T, axes = model.zoom_head.hand_eye(), model.zoom_head.axes
     by_board: dict[int, list[View]] = defaultdict(list)
     for view in views:
         by_board[view.board].append(view)
     candidates = []
     for same in by_board.values():
-        boards = [board_pose(model.fixed, v.corners_px, points) for v in same if v.camera == "fixed"]
+        boards = [board_pose(model.fixed.lens, v.corners_px, points) for v in same if v.camera == "fixed"]
         for view in same:
             if view.camera == "fixed":
                 continue
             T_zoom_board = board_pose(model.lens_of(view), view.corners_px, points)
-            head = base_head(view.pan, view.tilt, model.head)
-            T_zoom0_zoom = model.hand.inv() * head * model.hand  # Eq. 2 solved for Gamma
+            T_zoom0_zoom = T.inv() * base_head(view.pan, view.tilt, axes) * T  # Eq. 2 solved for Gamma
             candidates += [T_zoom0_zoom * T_zoom_board * board.inv() for board in boards]
     return _most_central(candidates, scale=float(np.ptp(points, axis=0).max()))
 
@@ -347,7 +352,7 @@ def _most_central(candidates: Sequence[RigidTransform], scale: float) -> RigidTr
     return candidates[int(np.argmin(np.median(far + turned, axis=1)))]
 
 
-def rough_hand(model: RigModel, views: Sequence[View], points: Array, *, regularize: bool = False) -> RigidTransform:
+def rough_hand(model: BundleModel, views: Sequence[View], points: Array, *, regularize: bool = False) -> RigidTransform:
     """Estimate T from all motions within each placement, by Park and Martin's method.
 
     Args:
@@ -364,14 +369,14 @@ def rough_hand(model: RigModel, views: Sequence[View], points: Array, *, regular
 
 
 def head_motions(
-    model: RigModel, views: Sequence[View], points: Array
+    model: BundleModel, views: Sequence[View], points: Array
 ) -> tuple[list[RigidTransform], list[RigidTransform]]:
     """Make the motions A of the head and B of the camera between all zoom views of each placement (Eq. 3).
 
     Raises:
         CalibrationError: no placement is seen from two head poses.
     """
-    assert model.zoom is not None
+    assert model.zoom_head is not None
     placements: dict[int, list[View]] = defaultdict(list)
     for view in views:
         if view.camera == "zoom":
@@ -379,7 +384,7 @@ def head_motions(
     A: list[RigidTransform] = []
     B: list[RigidTransform] = []
     for same in placements.values():
-        heads = [base_head(view.pan, view.tilt, model.head) for view in same]
+        heads = [base_head(view.pan, view.tilt, model.zoom_head.axes) for view in same]
         boards = [board_pose(model.lens_of(view), view.corners_px, points) for view in same]
         for more, motion in zip((A, B), motions(heads, boards), strict=True):
             more.extend(motion)

@@ -59,11 +59,11 @@ from cotarget.calibration.initialization import (
 )
 from cotarget.calibration.model import (
     DEFAULT_OPTIONS,
+    BundleModel,
     CameraName,
     Options,
     Rejected,
     Residuals,
-    RigModel,
     Solution,
     View,
     stop_of,
@@ -228,22 +228,22 @@ def with_stop(lens: ZoomLens, nominal_px: float) -> ZoomLens:
     return ZoomLens((*lens.nominal_px, nominal_px), (*lens.stops, guess), (*lens.pupil, lens.pupil[-1]))
 
 
-def lens_prior(model: RigModel) -> Prior:
+def lens_prior(model: BundleModel) -> Prior:
     """Make the prior of the zoom samples beyond the first, from `PUPIL_SIGMA` and `BENT_SIGMAS`."""
-    assert model.zoom is not None
+    assert model.zoom_head is not None
+    lens = model.zoom_head.lens
     sigmas: dict[str, float] = {}
     stops = []
-    for i, (stop, nominal) in enumerate(zip(model.zoom.stops, model.zoom.nominal_px, strict=True)):
-        m = nominal / model.zoom.nominal_px[0]
+    for i, (stop, nominal) in enumerate(zip(lens.stops, lens.nominal_px, strict=True)):
+        m = nominal / lens.nominal_px[0]
         stops.append(replace(stop, distortion=(0.0,) * 5) if i else stop)
         if i:
             sigmas[f"zoom[{i}].pupil"] = PUPIL_SIGMA
             sigmas |= {f"zoom[{i}].{name}": sigma * m**power for name, (sigma, power) in BENT_SIGMAS.items()}
-    still = ZoomLens(model.zoom.nominal_px, tuple(stops))
-    return Prior(replace(model, zoom=still), sigmas)
+    return Prior(model.with_zoom_head(lens=ZoomLens(lens.nominal_px, tuple(stops))), sigmas)
 
 
-def fit_stop(model: RigModel, number: int, views: Sequence[View], points: Array) -> RigModel:
+def fit_stop(model: BundleModel, number: int, views: Sequence[View], points: Array) -> BundleModel:
     """Fit one zoom sample to views at it; every other parameter of the model is held.
 
     The boards' poses are free during the fit, and are returned as they were.
@@ -261,7 +261,7 @@ def fit_stop(model: RigModel, number: int, views: Sequence[View], points: Array)
     return replace(found.model, boards=model.boards)
 
 
-def expected_corners(model: RigModel, view: View, points: Array) -> Array:
+def expected_corners(model: BundleModel, view: View, points: Array) -> Array:
     """Predict the corners of a view's board, (N, 2) [px]; nan behind the camera.
 
     Args:
@@ -292,17 +292,18 @@ def find_expected(image: Image, board: BoardConfig, expected_px: Array) -> Array
     return found
 
 
-def check_stops(model: RigModel) -> None:
+def check_stops(model: BundleModel) -> None:
     """Refuse a lens whose true focal length does not grow with the nominal one.
 
     Raises:
         CalibrationError: two zoom samples contradict each other.
     """
-    assert model.zoom is not None
-    focal = [stop.focal_px[0] for stop in model.zoom.stops]
+    assert model.zoom_head is not None
+    lens = model.zoom_head.lens
+    focal = [stop.focal_px[0] for stop in lens.stops]
     for i, (a, b) in enumerate(itertools.pairwise(focal)):
         if b <= a:
-            n = model.zoom.nominal_px
+            n = lens.nominal_px
             raise CalibrationError(
                 f"zoom lens: the true focal length comes out as {a:.0f} px at {n[i]:.0f} px and {b:.0f} px at "
                 f"{n[i + 1]:.0f} px by the device's account; check that the lens stood still and was where it said"
@@ -369,8 +370,8 @@ def joint(
         raise CalibrationError("the head moved only at other focal lengths than the shortest; turn it there as well")
     model = steps.model
     if steps.has_head:
-        model = replace(model, hand=rough_hand(model, steps.views, points, regularize=options.regularize))
-    model = replace(model, gamma=rough_gamma(model, of_both(steps.views), points))
+        model = model.with_zoom_head(T_head_zoom=rough_hand(model, steps.views, points, regularize=options.regularize))
+    model = model.with_zoom_head(T_zoom0_fixed=rough_gamma(model, of_both(steps.views), points))
     used, rejected = list(steps.views), list(steps.rejected)
     blocks = tuple(block for block in ALL_BLOCKS if steps.has_head or block not in ("hand", "head"))
     warp_sigma = WARP_SHARE * float(np.ptp(points, axis=0).max())
@@ -427,16 +428,21 @@ def undetermined(found: Fit) -> str:
     return name_directions(names, weak_directions(found.normal, names, found.variance or 0.0, focal), focal)
 
 
-def _known(model: RigModel, start: RigModel, blocks: Sequence[Block], options: Options, warp_sigma: float) -> Prior:
+def _known(
+    model: BundleModel, start: BundleModel, blocks: Sequence[Block], options: Options, warp_sigma: float
+) -> Prior:
     """Make the prior of the board's warp, the zoom lens, the encoders, and of T, Gamma and head if regularized.
 
     The prior of T, Gamma and the head's geometry is at the start, with `limits_of_use` as standard deviations. It does
     not change directions that the corners determine, and it bounds the uncertainty of the others.
     """
-    reference, sigmas = replace(start, zoom=model.zoom), dict.fromkeys(("board.warp_x", "board.warp_y"), warp_sigma)
+    sigmas = dict.fromkeys(("board.warp_x", "board.warp_y"), warp_sigma)
+    known = model
     if model.stops > 1:
         lens = lens_prior(model)
-        reference, sigmas = replace(reference, zoom=lens.reference.zoom), {**sigmas, **lens.sigmas}
+        known, sigmas = lens.reference, {**sigmas, **lens.sigmas}
+    assert known.zoom_head is not None
+    reference = start.with_zoom_head(lens=known.zoom_head.lens)
     if options.regularize:
         names = [
             name for name in parameter_names(blocks, model.stops) if not name.startswith(("fixed.", "zoom[", "board."))
@@ -449,7 +455,7 @@ def _known(model: RigModel, start: RigModel, blocks: Sequence[Block], options: O
 
 def _all_stops(
     found: Fit, views: Sequence[View], points: Array, nominal_px: Sequence[float]
-) -> tuple[RigModel, list[View], list[Rejected]]:
+) -> tuple[BundleModel, list[View], list[Rejected]]:
     """Add the zoom samples beyond the first in their order, each fitted by itself.
 
     Returns:
@@ -457,7 +463,7 @@ def _all_stops(
     """
     model, used, rejected = found.model, list(found.views), []
     for number, nominal in enumerate(nominal_px[1:], start=1):
-        assert model.zoom is not None
+        assert model.zoom_head is not None
         at_stop = [v for v in views if v.camera == "zoom" and stop_of(nominal_px, v) == number]
         here = [v for v in at_stop if v.board in model.boards]
         rejected += [Rejected(v.name, NO_PLACE) for v in at_stop if v.board not in model.boards]
@@ -468,7 +474,7 @@ def _all_stops(
             continue
         seen_too = {view.board for view in here}
         with_fixed = [view for view in used if view.camera == "fixed" and view.board in seen_too]
-        start = replace(model, zoom=with_stop(model.zoom, nominal))
+        start = model.with_zoom_head(lens=with_stop(model.zoom_head.lens, nominal))
         model = fit_stop(start, start.stops - 1, [*with_fixed, *here], points)
         used += here
     return model, used, rejected
@@ -571,7 +577,7 @@ def _with_k3_where_needed(found: Fit, points: Array, prior: Prior) -> tuple[Fit,
     covariance = covariance_of(freely)
     if covariance is None or freely.model.fixed is None:
         return found, prior
-    k3, sigma = freely.model.fixed.distortion[4], covariance.sigma("fixed.k3")
+    k3, sigma = freely.model.fixed.lens.distortion[4], covariance.sigma("fixed.k3")
     return fitted(freely, float(np.sqrt(k3**2 - sigma**2))) if abs(k3) > K3_SIGMAS * sigma else (found, prior)
 
 

@@ -1,22 +1,19 @@
-"""Data of a calibration: captures, views, options, the rig's model, residuals and covariance."""
+"""Data of a calibration: captures, views, options, the model of a fit, residuals and covariance."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from annotated_types import Ge
 
-from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.camera import Intrinsics
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
-from cotarget.pantilt import IDEAL_HEAD, HeadGeometry
 from cotarget.rig import Image
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.schema import NotNegative, model
-
-STILL = RigidTransform.identity()
-
 
 CameraName = Literal["fixed", "zoom"]
 Count = Annotated[int, Ge(0)]
@@ -208,37 +205,37 @@ class HeldOut:
 
 
 @dataclass(frozen=True, eq=False)
-class RigModel:
-    """Model of a rig and its boards: all that predicts the corners of a view.
+class BundleModel:
+    """Parameters of a bundle adjustment: the rig's geometry and the boards, which predict the corners of every view.
 
     Attributes:
-        fixed: intrinsics of the fixed camera; None while only the zoom camera is modelled.
-        zoom: optics of the zoom camera; None while only the fixed camera is modelled.
-        gamma: T_zoom0_fixed, at the first zoom sample.
-        hand: T_head_zoom, at the first zoom sample.
-        head: geometry of the head.
         boards: T_fixed_board by the number of the placement.
+        fixed: fixed camera; None while only the zoom camera is modelled.
+        zoom_head: zoom camera on its head; None while only the fixed camera is modelled. Its T_head_zoom is the
+            identity until it is estimated, and where the head never moves.
         warp: height of the board's middle above its edges, towards its z, by the bend along x and along y [m].
     """
 
     boards: Mapping[int, RigidTransform]
-    fixed: Intrinsics | None = None
-    zoom: ZoomLens | None = None
-    gamma: RigidTransform = STILL
-    hand: RigidTransform = STILL
-    head: HeadGeometry = IDEAL_HEAD
+    fixed: FixedCamera | None = None
+    zoom_head: ZoomHead | None = None
     warp: tuple[float, float] = (0.0, 0.0)
+
+    def with_zoom_head(self, **changes: Any) -> "BundleModel":
+        """Return the model with fields of its `ZoomHead` replaced."""
+        assert self.zoom_head is not None
+        return replace(self, zoom_head=replace(self.zoom_head, **changes))
 
     @property
     def stops(self) -> int:
         """Number of zoom samples."""
-        return 0 if self.zoom is None else len(self.zoom.stops)
+        return 0 if self.zoom_head is None else len(self.zoom_head.lens.stops)
 
     @property
     def focal_px(self) -> dict[str, float]:
         """Focal length of every lens [px], by the prefix of its parameters' names ("fixed", "zoom[0]")."""
-        found = {} if self.fixed is None else {"fixed": self.fixed.focal_px[0]}
-        stops = () if self.zoom is None else self.zoom.stops
+        found = {} if self.fixed is None else {"fixed": self.fixed.lens.focal_px[0]}
+        stops = () if self.zoom_head is None else self.zoom_head.lens.stops
         return found | {f"zoom[{i}]": stop.focal_px[0] for i, stop in enumerate(stops)}
 
     def lens_of(self, view: View) -> Intrinsics:
@@ -248,9 +245,10 @@ class RigModel:
             CalibrationError: there is no model of the view's camera.
         """
         if view.camera == "fixed" and self.fixed is not None:
-            return self.fixed
-        if view.camera == "zoom" and self.zoom is not None:
-            return self.zoom.stops[stop_of(self.zoom.nominal_px, view)]
+            return self.fixed.lens
+        if view.camera == "zoom" and self.zoom_head is not None:
+            lens = self.zoom_head.lens
+            return lens.stops[stop_of(lens.nominal_px, view)]
         raise CalibrationError(f"there are views of the {view.camera} camera, but no model of it")
 
 
@@ -268,7 +266,7 @@ class Solution:
         held_out: result of the held-out check, or None.
     """
 
-    model: RigModel
+    model: BundleModel
     residuals: Residuals
     views: tuple[View, ...]
     has_head: bool

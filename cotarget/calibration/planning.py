@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from cotarget.board import board_outline, board_points
 from cotarget.calibration.bundle import Block, Fit, base_heads, information, parameter_names
-from cotarget.calibration.model import RigModel, View, unseen
+from cotarget.calibration.model import BundleModel, View, unseen
 from cotarget.calibration.uncertainty import miss_derivatives
 from cotarget.camera import Intrinsics
 from cotarget.config import BoardConfig
@@ -43,7 +43,7 @@ class PredictedAccuracy:
         pointing: mean over targets of J^T J, with J the derivative of the pointing error by the parameters, (n, n).
     """
 
-    model: RigModel
+    model: BundleModel
     free: tuple[Block, ...]
     normal: Array
     variance: float
@@ -91,13 +91,13 @@ def predict_accuracy(found: Fit, square: float) -> PredictedAccuracy | None:
         The prediction; None where there are too few corners, or no target is within reach.
     """
     model = found.model
-    if found.variance is None or model.fixed is None or model.zoom is None:
+    if found.variance is None or model.fixed is None or model.zoom_head is None:
         return None
     size = np.array(model.fixed.size, dtype=float) - 1
     u, v, z = np.meshgrid(*(np.linspace(BORDER, 1 - BORDER, n) for n in ACCURACY_GRID), DEPTHS_SQUARES)
     pixels = np.stack([u.ravel(), v.ravel()], axis=-1) * size
     names = parameter_names(found.free, model.stops)
-    J, _ = miss_derivatives(model, names, pixels, z.ravel() * square, model.zoom.nominal_px[0])
+    J, _ = miss_derivatives(model, names, pixels, z.ravel() * square, model.zoom_head.lens.nominal_px[0])
     reached = np.isfinite(J).all(axis=(1, 2))
     if not reached.any():
         return None
@@ -215,7 +215,7 @@ def distance(board: BoardConfig, lens: Intrinsics, share: float) -> float:
 
 
 def plan_placements(
-    model: RigModel,
+    model: BundleModel,
     board: BoardConfig,
     coverage: dict[str, Coverage],
     shares: Sequence[float],
@@ -228,7 +228,7 @@ def plan_placements(
     """Choose a board placement for each distance: of random candidates, the one that adds most to the coverage.
 
     Args:
-        model: rough model of the rig; while its ``zoom`` is None, only the fixed camera counts.
+        model: rough model of the rig; while its ``zoom_head`` is None, only the fixed camera counts.
         board: the board.
         coverage: coverage of the images "fixed" and "zoom".
         shares: distances, as shares of the way from near to far.
@@ -241,27 +241,28 @@ def plan_placements(
         T_fixed_board, one for each distance at which a candidate is visible.
     """
     assert model.fixed is not None
+    fixed, head = model.fixed, model.zoom_head
     chosen = []
     for share in shares:
-        pixels = rng.uniform(size=(CANDIDATES, 2)) * (np.array(model.fixed.size) - 1)
+        pixels = rng.uniform(size=(CANDIDATES, 2)) * (np.array(fixed.size) - 1)
         turns = random_turns(CANDIDATES, rng)
         middle = board_points(board).mean(axis=0)
-        x = model.fixed.ray(pixels) * distance(board, model.fixed, share)
-        if model.zoom is not None:
-            turns = _between(x, model.gamma.inv().translation) * turns
+        x = fixed.ray(pixels) * distance(board, fixed.lens, share)
+        if head is not None:
+            turns = _between(x, head.T_zoom0_fixed.inv().translation) * turns
         R = turns.as_matrix()
         t = x - R @ middle
         x_fixed = board_body(board) @ R.swapaxes(1, 2) + t[:, None]
-        good, seen = visible(model.fixed, x_fixed, board, margin_px)
-        good &= ~coverage["fixed"].hidden(pixels, distance(board, model.fixed, share))
-        if model.zoom is not None:
-            x_zoom0 = model.gamma.apply(x_fixed.reshape(-1, 3)).reshape(x_fixed.shape)
-            in_zoom, seen_zoom = visible(model.zoom.stops[0], x_zoom0, board, margin_px)
+        good, seen = visible(fixed.lens, x_fixed, board, margin_px)
+        good &= ~coverage["fixed"].hidden(pixels, distance(board, fixed.lens, share))
+        if head is not None:
+            x_zoom0 = head.T_zoom0_fixed.apply(x_fixed.reshape(-1, 3)).reshape(x_fixed.shape)
+            in_zoom, seen_zoom = visible(head.lens.stops[0], x_zoom0, board, margin_px)
             good = np.logical_and(good, in_zoom) if shared else good
         gains: list[tuple[float, int]] = []
         for k in np.flatnonzero(good):
             gain = coverage["fixed"].gain(seen[k])
-            if model.zoom is not None and in_zoom[k]:
+            if head is not None and in_zoom[k]:
                 gain += coverage["zoom"].gain(seen_zoom[k])
             gains.append((gain, int(k)))
         for _, candidate in sorted(gains, reverse=True):
@@ -299,7 +300,7 @@ def _between(x_fixed: Array, center_fixed: Array) -> Rotation:
 
 
 def plan_poses(
-    model: RigModel,
+    model: BundleModel,
     T_fixed_board: RigidTransform,
     board: BoardConfig,
     coverage: Coverage,
@@ -323,12 +324,13 @@ def plan_poses(
     Returns:
         Up to ``count`` pairs (pan, tilt) [rad], within the limits.
     """
-    assert model.zoom is not None
-    lens = model.zoom.stops[0]
-    middle = (model.hand * model.gamma * T_fixed_board).apply(board_points(board).mean(axis=0))
+    head = model.zoom_head
+    assert head is not None
+    lens = head.lens.stops[0]
+    middle = (head.T_base_fixed * T_fixed_board).apply(board_points(board).mean(axis=0))
     ray = lens.ray(lens.image_center_px)
     try:
-        centred = nearest(solve(middle, model.hand, model.head, ray), limits.pan, limits.tilt)
+        centred = nearest(solve(middle, head.hand_eye(), head.axes, ray), limits.pan, limits.tilt)
     except UnreachableError:
         return []
     reach = np.arctan(np.hypot(*lens.size) / 2 / lens.focal_px[0])
@@ -336,10 +338,10 @@ def plan_poses(
     tilt = float(centred.tilt) + rng.uniform(-reach, reach, POSES)
     allowed = limits.allow(pan, tilt)
     pan, tilt = pan[allowed], tilt[allowed]
-    x_base = (model.hand * model.gamma * T_fixed_board).apply(board_body(board))
-    R, t, _ = base_heads(model.head, pan, tilt)
+    x_base = (head.T_base_fixed * T_fixed_board).apply(board_body(board))
+    R, t, _ = base_heads(head.axes, pan, tilt)
     x_head = (x_base - t[:, None]) @ R
-    x_zoom = model.hand.inv().apply(x_head.reshape(-1, 3)).reshape(x_head.shape)
+    x_zoom = head.hand_eye().inv().apply(x_head.reshape(-1, 3)).reshape(x_head.shape)
     good, seen = visible(lens, x_zoom, board, margin_px)
     candidates = [int(k) for k in np.flatnonzero(good)]
     chosen: list[tuple[float, float]] = []
@@ -352,11 +354,11 @@ def plan_poses(
     return chosen
 
 
-def seen_at_home(model: RigModel, T_fixed_board: RigidTransform, board: BoardConfig) -> bool:
+def seen_at_home(model: BundleModel, T_fixed_board: RigidTransform, board: BoardConfig) -> bool:
     """Check whether the zoom camera should see a board at pan = tilt = 0."""
-    assert model.zoom is not None
-    x_zoom = (model.gamma * T_fixed_board).apply(board_body(board))
-    return bool(visible(model.zoom.stops[0], x_zoom[None], board, 0.0)[0][0])
+    assert model.zoom_head is not None
+    x_zoom = (model.zoom_head.T_zoom0_fixed * T_fixed_board).apply(board_body(board))
+    return bool(visible(model.zoom_head.lens.stops[0], x_zoom[None], board, 0.0)[0][0])
 
 
 def random_turns(count: int, rng: np.random.Generator) -> Rotation:

@@ -13,7 +13,7 @@ from cotarget.board import board_points
 from cotarget.calibration.bundle import predict_pixels
 from cotarget.calibration.file import Calibration
 from cotarget.calibration.initialization import at_home, place_boards
-from cotarget.calibration.model import RigModel, View
+from cotarget.calibration.model import BundleModel, View
 from cotarget.calibration.uncertainty import model_of
 from cotarget.errors import CalibrationError
 from cotarget.rig import RigSpec
@@ -68,8 +68,8 @@ def implausibility(calibration: Calibration, spec: RigSpec | None = None) -> str
 
 
 def _impossible_lens(calibration: Calibration) -> str:
-    lenses = {"fixed": calibration.fixed}
-    lenses |= {f"zoom.stops[{i}]": stop for i, stop in enumerate(calibration.zoom.stops)}
+    lenses = {"fixed": calibration.fixed.lens}
+    lenses |= {f"zoom.stops[{i}]": stop for i, stop in enumerate(calibration.zoom_head.lens.stops)}
     low, high = FOCAL_WIDTHS
     for where, lens in lenses.items():
         fx, fy = lens.focal_px
@@ -85,18 +85,19 @@ def _impossible_lens(calibration: Calibration) -> str:
 
 
 def _impossible_length(calibration: Calibration) -> str:
+    head = calibration.zoom_head
     lengths = {
-        "T_zoom0_fixed": float(np.linalg.norm(calibration.T_zoom0_fixed.translation)),
-        "head.axis_offset": abs(calibration.head.axis_offset),
+        "T_zoom0_fixed": float(np.linalg.norm(head.T_zoom0_fixed.translation)),
+        "head.axis_offset": abs(head.axes.axis_offset),
     }
-    if calibration.T_head_zoom is not None:
-        lengths["T_head_zoom"] = float(np.linalg.norm(calibration.T_head_zoom.translation))
+    if head.T_head_zoom is not None:
+        lengths["T_head_zoom"] = float(np.linalg.norm(head.T_head_zoom.translation))
     if calibration.board is not None:
         lengths["board.square"] = calibration.board.square
     for where, length in lengths.items():
         if length > LARGEST_M[where]:
             return f"{where}: {WHAT[where].format(length)}; lengths are in metres: is {length / 1000:.3g} m meant?"
-    for i, pupil in enumerate(calibration.zoom.pupil):
+    for i, pupil in enumerate(head.lens.pupil):
         if abs(pupil) > LARGEST_M["head.axis_offset"]:
             return f"zoom.stops[{i}].pupil: the entrance pupil moves by {pupil:.3g} m; lengths are in metres"
     return ""
@@ -104,9 +105,10 @@ def _impossible_length(calibration: Calibration) -> str:
 
 def _contradiction(calibration: Calibration) -> str:
     """Describe how T and Gamma contradict the views that the calibration holds, or a usual rig where it holds none."""
-    if calibration.T_head_zoom is None:
+    head = calibration.zoom_head
+    if head.T_head_zoom is None:
         return ""
-    arm, baseline = (float(np.linalg.norm(T.translation)) for T in (calibration.T_head_zoom, calibration.T_zoom0_fixed))
+    arm, baseline = (float(np.linalg.norm(T.translation)) for T in (head.T_head_zoom, head.T_zoom0_fixed))
     views = _checked_views(calibration.views)
     if not views:
         if arm > max(LONGEST_ARM, baseline):
@@ -128,9 +130,11 @@ def _contradiction(calibration: Calibration) -> str:
     )
 
 
-def _exchanged(model: RigModel) -> RigModel:
+def _exchanged(model: BundleModel) -> BundleModel:
     """Exchange T and Gamma."""
-    return RigModel({}, model.fixed, model.zoom, model.hand, model.gamma, model.head, model.warp)
+    head = model.zoom_head
+    assert head is not None
+    return model.with_zoom_head(T_zoom0_fixed=head.hand_eye(), T_head_zoom=head.T_zoom0_fixed)
 
 
 def _checked_views(views: Sequence[View]) -> list[View]:
@@ -143,7 +147,7 @@ def _checked_views(views: Sequence[View]) -> list[View]:
     return [view for same in both[:: max(len(both) // CHECKED_PLACEMENTS, 1)][:CHECKED_PLACEMENTS] for view in same]
 
 
-def _typical_angle(calibration: Calibration, model: RigModel, views: Sequence[View]) -> float:
+def _typical_angle(calibration: Calibration, model: BundleModel, views: Sequence[View]) -> float:
     """Compute the median angle between corners seen and predicted, in the worse of both cameras [rad]."""
     assert calibration.board is not None
     points = board_points(calibration.board)
@@ -163,11 +167,12 @@ def _another_rig(calibration: Calibration, spec: RigSpec) -> str:
     of_rig = shortest, longest = spec.zoom.focal_range
     match calibration.provenance.get("focal_range_px"):
         case [int() | float() as low, int() | float() as high] if low > 0 and high > 0:
-            factor = spec.zoom.size[0] / calibration.zoom.size[0]
+            factor = spec.zoom.size[0] / calibration.zoom_head.lens.size[0]
             calibrated = low * factor, high * factor
             is_other = any(max(a / b, b / a) > OTHER_LENS for a, b in zip(calibrated, of_rig, strict=True))
         case _:  # captures of unknown origin: they need not cover the lens's range, but lie in it
-            calibrated = fitting.zoom.nominal_px[0], fitting.zoom.nominal_px[-1]
+            nominal_px = fitting.zoom_head.lens.nominal_px
+            calibrated = nominal_px[0], nominal_px[-1]
             is_other = calibrated[0] > longest * OTHER_LENS or calibrated[1] * OTHER_LENS < shortest
     if not is_other:
         return ""

@@ -53,13 +53,16 @@ def sequential(
         )
     stereo_fit = stereo(steps.model, pairs, points)
     check_pairs(steps, stereo_fit.rms_px)
-    model = replace(steps.model, gamma=stereo_fit.model.gamma)
+    assert stereo_fit.model.zoom_head is not None
+    model = steps.model.with_zoom_head(T_zoom0_fixed=stereo_fit.model.zoom_head.T_zoom0_fixed)
     used, handeye_rms = of_both(steps.views), None
     if steps.has_head:
         zoom_views = [view for view in steps.views if view.camera == "zoom"]
-        model = place_boards(replace(model, hand=rough_hand(model, zoom_views, points)), steps.views, points)
+        model = place_boards(
+            model.with_zoom_head(T_head_zoom=rough_hand(model, zoom_views, points)), steps.views, points
+        )
         hand_fit = fit(model, zoom_views, points, {"hand", "head"})
-        model, handeye_rms = replace(model, hand=hand_fit.model.hand, head=hand_fit.model.head), hand_fit.rms_px
+        model, handeye_rms = replace(model, zoom_head=hand_fit.model.zoom_head), hand_fit.rms_px
     else:
         model = place_boards(model, used, points)
     residuals = Residuals(

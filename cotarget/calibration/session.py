@@ -51,7 +51,7 @@ from cotarget.calibration.joint import (
     spread_stops,
     with_stop,
 )
-from cotarget.calibration.model import Capture, Progress, Rejected, RigModel, View, unseen
+from cotarget.calibration.model import BundleModel, Capture, Progress, Rejected, View, unseen
 from cotarget.calibration.planning import (
     Coverage,
     PredictedAccuracy,
@@ -80,6 +80,7 @@ from cotarget.rig import (
     ZoomCamera,
     ZoomState,
 )
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 
 log = logging.getLogger(__name__)
 # Requested poses are rounded to 0.1 mm and 0.1 mrad, finer than a person holds a board. The fits behind a plan sum in
@@ -373,7 +374,7 @@ OTHER_LENS = 1.25  # ratio of focal lengths from which the lens and not the head
 CENTRAL = 0.12  # a board is central within this distance of the image's centre, over the image's width
 
 
-def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> RigModel:
+def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> BundleModel:
     """Estimate rough intrinsics of the fixed camera, from one board straight ahead and a few tilted ones.
 
     Raises:
@@ -401,7 +402,7 @@ def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> RigModel
     recorder.see_zoom(expected=False)
     coverage = {"fixed": Coverage(size)}
     for k in range(LEARNING):
-        model = RigModel(boards={}, fixed=lens)
+        model = BundleModel(boards={}, fixed=FixedCamera(lens))
         shares = [preferred_share(k)]
         wishes = plan_placements(model, board, coverage, shares, rng, shared=False, margin_px=ROUGH_MARGIN * width)
         if not wishes:
@@ -411,10 +412,10 @@ def learn_fixed(recorder: CaptureRecorder, rng: np.random.Generator) -> RigModel
             coverage["fixed"].add(view.corners_px[view.seen])
         recorder.see_zoom(expected=False)
     views = [view for view in recorder.views if view.camera == "fixed"]
-    return RigModel(boards={}, fixed=rough_intrinsics("fixed", views, points, size))
+    return BundleModel(boards={}, fixed=FixedCamera(rough_intrinsics("fixed", views, points, size)))
 
 
-def learn_zoom(recorder: CaptureRecorder, model: RigModel) -> RigModel:
+def learn_zoom(recorder: CaptureRecorder, model: BundleModel) -> BundleModel:
     """Estimate rough Gamma and T: find the board in the zoom image, and turn the head a little."""
     assert model.fixed is not None
     focal = recorder.rig.zoom.state().focal_px
@@ -426,52 +427,54 @@ def learn_zoom(recorder: CaptureRecorder, model: RigModel) -> RigModel:
     if centred is not view:
         by_pan, by_tilt = _turn_a_little(recorder, centred)
     _present_otherwise_tilted(recorder, model, centred)
-    model = _likeliest(replace(model, zoom=ZoomLens((focal,), (zoom,))), recorder, [centred, by_pan, by_tilt])
+    still = RigidTransform.identity()
+    model = replace(model, zoom_head=ZoomHead(ZoomLens((focal,), (zoom,)), still, still))
+    model = _likeliest(model, recorder, [centred, by_pan, by_tilt])
     return refitted(model, recorder).model
 
 
-def _present_otherwise_tilted(recorder: CaptureRecorder, model: RigModel, view: View) -> None:
+def _present_otherwise_tilted(recorder: CaptureRecorder, model: BundleModel, view: View) -> None:
     """Present the board in the same place with another tilt; only the true one of Gamma's mirror images fits both."""
     assert model.fixed is not None
     points = board_points(recorder.board)
     fixed_view = next(v for v in recorder.of_placement(view.board) if v.camera == "fixed")
-    middle = board_pose(model.fixed, fixed_view.corners_px, points).apply(points.mean(axis=0))
+    middle = board_pose(model.fixed.lens, fixed_view.corners_px, points).apply(points.mean(axis=0))
     recorder.turn(view.pan, view.tilt)
     recorder.present(facing_board(recorder.board, middle, CLEARLY_TILTED.inv()))
     recorder.see_fixed()
     recorder.see_zoom(expected=False)
 
 
-def _likeliest(model: RigModel, recorder: CaptureRecorder, seen: Sequence[View]) -> RigModel:
+def _likeliest(model: BundleModel, recorder: CaptureRecorder, seen: Sequence[View]) -> BundleModel:
     """Choose rough Gamma and T from one placement seen from three head poses.
 
     Each view has two possible poses of the board. Every combination makes a model, and the one that fits all views so
     far best is chosen.
     """
     assert model.fixed is not None
-    assert model.zoom is not None
-    points, zoom = board_points(recorder.board), model.zoom.stops[0]
+    assert model.zoom_head is not None
+    points, zoom = board_points(recorder.board), model.zoom_head.lens.stops[0]
     heads = [base_head(view.pan, view.tilt) for view in seen]
     fixed_view = next(v for v in recorder.of_placement(seen[0].board) if v.camera == "fixed")
-    T_fixed_board = board_pose(model.fixed, fixed_view.corners_px, points)
+    T_fixed_board = board_pose(model.fixed.lens, fixed_view.corners_px, points)
     both = {v.board for v in recorder.views if v.camera == "fixed"} & {
         v.board for v in recorder.views if v.camera == "zoom"
     }
     views = [view for view in recorder.views if view.board in both]
-    results: list[tuple[float, RigModel]] = []
+    results: list[tuple[float, BundleModel]] = []
     refused = None
     for boards in itertools.product(*(pose_candidates(zoom, view.corners_px, points) for view in seen)):
         try:
             # Small turns determine the rotation only. The translation, some centimetres, is fitted from more views.
             hand = RigidTransform.from_rotation(park_martin(*motions(heads, boards)).rotation)
             gamma = hand.inv() * heads[0] * hand * boards[0] * T_fixed_board.inv()  # Eq. 2 solved for Gamma
-            start = place_boards(replace(model, hand=hand, gamma=gamma), views, points)
+            start = place_boards(model.with_zoom_head(T_zoom0_fixed=gamma, T_head_zoom=hand), views, points)
             result = fit(start, views, points, {"gamma", "hand"})
         except CalibrationError as error:
             refused = refused or error
             continue
         # The fit's T serves the comparison only: these few views do not determine its translation.
-        results.append((result.rms_px, replace(model, hand=hand, gamma=gamma)))
+        results.append((result.rms_px, model.with_zoom_head(T_zoom0_fixed=gamma, T_head_zoom=hand)))
     if not results:
         _check_lens(zoom.focal_px[0], recorder)
         raise refused or CalibrationError("hand-eye: no motion of the head was seen")
@@ -495,7 +498,7 @@ def _check_lens(told_px: float, recorder: CaptureRecorder) -> None:
         )
 
 
-def _find_with_zoom(recorder: CaptureRecorder, model: RigModel) -> View:
+def _find_with_zoom(recorder: CaptureRecorder, model: BundleModel) -> View:
     """Scan with the head until the zoom camera sees a placement that the fixed camera sees too.
 
     Raises:
@@ -511,7 +514,7 @@ def _find_with_zoom(recorder: CaptureRecorder, model: RigModel) -> View:
     grid = [(pan, tilt) for pan, tilt in grid if limits.allow(pan, tilt)]
     tried = []
     for share, turned in SHOWN:
-        depth = distance(recorder.board, model.fixed, share)
+        depth = distance(recorder.board, model.fixed.lens, share)
         turn = Rotation.from_rotvec(np.radians([*turned, 0.0]))
         recorder.present(facing_board(recorder.board, np.array([0.0, 0.0, depth]), turn))
         if recorder.see_fixed() is None:
@@ -581,7 +584,7 @@ def _centred(recorder: CaptureRecorder, view: View, by_pan: View, by_tilt: View)
     return recorder.see_zoom(expected=False) or view
 
 
-def refitted(model: RigModel, recorder: CaptureRecorder) -> Fit:
+def refitted(model: BundleModel, recorder: CaptureRecorder) -> Fit:
     """Fit the rough model to all views so far: Gamma alone at first, everything with `ENOUGH_VIEWS` zoom views."""
     points: Array = board_points(recorder.board)
     views = recorder.views
@@ -596,9 +599,9 @@ def refitted(model: RigModel, recorder: CaptureRecorder) -> Fit:
     by_camera = {name: [view for view in views if view.camera == name] for name in ("fixed", "zoom")}
     fixed = rough_intrinsics("fixed", by_camera["fixed"], points, recorder.rig.fixed.size)
     zoom = rough_intrinsics("zoom", by_camera["zoom"], points, recorder.rig.zoom.size)
-    assert model.zoom is not None
-    lens = ZoomLens(model.zoom.nominal_px, (zoom,))
-    afresh = place_boards(replace(model, fixed=fixed, zoom=lens), views, points)
+    assert model.zoom_head is not None
+    lens = ZoomLens(model.zoom_head.lens.nominal_px, (zoom,))
+    afresh = place_boards(replace(model, fixed=FixedCamera(fixed)).with_zoom_head(lens=lens), views, points)
     again = fit(fit(afresh, views, points, {"gamma"}).model, views, points, blocks)
     return min((result, again), key=lambda one: one.rms_px)
 
@@ -663,12 +666,12 @@ BORDER_PX = 12.0  # border of the image to which no point of the board is brough
 
 def see_stops(
     recorder: CaptureRecorder,
-    model: RigModel,
+    model: BundleModel,
     stops: Sequence[float],
     placements: int,
     rng: np.random.Generator,
     tell: Callable[[str], None],
-) -> RigModel:
+) -> BundleModel:
     """Take views at all zoom samples but the first, and add the samples to the model.
 
     Args:
@@ -683,7 +686,7 @@ def see_stops(
         The model with the zoom samples that were seen.
     """
     assert model.fixed is not None
-    assert model.zoom is not None
+    assert model.zoom_head is not None
     points = board_points(recorder.board)
     size = recorder.rig.zoom.size
     coverage = {"fixed": Coverage(recorder.rig.fixed.size)}
@@ -692,7 +695,7 @@ def see_stops(
             coverage["fixed"].add(view.corners_px[view.seen])
     reachable = functools.partial(_reachable, model, recorder.rig.head.limits, points)
     at_stop: dict[int, Coverage] = {}
-    only_fixed = replace(model, zoom=None)
+    only_fixed = replace(model, zoom_head=None)
     done = 0
     for _ in range(ATTEMPTS * placements):
         if done == placements:
@@ -706,7 +709,7 @@ def see_stops(
         recorder.present(wishes[0])
         fixed_view = recorder.see_fixed()
         if fixed_view is None:
-            coverage["fixed"].misses.append(where_in(model.fixed, recorder.board, wishes[0]))
+            coverage["fixed"].misses.append(where_in(model.fixed.lens, recorder.board, wishes[0]))
             continue
         done += 1
         coverage["fixed"].add(fixed_view.corners_px[fixed_view.seen])
@@ -725,44 +728,46 @@ def see_stops(
     return model
 
 
-def _reachable(model: RigModel, limits: PanTiltLimits, points: Array, wish: RigidTransform) -> bool:
+def _reachable(model: BundleModel, limits: PanTiltLimits, points: Array, wish: RigidTransform) -> bool:
     """Check whether the head can point at every corner of a board at a pose T_fixed_board."""
-    assert model.zoom is not None
-    lens = model.zoom.stops[0]
-    corners = (model.hand * model.gamma * wish).apply(points)
-    found = solve(corners, model.hand, model.head, lens.ray(lens.image_center_px))
+    head = model.zoom_head
+    assert head is not None
+    lens = head.lens.stops[0]
+    corners = (head.T_base_fixed * wish).apply(points)
+    found = solve(corners, head.hand_eye(), head.axes, lens.ray(lens.image_center_px))
     return bool(limits.allow(found.pan[:, 0], found.tilt[:, 0]).all())
 
 
-def _stop_at(model: RigModel, nominal: float) -> tuple[int, RigModel]:
+def _stop_at(model: BundleModel, nominal: float) -> tuple[int, BundleModel]:
     """Find the zoom sample at a nominal focal length [px]; beyond the last one, add it to the model.
 
     Returns:
         Number of the zoom sample, and the model that contains it.
     """
-    assert model.zoom is not None
-    away = np.abs(np.log(np.array(model.zoom.nominal_px) / nominal))
-    if nominal <= model.zoom.nominal_px[-1] or away.min() <= SAME_FOCAL:
+    assert model.zoom_head is not None
+    lens = model.zoom_head.lens
+    away = np.abs(np.log(np.array(lens.nominal_px) / nominal))
+    if nominal <= lens.nominal_px[-1] or away.min() <= SAME_FOCAL:
         return int(np.argmin(away)), model
-    return model.stops, replace(model, zoom=with_stop(model.zoom, nominal))
+    return model.stops, model.with_zoom_head(lens=with_stop(lens, nominal))
 
 
 def _see_stop(
     recorder: CaptureRecorder,
-    model: RigModel,
+    model: BundleModel,
     number: int,
     fixed_view: View,
     coverage: Coverage,
     rng: np.random.Generator,
     points: Array,
-) -> RigModel | None:
+) -> BundleModel | None:
     """Take views of the present placement at a zoom sample; fit the sample when it is first seen.
 
     Returns:
         The model with the zoom sample; None where a sample not yet fitted was not seen.
     """
-    assert model.zoom is not None
-    nominal = model.zoom.nominal_px[number]
+    assert model.zoom_head is not None
+    nominal = model.zoom_head.lens.nominal_px[number]
     known = any(view.camera == "zoom" and same_focal(view, nominal) for view in recorder.views)
     placed = place_boards(model, [fixed_view], points)
     here: list[View] = []
@@ -771,12 +776,12 @@ def _see_stop(
         if seen is not None and not known:
             here.append(seen)
             placed = fit_stop(placed, number, [fixed_view, *here], points)
-    return replace(model, zoom=placed.zoom) if known or here else None
+    return replace(model, zoom_head=placed.zoom_head) if known or here else None
 
 
 def _see_part(
     recorder: CaptureRecorder,
-    model: RigModel,
+    model: BundleModel,
     nominal: float,
     coverage: Coverage,
     rng: np.random.Generator,
@@ -796,7 +801,7 @@ def _see_part(
 
 
 def plan_part(
-    model: RigModel,
+    model: BundleModel,
     board: int,
     nominal: float,
     coverage: Coverage,
@@ -818,17 +823,17 @@ def plan_part(
     Returns:
         Pan and tilt [rad]; None where no pose within the limits shows enough of the board.
     """
-    assert model.zoom is not None
-    lens = model.zoom.at(nominal)
-    hand = model.hand * model.zoom.to_pupil(nominal)
-    T_base_board = model.hand * model.gamma * model.boards[board]
+    head = model.zoom_head
+    assert head is not None
+    lens, hand = head.lens.at(nominal), head.hand_eye(nominal)
+    T_base_board = head.T_base_fixed * model.boards[board]
     chosen = points[rng.integers(len(points), size=CANDIDATES)]
     pixels = rng.uniform(BORDER_PX, np.array(lens.size) - 1 - BORDER_PX, size=(CANDIDATES, 2))
-    found = solve(T_base_board.apply(chosen), hand, model.head, lens.ray(pixels))
+    found = solve(T_base_board.apply(chosen), hand, head.axes, lens.ray(pixels))
     pan, tilt = found.pan[:, 0], found.tilt[:, 0]
     allowed = limits.allow(pan, tilt)
     best, most = None, 0.0
-    R, t, _ = base_heads(model.head, np.nan_to_num(pan), np.nan_to_num(tilt))
+    R, t, _ = base_heads(head.axes, np.nan_to_num(pan), np.nan_to_num(tilt))
     x_zoom = hand.inv().apply(((T_base_board.apply(points) - t[:, None]) @ R).reshape(-1, 3)).reshape(CANDIDATES, -1, 3)
     for k in np.flatnonzero(allowed):
         seen = _seen(lens, x_zoom[k])
@@ -1005,11 +1010,11 @@ def _stops_without_views(recorder: CaptureRecorder, stops: Sequence[float]) -> l
 
 def _cover(
     recorder: CaptureRecorder,
-    model: RigModel,
+    model: BundleModel,
     placements: int,
     rng: np.random.Generator,
     tell: Callable[[str], None],
-) -> RigModel:
+) -> BundleModel:
     """Take views of placements that cover both images, from several head poses each, and refine the rough model."""
     rig, points = recorder.rig, board_points(recorder.board)
     coverage = {"fixed": Coverage(rig.fixed.size), "zoom": Coverage(rig.zoom.size)}
@@ -1032,7 +1037,7 @@ def _cover(
             raise CalibrationError(f"the fixed camera lost the board: not seen {misses} times in a row")
         if fixed_view is None:
             assert model.fixed is not None
-            coverage["fixed"].misses.append(where_in(model.fixed, recorder.board, wish))
+            coverage["fixed"].misses.append(where_in(model.fixed.lens, recorder.board, wish))
             continue
         T = _see_from_everywhere(recorder, model, wish, fixed_view, coverage, margin, rng)
         done += 1
@@ -1048,7 +1053,7 @@ def _cover(
 
 def _next_placement(
     recorder: CaptureRecorder,
-    model: RigModel,
+    model: BundleModel,
     coverage: dict[str, Coverage],
     rng: np.random.Generator,
     margin: float,
@@ -1059,7 +1064,7 @@ def _next_placement(
     Before the accuracy can be predicted, it is the one that most head poses show.
     """
     assert model.fixed is not None
-    assert model.zoom is not None
+    assert model.zoom_head is not None
     board, limits, points = recorder.board, recorder.rig.head.limits, board_points(recorder.board)
     margin_px = margin * model.fixed.size[0]
     shares = [preferred_share(recorder.number), *rng.uniform(size=CHOICES - 1)]
@@ -1067,7 +1072,9 @@ def _next_placement(
     wishes += plan_placements(model, board, coverage, shares[len(wishes) :], rng, shared=False, margin_px=margin_px)
     best, least = None, (np.inf, np.inf)
     for wish in wishes:
-        turns = plan_poses(model, wish, board, coverage["zoom"], limits, MOVED_VIEWS, rng, margin * model.zoom.size[0])
+        turns = plan_poses(
+            model, wish, board, coverage["zoom"], limits, MOVED_VIEWS, rng, margin * model.zoom_head.lens.size[0]
+        )
         if seen_at_home(model, wish, board):
             turns = [(0.0, 0.0), *turns]
         error = np.inf
@@ -1083,7 +1090,7 @@ def _next_placement(
 
 def _see_from_everywhere(
     recorder: CaptureRecorder,
-    model: RigModel,
+    model: BundleModel,
     wish: RigidTransform,
     fixed_view: View,
     coverage: dict[str, Coverage],
@@ -1097,7 +1104,7 @@ def _see_from_everywhere(
     assert model.fixed is not None
     rig, board = recorder.rig, recorder.board
     # Of the view's two possible poses, the one nearer to the requested rotation.
-    poses = pose_candidates(model.fixed, fixed_view.corners_px, board_points(board))
+    poses = pose_candidates(model.fixed.lens, fixed_view.corners_px, board_points(board))
     T = min(poses, key=lambda pose: float((pose.rotation * wish.rotation.inv()).magnitude()))
     home = seen_at_home(model, T, board)
     turns = plan_poses(

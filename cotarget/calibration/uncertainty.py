@@ -36,7 +36,7 @@ from cotarget.calibration.bundle import (
     stepped,
 )
 from cotarget.calibration.file import Calibration
-from cotarget.calibration.model import Covariance, HeldOut, RigModel, View, stop_of
+from cotarget.calibration.model import BundleModel, Covariance, HeldOut, View, stop_of
 from cotarget.errors import CalibrationError
 from cotarget.geometry import Array, RigidTransform
 from cotarget.pantilt import solve
@@ -123,8 +123,8 @@ def cross_validate(found: Fit, points: Array, prior: Prior | None, folds: int) -
     for k in range(folds):
         out = set(numbers[k::folds])
         rest = [view for view in found.views if view.board not in out]
-        assert found.model.zoom is not None
-        stops = found.model.zoom.nominal_px
+        assert found.model.zoom_head is not None
+        stops = found.model.zoom_head.lens.nominal_px
         remaining = Counter(stop_of(stops, view) for view in rest if view.camera == "zoom")
         kept = [
             view
@@ -169,7 +169,7 @@ def _predicted(found: Fit, covariance: Array, kept: Sequence[View], points: Arra
     """
     model, variance = found.model, found.variance
     assert variance is not None
-    assert model.zoom is not None
+    assert model.zoom_head is not None
     fixed = [view for view in kept if view.camera == "fixed"]
     zoom = [view for view in kept if view.camera == "zoom"]
     told = fit(model, fixed, points, ()).model
@@ -197,7 +197,8 @@ def _predicted(found: Fit, covariance: Array, kept: Sequence[View], points: Arra
         if found.jitter and p.by_turn is not None:
             Q = _mean(p.by_turn, batch)
             cov = cov + found.jitter**2 * Q @ Q.swapaxes(1, 2)
-        scale = model.zoom.nominal_px[0] / model.zoom.nominal_px[batch.stop or 0]
+        nominal = model.zoom_head.lens.nominal_px
+        scale = nominal[0] / nominal[batch.stop or 0]
         misses[batch.rows] = _mean(p.pixels - batch.observed, batch) * scale
         covariances[batch.rows] = cov * scale**2
     return misses, covariances
@@ -284,7 +285,8 @@ def line_of_sight_covariance(
     Raises:
         CalibrationError: the calibration has no covariance, or an unusable one, or no T.
     """
-    calibration.hand_eye()
+    calibration.zoom_head.hand_eye()  # raises without T
+    lens = calibration.zoom_head.lens
     covariance = calibration.covariance
     if covariance is None:
         raise CalibrationError("this calibration has no covariance; calibrate again, by the joint method")
@@ -292,7 +294,7 @@ def line_of_sight_covariance(
     known = parameter_names(EVERY_BLOCK, model.stops)
     if unknown := [name for name in covariance.parameters if name not in known]:
         raise CalibrationError(f"covariance.parameters: '{unknown[0]}' is no parameter; they are: {', '.join(known)}")
-    nominal = np.asarray(calibration.zoom.nominal_px[0] if nominal_px is None else nominal_px, dtype=float)
+    nominal = np.asarray(lens.nominal_px[0] if nominal_px is None else nominal_px, dtype=float)
     depth = np.asarray(depth, dtype=float)
     shape = np.broadcast_shapes(np.shape(pixel)[:-1], depth.shape, nominal.shape)
     pixels = np.array(np.broadcast_to(pixel, (*shape, 2)), dtype=float).reshape(-1, 2)
@@ -304,14 +306,12 @@ def line_of_sight_covariance(
     by_parameter, by_turn = miss_derivatives(model, covariance.parameters, pixels, depths, nominals, turned)
     found = by_parameter @ covariance.matrix @ by_parameter.swapaxes(-1, -2)
     found = found + calibration.jitter**2 * by_turn @ by_turn.swapaxes(-1, -2)
-    doubt = _at_each(
-        nominals, lambda f: calibration.zoom.center_doubt_px(f) / np.array(calibration.zoom.at(f).focal_px)
-    )
+    doubt = _at_each(nominals, lambda f: lens.center_doubt_px(f) / np.array(lens.at(f).focal_px))
     return np.asarray(found + doubt[:, None] ** 2 * np.eye(2)).reshape(*shape, 2, 2)
 
 
 def miss_derivatives(
-    model: RigModel,
+    model: BundleModel,
     parameters: Sequence[str],
     pixels: Array,
     depths: Array,
@@ -341,7 +341,7 @@ def miss_derivatives(
     model = replace(model, boards={})
     x_zoom = _moved_targets(model, x_fixed, pan, tilt)
 
-    def miss(at: RigModel, x_zoom: Array) -> Array:
+    def miss(at: BundleModel, x_zoom: Array) -> Array:
         off = _directions(at, x_zoom, nominals) - _at_each(nominals, lambda f: _line_of_sight(at, f))
         return np.einsum("ni,nij->nj", off, across)
 
@@ -376,51 +376,47 @@ def _at_each(nominals: Array, compute: Callable[[float], Array]) -> Array:
     return np.array([compute(float(focal)) for focal in focals])[which]
 
 
-def _pointed(model: RigModel, x_fixed: Array, nominals: Array) -> tuple[Array, Array]:
+def _pointed(model: BundleModel, x_fixed: Array, nominals: Array) -> tuple[Array, Array]:
     """Solve pan and tilt that show targets in the middle of the zoom image, facing forward, (n,) each [rad]."""
-    assert model.zoom is not None
-    x_base, zoom = (model.hand * model.gamma).apply(x_fixed), model.zoom
+    assert model.zoom_head is not None
+    head = model.zoom_head
+    x_base = head.T_base_fixed.apply(x_fixed)
     angles = np.empty((2, len(nominals)))
     for nominal in np.unique(nominals):
         these = nominals == nominal
-        hand = model.hand * zoom.to_pupil(nominal)
-        found = solve(x_base[these], hand, model.head, _line_of_sight(model, nominal))
+        found = solve(x_base[these], head.hand_eye(nominal), head.axes, _line_of_sight(model, nominal))
         angles[:, these] = found.pan[:, 0], found.tilt[:, 0]
     return angles[0], angles[1]
 
 
-def model_of(calibration: Calibration) -> RigModel:
+def model_of(calibration: Calibration) -> BundleModel:
     """Make the fit's model from a calibration, without boards; T is the identity where the calibration has none."""
-    hand = calibration.T_head_zoom
-    return RigModel(
-        boards={},
-        fixed=calibration.fixed,
-        zoom=calibration.zoom,
-        gamma=calibration.T_zoom0_fixed,
-        hand=RigidTransform.identity() if hand is None else hand,
-        head=calibration.head,
-        warp=calibration.board_warp,
-    )
+    head = calibration.zoom_head
+    if head.T_head_zoom is None:
+        head = replace(head, T_head_zoom=RigidTransform.identity())
+    return BundleModel({}, calibration.fixed, head, calibration.board_warp)
 
 
-def _moved_targets(model: RigModel, x_fixed: Array, pan: Array, tilt: Array) -> Array:
+def _moved_targets(model: BundleModel, x_fixed: Array, pan: Array, tilt: Array) -> Array:
     """Compute the targets in the moved zoom camera's frame at the first zoom sample [m], (n, 3) (Eq. 2)."""
-    x_base = (model.hand * model.gamma).apply(x_fixed)
-    R, t, _ = base_heads(model.head, pan, tilt)
-    return model.hand.inv().apply(np.einsum("vji,vj->vi", R, x_base - t))
+    head = model.zoom_head
+    assert head is not None
+    x_base = head.T_base_fixed.apply(x_fixed)
+    R, t, _ = base_heads(head.axes, pan, tilt)
+    return head.hand_eye().inv().apply(np.einsum("vji,vj->vi", R, x_base - t))
 
 
-def _directions(model: RigModel, x_zoom: Array, nominals: Array) -> Array:
+def _directions(model: BundleModel, x_zoom: Array, nominals: Array) -> Array:
     """Compute unit vectors from the pupil at nominal focal lengths (n,) to the targets of `_moved_targets`, (n, 3)."""
-    assert model.zoom is not None
-    zoom = model.zoom
+    assert model.zoom_head is not None
+    zoom = model.zoom_head.lens
     return _unit(x_zoom - _at_each(nominals, lambda f: np.array([0.0, 0.0, zoom.pupil_at(f)])))
 
 
-def _line_of_sight(model: RigModel, nominal_px: float) -> Array:
+def _line_of_sight(model: BundleModel, nominal_px: float) -> Array:
     """Compute the unit vector through the middle of the zoom image at a nominal focal length, (3,)."""
-    assert model.zoom is not None
-    lens = model.zoom.at(nominal_px)
+    assert model.zoom_head is not None
+    lens = model.zoom_head.lens.at(nominal_px)
     return _unit(lens.ray(lens.image_center_px))
 
 

@@ -172,7 +172,7 @@ def summary(found: "Calibration", path: Path) -> dict[str, Any]:
     residuals = {k: v for k, v in dataclasses.asdict(found.residuals).items() if k != "rejected"}
     told = residuals | {
         "rejected": len(found.residuals.rejected),
-        "baseline_m": float(np.linalg.norm(found.T_zoom0_fixed.translation)),
+        "baseline_m": float(np.linalg.norm(found.zoom_head.T_zoom0_fixed.translation)),
         "head_jitter_deg": math.degrees(found.jitter),
         "held_out": None if found.held_out is None else dataclasses.asdict(found.held_out),
     }

@@ -52,11 +52,11 @@ def aim(options: argparse.Namespace) -> None:
     if options.wanted_px is not None and target is None:
         raise ConfigError("--wanted-px needs --target NAME, whose true size gives the focal length")
     if options.wanted_px is not None and target is not None:
-        side = calibration.zoom.size[int(target.is_vertical())]
+        side = calibration.zoom_head.lens.size[int(target.is_vertical())]
         if options.wanted_px > side:
             raise ConfigError(
                 f"--wanted-px: {options.wanted_px:g} px do not fit into the zoom camera's {{}}x{{}} image".format(
-                    *calibration.zoom.size
+                    *calibration.zoom_head.lens.size
                 )
             )
     depth = options.depth
@@ -70,7 +70,7 @@ def aim(options: argparse.Namespace) -> None:
     pitch_mm = calibration.pitch_mm or spec.zoom.pitch_mm
     shortest, longest = spec.zoom.focal_range
     if options.rig is None:  # without a rig.toml, the calibration gives the shortest focal length
-        shortest = calibration.zoom.nominal_px[0]
+        shortest = calibration.zoom_head.lens.nominal_px[0]
     limits = spec.head.limits
     reach = Reach(limits.pan, limits.tilt, (shortest, max(shortest, longest)), step=limits.step)
     wanted_size = (
@@ -98,7 +98,7 @@ def aim(options: argparse.Namespace) -> None:
     )
     # The error budget holds for the exact inverse; the shortcut's additional error is not modelled.
     budget = error_budget(calibration, pixel, found, reach, size_px=options.size_px) if options.ik == "exact" else None
-    calibrated = calibration.zoom.nominal_px
+    calibrated = calibration.zoom_head.lens.nominal_px
     within = calibrated[0] * (1 - SAME_FOCAL) <= found.nominal_px <= calibrated[-1] * (1 + SAME_FOCAL)
     if not within:
         print(
@@ -116,7 +116,7 @@ def aim(options: argparse.Namespace) -> None:
             file=sys.stderr,
         )
     if wanted_size is not None and found.limited:
-        focal = calibration.zoom.at(found.nominal_px).focal_px[int(wanted_size.vertical)]
+        focal = calibration.zoom_head.lens.at(found.nominal_px).focal_px[int(wanted_size.vertical)]
         shown, wanted = _pixels(focal * wanted_size.size / found.range), _pixels(wanted_size.wanted_px)
         if shown != wanted:
             print(
@@ -147,7 +147,7 @@ def _fits_from(calibration: "Calibration", targets: Mapping[str, "TargetProfile"
     """
     for name, target in targets.items():
         axis = int(target.is_vertical())
-        yield calibration.fixed.focal_px[axis] * target.size / calibration.fixed.size[axis], name
+        yield calibration.fixed.lens.focal_px[axis] * target.size / calibration.fixed.size[axis], name
 
 
 def _pixels(size: float) -> str:
@@ -245,7 +245,7 @@ def latency(options: argparse.Namespace) -> None:
     calibration = None
     if options.calibration is not None:  # refused before the head moves
         calibration = load_plausible(options.calibration, describe(config), insist=options.insist)
-        calibration.hand_eye()
+        calibration.zoom_head.hand_eye()
         check_board_is_told(options.rig, config)
     where = "sim" if config.backend == "sim" else "hardware"
     with open_named(options.rig, config) as rig:

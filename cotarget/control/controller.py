@@ -112,7 +112,7 @@ class Controller:
             now,
             self._true(self._rig.zoom.state().focal_px),
         )
-        nominal = self._calibration.zoom.nominal_for(choice.focal_px)
+        nominal = self._calibration.zoom_head.lens.nominal_for(choice.focal_px)
         if abs(math.log(nominal / focal)) > NO_CHANGE:
             focal = self._rig.zoom.zoom(nominal)
             self.lens_commands += 1
@@ -195,7 +195,7 @@ class Controller:
 
     def _true(self, nominal_px: float) -> float:
         """True focal length at a nominal one [px]."""
-        return self._calibration.zoom.at(nominal_px).focal_px[0]
+        return self._calibration.zoom_head.lens.at(nominal_px).focal_px[0]
 
     def _aim(self, estimate: Estimate, reach: Reach, zoomed: Aim | None = None) -> Aim:
         """Solve the aim at an estimate, corrected by the head's bias; at the focal length of another aim if given."""

@@ -126,7 +126,7 @@ def is_seen_well(
     seen = estimate.appearance(pan, tilt, nominal_px)
     if seen is None:
         return False
-    zoom, focal = estimate.calibration.zoom, float(seen.focal_px[0])
+    zoom, focal = estimate.calibration.zoom_head.lens, float(seen.focal_px[0])
     wanted_px = min(estimate.target.wanted_px, seen.size_px * zoom.at(longest_px).focal_px[0] / focal)
     if not GOOD_SIZE[0] * wanted_px <= seen.size_px <= GOOD_SIZE[1] * wanted_px:
         return False

@@ -62,13 +62,14 @@ class SightLines:
             CalibrationError: the calibration has no T.
         """
         self._calibration = calibration
-        self._head: HeadGeometry = calibration.head
-        self._fixed = calibration.T_base_fixed.as_matrix()[:3]  # rotation and translation side by side, (3, 4)
-        self._hand_t = np.asarray(calibration.hand_eye().translation)
-        self._hand_z = calibration.hand_eye().rotation.as_matrix()[:, 2]
-        self._unhand = calibration.hand_eye().rotation.as_matrix().T
-        self._dz = np.array([0.0, 0.0, calibration.head.axis_offset])
-        x, y, z = calibration.head.tilt_axis
+        head = calibration.zoom_head
+        self._head: HeadGeometry = head.axes
+        self._fixed = head.T_base_fixed.as_matrix()[:3]  # rotation and translation side by side, (3, 4)
+        self._hand_t = np.asarray(head.hand_eye().translation)
+        self._hand_z = head.hand_eye().rotation.as_matrix()[:, 2]
+        self._unhand = head.hand_eye().rotation.as_matrix().T
+        self._dz = np.array([0.0, 0.0, head.axes.axis_offset])
+        x, y, z = head.axes.tilt_axis
         across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # cross product with the tilt axis
         self._across = self._unhand @ across
         self._across_twice = self._across @ across
@@ -78,7 +79,7 @@ class SightLines:
         head = self._head
         true_pan = head.pan_scale * pan + head.pan_zero
         true_tilt = head.tilt_scale * tilt + head.tilt_zero
-        hand_t = self._hand_t + self._hand_z * self._calibration.zoom.pupil_at(nominal_px)
+        hand_t = self._hand_t + self._hand_z * self._calibration.zoom_head.lens.pupil_at(nominal_px)
         c, s = math.cos(true_pan), math.sin(true_pan)
         unpan = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
         unpan_slope = np.array([[-s, 0.0, -c], [0.0, 0.0, 0.0], [c, 0.0, -s]]) * head.pan_scale
@@ -202,7 +203,7 @@ class Estimate:
         tangent, J, d = self.sight_lines.at(pan, tilt, nominal_px).project(self.state)
         if d[2] <= 0:
             return None
-        lens = self.calibration.zoom.at(nominal_px)
+        lens = self.calibration.zoom_head.lens.at(nominal_px)
         focal = np.array(lens.focal_px)
         J = focal[:, None] * J
         P = self.state_covariance

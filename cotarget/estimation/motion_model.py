@@ -202,7 +202,7 @@ def filter_settings(target: TargetProfile, calibration: Calibration | None = Non
     """
     motion = replace(MOTIONS[target.motion], nearest=NEAREST_SIZES * target.size)
     if calibration is not None and calibration.covariance is not None:
-        middle = calibration.fixed.image_center_px
+        middle = calibration.fixed.lens.image_center_px
         sigma = float(predicted_pointing(calibration, middle, USUAL_DEPTH)) / math.sqrt(2)  # along one axis
         if np.isfinite(sigma):
             motion = replace(motion, bias_sigma=math.hypot(LEAST_BIAS, sigma))

@@ -376,7 +376,7 @@ class TargetFilter:
         Returns:
             False if the measurement is older than all that is kept, is a duplicate, or has a pixel without a ray.
         """
-        found = self._calibration.fixed.tangents(detection.center_px)
+        found = self._calibration.fixed.lens.tangents(detection.center_px)
         if found is None:
             return False
         z, J = found
@@ -420,7 +420,7 @@ class TargetFilter:
         Returns:
             False if the measurement was not added, see `update_fixed`.
         """
-        lens = self._calibration.zoom.at(nominal_px)
+        lens = self._calibration.zoom_head.lens.at(nominal_px)
         found = lens.tangents(pixel)
         if found is None:
             return False

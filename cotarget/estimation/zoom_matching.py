@@ -20,7 +20,6 @@ from cotarget.config import TargetProfile
 from cotarget.detection import Detection
 from cotarget.estimation.correlation import Likeness, Samples, correlate, resample, summit
 from cotarget.geometry import Array
-from cotarget.pantilt import base_head
 from cotarget.rig import Frame, Image
 
 # Fewest pixels from which a background's colours are computed.
@@ -496,8 +495,7 @@ class CloseupFinder:
             CalibrationError: the calibration has no T.
         """
         self._calibration = calibration
-        self._T_base_fixed = calibration.T_base_fixed
-        self._T_zoom_head = calibration.hand_eye().inv()
+        calibration.zoom_head.hand_eye()  # raises without T
         self._target, self._settings = target, settings
         self._fixed_views: deque[FixedView] = deque()
         self._usual_score, self._sure_t = 0.0, -math.inf
@@ -577,12 +575,9 @@ class CloseupFinder:
             return None
         # A small cross at the target, parallel to the fixed image plane, for numerical derivatives.
         cross = x + STEP * x[2] * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], dtype=float)
-        calibration, nominal = self._calibration, expected.nominal_px
-        T_base_head = base_head(expected.pan, expected.tilt, calibration.head)
-        x_head = T_base_head.inv().apply(self._T_base_fixed.apply(cross))
-        pupil = np.array([0.0, 0.0, calibration.zoom.pupil_at(nominal)])
-        zoom = calibration.zoom.at(nominal).project(self._T_zoom_head.apply(x_head) - pupil)
-        fixed = calibration.fixed.project(cross)
+        head = self._calibration.zoom_head
+        zoom = head.project(cross, expected.pan, expected.tilt, expected.nominal_px)
+        fixed = self._calibration.fixed.project(cross)
         if not (np.isfinite(zoom).all() and np.isfinite(fixed).all()):
             return None
         J = (zoom[1:3] - zoom[3:5]).T @ np.linalg.inv((fixed[1:3] - fixed[3:5]).T)

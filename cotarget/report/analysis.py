@@ -69,7 +69,7 @@ def lens_curves(calibration: Calibration) -> LensCurves:
     Standard deviations come from linear propagation of the covariance, and from the doubt between zoom samples
     (`ZoomLens.center_doubt_px`).
     """
-    lens = calibration.zoom
+    lens = calibration.zoom_head.lens
     nominal = np.geomspace(lens.nominal_px[0], lens.nominal_px[-1], POINTS)
     return LensCurves(
         nominal,
@@ -102,13 +102,13 @@ def _sigmas(calibration: Calibration, nominal_px: Array) -> dict[str, Array]:
     for i in own:
         step = np.zeros(len(known))
         step[known.index(covariance.parameters[i])] = STEP
-        ends = [stepped(model, s, np.empty((0, POSE_PARAMETERS)), EVERY_BLOCK).zoom for s in (step, -step)]
-        plus, minus = (_evaluate(lens, nominal_px) for lens in ends if lens is not None)
+        ends = [stepped(model, s, np.empty((0, POSE_PARAMETERS)), EVERY_BLOCK).zoom_head for s in (step, -step)]
+        plus, minus = (_evaluate(head.lens, nominal_px) for head in ends if head is not None)
         columns.append((plus - minus) / (2 * STEP))
     J = np.array(columns)  # (parameters, 6, n)
     variance = np.einsum("pcn,pq,qcn->cn", J, covariance.matrix[np.ix_(own, own)], J)
     sigmas = dict(zip(CURVES, np.sqrt(np.maximum(variance, 0.0)), strict=True))
-    doubt = np.array([calibration.zoom.center_doubt_px(float(n)) for n in nominal_px])
+    doubt = np.array([calibration.zoom_head.lens.center_doubt_px(float(n)) for n in nominal_px])
     return sigmas | {name: np.hypot(sigmas[name], doubt[:, i]) for i, name in enumerate(("cx", "cy"))}
 
 
@@ -190,12 +190,12 @@ def uncalibrated_px(calibration: Calibration) -> float | None:
     """Find the longest nominal focal length [px] of a lens that is not calibrated so far; None if it is, or unknown."""
     told = calibration.provenance.get("focal_range_px")
     longest = told[-1] if isinstance(told, list) and told and isinstance(told[-1], int | float) else None
-    return longest if longest is not None and longest > calibration.zoom.nominal_px[-1] * FARTHER else None
+    return longest if longest is not None and longest > calibration.zoom_head.lens.nominal_px[-1] * FARTHER else None
 
 
 def can_point(calibration: Calibration) -> bool:
     """Check whether pointing can be predicted: the calibration has T and a covariance."""
-    return calibration.T_head_zoom is not None and calibration.covariance is not None
+    return calibration.zoom_head.T_head_zoom is not None and calibration.covariance is not None
 
 
 def pointing(calibration: Calibration, nominal_px: Sequence[float] | None = None) -> tuple[AtFocal, ...]:
@@ -204,10 +204,10 @@ def pointing(calibration: Calibration, nominal_px: Sequence[float] | None = None
     Returns:
         One result per focal length, nan where the head reaches no target; empty where nothing can be predicted.
     """
-    nominals = calibration.zoom.nominal_px if nominal_px is None else nominal_px
+    nominals = calibration.zoom_head.lens.nominal_px if nominal_px is None else nominal_px
     if not can_point(calibration) or not nominals:
         return ()
-    focals = [float(np.mean(calibration.zoom.at(nominal).focal_px)) for nominal in nominals]
+    focals = [float(np.mean(calibration.zoom_head.lens.at(nominal).focal_px)) for nominal in nominals]
     return tuple(itertools.starmap(AtFocal, zip(nominals, focals, _over_the_view(calibration, nominals), strict=True)))
 
 
@@ -233,7 +233,7 @@ def with_more_placements(calibration: Calibration, at: AtFocal, more: int = MORE
 
 def between_stops(calibration: Calibration) -> list[float]:
     """List nominal focal lengths between the zoom samples, where the lens is interpolated [px]."""
-    stops = calibration.zoom.nominal_px
+    stops = calibration.zoom_head.lens.nominal_px
     each = max(1, BETWEEN_STOPS // max(len(stops) - 1, 1))
     return [float(n) for a, b in itertools.pairwise(stops) for n in np.geomspace(a, b, each + 2)[1:-1]]
 
@@ -254,7 +254,7 @@ def corner_errors(calibration: Calibration, nominal_px: float) -> tuple[float, d
     right, bottom = np.array(calibration.fixed.size) - 1.0
     places = {"upper left": (0.0, 0.0), "upper right": (right, 0.0), "lower left": (0.0, bottom)}
     places |= {"lower right": (right, bottom)}
-    pixels = np.array([calibration.fixed.image_center_px, *places.values()])
+    pixels = np.array([calibration.fixed.lens.image_center_px, *places.values()])
     errors = predicted_pointing(calibration, pixels[None], sample_depths()[:, None], nominal_px=nominal_px)
     middle, *rms = np.sqrt(np.mean(errors**2, axis=0)).tolist()
     return middle, {name: error for name, error in zip(places, rms, strict=True) if np.isfinite(error)}
@@ -282,7 +282,7 @@ def contributions(calibration: Calibration) -> tuple[Contribution, ...]:
         covariance.parameters,
         np.tile(pixels, (len(depths), 1)),
         np.repeat(depths, len(pixels)),
-        calibration.zoom.nominal_px[-1],
+        calibration.zoom_head.lens.nominal_px[-1],
     )
     reached = np.isfinite(by_parameter).all(axis=(1, 2))
     if not reached.any():
@@ -456,13 +456,13 @@ def gather(calibration: Calibration) -> Evidence | None:
     normals = np.array([T.rotation.as_matrix()[:, 2] for T in boards])
     distances = np.linalg.norm(middles, axis=-1)
     facing = np.abs(np.sum(normals * middles, axis=-1)) / distances
-    stops = [stop_of(calibration.zoom.nominal_px, view) for view in views if view.camera == "zoom"]
+    stops = [stop_of(calibration.zoom_head.lens.nominal_px, view) for view in views if view.camera == "zoom"]
     return Evidence(
         views=views,
         corners={name: _corners(calibration, found, name) for name in CAMERAS},
         distances=distances,
         leanings=np.arccos(np.clip(facing, 0.0, 1.0)),
-        per_stop=tuple(np.bincount(stops, minlength=len(calibration.zoom.stops)).tolist()),
+        per_stop=tuple(np.bincount(stops, minlength=len(calibration.zoom_head.lens.stops)).tolist()),
         shape=_shape(found, points),
     )
 
@@ -470,7 +470,7 @@ def gather(calibration: Calibration) -> Evidence | None:
 def _corners(calibration: Calibration, found: Fit, name: CameraName) -> Corners:
     mine = [i for i, view in enumerate(found.views) if view.camera == name]
     seen = [found.views[i].seen for i in mine]
-    size = calibration.fixed.size if name == "fixed" else calibration.zoom.size
+    size = calibration.fixed.size if name == "fixed" else calibration.zoom_head.lens.size
     at = [found.views[i].corners_px[s] for i, s in zip(mine, seen, strict=True)]
     off = [found.left[i][s] for i, s in zip(mine, seen, strict=True)]
     return Corners(size, np.concatenate([np.empty((0, 2)), *at]), np.concatenate([np.empty((0, 2)), *off]))

@@ -102,7 +102,7 @@ def depth_figure(calibration: Calibration, at: AtFocal, boards: Array | None) ->
     corners = np.array([(0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)], dtype=float)
     with styled(3.0) as figure:
         ax = figure.subplots()
-        pixels = np.vstack([calibration.fixed.image_center_px, corners])
+        pixels = np.vstack([calibration.fixed.lens.image_center_px, corners])
         error = np.degrees(predicted_pointing(calibration, pixels, depths[:, None], nominal_px=at.nominal_px))
         worst = np.fmax.reduce(error[:, 1:], axis=1)  # nan only where no corner is reached
         ax.plot(depths, error[:, 0], color=BLUE, lw=1.6, label="middle of the fixed image")
@@ -427,7 +427,7 @@ def draw(
         _pointing(calibration, at, between, evidence, add)
     if evidence is not None:
         _corners(calibration, evidence, add)
-    if len(calibration.zoom.stops) > 1:
+    if len(calibration.zoom_head.lens.stops) > 1:
         bands = "" if calibration.covariance is None else " The bands are one standard deviation."
         add(
             "lens",
@@ -495,7 +495,9 @@ def _corners(calibration: Calibration, evidence: Evidence, add: Add) -> None:
     )
     add(
         "situation",
-        situation_figure(evidence, calibration.zoom.nominal_px, calibration.T_head_zoom is not None),
+        situation_figure(
+            evidence, calibration.zoom_head.lens.nominal_px, calibration.zoom_head.T_head_zoom is not None
+        ),
         f"Histograms of the distances and the slants of {count(len(evidence.distances), 'board')}, head poses",
         "How far the boards were from the fixed camera, how they were turned from facing it, and where the head was. "
         "Near and far, turned to all sides, and both axes moved is what determines a rig.",

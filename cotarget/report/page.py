@@ -93,7 +93,7 @@ def write_report(path: Path, calibration: Calibration, source: str = "calibratio
         ConfigError: a file cannot be written.
     """
     if calibration.covariance is not None:
-        check_covariance(calibration.covariance, len(calibration.zoom.stops))
+        check_covariance(calibration.covariance, len(calibration.zoom_head.lens.stops))
     at = pointing(calibration)
     between = pointing(calibration, between_stops(calibration))
     evidence = gather(calibration)

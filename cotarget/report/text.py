@@ -88,7 +88,7 @@ def _missing(calibration: Calibration) -> Iterator[str]:
     """Advise on what the calibration lacks: undetermined parameters, a head, a covariance."""
     if open_ := undetermined(calibration):
         yield f"Add what is missing: {open_}."
-    if calibration.T_head_zoom is None:
+    if calibration.zoom_head.T_head_zoom is None:
         yield "Calibrate on a rig whose head moves: two cameras alone cannot be pointed."
     if calibration.provenance.get("method") == "sequential":
         yield "Calibrate again by the joint method, from the same captures: it points better and says how well."
@@ -219,9 +219,10 @@ def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
     turned = int(np.count_nonzero(evidence.leanings >= TURNED))
     if turned < FEW_TURNED * number:
         yield f"Only {turned} of {count(number, 'placement')} were turned by 20 degrees or more: {TILT_BOARDS}."
-    if calibration.T_head_zoom is None or calibration.board is None:
+    if calibration.zoom_head.T_head_zoom is None or calibration.board is None:
         return
-    limit = distance(calibration.board, calibration.fixed, FAR_SHARE)
+    lens = calibration.zoom_head.lens
+    limit = distance(calibration.board, calibration.fixed.lens, FAR_SHARE)
     far = int(np.count_nonzero(evidence.distances > limit))
     if far < FEW_FAR * number:
         yield (
@@ -232,21 +233,21 @@ def _situation(calibration: Calibration, evidence: Evidence) -> Iterator[str]:
     for axis, turn in zip(("pan", "tilt"), np.ptp(poses, axis=0) if len(poses) else (), strict=False):
         if turn < LEAST_TURN:
             yield f"The head's {axis} changed by {digits(np.degrees(turn))} degrees in all: {NEARER}."
-    for nominal, views in zip(calibration.zoom.nominal_px, evidence.per_stop, strict=True):
+    for nominal, views in zip(lens.nominal_px, evidence.per_stop, strict=True):
         if views < FEWEST_AT_STOP:
             yield (
                 f"The zoom sample at {nominal:.0f} px has {count(views, 'view')}: add some, {FEWEST_AT_STOP} at least."
             )
     if (longest := uncalibrated_px(calibration)) is not None:
         yield (
-            f"The lens goes to {longest:.0f} px by its own account, but was calibrated to "
-            f"{calibration.zoom.nominal_px[-1]:.0f} px: no part of a board was seen beyond. Hold boards far away "
-            "where the head reaches, with squares that still show several corners there."
+            f"The lens goes to {longest:.0f} px by its own account, but was calibrated to {lens.nominal_px[-1]:.0f} "
+            "px: no part of a board was seen beyond. Hold boards far away where the head reaches, with squares that "
+            "still show several corners there."
         )
     zooms = any(view.focal_px is not None for view in evidence.views if view.camera == "zoom")
-    if zooms and len(calibration.zoom.stops) == 1:
+    if zooms and len(lens.stops) == 1:
         yield (
-            f"Only one focal length was calibrated, {calibration.zoom.nominal_px[0]:.0f} px by the lens's own account. "
+            f"Only one focal length was calibrated, {lens.nominal_px[0]:.0f} px by the lens's own account. "
             "If the lens zooms, capture boards at several: the longest is where an error shows most, and nothing here "
             "speaks of it."
         )
@@ -312,12 +313,16 @@ class Table:
 def parameter_tables(calibration: Calibration) -> list[Table]:
     """Make tables of all parameters in groups, with value ± one standard deviation."""
     header = ("parameter", "value ± σ", "unit")
-    fixed = Table("Fixed camera", header, tuple(_lens(calibration, calibration.fixed, "fixed")), _about_k3(calibration))
+    fixed = Table(
+        "Fixed camera", header, tuple(_lens(calibration, calibration.fixed.lens, "fixed")), _about_k3(calibration)
+    )
     tables = [fixed, *_zoom(calibration)]
-    tables.append(_pose_table(calibration, "Offset between the cameras", "T_zoom0_fixed", calibration.T_zoom0_fixed))
-    if calibration.T_head_zoom is not None:
+    tables.append(
+        _pose_table(calibration, "Offset between the cameras", "T_zoom0_fixed", calibration.zoom_head.T_zoom0_fixed)
+    )
+    if calibration.zoom_head.T_head_zoom is not None:
         title = "Place of the zoom camera on the head"
-        tables.append(_pose_table(calibration, title, "T_head_zoom", calibration.T_head_zoom))
+        tables.append(_pose_table(calibration, title, "T_head_zoom", calibration.zoom_head.T_head_zoom))
         tables.append(Table("Pan-tilt head", header, tuple(_head(calibration))))
     if calibration.board is not None:
         rows = zip(("x", "y"), calibration.board_warp, strict=True)
@@ -335,9 +340,9 @@ def _held(lens: Intrinsics) -> str:
 
 
 def _about_k3(calibration: Calibration) -> str:
-    k3, sigma = calibration.fixed.distortion[4], sigma_of(calibration, "fixed.k3")
+    k3, sigma = calibration.fixed.lens.distortion[4], sigma_of(calibration, "fixed.k3")
     if sigma is None:
-        return _held(calibration.fixed)
+        return _held(calibration.fixed.lens)
     if not k3:
         return f"k3 is held at 0; the corners lean to one of {digits(sigma, 1)}, a doubt that is counted everywhere."
     return f"The corners ask for k3: it is {value_and_sigma(k3, sigma)}. Beyond the boards such a lens is less certain."
@@ -354,7 +359,7 @@ def _lens(calibration: Calibration, lens: Intrinsics, owner: str) -> Iterator[tu
 
 
 def _zoom(calibration: Calibration) -> list[Table]:
-    lens = calibration.zoom
+    lens = calibration.zoom_head.lens
     if len(lens.stops) == 1:
         title = f"Zoom camera (nominal focal length {lens.nominal_px[0]:.0f} px)"
         rows = tuple(_lens(calibration, lens.stops[0], "zoom[0]"))
@@ -407,7 +412,7 @@ def _length_sigma_mm(calibration: Calibration, name: str, T: RigidTransform) -> 
 
 def _head(calibration: Calibration) -> Iterator[tuple[str, ...]]:
     for name, (words, factor, unit) in HEAD_WORDS.items():
-        value, sigma = getattr(calibration.head, name), sigma_of(calibration, f"head.{name}")
+        value, sigma = getattr(calibration.zoom_head.axes, name), sigma_of(calibration, f"head.{name}")
         if sigma is None and name.startswith(("pan", "tilt")) and value == getattr(IDEAL_HEAD, name):
             continue
         yield words, value_and_sigma(factor * value, sigma and factor * sigma), unit
@@ -462,7 +467,7 @@ def key_figures(calibration: Calibration) -> list[tuple[str, str]]:
         found.append(("Kept out of the fit", against))
     jitter = f"{digits(float(np.degrees(calibration.jitter)))} degrees an axis" if calibration.jitter else "none found"
     found.append(("Head's jitter", jitter))
-    for name, camera in (("fixed", calibration.fixed), ("zoom", calibration.zoom.stops[0])):
+    for name, camera in (("fixed", calibration.fixed.lens), ("zoom", calibration.zoom_head.lens.stops[0])):
         across = 2 * np.degrees(np.arctan(camera.size[0] / 2 / camera.focal_px[0]))
         found.append((f"Image, {name} camera", f"{camera.size[0]} × {camera.size[1]} px, about {across:.0f}° across"))
     if calibration.pitch_mm is not None:
@@ -574,7 +579,7 @@ def judge(
         between: `pointing` at `between_stops`; None to compute it.
         evidence: evidence from its corners, as `gather` returns it; None to compute it.
     """
-    if calibration.T_head_zoom is None:
+    if calibration.zoom_head.T_head_zoom is None:
         return Verdict(_without_head(calibration), "unknown")
     if calibration.covariance is None:
         return _without_covariance(calibration)
@@ -590,7 +595,7 @@ def judge(
     between = pointing(calibration, between_stops(calibration)) if between is None else between
     if not np.isfinite(at[-1].rms):
         return Verdict("Reaches no point of the fixed image with the head: its geometry cannot be right.", "bad")
-    width = calibration.zoom.size[0]
+    width = calibration.zoom_head.lens.size[0]
     level: Level = "care" if mismatch or calibration.held_out is None else "good"
     parts = [*mismatch, _how_well(at, between)]
     if at[-1].rms_px > FAR_OFF * width:

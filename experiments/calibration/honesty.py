@@ -89,7 +89,10 @@ def inside(calibration: Calibration, truth: Truth, names: Sequence[str], level: 
 
 def error_of(calibration: Calibration, truth: Truth) -> dict[str, float]:
     """Compute truth minus estimate by name; for a transform, the rotation exp(w) in front of R and the shift of t."""
-    pairs = [("fixed", truth.fixed, calibration.fixed), ("zoom[0]", truth.zoom, calibration.zoom.stops[0])]
+    pairs = [
+        ("fixed", truth.fixed, calibration.fixed.lens),
+        ("zoom[0]", truth.zoom, calibration.zoom_head.lens.stops[0]),
+    ]
     error = {
         f"{camera}.{name}": a - b
         for camera, true, lens in pairs
@@ -101,8 +104,8 @@ def error_of(calibration: Calibration, truth: Truth) -> dict[str, float]:
         )
     }
     transforms = [
-        ("T_zoom0_fixed", truth.gamma, calibration.T_zoom0_fixed),
-        ("T_head_zoom", truth.hand, calibration.hand_eye()),
+        ("T_zoom0_fixed", truth.gamma, calibration.zoom_head.T_zoom0_fixed),
+        ("T_head_zoom", truth.hand, calibration.zoom_head.hand_eye()),
     ]
     for transform, true_T, found in transforms:
         turn, shift = (true_T.rotation * found.rotation.inv()).as_rotvec(), true_T.translation - found.translation
@@ -110,8 +113,8 @@ def error_of(calibration: Calibration, truth: Truth) -> dict[str, float]:
             f"{transform}.{k}": float(v)
             for k, v in zip(("rx", "ry", "rz", "tx", "ty", "tz"), (*turn, *shift), strict=True)
         }
-    error["head.axis_offset"] = truth.dz - calibration.head.axis_offset
-    error["head.squareness"] = truth.eps - calibration.head.squareness
+    error["head.axis_offset"] = truth.dz - calibration.zoom_head.axes.axis_offset
+    error["head.squareness"] = truth.eps - calibration.zoom_head.axes.squareness
     error |= {f"board.warp_{axis}": -warp for axis, warp in zip("xy", calibration.board_warp, strict=True)}
     return error
 

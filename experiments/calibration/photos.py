@@ -79,7 +79,7 @@ def one(calibration: Calibration, _: PhotosSettings, number: int) -> list[Row]:
 
 
 def _all(whole: Calibration) -> Row:
-    residuals, gamma = whole.residuals, whole.T_zoom0_fixed
+    residuals, gamma = whole.residuals, whole.zoom_head.T_zoom0_fixed
     assert residuals is not None
     return {
         "pair": "all",
@@ -99,13 +99,13 @@ def _without(whole: Calibration, pair: int) -> Row:
     """Calibrate without a pair, then fit the pose of its board alone."""
     assert whole.board is not None
     points = board_points(whole.board)
-    sizes = {"fixed": whole.fixed.size, "zoom": whole.zoom.size}
+    sizes = {"fixed": whole.fixed.size, "zoom": whole.zoom_head.lens.size}
     others = [view for view in whole.views if view.board != pair]
     calibration = calibrate_views(others, whole.board, sizes, options=NOT_HELD_OUT)  # type: ignore[arg-type]
     mine = [view for view in whole.views if view.board == pair]
     left = fit(place_boards(model_of(calibration), mine, points), mine, points, ())
     name = ", ".join(str(view.source) for view in mine)
-    baseline = float(1e3 * np.linalg.norm(calibration.T_zoom0_fixed.translation))
+    baseline = float(1e3 * np.linalg.norm(calibration.zoom_head.T_zoom0_fixed.translation))
     corners = int(sum(view.seen.sum() for view in mine))
     return {"pair": name, "left_out_rms_px": left.rms_px, "baseline_mm": baseline, "corners": corners}
 
@@ -116,7 +116,7 @@ def _baseline_sigma(calibration: Calibration) -> float:
     if covariance is None:
         return float("nan")
     rows = [covariance.parameters.index(f"T_zoom0_fixed.{name}") for name in ("tx", "ty", "tz")]
-    t = calibration.T_zoom0_fixed.translation
+    t = calibration.zoom_head.T_zoom0_fixed.translation
     along = t / np.linalg.norm(t)
     return float(np.sqrt(along @ covariance.matrix[np.ix_(rows, rows)] @ along))
 

@@ -96,11 +96,12 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
 
 def without_offsets(calibration: Calibration) -> Calibration:
     """Remove all offsets from a calibration: the same rotations, and the whole rig at one point."""
-    return dataclasses.replace(
-        calibration,
-        T_zoom0_fixed=RigidTransform.from_rotation(calibration.T_zoom0_fixed.rotation),
-        T_head_zoom=RigidTransform.from_rotation(calibration.hand_eye().rotation),
+    head = dataclasses.replace(
+        calibration.zoom_head,
+        T_zoom0_fixed=RigidTransform.from_rotation(calibration.zoom_head.T_zoom0_fixed.rotation),
+        T_head_zoom=RigidTransform.from_rotation(calibration.zoom_head.hand_eye().rotation),
     )
+    return dataclasses.replace(calibration, zoom_head=head)
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, dict[str, float]]]]:

@@ -101,7 +101,7 @@ def one(_: None, settings: RigsSettings, seed: int) -> list[Row]:
     off = misses(calibration, truth, pixels[reached], depths[reached])
     expected = predicted_pointing(calibration, pixels[reached], depths[reached])
     measured, predicted = LONGEST_PX * rms(off), LONGEST_PX * rms(expected)
-    away = calibration.T_zoom0_fixed * truth.gamma.inv()
+    away = calibration.zoom_head.T_zoom0_fixed * truth.gamma.inv()
     held_out = calibration.held_out
     return [
         row
@@ -136,15 +136,8 @@ def by_chance(calibration: Calibration, pixels: Array, depths: Array, rng: np.ra
         step[columns] = drawn
         other = stepped(model, step, np.empty((0, POSE_PARAMETERS)), EVERY_BLOCK)
         assert other.fixed is not None
-        assert other.zoom is not None
-        wrong = replace(
-            calibration,
-            fixed=other.fixed,
-            zoom=other.zoom,
-            T_zoom0_fixed=other.gamma,
-            T_head_zoom=other.hand,
-            head=other.head,
-        )
+        assert other.zoom_head is not None
+        wrong = replace(calibration, fixed=other.fixed, zoom_head=other.zoom_head)
         beyond += rms(misses(wrong, truth, pixels, depths)) > WITHIN * predicted
     return beyond / CHANCE_DRAWS
 

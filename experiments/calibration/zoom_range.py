@@ -103,9 +103,9 @@ def predicted(calibration: Calibration, nominal_px: float) -> float:
 
 def lens_errors(calibration: Calibration, truth: Truth, nominal_px: float) -> dict[str, float]:
     """Give errors of the focal length [%] and of the ray through the image's centre in the head's frame [degrees]."""
-    found, true = calibration.zoom.at(nominal_px), truth.zoom_lens_for(nominal_px)
+    found, true = calibration.zoom_head.lens.at(nominal_px), truth.zoom_lens_for(nominal_px)
     middle = found.image_center_px
-    here = calibration.hand_eye().rotation.apply(found.ray(middle))
+    here = calibration.zoom_head.hand_eye().rotation.apply(found.ray(middle))
     there = truth_hand(truth).rotation.apply(np.append(true.directions(middle), 1.0))
     return {
         "focal_off_percent": 100 * abs(found.focal_px[0] / true.focal_px[0] - 1),

@@ -151,7 +151,7 @@ def measured_depths(
     wide = truth.fixed.project(x_fixed + half)[:, 0] - truth.fixed.project(x_fixed - half)[:, 0] + noise_px
     return np.array(
         [
-            depth_from_size(calibration.fixed, TARGET.size, size_px, pixel, vertical=False)
+            depth_from_size(calibration.fixed.lens, TARGET.size, size_px, pixel, vertical=False)
             for size_px, pixel in zip(wide, pixels, strict=True)
         ]
     )

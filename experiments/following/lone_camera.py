@@ -70,7 +70,7 @@ class LoneCamera:
         """
         self._rig, self._truth, self._calibration, self._target = rig, truth, calibration, target
         self._detector, self._delay_s, self._field = detector, delay_s, list(field)
-        self._zoom = calibration.zoom
+        self._zoom = calibration.zoom_head.lens
         self._shortest, longest = (self._zoom.at(f).focal_px[0] for f in rig.zoom.focal_range)
         self._policy = ZoomController((self._shortest, longest), rig.zoom.size)
         self._head_controller = HeadController(rig.head.limits)
@@ -126,18 +126,20 @@ class LoneCamera:
         sides = (w / fx, h / fy)
         distance = self._course.range if self._course.known else self._target.size / max(sides)
         ray = lens.ray(found.center_px)
-        hand = self._calibration.hand_eye(nominal)
-        x_base = (base_head(pan, tilt, self._calibration.head) * hand).apply(ray / np.linalg.norm(ray) * distance)
+        hand = self._calibration.zoom_head.hand_eye(nominal)
+        x_base = (base_head(pan, tilt, self._calibration.zoom_head.axes) * hand).apply(
+            ray / np.linalg.norm(ray) * distance
+        )
         limits = self._rig.head.limits
         ways = solve(
             x_base,
-            self._calibration.hand_eye(),
-            self._calibration.head,
+            self._calibration.zoom_head.hand_eye(),
+            self._calibration.zoom_head.axes,
             lens.ray(lens.image_center_px),
             pupil=self._zoom.pupil_at(nominal),
         )
         try:
-            pointing = nearest(ways, limits.pan, limits.tilt, (pan, tilt), self._calibration.head)
+            pointing = nearest(ways, limits.pan, limits.tilt, (pan, tilt), self._calibration.zoom_head.axes)
             pan, tilt = float(pointing.pan), float(pointing.tilt)
         except UnreachableError:  # beyond the head's limits: clip
             pan, tilt = (min(max(q, low), high) for q, (low, high) in ((pan, limits.pan), (tilt, limits.tilt)))
@@ -224,14 +226,14 @@ def scan_of(rig: Rig, calibration: Calibration) -> list[Angles]:
         calibration: calibration, for the fixed camera's direction and field of view.
     """
     width, height = rig.zoom.size
-    fx, fy = calibration.zoom.stops[0].focal_px
+    fx, fy = calibration.zoom_head.lens.stops[0].focal_px
     views = (1 - OVERLAP) * 2 * math.atan(width / 2 / fx), (1 - OVERLAP) * 2 * math.atan(height / 2 / fy)
-    fixed = calibration.fixed
+    fixed = calibration.fixed.lens
     width, height = fixed.size
     edges = fixed.ray(
         np.array([[0.0, height / 2], [width - 1.0, height / 2], [width / 2, 0.0], [width / 2, height - 1]])
     )
-    axis_base = calibration.T_base_fixed.rotation.apply(edges)
+    axis_base = calibration.zoom_head.T_base_fixed.rotation.apply(edges)
     pans, tilts = np.arctan2(axis_base[:2, 0], axis_base[:2, 2]), np.arctan2(-axis_base[2:, 1], axis_base[2:, 2])
     stops = []
     for angles, view, (low, high) in zip(

@@ -14,6 +14,7 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.geometry import Array, RigidTransform, Rotation
 from cotarget.pantilt import HeadGeometry
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from experiments.calibration.random_rigs import OUT_OF_PLANE, any_direction, any_lens
 from experiments.calibration.synthetic.rig import LONGEST_PX, NOMINAL_PX, SIZE, Lens, Truth, undistorted
 
@@ -57,11 +58,13 @@ def idealised(truth: Truth) -> Truth:
 def exact_calibration(truth: Truth) -> Calibration:
     """Give the calibration of a rig without error."""
     return Calibration(
-        fixed=_intrinsics(truth.fixed),
-        zoom=ZoomLens((NOMINAL_PX,), (_intrinsics(truth.zoom),)),
-        T_zoom0_fixed=truth.gamma,
-        T_head_zoom=truth.hand,
-        head=HeadGeometry(truth.dz, truth.eps),
+        fixed=FixedCamera(_intrinsics(truth.fixed)),
+        zoom_head=ZoomHead(
+            ZoomLens((NOMINAL_PX,), (_intrinsics(truth.zoom),)),
+            truth.gamma,
+            truth.hand,
+            HeadGeometry(truth.dz, truth.eps),
+        ),
     )
 
 

@@ -112,23 +112,19 @@ def models_of(
         crude: scatter of crude measurements.
         centring: how the table is learnt and the zeros are set.
     """
-    beside = -calibration.T_base_fixed.inv().translation  # position of the head, seen from the fixed camera
+    beside = -calibration.zoom_head.T_base_fixed.inv().translation  # position of the head, seen from the fixed camera
     still = RigidTransform.identity()
-    planar = replace(
-        calibration,
-        T_zoom0_fixed=RigidTransform.from_translation([*beside[:2], 0.0]),
-        T_head_zoom=still,
-    )
+    planar = _between(calibration, RigidTransform.from_translation([*beside[:2], 0.0]), still)
     believed = {
         FULL: calibration,
         IGNORED: without_offsets(calibration),
-        PARALLEL: replace(calibration, T_zoom0_fixed=RigidTransform.from_translation(beside), T_head_zoom=still),
+        PARALLEL: _between(calibration, RigidTransform.from_translation(beside), still),
         PLANAR: planar,
         PLANAR_TURNED: in_plane(calibration),
-        CRUDE_OFFSET: replace(
+        CRUDE_OFFSET: _between(
             calibration,
-            T_zoom0_fixed=scattered(truth.gamma, crude.between, crude.turn, rng),
-            T_head_zoom=scattered(truth.hand, crude.lever, crude.turn, rng),
+            scattered(truth.gamma, crude.between, crude.turn, rng),
+            scattered(truth.hand, crude.lever, crude.turn, rng),
         ),
     }
     models: dict[str, Model] = {name: _by(found) for name, found in believed.items()}
@@ -138,17 +134,23 @@ def models_of(
     return Models(models, zeros)
 
 
+def _between(calibration: Calibration, T_zoom0_fixed: RigidTransform, T_head_zoom: RigidTransform) -> Calibration:
+    """Give the calibration with other transforms between the cameras and the head."""
+    head = replace(calibration.zoom_head, T_zoom0_fixed=T_zoom0_fixed, T_head_zoom=T_head_zoom)
+    return replace(calibration, zoom_head=head)
+
+
 def _by(calibration: Calibration) -> Model:
     return lambda pixels, depths: aim(calibration, calibration.fixed.ray(pixels) * depths[:, None])
 
 
 def in_plane(calibration: Calibration) -> Calibration:
     """Move the head's centre into the fixed camera's image plane, and the zoom camera to that centre."""
-    fixed_base = calibration.T_base_fixed.inv()
+    fixed_base = calibration.zoom_head.T_base_fixed.inv()
     centre = fixed_base.translation * [1.0, 1.0, 0.0]
     base_fixed = RigidTransform.from_components(centre, fixed_base.rotation).inv()
-    hand = RigidTransform.from_rotation(calibration.hand_eye().rotation)
-    return replace(calibration, T_zoom0_fixed=hand.inv() * base_fixed, T_head_zoom=hand)
+    hand = RigidTransform.from_rotation(calibration.zoom_head.hand_eye().rotation)
+    return _between(calibration, hand.inv() * base_fixed, hand)
 
 
 def scattered(T: RigidTransform, shift: float, turn: float, rng: np.random.Generator) -> RigidTransform:

@@ -77,7 +77,7 @@ def any_pose(rig: Rig, calibration: Calibration, seed: int) -> tuple[float, floa
     """Draw pan and tilt at which the zoom camera looks into the fixed view [rad]."""
     rng = np.random.default_rng((seed, STREAM))
     pixel = rng.uniform(0.0, np.array(rig.fixed.size) - 1.0)
-    pan, tilt = towards(calibration.T_base_fixed.apply(FAR * calibration.fixed.ray(pixel)))
+    pan, tilt = towards(calibration.zoom_head.T_base_fixed.apply(FAR * calibration.fixed.ray(pixel)))
     limits = rig.head.limits
     return float(np.clip(pan, *limits.pan)), float(np.clip(tilt, *limits.tilt))
 

@@ -68,7 +68,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
         calibration = calibrate(rig, config.board, placements=settings.placements, stops=1, seed=seed)
     truth = world.truth()
     lenses = {"fixed": truth.fixed_lens, "zoom": truth.zoom_lens_for(truth.focal_range[0])}
-    found = {"fixed": calibration.fixed, "zoom": calibration.zoom.stops[0]}
+    found = {"fixed": calibration.fixed.lens, "zoom": calibration.zoom_head.lens.stops[0]}
     rows = []
     for camera, lens in lenses.items():
         true, mine = ((*each.focal_px[::-1], *each.center_px[::-1]) for each in (lens, found[camera]))

@@ -49,8 +49,8 @@ def test_what_a_held_scale_does_is_what_fits_say_that_hold_it_elsewhere(found, n
     i = covariance.parameters.index(f"head.{name}")
     own = len(parameter_names(ALL_BLOCKS))
     by_held = covariance.matrix[:own, i] / covariance.matrix[i, i]
-    head = replace(found.model.head, **{name: 1 + ELSEWHERE})
-    moved = fit(replace(found.model, head=head), found.views, POINTS, ALL_BLOCKS).model
+    axes = replace(found.model.zoom_head.axes, **{name: 1 + ELSEWHERE})
+    moved = fit(found.model.with_zoom_head(axes=axes), found.views, POINTS, ALL_BLOCKS).model
     sigmas = np.sqrt(np.diagonal(covariance_of(found).matrix))
     expected = difference(moved, found.model, ALL_BLOCKS) / ELSEWHERE
     np.testing.assert_allclose(by_held / sigmas, expected / sigmas, atol=0.01 * np.abs(expected / sigmas).max())
@@ -70,7 +70,7 @@ def test_scales_that_are_off_are_doubted_by_as_much(calibration):
     """No more than the corners can tell of them: some three ten-thousandths."""
     assert calibration.covariance.sigma("head.pan_scale") == pytest.approx(0.002, abs=0.0012)
     assert calibration.covariance.sigma("head.tilt_scale") == pytest.approx(0.002, abs=0.0012)
-    assert calibration.head.pan_scale == 1.0
+    assert calibration.zoom_head.axes.pan_scale == 1.0
 
 
 def test_pointing_with_scales_off_is_within_twice_what_is_predicted(calibration):
@@ -90,5 +90,5 @@ def test_pointing_with_scales_off_is_within_twice_what_is_predicted(calibration)
 
 def test_encoders_that_are_found_are_not_doubted(views):
     calibration = calibrate_views(views, BOARD, SIZES, options=Options(folds=0, encoders=True))
-    assert calibration.head.pan_scale == pytest.approx(1.002, abs=0.001)
+    assert calibration.zoom_head.axes.pan_scale == pytest.approx(1.002, abs=0.001)
     assert calibration.covariance.sigma("head.pan_scale") < 0.001

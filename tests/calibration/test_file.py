@@ -21,6 +21,8 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_GAMMA, DEFAULT_T, BoardConfig
 from cotarget.errors import CalibrationError, ConfigError
 from cotarget.pantilt import HeadGeometry
+from cotarget.rig_geometry import FixedCamera, ZoomHead
+from tests.rigs import with_zoom_head
 
 ROUNDING = 1e-15  # between radians and degrees, matrix and rotation vector
 
@@ -29,11 +31,13 @@ def example():
     rng = np.random.default_rng(0)
     lens = Intrinsics((640, 480), (686.1, 684.2), (325.3, 239.4), (-0.2, 0.01, 1e-5, -1e-4, 0.0))
     return Calibration(
-        fixed=lens,
-        zoom=ZoomLens((667.0, 1300.0), (lens, lens.scaled(2.0)), (0.0, -0.012)),
-        T_zoom0_fixed=DEFAULT_GAMMA,
-        T_head_zoom=DEFAULT_T,
-        head=HeadGeometry(0.005, 0.0017, 1.001, 0.999, 0.01, -0.02),
+        fixed=FixedCamera(lens),
+        zoom_head=ZoomHead(
+            ZoomLens((667.0, 1300.0), (lens, lens.scaled(2.0)), (0.0, -0.012)),
+            DEFAULT_GAMMA,
+            DEFAULT_T,
+            HeadGeometry(0.005, 0.0017, 1.001, 0.999, 0.01, -0.02),
+        ),
         pitch_mm=0.009,
         residuals=Residuals(0.1, 0.2, None, 0.4, 5, 6, 7, 8, (Rejected("a.png", "no board"),)),
         covariance=Covariance(("fixed.fx", "zoom[1].pupil"), np.array([[0.04, 1e-5 / 3], [1e-5 / 3, 1e-8]])),
@@ -61,12 +65,19 @@ def test_round_trip(tmp_path):
     path, before = tmp_path / "calibration.json", example()
     save_calibration(path, before)
     after = load_calibration(path)
-    for name in ("fixed", "zoom", "pitch_mm", "residuals", "held_out", "board"):
+    assert after.zoom_head.lens == before.zoom_head.lens
+    for name in ("fixed", "pitch_mm", "residuals", "held_out", "board"):
         assert getattr(after, name) == getattr(before, name)
     assert dict(after.provenance) == dict(before.provenance)
-    assert np.allclose(after.T_zoom0_fixed.as_matrix(), before.T_zoom0_fixed.as_matrix(), rtol=0, atol=ROUNDING)
-    assert np.allclose(after.T_head_zoom.as_matrix(), before.T_head_zoom.as_matrix(), rtol=0, atol=ROUNDING)
-    assert dataclasses.astuple(after.head) == pytest.approx(dataclasses.astuple(before.head), abs=ROUNDING)
+    assert np.allclose(
+        after.zoom_head.T_zoom0_fixed.as_matrix(), before.zoom_head.T_zoom0_fixed.as_matrix(), rtol=0, atol=ROUNDING
+    )
+    assert np.allclose(
+        after.zoom_head.T_head_zoom.as_matrix(), before.zoom_head.T_head_zoom.as_matrix(), rtol=0, atol=ROUNDING
+    )
+    assert dataclasses.astuple(after.zoom_head.axes) == pytest.approx(
+        dataclasses.astuple(before.zoom_head.axes), abs=ROUNDING
+    )
     assert after.jitter == pytest.approx(before.jitter, abs=ROUNDING)
     assert after.covariance.parameters == before.covariance.parameters
     assert (after.covariance.matrix == before.covariance.matrix).all()
@@ -87,11 +98,17 @@ def test_round_trip(tmp_path):
 def test_optional_parts_may_be_missing(tmp_path):
     path = tmp_path / "c.json"
     bare = replace(
-        example(), T_head_zoom=None, pitch_mm=None, residuals=None, covariance=None, board=None, views=(), provenance={}
+        with_zoom_head(example(), T_head_zoom=None),
+        pitch_mm=None,
+        residuals=None,
+        covariance=None,
+        board=None,
+        views=(),
+        provenance={},
     )
     save_calibration(path, bare)
     after = load_calibration(path)
-    assert (after.T_head_zoom, after.pitch_mm, after.residuals, after.covariance) == (None, None, None, None)
+    assert (after.zoom_head.T_head_zoom, after.pitch_mm, after.residuals, after.covariance) == (None, None, None, None)
 
 
 def edited(tmp_path, edit):

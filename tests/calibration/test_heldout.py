@@ -106,7 +106,7 @@ def test_what_is_measured_is_the_miss_of_the_prediction(stops):
     squares = []
     for k in range(folds):
         model = fitted(start, [v for v in views if v.board % folds != k]).model
-        rig = truth_of(Calibration(model.fixed, model.zoom, model.gamma, model.hand, model.head))
+        rig = truth_of(Calibration(model.fixed, model.zoom_head))
         kept = [v for v in views if v.board % folds == k]
         for fixed_view in (v for v in kept if v.camera == "fixed"):
             D = np.array(rig.fixed.distortion)
@@ -115,7 +115,7 @@ def test_what_is_measured_is_the_miss_of_the_prediction(stops):
             x_fixed = POINTS @ cv2.Rodrigues(w)[0].T + t.ravel()
             for view in (v for v in kept if v.camera == "zoom" and v.board == fixed_view.board):
                 stop = int(view.focal_px > NOMINAL_PX)
-                lens, pupil = model.zoom.stops[stop], [0.0, 0.0, model.zoom.pupil[stop]]
+                lens, pupil = model.zoom_head.lens.stops[stop], [0.0, 0.0, model.zoom_head.lens.pupil[stop]]
                 lens = Lens(*lens.focal_px, *lens.center_px, lens.distortion)
                 off = lens.project(rig.in_zoom(x_fixed, view.pan, view.tilt) - pupil) - view.corners_px
                 squares.append(np.sum((np.nanmean(off, axis=0) / (1 + stop)) ** 2))

@@ -166,7 +166,7 @@ def test_the_encoders_scales_are_found():
     for name, true in zip(("pan_scale", "tilt_scale"), SCALES, strict=True):
         sigma = found.covariance.sigma(f"head.{name}")
         assert sigma < LEAST_TOLD * SUPPOSED
-        assert abs(getattr(found.head, name) - true) < SCALE_SIGMAS * sigma
+        assert abs(getattr(found.zoom_head.axes, name) - true) < SCALE_SIGMAS * sigma
     measured, predicted = pointing(found, truth)
     assert measured < POINTING_FACTOR * predicted
 

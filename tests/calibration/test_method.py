@@ -10,12 +10,13 @@ from cotarget.board import board_points
 from cotarget.calibration import Options, calibrate_photos, calibrate_views
 from cotarget.calibration.bundle import EVERY_BLOCK, batches_of, difference, fit, parameter_names, predict, stepped
 from cotarget.calibration.initialization import rough_gamma
-from cotarget.calibration.model import RigModel, View
+from cotarget.calibration.model import BundleModel, View
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import DEFAULT_GAMMA, DEFAULT_T, BoardConfig
 from cotarget.errors import CalibrationError, ConfigError
-from cotarget.geometry import pose
+from cotarget.geometry import RigidTransform, pose
 from cotarget.pantilt import HeadGeometry
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from experiments.calibration.synthetic.aims import pointing_errors
 from experiments.calibration.synthetic.rig import SIZE, Truth, other_rig
 from experiments.calibration.synthetic.views import synthetic_views
@@ -31,13 +32,13 @@ def test_exact_corners_give_the_truth_exactly():
     truth = Truth()
     views = synthetic_views(truth, POINTS, np.random.default_rng(0), boards=8, noise_px=0.0)
     calibration = calibrate_views(views, BOARD, SIZES)
-    lens = calibration.zoom.stops[0]
+    lens = calibration.zoom_head.lens.stops[0]
     # Corners are exact to rounding; the solver stops at a relative fall of the cost of 1e-10.
     assert np.allclose([*lens.focal_px, *lens.center_px], [692, 693, 326, 235], atol=1e-3)
-    assert np.allclose(calibration.T_zoom0_fixed.as_matrix(), truth.gamma.as_matrix(), atol=1e-6)
-    assert np.allclose(calibration.T_head_zoom.as_matrix(), truth.hand.as_matrix(), atol=1e-6)
-    assert calibration.head.axis_offset == pytest.approx(truth.dz, abs=1e-6)
-    assert calibration.head.squareness == pytest.approx(truth.eps, abs=1e-6)
+    assert np.allclose(calibration.zoom_head.T_zoom0_fixed.as_matrix(), truth.gamma.as_matrix(), atol=1e-6)
+    assert np.allclose(calibration.zoom_head.T_head_zoom.as_matrix(), truth.hand.as_matrix(), atol=1e-6)
+    assert calibration.zoom_head.axes.axis_offset == pytest.approx(truth.dz, abs=1e-6)
+    assert calibration.zoom_head.axes.squareness == pytest.approx(truth.eps, abs=1e-6)
 
 
 @pytest.mark.parametrize(("truth", "bounds", "refined_bounds"), [
@@ -62,7 +63,7 @@ def test_the_derivatives_are_those_of_the_predictions():
     boards = {i: pose(np.add(rng.normal(0, 0.3, 3), [-0.4, -0.25, 4]), rng.normal(0, 15, 3)) for i in range(2)}
     zoom = ZoomLens((667.0, 1334.0), (lens, lens.scaled(2.0)), (0.0, -0.03))
     head = HeadGeometry(0.05, 0.02, 1.01, 0.98, 0.02, -0.03)
-    model = RigModel(boards, lens, zoom, DEFAULT_GAMMA, DEFAULT_T, head)
+    model = BundleModel(boards, FixedCamera(lens), ZoomHead(zoom, DEFAULT_GAMMA, DEFAULT_T, head))
     blank = np.zeros((54, 2))
     views = [
         View("fixed", blank, 0),
@@ -94,14 +95,14 @@ def test_the_derivatives_are_those_of_the_predictions():
         if found.by_turn is not None:
             for k, axis in enumerate(("pan_zero", "tilt_zero")):
                 heads = (replace(head, **{axis: getattr(head, axis) + s * h}) for s in (1, -1))
-                high, low = (replace(model, head=one) for one in heads)
+                high, low = (model.with_zoom_head(axes=one) for one in heads)
                 assert np.allclose(change(high, low), found.by_turn[..., k], atol=1e-6 * np.abs(found.by_turn).max())
 
 
 def test_a_step_and_the_difference_are_inverse():
     lens = Intrinsics(SIZE, (686.0, 684.0), (325.0, 239.0))
     zoom = ZoomLens((667.0, 1334.0), (lens, lens.scaled(2.0)))
-    model = RigModel({}, lens, zoom, DEFAULT_GAMMA, DEFAULT_T)
+    model = BundleModel({}, FixedCamera(lens), ZoomHead(zoom, DEFAULT_GAMMA, DEFAULT_T))
     step = np.random.default_rng(0).normal(0, 0.01, len(parameter_names(EVERY_BLOCK, 2)))
     there = stepped(model, step, np.zeros((0, 6)), EVERY_BLOCK)
     assert np.allclose(difference(there, model, EVERY_BLOCK), step, atol=1e-12)
@@ -132,7 +133,8 @@ def test_the_first_guess_of_gamma_is_exact_for_exact_corners():
     truth = Truth(hand=pose([0.1, -0.08, 0.05], [3.0, -4.0, 20.0]))
     views = synthetic_views(truth, POINTS, np.random.default_rng(0), boards=6, noise_px=0.0)
     fixed, zoom = (Intrinsics(SIZE, (n.fx, n.fy), (n.cx, n.cy), n.distortion) for n in (truth.fixed, truth.zoom))
-    model = RigModel({}, fixed, ZoomLens((667.0,), (zoom,)), hand=truth.hand, head=HeadGeometry(truth.dz, truth.eps))
+    still, axes = RigidTransform.identity(), HeadGeometry(truth.dz, truth.eps)
+    model = BundleModel({}, FixedCamera(fixed), ZoomHead(ZoomLens((667.0,), (zoom,)), still, truth.hand, axes))
     moved = [view for view in views if view.camera == "fixed" or view.pan != 0]
     off = rough_gamma(model, moved, POINTS) * truth.gamma.inv()
     assert off.rotation.magnitude() < 1e-5  # OpenCV refines a pose until it changes by 1e-6 or so
@@ -186,7 +188,7 @@ def test_two_cameras_that_did_not_stand_still_are_refused(turned, method):
 
 def test_two_cameras_that_stood_still_are_not():
     found = calibrate_views(without_a_head(0), BOARD, SIZES, options=Options(folds=0))
-    off = found.T_zoom0_fixed.translation - Truth().gamma.translation
+    off = found.zoom_head.T_zoom0_fixed.translation - Truth().gamma.translation
     assert (np.abs(off) < 3 * np.array([found.covariance.sigma(f"T_zoom0_fixed.t{axis}") for axis in "xyz"])).all()
 
 
@@ -201,7 +203,7 @@ def test_what_cannot_be_calibrated_is_refused_in_words():
     with pytest.raises(CalibrationError, match="40 finite corners"):
         calibrate_views(views, BoardConfig(corners=(8, 5)), SIZES)
     with pytest.raises(CalibrationError, match="no views"):
-        fit(RigModel({}), [], POINTS, ())
+        fit(BundleModel({}), [], POINTS, ())
 
 
 @pytest.mark.skipif(not PHOTOS.is_dir(), reason=f"the real stereo photos are not at {PHOTOS}")
@@ -212,6 +214,6 @@ def test_real_photos():
     assert residuals.rejected == ()
     # Known to be possible with these corners: 0.177, 0.182 and 0.196 px; mrcal's baseline is 83.15 mm.
     assert max(residuals.fixed_rms_px, residuals.zoom_rms_px, residuals.stereo_rms_px) < 0.20
-    assert np.linalg.norm(calibration.T_zoom0_fixed.translation) == pytest.approx(0.08315, abs=0.0005)
-    assert calibration.T_head_zoom is None
+    assert np.linalg.norm(calibration.zoom_head.T_zoom0_fixed.translation) == pytest.approx(0.08315, abs=0.0005)
+    assert calibration.zoom_head.T_head_zoom is None
     assert residuals.handeye_rms_px is None

@@ -14,8 +14,10 @@ from cotarget.config import BoardConfig, RigConfig, SimConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform
 from cotarget.pantilt import HeadGeometry
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth, other_rig
 from experiments.calibration.synthetic.views import synthetic_views
+from tests.rigs import with_zoom_head
 
 SPEC = describe(RigConfig(sim=SimConfig()))
 NOISE_PX = 0.1
@@ -30,11 +32,13 @@ def calibration_of(truth, *, with_views=True):
     board = BoardConfig()
     views = synthetic_views(truth, board_points(board), np.random.default_rng(1), boards=6, noise_px=NOISE_PX)
     return Calibration(
-        fixed=intrinsics(truth.fixed),
-        zoom=ZoomLens((NOMINAL_PX,), (intrinsics(truth.zoom),)),
-        T_zoom0_fixed=truth.gamma,
-        T_head_zoom=truth.hand,
-        head=HeadGeometry(truth.dz, truth.eps),
+        fixed=FixedCamera(intrinsics(truth.fixed)),
+        zoom_head=ZoomHead(
+            ZoomLens((NOMINAL_PX,), (intrinsics(truth.zoom),)),
+            truth.gamma,
+            truth.hand,
+            HeadGeometry(truth.dz, truth.eps),
+        ),
         board=board,
         views=tuple(views) if with_views else (),
     )
@@ -49,22 +53,32 @@ def in_mm(T):
 
 
 def exchanged(calibration):
-    return replace(calibration, T_head_zoom=calibration.T_zoom0_fixed, T_zoom0_fixed=calibration.T_head_zoom)
+    return with_zoom_head(
+        calibration, T_head_zoom=calibration.zoom_head.T_zoom0_fixed, T_zoom0_fixed=calibration.zoom_head.T_head_zoom
+    )
 
 
 def with_lens(calibration, **changed):
-    return replace(calibration, fixed=replace(calibration.fixed, **changed))
+    return replace(calibration, fixed=FixedCamera(replace(calibration.fixed.lens, **changed)))
 
 
 IMPLAUSIBLE = {
-    "a baseline in millimetres": (replace(PLAIN, T_zoom0_fixed=in_mm(PLAIN.T_zoom0_fixed)), "T_zoom0_fixed: .* metres"),
-    "a lever in millimetres": (replace(PLAIN, T_head_zoom=in_mm(PLAIN.T_head_zoom)), "T_head_zoom: .* metres"),
-    "an axis offset in millimetres": (replace(PLAIN, head=HeadGeometry(5.0)), "head.axis_offset: .* metres"),
+    "a baseline in millimetres": (
+        with_zoom_head(PLAIN, T_zoom0_fixed=in_mm(PLAIN.zoom_head.T_zoom0_fixed)),
+        "T_zoom0_fixed: .* metres",
+    ),
+    "a lever in millimetres": (
+        with_zoom_head(PLAIN, T_head_zoom=in_mm(PLAIN.zoom_head.T_head_zoom)),
+        "T_head_zoom: .* metres",
+    ),
+    "an axis offset in millimetres": (with_zoom_head(PLAIN, axes=HeadGeometry(5.0)), "head.axis_offset: .* metres"),
     "a square in millimetres": (replace(PLAIN, board=BoardConfig(square=25.0)), "board.square: .* metres"),
     "T and Gamma exchanged": (exchanged(GOOD), "exchanged"),
     "T and Gamma exchanged, without views": (exchanged(PLAIN), "exchanged"),
     "a lever of 2 mm in millimetres": (
-        replace(GOOD, T_head_zoom=RigidTransform.from_components([0.0, 0.0, 2.0], GOOD.T_head_zoom.rotation)),
+        with_zoom_head(
+            GOOD, T_head_zoom=RigidTransform.from_components([0.0, 0.0, 2.0], GOOD.zoom_head.T_head_zoom.rotation)
+        ),
         "miss the corners",
     ),
     "a focal length in millimetres": (with_lens(PLAIN, focal_px=(6.0, 6.0)), "fixed.fx: .* pixels"),
@@ -97,7 +111,7 @@ def test_another_lens_is_another_rig():
     for focal_range in ([own[0] / 2, own[1]], [own[0], own[1] / 2]):
         with pytest.raises(CalibrationError, match="another rig's"):
             check_plausible(replace(GOOD, provenance={"focal_range_px": focal_range}), SPEC)
-    farther = replace(GOOD, zoom=ZoomLens((2 * own[1],), GOOD.zoom.stops))
+    farther = with_zoom_head(GOOD, lens=ZoomLens((2 * own[1],), GOOD.zoom_head.lens.stops))
     with pytest.raises(CalibrationError, match="another rig's"):
         check_plausible(farther, SPEC)
 

@@ -52,9 +52,7 @@ def fitted(start, views):
 
 def test_its_error_is_that_of_the_calibration(found, predicted):
     model = found.model
-    calibration = Calibration(
-        model.fixed, model.zoom, model.gamma, model.hand, model.head, covariance=covariance_of(found)
-    )
+    calibration = Calibration(model.fixed, model.zoom_head, covariance=covariance_of(found))
     across, down = (np.linspace(BORDER, 1 - BORDER, count) for count in ACCURACY_GRID)
     pixels = np.array([(u, v) for u in across for v in down]) * (np.array(SIZE) - 1)
     errors = [predicted_pointing(calibration, pixels, depth * BOARD.square) for depth in DEPTHS_SQUARES]

@@ -69,7 +69,7 @@ def test_progress_ends_where_it_said(session):
 def test_captures_give_the_same_calibration(session):
     _, calibration, directory, _ = session
     again = calibrate_captures(directory)
-    error = again.T_zoom0_fixed.inv() * calibration.T_zoom0_fixed
+    error = again.zoom_head.T_zoom0_fixed.inv() * calibration.zoom_head.T_zoom0_fixed
     # The very same images; only boards that a quick look had missed may be found now.
     assert error.rotation.magnitude() < 1e-4
     assert np.linalg.norm(error.translation) < 1e-3
@@ -132,7 +132,8 @@ def test_a_broken_rig_is_refused_in_one_line(broken, message):
 
 def test_a_lens_that_reports_two_thirds_of_its_focal_length_is_calibrated_all_the_same():
     found = calibrate(SyntheticRig(told=478 / 692), BOARD, placements=8)
-    assert found.zoom.stops[0].focal_px[0] == pytest.approx(Truth().zoom.fx, rel=0.01)  # 8 placements know it to 0.2 %
+    shortest = found.zoom_head.lens.stops[0]
+    assert shortest.focal_px[0] == pytest.approx(Truth().zoom.fx, rel=0.01)  # 8 placements know it to 0.2 %
 
 
 @pytest.mark.parametrize(("halts", "arrives"), [(1, True), (2, True), (3, False)])

@@ -20,17 +20,19 @@ from cotarget.calibration import (
 from cotarget.calibration.bundle import ALL_BLOCKS, Fit, coordinate_variance, fit, parameter_names
 from cotarget.calibration.initialization import at_home
 from cotarget.calibration.joint import joint
-from cotarget.calibration.model import RigModel
+from cotarget.calibration.model import BundleModel
 from cotarget.calibration.uncertainty import covariance_of
 from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig
 from cotarget.errors import CalibrationError
 from cotarget.geometry import RigidTransform
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.targeting import Reach, aim, error_budget, point_at
 from experiments.calibration.honesty import GROUPS, error_of, inside
 from experiments.calibration.synthetic.aims import draw_targets, pointing_errors
 from experiments.calibration.synthetic.rig import SIZE, Truth, other_rig
 from experiments.calibration.synthetic.views import synthetic_views
+from tests.rigs import with_zoom_head
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)
@@ -52,7 +54,7 @@ def noisy(views, rng, outliers=0.0):
 
 
 def calibrated(model, covariance):
-    return Calibration(model.fixed, model.zoom, model.gamma, model.hand, model.head, covariance=covariance)
+    return Calibration(model.fixed, model.zoom_head, covariance=covariance)
 
 
 def honesty(truth, seeds, outliers=0.0):
@@ -93,7 +95,9 @@ def ideal(parameters, matrix):
     lens = Intrinsics((641, 481), (500.0, 500.0), (320.0, 240.0))
     still = RigidTransform.identity()
     return Calibration(
-        lens, ZoomLens((500.0,), (lens,)), still, still, covariance=Covariance(parameters, np.array(matrix, float))
+        fixed=FixedCamera(lens),
+        zoom_head=ZoomHead(ZoomLens((500.0,), (lens,)), still, still),
+        covariance=Covariance(parameters, np.array(matrix, float)),
     )
 
 
@@ -147,7 +151,7 @@ def test_many_targets_at_once_and_out_of_reach():
     each = [predicted_pointing(calibration, pixels[0], depths[0], nominal_px=f) for f in zoomed.ravel()]
     assert np.allclose(longer, each, rtol=1e-9)
     lever = RigidTransform.from_translation([0.0, 0.5, 0.0])  # with the fixed camera where the axes cross
-    calibration = replace(calibration, T_head_zoom=lever, T_zoom0_fixed=lever.inv())
+    calibration = with_zoom_head(calibration, T_head_zoom=lever, T_zoom0_fixed=lever.inv())
     near_and_far = predicted_pointing(calibration, pixels[0, 0], [0.1, 10.0])
     assert np.isnan(near_and_far).tolist() == [True, False]  # nearer than the lever arm
 
@@ -218,7 +222,7 @@ def test_where_there_is_none(views, calibration):
 
 def test_what_the_views_leave_open_has_no_covariance():
     lens = Intrinsics(SIZE, (686.0, 684.0), (325.0, 239.0))
-    model, off = RigModel({0: RigidTransform.identity()}, lens), np.full((2, 20, 2), 0.1)
+    model, off = BundleModel({0: RigidTransform.identity()}, FixedCamera(lens)), np.full((2, 20, 2), 0.1)
 
     def found(normal, variance=0.01):
         return covariance_of(Fit(model, ("fixed",), off, off, normal, variance, 0.0, ()))

@@ -15,6 +15,7 @@ from cotarget.config import BoardConfig
 from cotarget.geometry import RigidTransform
 from experiments.calibration.synthetic.aims import draw_targets, misses
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth, undistorted
+from tests.rigs import with_zoom_head
 from tests.synthetic_rig import FOURFOLD, SyntheticRig, fourfold, zoomed
 
 BOARD = BoardConfig()
@@ -49,12 +50,12 @@ def session(tmp_path_factory):
 
 def at(calibration, nominal_px):
     """The calibration at one focal length, as if that were the only one."""
-    to_pupil = RigidTransform.from_translation([0.0, 0.0, calibration.zoom.pupil_at(nominal_px)])
-    return replace(
+    to_pupil = RigidTransform.from_translation([0.0, 0.0, calibration.zoom_head.lens.pupil_at(nominal_px)])
+    return with_zoom_head(
         calibration,
-        zoom=ZoomLens((nominal_px,), (calibration.zoom.at(nominal_px),)),
-        T_zoom0_fixed=to_pupil.inv() * calibration.T_zoom0_fixed,
-        T_head_zoom=calibration.T_head_zoom * to_pupil,
+        lens=ZoomLens((nominal_px,), (calibration.zoom_head.lens.at(nominal_px),)),
+        T_zoom0_fixed=to_pupil.inv() * calibration.zoom_head.T_zoom0_fixed,
+        T_head_zoom=calibration.zoom_head.T_head_zoom * to_pupil,
     )
 
 
@@ -78,8 +79,10 @@ def test_the_rig_zooms():
 
 def test_every_stop_is_found(session):
     calibration, _ = session
-    assert calibration.zoom.nominal_px == pytest.approx(FOCAL_LENGTHS[::2])
-    assert {view.focal_px for view in calibration.views if view.camera == "zoom"} == set(calibration.zoom.nominal_px)
+    assert calibration.zoom_head.lens.nominal_px == pytest.approx(FOCAL_LENGTHS[::2])
+    assert {view.focal_px for view in calibration.views if view.camera == "zoom"} == set(
+        calibration.zoom_head.lens.nominal_px
+    )
     assert calibration.residuals.rejected == ()
     in_part = [view for view in calibration.views if not view.seen.all()]
     assert in_part, "at four times the focal length a board fills more than the image"
@@ -90,10 +93,11 @@ def test_it_points_over_the_whole_range(session, nominal):
     calibration, _ = session
     stop = fourfold(nominal)
     found, true = at(calibration, nominal), zoomed(Truth(), stop)
-    lens = found.zoom.stops[0]
+    lens = found.zoom_head.lens.stops[0]
     assert lens.focal_px == pytest.approx((stop.lens.fx, stop.lens.fy), rel=FOCAL_TOLERANCE)
     look = np.append(undistorted((np.array(SIZE) - 1) / 2, stop.lens), 1.0)
-    there, here = true.hand.rotation.apply(look), found.T_head_zoom.rotation.apply(lens.ray(lens.image_center_px))
+    there = true.hand.rotation.apply(look)
+    here = found.zoom_head.T_head_zoom.rotation.apply(lens.ray(lens.image_center_px))
     assert np.linalg.norm(np.cross(here, there)) < BORESIGHT_TOLERANCE * np.linalg.norm(here) * np.linalg.norm(there)
     targets = draw_targets(np.random.default_rng(5), TARGETS)
     measured = rms(misses(found, true, *targets))
@@ -116,14 +120,17 @@ def test_captures_in_any_order_give_the_same_calibration(session):
     assert {(view.source, int(view.seen.sum())) for view in again.views} == {
         (view.source, int(view.seen.sum())) for view in calibration.views
     }
-    pairs = [(calibration.fixed, again.fixed), *zip(calibration.zoom.stops, again.zoom.stops, strict=True)]
+    pairs = [
+        (calibration.fixed.lens, again.fixed.lens),
+        *zip(calibration.zoom_head.lens.stops, again.zoom_head.lens.stops, strict=True),
+    ]
     for one, other in pairs:
         assert one.focal_px == pytest.approx(other.focal_px, abs=SAME_PX)
         assert one.center_px == pytest.approx(other.center_px, abs=SAME_PX)
-    assert again.zoom.nominal_px == calibration.zoom.nominal_px
-    assert again.zoom.pupil == pytest.approx(calibration.zoom.pupil, abs=SAME_PUPIL)
+    assert again.zoom_head.lens.nominal_px == calibration.zoom_head.lens.nominal_px
+    assert again.zoom_head.lens.pupil == pytest.approx(calibration.zoom_head.lens.pupil, abs=SAME_PUPIL)
     for name in ("T_zoom0_fixed", "T_head_zoom"):
-        one, other = getattr(calibration, name).as_matrix(), getattr(again, name).as_matrix()
+        one, other = getattr(calibration.zoom_head, name).as_matrix(), getattr(again.zoom_head, name).as_matrix()
         assert np.allclose(one, other, rtol=0, atol=SAME_POSE)
 
 

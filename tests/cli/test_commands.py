@@ -5,7 +5,6 @@ import math
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,7 +18,9 @@ from cotarget.camera import Intrinsics, ZoomLens
 from cotarget.config import BoardConfig, RigConfig
 from cotarget.geometry import RigidTransform, pose
 from cotarget.pantilt import HeadGeometry
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from experiments.calibration.synthetic.rig import NOMINAL_PX, Truth, undistorted
+from tests.rigs import with_zoom_head
 from tests.synthetic_rig import draw, fourfold, pixel_rays, zoomed
 
 OLD = "what was there before\n"
@@ -32,11 +33,13 @@ def true_calibration(config, zoom_size=None, with_head=True):
     sim = config.sim
     zoom = Intrinsics(zoom_size or sim.zoom.size, sim.zoom.focal_px, sim.zoom.center_px, sim.zoom.distortion)
     return Calibration(
-        fixed=Intrinsics(sim.fixed.size, sim.fixed.focal_px, sim.fixed.center_px, sim.fixed.distortion),
-        zoom=ZoomLens((sim.zoom.focal_mm[0] / sim.zoom.pitch_mm,), (zoom,)),
-        T_zoom0_fixed=sim.T_zoom0_fixed,
-        T_head_zoom=sim.T_head_zoom if with_head else None,
-        head=HeadGeometry(sim.head.axis_offset_mm / 1000, math.radians(sim.head.squareness_deg)),
+        fixed=FixedCamera(Intrinsics(sim.fixed.size, sim.fixed.focal_px, sim.fixed.center_px, sim.fixed.distortion)),
+        zoom_head=ZoomHead(
+            ZoomLens((sim.zoom.focal_mm[0] / sim.zoom.pitch_mm,), (zoom,)),
+            sim.T_zoom0_fixed,
+            sim.T_head_zoom if with_head else None,
+            HeadGeometry(sim.head.axis_offset_mm / 1000, math.radians(sim.head.squareness_deg)),
+        ),
         pitch_mm=sim.zoom.pitch_mm,
     )
 
@@ -64,8 +67,10 @@ def folder(tmp_path, monkeypatch):
     save_calibration(tmp_path / "wide.json", true_calibration(RigConfig(), zoom_size=(640, 360)))
     save_calibration(tmp_path / "headless.json", true_calibration(RigConfig(), with_head=False))
     good = true_calibration(RigConfig())
-    wide_apart = RigidTransform.from_components(1000 * good.T_zoom0_fixed.translation, good.T_zoom0_fixed.rotation)
-    save_calibration(tmp_path / "millimetres.json", replace(good, T_zoom0_fixed=wide_apart))
+    wide_apart = RigidTransform.from_components(
+        1000 * good.zoom_head.T_zoom0_fixed.translation, good.zoom_head.T_zoom0_fixed.rotation
+    )
+    save_calibration(tmp_path / "millimetres.json", with_zoom_head(good, T_zoom0_fixed=wide_apart))
     (tmp_path / "broken.json").write_text('{"schema": 2, "fixed": {')
     (tmp_path / "empty.json").write_text('{"schema": 2}')
     for name in ("out.json", "out.csv", "out.mp4"):

@@ -1,7 +1,6 @@
 """`follow` says whether the close-up showed what the fixed camera saw: by state, reason and exit status."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from cotarget.evaluation import true_calibration
 from cotarget.geometry import pose
 from cotarget.sim.world import SimWorld
 from tests.cli.test_commands import call
+from tests.rigs import with_zoom_head
 
 SECONDS = 5.0  # the book is found at once, the lens needs a second, and 3 s without a sight are unconfirmed
 RIG = """
@@ -58,8 +58,8 @@ def test_a_target_in_both_views_is_followed(tmp_path, capsys, true):
 )
 def test_a_target_that_the_close_up_never_shows_is_unconfirmed(tmp_path, capsys, true, wrong):
     calibration = {
-        "millimetres": replace(true, T_zoom0_fixed=millimetres(true.T_zoom0_fixed)),
-        "another rig": replace(true, T_zoom0_fixed=pose([0.3, 0.1, 0.1], [-2, 2, 1])),
+        "millimetres": with_zoom_head(true, T_zoom0_fixed=millimetres(true.zoom_head.T_zoom0_fixed)),
+        "another rig": with_zoom_head(true, T_zoom0_fixed=pose([0.3, 0.1, 0.1], [-2, 2, 1])),
         "size": true,
     }[wrong]
     rig = RIG + (LARGE_BOOK if wrong == "size" else "")
@@ -73,7 +73,9 @@ def test_a_target_that_the_close_up_never_shows_is_unconfirmed(tmp_path, capsys,
 
 @pytest.mark.render
 def test_offsets_in_millimetres_are_refused(tmp_path, capsys, true):
-    status, out, err = follow(tmp_path, capsys, replace(true, T_zoom0_fixed=millimetres(true.T_zoom0_fixed)))
+    status, out, err = follow(
+        tmp_path, capsys, with_zoom_head(true, T_zoom0_fixed=millimetres(true.zoom_head.T_zoom0_fixed))
+    )
     assert (status, out) == (1, "")
     assert "T_zoom0_fixed: the cameras are 4" in err
     assert len(err.splitlines()) == 1

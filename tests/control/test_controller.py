@@ -17,6 +17,7 @@ from cotarget.errors import UnreachableError
 from cotarget.estimation import Appearance
 from cotarget.geometry import pose
 from cotarget.rig import PanTiltLimits, PanTiltState, ZoomState
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.motion import Axis
 from cotarget.targeting import WantedSize
 from tests.rigs import rig_of
@@ -30,12 +31,16 @@ LIMITS = PanTiltLimits((-1.0, 1.0), (-0.8, 0.5), math.radians(149), math.radians
 DELAY, FRAME = 0.1, 0.04
 HERE = pose([0, 0, 0], [0, 0, 0])
 CALIBRATION = Calibration(
-    Intrinsics(SIZE, (700.0, 700.0), CENTER),
-    ZoomLens(
-        (SHORTEST, LONGEST), tuple(Intrinsics(SIZE, (TRUE * f, TRUE * f), CENTER) for f in (SHORTEST, LONGEST)), (0, 0)
+    fixed=FixedCamera(Intrinsics(SIZE, (700.0, 700.0), CENTER)),
+    zoom_head=ZoomHead(
+        ZoomLens(
+            (SHORTEST, LONGEST),
+            tuple(Intrinsics(SIZE, (TRUE * f, TRUE * f), CENTER) for f in (SHORTEST, LONGEST)),
+            (0, 0),
+        ),
+        HERE,
+        HERE,
     ),
-    HERE,
-    HERE,
 )
 
 

@@ -200,7 +200,7 @@ def test_a_rig_is_calibrated_over_the_wire(rig, capsys):
 @short_lens
 def test_a_rig_is_calibrated_over_the_wire_at_two_focal_lengths(rig, capsys):
     found = check_calibration(rig, capsys, placements=8, stops=2)
-    assert len(found.zoom.stops) == 2
+    assert len(found.zoom_head.lens.stops) == 2
 
 
 def check_calibration(rig, capsys, placements, stops):

@@ -14,6 +14,7 @@ from cotarget.evaluation import closeup_of, true_calibration
 from cotarget.geometry import pose
 from cotarget.metrics import SERVED_S
 from tests.env_episodes import FRAME_S, field_rig, run
+from tests.rigs import with_zoom_head
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +183,7 @@ def test_a_calibration_that_is_wrong_serves_worse(field):
     rig = Follow("book", rig=field, seconds=4.0)
     rig.reset(seed=5)
     true = true_calibration(rig.episode.world)
-    wrong = dataclasses.replace(true, T_zoom0_fixed=pose([0, 0, 0], [0, 3, 0]) * true.T_zoom0_fixed)
+    wrong = with_zoom_head(true, T_zoom0_fixed=pose([0, 0, 0], [0, 3, 0]) * true.zoom_head.T_zoom0_fixed)
     earned = []
     for calibration in (true, wrong):
         env = Follow("book", rig=field, seconds=4.0, calibration=calibration)

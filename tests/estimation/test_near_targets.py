@@ -90,7 +90,7 @@ def test_a_velocity_along_the_axis_that_no_size_measures_is_as_uncertain_as_at_f
     """Its standard deviation returns to the usual speed: the target has been seen in part for five seconds."""
     calibration, target = calibration_of(Truth()), DEFAULT_TARGETS[name]
     estimator = TargetFilter(calibration, target)
-    box = Detection(np.array(calibration.fixed.image_center_px), np.array([60.0, 80.0]), 1.0)
+    box = Detection(np.array(calibration.fixed.lens.image_center_px), np.array([60.0, 80.0]), 1.0)
     for i in range(100):
         estimator.update_fixed(box if i < 25 else replace(box, clipped=True), i / RATE)
     found = estimator.at(99 / RATE)
@@ -100,7 +100,7 @@ def test_a_velocity_along_the_axis_that_no_size_measures_is_as_uncertain_as_at_f
 
 def test_a_box_that_is_cut_brings_a_target_nearer_and_never_moves_it_away():
     calibration, person = calibration_of(Truth()), DEFAULT_TARGETS["person"]
-    middle = np.array(calibration.fixed.image_center_px)
+    middle = np.array(calibration.fixed.lens.image_center_px)
     whole = Detection(middle, np.array([31.0, 120.0]), 1.0)
     found = {}
     for part in (0.3, 0.9, 1.0, 1.4):

@@ -17,10 +17,12 @@ from cotarget.estimation import TargetFilter, filter_settings
 from cotarget.estimation.measurement_model import SightLines
 from cotarget.estimation.motion_model import MOTIONS, STATES, USUAL_BIAS, MotionSettings, propagate
 from cotarget.geometry import RigidTransform
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.targeting import Reach, aim, depth_of, point_at
 from cotarget.tracking.track import LiveTrack, tracking_settings
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, Truth
 from tests.moving_targets import APART, RATE, Flight, calibration_of, magnified, show
+from tests.rigs import with_zoom_head
 
 SPLIT = 0.15  # by which two predictions may differ from one, in variances: a person over half a second
 TRIANGULATED = 0.15  # of the logarithm of a depth by 0.4 m of baseline, 0.1 foretold, and half as much for three runs
@@ -135,9 +137,9 @@ def test_the_sight_is_from_where_the_entrance_pupil_has_moved():
     """A lens whose pupil moves forward by 0.2 m sees the same direction less 0.2 m along its own z."""
     truth, forward = Truth(), 0.2
     still = calibration_of(truth)
-    lens = still.zoom.stops[0]
+    lens = still.zoom_head.lens.stops[0]
     zoom = ZoomLens((NOMINAL_PX, 2 * NOMINAL_PX), (lens, lens.scaled(2.0)), (0.0, forward))
-    sight = SightLines(replace(still, zoom=zoom)).at(0.4, 0.2, 2 * NOMINAL_PX)
+    sight = SightLines(with_zoom_head(still, lens=zoom)).at(0.4, 0.2, 2 * NOMINAL_PX)
     x_fixed = np.array([2.7, -0.9, 9.0])
     x = np.zeros(STATES)
     x[:3] = *(x_fixed[:2] / 9.0), math.log(9.0)
@@ -491,7 +493,8 @@ def test_a_height_appears_by_the_vertical_focal_length(name, focal):
     """Both cameras in one place, fy twice fx: a height appears fy / depth large, anything else fx / depth."""
     lens, still = Intrinsics((641, 481), (500.0, 1000.0), (320.0, 240.0)), RigidTransform.identity()
     target = DEFAULT_TARGETS[name]
-    estimator = TargetFilter(Calibration(lens, ZoomLens((500.0,), (lens,)), still, still), target)
+    head = ZoomHead(ZoomLens((500.0,), (lens,)), still, still)
+    estimator = TargetFilter(Calibration(FixedCamera(lens), head), target)
     assert estimator.update_fixed(Detection(np.array([320.0, 240.0]), np.array([50.0, 40.0]), 1.0), 0.0)
     found = estimator.at(0.0)
     seen = found.appearance(0.0, 0.0, 500.0)
@@ -524,7 +527,7 @@ def test_a_long_gap_and_a_target_that_flies_at_the_camera_leave_a_covariance():
     again = estimator.at(20.0)
     there = flight.path(0.2)
     assert np.abs(again.state[:2] - there[:2] / there[2]).max() < 0.02
-    near = flight.calibration.fixed.image_center_px
+    near = flight.calibration.fixed.lens.image_center_px
     charging = TargetFilter(flight.calibration, flight.target)
     for i in range(30):  # from 30 m to 1 m in 1.2 s
         charging.update_fixed(Detection(near, np.array([550.0, 100.0]) / (30.0 - i), 1.0), i / RATE)
@@ -623,4 +626,4 @@ def test_a_calibrations_own_doubt_is_the_prior_of_the_heads_bias():
     sigma = filter_settings(person, doubtful).motion.bias_sigma
     assert sigma == pytest.approx(math.hypot(5e-4, 2 / 692 / math.sqrt(2)), rel=0.02)
     with pytest.raises(CalibrationError):
-        TargetFilter(replace(calibration, T_head_zoom=None), person)
+        TargetFilter(with_zoom_head(calibration, T_head_zoom=None), person)

@@ -18,6 +18,7 @@ from cotarget.estimation.zoom_matching import CloseupFinder, Expected, look
 from cotarget.evaluation import true_calibration
 from cotarget.geometry import pose
 from cotarget.rig import Frame
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.world import SimWorld
 from cotarget.targeting import Reach, aim
 
@@ -44,7 +45,10 @@ def calibration(roll_deg=0.0):
     fixed = Intrinsics(SIZE, (FOCAL, FOCAL), CENTER, (-0.2, 0.0, 0.0, 0.0, 0.0))
     home = pose([-BASELINE, 0.0, 0.0], [0.0, 0.0, roll_deg])
     return Calibration(
-        fixed, ZoomLens((FOCAL,), (Intrinsics(SIZE, (FOCAL, FOCAL), CENTER),)), home, pose([0, 0, 0], [0, 0, 0])
+        fixed=FixedCamera(fixed),
+        zoom_head=ZoomHead(
+            ZoomLens((FOCAL,), (Intrinsics(SIZE, (FOCAL, FOCAL), CENTER),)), home, pose([0, 0, 0], [0, 0, 0])
+        ),
     )
 
 

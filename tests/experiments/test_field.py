@@ -25,6 +25,7 @@ from experiments.following import dead_zone, delay, env_score, field, first_shot
 from experiments.following.field_scenes import hold_config
 from experiments.following.shots import CAUSES, Shot, budget
 from experiments.following.wide_view import Seen, WideView, open_on, record
+from tests.rigs import with_zoom_head
 
 FIELD = (hold, first_shot, delay, five_targets, dead_zone, sim_speed)
 SMALL = 0.03  # relative: products of angles of a hundredth that are taken for sums
@@ -293,7 +294,7 @@ def test_each_cause_alone(still):
     assert alone("delay", parts(moved=np.array([0.0, 0.1, 0.0]))) == pytest.approx(0.1 / away, rel=SMALL)
     longer = parts(moved=np.array([0.0, 0.1, 0.0]), depth=12.0)["delay"]
     assert longer == pytest.approx(0.1 * 10 / 12 / away, rel=SMALL)
-    turned = dataclasses.replace(exact, T_zoom0_fixed=pose([0, 0, 0], [0, 0.1, 0]) * exact.T_zoom0_fixed)
+    turned = with_zoom_head(exact, T_zoom0_fixed=pose([0, 0, 0], [0, 0.1, 0]) * exact.zoom_head.T_zoom0_fixed)
     assert alone("calibration", parts(turned)) == pytest.approx(math.radians(0.1), rel=SMALL)
     # The middle of the image is 6.5 and 4.5 px beside the principal point, at 1384 and 2768 px.
     lens = alone("lens", parts(nominal_px=4 * shortest))

@@ -43,7 +43,7 @@ def test_the_papers_way_aims_by_its_shortcut_at_where_the_target_was_seen(run):
     assert len(aimed) > 3
     for step in aimed:
         np.testing.assert_allclose(known.fixed.project(step.aim.x_fixed), step.target.box.center_px, atol=1e-6)
-        by_hand = shortcut(step.aim.x_fixed, known.T_zoom0_fixed, known.hand_eye(), "table")
+        by_hand = shortcut(step.aim.x_fixed, known.zoom_head.T_zoom0_fixed, known.zoom_head.hand_eye(), "table")
         assert (step.aim.pan, step.aim.tilt) == pytest.approx((float(by_hand.pan), float(by_hand.tilt)))
         assert step.commanded[:2] == pytest.approx((step.aim.pan, step.aim.tilt))
 
@@ -105,8 +105,8 @@ def test_a_worker_has_the_rig_as_it_was_read_wherever_it_is(tmp_path, own, monke
     for config in (settings.config("indoor", ("book",), 7), given[-1].config("indoor", ("book",), 7)):
         assert config.sim.fixed.focal_px == (600, 601)
         assert config.target("book").template == tmp_path / "book.png"
-    assert make(*given).fixed.focal_px == (600, 601)
-    assert fig4_book.EXPERIMENT.prepare(settings).fixed.focal_px == (600, 601)
+    assert make(*given).fixed.lens.focal_px == (600, 601)
+    assert fig4_book.EXPERIMENT.prepare(settings).fixed.lens.focal_px == (600, 601)
     assert identity(settings) == before
     own.unlink()
     assert settings.config("indoor", (), 7).sim.fixed.focal_px == (600, 601)

@@ -64,9 +64,9 @@ def test_a_scan_sees_all_that_the_wide_camera_does(size):
     poses = np.array(scan_of(world.rig, calibration))
     rim = np.array([[u, v] for u in (0.0, 0.5, 1.0) for v in (0.0, 0.5, 1.0)]) * (np.array(size) - 1.0)
     far = calibration.fixed.ray(rim) * 1000.0  # where the cameras' offset does not count
-    x = calibration.T_base_fixed.apply(far)
+    x = calibration.zoom_head.T_base_fixed.apply(far)
     pans, tilts = np.arctan2(x[:, 0], x[:, 2]), np.arctan2(-x[:, 1], np.hypot(x[:, 0], x[:, 2]))
-    f = calibration.zoom.stops[0].focal_px[0]
+    f = calibration.zoom_head.lens.stops[0].focal_px[0]
     across, down = math.atan(320 / f), math.atan(240 / f)
     for pan, tilt in zip(pans, tilts, strict=True):
         near = (np.abs(poses[:, 0] - pan) < across) & (np.abs(poses[:, 1] - tilt) < down)

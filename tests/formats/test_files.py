@@ -70,21 +70,21 @@ def old(tmp_path, monkeypatch):
 def test_v010_calibration_loads():
     then, found = read(OLD / "calibration.json"), load_calibration(OLD / "calibration.json")
     assert found.fixed.size == (640, 480)
-    assert found.fixed.focal_px == (then["fixed"]["fx"], then["fixed"]["fy"])
-    assert found.fixed.center_px == (then["fixed"]["cx"], then["fixed"]["cy"])
-    assert found.fixed.distortion == tuple(then["fixed"]["distortion"])
-    assert found.zoom.size == (320, 240)
-    assert found.zoom.nominal_px == pytest.approx((1000 / 3, 2500 / 3))
-    assert found.zoom.stops[1].focal_px[0] == then["zoom"]["stops"][1]["fx"]
-    assert found.zoom.pupil == (0.0, then["zoom"]["stops"][1]["pupil"])
+    assert found.fixed.lens.focal_px == (then["fixed"]["fx"], then["fixed"]["fy"])
+    assert found.fixed.lens.center_px == (then["fixed"]["cx"], then["fixed"]["cy"])
+    assert found.fixed.lens.distortion == tuple(then["fixed"]["distortion"])
+    assert found.zoom_head.lens.size == (320, 240)
+    assert found.zoom_head.lens.nominal_px == pytest.approx((1000 / 3, 2500 / 3))
+    assert found.zoom_head.lens.stops[1].focal_px[0] == then["zoom"]["stops"][1]["fx"]
+    assert found.zoom_head.lens.pupil == (0.0, then["zoom"]["stops"][1]["pupil"])
     for name in ("T_zoom0_fixed", "T_head_zoom"):
-        T = getattr(found, name)
+        T = getattr(found.zoom_head, name)
         assert T.translation == pytest.approx(then[name]["translation"])
         assert np.degrees(T.rotation.as_rotvec()) == pytest.approx(then[name]["rotvec_deg"])
-    assert found.head.axis_offset == then["head"]["axis_offset"]
-    assert math.degrees(found.head.squareness) == pytest.approx(then["head"]["squareness_deg"])
-    assert (found.head.pan_scale, found.head.tilt_scale) == (1.0, 1.0)
-    assert (found.head.pan_zero, found.head.tilt_zero, found.pitch_mm) == (0.0, 0.0, 0.018)
+    assert found.zoom_head.axes.axis_offset == then["head"]["axis_offset"]
+    assert math.degrees(found.zoom_head.axes.squareness) == pytest.approx(then["head"]["squareness_deg"])
+    assert (found.zoom_head.axes.pan_scale, found.zoom_head.axes.tilt_scale) == (1.0, 1.0)
+    assert (found.zoom_head.axes.pan_zero, found.zoom_head.axes.tilt_zero, found.pitch_mm) == (0.0, 0.0, 0.018)
     assert math.degrees(found.jitter) == pytest.approx(then["head"]["jitter_deg"])
     assert found.residuals.stereo_rms_px == then["residuals"]["stereo_rms_px"]
     assert (found.residuals.fixed_views, found.residuals.zoom_views, found.residuals.pairs) == (13, 18, 6)
@@ -106,7 +106,7 @@ def test_v010_calibration_loads():
 
 def test_v010_calibrations_by_other_methods_load():
     photos, sequential = (load_calibration(OLD / f"calibration_{name}.json") for name in ("photos", "sequential"))
-    assert (photos.T_head_zoom, photos.pitch_mm, photos.residuals.handeye_rms_px) == (None, None, None)
+    assert (photos.zoom_head.T_head_zoom, photos.pitch_mm, photos.residuals.handeye_rms_px) == (None, None, None)
     assert (sequential.covariance, sequential.held_out) == (None, None)
     plain = load_calibration(OLD / "calibration_plain.json")
     assert (plain.residuals, plain.covariance, plain.board, plain.views) == (None, None, None, ())
@@ -166,10 +166,10 @@ def test_v010_captures_are_calibrated(old, capsys):
     assert_keys("calibration_json.txt", read(old / "now.json"), may_lack=[*OF_SESSIONS, "provenance.photos"])
     found, before = load_calibration(old / "now.json"), load_calibration(OLD / "calibration.json")
     for name in ("T_zoom0_fixed", "T_head_zoom"):
-        apart = getattr(found, name).inv() * getattr(before, name)
+        apart = getattr(found.zoom_head, name).inv() * getattr(before.zoom_head, name)
         assert np.linalg.norm(apart.translation) < CAPTURES_M
         assert np.degrees(apart.rotation.magnitude()) < CAPTURES_DEG
-    assert found.fixed.focal_px == pytest.approx(before.fixed.focal_px, rel=CAPTURES_FOCAL)
+    assert found.fixed.lens.focal_px == pytest.approx(before.fixed.lens.focal_px, rel=CAPTURES_FOCAL)
 
 
 def assert_is_captures(folder, may_lack=()):

@@ -16,6 +16,7 @@ from cotarget.detection import Detection
 from cotarget.errors import ConfigError, StaleFrameError
 from cotarget.pipeline import FollowSettings, State, follow
 from cotarget.rig import Frame, PanTiltLimits, PanTiltState, ZoomState
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.sim.motion import Axis
 from experiments.calibration.synthetic.rig import SIZE, Lens, Truth
 from tests.rigs import rig_of
@@ -28,10 +29,10 @@ BOOK = replace(DEFAULT_TARGETS["book"], template=None)
 PLAIN = Lens(686.0, 684.0, 325.0, 239.0)
 TRUTH = Truth(fixed=PLAIN, zoom=Lens(692.0, 693.0, 326.0, 235.0), dz=0.0, eps=0.0)
 CALIBRATION = Calibration(
-    Intrinsics(SIZE, (686.0, 684.0), (325.0, 239.0)),
-    ZoomLens((667.0,), (Intrinsics(SIZE, (692.0, 693.0), (326.0, 235.0)),)),
-    TRUTH.gamma,
-    TRUTH.hand,
+    fixed=FixedCamera(Intrinsics(SIZE, (686.0, 684.0), (325.0, 239.0))),
+    zoom_head=ZoomHead(
+        ZoomLens((667.0,), (Intrinsics(SIZE, (692.0, 693.0), (326.0, 235.0)),)), TRUTH.gamma, TRUTH.hand
+    ),
 )
 WIDE = PanTiltLimits((-2.7, 2.7), (-0.8, 0.5), math.radians(149), math.radians(206), STEP)
 ROUNDED_PX = 0.5  # products of angles that are taken for sums

@@ -18,16 +18,21 @@ from cotarget.estimation.zoom_matching import CloseupFinder, MatchingSettings, Z
 from cotarget.fusion import MOST_WAITING, FusionSettings, TargetFusion
 from cotarget.geometry import pose
 from cotarget.rig import Frame, PanTiltState, ZoomState
+from cotarget.rig_geometry import FixedCamera, ZoomHead
 from cotarget.tracking.track import Track, tracking_settings
 from cotarget.tracking.tracker import Tracker
 
 SIZE, CENTER, FOCAL, ZOOMED = (640, 480), (319.5, 239.5), 700.0, 3000.0
 BASELINE = 0.4
 CALIBRATION = Calibration(
-    Intrinsics(SIZE, (FOCAL, FOCAL), CENTER),
-    ZoomLens((FOCAL, ZOOMED), (Intrinsics(SIZE, (FOCAL, FOCAL), CENTER), Intrinsics(SIZE, (ZOOMED, ZOOMED), CENTER))),
-    pose([-BASELINE, 0, 0], [0, 0, 0]),
-    pose([0, 0, 0], [0, 0, 0]),
+    fixed=FixedCamera(Intrinsics(SIZE, (FOCAL, FOCAL), CENTER)),
+    zoom_head=ZoomHead(
+        ZoomLens(
+            (FOCAL, ZOOMED), (Intrinsics(SIZE, (FOCAL, FOCAL), CENTER), Intrinsics(SIZE, (ZOOMED, ZOOMED), CENTER))
+        ),
+        pose([-BASELINE, 0, 0], [0, 0, 0]),
+        pose([0, 0, 0], [0, 0, 0]),
+    ),
 )
 BOOK, BIRD, PERSON = (DEFAULT_TARGETS[name] for name in ("book", "bird", "person"))
 PICTURE = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)

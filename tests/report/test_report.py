@@ -38,6 +38,7 @@ from experiments.calibration.synthetic.aims import pointing_errors
 from experiments.calibration.synthetic.rig import NOMINAL_PX, SIZE, SIZES, Lens, Stop, Truth
 from experiments.calibration.synthetic.views import Placing, noisy, placed, synthetic_views, views_at_stops, zoom_view
 from tests.full_disk import SAID, full_disk
+from tests.rigs import with_zoom_head
 
 BOARD = BoardConfig()
 POINTS = board_points(BOARD)
@@ -157,9 +158,9 @@ def test_numbers_in_the_page_are_those_of_the_calibration(plain, tmp_path):
     sigma = np.sqrt(plain.covariance.matrix[0, 0])
     assert plain.covariance.parameters[0] == "fixed.fx"
     value, printed = re.search(r"focal length across ([\d.]+) ± ([\d.]+) px", text).groups()
-    assert float(value) == pytest.approx(plain.fixed.focal_px[0], abs=sigma)
+    assert float(value) == pytest.approx(plain.fixed.lens.focal_px[0], abs=sigma)
     assert float(printed) == pytest.approx(sigma, rel=ROUNDED)
-    shift = plain.T_zoom0_fixed.translation[0] * 1000
+    shift = plain.zoom_head.T_zoom0_fixed.translation[0] * 1000
     assert float(re.search(r"position x (-?[\d.]+) ±", text).group(1)) == pytest.approx(shift, abs=0.5)
     assert "distance measured 0.123 px distance predicted 0.0456 px" in text
     assert "every distance over what was predicted of it 1.95" in text
@@ -227,7 +228,7 @@ def test_the_verdict_says_the_plain_truth(plain):
         found = judge(replace(plain, covariance=None, held_out=None, provenance={"method": method}))
         assert words in found.text
         assert found.level == level
-    no_head = judge(replace(plain, T_head_zoom=None))
+    no_head = judge(with_zoom_head(plain, T_head_zoom=None))
     assert "without a head" in no_head.text
     assert no_head.level == "unknown"
     open_ = judge(replace(plain, covariance=plain.covariance.scaled({"T_head_zoom.rx": 1e6})))
@@ -239,18 +240,19 @@ def test_the_verdict_says_the_plain_truth(plain):
 
 
 def partial_calibrations():
+    """By name, whether the calibration has a head, and what else is changed."""
     nothing = {"covariance": None, "held_out": None, "residuals": None, "board": None, "provenance": {}}
     return {
-        "photos": {"T_head_zoom": None, "covariance": None},
-        "nothing but the rig": nothing,
-        "not even a head": {**nothing, "T_head_zoom": None},
-        "one parameter": {"covariance": Covariance(("fixed.fx",), np.eye(1))},
+        "photos": (False, {"covariance": None}),
+        "nothing but the rig": (True, nothing),
+        "not even a head": (False, nothing),
+        "one parameter": (True, {"covariance": Covariance(("fixed.fx",), np.eye(1))}),
     }
 
 
-@pytest.mark.parametrize("changes", partial_calibrations().values(), ids=partial_calibrations())
-def test_a_calibration_that_lacks_something_has_a_page_too(plain, changes, tmp_path):
-    calibration = bare(plain, **changes)
+@pytest.mark.parametrize(("has_head", "changes"), partial_calibrations().values(), ids=partial_calibrations())
+def test_a_calibration_that_lacks_something_has_a_page_too(plain, has_head, changes, tmp_path):
+    calibration = bare(plain if has_head else with_zoom_head(plain, T_head_zoom=None), **changes)
     found = write_report(tmp_path / "r.html", calibration)
     page = (tmp_path / "r.html").read_text()
     assert read(page).sections == [name for name in SECTIONS if name != "lens"]
@@ -291,8 +293,8 @@ def test_a_view_of_corners_on_one_line_is_named_and_ends_no_report(plain, caplog
 
 
 def test_a_lens_that_zooms_further_than_was_calibrated_is_told(plain):
-    known = replace(plain, provenance={"focal_range_px": [667.0, plain.zoom.nominal_px[-1]]})
-    further = replace(plain, provenance={"focal_range_px": [667.0, 3 * plain.zoom.nominal_px[-1]]})
+    known = replace(plain, provenance={"focal_range_px": [667.0, plain.zoom_head.lens.nominal_px[-1]]})
+    further = replace(plain, provenance={"focal_range_px": [667.0, 3 * plain.zoom_head.lens.nominal_px[-1]]})
     assert "goes to" not in judge(known).text
     assert "the lens goes to 2001 px by its own account" in judge(further).text
     assert judge(further).level == "care"
@@ -359,7 +361,7 @@ def test_more_placements_take_nothing_from_the_jitter_nor_from_a_lens_between_it
     assert 0.9 * np.sqrt(2) * jitter < what_stays(shaky, at) < np.sqrt(2) * jitter
     assert with_more_placements(shaky, at, 36) ** 2 == pytest.approx(at.rms**2 - 0.75 * exact.rms**2)
     (between,) = pointing(stops, [1.7 * NOMINAL_PX])
-    doubt = np.linalg.norm(stops.zoom.center_doubt_px(1.7 * NOMINAL_PX)) / between.focal_px
+    doubt = np.linalg.norm(stops.zoom_head.lens.center_doubt_px(1.7 * NOMINAL_PX)) / between.focal_px
     assert doubt > 0
     assert what_stays(stops, between) == pytest.approx(doubt, rel=0.01)
     said = f"from {digits(np.degrees(at.rms))} to {digits(np.degrees(with_more_placements(shaky, at)))} degrees"
@@ -379,12 +381,12 @@ def test_what_is_left_when_a_parameter_is_known():
 def test_curves_of_the_zoom_lens_are_as_uncertain_as_the_stops(stops):
     curves = lens_curves(stops)
     for where, i in ((0, 0), (-1, 1)):
-        nominal = stops.zoom.nominal_px[i]
+        nominal = stops.zoom_head.lens.nominal_px[i]
         sigma = stops.covariance.sigma
-        assert curves.values["ratio_x"][where] == pytest.approx(stops.zoom.stops[i].focal_px[0] / nominal)
+        assert curves.values["ratio_x"][where] == pytest.approx(stops.zoom_head.lens.stops[i].focal_px[0] / nominal)
         assert curves.sigmas["ratio_x"][where] == pytest.approx(sigma(f"zoom[{i}].fx") / nominal, rel=1e-4)
         assert curves.sigmas["cy"][where] == pytest.approx(sigma(f"zoom[{i}].cy"), rel=1e-4)
-        grown = (nominal / stops.zoom.nominal_px[0]) ** 2
+        grown = (nominal / stops.zoom_head.lens.nominal_px[0]) ** 2
         assert curves.sigmas["kappa1"][where] == pytest.approx(sigma(f"zoom[{i}].k1") / grown, rel=1e-4)
     assert curves.sigmas["pupil_mm"][-1] == pytest.approx(1000 * stops.covariance.sigma("zoom[1].pupil"), rel=1e-4)
     assert correlations(stops)

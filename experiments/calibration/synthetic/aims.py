@@ -39,9 +39,9 @@ def aim(calibration: Calibration, x_fixed: Array) -> Array:
     Returns:
         Angles as the head reports them [rad], (2,) or (n, 2); nan where there is no such pose.
     """
-    head = calibration.head
+    head = calibration.zoom_head.axes
     model = truth_of(calibration)
-    lens = calibration.zoom.stops[0]
+    lens = calibration.zoom_head.lens.stops[0]
     q = aimed(model, np.atleast_2d(x_fixed), lens.ray(lens.image_center_px))
     q = (q - [head.pan_zero, head.tilt_zero]) / [head.pan_scale, head.tilt_scale]
     return q if np.ndim(x_fixed) > 1 else q[0]

@@ -167,14 +167,14 @@ def truth_of(calibration: Calibration) -> Truth:
     """Make the rig that a calibration describes, at its shortest focal length."""
     fixed, zoom = (
         Lens(*lens.focal_px, *lens.center_px, lens.distortion)
-        for lens in (calibration.fixed, calibration.zoom.stops[0])
+        for lens in (calibration.fixed.lens, calibration.zoom_head.lens.stops[0])
     )
-    head = calibration.head
+    head = calibration.zoom_head.axes
     return Truth(
         fixed=fixed,
         zoom=zoom,
-        gamma=calibration.T_zoom0_fixed,
-        hand=calibration.hand_eye(),
+        gamma=calibration.zoom_head.T_zoom0_fixed,
+        hand=calibration.zoom_head.hand_eye(),
         dz=head.axis_offset,
         eps=head.squareness,
         pan_scale=head.pan_scale,

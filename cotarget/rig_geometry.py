@@ -1,0 +1,149 @@
+"""Geometry of a calibrated rig: the fixed camera, and the zoom camera on its pan-tilt head.
+
+A fit estimates these classes, a calibration file holds them, and aiming, tracking and evaluation use them. The frames
+are "fixed" (the fixed camera), "zoom0" (the zoom camera at pan = tilt = 0), "zoom" (the zoom camera as the head turns
+it), "head" (turned by both axes) and "base" (the head's foot); see docs/method.md.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from cotarget.camera import Intrinsics, ZoomLens
+from cotarget.errors import CalibrationError
+from cotarget.geometry import Array, RigidTransform
+from cotarget.pantilt import IDEAL_HEAD, HeadGeometry, base_head, zoom_fixed
+
+
+@dataclass(frozen=True)
+class FixedCamera:
+    """A calibrated fixed camera, whose frame is "fixed".
+
+    Attributes:
+        lens: intrinsics.
+    """
+
+    lens: Intrinsics
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Image size (width, height) [px]."""
+        return self.lens.size
+
+    def ray(self, pixel: Array) -> Array:
+        """Compute the rays of pixels (..., 2) with z = 1, (..., 3); see `Intrinsics.ray`."""
+        return self.lens.ray(pixel)
+
+    def project(self, x_fixed: Array) -> Array:
+        """Project points (..., 3) [m] into the image, (..., 2) [px]; see `Intrinsics.project`."""
+        return self.lens.project(x_fixed)
+
+    def resized(self, size: tuple[int, int]) -> "FixedCamera":
+        """Return the same camera for a stream scaled to another size (width, height) [px].
+
+        Raises:
+            ConfigError: the aspect ratio differs.
+        """
+        return FixedCamera(self.lens.resized(size))
+
+
+@dataclass(frozen=True, eq=False)
+class ZoomHead:
+    """A calibrated zoom camera on its pan-tilt head.
+
+    Attributes:
+        lens: optics of the zoom camera over its focal range.
+        T_zoom0_fixed: the paper's Gamma, at the shortest focal length.
+        T_head_zoom: the paper's T, at the shortest focal length; None where no head was calibrated.
+        axes: geometry of the head's axes.
+    """
+
+    lens: ZoomLens
+    T_zoom0_fixed: RigidTransform
+    T_head_zoom: RigidTransform | None
+    axes: HeadGeometry = IDEAL_HEAD
+
+    def hand_eye(self, nominal_px: float | None = None) -> RigidTransform:
+        """Return T_head_zoom at a focal length, and refuse a calibration without it.
+
+        Args:
+            nominal_px: nominal focal length whose entrance pupil is the origin [px]; None for the shortest one.
+
+        Raises:
+            CalibrationError: no head was calibrated.
+        """
+        if self.T_head_zoom is None:
+            raise CalibrationError("this calibration has no T_head_zoom; calibrate on a rig, whose head moves")
+        if nominal_px is None:
+            return self.T_head_zoom
+        return self.T_head_zoom * self.lens.to_pupil(nominal_px)
+
+    @cached_property
+    def T_base_fixed(self) -> RigidTransform:
+        """Transform from the fixed camera to the base, T_head_zoom T_zoom0_fixed (Eq. 6).
+
+        Raises:
+            CalibrationError: no head was calibrated.
+        """
+        return self.hand_eye() * self.T_zoom0_fixed
+
+    @cached_property
+    def _base_fixed(self) -> Array:
+        """Rotation and translation of T_base_fixed side by side, (3, 4)."""
+        return self.T_base_fixed.as_matrix()[:3]
+
+    @cached_property
+    def _T_zoom_head(self) -> RigidTransform:
+        """Inverse of T_head_zoom."""
+        return self.hand_eye().inv()
+
+    def in_base(self, x_fixed: Array) -> Array:
+        """Map a point from the fixed camera's frame to the base's, (3,) [m] (Eq. 6).
+
+        It takes a third of the time of scipy's transform.
+
+        Raises:
+            CalibrationError: no head was calibrated.
+        """
+        x, y, z = x_fixed
+        return np.asarray(self._base_fixed @ np.array((x, y, z, 1.0)))
+
+    def T_fixed_zoom(self, pan: float, tilt: float) -> RigidTransform:
+        """Compute the pose of the zoom camera, at the shortest focal length, in the fixed camera's frame (Eq. 2).
+
+        Args:
+            pan: reported pan [rad].
+            tilt: reported tilt [rad].
+
+        Raises:
+            CalibrationError: no head was calibrated.
+        """
+        return zoom_fixed(pan, tilt, self.hand_eye(), self.T_zoom0_fixed, self.axes).inv()
+
+    def project(self, x_fixed: Array, pan: float, tilt: float, nominal_px: float) -> Array:
+        """Project points of the fixed camera's frame into the zoom image (Eq. 2).
+
+        Args:
+            x_fixed: points [m], (..., 3).
+            pan: reported pan [rad].
+            tilt: reported tilt [rad].
+            nominal_px: nominal focal length [px].
+
+        Returns:
+            Pixels, (..., 2); nan behind the camera.
+
+        Raises:
+            CalibrationError: no head was calibrated.
+        """
+        x_head = base_head(pan, tilt, self.axes).inv().apply(self.T_base_fixed.apply(x_fixed))
+        pupil = np.array([0.0, 0.0, self.lens.pupil_at(nominal_px)])
+        return self.lens.at(nominal_px).project(self._T_zoom_head.apply(x_head) - pupil)
+
+    def resized(self, size: tuple[int, int]) -> "ZoomHead":
+        """Return the same camera and head for a stream scaled to another size (width, height) [px].
+
+        Raises:
+            ConfigError: the aspect ratio differs.
+        """
+        return replace(self, lens=self.lens.resized(size))
