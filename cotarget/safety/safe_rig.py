@@ -397,7 +397,7 @@ class _Guard:
     def _report(self, failure: BaseException, error: BaseException | None = None) -> None:
         """Log why the rig could not be closed, unless that is logged already or is the error that led here."""
         if str(failure) == self.watchdog.logged or (error is not None and str(failure) == str(error)):
-            log.error("the head could not be halted to the end")
+            log.error("the head could not be halted, and may go on to the goal of its last command")
         else:
             log.error("the rig could not be closed: %s", failure)
 
