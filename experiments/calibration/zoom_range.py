@@ -26,7 +26,7 @@ from cotarget.calibration.calibrate import calibrate
 from cotarget.config import RigConfig, SimConfig, SimEffects
 from cotarget.control.controller import reach_of
 from cotarget.evaluation import pointing_errors, true_calibration
-from cotarget.geometry import RigidTransform, angle_between
+from cotarget.geometry import angle_between
 from cotarget.safety.safe_rig import guard
 from cotarget.sim.truth import Truth
 from cotarget.sim.world import SimWorld
@@ -83,7 +83,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
                     "p95_deg": float(np.degrees(np.percentile(errors, 95))),
                     "rms_deg": rms(np.degrees(errors)),
                     "predicted_deg": float(np.degrees(predicted(calibration, float(nominal)))),
-                    **lens_errors(calibration, truth, float(nominal)),
+                    **lens_errors(calibration, exact, truth, float(nominal)),
                 }
                 if HEADS[head]:
                     for name, one_calibration in (("rounded", calibration), ("rounding", exact)):
@@ -101,21 +101,16 @@ def predicted(calibration: Calibration, nominal_px: float) -> float:
     return rms(predicted_pointing(calibration, pixels, z.ravel(), nominal_px=nominal_px))
 
 
-def lens_errors(calibration: Calibration, truth: Truth, nominal_px: float) -> dict[str, float]:
+def lens_errors(calibration: Calibration, exact: Calibration, truth: Truth, nominal_px: float) -> dict[str, float]:
     """Give errors of the focal length [%] and of the ray through the image's centre in the head's frame [degrees]."""
     found, true = calibration.zoom_head.lens.at(nominal_px), truth.zoom_lens_for(nominal_px)
     middle = found.image_center_px
     here = calibration.zoom_head.hand_eye().rotation.apply(found.ray(middle))
-    there = truth_hand(truth).rotation.apply(np.append(true.directions(middle), 1.0))
+    there = exact.zoom_head.hand_eye().rotation.apply(np.append(true.directions(middle), 1.0))
     return {
         "focal_off_percent": 100 * abs(found.focal_px[0] / true.focal_px[0] - 1),
         "boresight_off_deg": float(np.degrees(angle_between(here, there))),
     }
-
-
-def truth_hand(truth: Truth) -> RigidTransform:
-    """Give the true T_head_zoom, from the world's own poses at home."""
-    return truth.T_world_base.inv() * truth.T_world_camera("zoom", 0.0)
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
