@@ -11,14 +11,15 @@ import importlib
 import importlib.util
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from cotarget.errors import ConfigError, CotargetError, DeviceError, choices
 
 FORM = "module:name"
+LONGEST = 60  # characters of a wrong answer that a message repeats
 
 
 def is_own(name: str) -> bool:
@@ -115,26 +116,44 @@ def _is_ours(file: str) -> bool:
     return file == __file__ or file.startswith("<frozen") or "importlib" in file
 
 
-def reporting(function: Callable[..., Any], what: str) -> Callable[..., Any]:
-    """Wrap a user's function so that its errors name file and line."""
+class Answer(NamedTuple):
+    """What a method of a user's device has to return: the check, and its description in messages."""
+
+    is_right: Callable[[Any], bool]
+    description: str
+
+
+def reporting(function: Callable[..., Any], what: str, answer: Answer | None = None) -> Callable[..., Any]:
+    """Wrap a user's function so that its errors name file and line, and a wrong answer is an error."""
 
     @functools.wraps(function)
     def call(*arguments: Any, **keywords: Any) -> Any:
         with calling(what):
-            return function(*arguments, **keywords)
+            found = function(*arguments, **keywords)
+        if answer is not None and not answer.is_right(found):
+            said = " ".join(repr(found).split())
+            said = said if len(said) <= LONGEST else f"a {type(found).__name__}"
+            raise DeviceError(f"{what}: {function.__name__} returned {said}; it has to return {answer.description}")
+        return found
 
     return call
 
 
 class Reporting:
-    """A user's device whose errors name file and line; everything else passes through."""
+    """A user's device whose errors name file and line, and whose answers are checked; everything else passes through.
 
-    def __init__(self, device: Any, what: str) -> None:
-        self._device, self._what = device, what
+    Args:
+        device: the device.
+        what: its table in rig.toml, for messages.
+        answers: what its methods have to return, by name.
+    """
+
+    def __init__(self, device: Any, what: str, answers: Mapping[str, Answer]) -> None:
+        self._device, self._what, self._answers = device, what, answers
 
     def __getattr__(self, name: str) -> Any:
         if not hasattr(type(self._device), name) and name not in vars(self._device):
             raise AttributeError(name)  # so that hasattr works
         with calling(self._what):
             found = getattr(self._device, name)
-        return reporting(found, self._what) if callable(found) else found
+        return reporting(found, self._what, self._answers.get(name)) if callable(found) else found

@@ -233,6 +233,28 @@ def test_an_error_of_a_device_is_one_line_that_names_file_and_line(rig):
         opened.fixed.read()
 
 
+@pytest.mark.parametrize(("method", "answer", "said"), [
+    ("head.state", "(0.1, 0.2)", "hardware.head: state returned (0.1, 0.2); it has to return a PanTiltState"),
+    ("head.move", "None", "hardware.head: move returned None; it has to return pan and tilt as commanded [rad]"),
+    ("zoom.state", "100.0", "hardware.zoom: state returned 100.0; it has to return a ZoomState"),
+    ("zoom.zoom", "None", "hardware.zoom: zoom returned None; it has to return the focal length that the lens will "),
+    ("zoom.capture", "np.zeros((48, 64, 3), np.uint8)", "hardware.zoom: capture returned a ndarray; it has to return "),
+    ("fixed.read", "Frame(np.zeros((48, 64), np.uint8), 0.0)", "hardware.fixed: read returned a Frame; it has to "),
+    ("fixed.read", "Frame(np.zeros((48, 64, 3)), 0.0)", "hardware.fixed: read returned a Frame; it has to return a "),
+])  # fmt: skip
+def test_an_answer_of_another_kind_is_one_line_that_names_device_and_method(rig, method, answer, said):
+    device, name = method.split(".")
+    kind = {"head": "Head", "zoom": "Zoom", "fixed": "Camera"}[device]
+    other = f"\n\nclass Other({kind}):\n    def {name}(self, *a, **k):\n        return {answer}\n"
+    (rig.parent / "devices.py").write_text(DEVICES + other)
+    rig.write_text(RIG.replace(f'"devices:{kind}"', '"devices:Other"'))
+    arguments = {"head.move": (0.1, 0.2), "zoom.zoom": (200.0,)}.get(method, ())
+    with pytest.raises(DeviceError) as caught, open_rig(rig) as opened:
+        getattr(getattr(opened, device), name)(*arguments)
+    assert str(caught.value).startswith(said)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_module_on_pythons_path_needs_no_file_beside_rig_toml(rig, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(rig.parent))
     check(parse_config({"hardware": {"fixed": {"driver": "devices:Camera", "colour": "blue"}}}))

@@ -4,7 +4,10 @@ import contextlib
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass, replace
+from numbers import Real
 from typing import Any, ClassVar, Protocol
+
+import numpy as np
 
 from cotarget.config import HardwareConfig, RigConfig, SafetyConfig
 from cotarget.drivers import DRIVERS
@@ -12,8 +15,8 @@ from cotarget.drivers.board import BoardSettings, make_board
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import rig_lock
 from cotarget.errors import ConfigError, choices
-from cotarget.plugins import FORM, Reporting, calling, is_own, load
-from cotarget.rig import CameraSpec, Clock, HeadSpec, Rig, RigSpec, ZoomSpec
+from cotarget.plugins import FORM, Answer, Reporting, calling, is_own, load
+from cotarget.rig import CameraSpec, Clock, Frame, HeadSpec, PanTiltState, Rig, RigSpec, ZoomSpec, ZoomState
 from cotarget.schema import missing_key, validate
 
 # Python's thread switch interval [s], instead of 5 ms: a driver's thread that waits for its turn delays every command.
@@ -26,6 +29,37 @@ ROLES: Mapping[str, tuple[type[Any], tuple[str, ...]]] = {
     "head": (HeadSpec, ("limits", "state", "move", "halt", "close")),
     "fixed": (CameraSpec, CAMERA),
     "zoom": (ZoomSpec, (*CAMERA, "still_size", "focal_range", "zoom", "state", "capture")),
+}
+
+
+def _is_frame(answer: object) -> bool:
+    return (
+        isinstance(answer, Frame)
+        and isinstance(answer.image, np.ndarray)
+        and answer.image.dtype == np.uint8
+        and answer.image.shape[2:] == (3,)
+    )
+
+
+def _are_numbers(answer: Any, count: int) -> bool:
+    numbers = list(answer) if isinstance(answer, tuple | list | np.ndarray) else []
+    return len(numbers) == count and all(isinstance(each, Real) for each in numbers)
+
+
+FRAME = Answer(_is_frame, "a Frame, whose image is (H, W, 3) BGR of uint8")
+# By table of [hardware] that has a driver: what methods of the opened device have to return.
+ANSWERS: Mapping[str, Mapping[str, Answer]] = {
+    "head": {
+        "state": Answer(lambda answer: isinstance(answer, PanTiltState), "a PanTiltState"),
+        "move": Answer(lambda answer: _are_numbers(answer, 2), "pan and tilt as commanded [rad]"),
+    },
+    "fixed": {"read": FRAME},
+    "zoom": {
+        "read": FRAME,
+        "capture": FRAME,
+        "state": Answer(lambda answer: isinstance(answer, ZoomState), "a ZoomState"),
+        "zoom": Answer(lambda answer: isinstance(answer, Real), "the focal length that the lens will reach [px]"),
+    },
 }
 
 
@@ -118,7 +152,7 @@ class Device:
             raise ConfigError(
                 f"{self.where}.{KEY}: {self.driver.__name__} has no {lacks[0]}; docs/drivers.md says what it needs"
             )
-        return Reporting(device, self.where)
+        return Reporting(device, self.where, ANSWERS[self.role])
 
 
 def device_of(role: str, table: Mapping[str, Any]) -> Device:
