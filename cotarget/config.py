@@ -500,6 +500,10 @@ def _file_name(path: Path) -> Path:
     return path
 
 
+# A head that moves without a frame for longer is not watched; milliseconds were meant for seconds [s].
+LONGEST_UNSEEN_S = 60.0
+
+
 @model
 class SafetyConfig:
     """Soft limits of the head, within the device's own, and when the head is halted.
@@ -518,8 +522,8 @@ class SafetyConfig:
     pan_deg: Limits | None = None
     tilt_deg: Limits | None = None
     speed_deg_s: Positive | None = None
-    max_frame_age_s: Positive = 1.0
-    watchdog_s: Positive = 0.35
+    max_frame_age_s: Annotated[Positive, Le(LONGEST_UNSEEN_S)] = 1.0
+    watchdog_s: Annotated[Positive, Le(LONGEST_UNSEEN_S)] = 0.35
     stop_file: Annotated[FilePath, Check(_file_name)] | None = None
 
 

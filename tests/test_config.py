@@ -144,6 +144,8 @@ def test_offsets_and_targets_are_taken(tmp_path):
         ("[safety]\nstop_file = '.'", "safety.stop_file: '.' is a folder; name a file in it, as 'stop'"),
         ("[safety]\nstop_file = 'run/..'", "safety.stop_file: 'run/..' is a folder; name a file in it, as 'stop'"),
         ("[safety]\nwatchdog_s = 0", "safety.watchdog_s: 0 is not greater than zero"),
+        ("[safety]\nwatchdog_s = 350", "safety.watchdog_s: 350 is more than 60"),
+        ("[safety]\nmax_frame_age_s = 1000", "safety.max_frame_age_s: 1000 is more than 60"),
         ("[safety]\nwatchdog_s = inf", "safety.watchdog_s: inf is not a finite number"),
         (
             "[safety]\nwatchdog_s = 0.04",
