@@ -6,6 +6,8 @@ import signal
 import sys
 import tempfile
 
+import pytest
+
 # Tests run side by side: threads of their own in each would only get into each other's way.
 for _threads in ("OPENBLAS_NUM_THREADS", "LP_NUM_THREADS"):  # of linear algebra, of rendering
     os.environ.setdefault(_threads, "1")
@@ -23,6 +25,12 @@ _bytecode = tempfile.mkdtemp(prefix="cotarget-tests-") if sys.dont_write_bytecod
 if _bytecode:
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     os.environ["PYTHONPYCACHEPREFIX"] = _bytecode
+
+
+@pytest.fixture(autouse=True)
+def _state_home(tmp_path_factory, monkeypatch):
+    """A state folder for each test: a unit whose position one test loses is no unit of the next, nor of the user."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.getbasetemp() / f"state-{os.urandom(8).hex()}"))
 
 
 def pytest_unconfigure(config):

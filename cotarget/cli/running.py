@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from cotarget.calibration import Calibration
     from cotarget.config import RigConfig, TargetProfile
     from cotarget.metrics import Label, Tracked
-    from cotarget.pipeline import Step
+    from cotarget.pipeline import State, Step
     from cotarget.recording.replay import Replay
     from cotarget.rig import Rig
     from cotarget.sim.truth import Truth
@@ -224,7 +224,7 @@ def follow(options: argparse.Namespace) -> int:
         print_json(run.counts, options.csv)
         if run.interrupted is not None:
             raise run.interrupted
-    return run.status
+    return exit_status(run.counts["states"], run.confirmed)
 
 
 def _files(options: argparse.Namespace) -> list[Path | None]:
@@ -286,17 +286,21 @@ class _Run:
     confirmed: int
     interrupted: KeyboardInterrupt | None = None
 
-    @property
-    def status(self) -> int:
-        """Exit status of `follow`: 0 for a target that was followed and, where there was time for it, confirmed."""
-        from cotarget.pipeline import State
 
-        states = self.counts["states"]
-        if not sum(states.values()) - states[State.SEARCHING] - states[State.UNREACHABLE]:
-            return NOBODY_FOLLOWED
-        # A wrong match in a few frames confirms nothing; a target hidden from the zoom camera for a while was confirmed
-        # before or after.
-        return NEVER_CONFIRMED if states[State.UNCONFIRMED] > self.confirmed else 0
+def exit_status(states: "Mapping[State, int]", confirmed: int) -> int:
+    """Exit status of `follow`: 0 for a target that was followed and, where there was time for it, confirmed.
+
+    Args:
+        states: number of frames in each state.
+        confirmed: number of frames in which the zoom camera showed the followed target.
+    """
+    from cotarget.pipeline import State
+
+    if not any(states[each] for each in (State.FOLLOWING, State.COASTING, State.UNCONFIRMED)):
+        return NOBODY_FOLLOWED
+    # A wrong match in a few frames confirms nothing; a target hidden from the zoom camera for a while was confirmed
+    # before or after.
+    return NEVER_CONFIRMED if states[State.UNCONFIRMED] > confirmed else 0
 
 
 def _follow(

@@ -5,9 +5,8 @@
 `PositionLostMarker` stores from one program to the next that the position of a PTU-D46 may be lost. A unit that hit a
 limit, stalled or was switched off goes on counting from a wrong position, and no later answer shows it: its limits, and
 the soft limits inside them, are off by the loss. The marker is a file that stays until the unit has found its limits
-again. It lies beside the rig's stop file, or else in the user's state folder. It applies to every head of the rig,
-because a serial adapter may come back at another port. Version 0.1 had no default stop file; its markers in the state
-folder apply to the unit at their port.
+again. One lies beside the rig's stop file and applies to every head of the rig, because a serial adapter may come back
+at another port. Another in the user's state folder applies to the unit at its port, whatever rig.toml names it.
 """
 
 import contextlib
@@ -47,7 +46,7 @@ class PositionLostMarker:
         stop_file: stop file of the rig; None where it has none.
 
     Attributes:
-        file: path of the marker.
+        file: path of the marker beside the stop file; that in the user's state folder where there is no stop file.
     """
 
     def __init__(self, port: str, stop_file: Path | None) -> None:
@@ -56,10 +55,10 @@ class PositionLostMarker:
         beside = without if stop_file is None else stop_file
         self._folder, self._begin = beside.parent, f"{beside.name}."
         self.file = self._folder / f"{self._begin}{port}{SUFFIX}"
-        self._earlier = without.with_name(f"{without.name}.{port}{SUFFIX}")
+        self._of_port = without.with_name(f"{without.name}.{port}{SUFFIX}")
 
     def refuse(self) -> None:
-        """Raise if there is a marker for any unit of this rig.
+        """Raise if there is a marker for any unit of this rig, or for the unit at this port.
 
         Raises:
             DeviceError: a marker exists; the message has its reason, and the remedy.
@@ -73,24 +72,25 @@ class PositionLostMarker:
                 f"{self._folder}: cannot be read, where it would say that the head's position is lost: {error.strerror}"
             ) from None
         found = [file for file in files if file.name.startswith(self._begin) and file.name.endswith(SUFFIX)]
-        for file in (*found, *([self._earlier] if self._earlier.exists() else [])):
+        for file in (*found, *([self._of_port] if self._of_port.exists() else [])):
             raise DeviceError(f"{_reason(file)} (or, where no unit is at that port any more, remove {file})")
 
     def note(self, reason: str) -> None:
-        """Write the marker; a failure is logged."""
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            self.file.write_text(f"{reason}\n", encoding="utf-8")
-        except OSError as error:
-            log.error("%s: cannot be written (%s), so that nobody will remember: %s", self.file, error.strerror, reason)
+        """Write the markers; a failure is logged."""
+        for file in dict.fromkeys((self.file, self._of_port)):
+            try:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_text(f"{reason}\n", encoding="utf-8")
+            except OSError as error:
+                log.error("%s: cannot be written (%s), so that nobody will remember: %s", file, error.strerror, reason)
 
     def forget(self) -> None:
-        """Remove the unit's marker after a reset.
+        """Remove the unit's markers after a reset.
 
         Raises:
             DeviceError: the file cannot be removed.
         """
-        for file in (self.file, self._earlier):
+        for file in (self.file, self._of_port):
             try:
                 file.unlink(missing_ok=True)
             except NotADirectoryError:

@@ -353,7 +353,7 @@ class Loop:
             self._expect_motion()
             if self._active is not None:
                 self._take_up_again(self._active, cut)
-            elif self._cuts == TRIES:
+            elif self._cuts >= TRIES:
                 raise
         self._link.check()
 

@@ -29,10 +29,13 @@ def locate_stop_file(rig: Path, backend: object, said: object) -> Path | None:
         said: its `stop_file`; None where it has none, and False to do without one.
 
     Returns:
-        The path; by default RIG.stop beside rig.toml for real devices, and None for any other rig.
+        The path; by default RIG.stop beside rig.toml, or the file that it links to, for real devices, and None for any
+        other rig.
     """
     if said is None:
-        return rig.with_suffix(SUFFIX) if backend == "hardware" else None
+        if backend != "hardware":
+            return None
+        return (rig.resolve() if rig.is_symlink() else rig).with_suffix(SUFFIX)
     return rig.parent / said if isinstance(said, str) else None
 
 

@@ -12,6 +12,7 @@ import pytest
 import cotarget.detect_video  # noqa: F401  # before the fixture replaces the detectors that it imports
 from cotarget.backends import OPENERS
 from cotarget.cli.common import FEW, MANY, LensAtItsEnd, Reasons, folded
+from cotarget.cli.running import exit_status
 from cotarget.config import DEFAULT_TARGETS
 from cotarget.drawing import side_by_side
 from cotarget.errors import DeviceError
@@ -191,6 +192,14 @@ def test_what_went_wrong_is_told_at_the_end_and_in_json(folder, capsys, monkeypa
     assert line.startswith("cotarget follow: ")
     assert f"{count} of {told['steps']} frames: the point needs pan " in line
     assert "beyond the limits pan -1 to 1," in line
+
+
+def test_a_target_out_of_reach_that_leaves_the_view_was_not_followed():
+    """It is unreachable as long as it is seen, and lost afterwards."""
+    states = dict.fromkeys(State, 0) | {State.UNREACHABLE: 100, State.LOST: 12}
+    assert exit_status(states, 0) == 4
+    assert exit_status(states | {State.FOLLOWING: 1}, 0) == 0
+    assert exit_status(states | {State.FOLLOWING: 1, State.UNCONFIRMED: 5}, 4) == 3
 
 
 HARDWARE = """

@@ -8,13 +8,18 @@ from cotarget.errors import DeviceError
 USB = "/dev/serial/by-id/usb-FTDI_FT232R-if00"
 
 
+@pytest.fixture(autouse=True)
+def _state(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+
 @pytest.fixture
 def stop_file(tmp_path):
     return tmp_path / "made when needed" / "stop"
 
 
 def test_each_rig_remembers_its_own_heads(stop_file):
-    lost, other = PositionLostMarker(USB, stop_file), PositionLostMarker(USB, stop_file.with_name("other"))
+    lost, other = PositionLostMarker(USB, stop_file), PositionLostMarker("/dev/ttyUSB1", stop_file.with_name("other"))
     lost.refuse()
     lost.note(str(PositionLostError(USB, "fell off the roof")))
     assert lost.file.name == "stop.dev-serial-by-id-usb-FTDI-FT232R-if00.position-lost"
@@ -24,6 +29,16 @@ def test_each_rig_remembers_its_own_heads(stop_file):
     lost.forget()
     lost.refuse()
     lost.forget()
+
+
+def test_a_lost_unit_is_refused_by_every_rig_file_that_names_its_port(stop_file):
+    """The default stop file has the name of rig.toml, and a unit may stand in several of them."""
+    PositionLostMarker(USB, stop_file.with_name("calib.stop")).note("lost")
+    for another in (stop_file.with_name("follow.stop"), None):
+        with pytest.raises(DeviceError, match=r"^lost \(or, where no unit"):
+            PositionLostMarker(USB, another).refuse()
+    PositionLostMarker(USB, stop_file.with_name("calib.stop")).forget()
+    PositionLostMarker(USB, stop_file.with_name("follow.stop")).refuse()
 
 
 def test_the_reset_of_one_head_says_nothing_of_another(stop_file):

@@ -37,6 +37,13 @@ def test_every_reader_of_a_rig_finds_the_same_file(tmp_path, text, file):
                 find_stop_file(rig)
 
 
+def test_a_link_to_a_rig_has_the_stop_file_of_the_rig(tmp_path):
+    (tmp_path / "roof.toml").write_text(HARDWARE)
+    link = tmp_path / "calib.toml"
+    link.symlink_to(tmp_path / "roof.toml")
+    assert load_config(link).safety.stop_file == find_stop_file(link) == find_stop_file(tmp_path / "roof.toml")
+
+
 def test_a_broken_line_of_the_stop_file_is_not_taken_for_the_default(tmp_path):
     """Else a stop would be made that no rig watches."""
     (tmp_path / "roof.toml").write_text(HARDWARE + '[safety]\nstop_file = "run/halt\n')
