@@ -152,7 +152,9 @@ class Reporting:
         self._device, self._what, self._answers = device, what, answers
 
     def __getattr__(self, name: str) -> Any:
-        if not hasattr(type(self._device), name) and name not in vars(self._device):
+        with calling(self._what):
+            there = hasattr(type(self._device), name) or hasattr(self._device, name)
+        if not there:
             raise AttributeError(name)  # so that hasattr works
         with calling(self._what):
             found = getattr(self._device, name)

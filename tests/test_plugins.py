@@ -255,6 +255,41 @@ def test_an_answer_of_another_kind_is_one_line_that_names_device_and_method(rig,
     assert "\n" not in str(caught.value)
 
 
+def test_a_device_may_delegate_to_another_and_may_have_slots(rig):
+    other = """
+
+class Delegating:
+    Settings = CameraSettings
+    __slots__ = ("inner",)
+
+    def __init__(self, settings, clock):
+        self.inner = Camera(settings, clock)
+
+    def __getattr__(self, name):
+        return getattr(self.inner, name)
+
+
+class Slots:
+    Settings, limits, __slots__ = HeadSettings, LIMITS, ("clock",)
+    state, halt, close = Head.state, Head.halt, Head.close
+    at = (0.0, 0.0)
+
+    def __init__(self, settings, clock, safety):
+        self.clock = clock
+
+    def move(self, pan, tilt, speed=None, wait=False):
+        return pan, tilt
+"""
+    (rig.parent / "devices.py").write_text(DEVICES + other)
+    rig.write_text(RIG.replace("devices:Camera", "devices:Delegating").replace("devices:Head", "devices:Slots"))
+    with open_rig(rig, guarded=False) as opened:
+        assert opened.fixed.size == (64, 48)
+        assert opened.fixed.read().image[0, 0].tolist() == [128] * 3
+        assert opened.head.move(0.1, 0.2) == (0.1, 0.2)
+        assert not hasattr(opened.head, "no_such")
+        assert not hasattr(opened.fixed, "no_such")
+
+
 def test_a_module_on_pythons_path_needs_no_file_beside_rig_toml(rig, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(rig.parent))
     check(parse_config({"hardware": {"fixed": {"driver": "devices:Camera", "colour": "blue"}}}))
