@@ -73,17 +73,17 @@ def _from_file(path: str) -> ModuleType:
     file = Path(path)
     if str(file.parent) not in sys.path:
         sys.path.append(str(file.parent))
-    spec = importlib.util.spec_from_file_location(file.stem, file)
+    # A name of its own, because dataclasses look their module up by it: the file may be a second webcam.py, or be
+    # called as the library that it imports. Dots would make it a module of a package.
+    spec = importlib.util.spec_from_file_location(path.replace(".", "_"), file)
     if spec is None or spec.loader is None or not file.is_file():
         raise ModuleNotFoundError(f"there is no {file}")
     module = importlib.util.module_from_spec(spec)
-    # Dataclasses look their module up by its name; a module of that name that is imported already keeps it.
-    added = sys.modules.setdefault(spec.name, module) is module
+    sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
     except BaseException:
-        if added:
-            del sys.modules[spec.name]
+        del sys.modules[spec.name]
         raise
     return module
 

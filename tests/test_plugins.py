@@ -1,5 +1,6 @@
 """Drivers and detectors of a user's own, which rig.toml names and nobody puts into the package."""
 
+import colorsys
 import json
 import math
 
@@ -288,6 +289,23 @@ class Slots:
         assert opened.head.move(0.1, 0.2) == (0.1, 0.2)
         assert not hasattr(opened.head, "no_such")
         assert not hasattr(opened.fixed, "no_such")
+
+
+def test_an_own_file_may_have_the_name_of_another_module(rig):
+    """Of a module of Python that it imports itself, and of another own file in the same process."""
+    other = rig.parent / "other"
+    other.mkdir()
+    text = f"from __future__ import annotations\n\nfrom colorsys import rgb_to_hls\n{DEVICES}"
+    for folder, name, kind in (
+        (rig.parent, "colorsys", "Hz"),
+        (rig.parent, "webcam", "Rate"),
+        (other, "webcam", "Fps"),
+    ):
+        own = text.replace("rate_hz: float", f"rate_hz: {kind}") + f"\n\n{kind} = float\n"
+        (folder / f"{name}.py").write_text(own)
+        (folder / "rig.toml").write_text(RIG.replace("devices:", f"{name}:"))
+        assert describe(load_config(folder / "rig.toml")).fixed.rate_hz == 100.0
+    assert colorsys.rgb_to_hls(0.0, 0.0, 0.0) == (0.0, 0.0, 0.0)
 
 
 def test_a_module_on_pythons_path_needs_no_file_beside_rig_toml(rig, tmp_path, monkeypatch):
