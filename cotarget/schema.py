@@ -234,6 +234,8 @@ def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str
     kind, loc, value = error["type"], error["loc"], error["input"]
     if kind == "json_invalid":  # a text with half of a surrogate pair, or tables in tables without end
         return f"{where or 'the file'}: {error['msg']}"
+    if said := _no_alternative(cls, errors, loc, where):
+        return said
     outer, hint = _table_at(cls, loc[:-1]), None if kind == UNKNOWN else _hint_at(cls, loc)
     at, above = _join(where, loc), _join(where, loc[:-1])
     if kind == UNKNOWN:
@@ -246,7 +248,7 @@ def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str
         here, listed = (above, loc[:-1]) if kind == MISSING else (at, loc)
         of_list = _hint_at(cls, listed)
         return f"{here}: has {len(value)} values where {len(typing.get_args(bare(of_list)))} are wanted{_form(of_list)}"
-    if kind == "tuple_type":
+    if kind == "tuple_type" and typing.get_args(bare(hint)):
         return f"{at}: {value!r} is not a list of {_elements(hint)}{_form(hint)}"
     if kind in NO_TABLE:
         return f"{at}: {value!r} is not a table"
@@ -265,6 +267,30 @@ def _message(cls: type[Any], errors: list[Any], where: str, beside: Iterable[str
             at = at[: at.rindex("[")]
         return f"{at}: {said}"
     return f"{at}: {value!r}: {error['msg']}"
+
+
+def _no_alternative(cls: type[Any], errors: list[Any], loc: tuple[str | int, ...], where: str) -> str:
+    """Say which types a value of a union is none of; empty for an error that no union is around.
+
+    pydantic's place of such an error goes on with the type that it tried, which no key of the table is.
+    """
+    for end in range(len(loc)):
+        if _is_union(_hint_at(cls, loc[:end])):
+            at, tried = _join(where, loc[:end]), [each for each in errors if each["loc"][:end] == loc[:end]]
+            of_value = [each for each in tried if len(each["loc"]) == end + 1]  # the others are of parts of it
+            value = f" {of_value[0]['input']!r}" if of_value else ""
+            if len(of_value) == len(tried) and all(each["type"] in WORDS for each in tried):
+                return f"{at}:{value} is not {' or '.join(dict.fromkeys(WORDS[each['type']] for each in tried))}"
+            return f"{at}:{value} fits none of its types: {'; '.join(dict.fromkeys(each['msg'] for each in tried))}"
+    return ""
+
+
+def _is_union(hint: Any) -> bool:
+    """Whether an annotation is a union of several types, beside None."""
+    if typing.get_origin(hint) is Annotated:
+        hint = typing.get_args(hint)[0]
+    kinds = [each for each in typing.get_args(hint) if each is not types.NoneType]
+    return typing.get_origin(hint) in (types.UnionType, typing.Union) and len(kinds) > 1
 
 
 def _out_of_range(error: Any, hint: Any) -> str:
@@ -298,7 +324,7 @@ def _hint_at(hint: Any, loc: Iterable[str | int]) -> Any:
             hint = typing.get_type_hints(outer, include_extras=True)[str(part)]
         elif isinstance(part, int):
             args = typing.get_args(outer)
-            hint = args[0] if args[-1] is ... else args[part]
+            hint = args[0] if args[-1] is ... or len(args) == 1 else args[part]
         else:
             hint = typing.get_args(outer)[1]  # of a Mapping
     return hint

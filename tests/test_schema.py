@@ -5,7 +5,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import pytest
 from annotated_types import Interval
@@ -118,6 +118,40 @@ def test_a_plain_dataclass_is_read_as_strictly():
     for table in ({"rate_hz": "2"}, {"rat": 2}):
         with pytest.raises(ConfigError):
             validate(Plain, table, "plain")
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ({"source": 1.5}, "camera.source: 1.5 is not a whole number or a text"),
+        ({"ports": {"left": True}}, "camera.ports.left: True is not a whole number or a text"),
+        ({"gains": [1, "a"]}, "camera.gains[1]: 'a' is not a whole number"),
+        (
+            {"gain": -1},
+            "camera.gain: -1 fits none of its types: Input should be greater than 0; Input should be 'auto'",
+        ),
+        (
+            {"lens": {"foc": 1}},
+            "camera.lens: {'foc': 1} fits none of its types: Unexpected keyword argument; ",
+        ),
+        ({"sizes": 3}, "camera.sizes: 3: Input should be a valid "),
+    ],
+)
+def test_a_value_that_is_none_of_several_types_is_one_line_that_names_the_key(table, said):
+    @dataclass(frozen=True)
+    class Own:
+        source: int | str = 0
+        ports: dict[str, int | str | None] = field(default_factory=dict)
+        gains: list[int] = field(default_factory=list)
+        gain: Annotated[int, Interval(gt=0)] | Literal["auto"] = "auto"
+        lens: Lens | str = ""
+        sizes: tuple = ()
+
+    assert validate(Own, {"source": "a", "gain": 3}, "camera") == Own("a", gain=3)
+    with pytest.raises(ConfigError) as caught:
+        validate(Own, table, "camera")
+    assert str(caught.value).startswith(said)
+    assert "\n" not in str(caught.value)
 
 
 QUICK = """
