@@ -117,7 +117,7 @@ def _is_ours(file: str) -> bool:
 
 
 class Answer(NamedTuple):
-    """What a method of a user's device has to return: the check, and its description in messages."""
+    """What a user's device has to answer by a method or attribute: the check, and its description in messages."""
 
     is_right: Callable[[Any], bool]
     description: str
@@ -131,12 +131,28 @@ def reporting(function: Callable[..., Any], what: str, answer: Answer | None = N
         with calling(what):
             found = function(*arguments, **keywords)
         if answer is not None and not answer.is_right(found):
-            said = " ".join(repr(found).split())
-            said = said if len(said) <= LONGEST else f"a {type(found).__name__}"
-            raise DeviceError(f"{what}: {function.__name__} returned {said}; it has to return {answer.description}")
+            said = f"{function.__name__} returned {_short(found)}"
+            raise DeviceError(f"{what}: {said}; it has to return {answer.description}")
         return found
 
     return call
+
+
+def check_attribute(device: Any, name: str, what: str, answer: Answer) -> None:
+    """Refuse a device's attribute that is not what it has to be.
+
+    Raises:
+        DeviceError: it is not.
+    """
+    with calling(what):
+        found = getattr(device, name)
+    if not answer.is_right(found):
+        raise DeviceError(f"{what}: {name} is {_short(found)}; it has to be {answer.description}")
+
+
+def _short(wrong: Any) -> str:
+    said = " ".join(repr(wrong).split())
+    return said if len(said) <= LONGEST else f"a {type(wrong).__name__}"
 
 
 class Reporting:

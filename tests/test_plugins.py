@@ -104,6 +104,12 @@ class Head:
         pass
 
 
+class Limitless(Head):
+    @property
+    def limits(self):
+        return 1 / 0
+
+
 class Broken:
     Settings = CameraSettings
 
@@ -229,6 +235,9 @@ def test_an_error_of_a_device_is_one_line_that_names_file_and_line(rig):
     rig.write_text(RIG.replace("devices:Camera", "devices:Short"))
     with pytest.raises(ConfigError, match=r"^hardware\.fixed\.driver: Short has no read; docs/drivers\.md says what"):
         open_rig(rig)
+    rig.write_text(RIG.replace("devices:Head", "devices:Limitless"))
+    with pytest.raises(DeviceError, match=r"^hardware\.head: .*devices\.py:\d+: ZeroDivisionError: "):
+        open_rig(rig)
     rig.write_text(RIG.replace('"green"', '"pink"'))
     with open_rig(rig) as opened, pytest.raises(DeviceError, match=r"^hardware\.fixed: .*devices\.py:\d+: KeyError"):
         opened.fixed.read()
@@ -254,6 +263,40 @@ def test_an_answer_of_another_kind_is_one_line_that_names_device_and_method(rig,
         getattr(getattr(opened, device), name)(*arguments)
     assert str(caught.value).startswith(said)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("attribute", "wrong", "said"), [
+    ("head.limits", "((-1.0, 1.0), (-0.5, 0.5))", "limits is ((-1.0, 1.0), (-0.5, 0.5)); it has to be a PanTiltLimits"),
+    ("fixed.size", "None", "size is None; it has to be (width, height) [px], a tuple of two whole numbers above zero"),
+    ("fixed.size", "[64, 48]", "size is [64, 48]; it has to be (width, height)"),
+    ("zoom.size", "(64.0, 48.0)", "size is (64.0, 48.0); it has to be (width, height)"),
+    ("zoom.still_size", "(0, 48)", "still_size is (0, 48); it has to be (width, height)"),
+    ("zoom.focal_range", "(400.0, 100.0)", "focal_range is (400.0, 100.0); it has to be (shortest, longest) focal "),
+])  # fmt: skip
+def test_an_attribute_of_another_kind_is_one_line_and_the_device_is_closed(rig, attribute, wrong, said):
+    device, name = attribute.split(".")
+    kind = {"head": "Head", "zoom": "Zoom", "fixed": "Camera"}[device]
+    other = f"""
+
+class Other({kind}):
+    def __setattr__(self, name, value):
+        if name != {name!r}:
+            super().__setattr__(name, value)
+
+    @property
+    def {name}(self):
+        return {wrong}
+
+    def close(self):
+        open({str(rig.parent / "closed")!r}, "w").close()
+"""
+    (rig.parent / "devices.py").write_text(DEVICES + other)
+    rig.write_text(RIG.replace(f'"devices:{kind}"', '"devices:Other"'))
+    with pytest.raises(DeviceError) as caught:
+        open_rig(rig)
+    assert str(caught.value).startswith(f"hardware.{device}: {said}")
+    assert "\n" not in str(caught.value)
+    assert (rig.parent / "closed").exists()
 
 
 def test_a_device_may_delegate_to_another_and_may_have_slots(rig):

@@ -4,7 +4,7 @@ import contextlib
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass, replace
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -15,8 +15,19 @@ from cotarget.drivers.board import BoardSettings, make_board
 from cotarget.drivers.clock import MonotonicClock
 from cotarget.drivers.interlock import rig_lock
 from cotarget.errors import ConfigError, choices
-from cotarget.plugins import FORM, Answer, Reporting, calling, is_own, load
-from cotarget.rig import CameraSpec, Clock, Frame, HeadSpec, PanTiltState, Rig, RigSpec, ZoomSpec, ZoomState
+from cotarget.plugins import FORM, Answer, Reporting, calling, check_attribute, is_own, load
+from cotarget.rig import (
+    CameraSpec,
+    Clock,
+    Frame,
+    HeadSpec,
+    PanTiltLimits,
+    PanTiltState,
+    Rig,
+    RigSpec,
+    ZoomSpec,
+    ZoomState,
+)
 from cotarget.schema import missing_key, validate
 
 # Python's thread switch interval [s], instead of 5 ms: a driver's thread that waits for its turn delays every command.
@@ -46,6 +57,10 @@ def _are_numbers(answer: Any, count: int) -> bool:
     return len(numbers) == count and all(isinstance(each, Real) for each in numbers)
 
 
+def _are_two(attribute: Any, kind: type[Any]) -> bool:
+    return isinstance(attribute, tuple) and len(attribute) == 2 and all(isinstance(each, kind) for each in attribute)
+
+
 FRAME = Answer(_is_frame, "a Frame, whose image is (H, W, 3) BGR of uint8")
 # By table of [hardware] that has a driver: what methods of the opened device have to return.
 ANSWERS: Mapping[str, Mapping[str, Answer]] = {
@@ -60,6 +75,19 @@ ANSWERS: Mapping[str, Mapping[str, Answer]] = {
         "state": Answer(lambda answer: isinstance(answer, ZoomState), "a ZoomState"),
         "zoom": Answer(lambda answer: isinstance(answer, Real), "the focal length that the lens will reach [px]"),
     },
+}
+SIZE = Answer(
+    lambda size: _are_two(size, Integral) and min(size) > 0,
+    "(width, height) [px], a tuple of two whole numbers above zero",
+)
+FOCAL_RANGE = Answer(
+    lambda ends: _are_two(ends, Real) and 0 < ends[0] <= ends[1], "(shortest, longest) focal length [px], a tuple"
+)
+# By table of [hardware] that has a driver: what attributes of the opened device have to be.
+ATTRIBUTES: Mapping[str, Mapping[str, Answer]] = {
+    "head": {"limits": Answer(lambda limits: isinstance(limits, PanTiltLimits), "a PanTiltLimits of cotarget.rig")},
+    "fixed": {"size": SIZE},
+    "zoom": {"size": SIZE, "still_size": SIZE, "focal_range": FOCAL_RANGE},
 }
 
 
@@ -142,17 +170,23 @@ class Device:
 
         Raises:
             ConfigError: the device differs from its settings.
-            DeviceError: the device cannot be opened.
+            DeviceError: the device cannot be opened, or an attribute is not what it has to be.
         """
         if not self.own:
             return self.driver(self.settings, *arguments)
         with calling(self.where):
             device = self.driver(self.settings, *arguments)
-        if lacks := [name for name in ROLES[self.role][1] if not hasattr(device, name)]:
+            lacks = [name for name in ROLES[self.role][1] if not hasattr(device, name)]
+        if lacks:
             raise ConfigError(
                 f"{self.where}.{KEY}: {self.driver.__name__} has no {lacks[0]}; docs/drivers.md says what it needs"
             )
-        return Reporting(device, self.where, ANSWERS[self.role])
+        with contextlib.ExitStack() as opened:
+            own = opened.enter_context(contextlib.closing(Reporting(device, self.where, ANSWERS[self.role])))
+            for name, answer in ATTRIBUTES[self.role].items():
+                check_attribute(device, name, self.where, answer)
+            opened.pop_all()
+        return own
 
 
 def device_of(role: str, table: Mapping[str, Any]) -> Device:
