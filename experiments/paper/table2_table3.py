@@ -83,7 +83,7 @@ def one(_: None, settings: Settings, seed: int) -> list[Row]:
 
 def _pose_rows(seed: int, calibration: Calibration, name: str, true: RigidTransform) -> Iterator[Row]:
     """Make the rows of a translation [mm] and a rotation vector [degrees]."""
-    mine: RigidTransform = getattr(calibration, name)
+    mine: RigidTransform = getattr(calibration.zoom_head, name)
     turned = np.degrees((mine.rotation * true.rotation.inv()).as_rotvec())
     vectors = [each.rotation.as_rotvec(degrees=True) for each in (mine, true)]
     for i, axis in enumerate(PLACES):
