@@ -50,6 +50,7 @@ class PositionLostMarker:
     """
 
     def __init__(self, port: str, stop_file: Path | None) -> None:
+        self._has_lasting_port = not port.startswith("/dev/pts/")  # another emulator gets a pseudo-terminal's name
         port = re.sub(r"[^A-Za-z0-9.]+", "-", port).strip("-")[-LONGEST_NAME:]
         without = _state_home() / WITHOUT_STOP_FILE
         beside = without if stop_file is None else stop_file
@@ -77,7 +78,7 @@ class PositionLostMarker:
 
     def note(self, reason: str) -> None:
         """Write the markers; a failure is logged."""
-        for file in dict.fromkeys((self.file, self._of_port)):
+        for file in dict.fromkeys((self.file, self._of_port) if self._has_lasting_port else (self.file,)):
             try:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_text(f"{reason}\n", encoding="utf-8")

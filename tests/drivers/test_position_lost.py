@@ -41,6 +41,11 @@ def test_a_lost_unit_is_refused_by_every_rig_file_that_names_its_port(stop_file)
     PositionLostMarker(USB, stop_file.with_name("follow.stop")).refuse()
 
 
+def test_a_pseudo_terminal_whose_name_another_emulator_gets_is_remembered_by_its_rig_alone(stop_file):
+    PositionLostMarker("/dev/pts/3", stop_file.with_name("one.stop")).note("lost")
+    PositionLostMarker("/dev/pts/3", stop_file.with_name("two.stop")).refuse()
+
+
 def test_the_reset_of_one_head_says_nothing_of_another(stop_file):
     """Two heads may share a stop file; a unit may come back at another port, which nobody can tell from that."""
     first, second = PositionLostMarker("/dev/ttyUSB0", stop_file), PositionLostMarker("/dev/ttyUSB1", stop_file)
