@@ -220,7 +220,8 @@ def follow(options: argparse.Namespace) -> int:
         run = _follow(
             opened, calibration, config, spec.fixed.rate_hz, options, options.target, selection, options.seconds
         )
-        _tell_if_nothing_was_seen("follow", options.target, target, run.counts["states"], selection)
+        if run.interrupted is None:  # a run cut short may not have had the time to see anything
+            _tell_if_nothing_was_seen("follow", options.target, target, run.counts["states"], selection)
         print_json(run.counts, options.csv)
         if run.interrupted is not None:
             raise run.interrupted

@@ -251,9 +251,5 @@ def test_following_is_ended_by_a_signal_with_the_head_halted(start, tmp_path, nu
         ["moved", "halting", "halted", "halting", "halted", "closing", "closed"],
         ["halting", "halted", "halting", "halted", "closing", "closed"],  # ended in the middle of a command
     )
-    assert returned == status
-    *hints, last_line = err.splitlines()
-    assert last_line == f"cotarget follow: {said}; steps.csv holds what there was until then"
-    # Where the signal comes in the step that first sees the book, no step that was completed has seen it.
-    assert all(hint.startswith("cotarget follow: no book was seen in ") for hint in hints)
+    assert (returned, err) == (status, f"cotarget follow: {said}; steps.csv holds what there was until then\n")
     assert len((tmp_path / "steps.csv").read_text().splitlines()) > 1
